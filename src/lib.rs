@@ -38,6 +38,7 @@ pub mod checkpoint;
 pub mod cli;
 pub mod compress;
 pub mod dataset;
+pub mod engine;
 pub mod evaluate;
 pub mod export;
 pub mod exposure;

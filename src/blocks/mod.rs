@@ -5,11 +5,10 @@
 //! of its own: it has the views that see its cell (`sight.rs`), starts from the Gaussians of the coarse model in and
 //! around the cell, and has the others frozen behind them (`task.rs`). What it ends with in its cell is its part of the
 //! merged model (`merge.rs`), which has at most the rows that were promised, as every block has a share of them.
-//! Schedulers start the tasks (`engine/`); there is none here. Prints nothing.
+//! Engines start the tasks (`crate::engine`); there is no scheduler here. Prints nothing.
 
 mod crop;
 mod divide;
-pub mod engine;
 mod ground;
 mod merge;
 mod options;
@@ -17,6 +16,7 @@ mod picture;
 mod plan;
 mod sight;
 mod status;
+mod submit;
 mod task;
 
 use std::path::{Path, PathBuf};
@@ -33,8 +33,11 @@ pub use merge::{Merged, merge};
 pub use options::{Grid, PlanOptions, Size};
 pub use plan::plan;
 pub use status::{State, status};
+pub use submit::submit;
 pub use task::run;
 
+/// Most bytes of a plan, which takes 0.4 kB per block.
+const MAX_PLAN: u64 = 256 << 20;
 /// The plan in its folder.
 pub const PLAN_FILE: &str = "plan.toml";
 /// Description of the coarse run, and of each block's, in the plan's folder: options that the user gave, and what the
@@ -122,7 +125,7 @@ impl Blocks {
     /// When there is none, or it is not one.
     pub fn read(folder: &Path) -> Result<Self, Failure> {
         let path = folder.join(PLAN_FILE);
-        let text = foreign::read_text(&path, foreign::MAX_OPTIONS).map_err(|error| {
+        let text = foreign::read_text(&path, MAX_PLAN).map_err(|error| {
             let remedy = "name a folder that `densify blocks plan` wrote";
             Failure::input(format!("{}: {error}; {remedy}", path.display()))
         })?;
@@ -195,12 +198,6 @@ impl Blocks {
 fn is_plain(name: &str) -> bool {
     let is_word = |c: char| c.is_ascii_alphanumeric() || c == '-';
     !name.is_empty() && name.chars().all(is_word)
-}
-
-/// A path as text, for commands and descriptions.
-fn utf8(path: &Path) -> Result<&str, Failure> {
-    let wrong = || Failure::input(format!("{}: the name is not UTF-8; rename it", path.display()));
-    path.to_str().ok_or_else(wrong)
 }
 
 /// Folder of a block in that of the plan.

@@ -4,11 +4,10 @@ use std::fs;
 use std::path::Path;
 
 use super::crop::{beyond, inside};
-use super::{
-    BLOCK_FILE, Blocks, COARSE_FILE, MERGED_FILE, Task, block_folder, merge, run_folder, utf8,
-};
+use super::{BLOCK_FILE, Blocks, COARSE_FILE, MERGED_FILE, Task, block_folder, merge, run_folder};
 use crate::camera::Camera;
 use crate::dataset::Dataset;
+use crate::engine::utf8;
 use crate::export::PLY;
 use crate::failure::Failure;
 use crate::gaussians::Gaussians;

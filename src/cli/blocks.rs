@@ -9,10 +9,10 @@ use super::console::Console;
 use super::export::{check_output, format_of};
 use super::flags::words;
 use super::train::Follower;
-use crate::blocks::engine::{Engine, Submission, submit};
 use crate::blocks::{
-    self, Block, Blocks, Grid, PlanOptions, Size, State, Task, merge, plan, status,
+    self, Block, Blocks, Grid, PlanOptions, Size, State, Task, merge, plan, status, submit,
 };
+use crate::engine::{Engine, SubmissionArgs};
 use crate::failure::Failure;
 use crate::memory::Bytes;
 use crate::number::{self, grouped};
@@ -92,15 +92,8 @@ struct SubmitArgs {
     /// What starts them
     #[arg(long, value_name = "ENGINE", default_value = "local")]
     engine: Engine,
-    /// Print the files for the engine, and start nothing
-    #[arg(long)]
-    dry_run: bool,
-    /// Hand in again what is not complete
-    #[arg(long)]
-    again: bool,
-    /// Ask HyperQueue for memory too: its workers must offer the resource `mem`, in bytes, else tasks wait for ever
-    #[arg(long)]
-    mem_resource: bool,
+    #[command(flatten)]
+    more: SubmissionArgs,
 }
 
 /// Runs one task of a plan, or what is left of it: engines call this.
@@ -218,16 +211,8 @@ fn table(blocks: &Blocks) -> String {
 }
 
 fn run_submit(args: &SubmitArgs, console: &Console) -> Result<(), Failure> {
-    if args.mem_resource && args.engine != Engine::Hq {
-        return Err(Failure::input("--mem-resource is for --engine hq; leave it out"));
-    }
+    let submission = args.more.with(args.engine)?;
     let blocks = Blocks::read(&args.folder)?;
-    let submission = Submission {
-        engine: args.engine,
-        dry_run: args.dry_run,
-        again: args.again,
-        with_memory: args.mem_resource,
-    };
     let follower = Follower::new(console);
     follower.listen();
     submit(&args.folder, &blocks, submission, &follower)

@@ -132,6 +132,8 @@ enum Command {
     Policies(policies::PoliciesArgs),
     Scenegen(Box<scenegen::ScenegenArgs>),
     Selftest(selftest::SelftestArgs),
+    #[command(hide = true)]
+    StudyRun(study::StudyRun),
     Trade(study::Trade),
     View(Box<view::ViewArgs>),
 }
@@ -178,6 +180,7 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
         Command::Knobs(knobs) => knobs::run(&knobs, &console),
         Command::Policies(policies) => policies::run(&policies, &console),
         Command::Scenegen(scenegen) => scenegen::run(&scenegen, &console),
+        Command::StudyRun(run) => study::run(&run, &console),
         Command::Trade(trade) => study::trade(&trade, &console),
         Command::Selftest(selftest) => selftest::run(&selftest, &console),
         Command::View(view) => view::run(&view, given, &console),

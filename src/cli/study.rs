@@ -4,7 +4,7 @@ use super::console::Console;
 use super::flags::words;
 use crate::failure::Failure;
 use crate::study::Finished;
-pub(super) use crate::study::{Comparison, Trade};
+pub(super) use crate::study::{Comparison, StudyRun, Trade};
 
 pub(super) fn compare(args: &Comparison, console: &Console) -> Result<(), Failure> {
     let train = words(&args.train, "densify compare ... --")?;
@@ -16,7 +16,13 @@ pub(super) fn trade(args: &Trade, console: &Console) -> Result<(), Failure> {
     finish(args.run(train, console)?, console)
 }
 
-fn finish(Finished { summary, report }: Finished, console: &Console) -> Result<(), Failure> {
+pub(super) fn run(args: &StudyRun, _: &Console) -> Result<(), Failure> {
+    args.make()
+}
+
+/// Shows what has come out; nothing yet, where a scheduler has runs.
+fn finish(done: Option<Finished>, console: &Console) -> Result<(), Failure> {
+    let Some(Finished { summary, report }) = done else { return Ok(()) };
     console.result(summary);
     console.result(format_args!("everything in {}", report.display()));
     Ok(())

@@ -40,5 +40,5 @@ absent!(devices, "gpu", run(DevicesArgs) "densify devices");
 absent!(scenegen, "scenegen", run(ScenegenArgs) "densify scenegen");
 absent!(report, "study", run(ReportArgs) "densify report");
 absent!(selftest, "selftest", run(SelftestArgs) "densify selftest");
-absent!(study, "study", compare(Comparison) "densify compare", trade(Trade) "densify trade");
+absent!(study, "study", compare(Comparison) "densify compare", trade(Trade) "densify trade", run(StudyRun) "densify study-run");
 absent!(view, "view", run(ViewArgs, &clap::ArgMatches) "densify view");

@@ -28,6 +28,8 @@ pub use overlay::Partial;
 #[cfg(feature = "study")]
 pub(crate) use report::Reductions;
 pub use report::{LeftOut, Requirements};
+#[cfg(feature = "study")]
+pub(crate) use resolve::promised_bytes;
 pub use resolve::{Alternatives, DEFAULT_BUDGET, Plan, plan};
 pub(crate) use resolve::{promised, use_threads};
 pub use resume::{Resumed, start};

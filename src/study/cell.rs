@@ -4,16 +4,19 @@ use std::fmt;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use serde::{Deserialize, Serialize};
 use toml::Value;
 
 use super::child::{Child, has_geometry, in_run, summary};
 use super::record::Outcome;
 use crate::failure::{Failure, OTHER};
-use crate::output::{geometry_of, model_path, scores_of};
+use crate::foreign;
+use crate::output::{geometry_of, model_path, scores_of, write_atomically};
 use crate::run::Partial;
 
-/// A run of a study.
-#[derive(Debug, Clone, PartialEq, Default)]
+/// A run of a study, as it also stands in a file for who is to make it.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub(super) struct Cell {
     pub(super) scene: PathBuf,
     /// The scene's short name.
@@ -28,11 +31,29 @@ pub(super) struct Cell {
     pub(super) title: String,
     /// The same for names of folders.
     pub(super) folder: String,
-    /// The description of the run.
-    pub(super) spec: Partial,
     /// Whether scores are of the model as any viewer would show it, without shortcuts; else they are
     /// those that the run measured itself.
     pub(super) scores_without_shortcuts: bool,
+    /// The description of the run.
+    #[serde(with = "as_table")]
+    pub(super) spec: Partial,
+}
+
+mod as_table {
+    use serde::de::Error;
+    use serde::{Deserialize, Deserializer, Serialize, Serializer};
+    use toml::Table;
+
+    use crate::run::Partial;
+
+    pub(super) fn serialize<S: Serializer>(spec: &Partial, to: S) -> Result<S::Ok, S::Error> {
+        spec.clone().into_table().serialize(to)
+    }
+
+    pub(super) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Partial, D::Error> {
+        Partial::new(Table::deserialize(from)?, "spec")
+            .map_err(|failure| D::Error::custom(failure.message))
+    }
 }
 
 impl fmt::Display for Cell {
@@ -69,7 +90,7 @@ impl Cell {
     }
 
     /// Name of the run's folder.
-    fn run(&self) -> String {
+    pub(super) fn run(&self) -> String {
         format!("{}-{}-seed{}", self.label, self.folder, self.seed)
     }
 
@@ -93,6 +114,41 @@ impl Cell {
         let done = child.train().and_then(|()| measure());
         done.map_err(|failure| in_run(self, failure))?;
         self.record(&folder)
+    }
+
+    /// Writes what whoever is to make the run needs.
+    pub(super) fn write(&self, output: &Path) -> Result<(), Failure> {
+        let text = toml::to_string(self).map_err(Failure::input)?;
+        write_atomically(&task_file(output, &self.run()), |out| out.write_all(text.as_bytes()))?;
+        Ok(())
+    }
+
+    /// The run of this name, as it was written.
+    pub(super) fn read(output: &Path, name: &str) -> Result<Self, Failure> {
+        let path = task_file(output, name);
+        let within = |problem: String| Failure::input(format!("{}: {problem}", path.display()));
+        let text =
+            foreign::read_text(&path, foreign::MAX_OPTIONS).map_err(|e| within(e.to_string()))?;
+        toml::from_str(&text).map_err(|e| within(e.to_string().trim().to_owned()))
+    }
+
+    /// Makes the run, unless that is done, and leaves its record beside its folder.
+    pub(super) fn make(&self, output: &Path) -> Result<(), Failure> {
+        if self.made(output).is_some() {
+            return Ok(());
+        }
+        let outcome = self.train(output)?;
+        let text = serde_json::to_string(&outcome).map_err(Failure::input)?;
+        write_atomically(&record_file(output, &self.run()), |out| out.write_all(text.as_bytes()))?;
+        Ok(())
+    }
+
+    /// The record that [`Self::make`] has left of this very run.
+    pub(super) fn made(&self, output: &Path) -> Option<Outcome> {
+        let text =
+            foreign::read_text(&record_file(output, &self.run()), foreign::MAX_OPTIONS).ok()?;
+        let outcome: Outcome = serde_json::from_str(&text).ok()?;
+        outcome.is_of(&self.spec).then_some(outcome)
     }
 
     fn record(&self, folder: &Path) -> Result<Outcome, Failure> {
@@ -134,4 +190,14 @@ impl Cell {
             geometry: geometry_of(folder, iterations)?,
         })
     }
+}
+
+/// What whoever is to make a run needs.
+fn task_file(output: &Path, name: &str) -> PathBuf {
+    output.join("runs").join(format!("{name}.task.toml"))
+}
+
+/// The record of a run that an engine has started.
+fn record_file(output: &Path, name: &str) -> PathBuf {
+    output.join("runs").join(format!("{name}.record.json"))
 }

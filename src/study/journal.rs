@@ -38,8 +38,7 @@ impl Journal {
 
     /// The outcome of the run with this description, by this version of densify.
     pub(super) fn outcome(&self, spec: &Partial) -> Option<&Outcome> {
-        let is_ours = |run: &&Outcome| run.densify == env!("CARGO_PKG_VERSION");
-        self.records.iter().rev().filter(is_ours).find(|run| spec.is_table(&run.spec))
+        self.records.iter().rev().find(|run| run.is_of(spec))
     }
 
     /// Adds a record and writes them all.

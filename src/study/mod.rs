@@ -10,6 +10,7 @@ mod child;
 mod columns;
 mod compare;
 pub(crate) mod difference;
+mod engines;
 mod journal;
 mod markdown;
 pub(crate) mod panel;
@@ -21,6 +22,7 @@ pub(crate) mod window;
 use std::path::{Path, PathBuf};
 
 pub(crate) use compare::Comparison;
+pub(crate) use engines::{EngineArgs, StudyRun};
 pub(crate) use trade::Trade;
 
 use crate::dataset::builtin;
@@ -61,9 +63,24 @@ impl<'a> Study<'a> {
         Ok(Self { output, observer, journal })
     }
 
-    /// Makes the runs that are not done yet, one after another; returns the outcomes of all. Where
-    /// several cells describe the same run, it is made once: the seed decides everything.
-    fn run(&mut self, cells: &[Cell]) -> Result<Vec<Outcome>, Failure> {
+    /// Makes the runs that are not done yet, one after another or by an engine; returns the outcomes of all,
+    /// or `None` where not all are done, as a scheduler has them. Where several cells describe the same run,
+    /// it is made once: the seed decides everything.
+    fn run(
+        &mut self,
+        cells: &[Cell],
+        engine: &EngineArgs,
+    ) -> Result<Option<Vec<Outcome>>, Failure> {
+        let is_left = self.collect(cells)?;
+        if let Some(submission) = engine.submission()?
+            && is_left
+        {
+            let is_done = |cell: &Cell| self.journal.outcome(&cell.spec).is_some();
+            engines::submit(self.output, cells, is_done, submission, self.observer)?;
+            if self.collect(cells)? {
+                return Ok(None);
+            }
+        }
         let count = cells.len();
         let mut outcomes = Vec::new();
         for (i, cell) in cells.iter().enumerate() {
@@ -82,7 +99,21 @@ impl<'a> Study<'a> {
             let (factor, level) = (cell.factor.clone(), cell.level.clone());
             outcomes.push(Outcome { factor, level, ..outcome });
         }
-        Ok(outcomes)
+        Ok(Some(outcomes))
+    }
+
+    /// Takes the records of runs that an engine has made into the journal; whether runs are left.
+    fn collect(&mut self, cells: &[Cell]) -> Result<bool, Failure> {
+        let mut is_left = false;
+        for cell in cells {
+            if self.journal.outcome(&cell.spec).is_none() {
+                match cell.made(self.output) {
+                    Some(outcome) => self.journal.add(outcome)?,
+                    None => is_left = true,
+                }
+            }
+        }
+        Ok(is_left)
     }
 
     /// Writes the report, as `name`.md, and as `name`.html with its pictures in it.

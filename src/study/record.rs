@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 use toml::Table;
 
 use crate::metrics::geometry::Geometry;
+use crate::run::Partial;
 
 /// The result of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -51,6 +52,11 @@ pub(super) struct Outcome {
 }
 
 impl Outcome {
+    /// Whether it is of the run with this description, by this version of densify.
+    pub(super) fn is_of(&self, spec: &Partial) -> bool {
+        self.densify == env!("CARGO_PKG_VERSION") && spec.is_table(&self.spec)
+    }
+
     /// Whether the budget was kept at every instant.
     pub(super) fn kept_its_budget(&self) -> bool {
         self.peak_rows <= self.budget

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Trains a scene in four blocks with Slurm, kills one task on the way, and compares the merged model with that of this
-# machine alone, byte for byte. Called by slurm.sh:
+# machine alone, byte for byte. Then a comparison of policies is handed in and collected. Called by slurm.sh:
 #
 #   tests/engines/slurm.sh tests/engines/slurm_blocks.sh PROGRAM
 set -euo pipefail
@@ -34,4 +34,19 @@ squeue --noheader
 [ -n "$killed" ] || fail 'no task was killed'
 grep -q 'resume   from step' "$scratch"/slurm/logs/densify-blocks-*.log || fail 'no task has gone on from a checkpoint'
 cmp "$scratch/local/merged.ply" "$scratch/slurm/merged.ply" || fail 'Slurm made another model'
+
+study() {
+    "$program" compare "$scratch/scene" -o "$scratch/$1" --policies vanilla,diet --budget 1k --seeds 1 --iterations 200 \
+        "${@:2}" -- --backend cpu --threads 1 --sh-degree 0
+}
+study alone >/dev/null
+study handed --engine slurm
+for _ in $(seq 240); do
+    [ -f "$scratch/handed/compare.md" ] && break
+    sleep 0.5
+    study handed --engine slurm >/dev/null
+done
+models() { grep -o '"run":"[^"]*"\|"model":[0-9]*' "$scratch/$1/compare.jsonl" | sort; }
+[ "$(models alone)" = "$(models handed)" ] || fail 'Slurm made other runs'
+echo "the same $(wc -l <"$scratch/handed/compare.jsonl") runs of a study"
 echo "the same model of $(stat -c %s "$scratch/slurm/merged.ply") bytes, with one task killed and requeued"

@@ -17,6 +17,8 @@ use densify_policies::registry::PolicyEntry;
 use toml::Table;
 
 pub(crate) use plan::promised;
+#[cfg(feature = "study")]
+pub(crate) use plan::promised_bytes;
 pub use plan::{Alternatives, Plan, plan};
 pub use size::DEFAULT_BUDGET;
 pub(super) use size::{Size, check, check_grant};
@@ -44,8 +46,8 @@ use exposure::Exposure;
 
 /// Most points of a random initialisation, where none is given (Kerbl et al. 2023 use 100,000).
 const RANDOM_POINTS: usize = 100_000;
-/// How much more memory a process that goes on with a run may be found to take than the one that began it, which leaves
-/// room for it: else it could be refused its own run.
+/// How much more memory a process that goes on with a run may be found to take than the one that began it, without being
+/// refused its own run. The room that the ledger keeps for the allocator is larger.
 const UNSTEADY: u64 = 1 << 20;
 /// Threads that decode training views ahead of the trainer.
 pub(super) const DECODERS: usize = 2;
@@ -138,10 +140,10 @@ impl<'a> Inputs<'a> {
                 size("--freeze", freeze.as_ref().map(|file| &*file.0))?,
             ),
         };
-        // Tracks have a line of their own, and are given back. A process that goes on may take a little more.
+        // Tracks have a line of their own, and are given back.
         let is_resumed = saved.is_some() && exposures != Begun::Reckoned;
-        let more = if is_resumed { 0 } else { UNSTEADY };
-        let resident = resident().map(|now| now.saturating_sub(dataset.tracks.bytes()) + more);
+        let apart = dataset.tracks.bytes() + if is_resumed { UNSTEADY } else { 0 };
+        let resident = resident().map(|now| now.saturating_sub(apart));
         let peak = peak_resident();
         let colours = match dataset.tracks.len() {
             ..MIN_TRACKS => None,

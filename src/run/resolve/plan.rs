@@ -69,6 +69,17 @@ pub(crate) fn promised(
     Ok((setting.rows, ledger))
 }
 
+/// What a run takes of the host's memory at most `[bytes]`.
+///
+/// # Errors
+/// As [`plan`].
+#[cfg(feature = "study")]
+pub(crate) fn promised_bytes(spec: &RunSpec, observer: &dyn Observer) -> Result<u64, Failure> {
+    let inputs = Inputs::load(spec, None, observer)?;
+    let setting = Size::choose(&inputs)?.setting;
+    Ok(inputs.ledger(&setting, &inputs.needs(setting.rows)?).on_host())
+}
+
 /// What `memory` holds, as the solver finds it for such a run without `--budget`; `planned` rows are a model.
 fn alternatives(inputs: &Inputs<'_>, memory: u64, planned: usize) -> Result<Alternatives, Failure> {
     let own = inputs.spec.data.resolution.unwrap_or(Resolution::Divisor(1));

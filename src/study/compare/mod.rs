@@ -19,7 +19,7 @@ use super::cell::Cell;
 use super::child::shared_options;
 use super::difference::{Difference, Pair};
 use super::record::Outcome;
-use super::{Finished, Study, distinct, labels};
+use super::{EngineArgs, Finished, Study, distinct, labels};
 use crate::failure::Failure;
 use crate::number::{self, grouped};
 use crate::run::{Observer, Partial};
@@ -48,7 +48,7 @@ Examples:
 /// Every policy runs with every budget and every seed, one run after another. A run that is
 /// finished is not run again: call the same command to go on after an interruption. The folder then
 /// holds compare.md (tables and pictures), compare.html (the same as one file), compare.jsonl (a record per run),
-/// plots as SVG, and the runs themselves.
+/// plots as SVG, and the runs themselves. With --engine a cluster makes the runs.
 ///
 /// Quality is measured on views held out. Differences are taken between runs of the same scene,
 /// budget and seed, against the first policy named, with 95 % intervals of their mean from three
@@ -84,6 +84,8 @@ pub(crate) struct Comparison {
     /// Options of `densify train` for every run
     #[arg(last = true, value_name = "TRAIN OPTIONS")]
     pub train: Vec<String>,
+    #[command(flatten)]
+    pub engine: EngineArgs,
 }
 
 /// A budget for all scenes, or for one.
@@ -116,12 +118,16 @@ impl SceneBudget {
 }
 
 impl Comparison {
-    /// Makes the runs that are not done yet, all with the options `train`, and writes tables and pictures.
-    pub(crate) fn run(&self, train: Partial, observer: &dyn Observer) -> Result<Finished, Failure> {
+    /// Makes the runs that are not done yet, or hands them in, which is `None`; all with the options `train`, and writes tables and pictures.
+    pub(crate) fn run(
+        &self,
+        train: Partial,
+        observer: &dyn Observer,
+    ) -> Result<Option<Finished>, Failure> {
         let policies = all_policies(&self.policies)?;
         let cells = self.cells(&policies, train)?;
         let mut study = Study::open(&self.output, "compare", observer)?;
-        let outcomes = study.run(&cells)?;
+        let Some(outcomes) = study.run(&cells, &self.engine)? else { return Ok(None) };
         let mut text = report::markdown(&outcomes, &policies);
         text += "\n## Pictures\n";
         for picture in plots::draw(&self.output, &outcomes, &policies)? {
@@ -132,7 +138,7 @@ impl Comparison {
             text += &format!("\n![{caption}]({})\n\n{caption}.\n", picture.file);
         }
         text += &report::options(&outcomes)?;
-        study.finish("compare", &text, report::summary(&outcomes, &policies))
+        study.finish("compare", &text, report::summary(&outcomes, &policies)).map(Some)
     }
 
     /// All runs, in the order in which they run: seed after seed, so that an interrupted comparison is a

@@ -12,7 +12,7 @@ use clap::Args;
 use super::cell::Cell;
 use super::child::shared_options;
 use super::record::Outcome;
-use super::{Finished, Study, labels};
+use super::{EngineArgs, Finished, Study, labels};
 use crate::failure::Failure;
 use crate::knobs::{EXACT, preset};
 use crate::number;
@@ -42,7 +42,7 @@ Examples:
 ///
 /// A run that is finished is not run again: call the same command to go on after an interruption. The
 /// folder then holds trade.md (tables and plots), trade.html (the same as one file), trade.jsonl (a record per
-/// line), plots as SVG, and the runs themselves.
+/// line), plots as SVG, and the runs themselves. With --engine a cluster makes the runs.
 #[derive(Debug, Clone, Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Trade {
@@ -68,23 +68,29 @@ pub(crate) struct Trade {
     /// Options of `densify train` for every run
     #[arg(last = true, value_name = "TRAIN OPTIONS")]
     pub train: Vec<String>,
+    #[command(flatten)]
+    pub engine: EngineArgs,
 }
 
 impl Trade {
-    /// Makes what is not done yet, all runs with the options `train`, and writes tables and plots.
-    pub(crate) fn run(&self, train: Partial, observer: &dyn Observer) -> Result<Finished, Failure> {
+    /// Makes what is not done yet, or hands it in, which is `None`; all runs with the options `train`, and writes tables and plots.
+    pub(crate) fn run(
+        &self,
+        train: Partial,
+        observer: &dyn Observer,
+    ) -> Result<Option<Finished>, Failure> {
         let shared = shared_options(train, &OWN_OPTIONS)?;
         let factors = factors(self, &shared, observer)?;
         let cells = self.cells(&factors, &shared)?;
         let mut study = Study::open(&self.output, "trade", observer)?;
-        let outcomes = study.run(&cells)?;
+        let Some(outcomes) = study.run(&cells, &self.engine)? else { return Ok(None) };
         let report = Report::new(self, &factors, outcomes);
         let mut text = table::markdown(&report);
         text += "\n## Plots\n";
         for picture in plots::draw(&self.output, &report)? {
             text += &format!("\n![{}]({})\n", picture.caption, picture.file);
         }
-        study.finish("trade", &text, table::summary(&report))
+        study.finish("trade", &text, table::summary(&report)).map(Some)
     }
 
     /// All runs in which at most one knob is changed, in the order in which they run: seed after seed, so

@@ -133,6 +133,7 @@ pub(super) fn sample() -> Report {
         budget: 1000,
         output: "x".into(),
         train: vec!["--policy=diet".into()],
+        engine: crate::study::EngineArgs::default(),
     };
     let factor = |name: &str, levels: &[&str]| Factor {
         name: name.to_owned(),

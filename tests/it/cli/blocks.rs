@@ -4,7 +4,9 @@ use std::path::Path;
 
 use toml::Table;
 
-use super::{Outcome, WITHOUT_GPU, call, count, gaussians, json, read, read_text, scratch, text};
+use super::{Outcome, call, count, gaussians, json, read, read_text, scratch, text};
+#[cfg(unix)]
+use super::{call_with_path, run_place, stand_in};
 use crate::photographs::{Photographs, VIEWS};
 
 /// Two blocks of a small scene.
@@ -105,8 +107,6 @@ fn a_scene_in_blocks_becomes_one_model() {
 #[cfg(unix)]
 #[test]
 fn schedulers_are_handed_what_makes_the_same_model() {
-    use std::os::unix::fs::PermissionsExt;
-
     let scene = Photographs::colmap_text();
     let (root, folder) = scratch();
     plan(scene.path(), &folder, "").ok();
@@ -117,16 +117,7 @@ fn schedulers_are_handed_what_makes_the_same_model() {
     let bin = root.path().join("bin");
     std::fs::create_dir(&bin).unwrap();
     let submit = |flags: &str, path: &str| {
-        let mut command = assert_cmd::Command::new(env!("CARGO_BIN_EXE_densify"));
-        let words = ["blocks", "submit", text(&folder)].into_iter().chain(flags.split_whitespace());
-        let command = command.args(words).envs([WITHOUT_GPU]);
-        let output = command.env("PATH", path).output().expect("it starts");
-        let text = |bytes| String::from_utf8(bytes).expect("messages are UTF-8");
-        Outcome {
-            code: output.status.code(),
-            stdout: text(output.stdout),
-            stderr: text(output.stderr),
-        }
+        call_with_path(&format!("blocks submit {} {flags}", text(&folder)), path)
     };
     submit("--engine slurm", text(&bin)).refused("no Slurm", &["sbatch", "PATH"]);
     submit("--engine hq", text(&bin)).refused("no HyperQueue", &["hq", "PATH"]);
@@ -134,13 +125,9 @@ fn schedulers_are_handed_what_makes_the_same_model() {
 
     let shown = submit("--engine slurm --dry-run", text(&bin)).ok().stdout;
     let calls = root.path().join("calls");
-    let fake = |name: &str, script: String| {
-        let path = bin.join(name);
-        std::fs::write(&path, format!("#!/bin/sh\n{script}\n")).unwrap();
-        std::fs::set_permissions(&path, PermissionsExt::from_mode(0o755)).unwrap();
-    };
     let counted = "wc -l <";
-    fake("sbatch", format!("echo \"$@\" >> {0}; echo \"$({counted} {0});cluster\"", text(&calls)));
+    let script = format!("echo \"$@\" >> {0}; echo \"$({counted} {0});cluster\"", text(&calls));
+    stand_in(&bin, "sbatch", &script);
     let path = format!("{}:{}", text(&bin), std::env::var("PATH").unwrap());
     let said = submit("--engine slurm", &path).ok().stdout;
     assert!(said.contains("1, 2, 3"), "{said}");
@@ -160,17 +147,14 @@ fn schedulers_are_handed_what_makes_the_same_model() {
     assert_eq!(asked, (most + (1 << 20) - 1) >> 20);
     assert!(array.contains("#SBATCH --array=0,1\n") && array.contains("#SBATCH --requeue\n"));
     for (name, place) in [("coarse", ""), ("blocks", "1"), ("blocks", "0"), ("merge", "")] {
-        let mut bash = assert_cmd::Command::new("bash");
-        let bash = bash.arg(script(name)).envs([WITHOUT_GPU]);
-        let done = bash.env("SLURM_ARRAY_TASK_ID", place).output().unwrap();
-        assert!(done.status.success(), "{name} {place}: {done:?}");
+        run_place(&script(name), place);
     }
     assert!(read(&folder.join("merged.ply")) == read(&local.join("merged.ply")));
 
     // The same as a job of HyperQueue, before anything was done.
     std::fs::remove_file(folder.join("merged.ply")).unwrap();
     std::fs::remove_dir_all(folder.join("blocks/block-0-0/run")).unwrap();
-    fake("hq", "[ \"$3\" = submit-file ] && [ -f \"$4\" ] && echo 7".to_owned());
+    stand_in(&bin, "hq", "[ \"$3\" = submit-file ] && [ -f \"$4\" ] && echo 7");
     submit("--engine hq", &path).refused("twice", &["--again"]);
     submit("--engine hq --again --mem-resource", &path).ok();
     let job: Table = read_text(&folder.join("hq/job.toml")).parse().expect("it is TOML");

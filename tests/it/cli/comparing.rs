@@ -3,14 +3,21 @@
 use std::path::Path;
 
 use densify_policies::registry::policies;
+use serde_json::{Value, json};
 
 use super::{Outcome, call, files, read, read_text, records, scratch, text};
+#[cfg(unix)]
+use super::{call_with_path, run_place, stand_in};
 use crate::photographs::Photographs;
 
 /// Two policies, two budgets, two seeds, in runs of some dozen steps.
 fn compare(scene: &Path, output: &Path, more: &str) -> Outcome {
+    call(&compare_words(scene, output, more))
+}
+
+fn compare_words(scene: &Path, output: &Path, more: &str) -> String {
     let what = "--seeds 2 --policies vanilla,diet --budget 250,320 --iterations 24";
-    call(&format!("compare {} -o {} {what} {more}", text(scene), text(output)))
+    format!("compare {} -o {} {what} {more}", text(scene), text(output))
 }
 
 #[test]
@@ -149,4 +156,86 @@ fn bad_comparisons_are_refused_before_anything_runs() {
             .refused(policies, &words);
     }
     assert!(!output.join("compare.md").exists());
+}
+
+/// A scheduler is handed the runs, and the same call collects them. Slurm's program is one that does nothing; its script
+/// is then run by hand.
+#[cfg(unix)]
+#[test]
+fn a_scheduler_makes_the_same_runs_and_the_same_call_collects_them() {
+    let scene = Photographs::colmap_text();
+    let (root, alone) = scratch();
+    let flags = "-- --sh-degree 0 --threads 1";
+    compare(scene.path(), &alone, flags).ok();
+    let output = root.path().join("handed-in");
+    let bin = root.path().join("bin");
+    std::fs::create_dir(&bin).expect("a folder");
+    let path = format!("{}:{}", text(&bin), std::env::var("PATH").expect("a path"));
+    let handed = |more: &str, path: &str| {
+        let words = compare_words(scene.path(), &output, &format!("--engine slurm {more} {flags}"));
+        call_with_path(&words, path)
+    };
+    let shown = handed("--dry-run", text(&bin)).ok().stdout;
+    assert!(shown.contains("0 of 8 done") && !output.exists(), "{shown}");
+    handed("", text(&bin)).refused("no Slurm", &["sbatch", "PATH"]);
+    stand_in(&bin, "sbatch", "echo 7");
+    let said = handed("", &path).ok().stdout;
+    assert!(said.contains("job      7") && said.contains("again to collect"), "{said}");
+    let script = output.join("slurm/runs.sh");
+    let text_of_script = read_text(&script);
+    assert!(shown.contains(&text_of_script), "{shown}");
+    assert!(text_of_script.contains("#SBATCH --array=0,1,2,3,4,5,6,7\n"), "{text_of_script}");
+    assert!(text_of_script.contains("#SBATCH --cpus-per-task=1\n"), "{text_of_script}");
+    for place in ["3", "0", "1", "2", "4", "5", "6"] {
+        run_place(&script, place);
+    }
+    let said = handed("", &path).ok().stdout;
+    assert!(said.contains("7 of 8 done") && said.contains("as job 7"), "{said}");
+    assert!(!output.join("compare.md").exists());
+    // What is left, and nothing else, is handed in again.
+    handed("--again", &path).ok();
+    assert!(read_text(&script).contains("#SBATCH --array=7\n"));
+    run_place(&script, "7");
+    let said = handed("", &path).ok().stdout;
+    assert!(said.contains("[8/8]") && said.contains("PSNR [dB]"), "{said}");
+    assert!(read_text(&output.join("compare.md")).contains("| diet |"));
+    let results = |folder: &Path| -> Vec<Value> {
+        let found = records(&folder.join("compare.jsonl"));
+        let mut found: Vec<Value> =
+            found.iter().map(|r| json!([r["run"], r["model"], r["psnr"]])).collect();
+        found.sort_by_key(ToString::to_string);
+        found
+    };
+    assert_eq!(results(&output), results(&alone));
+
+    // A run with other options is another run, whatever has its name.
+    let other = compare_words(
+        scene.path(),
+        &output,
+        "--engine slurm --dry-run -- --sh-degree 1 --threads 1",
+    );
+    assert!(call(&other).ok().stdout.contains("0 of 8 done"));
+    compare(scene.path(), &output, "--again -- --sh-degree 0")
+        .refused("no engine", &["--again", "--engine"]);
+}
+
+#[test]
+fn several_runs_at_once_are_the_same_runs() {
+    let scene = Photographs::colmap_text();
+    let (root, alone) = scratch();
+    let flags = "-- --sh-degree 0 --threads 1";
+    compare(scene.path(), &alone, flags).ok();
+    let output = root.path().join("at-once");
+    let said = compare(scene.path(), &output, &format!("--engine local {flags}")).ok().stdout;
+    assert!(said.contains("started  ") && said.contains("[8/8]"), "{said}");
+    let models = |folder: &Path| -> Vec<Value> {
+        let mut found = records(&folder.join("compare.jsonl"));
+        found.sort_by_key(|record| record["run"].to_string());
+        found.iter().map(|record| record["model"].clone()).collect()
+    };
+    assert_eq!(models(&output), models(&alone));
+    // One that fails is named, with what it said.
+    let wrong =
+        compare(scene.path(), &output, "--engine local -- --sh-degree 0 --threads 1 --memory 1MiB");
+    wrong.refused("too little memory", &["--memory"]);
 }

@@ -103,6 +103,33 @@ fn outcome_of(mut command: Command) -> Outcome {
     Outcome { code: output.status.code(), stdout: text(output.stdout), stderr: text(output.stderr) }
 }
 
+/// Calls the program where programs are looked for in `path` alone.
+#[cfg(unix)]
+fn call_with_path(words: &str, path: &str) -> Outcome {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_densify"));
+    command.args(words.split_whitespace()).envs([WITHOUT_GPU]).env("PATH", path);
+    outcome_of(command)
+}
+
+/// Puts a program into a folder that does what a shell's `script` says.
+#[cfg(unix)]
+fn stand_in(folder: &Path, name: &str, script: &str) {
+    use std::os::unix::fs::PermissionsExt;
+
+    let path = folder.join(name);
+    std::fs::write(&path, format!("#!/bin/sh\n{script}\n")).expect("it is written");
+    std::fs::set_permissions(&path, PermissionsExt::from_mode(0o755)).expect("it is ours");
+}
+
+/// Does what Slurm does with the script of an array: runs it for a place.
+#[cfg(unix)]
+fn run_place(script: &Path, place: &str) {
+    let mut bash = Command::new("bash");
+    let done = bash.arg(script).envs([WITHOUT_GPU]).env("SLURM_ARRAY_TASK_ID", place).output();
+    let done = done.expect("it starts");
+    assert!(done.status.success(), "{} {place}: {done:?}", script.display());
+}
+
 /// Calls the program with words separated by spaces.
 fn call(words: &str) -> Outcome {
     densify(&words.split_whitespace().collect::<Vec<_>>())
