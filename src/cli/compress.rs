@@ -42,7 +42,7 @@ pub(super) struct CompressArgs {
     #[arg(long)]
     overwrite: bool,
     /// Training steps of each attempt
-    #[arg(short, long, value_name = "N", default_value = "1200")]
+    #[arg(short, long, value_name = "N", default_value = "2000")]
     iterations: Whole<1, { u32::MAX }>,
     /// Everything random follows from this number
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]

@@ -61,13 +61,13 @@ pub(super) fn check(options: &Options<'_>, model: &Gaussians) -> Result<(), Fail
 pub(super) struct Packing {
     pub(super) format: &'static Format,
     pub(super) rows: usize,
-    /// Whether they are all, as accurate as the format usually has them.
+    /// Whether they are all, at least as accurate as the format usually has them.
     pub(super) is_whole: bool,
 }
 
 /// In which formats to try this model, and how many of its rows, as it is, then make a file of the target: the format
-/// that holds most, the first of equals; where it has several forms all that hold at least half as many as the one
-/// that holds most. None where not even one row fits.
+/// that holds most, the first of equals; where it has several forms all that hold at least four fifths as many as the one
+/// that holds most, or, where it holds all as it is, the most accurate if that does too. None where not even one row fits.
 pub(super) fn packings(options: &Options<'_>, model: &Gaussians) -> Result<Vec<Packing>, Failure> {
     let mut best = None;
     for &format in options.formats {
@@ -82,8 +82,14 @@ pub(super) fn packings(options: &Options<'_>, model: &Gaussians) -> Result<Vec<P
     let forms = (format.writer)().forms();
     // Without bands above 0 all forms are the same.
     let has_one = forms.is_empty() || model.sh_degree == 0;
-    if as_it_is.is_whole || has_one || matches!(options.to, Target::Rows(_)) {
+    let Target::Bytes(most) = options.to else { return Ok(vec![as_it_is]) };
+    if has_one {
         return Ok(vec![as_it_is]);
+    }
+    if as_it_is.is_whole {
+        // Beside all rows there may be room for the most accurate colour.
+        let format = if bytes(&forms[0], model)? <= most { &forms[0] } else { format };
+        return Ok(vec![Packing { format, ..as_it_is }]);
     }
     let mut found: Vec<Packing> = Vec::new();
     for format in forms {
@@ -95,7 +101,7 @@ pub(super) fn packings(options: &Options<'_>, model: &Gaussians) -> Result<Vec<P
     }
     // Rows show more than the accuracy of their colour.
     let most = found.iter().map(|packing| packing.rows).max().unwrap_or(0);
-    found.retain(|packing| 2 * packing.rows >= most);
+    found.retain(|packing| 5 * packing.rows >= 4 * most);
     Ok(found)
 }
 

@@ -211,10 +211,7 @@ fn scratch(output: &Path) -> Result<TempPath, Failure> {
 fn degrees(own: u8, to: Target) -> Vec<u8> {
     match to {
         Target::Rows(_) => vec![own],
-        // Bands 2 and 3 go together: what two thirds of the third's room buy is little.
-        Target::Bytes(_) => {
-            [own].into_iter().chain([1, 0].into_iter().filter(|it| *it < own)).collect()
-        }
+        Target::Bytes(_) => (0..=own).rev().collect(),
     }
 }
 

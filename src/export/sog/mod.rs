@@ -29,10 +29,12 @@ pub(super) const FORMAT: Format = Format {
 
 inventory::submit! { FORMAT }
 
-/// With an entry of the palette for every row, and for every 4, 16 and 64 rows.
-const FORMS: [Format; 4] = [
+/// With an entry of the palette for every row, and for every 2, 4, 8, 16 and 64 rows.
+const FORMS: [Format; 6] = [
     Format { writer: || Box::new(SogWriter::sharing(1)), ..FORMAT },
+    Format { writer: || Box::new(SogWriter::sharing(2)), ..FORMAT },
     Format { writer: || Box::new(SogWriter::sharing(4)), ..FORMAT },
+    Format { writer: || Box::new(SogWriter::sharing(8)), ..FORMAT },
     Format { writer: || Box::new(SogWriter::sharing(16)), ..FORMAT },
     Format { writer: || Box::new(SogWriter::sharing(64)), ..FORMAT },
 ];
