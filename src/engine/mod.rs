@@ -135,11 +135,10 @@ impl Batch {
 
     /// The program and what starts a task, but its name.
     fn words(&self) -> Result<Vec<String>, Failure> {
-        let program = std::env::current_exe().map_err(|error| Failure {
-            code: OTHER,
-            message: format!("cannot find the program that is running: {error}"),
-        })?;
-        Ok([utf8(&program)?.to_owned()].into_iter().chain(self.command.iter().cloned()).collect())
+        Ok([utf8(&program()?)?.to_owned()]
+            .into_iter()
+            .chain(self.command.iter().cloned())
+            .collect())
     }
 }
 
@@ -178,7 +177,8 @@ pub fn submit(
     observer: &dyn Observer,
 ) -> Result<(), Failure> {
     let files = match submission.engine {
-        Engine::Local => Vec::new(),
+        Engine::Local if submission.dry_run => return local::show(batch, observer),
+        Engine::Local => return local::run(batch, observer),
         Engine::Slurm => slurm::files(batch)?,
         Engine::Hq => vec![hq::file(batch, submission.with_memory)?],
     };
@@ -186,13 +186,7 @@ pub fn submit(
         for EngineFile { path, text } in &files {
             observer.say(format_args!("# {}\n{text}", path.display()));
         }
-        if submission.engine == Engine::Local {
-            local::show(batch, observer)?;
-        }
         return Ok(());
-    }
-    if submission.engine == Engine::Local {
-        return local::run(batch, observer);
     }
     if let Some(jobs) = submitted(&batch.folder).filter(|_| !submission.again) {
         return Err(Failure::input(format!(
@@ -208,9 +202,8 @@ pub fn submit(
         write_atomically(path, |out| out.write_all(text.as_bytes()))?;
     }
     let jobs = match submission.engine {
-        Engine::Local => Vec::new(),
-        Engine::Slurm => slurm::hand_in(&files)?,
-        Engine::Hq => vec![hq::hand_in(&files[0])?],
+        Engine::Hq => files.iter().map(hq::hand_in).collect::<Result<_, _>>()?,
+        _ => slurm::hand_in(&files)?,
     };
     observer.say(format_args!("job      {}", jobs.join(", ")));
     let text = toml::to_string(&Submitted { engine: submission.engine, jobs });
@@ -233,6 +226,17 @@ fn asked(program: &str, arguments: &[&str], remedy: &str) -> Result<String, Fail
         arguments.join(" "),
         foreign::lines(&said(&output.stderr))
     )))
+}
+
+/// The program that is running, which also does what is handed in.
+///
+/// # Errors
+/// When the system does not say where it is.
+pub(crate) fn program() -> Result<PathBuf, Failure> {
+    std::env::current_exe().map_err(|error| Failure {
+        code: OTHER,
+        message: format!("cannot find the program that is running: {error}"),
+    })
 }
 
 /// A path as text, for commands and descriptions.

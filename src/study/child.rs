@@ -2,10 +2,11 @@
 //! that describes it.
 
 use std::fmt::Display;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Command, Stdio};
 
 use crate::dataset::{GroundTruth, builtin};
+use crate::engine::program;
 use crate::failure::{Failure, OTHER};
 use crate::output::{Summary, summary_of, write_atomically};
 use crate::run::{Partial, RunSpec};
@@ -66,13 +67,6 @@ pub(super) fn shared_options(given: Partial, own: &[&str]) -> Result<Partial, Fa
 /// A failure within a run of a study.
 pub(super) fn in_run(run: &impl Display, failure: Failure) -> Failure {
     failure.and(&format!("this was the run {run}; the same command goes on from here"))
-}
-
-fn program() -> Result<PathBuf, Failure> {
-    std::env::current_exe().map_err(|e| Failure {
-        code: OTHER,
-        message: format!("cannot find the program that is running: {e}"),
-    })
 }
 
 fn wait_for(command: &mut Command) -> Result<(), Failure> {

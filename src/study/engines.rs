@@ -7,7 +7,7 @@ use clap::Args;
 use super::cell::Cell;
 use crate::engine::{self, Batch, Engine, Job, Stage, Submission, SubmissionArgs, utf8};
 use crate::failure::Failure;
-use crate::run::{Observer, Partial, Silent, promised_bytes};
+use crate::run::{Observer, Partial, RunSpec, Silent, promised_bytes};
 
 /// Who makes the runs of a study.
 #[derive(Debug, Clone, Default, Args)]
@@ -76,14 +76,15 @@ pub(super) fn submit(
             continue;
         }
         described.push(&cell.spec);
+        let spec = cell.spec.clone().describe()?;
         if !submission.dry_run {
             cell.write(&folder)?;
         }
         jobs.push(Job {
             name: cell.run(),
             place,
-            memory: promised(cell, &mut memory)?,
-            threads: threads(cell)?,
+            memory: promised(cell, &spec, &mut memory)?,
+            threads: threads(&spec),
             may_have_fewer_threads: false,
         });
     }
@@ -101,19 +102,19 @@ pub(super) fn submit(
 }
 
 /// What a run takes at most `[bytes]`, which does not depend on its seed.
-fn promised(cell: &Cell, known: &mut Vec<(Partial, u64)>) -> Result<u64, Failure> {
+fn promised(cell: &Cell, spec: &RunSpec, known: &mut Vec<(Partial, u64)>) -> Result<u64, Failure> {
     let mut kind = cell.spec.clone();
     kind.remove("seed");
     if let Some((_, bytes)) = known.iter().find(|(other, _)| *other == kind) {
         return Ok(*bytes);
     }
-    let bytes = promised_bytes(&cell.spec.clone().describe()?, &Silent)?;
+    let bytes = promised_bytes(spec, &Silent)?;
     known.push((kind, bytes));
     Ok(bytes)
 }
 
 /// Processor threads of a run: those that were asked for, or all.
-fn threads(cell: &Cell) -> Result<u32, Failure> {
-    let own = cell.spec.clone().describe()?.device.threads.map(|threads| threads.0);
-    Ok(own.unwrap_or_else(|| rayon::current_num_threads().try_into().unwrap_or(1)))
+fn threads(spec: &RunSpec) -> u32 {
+    let own = spec.device.threads.map(|threads| threads.0);
+    own.unwrap_or_else(|| rayon::current_num_threads().try_into().unwrap_or(1))
 }

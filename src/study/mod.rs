@@ -71,8 +71,9 @@ impl<'a> Study<'a> {
         cells: &[Cell],
         engine: &EngineArgs,
     ) -> Result<Option<Vec<Outcome>>, Failure> {
+        let submission = engine.submission()?;
         let is_left = self.collect(cells)?;
-        if let Some(submission) = engine.submission()?
+        if let Some(submission) = submission
             && is_left
         {
             let is_done = |cell: &Cell| self.journal.outcome(&cell.spec).is_some();

@@ -158,6 +158,15 @@ fn bad_comparisons_are_refused_before_anything_runs() {
     assert!(!output.join("compare.md").exists());
 }
 
+/// What the runs of a study are called and arrive at, in an order that does not depend on who made them.
+fn results(folder: &Path) -> Vec<Value> {
+    let found = records(&folder.join("compare.jsonl"));
+    let mut found: Vec<Value> =
+        found.iter().map(|r| json!([r["run"], r["model"], r["psnr"]])).collect();
+    found.sort_by_key(ToString::to_string);
+    found
+}
+
 /// A scheduler is handed the runs, and the same call collects them. Slurm's program is one that does nothing; its script
 /// is then run by hand.
 #[cfg(unix)]
@@ -199,13 +208,6 @@ fn a_scheduler_makes_the_same_runs_and_the_same_call_collects_them() {
     let said = handed("", &path).ok().stdout;
     assert!(said.contains("[8/8]") && said.contains("PSNR [dB]"), "{said}");
     assert!(read_text(&output.join("compare.md")).contains("| diet |"));
-    let results = |folder: &Path| -> Vec<Value> {
-        let found = records(&folder.join("compare.jsonl"));
-        let mut found: Vec<Value> =
-            found.iter().map(|r| json!([r["run"], r["model"], r["psnr"]])).collect();
-        found.sort_by_key(ToString::to_string);
-        found
-    };
     assert_eq!(results(&output), results(&alone));
 
     // A run with other options is another run, whatever has its name.
@@ -228,12 +230,7 @@ fn several_runs_at_once_are_the_same_runs() {
     let output = root.path().join("at-once");
     let said = compare(scene.path(), &output, &format!("--engine local {flags}")).ok().stdout;
     assert!(said.contains("started  ") && said.contains("[8/8]"), "{said}");
-    let models = |folder: &Path| -> Vec<Value> {
-        let mut found = records(&folder.join("compare.jsonl"));
-        found.sort_by_key(|record| record["run"].to_string());
-        found.iter().map(|record| record["model"].clone()).collect()
-    };
-    assert_eq!(models(&output), models(&alone));
+    assert_eq!(results(&output), results(&alone));
     // One that fails is named, with what it said.
     let wrong =
         compare(scene.path(), &output, "--engine local -- --sh-degree 0 --threads 1 --memory 1MiB");
