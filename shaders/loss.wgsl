@@ -173,7 +173,7 @@ fn similar(
 }
 
 // SSIM, its derivatives, and the sums of the tile. now.a, now.b: bits of the weights of |e| and of
-// 1 − SSIM in the error.
+// 1 − SSIM in the error; now.c, now.d: in what rows are scored by.
 @compute @workgroup_size(256)
 fn similarity(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -253,7 +253,8 @@ fn similarity(
                 wrong[half] +=
                     off * bitcast<f32>(now.a) + (1.0 - found.ssim) * bitcast<f32>(now.b);
                 if (frame.draw.w & BY_PIXEL) != 0u {
-                    lost[half] += off * (1.0 - SSIM_WEIGHT) + (1.0 - found.ssim) * SSIM_WEIGHT;
+                    lost[half] +=
+                        off * bitcast<f32>(now.c) + (1.0 - found.ssim) * bitcast<f32>(now.d);
                 }
                 for (var p = 0u; p < 4u; p++) {
                     if n + p < eight.inside {

@@ -10,15 +10,22 @@ use crate::policy::{PolicyError, PolicyResult};
 /// Length of the run that defaults in steps are written for `[steps]`.
 pub const REFERENCE_ITERATIONS: u32 = 30_000;
 
-/// Checks that a parameter is finite and in its range, for [`ConfiguredPolicy::new`]. The registry adds
-/// the policy's name to the error.
+/// Largest size of a parameter: its products must be finite as `f32`.
+const LARGEST: f64 = 1e30;
+
+/// Checks that a parameter is in its range, as it is and as `f32`, and at most 1e30 in size, for
+/// [`ConfiguredPolicy::new`]. The registry adds the policy's name to the error.
 ///
 /// [`ConfiguredPolicy::new`]: crate::registry::ConfiguredPolicy::new
 ///
 /// # Errors
 /// [`PolicyError::BadParameter`] with the value and the range.
 pub fn in_range(parameter: &str, value: f64, range: impl RangeBounds<f64>) -> PolicyResult {
-    if value.is_finite() && range.contains(&value) {
+    let [is_in_range, is_so_rounded] =
+        [value, f64::from(value as f32)].map(|value| range.contains(&value));
+    // Also false for what is not a number.
+    let is_moderate = value.abs() <= LARGEST;
+    if is_in_range && is_so_rounded && is_moderate {
         return Ok(());
     }
     let mut limits = Vec::new();
@@ -32,13 +39,17 @@ pub fn in_range(parameter: &str, value: f64, range: impl RangeBounds<f64>) -> Po
         Bound::Excluded(high) => limits.push(format!("less than {high}")),
         Bound::Unbounded => {}
     }
-    if limits.is_empty() {
-        limits.push("finite".to_owned());
+    if !is_moderate {
+        limits.push(format!("at most {LARGEST:e} in size"));
     }
-    Err(bad_parameter(
-        parameter,
-        format!("{value} is out of range; it must be {}", limits.join(" and ")),
-    ))
+    let limits = limits.join(" and ");
+    let reason = if is_in_range {
+        let rounded = if is_so_rounded { "" } else { " as a 32-bit number" };
+        format!("{value:e} is out of range; it must be {limits}{rounded}")
+    } else {
+        format!("{value} is out of range; it must be {limits}")
+    };
+    Err(bad_parameter(parameter, reason))
 }
 
 /// A [`PolicyError::BadParameter`], for [`ConfiguredPolicy::new`]. The registry adds the policy's name.
@@ -187,8 +198,15 @@ mod tests {
         let open = (Bound::Excluded(0.0), Bound::Excluded(1.0));
         let message = reason(in_range("rho", 0.0, open));
         assert_eq!(message, "0 is out of range; it must be greater than 0 and less than 1");
-        assert_eq!(reason(in_range("rho", f64::NAN, ..)), "NaN is out of range; it must be finite");
+        let message = reason(in_range("rho", f64::NAN, ..));
+        assert_eq!(message, "NaN is out of range; it must be at most 1e30 in size");
+        let message = reason(in_range("rho", 1e39, 0.0..));
+        assert_eq!(message, "1e39 is out of range; it must be at least 0 and at most 1e30 in size");
+        let message = reason(in_range("rho", 1e-50, (Bound::Excluded(0.0), Bound::Unbounded)));
+        assert_eq!(message, "1e-50 is out of range; it must be greater than 0 as a 32-bit number");
         reason(in_range("rho", f64::INFINITY, 0.0..));
+        let message = reason(in_range("rho", 0.999_999_999, open));
+        assert!(message.ends_with("less than 1 as a 32-bit number"), "{message}");
     }
 
     #[test]

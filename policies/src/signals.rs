@@ -115,7 +115,8 @@ signals! {
     /// Sum over all pixels of α·T·e, >= 0, e the pixel's part of the training loss:
     /// 0.8·|I − G| + 0.2·(1 − SSIM), the mean over channels. Divided by
     /// [`WeightSum`](Self::WeightSum) it is the mean error where the row is seen.
-    /// If [`Needs::error_score`](crate::policy::Needs::error_score) weighs pixels, so does this sum.
+    /// If [`Needs::error_score`](crate::policy::Needs::error_score) weighs pixels or has another map, so does this
+    /// sum.
     WeightedError: Sum "pixels" [WeightedError];
     /// Sum over views of an error per row, >= 0, as [`ErrorScore`](crate::policy::ErrorScore) says.
     ErrorScore: Sum "1" [Weight, WeightedError];

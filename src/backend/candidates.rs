@@ -4,7 +4,7 @@
 use std::cmp::Ordering;
 use std::collections::HashMap;
 
-use densify_policies::policy::{Candidate, CandidateRequest, ErrorMode};
+use densify_policies::policy::{Candidate, CandidateRequest, ErrorMap, ErrorMode};
 
 use super::{StateError, Tensor};
 use crate::dataset::images::Image8;
@@ -219,7 +219,7 @@ pub(super) fn ranked(count: usize, spaced: bool) -> usize {
 pub(super) fn error_weights(mode: ErrorMode) -> Option<[f32; 2]> {
     match mode {
         ErrorMode::Gradient => None,
-        ErrorMode::L1 => Some([1.0, 0.0]),
-        ErrorMode::L1Dssim => Some([0.8, 0.2]),
+        ErrorMode::L1 => Some(ErrorMap::L1.weights()),
+        ErrorMode::L1Dssim => Some(ErrorMap::Loss.weights()),
     }
 }

@@ -2,7 +2,8 @@
 
 use densify::backend::{Backend, StepInput, Storage, Tensor, Values};
 use densify_policies::policy::{
-    Cadence, CandidateRequest, DepthMode, ErrorMode, LossTerms, Needs, Signal, SignalSet,
+    Cadence, CandidateRequest, DepthMode, ErrorMode, ErrorScore, LossTerms, MaskTerm, Needs,
+    Signal, SignalSet,
 };
 
 use crate::subject::{make, make_with, repeatable, saved, step_input, storages};
@@ -10,15 +11,15 @@ use densify::camera::Camera;
 use densify::gaussians::Gaussians;
 use densify::verify::{Differentiable, Setup, Subject, scenes};
 
-const CADENCE: Cadence = Cadence { all: 2, sh_rest: 3 };
-/// Steps before the state is taken: no optimiser step is due, and all have sums that wait.
+/// Steps before the state is taken: with sums over several steps, no step is due, and all have some that wait.
 const BEFORE: u32 = 7;
 
-fn needs() -> Needs {
-    let signals = [Signal::VisibleCount, Signal::ScreenGradient, Signal::WeightMax, Signal::Age];
+/// All signals, with sums over several steps.
+fn in_batches() -> Needs {
+    let signals = Signal::ALL.into_iter().filter(|signal| *signal != Signal::Mask).collect();
     Needs {
-        signals: SignalSet::from(signals),
-        cadence: CADENCE,
+        signals,
+        cadence: Cadence { all: 2, sh_rest: 3 },
         candidates: Some(CandidateRequest {
             from: 0,
             until: 100,
@@ -33,19 +34,29 @@ fn needs() -> Needs {
     }
 }
 
+/// All signals, with masks, which bear no sums over several steps.
+fn with_masks() -> Needs {
+    Needs {
+        signals: Signal::ALL.into(),
+        error_score: ErrorScore { edge: 1.0, footprint: 0.5, ..ErrorScore::default() },
+        mask: Some(MaskTerm { start: 1.0, rate: 0.01, weight: 5e-4, threshold: 0.01 }),
+        ..Needs::default()
+    }
+}
+
 fn backend(
     subject: &Subject,
-    (storage, frozen): (Storage, usize),
+    (storage, frozen, needs): (Storage, usize, fn() -> Needs),
     model: &Gaussians,
 ) -> Box<dyn Differentiable> {
     make_with(subject, model, Setup { storage, frozen, needs: needs(), ..Setup::default() })
 }
 
-fn step(backend: &mut dyn Backend, camera: &Camera, number: u32) {
+fn step(backend: &mut dyn Backend, needs: &Needs, camera: &Camera, number: u32) {
     let target = scenes::target(camera);
     let degree = (number / 2).min(3) as u8;
     let input = StepInput {
-        cadence: CADENCE,
+        cadence: needs.cadence,
         loss_terms: LossTerms { opacity: 0.01, scale: 0.0 },
         ..step_input(number, camera, &target, degree)
     };
@@ -53,20 +64,20 @@ fn step(backend: &mut dyn Backend, camera: &Camera, number: u32) {
 }
 
 /// Four more steps, with a new epoch among them, and everything that can be seen of the backend.
-fn future(backend: &mut dyn Backend) -> impl PartialEq + std::fmt::Debug + use<> {
+fn future(backend: &mut dyn Backend, needs: &Needs) -> impl PartialEq + std::fmt::Debug + use<> {
     let camera = scenes::camera(48, 40, 51);
     for i in BEFORE + 1..BEFORE + 5 {
         if i == BEFORE + 3 {
             backend.begin_epoch();
         }
-        step(backend, &camera, i);
+        step(backend, needs, &camera, i);
     }
-    let signals = backend.take_signals(needs().signals).expect("signals");
+    let signals = backend.take_signals(needs.signals).expect("signals");
     let candidates = backend.candidates().to_vec();
     let bits = |s: Signal| -> Vec<u32> {
         signals.get(s).expect("it was asked for").iter().map(|v| v.to_bits()).collect()
     };
-    let columns: Vec<_> = needs().signals.iter().map(|s| (s, bits(s))).collect();
+    let columns: Vec<_> = needs.signals.iter().map(|s| (s, bits(s))).collect();
     (backend.download().expect("the model"), columns, candidates)
 }
 
@@ -82,16 +93,19 @@ fn is_zero(tensor: &Tensor) -> bool {
 fn a_backend_that_took_back_its_state_has_the_same_future() {
     let camera = scenes::camera(48, 40, 51);
     let model = scenes::cloud(200, 3, &camera, 52);
-    let stored = storages().map(|storage| (Subject::NATIVE, (storage, 0)));
+    let in_batches: fn() -> Needs = in_batches;
+    let stored = storages().map(|storage| (Subject::NATIVE, (storage, 0, in_batches)));
     // With frozen rows too: a task of the native backend, and a part of another.
-    let all = repeatable()
-        .into_iter()
-        .flat_map(|subject| [0, 141].map(|frozen| (subject.clone(), (Storage::default(), frozen))));
+    let all = repeatable().into_iter().flat_map(|subject| {
+        let setups = [(0, in_batches), (141, with_masks)];
+        setups.map(|(frozen, needs)| (subject.clone(), (Storage::default(), frozen, needs)))
+    });
     for (subject, setup) in all.chain(stored) {
+        let needs = setup.2();
         let mut whole = backend(&subject, setup, &model);
         whole.begin_epoch();
         for i in 1..=BEFORE {
-            step(&mut *whole, &camera, i);
+            step(&mut *whole, &needs, &camera, i);
         }
         let (model, state) = saved(&*whole);
         let ages = state.iter().find_map(Tensor::ages).expect("ages of the rows");
@@ -99,16 +113,17 @@ fn a_backend_that_took_back_its_state_has_the_same_future() {
         let counted: Vec<f32> = ages.into_iter().map(|age| age as f32).collect();
         assert_eq!(signals.get(Signal::Age), Some(&*counted), "{}", subject.name());
         whole.give_back(signals);
-        let expected = future(&mut *whole);
+        let expected = future(&mut *whole, &needs);
 
         let without = |left_out: &str| {
             let mut backend = backend(&subject, setup, &model);
             for tensor in state.iter().filter(|t| t.name != left_out) {
                 backend.restore(tensor.clone()).expect("it is this backend's");
             }
-            future(&mut *backend)
+            future(&mut *backend, &needs)
         };
-        let name = format!("{}, {setup:?}", subject.name());
+        let masks = if needs.mask.is_some() { ", with masks" } else { "" };
+        let name = format!("{}, {:?}, {} frozen{masks}", subject.name(), setup.0, setup.1);
         assert!(without("") == expected, "{name}");
         // None of it is idle.
         let told: Vec<&Tensor> = state.iter().filter(|t| !is_zero(t)).collect();
@@ -118,10 +133,11 @@ fn a_backend_that_took_back_its_state_has_the_same_future() {
         }
 
         let mut other = make(&subject, &model);
-        let waiting = state
-            .iter()
-            .find(|t| t.name.contains("waiting") || t.name.contains("summed"))
-            .expect("sums that wait");
-        assert!(other.restore(waiting.clone()).is_err(), "a run without sums took them");
+        let is_of_needs = |name: &str| match needs.mask {
+            Some(_) => name.contains("mask"),
+            None => name.contains("waiting") || name.contains("summed"),
+        };
+        let special = state.iter().find(|t| is_of_needs(&t.name)).expect("what the needs add");
+        assert!(other.restore(special.clone()).is_err(), "{name}: a run without took it");
     }
 }

@@ -6,7 +6,9 @@ use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::{Gaussians, dc_to_rgb};
 use densify_policies::plan::EditPlan;
-use densify_policies::policy::{ErrorScore, Needs, SUPPORT_WEIGHT, Signal, SignalKind, SignalSet};
+use densify_policies::policy::{
+    ErrorMap, ErrorScore, Needs, SUPPORT_WEIGHT, Signal, SignalKind, SignalSet,
+};
 
 use crate::subject::{all, devices, make_with, normalised, repeatable, step_input, storages};
 use densify::verify::compare::{Table, relative_error};
@@ -78,7 +80,7 @@ pub(crate) fn reference(
     let mut errors = vec![0.0; splats.len()];
     let mut largest = vec![(0.0, None); image.alpha.len()];
     each_blended(&splats, &by_depth(&splats), view, &Rules::STANDARD, |pixel, row, weight, _| {
-        errors[row] += weight * loss.by_pixel[pixel];
+        errors[row] += weight * mixed(loss.by_pixel[pixel], ErrorMap::Loss);
         if weight > largest[pixel].0 {
             largest[pixel] = (weight, Some(row));
         }
@@ -240,6 +242,15 @@ fn edge(target: &Image8, pixel: usize) -> f64 {
     (9.0 * luma(x, y) - around.map(|(x, y)| luma(x, y)).sum::<f64>()).clamp(0.0, 255.0)
 }
 
+/// The error of a pixel from its parts.
+fn mixed([absolute, dissimilar]: [f64; 2], map: ErrorMap) -> f64 {
+    match map {
+        ErrorMap::Loss => 0.8 * absolute + 0.2 * dissimilar,
+        ErrorMap::L1 => absolute,
+        ErrorMap::Dssim => dissimilar,
+    }
+}
+
 /// Each row's score of one view, by the definition of [`ErrorScore`].
 fn scores(model: &Gaussians, view: View<'_>, target: &Image8, score: &ErrorScore) -> Vec<f64> {
     let model = Model::of(model);
@@ -252,7 +263,8 @@ fn scores(model: &Gaussians, view: View<'_>, target: &Image8, score: &ErrorScore
     let splats = project(&model, view, &Rules::STANDARD);
     let mut sums = vec![(0.0, 0.0); splats.len()];
     each_blended(&splats, &by_depth(&splats), view, &Rules::STANDARD, |pixel, row, w, _| {
-        let map = loss.by_pixel[pixel].powf(power) * (1.0 + weight * edges[pixel] / mean);
+        let map = mixed(loss.by_pixel[pixel], score.map).powf(power)
+            * (1.0 + weight * edges[pixel] / mean);
         sums[row] = (sums[row].0 + w * map, sums[row].1 + w);
     });
     let of_row = |(error, w): (f64, f64)| {
@@ -267,12 +279,20 @@ fn error_scores_weigh_pixels_sizes_and_views() {
     for subject in all() {
         let mut table = Table::new(&format!("error scores, {}", subject.name()));
         for score in [
-            ErrorScore { power: 4.0, edge: 0.25, footprint: 0.75, view_power: 0.4 },
+            ErrorScore {
+                power: 4.0,
+                edge: 0.25,
+                footprint: 0.75,
+                view_power: 0.4,
+                ..ErrorScore::default()
+            },
             ErrorScore { power: 2.0, ..ErrorScore::default() },
             ErrorScore { power: 1.5, ..ErrorScore::default() },
             ErrorScore { edge: 1.5, ..ErrorScore::default() },
             ErrorScore { footprint: 1.0, ..ErrorScore::default() },
             ErrorScore { view_power: 0.5, ..ErrorScore::default() },
+            ErrorScore { map: ErrorMap::L1, ..ErrorScore::default() },
+            ErrorScore { map: ErrorMap::Dssim, edge: 1.5, ..ErrorScore::default() },
         ] {
             let wanted = [Signal::ErrorScore];
             let needs = Needs { signals: wanted.into(), error_score: score, ..Needs::default() };

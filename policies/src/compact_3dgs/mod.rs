@@ -134,12 +134,10 @@ impl ConfiguredPolicy for Compact {
 
     fn new(params: CompactParams, scene: &SceneInfo) -> PolicyResult<Self> {
         let CompactParams { mask_start, mask_rate, mask_weight, min_mask, mask_every, .. } = params;
-        // Rounded to the f32 that backends take: 0.99999999 becomes 1.
-        let rounded = |value: f64| f64::from(value as f32);
         in_range("mask_start", mask_start, -20.0..=20.0)?;
-        in_range("mask_rate", rounded(mask_rate), (Excluded(0.0), Unbounded))?;
+        in_range("mask_rate", mask_rate, (Excluded(0.0), Unbounded))?;
         in_range("mask_weight", mask_weight, 0.0..)?;
-        in_range("min_mask", rounded(min_mask), (Excluded(0.0), Excluded(1.0)))?;
+        in_range("min_mask", min_mask, (Excluded(0.0), Excluded(1.0)))?;
         Ok(Self {
             growth: Vanilla::new(params.growth.clone(), scene)?,
             prune: Window { from: 0, until: u32::MAX, every: mask_every },

@@ -112,10 +112,13 @@ fn run_event(
         }
         let schedule = |policy: &dyn DensityPolicy| {
             let terms = policy.loss_terms(step, needs.loss_terms);
-            (policy.cadence(step), terms, policy.noise(step, needs.noise))
+            let resolution = policy.resolution(step);
+            (policy.cadence(step), terms, policy.noise(step, needs.noise), resolution)
         };
         if copy.aux_views(step, rows, budget) != aux || schedule(&**copy) != schedule(policy) {
-            return Err(differs("wants other views, or another cadence, terms or noise"));
+            return Err(differs(
+                "wants other views, or another cadence, resolution, terms or noise",
+            ));
         }
         let sees_all = *check == Check::ReadsOnlyDeclared;
         observe(&mut **copy, step, rows, &views, &request, sees_all)?;

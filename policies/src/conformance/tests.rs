@@ -52,6 +52,9 @@ enum Fault {
     DeclaresNan,
     HasUndeclaredCadence,
     HasNanTermsLate,
+    ShrinksImagesTooFar,
+    /// Follows what it does not save.
+    ShrinksImagesUnsaved,
     NeverEdits,
     /// Takes one row in a thousand, by the system's clock.
     ReadsTheClock,
@@ -63,7 +66,7 @@ enum Fault {
     UpdatesUndeclared,
 }
 
-const FAULTS: [(Fault, Option<Check>); 26] = [
+const FAULTS: [(Fault, Option<Check>); 28] = [
     (Fault::None, None),
     (Fault::ReadsUndeclared, Some(Check::ReadsOnlyDeclared)),
     (Fault::ReadsUndeclaredIfPresent, Some(Check::ReadsOnlyDeclared)),
@@ -84,6 +87,8 @@ const FAULTS: [(Fault, Option<Check>); 26] = [
     (Fault::DeclaresNan, Some(Check::DeclaresValidNumbers)),
     (Fault::HasUndeclaredCadence, Some(Check::DeclaresValidNumbers)),
     (Fault::HasNanTermsLate, Some(Check::DeclaresValidNumbers)),
+    (Fault::ShrinksImagesTooFar, Some(Check::DeclaresValidNumbers)),
+    (Fault::ShrinksImagesUnsaved, Some(Check::RestoresState)),
     (Fault::NeverEdits, Some(Check::Edits)),
     (Fault::ReadsTheClock, Some(Check::IsDeterministic)),
     (Fault::PanicsOnManyRows, Some(Check::NeverFails)),
@@ -150,6 +155,7 @@ impl DensityPolicy for Faulty {
             needs.loss_terms.opacity = f32::NAN;
         }
         needs.cadence.all = 3;
+        needs.least_resolution = Some(0.5);
         needs
     }
 
@@ -166,6 +172,18 @@ impl DensityPolicy for Faulty {
     fn loss_terms(&self, step: u32, declared: LossTerms) -> LossTerms {
         let is_wrong = self.has(Fault::HasNanTermsLate) && step > 90;
         LossTerms { scale: if is_wrong { f32::NAN } else { 0.0 }, ..declared }
+    }
+
+    fn resolution(&self, step: u32) -> f64 {
+        let is_too_far = self.has(Fault::ShrinksImagesTooFar) && step > 90;
+        let is_other = self.has(Fault::ShrinksImagesUnsaved) && self.unsaved > 2;
+        if is_too_far {
+            0.4
+        } else if is_other {
+            0.5
+        } else {
+            1.0
+        }
     }
 
     fn aux_views(&self, step: u32, _rows: usize, _budget: usize) -> u32 {
@@ -189,6 +207,9 @@ impl DensityPolicy for Faulty {
 
     fn plan(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
         self.events += 1;
+        if self.has(Fault::ShrinksImagesUnsaved) {
+            self.unsaved += 1;
+        }
         let opacity = now.signal(Signal::Opacity)?;
         let gradient = now.signal(Signal::ScreenGradient)?;
         let rows: Vec<u32> = (0..now.rows() as u32).collect();

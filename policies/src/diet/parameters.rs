@@ -186,9 +186,7 @@ impl DietParams {
         in_range("rows_per_candidate", f64::from(self.rows_per_candidate), 1.0..)?;
         in_range("min_alpha", self.min_alpha, 0.0..=1.0)?;
         in_range("size_pixels", self.size_pixels, (Excluded(0.0), Unbounded))?;
-        // Rounded to the f32 that plans take: 0.99999999 becomes 1.
-        let newborn_opacity = f64::from(self.newborn_opacity as f32);
-        in_range("newborn_opacity", newborn_opacity, (Excluded(0.0), Excluded(1.0)))?;
+        in_range("newborn_opacity", self.newborn_opacity, (Excluded(0.0), Excluded(1.0)))?;
         in_range("reinit_share", self.reinit_share, (Excluded(0.0), Included(1.0)))?;
         Ok(())
     }

@@ -107,12 +107,10 @@ impl IgsParams {
     pub(super) fn check(&self) -> PolicyResult {
         let positive = (Excluded(0.0), Unbounded);
         let inside = (Excluded(0.0), Excluded(1.0));
-        // Rounded to the f32 that plans take: 0.99999999 becomes 1.
-        let rounded = |value: f64| f64::from(value as f32);
         in_range("tau", self.tau, 0.0..)?;
         in_range("views", self.views.into(), 1.0..)?;
-        in_range("split_share", rounded(self.split_share), inside)?;
-        in_range("child_opacity", rounded(self.child_opacity), (Excluded(0.0), Included(1.0)))?;
+        in_range("split_share", self.split_share, inside)?;
+        in_range("child_opacity", self.child_opacity, (Excluded(0.0), Included(1.0)))?;
         in_range("final_divisor", self.final_divisor, 1.0..)?;
         in_range("min_opacity", self.min_opacity, 0.0..=1.0)?;
         in_range("first_prune_opacity", self.first_prune_opacity, 0.0..=1.0)?;

@@ -169,9 +169,7 @@ impl ConfiguredPolicy for Mcmc {
         &[Step("grow_from"), Step("grow_until"), Interval("grow_every")];
 
     fn new(params: McmcParams, scene: &SceneInfo) -> PolicyResult<Self> {
-        // Rounded to the f32 that plans take: 0.99999999 becomes 1.
-        let rounded = |value: f64| f64::from(value as f32);
-        in_range("min_opacity", rounded(params.min_opacity), (Excluded(0.0), Excluded(1.0)))?;
+        in_range("min_opacity", params.min_opacity, (Excluded(0.0), Excluded(1.0)))?;
         in_range("growth", params.growth, 0.0..=1.0)?;
         in_range("most_shares", params.most_shares.into(), 2.0..=51.0)?;
         in_range("opacity_term", params.opacity_term, 0.0..)?;
@@ -179,7 +177,7 @@ impl ConfiguredPolicy for Mcmc {
         in_range("noise", params.noise, 0.0..)?;
         in_range("noise_sharpness", params.noise_sharpness, 0.0..)?;
         in_range("noise_opacity", params.noise_opacity, 0.0..=1.0)?;
-        in_range("start_opacity", rounded(params.start_opacity), (Excluded(0.0), Excluded(1.0)))?;
+        in_range("start_opacity", params.start_opacity, (Excluded(0.0), Excluded(1.0)))?;
         in_range("start_scale", params.start_scale, (Excluded(0.0), Unbounded))?;
         let McmcParams { grow_from: from, grow_until: until, grow_every: every, .. } = params;
         let growth = growth_of_event(params.growth, every, scene.iterations);

@@ -63,13 +63,11 @@ impl Default for MiniSplattingParams {
 impl MiniSplattingParams {
     /// Checks ranges; those of growth are checked where it is made.
     pub(super) fn check(&self) -> PolicyResult {
-        // Rounded to the f32 that plans take: 0.99999999 becomes 1.
-        let rounded = |value: f64| f64::from(value as f32);
         let inside = (Excluded(0.0), Excluded(1.0));
         in_range("dominant_share", self.dominant_share, 0.0..=1.0)?;
         in_range("reinit_share", self.reinit_share, (Excluded(0.0), Included(1.0)))?;
         in_range("sample_share", self.sample_share, 0.0..=1.0)?;
-        in_range("restart_opacity", rounded(self.restart_opacity), inside)?;
+        in_range("restart_opacity", self.restart_opacity, inside)?;
         in_range("cut_mass", self.cut_mass, 0.0..=1.0)?;
         in_range("opacity_rate", self.opacity_rate, (Excluded(0.0), Unbounded))
     }

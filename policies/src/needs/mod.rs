@@ -10,7 +10,9 @@ mod terms;
 use serde::{Deserialize, Serialize};
 
 use crate::signals::{Signal, SignalSet};
-pub use pixels::{AuxRequest, CandidateRequest, DepthMode, ErrorMode, ErrorScore, PixelMap};
+pub use pixels::{
+    AuxRequest, CandidateRequest, DepthMode, ErrorMap, ErrorMode, ErrorScore, PixelMap,
+};
 pub use rates::{Cadence, Fade, Rate, RateOverrides};
 pub use terms::{LossTerms, MaskTerm, NoiseTerm};
 

@@ -9,15 +9,16 @@ use crate::signals::AuxColumn;
 ///
 /// (Σ w·M(p) / (Σ w)^`footprint`)^`view_power`, with M(p) = e(p)^`power` · (1 + `edge` · g(p) / ḡ),
 ///
-/// both sums over the pixels p that the row is blended into, w its blend weight α·T there and e the pixel's
-/// part of the training loss, as in [`Signal::WeightedError`](crate::policy::Signal::WeightedError). g is the 8-neighbour Laplacian of the
-/// photograph's 8-bit luma, clipped to 0..255, and ḡ its mean over the view (in a view without edges all
-/// weigh the same).
+/// both sums over the pixels p that the row is blended into, w its blend weight α·T there and e the error of
+/// the pixel that `map` names. g is the 8-neighbour Laplacian of the photograph's 8-bit luma, clipped to
+/// 0..255, and ḡ its mean over the view (in a view without edges all weigh the same).
 ///
 /// The default is Σ w·e. A power above 1 looks at the worst pixels, a footprint of 1 at the mean error
 /// whatever the row's size, and a view power below 1 at rows that many views complain of.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ErrorScore {
+    /// The error e of a pixel.
+    pub map: ErrorMap,
     /// Power of a pixel's error, in (0, 16].
     pub power: f32,
     /// Weight of edges, >= 0; 0: none, at no cost.
@@ -28,9 +29,34 @@ pub struct ErrorScore {
     pub view_power: f32,
 }
 
+/// The error of a pixel that an [`ErrorScore`] sums, >= 0; means over channels of the rendering I and the
+/// photograph G.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum ErrorMap {
+    /// Its part of the training loss: 0.8 · |I − G| + 0.2 · (1 − SSIM).
+    #[default]
+    Loss,
+    /// |I − G|: colour, whatever is around.
+    L1,
+    /// 1 − SSIM: structure.
+    Dssim,
+}
+
+impl ErrorMap {
+    /// The weights of |I − G| and of 1 − SSIM.
+    #[must_use]
+    pub fn weights(self) -> [f32; 2] {
+        match self {
+            Self::Loss => [0.8, 0.2],
+            Self::L1 => [1.0, 0.0],
+            Self::Dssim => [0.0, 1.0],
+        }
+    }
+}
+
 impl Default for ErrorScore {
     fn default() -> Self {
-        Self { power: 1.0, edge: 0.0, footprint: 0.0, view_power: 1.0 }
+        Self { map: ErrorMap::Loss, power: 1.0, edge: 0.0, footprint: 0.0, view_power: 1.0 }
     }
 }
 

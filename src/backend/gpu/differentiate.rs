@@ -110,7 +110,7 @@ impl Differentiable for GpuBackend {
         };
         // Nothing was counted in this run, so that there is nothing for which bands might not do.
         self.write("state", bytemuck::bytes_of(&<State as bytemuck::Zeroable>::zeroed()));
-        let (state, _) = self.run(&frame, |passes, to| passes.loss(to, [0.0; 2]))?;
+        let (state, _) = self.run(&frame, |passes, to| passes.loss(to, [[0.0; 2]; 2]))?;
         let planes = self.read("pixel gradient", 0, 12 * pixels.len() as u64)?;
         let n = pixels.len();
         let gradient = (0..3 * n).map(|i| planes[i % 3 * n + i / 3]).collect();

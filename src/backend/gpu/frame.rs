@@ -152,7 +152,7 @@ impl Frame {
             | (if noise.is_some() { due::NOISE } else { 0 });
         self.draw = [folded_seed(input.seed), input.step, due | adds, self.draw[3]];
         self.background[3] = planes.full_depth;
-        let ErrorScore { power, edge, footprint, view_power } = planes.score;
+        let ErrorScore { power, edge, footprint, view_power, .. } = planes.score;
         self.score = [power, edge, footprint, view_power];
         // To which planes the view adds.
         for (signal, plane) in Signal::ALL.into_iter().zip(self.planes.as_flattened_mut()) {

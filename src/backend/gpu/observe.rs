@@ -170,7 +170,7 @@ impl GpuBackend {
             if exposure.is_some() {
                 passes.expose(to, camera.width * camera.height);
             }
-            passes.loss(to, [0.0; 2]);
+            passes.loss(to, [[0.0; 2]; 2]);
         })?;
         let loss = state.output().loss;
         let image = self.rendering(camera.width, camera.height)?;

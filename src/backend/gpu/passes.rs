@@ -204,12 +204,12 @@ impl Passes<'_> {
         to.run(l.get("total_exposure"), [0; 4], 1);
     }
 
-    /// Stage 4, with the weights of |e| and 1 − SSIM in the error per pixel.
-    pub(super) fn loss(&self, to: &mut Recorder<'_>, error_weights: [f32; 2]) {
+    /// Stage 4, with the weights of |e| and 1 − SSIM in the errors per pixel, for candidates and for signals.
+    pub(super) fn loss(&self, to: &mut Recorder<'_>, error_weights: [[f32; 2]; 2]) {
         let l = self.launches;
-        let [a, b] = error_weights.map(f32::to_bits);
+        let [[a, b], [c, d]] = error_weights.map(|weights| weights.map(f32::to_bits));
         to.stage("loss");
-        to.run(l.get("similarity"), [a, b, 0, 0], self.shape.tiles);
+        to.run(l.get("similarity"), [a, b, c, d], self.shape.tiles);
         to.run(l.get("pixel_gradient"), [0; 4], self.shape.tiles);
         to.run(l.get("total"), [0; 4], 1);
     }

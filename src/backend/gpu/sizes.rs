@@ -72,6 +72,7 @@ impl Sizes {
         needs: &Needs,
         accumulation: Accumulation,
     ) -> Self {
+        let records = RecordLayout::new(needs.signals);
         Self {
             budget: budget as u64,
             frozen: 0,
@@ -80,13 +81,13 @@ impl Sizes {
             image,
             photographs: KeptPhotographs::default(),
             planes: SignalPlanes::new(needs).count,
-            records: RecordLayout::new(needs.signals),
+            records,
             accumulation,
             more: false,
             cadence: needs.cadence,
             dominant: counts_dominant(needs),
             masks: needs.mask.is_some(),
-            with_edges: needs.error_score.edge > 0.0,
+            with_edges: records.has(Field::Error) && needs.error_score.edge > 0.0,
             with_error: needs.candidates.is_some_and(|r| r.error != ErrorMode::Gradient),
             exposures: false,
         }

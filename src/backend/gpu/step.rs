@@ -55,13 +55,14 @@ impl GpuBackend {
         let trained = (self.rows - self.sizes.frozen as usize).max(1) as f32;
         let mask = self.mask.map(|mask| MaskTerm { weight: mask.weight / trained, ..mask });
         let pixels = camera.width * camera.height;
+        let by_map = self.planes.score.map.weights();
         // Up to dL/dpixel.
         let compare = |passes: &Passes<'_>, to: &mut Recorder<'_>, weights| {
             passes.forward(to);
             if exposure.is_some() {
                 passes.expose(to, pixels);
             }
-            passes.loss(to, weights);
+            passes.loss(to, [weights, by_map]);
             if exposure.is_some() {
                 passes.expose_bwd(to, pixels);
             }

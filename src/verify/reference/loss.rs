@@ -16,8 +16,8 @@ pub struct Loss {
     pub ssim: f64,
     /// Shape: [height, width, 3].
     pub gradient: Vec<f64>,
-    /// Each pixel's part of the loss: its mean over channels of 0.8 · |error| + 0.2 · (1 − SSIM).
-    pub by_pixel: Vec<f64>,
+    /// Each pixel's absolute error and its 1 − SSIM, means over channels.
+    pub by_pixel: Vec<[f64; 2]>,
 }
 
 /// Weights of the window, σ = 1.5 px, by (dy, dx); they sum to 1.
@@ -62,7 +62,7 @@ pub fn loss(rendered: &[f64], target: &[f64], width: usize, height: usize) -> Lo
     let yy = blurred(&product(target, target));
     let xy = blurred(&product(rendered, target));
     let mut ssim = 0.0;
-    let mut by_pixel = vec![0.0; rendered.len() / 3];
+    let mut by_pixel = vec![[0.0; 2]; rendered.len() / 3];
     // Gradients of Σ SSIM with respect to μx, E[x²] and E[xy] at every pixel.
     let [mut d_mx, mut d_xx, mut d_xy] = [(); 3].map(|()| vec![0.0; rendered.len()]);
     for i in 0..rendered.len() {
@@ -71,7 +71,9 @@ pub fn loss(rendered: &[f64], target: &[f64], width: usize, height: usize) -> Lo
         let d = xx[i] - mx[i] * mx[i] + yy[i] - my[i] * my[i] + C2;
         let value = a * b / (c * d);
         ssim += value;
-        by_pixel[i / 3] += (0.8 * (rendered[i] - target[i]).abs() + 0.2 * (1.0 - value)) / 3.0;
+        let [absolute, dissimilar] = &mut by_pixel[i / 3];
+        *absolute += (rendered[i] - target[i]).abs() / 3.0;
+        *dissimilar += (1.0 - value) / 3.0;
         d_mx[i] = (2.0 * my[i] * b - 2.0 * my[i] * a) / (c * d) - value * 2.0 * mx[i] / c
             + value * 2.0 * mx[i] / d;
         d_xx[i] = -value / d;

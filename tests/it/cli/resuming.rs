@@ -242,9 +242,11 @@ fn options_that_contradict_the_checkpoint_are_refused_by_name() {
     let (_root, run) = scratch();
     short_run(&scene, &run, "");
     let before = files(&run);
-    let cases: [(&str, &[&str]); 12] = [
+    let cases: [(&str, &[&str]); 13] = [
         ("--budget 400", &["--budget: 400 now, 330 in that run", "iteration_40"]),
         ("--policy vanilla", &["--policy: \"vanilla\" now, \"diet\" in that run"]),
+        // Its masks would begin in the midst of the run.
+        ("--policy compact-3dgs", &["--policy: \"compact-3dgs\" now, \"diet\" in that run"]),
         ("--policy-set diet.rho=0.5", &["--policy-set diet.rho: 0.5 now, 0.25 in"]),
         ("--lr opacity=0.5", &["--lr opacity: 0.5 now"]),
         ("--seed 3 --sh-degree 2", &["--seed: 3 now, 0 in", "--sh-degree: 2 now, 1 in"]),

@@ -4,9 +4,10 @@ use densify_policies::plan::{
     Decay, EditPlan, Offspring, OpacityRule, ParentFate, Placement, Reset, ScaleRule, Seed,
     UNTURNED, Update,
 };
+use densify_policies::policy::SignalSet;
 use proptest::prelude::*;
 
-use super::ROWS;
+use super::{ROWS, SIGNALS};
 
 /// One call.
 #[derive(Debug, Clone)]
@@ -17,7 +18,8 @@ pub(super) enum Call {
     Append(Seed),
     Decay(Decay),
     Clamp(f32),
-    Reset,
+    /// Of all signals, or of some.
+    Reset(Option<SignalSet>),
 }
 
 fn opacity_rule() -> impl Strategy<Value = OpacityRule> {
@@ -84,6 +86,9 @@ pub(super) fn call() -> impl Strategy<Value = Call> {
     let update = prop_oneof![3 => update, 1 => restart];
     let decay = (0.0_f32..0.3, 0.0_f32..0.3, any::<bool>());
     let decay = decay.prop_map(|(opacity, scale, seen_only)| Decay { opacity, scale, seen_only });
+    let some = prop::sample::subsequence(SIGNALS.to_vec(), 0..=SIGNALS.len());
+    let some = some.prop_map(|signals| Some(signals.into_iter().collect()));
+    let reset = prop_oneof![Just(None), some].prop_map(Call::Reset);
     let unit = || prop::array::uniform3(0.0_f32..1.0);
     let scales = prop::array::uniform3(0.01_f32..0.3);
     let seed = (unit(), unit(), scales, quaternion(), 0.01_f32..0.99).prop_map(
@@ -102,7 +107,7 @@ pub(super) fn call() -> impl Strategy<Value = Call> {
         4 => seed.prop_map(Call::Append),
         1 => decay.prop_map(Call::Decay),
         1 => (0.05_f32..0.9).prop_map(Call::Clamp),
-        1 => Just(Call::Reset),
+        2 => reset,
     ]
 }
 
@@ -115,8 +120,8 @@ pub(super) fn enter(plan: &mut EditPlan, call: &Call) -> bool {
         Call::Append(seed) => plan.append(seed),
         Call::Decay(how) => plan.decay(how),
         Call::Clamp(max) => plan.clamp_opacity(max),
-        Call::Reset => {
-            plan.reset(Reset::Signals);
+        Call::Reset(signals) => {
+            plan.reset(signals.map_or(Reset::Signals, Reset::Only));
             Ok(())
         }
     };

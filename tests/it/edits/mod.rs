@@ -29,9 +29,15 @@ use plain::{Row, execute};
 const ROWS: usize = 37;
 const SEED: u64 = 9;
 /// Signals whose sums are carried along, and age.
-const SIGNALS: [Signal; 4] =
-    [Signal::ScreenGradient, Signal::WeightMax, Signal::Age, Signal::VisibleCount];
-/// The last.
+const SIGNALS: [Signal; 6] = [
+    Signal::ScreenGradient,
+    Signal::WeightMax,
+    Signal::Age,
+    Signal::VisibleCount,
+    Signal::DepthMin,
+    Signal::WeightSum,
+];
+/// The number of views in which a row was seen.
 const SEEN: usize = 3;
 const SAME: Update = Update { keep_moments: false, ..Update::NONE };
 

@@ -3,6 +3,7 @@
 use densify_policies::plan::{
     Decay, OPACITY_LEAST, Offspring, OpacityRule, ParentFate, Placement, ScaleRule, Seed,
 };
+use densify_policies::policy::{Signal, SignalKind, SignalSet};
 use densify_policies::rng::{PolicyRng, Purpose};
 use glam::{DQuat, DVec3};
 
@@ -92,7 +93,7 @@ impl Row {
     /// Zero moments, age 0, no past.
     fn reborn(mut self) -> Self {
         self.moments = None;
-        self.signals = [0.0; SIGNALS.len()];
+        self.signals = SIGNALS.map(empty);
         self
     }
 
@@ -143,7 +144,7 @@ impl Row {
             quat: unfold(wide(seed.orientation).normalize()),
             logit: logit(f64::from(seed.opacity)),
             sh: vec![0.0; 12],
-            signals: [0.0; SIGNALS.len()],
+            signals: SIGNALS.map(empty),
             moments: None,
             opacity_rests: false,
             sh_rests_from: usize::MAX,
@@ -153,6 +154,11 @@ impl Row {
         sown.paint(seed.colour);
         sown
     }
+}
+
+/// The signal of a row that no view has seen since.
+fn empty(signal: Signal) -> f32 {
+    if signal.kind() == SignalKind::Minimum { f32::INFINITY } else { 0.0 }
 }
 
 /// Executes accepted calls of a step on the plain vector.
@@ -169,7 +175,7 @@ pub(super) fn execute(
     let mut seeds = Vec::new();
     let mut clamp = f32::INFINITY;
     let mut decay = None;
-    let mut reset = false;
+    let mut reset = SignalSet::default();
     for call in calls {
         match call {
             Call::Prune(row) => slots[*row as usize] = None,
@@ -201,7 +207,9 @@ pub(super) fn execute(
             Call::Append(seed) => seeds.push(new(Row::sown(seed))),
             Call::Decay(how) => decay = Some(*how),
             Call::Clamp(max) => clamp = clamp.min(*max),
-            Call::Reset => reset = true,
+            Call::Reset(signals) => {
+                reset = reset.union(signals.unwrap_or_else(|| Signal::ALL.into()));
+            }
         }
     }
     let families = slots.into_iter().zip(children);
@@ -217,9 +225,10 @@ pub(super) fn execute(
             row.logit = row.logit.min(logit(f64::from(clamp)));
             row.opacity_rests = true;
         }
-        if reset {
-            row.signals[0] = 0.0;
-            row.signals[SEEN] = 0.0;
+        for (signal, value) in SIGNALS.into_iter().zip(&mut row.signals) {
+            if signal.is_reset() && reset.contains(signal) {
+                *value = empty(signal);
+            }
         }
     }
     model

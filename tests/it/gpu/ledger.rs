@@ -3,30 +3,54 @@
 use densify::backend::gpu::GpuBackend;
 use densify::backend::{Backend, Setup};
 use densify::verify::scenes;
-use densify_policies::policy::{Needs, Signal};
+use densify_policies::policy::{AuxColumn, AuxRequest, ErrorScore, MaskTerm, Needs, Signal};
 
 use crate::subject::{GREY, ways};
 
 #[test]
 fn what_is_allocated_is_what_the_ledger_says() {
-    // A number of each pair for the error, and for attributes none.
-    let asked: [(&[Signal], u64); 3] =
-        [(&[], 9), (&[Signal::WeightedError], 10), (&[Signal::Position, Signal::Colour], 9)];
-    for (device, (signals, numbers)) in ways().flat_map(|device| asked.map(|asked| (device, asked)))
+    let needs = |signals: &[Signal]| Needs {
+        signals: signals.iter().copied().collect(),
+        ..Needs::default()
+    };
+    let mask = MaskTerm { start: 1.0, rate: 0.01, weight: 5e-4, threshold: 0.01 };
+    let columns = vec![AuxColumn::PixelCount, AuxColumn::MapSum];
+    // A number of each pair for the error, one more for the weight of scores, and for attributes none.
+    let asked = [
+        (needs(&[]), 9),
+        (needs(&[Signal::WeightedError]), 10),
+        (needs(&[Signal::Position, Signal::Colour]), 9),
+        (needs(&[Signal::DominantPixels]), 9),
+        (Needs { mask: Some(mask), ..needs(&[Signal::Mask]) }, 9),
+        (
+            Needs {
+                error_score: ErrorScore { edge: 1.0, ..ErrorScore::default() },
+                ..needs(&[Signal::ErrorScore])
+            },
+            11,
+        ),
+        (
+            Needs {
+                aux: Some(AuxRequest { columns, points: 3, ..AuxRequest::default() }),
+                ..needs(&[])
+            },
+            9,
+        ),
+    ];
+    for (device, (needs, numbers)) in
+        ways().flat_map(|device| asked.iter().map(move |asked| (device, asked)))
     {
         let camera = scenes::camera(40, 30, 32);
         let model = scenes::cloud(20, 3, &camera, 42);
         let options = Setup {
             largest_image: (40, 30),
             tile_cap: Some(700),
-            needs: Needs { signals: signals.iter().copied().collect(), ..Needs::default() },
+            needs: needs.clone(),
             ..Setup::new(model.len())
         };
         let mut gpu = GpuBackend::new(&model, &options, device).expect("a small model fits");
         let promised = gpu.promised();
-        let lines: u64 = gpu.ledger().lines.iter().map(|line| line.bytes).sum();
-        assert_eq!((gpu.allocated(), lines), (promised, promised));
-        assert_eq!(gpu.ledger().on_device(), promised);
+        assert_eq!((gpu.allocated(), gpu.ledger().on_device()), (promised, promised));
         assert_eq!(&device.promise(model.sh_degree, &options), gpu.ledger());
         gpu.render(&camera, GREY, 1).expect("a rendering");
         assert_eq!(gpu.allocated(), promised);
@@ -34,6 +58,11 @@ fn what_is_allocated_is_what_the_ledger_says() {
         let of_pairs = gpu.ledger().lines.iter().filter(|line| line.what.contains("per entry"));
         let records: u64 = of_pairs.map(|line| line.bytes).sum();
         let is_in_slots = device.accumulation().is_deterministic();
-        assert_eq!(records, if is_in_slots { 4 * numbers * 700 } else { 0 }, "{device:?}");
+        assert_eq!(
+            records,
+            if is_in_slots { 4 * numbers * 700 } else { 0 },
+            "{:?}, {needs:?}",
+            device.accumulation()
+        );
     }
 }

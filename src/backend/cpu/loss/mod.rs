@@ -67,7 +67,7 @@ pub(super) struct LossBuffers {
 pub(super) struct ImageTerms {
     /// Weights of |e| and of 1 − SSIM in the error of each pixel, if that is asked for.
     pub(super) error: Option<[f32; 2]>,
-    /// Whether each pixel's part of the loss goes to the last plane of the gradient, weighed like this.
+    /// Whether an error of each pixel goes to the last plane of the gradient, weighed like this.
     pub(super) by_pixel: Option<ErrorScore>,
 }
 
@@ -148,7 +148,8 @@ impl LossBuffers {
         // Of those that are not asked for, nothing.
         let ranking = &mut ranking[..if asked[0] { vectors } else { 0 }];
         let errors_by_pixel = &mut errors_by_pixel[..if asked[1] { vectors } else { 0 }];
-        let error_weights = [error_weights.unwrap_or_default(), [1.0 - SSIM_WEIGHT, SSIM_WEIGHT]];
+        let by_map = by_pixel.map(|score| score.map.weights());
+        let error_weights = [error_weights, by_map].map(Option::unwrap_or_default);
         let short = SHORT_STRIP * segments.pitch();
         let samples = (3 * grid.width * grid.height) as f64;
         let (mut l1, mut ssim) = (0.0_f64, 0.0_f64);
