@@ -103,6 +103,13 @@ fn run_event(
     let views: Vec<View> = (0..aux.min(scene.train_views).min(MAX_VIEWS))
         .map(|view| model.view(pattern, step, view, &request))
         .collect();
+    let schedule = |policy: &dyn DensityPolicy| {
+        let terms = policy.loss_terms(step, needs.loss_terms);
+        let resolution = policy.resolution(step);
+        (policy.cadence(step), terms, policy.noise(step, needs.noise), resolution)
+    };
+    // Before the plan, which may change what follows.
+    let wanted = schedule(policy);
     observe(policy, step, rows, &views, &request, false)?;
     let ops = plan(policy, scenario, &event, needs, false)?;
     for (check, copy) in copies {
@@ -110,12 +117,7 @@ fn run_event(
         if !copy.is_due(step) {
             return Err(differs("is not due at this step"));
         }
-        let schedule = |policy: &dyn DensityPolicy| {
-            let terms = policy.loss_terms(step, needs.loss_terms);
-            let resolution = policy.resolution(step);
-            (policy.cadence(step), terms, policy.noise(step, needs.noise), resolution)
-        };
-        if copy.aux_views(step, rows, budget) != aux || schedule(&**copy) != schedule(policy) {
+        if copy.aux_views(step, rows, budget) != aux || schedule(&**copy) != wanted {
             return Err(differs(
                 "wants other views, or another cadence, resolution, terms or noise",
             ));
