@@ -27,7 +27,7 @@
 //! - `hit` is what a pixel adds: `opacity`, the opacity o, as in the published code; or `blend-weight`,
 //!   the weight α·T that the Gaussian has there, so that what is hidden behind others counts less. The
 //!   paper has the opacity times the transmittance T; the blend weight also falls off towards the
-//!   Gaussian's rim.
+//!   Gaussian's rim. The default is what the published figures were made with.
 //! - `volume` is V: `plain`, as in the published code; or `clipped`, as in the paper, min(V / V90, 1),
 //!   where a tenth of all Gaussians is larger than V90.
 //! - `victims = "random"` draws as many Gaussians at random instead: a control that shows what the

@@ -38,8 +38,10 @@
 //! ## Under a budget
 //!
 //! The budget bounds growth and is never exceeded. The published code grows to several million and then
-//! prunes; here the budget is the peak, so that a run ends at somewhat less than `sample_share` of it, with
-//! half of the budget idle. Compare it by its final number too.
+//! prunes; here the budget is the peak. The sampling leaves `sample_share` of the Gaussians that dominate a
+//! pixel, which many do not, and the cut what carries `cut_mass` of the importance. With a budget of 8,000,
+//! runs of 7,000 steps at half size ended at 9 to 22 % of it, 15 % in the mean of six scenes. Compare it by
+//! its final number too.
 //!
 //! ## Differences from the published code
 //!
