@@ -1,5 +1,7 @@
 //! Masks of photographs: what of them is hidden, and what hidden pixels are.
 
+use image::DynamicImage;
+
 use super::error::DatasetError;
 use super::images::{SourceFile, decode};
 use super::options::MaskMode;
@@ -20,7 +22,7 @@ pub struct Mask {
 impl Mask {
     /// Decodes it at its own size; 0 is hidden, whichever colour of the file that is.
     pub(super) fn weights(&self) -> Result<image::GrayImage, DatasetError> {
-        let mut mask = decode(&self.file)?.into_luma8();
+        let mut mask = shape(decode(&self.file)?);
         match self.hides {
             Hides::Black => {}
             Hides::White => mask.iter_mut().for_each(|weight| *weight = 255 - *weight),
@@ -51,6 +53,20 @@ impl Mask {
         }
         Ok(())
     }
+}
+
+/// The values of a mask: its brightness; or its coverage, where that alone makes it.
+fn shape(mask: DynamicImage) -> image::GrayImage {
+    let luma = mask.to_luma8();
+    if !mask.color().has_alpha() || luma.iter().any(|value| Some(value) != luma.first()) {
+        return luma;
+    }
+    let alpha = mask.into_luma_alpha8();
+    let is_opaque = alpha.pixels().all(|pixel| pixel.0[1] == 255);
+    if is_opaque {
+        return luma;
+    }
+    image::GrayImage::from_fn(alpha.width(), alpha.height(), |x, y| [alpha[(x, y)].0[1]].into())
 }
 
 /// Which values of a mask hide a pixel.
@@ -126,6 +142,20 @@ mod tests {
             assert!(!source.is_masked());
             assert_eq!(loaded.bytes(), source.loaded_bytes());
         }
+    }
+
+    /// Its brightness, unless only its coverage differs.
+    #[test]
+    fn a_mask_can_be_drawn_by_coverage() {
+        let of = |values: [[u8; 2]; 2]| {
+            let image = image::GrayAlphaImage::from_fn(2, 1, |x, _| values[x as usize].into());
+            shape(image.into()).into_raw()
+        };
+        assert_eq!(of([[0, 0], [0, 255]]), [0, 255]);
+        assert_eq!(of([[255, 255], [255, 90]]), [255, 90]);
+        assert_eq!(of([[0, 0], [255, 255]]), [0, 255]);
+        assert_eq!(of([[0, 255], [255, 0]]), [0, 255], "brightness");
+        assert_eq!(of([[7, 255], [7, 255]]), [7, 7]);
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Finds the files of masks by the names that programs give them.
 //!
-//! In `masks/`: COLMAP's and nerfstudio's names. Beside the photograph: the layers of RealityCapture, and the dynamic
+//! In `masks/` and folders of similar names: COLMAP's and nerfstudio's names. Beside the photograph: the layers of RealityCapture, and the dynamic
 //! masks of instant-ngp.
 
 use std::ffi::OsStr;
@@ -13,6 +13,9 @@ use super::paths::{DataPath, Root};
 /// How the name of a mask ends that is a layer of RealityCapture, and how that of instant-ngp begins.
 const LAYER: &str = ".mask.png";
 const DYNAMIC: &str = "dynamic_mask_";
+
+/// Folders of the dataset that hold masks; the first of them that has one of an image counts.
+const FOLDERS: [&str; 4] = ["masks", "mask", "segmentation", "dynamic_masks"];
 
 /// The file of a mask.
 #[derive(Debug, Clone)]
@@ -34,6 +37,20 @@ pub(super) fn is_mask(name: &OsStr) -> bool {
     name.to_str().is_some_and(|name| name.ends_with(LAYER) || name.starts_with(DYNAMIC))
 }
 
+/// What is said where there is a folder for masks and no photograph has one.
+pub(super) fn unused_masks_note(dataset: &Path) -> Option<String> {
+    let holds_files = |folder: &PathBuf| {
+        folder.read_dir().is_ok_and(|mut entries| entries.any(|entry| entry.is_ok()))
+    };
+    let all = FOLDERS.map(|name| dataset.join(name));
+    let folder = all.into_iter().chain([dataset.join("images/masks")]).find(holds_files)?;
+    Some(format!(
+        "{} holds the mask of no photograph: masks lie in `masks/` of the dataset, each NAME.EXT.png or NAME.png \
+         after its photograph, below the same folders",
+        folder.display()
+    ))
+}
+
 impl Folders {
     /// The mask of an image, if there is one. What lies in `masks/` precedes what lies beside the image.
     pub(super) fn mask(
@@ -46,15 +63,21 @@ impl Folders {
         let listed = self.inside_images(&image.name);
         let file = image.path.file_name().and_then(OsStr::to_str).unwrap_or_default();
         let (inside, stem) = (with_file_name(&listed, file), stem(file));
-        for value in [
+        let renamed = |ending: &str| with_file_name(&listed, &format!("{stem}{ending}"));
+        let names = [
             format!("{inside}.png"),
             inside.clone(),
-            with_file_name(&listed, &format!("{stem}.png")),
+            renamed(".png"),
+            renamed(".jpg"),
+            renamed(".jpeg"),
             format!("{inside}{LAYER}"),
-            with_file_name(&listed, &format!("{stem}{LAYER}")),
-        ] {
-            if let Some(path) = at(&self.root, format!("masks/{value}"))? {
-                return Ok(Some(MaskFile::of(path)));
+            renamed(LAYER),
+        ];
+        for folder in FOLDERS.iter().filter(|folder| self.root.path().join(folder).is_dir()) {
+            for name in &names {
+                if let Some(path) = at(&self.root, format!("{folder}/{name}"))? {
+                    return Ok(Some(MaskFile::of(path)));
+                }
             }
         }
         let (root, places) = self.beside(image);

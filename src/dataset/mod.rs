@@ -128,6 +128,8 @@ struct Frame {
     reduced: Option<u32>,
     mask: Option<MaskFile>,
     lens: Lens,
+    /// Whether the pose file says what size the lens is for, and not the image.
+    is_sized: bool,
     rotation: DMat3,
     translation: DVec3,
     held_out: bool,

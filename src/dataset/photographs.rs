@@ -49,6 +49,8 @@ pub(super) fn photographs(
     let checked: Vec<_> = frames.par_iter().map(|frame| checked(listing, frame)).collect();
     let checked: Vec<Checked> = checked.into_iter().collect::<Result<_, _>>()?;
     notes.extend(turned_note(frames, &checked));
+    notes.extend(unsure_note(frames));
+    notes.extend(masks_note(frames));
     if let (Some(Resolution::Width(width)), Some(first)) = (options.resolution, frames.first())
         && checked.iter().any(|checked| checked.header.width < width)
     {
@@ -138,6 +140,25 @@ fn turned_note(frames: &[Frame], checked: &[Checked]) -> Option<String> {
         turned().count(),
         first.name
     ))
+}
+
+/// What is said about photographs that EXIF turns by a quarter while nothing says whether the poses mean that.
+fn unsure_note(frames: &[Frame]) -> Option<String> {
+    let is_unsure = |frame: &&Frame| !frame.is_sized && exif::quarter_turn(&frame.image).is_some();
+    let unsure: Vec<&Frame> = frames.iter().filter(is_unsure).collect();
+    let first = &unsure.first()?.name;
+    Some(format!(
+        "{} photographs are to be turned by a quarter, as their EXIF says, but the pose file has no size that would \
+         tell whether its poses mean that; they are taken as they are stored ({first} is the first). If the model is \
+         poor, turn the files themselves",
+        unsure.len()
+    ))
+}
+
+/// How many photographs have masks, if any.
+fn masks_note(frames: &[Frame]) -> Option<String> {
+    let masked = frames.iter().filter(|frame| frame.mask.is_some()).count();
+    (masked > 0).then(|| format!("{masked} of {} photographs have a mask", frames.len()))
 }
 
 /// Why a lens cannot be cut, with the remedy.

@@ -6,6 +6,7 @@ use std::path::Path;
 use glam::{DVec2, DVec3};
 
 use super::error::DatasetError;
+use super::masks::unused_masks_note;
 use super::normalise::{self, Normalisation};
 use super::photographs::{Photograph, photographs};
 use super::pose::POSE_REMEDY;
@@ -28,6 +29,9 @@ pub(super) fn prepare(
     refuse_duplicates(&scene.listing, &frames)?;
     let mut notes = std::mem::take(&mut scene.notes);
     let all = photographs(&scene.listing, &frames, options, &mut notes)?;
+    if frames.iter().all(|frame| frame.mask.is_none()) {
+        notes.extend(unused_masks_note(path));
+    }
     scene.notes = notes;
     assemble(path, all, scene, options)
 }

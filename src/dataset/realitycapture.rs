@@ -138,6 +138,7 @@ pub(super) fn read(
             reduced: found.reduced,
             mask,
             lens,
+            is_sized: false,
             rotation,
             translation,
             held_out: false,

@@ -119,6 +119,7 @@ pub(super) fn read(
             reduced: found.reduced,
             mask,
             lens,
+            is_sized: fields.size()?.is_some(),
             rotation,
             translation,
             held_out,
@@ -324,11 +325,16 @@ impl<'a> Fields<'a> {
     }
 
     /// The lens, at the size stated in the file, or else at that of the image.
+    /// The size that intrinsics are for, if the file says it.
+    fn size(&self) -> Result<Option<(u32, u32)>, DatasetError> {
+        Ok(self.side("w")?.zip(self.side("h")?))
+    }
+
     fn lens(&self, image: &Path, reduced: Option<u32>) -> Result<Lens, DatasetError> {
         let distortion = self.distortion()?;
-        let (width, height) = match (self.side("w")?, self.side("h")?) {
-            (Some(width), Some(height)) => (width, height),
-            _ => {
+        let (width, height) = match self.size()? {
+            Some(size) => size,
+            None => {
                 // Without a size, the intrinsics are those of the image at full size.
                 let header = images::probe(image)?;
                 let k = reduced.unwrap_or(1);

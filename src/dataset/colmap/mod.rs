@@ -105,6 +105,7 @@ pub(super) fn read(
             reduced: found.reduced,
             mask,
             lens: *lens,
+            is_sized: true,
             rotation: image.rotation,
             translation: image.translation,
             held_out: false,

@@ -37,9 +37,10 @@ pub(in crate::dataset) enum CutFault {
 const SAMPLES: u32 = 64;
 /// Cells along each side of a face that are asked whether they were seen.
 const CELLS: usize = 128;
-/// Steepest ray of a single pinhole, x/z: 55 degrees of a fisheye, as beyond it a pinhole's pixels see half of
-/// what those at its centre do; 80 of a lens that is a pinhole but for its distortion.
-const STEEPEST: f64 = 1.43;
+/// Steepest ray of a single pinhole, x/z: 65 degrees of a fisheye; 80 of a lens that is a pinhole but for its
+/// distortion. Further out a pinhole's pixels see little each, but narrow faces beside the front, which are drawn
+/// as often as it, cost more: docs/data.md has the figures.
+const STEEPEST: f64 = 2.15;
 const STEEPEST_PERSPECTIVE: f64 = 5.67;
 /// Least side of a face that is worth a view, x/z.
 const LEAST_SIDE: f64 = 0.2;

@@ -215,3 +215,26 @@ fn a_photograph_that_fits_its_camera_is_not_turned() {
         assert!(error.contains("b.png") && error.contains("12x20"), "{orientation:?}: {error}");
     }
 }
+
+/// Without a size in the pose file nothing tells whether it means the picture as it is stored.
+#[test]
+fn a_turn_of_which_the_poses_say_nothing_is_named() {
+    let sizeless = || {
+        Made::transforms(|json| {
+            for field in ["w", "h"] {
+                json.as_object_mut().unwrap().remove(field);
+            }
+        })
+    };
+    for (made, is_named) in [
+        (Made::realitycapture(), true),
+        (sizeless(), true),
+        (Made::transforms(|_| ()), false),
+        (Made::colmap_txt(), false),
+    ] {
+        say(&made.file("images/b.png"), turned(6));
+        let data = Dataset::load(made.path(), &LoadOptions::default()).unwrap();
+        let said = |note: &String| note.contains("1 photographs are to be turned");
+        assert_eq!(data.notes.iter().any(said), is_named, "{:?}", data.notes);
+    }
+}

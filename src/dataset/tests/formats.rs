@@ -157,6 +157,9 @@ fn masks_are_found() {
         (Made::colmap_txt(), "masks/b.png"),
         (Made::transforms(|_| ()), "masks/b.png"),
         (Made::colmap_txt(), "masks/b.mask.png"),
+        (Made::colmap_txt(), "mask/b.png"),
+        (Made::transforms(|_| ()), "segmentation/b.png.png"),
+        (Made::colmap_txt(), "dynamic_masks/b.png"),
         (Made::realitycapture(), "masks/b.png.mask.png"),
         (Made::realitycapture(), "images/b.png.mask.png"),
         (Made::colmap_txt(), "images/b.mask.png"),
@@ -171,6 +174,8 @@ fn masks_are_found() {
             .save(made.file(mask))
             .unwrap();
         let data = load(&made);
+        let said = |note: &String| note.contains("1 of 3 photographs have a mask");
+        assert!(data.notes.iter().any(said), "{mask}: {:?}", data.notes);
         assert_eq!(data.train[0].source.load().unwrap().mask, None, "{mask}");
         let found = data.train[1].source.load().unwrap().mask.unwrap();
         assert_eq!((found[0], found[19]), (0, 255), "{mask}");
@@ -185,6 +190,21 @@ fn masks_are_found() {
         assert_eq!((alpha[0], alpha[19], &found.mask), (0, 255, &None), "{mask}");
         assert_eq!(found.bytes(), source.loaded_bytes());
     }
+}
+
+#[test]
+fn masks_of_no_photograph_are_named() {
+    for file in ["masks/other.png", "images/masks/b.png", "segmentation/other.png"] {
+        let made = Made::colmap_txt();
+        std::fs::create_dir_all(made.file(file).parent().unwrap()).unwrap();
+        image(&made.file(file), SIZE, 200);
+        let folder = file.rsplit_once('/').unwrap().0;
+        let notes = load(&made).notes;
+        let said =
+            |note: &String| note.contains(folder) && note.contains("the mask of no photograph");
+        assert!(notes.iter().any(said), "{file}: {notes:?}");
+    }
+    assert!(!load(&Made::colmap_txt()).notes.iter().any(|note| note.contains("mask")));
 }
 
 /// instant-ngp hides where its masks are anything but black.
@@ -214,6 +234,8 @@ fn masks_are_found_in_the_folder_that_is_named() {
     let masks = [
         "masks/b.png.png",
         "masks/b.png",
+        "masks/b.jpg",
+        "masks/b.jpeg",
         "masks/b.png.mask.png",
         "masks/b.mask.png",
         "moved/b.png.mask.png",
@@ -225,7 +247,7 @@ fn masks_are_found_in_the_folder_that_is_named() {
         std::fs::rename(made.file("images"), made.file("moved")).unwrap();
         masks.iter().for_each(|mask| image(&made.file(mask), SIZE, 200));
         // All but black is hidden by this one.
-        image::GrayImage::new(SIZE.0, SIZE.1).save(made.file(masks[7])).unwrap();
+        image::GrayImage::new(SIZE.0, SIZE.1).save(made.file(masks[9])).unwrap();
         let options = LoadOptions { images: Some("moved".into()), ..LoadOptions::default() };
         for mask in masks {
             let data = load_with(&made, options.clone());
