@@ -1,6 +1,7 @@
 //! Which request gets what. No path names a file: what is served is built in, or made on request.
 
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use serde::Deserialize;
 
@@ -84,8 +85,9 @@ impl Routes<'_> {
     }
 
     fn frame(&self, wanted: Wanted) -> Answer {
+        let begun = Instant::now();
         match self.desk.ask(wanted) {
-            Ok(frame) => sent(frame),
+            Ok(frame) => sent(frame, begun.elapsed()),
             Err(Unmade::Superseded) => {
                 Answer::refusal(409, "a newer picture was asked for meanwhile")
             }
@@ -99,13 +101,15 @@ impl Routes<'_> {
     }
 }
 
-/// A picture, with what is known of it in the head.
-fn sent(frame: Frame) -> Answer {
+/// A picture, with what is known of it in the head: how long it took here too, waiting included, so that the page can
+/// tell that from the way to it.
+fn sent(frame: Frame, held: Duration) -> Answer {
     let Frame { jpeg, size: (width, height), range, mean, distance, measured, milliseconds } =
         frame;
     let mut answer = Answer::of("image/jpeg", jpeg)
         .with("X-Size", format!("{width}x{height}"))
-        .with("X-Milliseconds", format!("{milliseconds:.1}"));
+        .with("X-Milliseconds", format!("{milliseconds:.1}"))
+        .with("X-Held", format!("{:.1}", 1e3 * held.as_secs_f64()));
     if let Some(range) = range {
         answer = answer.with("X-Range", format!("{} {}", range.start, range.end));
     }

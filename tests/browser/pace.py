@@ -12,27 +12,9 @@ shown, and how long after the last movement the picture was as sharp as it gets.
 import sys
 from statistics import mean, median
 
-from view import Browser, served
+from view import TURN, Browser, served
 
 SECONDS = 4
-TURN = """
-const done = arguments[arguments.length - 1], stage = document.getElementById("stage"), begun = performance.now();
-const pictures = () => Number(stage.dataset.pictures), sides = [], before = pictures();
-let last = before;
-const turn = (now) => {
-  if (now - begun > 1000 * arguments[0]) {
-    const rate = (pictures() - before) / (performance.now() - begun) * 1000;
-    return done({ rate, said: Number(stage.dataset.rate), sides });
-  }
-  orbit(0.012, 0.002 * Math.sin(now / 700));
-  if (pictures() !== last) {
-    last = pictures();
-    sides.push(Number(stage.dataset.size.split("x")[0]));
-  }
-  requestAnimationFrame(turn);
-};
-requestAnimationFrame(turn);
-"""
 
 
 def measure(browser: Browser, url: str, rounds: int) -> None:

@@ -90,6 +90,44 @@ const seen = [...document.querySelectorAll("button, select, input, summary, [tab
 const name = (it) => it.ariaLabel || it.labels?.[0]?.textContent || it.textContent;
 return seen.filter((it) => !it.dataset.reached || !name(it).trim()).map((it) => it.id || it.outerHTML);
 """
+# Turns the scene with every frame of the screen, for some seconds; then says how many pictures were shown in a second,
+# and their widths.
+TURN = """
+const done = arguments[arguments.length - 1], stage = document.getElementById("stage"), begun = performance.now();
+const pictures = () => Number(stage.dataset.pictures), sides = [], before = pictures();
+let last = before;
+const turn = (now) => {
+  if (now - begun > 1000 * arguments[0]) {
+    const rate = (pictures() - before) / (performance.now() - begun) * 1000;
+    return done({ rate, said: Number(stage.dataset.rate), sides });
+  }
+  orbit(0.012, 0.002 * Math.sin(now / 700));
+  if (pictures() !== last) {
+    last = pictures();
+    sides.push(Number(stage.dataset.size.split("x")[0]));
+  }
+  requestAnimationFrame(turn);
+};
+requestAnimationFrame(turn);
+"""
+# How large a coarse picture is, of 1, after one that was half as large: by what it took to make and to come here, of
+# 1000 bytes that take a microsecond each, and what a reply takes alone.
+PACED = """
+const [milliseconds, took, alone] = arguments;
+[latency, perByte] = [alone, 1e-3];
+pace([{ bitmap: { width: 1, height: 1 }, bytes: 1000, milliseconds, held: milliseconds, took }], performance.now() - took, true, 0.5);
+return coarse;
+"""
+# Every reply comes later by so many milliseconds, as over a network; also counts the wishes that are under way at once.
+FAR = """
+const near = window.fetch;
+window.fetch = async (...wish) => {
+  window.atOnce = Math.max(window.atOnce ?? 0, underway);
+  const answer = await near(...wish);
+  await new Promise((resolve) => setTimeout(resolve, arguments[0]));
+  return answer;
+};
+"""
 
 
 class Browser:
@@ -414,6 +452,36 @@ def check(browser: Browser, url: str, densify: str, run: str, rendered: Path, fo
     is_clean(browser, url)
 
 
+def check_from_afar(browser: Browser, url: str) -> None:
+    """Over a slow network it moves as fluently, in pictures that are not much smaller."""
+
+    def turned() -> tuple[float, float]:
+        found = browser.wait(TURN, 3)
+        browser.is_sharp()
+        half = found["sides"][len(found["sides"]) // 2:]
+        return found["rate"], sum(half) / len(half)
+
+    browser.size(1280, 800)
+    browser.open(url)
+    browser.is_sharp()
+    # What does not get shorter with fewer pixels does not make pictures smaller.
+    for making, took, alone, is_larger in [(15, 20, 2, True), (80, 90, 2, False), (15, 115, 99, True), (15, 500, 99, True),
+                                           (80, 180, 99, False)]:
+        found = browser.run(PACED, making, took, alone)
+        assert (found > 0.5) == is_larger, f"{making} ms to make, {took} ms until it is here, {alone} ms of them on its way: {found}"
+    browser.open(url)
+    browser.is_sharp()
+    near, side = turned()
+    browser.run(FAR, 80)
+    browser.run("changed()")
+    browser.until("latency >= 80", "it does not see how far away it is")
+    far, smaller = turned()
+    print(f"{near:.1f} pictures/s, {side:.0f} px wide; 80 ms away {far:.1f}, {smaller:.0f} px wide")
+    assert smaller >= side / 2, f"pictures of {smaller:.0f} px from afar, {side:.0f} px from near"
+    assert far >= 0.4 * near, f"{far:.1f} pictures/s from afar, {near:.1f} from near"
+    assert browser.run("return atOnce") > 1, "from afar it waits for each picture before it asks for the next"
+
+
 def check_two(browser: Browser, url: str, folder: Path | None) -> None:
     """Two runs, seen from one camera, with a border between them."""
 
@@ -495,9 +563,11 @@ def main(densify: str, run: str, other: str, folder: str | None = None) -> None:
         subprocess.run(command, check=True, capture_output=True)
         with served(densify, run) as (browser, url):
             check(browser, url, densify, run, Path(rendered), kept)
+            check_from_afar(browser, url)
     with served(densify, run, other) as (browser, url):
         check_two(browser, url, kept)
-    print("the page shows a test camera as densify render does, compares, turns, flies, fits 360 px, and asks nobody else")
+    print("the page shows a test camera as densify render does, compares, turns, flies, fits 360 px, is fluent from afar, and "
+          "asks nobody else")
 
 
 if __name__ == "__main__":

@@ -123,11 +123,19 @@ function dolly(factor) {
 const page = Array.from(crypto.getRandomValues(new Uint8Array(12)), (x) => x.toString(16).padStart(2, "0")).join("");
 /** So long after the last change the picture is asked for in full [ms]. */
 const REST = 30;
-/** What a picture may take while we move [ms]. */
+/** From picture to picture while we move [ms]. */
 const PACE = 45;
 /** The two pictures that are shown, each a bitmap with what is known of it, and what they show. */
 const shown = [null, null];
 let coarse = 0.5, complete = -1, border = 0.5, wakeUp = () => {}, paces = [];
+/** What a reply takes which nothing has to be made for, and what each byte adds to that [ms]. */
+let latency = 0, perByte = 0;
+/** Wishes on their way, how many there were, and which one is shown. */
+let underway = 0, wishes = 0, newest = 0;
+/** What was wished for last and when, and least time from there to the next wish [ms]. */
+let last = { version: -1, isMoving: true, begun: 0 }, spacing = 0;
+/** When a picture was shown last. */
+let shownAt = 0;
 
 const wake = () => wakeUp();
 /** Waits for a change, but no longer than this [ms]. */
@@ -153,8 +161,8 @@ function fit([width, height], within) {
   return [width * s, height * s];
 }
 
-/** How many pixels to ask for. */
-function wantedSize(isMoving) {
+/** How many pixels to ask for: this part of each side of the sharp picture. */
+function wantedSize(part) {
   let [width, height] = fit(shape(), area()).map((side) => side * devicePixelRatio * byId("sharpness").value);
   const { side, pixels } = scene.limits;
   // A photograph is no sharper than its own size, and what is compared with it is what is measured.
@@ -162,12 +170,11 @@ function wantedSize(isMoving) {
     [width, height] = shape().map((own) => own * byId("sharpness").value);
   }
   const most = Math.min(1, side / width, side / height, Math.sqrt(pixels / (width * height)));
-  const s = most * (isMoving ? coarse : 1);
-  return [width, height].map((wanted) => Math.max(1, Math.floor(wanted * s)));
+  return [width, height].map((wanted) => Math.max(1, Math.floor(wanted * most * part)));
 }
 
-async function ask(place, { kind, model }, isMoving) {
-  const [width, height] = wantedSize(isMoving);
+async function ask(place, { kind, model }, isMoving, part) {
+  const [width, height] = wantedSize(part);
   const from = view ? { view } : { camera: pose() };
   const begun = performance.now();
   const answer = await fetch("frame", {
@@ -180,78 +187,129 @@ async function ask(place, { kind, model }, isMoving) {
   if (!answer.ok) throw new Error(await answer.text());
   const number = (name) => answer.headers.has(name) ? Number(answer.headers.get(name)) : null;
   const numbers = (name) => answer.headers.get(name)?.split(" ").map(Number) ?? null;
-  const bitmap = await createImageBitmap(await answer.blob());
+  const blob = await answer.blob(), bitmap = await createImageBitmap(blob);
   return {
-    bitmap, kind, model,
+    bitmap, kind, model, bytes: blob.size,
     mean: number("X-Mean"), distance: number("X-Distance"), milliseconds: number("X-Milliseconds"),
-    range: numbers("X-Range"), measured: numbers("X-Measured"), took: performance.now() - begun,
+    range: numbers("X-Range"), measured: numbers("X-Measured"), held: number("X-Held"), took: performance.now() - begun,
   };
 }
+
+/** How long until the next picture is to be asked for [ms]: for ever, where something has to happen first. */
+function untilNext() {
+  // Nobody sees a page in the background; a run in training need not draw for it.
+  if (document.hidden || complete === version || underway >= inFlight()) return Infinity;
+  const now = performance.now(), rest = REST - (now - changedAt);
+  const isNew = last.version !== version;
+  // While nothing new is wanted, the sharp picture waits for the hand to rest.
+  if (!isNew && (!last.isMoving || isFlying())) return Infinity;
+  return Math.max(last.begun + spacing - now, isNew ? 0 : rest);
+}
+
+/**
+ * How many pictures are asked for before the first of them is here. Over a network most of the wait is no work: the
+ * machine that renders would be idle through it.
+ */
+const inFlight = () => clamp(1 + Math.round(latency / PACE), 1, 4);
 
 /** Asks for pictures as long as the page is open: coarse ones while something changes, then a sharp one. */
 async function keepAsking() {
   for (;;) {
-    if (complete === version) {
-      await pause(Infinity);
-      continue;
-    }
-    const rest = REST - (performance.now() - changedAt);
-    const isMoving = rest > 0 || isFlying();
-    const asked = version;
-    const [left, right] = sides();
-    try {
-      const frames = [await ask(0, left, isMoving), right && await ask(1, right, isMoving)];
-      if (!frames[0]) continue;
-      for (const [i, frame] of frames.entries()) {
-        shown[i]?.bitmap.close();
-        shown[i] = frame;
-      }
-      trouble("");
-      draw();
-      pace(frames, isMoving);
-      if (!isMoving) complete = asked;
-      stage.dataset.pictures = Number(stage.dataset.pictures || 0) + 1;
-      stage.dataset.size = `${frames[0].bitmap.width}x${frames[0].bitmap.height}`;
-      // What is measured in some of the views only is asked for again.
-      const isPart = frames.some((frame) => frame?.measured && frame.measured[0] < frame.measured[1]);
-      if (isPart && complete === version) complete = -1;
-      stage.dataset.state = complete === version ? "sharp" : isPart ? "measuring" : "moving";
-      // What is in the middle is what one turns about next.
-      if (complete === version && frames[0].distance) camera.away = frames[0].distance;
-      if (complete === version) stage.dataset.rested = rested();
-    } catch (error) {
-      const isGone = error instanceof TypeError;
-      const gone = scene.live ? "Training has ended, or densify was stopped." : "densify view does not answer; start it again, and this page goes on.";
-      trouble(isGone ? gone : error.message);
-      stage.dataset.state = "trouble";
-      if (!isGone) complete = asked;
-      await new Promise((resolve) => setTimeout(resolve, 1000));
-    }
-    // While nothing new is wanted, the sharp picture waits for the hand to rest.
-    if (complete !== version && asked === version && !isFlying()) {
-      const left = REST - (performance.now() - changedAt);
-      if (left > 0) await pause(left);
-    }
+    const wait = untilNext();
+    if (wait > 0) await pause(wait);
+    else follow();
   }
+}
+
+/** Asks for a picture of what is to be seen now, and shows it. */
+async function follow() {
+  const begun = performance.now(), asked = version, wish = ++wishes;
+  const isMoving = begun - changedAt < REST || isFlying(), part = isMoving ? coarse : 1;
+  const [left, right] = sides();
+  last = { version, isMoving, begun };
+  underway += 1;
+  try {
+    const frames = await Promise.all([ask(0, left, isMoving, part), right && ask(1, right, isMoving, part)]);
+    // A newer one has taken its place: before it was made, or on its way here.
+    const isLate = wish < newest || !frames[0] || (right && !frames[1]);
+    if (isLate) frames.forEach((frame) => frame?.bitmap.close());
+    else show(frames, { begun, asked, wish, isMoving, part });
+  } catch (error) {
+    const isGone = error instanceof TypeError;
+    const gone = scene.live ? "Training has ended, or densify was stopped." : "densify view does not answer; start it again, and this page goes on.";
+    trouble(isGone ? gone : error.message);
+    stage.dataset.state = "trouble";
+    if (isGone) last.version = -1;
+    else complete = asked;
+    spacing = 1000;
+  }
+  underway -= 1;
+  wake();
+}
+
+/** Shows what has come of a wish. */
+function show(frames, { begun, asked, wish, isMoving, part }) {
+  newest = wish;
+  for (const [i, frame] of frames.entries()) {
+    shown[i]?.bitmap.close();
+    shown[i] = frame;
+  }
+  trouble("");
+  draw();
+  const { bitmap, distance } = frames[0];
+  if (!isMoving) complete = asked;
+  pace(frames, begun, isMoving, part);
+  stage.dataset.pictures = Number(stage.dataset.pictures || 0) + 1;
+  stage.dataset.size = `${bitmap.width}x${bitmap.height}`;
+  // What is measured in some of the views only is asked for again.
+  const isPart = frames.some((frame) => frame?.measured && frame.measured[0] < frame.measured[1]);
+  if (isPart && complete === version) complete = last.version = -1;
+  stage.dataset.state = complete === version ? "sharp" : isPart ? "measuring" : "moving";
+  if (complete !== version) return;
+  // What is in the middle is what one turns about next.
+  if (distance) camera.away = distance;
+  stage.dataset.rested = rested();
+  listenToTheLine();
+}
+
+/** Measures how long a reply takes which nothing has to be made for: while the picture rests, nothing else is on its way. */
+async function listenToTheLine() {
+  const begun = performance.now();
+  const answer = await fetch("", { method: "HEAD" }).catch(() => null);
+  if (answer?.ok) latency = performance.now() - begun;
 }
 
 /** How long nothing has changed [ms]. */
 const rested = () => Math.round(performance.now() - changedAt);
 
-/** Says what the picture took, and adapts the coarse size so that movement stays fluent. */
-function pace(frames, isMoving) {
-  const took = frames.reduce((sum, frame) => sum + (frame ? frame.took : 0), 0);
+/**
+ * Says what the picture took, and adapts the coarse size so that movement stays fluent: to what it takes to make and to
+ * send a picture, as fewer pixels shorten neither the way to here nor what the browser does with any picture.
+ */
+function pace(frames, begun, isMoving, part) {
+  const all = frames.filter(Boolean), most = (of) => Math.max(...all.map(of));
+  const total = (of) => all.reduce((sum, frame) => sum + of(frame), 0);
+  const bytes = total((frame) => frame.bytes), making = total((frame) => frame.milliseconds);
+  const took = most((frame) => frame.took), away = most((frame) => frame.took - frame.held);
   const { bitmap, milliseconds } = frames[0];
   const size = `${bitmap.width} × ${bitmap.height}`;
+  const now = performance.now(), since = Math.max(begun, shownAt);
+  shownAt = now;
+  // Wishes come no faster than they are done with.
+  spacing = most((frame) => frame.held);
   if (isMoving) {
-    coarse = clamp(coarse * clamp(Math.sqrt(PACE / took), 0.8, 1.1), 0.12, 1);
-    paces = [...paces.slice(-11), took];
+    // With so many under way, each may take so long for one to come in time.
+    const may = clamp(inFlight() * PACE - latency, PACE / 2, PACE);
+    coarse = clamp(part * clamp(Math.sqrt(may / (making + bytes * perByte)), 0.8, 1.1), 0.12, 1);
+    paces = [...paces.slice(-11), now - since];
     const mean = paces.reduce((sum, x) => sum + x, 0) / paces.length;
     stage.dataset.rate = (1000 / mean).toFixed(1);
     byId("status").textContent = `${size} · ${Math.round(1000 / mean)} pictures/s · ${took.toFixed(0)} ms`;
   } else {
-    const [seen, all] = frames.find((frame) => frame?.measured)?.measured ?? [0, 0];
-    const how = seen < all ? `measured in ${seen} of ${all} training views` : `sharp after ${rested()} ms, drawn in ${milliseconds.toFixed(0)}`;
+    // The sharp picture is the largest: it tells best what bytes take.
+    perByte = Math.max(0, away - latency) / bytes;
+    const [seen, every] = frames.find((frame) => frame?.measured)?.measured ?? [0, 0];
+    const how = seen < every ? `measured in ${seen} of ${every} training views` : `sharp after ${rested()} ms, drawn in ${milliseconds.toFixed(0)}`;
     byId("status").textContent = `${size} · ${how}`;
   }
 }
@@ -730,6 +788,7 @@ function listen() {
     try { localStorage.setItem("densify-view", "seen"); } catch { /* A browser that keeps nothing shows it again. */ }
     marks.focus();
   });
+  document.addEventListener("visibilitychange", wake);
   new ResizeObserver(() => { draw(); changed(); }).observe(stage);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
 }
