@@ -442,6 +442,8 @@ def check(browser: Browser, url: str, densify: str, run: str, rendered: Path, fo
     browser.run("document.getElementById('help').click()")
     width = browser.run("return document.getElementById('guide').scrollWidth")
     assert width <= 360, f"the help is {width} px wide"
+    below = browser.run("const it = document.getElementById('guide'); return [it.scrollHeight - it.clientHeight, it.scrollTop]")
+    assert below[0] > 0 and below[1] == 0, f"of the help {below[0]} px do not fit, and it opens {below[1]} px below its title"
     browser.keep(folder, "phone-help")
     browser.theme("dark")
     browser.run("document.getElementById('guide').close()")

@@ -557,7 +557,7 @@ document.addEventListener("keydown", (event) => {
   else if (key === "]") step(1);
   else if (low === "r") goHome();
   else if (low === "k") addKey();
-  else if (low === "h" || key === "?") byId("guide").showModal();
+  else if (low === "h" || key === "?") explain();
   else return;
   event.preventDefault();
 });
@@ -760,6 +760,12 @@ function fill() {
   byId("ramp").style.background = `linear-gradient(to right, ${scene.ramp.map((c) => `rgb(${c.join(" ")})`).join(", ")})`;
 }
 
+/** Opens the help at its beginning: where there is little room, its button has the focus far below. */
+function explain() {
+  byId("guide").showModal();
+  byId("guide").scrollTop = 0;
+}
+
 function listen() {
   const on = (id, event, action) => byId(id).addEventListener(event, action);
   for (const id of ["left", "right", "sharpness"]) on(id, "change", changed);
@@ -778,7 +784,7 @@ function listen() {
   on("remove", "click", () => { keys.pop(); showPath(); });
   on("play", "click", play);
   on("save", "click", savePath);
-  on("help", "click", () => byId("guide").showModal());
+  on("help", "click", explain);
   on("fold", "click", () => {
     const isFolded = document.body.classList.toggle("folded");
     byId("fold").textContent = isFolded ? "Show panel" : "Hide panel";
@@ -808,7 +814,7 @@ async function open() {
   listen();
   let isNew = true;
   try { isNew = localStorage.getItem("densify-view") === null; } catch { /* Then it is new. */ }
-  if (isNew) byId("guide").showModal();
+  if (isNew) explain();
   keepAsking();
   if (scene.live) followTraining(lookAgain);
 }
