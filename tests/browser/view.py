@@ -90,6 +90,12 @@ const seen = [...document.querySelectorAll("button, select, input, summary, [tab
 const name = (it) => it.ariaLabel || it.labels?.[0]?.textContent || it.textContent;
 return seen.filter((it) => !it.dataset.reached || !name(it).trim()).map((it) => it.id || it.outerHTML);
 """
+# Which of these parts of the page lie over each other.
+OVERLAPS = """
+const boxes = arguments[0].map((id) => [id, document.getElementById(id).getBoundingClientRect()]);
+const crosses = (a, b) => a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom;
+return boxes.flatMap(([id, box], i) => boxes.slice(i + 1).filter(([, other]) => crosses(box, other)).map(([other]) => `${id} and ${other}`));
+"""
 # Turns the scene with every frame of the screen, for some seconds; then says how many pictures were shown in a second,
 # and their widths.
 TURN = """
@@ -523,6 +529,11 @@ def check_two(browser: Browser, url: str, folder: Path | None) -> None:
     assert browser.run("return border") == 1, "the border follows a hand that has let go"
     browser.run("setBorder(0.5)")
     browser.keep(folder, "two")
+    browser.size(360, 740)
+    browser.is_sharp()
+    over = browser.run(OVERLAPS, ["left-name", "right-name", "fold", "status"])
+    assert not over, f"{over} lie over each other"
+    browser.keep(folder, "two-phone")
     is_clean(browser, url)
 
 
