@@ -37,6 +37,18 @@ def check(browser: Browser, url: str, run: Path, folder: Path | None) -> None:
     assert browser.run(PROBE)["spread"] > 4, "the picture is empty"
     browser.keep(folder, "live")
 
+    # A page that nobody sees lets training alone; seen again, it shows what there is by then.
+    hide = "Object.defineProperty(document, 'hidden', { configurable: true, value: true });"
+    seen = "document.dispatchEvent(new Event('visibilitychange'));"
+    browser.run(hide + seen)
+    browser.until("underway === 0", "a picture does not come")
+    before = browser.run("lookAgain(); return wishes")
+    time.sleep(0.5)
+    after = browser.run("return wishes")
+    assert after == before, f"in the background it asks for {after - before} pictures"
+    browser.run("delete document.hidden;" + seen)
+    browser.until(f"wishes > {before}", "seen again, it does not look")
+
     click("pause")
     browser.until(f"{STATE}.state === 'paused'", "it is not paused")
     assert browser.run("return document.getElementById('pause').textContent") == "Continue"
@@ -99,7 +111,7 @@ def main(densify: str, run: str, folder: str | None = None) -> None:
         assert code == 130, f"a stopped run ends with {code}"
     finally:
         program.kill()
-    print("the page of a run in training shows curves and edits, follows it, and pauses, steps, keeps and stops it")
+    print("the page of a run in training shows curves and edits, follows it while it is seen, and pauses, steps, keeps and stops it")
 
 
 if __name__ == "__main__":
