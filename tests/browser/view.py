@@ -280,6 +280,30 @@ def moves(browser: Browser) -> None:
     assert step[2] < 0 and after[4] < before[4], f"+ goes {step}"
     step, before, after = went(lambda: browser.press("-"))
     assert step[2] > 0 and after[4] > before[4], f"- goes {step}"
+    # Arrow keys do what dragging does, and with Shift they shift.
+    click = "document.querySelector(arguments[0]).click()"
+    right = "\ue014"
+    for mode in ("look", "pan", "orbit"):
+        browser.run(click, f"input[value={mode}]")
+        browser.run("document.getElementById('marks').focus()")
+        step, before, after = went(lambda: browser.press(right))
+        turns, shifts = before[3] != after[3], max(map(abs, step)) > 1e-6
+        assert (turns, shifts) == (mode != "pan", mode != "look"), f"an arrow key, to {mode}: {turns}, {shifts}"
+        # To the right is to the right.
+        assert mode != "look" or dot(after[3], before[1]) < 0, "an arrow to the right turns the head to the left"
+        assert mode != "pan" or step[0] > 0, f"an arrow to the right shifts by {step}"
+    keys = [{"type": kind, "value": key} for kind, key in [("keyDown", "\ue008"), ("keyDown", right), ("keyUp", right), ("keyUp", "\ue008")]]
+    shift = {"actions": [{"type": "key", "id": "keys", "actions": keys}]}
+    step, before, after = went(lambda: browser.call("POST", f"{browser.session}/actions", shift))
+    assert step[0] > 0 and before[3] == after[3], f"Shift with an arrow goes {step}"
+    # Keys are the scene's wherever the focus is, but for those that the control there needs.
+    for there, keys, is_used in [("#loop", "+", True), ("#loop", right, True), ("#fov", "+", True), ("#fov", right, False),
+                                 ("input[value=orbit]", "+", True), ("#left", "+", False)]:
+        browser.run("document.querySelector(arguments[0]).focus()", there)
+        at = browser.run("return camera.at")
+        browser.press(keys)
+        browser.is_sharp()
+        assert (browser.run("return camera.at") != at) == is_used, f"{keys!r} at {there}"
     slide = "const slider = document.getElementById(arguments[0]); slider.value = arguments[1];"
     slide += "for (const kind of ['input', 'change']) slider.dispatchEvent(new Event(kind, { bubbles: true }));"
     browser.run(slide, "fov", 30)

@@ -458,6 +458,10 @@ function cameraAt(x, y) {
 
 // ---- Moving.
 
+/** What dragging does, and the arrow keys do: as chosen in the panel; with Shift, or another button, it shifts. */
+const modeOf = ({ shiftKey, buttons = 0 }) =>
+  shiftKey || buttons & 6 ? "pan" : document.querySelector("input[name=drag]:checked").value;
+
 /** Pointers that were put on the stage, and where each was last, in pixels of the page. */
 const hands = new Map();
 let travelled = 0;
@@ -491,9 +495,8 @@ addEventListener("pointermove", (event) => {
     dolly(spread(before) / spread(now));
     pan(dx / 2 / height, dy / 2 / height);
   } else {
-    const mode = document.querySelector("input[name=drag]:checked").value;
-    const shifts = event.shiftKey || event.buttons & 6 || mode === "pan";
-    if (shifts) pan(dx / height, dy / height);
+    const mode = modeOf(event);
+    if (mode === "pan") pan(dx / height, dy / height);
     else if (mode === "look") look(radians(camera.fov) * dx / height, radians(camera.fov) * dy / height);
     else orbit(4 * dx / height, 4 * dy / height);
   }
@@ -542,14 +545,17 @@ const STEPS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowD
 document.addEventListener("keydown", (event) => {
   const { target, key } = event;
   if (!scene || event.ctrlKey || event.metaKey || event.altKey || byId("guide").open) return;
-  if (target.matches("select, input, [role=slider]")) return;
+  // Keys that a control needs itself are its own.
+  const needed = STEPS[key] ? "select, input:not([type=checkbox]), [role=slider]" : "select";
+  if (target.matches(needed)) return;
   const low = key.toLowerCase();
   if (FLIGHT[low]) {
     if (!held.size) { ticked = performance.now(); requestAnimationFrame(fly); }
     held.add(low);
   } else if (STEPS[key]) {
-    const [x, y] = STEPS[key];
-    if (event.shiftKey) pan(-0.05 * x, -0.05 * y);
+    const [x, y] = STEPS[key], mode = modeOf(event);
+    if (mode === "pan") pan(-0.05 * x, -0.05 * y);
+    else if (mode === "look") look(-0.06 * x, -0.06 * y);
     else orbit(0.06 * x, 0.06 * y);
   } else if (key === "+" || key === "=") dolly(0.9);
   else if (key === "-") dolly(1 / 0.9);
