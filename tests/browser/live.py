@@ -61,6 +61,10 @@ def check(browser: Browser, url: str, run: Path, folder: Path | None) -> None:
     browser.until("document.getElementById('training-numbers').textContent.includes('Checkpoint of step')", "no checkpoint is shown")
     assert (run / f"checkpoints/iteration_{paused + 1}.safetensors").is_file(), "no checkpoint is there"
     browser.is_sharp()
+    # The heading counts as the run does, whatever it said before.
+    browser.run("scene.models[0].rows = 1; sayModels()")
+    counts = "document.getElementById('models').textContent.split(': ')[1].replace('Gaussians', 'of at most')"
+    browser.until(f"document.getElementById('training-numbers').textContent.includes({counts})", "the heading keeps its count")
     # What only a run in training knows.
     colours = {}
     for kind in browser.run("return scene.kinds.map(({ kind }) => kind)"):

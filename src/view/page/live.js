@@ -55,6 +55,8 @@ function followTraining(look) {
     const { state, step, last, rows, budget, seconds, points, tests, edits, checkpoint } = now;
     section.dataset.state = state;
     section.dataset.step = step;
+    scene.models[0].rows = rows;
+    sayModels();
     byId("training-progress").max = last;
     byId("training-progress").value = step;
     const words = { preparing: "Preparing", training: "Training", paused: "Paused", stopping: "Stopping", ended: "Measuring and saving" };

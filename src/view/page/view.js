@@ -721,14 +721,19 @@ function showControls() {
   }
 }
 
+/** Says how many Gaussians each model has. */
+function sayModels() {
+  byId("models").replaceChildren(...scene.models.map(({ name, rows }) => {
+    const item = document.createElement("li");
+    item.textContent = `${name}: ${rows.toLocaleString("en")} Gaussians`;
+    return item;
+  }));
+}
+
 function fill() {
   document.title = `${scene.title} · densify view`;
   byId("title").textContent = scene.title;
-  for (const { name, rows } of scene.models) {
-    const item = document.createElement("li");
-    item.textContent = `${name}: ${rows.toLocaleString("en")} Gaussians`;
-    byId("models").append(item);
-  }
+  sayModels();
   const option = (value, text) => new Option(text, value);
   byId("right").append(option("", "nothing"));
   const isOfModel = (kind) => kind !== "photograph";
