@@ -480,6 +480,14 @@ def check(browser: Browser, url: str, densify: str, run: str, rendered: Path, fo
     browser.run("document.getElementById('fold').click()")
     browser.is_sharp()
     browser.keep(folder, "phone-dark")
+    # A phone on its side has its panel beside the picture.
+    browser.run("document.getElementById('fold').click()")
+    browser.size(740, 360)
+    browser.is_sharp()
+    width, height = browser.run("return area()")
+    assert width >= 400 and height >= 350, f"the picture is {width}x{height}"
+    assert browser.run("return document.getElementById('panel').clientWidth") > 200, "there is no panel"
+    browser.keep(folder, "phone-on-its-side")
 
     is_clean(browser, url)
 
