@@ -84,6 +84,9 @@ def check(browser: Browser, report: Path, folder: Path | None) -> None:
     browser.theme("light")
     show(".pair")
     browser.keep(folder, "report-phone-views")
+    crops = "return Array.from(document.querySelectorAll('.pair .crops img'), (it) => it.getBoundingClientRect().width)"
+    widths = browser.run(crops)
+    assert len(widths) > 2 and max(widths) - min(widths) < 0.5, f"crops of {widths} px"
     show(".curve")
     browser.keep(folder, "report-phone-curves")
 
