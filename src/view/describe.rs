@@ -18,6 +18,8 @@ use crate::run::POINTS_TO_LOOK_AT;
 /// Which way is up where no camera says so: as structure from motion has it, y points down.
 const UP: DVec3 = DVec3::NEG_Y;
 
+const NO_POINTS: &str = "it brings none; training of it begins from random points";
+
 /// A camera as camera paths have it: axes right, up, backward; row after row.
 fn pose(camera: &Camera) -> Value {
     let [right, down, forward] = [0, 1, 2].map(|axis| camera.rotation.row(axis));
@@ -58,7 +60,14 @@ pub(super) fn describe(stage: &mut Stage) -> Arc<[u8]> {
     let positions =
         points.positions.iter().map(|&at| stage.normalisation.world_from_scene(at).to_array());
     let points = Points { positions: positions.collect(), colours: points.colours };
-    let description = Description { rest: all_but_points(stage), points };
+    let mut rest = all_but_points(stage);
+    if points.positions.is_empty()
+        && stage.views.iter().any(|views| !views.is_empty())
+        && let Some(lacking) = rest["lacking"].as_array_mut()
+    {
+        lacking.push(json!({ "label": "The dataset’s points", "why": NO_POINTS }));
+    }
+    let description = Description { rest, points };
     serde_json::to_vec(&description).expect("numbers and text are JSON").into()
 }
 
@@ -119,7 +128,10 @@ mod tests {
     #[test]
     fn points_take_no_more_than_they_may() {
         let (_folder, mut stage) = stage_of_one_view();
-        let without = describe(&mut stage).len();
+        let lacks_points = |said: &[u8]| String::from_utf8_lossy(said).contains(NO_POINTS);
+        let said = describe(&mut stage);
+        assert!(lacks_points(&said), "it is not said that there are no points");
+        let without = said.len();
         // As many digits as numbers can have.
         let count = 2 * POINTS_TO_LOOK_AT;
         stage.points.positions = vec![DVec3::splat(-1.234_567_890_123_456_7e30); count];
@@ -130,7 +142,7 @@ mod tests {
             points <= POINTS_TO_LOOK_AT * POINT && points > POINTS_TO_LOOK_AT * POINT / 3,
             "{points}"
         );
-        assert!(stage.points.is_empty(), "they are held twice");
+        assert!(stage.points.is_empty() && !lacks_points(&said), "they are held twice, or missing");
         let said: Value = serde_json::from_slice(&said).expect("JSON");
         assert_eq!(
             said["points"]["positions"].as_array().expect("points").len(),
