@@ -8,6 +8,7 @@ use super::{DataSpec, DeviceSpec, Observer, RunConfig, use_threads};
 use crate::backend::{Backend, Device, Setup};
 #[cfg(feature = "view")]
 use crate::backend::{BackendError, MomentStorage, Storage};
+use crate::checkpoint::newest_step;
 use crate::dataset::{Dataset, View, builtin, is_archive};
 use crate::evaluate::Split;
 use crate::failure::Failure;
@@ -111,7 +112,17 @@ pub(crate) fn is_model(path: &Path) -> bool {
 
 /// The iteration asked for, or the last one saved.
 pub(crate) fn iteration(run: &Path, asked: Option<u32>) -> Result<u32, Failure> {
-    let saved = saved_iterations(run)?;
+    let saved = saved_iterations(run).map_err(|error| match newest_step(run) {
+        None => error.into(),
+        Some(step) => {
+            let run = run.display();
+            Failure::input(format!(
+                "{run} holds a run that was stopped before it saved a model, with a checkpoint of iteration {step}; \
+                 `densify train --resume -o {run}` goes on from there, and saves its model at the end, or earlier \
+                 with --save-iterations N"
+            ))
+        }
+    })?;
     let last = saved[saved.len() - 1];
     match asked {
         None => Ok(last),

@@ -356,13 +356,23 @@ fn what_cannot_be_shown_is_said_with_the_remedy() {
     let model = text(&model);
     for (words, expected) in [
         (format!("{run_text} --port {port}"), vec!["--port", "another program", "name none"]),
+    let stopped = root.path().join("stopped");
+    // Stopped before it had saved a model.
+    super::copy_unfinished(&run, &stopped, u32::MAX);
+    std::fs::remove_dir_all(stopped.join("point_cloud")).expect("the models");
         (format!("{run_text} --port 70000"), vec!["--port"]),
         (format!("{run_text} --host nowhere"), vec!["--host"]),
         (format!("{run_text} --host 192.0.2.1"), vec!["--host 192.0.2.1", "this machine"]),
         (format!("{run_text} --iteration 7"), vec!["--iteration 7", "40"]),
         (format!("{run_text} -r 2"), vec!["a run brings its own"]),
         (format!("{model} --iteration 40"), vec!["--iteration", "run"]),
-        (format!("{run_text} {}", text(&empty)), vec!["holds no run", "config.toml"]),
+        (format!("{run_text} {}", text(&empty)), vec!["neither a run", "config.toml", "two runs"]),
+        (format!("scene:spheres {run_text}"), vec!["scene:spheres is a scene", "two runs"]),
+        (format!("{run_text} scene:spheres"), vec!["scene:spheres is a scene", "two runs"]),
+        (
+            text(&stopped).to_owned(),
+            vec!["stopped", "checkpoint of iteration 40", "train --resume -o"],
+        ),
         (text(&empty).to_owned(), vec!["neither a run", "nor a scene"]),
         ("nowhere".to_owned(), vec!["nowhere", "neither a run"]),
         (format!("{} {run_text}", text(scene.path())), vec!["only runs and models"]),
