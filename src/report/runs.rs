@@ -6,12 +6,11 @@ use std::path::{Path, PathBuf};
 use super::Wanted;
 use crate::evaluate::Mean;
 use crate::failure::Failure;
-use crate::foreign;
 use crate::metrics::geometry::Geometry;
 use crate::output::{
     StepRecord, Summary, all_scores, events_of, geometry_of, psnr_by_view, steps_of, summary_of,
 };
-use crate::run::finished::{is_model, iteration_so_far};
+use crate::run::finished::{is_model, iteration_so_far, names_of};
 use crate::run::{Observer, Reductions, RunConfig};
 use crate::trainer::EditEvent;
 
@@ -53,7 +52,7 @@ impl Told {
             }
             whole.push(place);
         }
-        let names = names(&whole);
+        let names = names_of(&whole.iter().map(PathBuf::as_path).collect::<Vec<_>>());
         let told = wanted.runs.iter().zip(names);
         told.map(|(run, name)| Self::read(run, name, wanted.iteration, observer)).collect()
     }
@@ -109,41 +108,5 @@ impl Told {
     pub(super) fn seconds(&self) -> Option<f64> {
         let so_far = self.steps.last().map(|step| step.seconds);
         self.summary.as_ref().map(|summary| summary.seconds).or(so_far)
-    }
-}
-
-/// A name for each folder: its last part; where two have the same, with the part above it; and then with a
-/// number.
-fn names(folders: &[PathBuf]) -> Vec<String> {
-    let last = |folder: &Path, parts: usize| {
-        let all: Vec<_> = folder.components().map(std::path::Component::as_os_str).collect();
-        let parts = all[all.len().saturating_sub(parts)..].iter().collect::<PathBuf>();
-        foreign::one_line(&parts.to_string_lossy())
-    };
-    let short: Vec<String> = folders.iter().map(|folder| last(folder, 1)).collect();
-    let is_taken = |names: &[String], at: usize| {
-        names.iter().enumerate().any(|(other, name)| other != at && *name == names[at])
-    };
-    let longer =
-        |at: usize| if is_taken(&short, at) { last(&folders[at], 2) } else { short[at].clone() };
-    let names: Vec<String> = (0..folders.len()).map(longer).collect();
-    let numbered = |at: usize| match is_taken(&names, at) {
-        true => format!("{} ({})", names[at], at + 1),
-        false => names[at].clone(),
-    };
-    (0..folders.len()).map(numbered).collect()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn runs_are_called_by_as_little_as_tells_them_apart() {
-        let of = |folders: &[&str]| names(&folders.iter().map(PathBuf::from).collect::<Vec<_>>());
-        assert_eq!(of(&["/home/me/out/a", "/home/me/out/b"]), ["a", "b"]);
-        assert_eq!(of(&["/x/one/run", "/x/two/run", "/x/b"]), ["one/run", "two/run", "b"]);
-        assert_eq!(of(&["/x/one/run", "/y/one/run"]), ["one/run (1)", "one/run (2)"]);
-        assert_eq!(of(&["/x/a\u{1b}[1m"]), ["a\\u{1b}[1m"]);
     }
 }

@@ -12,6 +12,8 @@ use crate::checkpoint::newest_step;
 use crate::dataset::{Dataset, View, builtin, is_archive};
 use crate::evaluate::Split;
 use crate::failure::Failure;
+#[cfg(any(feature = "study", feature = "view"))]
+use crate::foreign;
 use crate::gaussians::Gaussians;
 use crate::import;
 use crate::metrics::geometry::{self, Geometry, KnownScene};
@@ -167,9 +169,28 @@ pub(crate) fn iteration_so_far(
 /// The last part of a path: what lies above is nobody's business.
 #[cfg(any(feature = "study", feature = "view"))]
 pub(crate) fn name_of(path: &Path) -> String {
-    let last = path.canonicalize().ok();
-    let last = last.as_deref().unwrap_or(path).file_name().unwrap_or(path.as_os_str());
-    last.to_string_lossy().into_owned()
+    names_of(&[path]).swap_remove(0)
+}
+
+/// The same of paths that are shown together, each with as much of what lies above as tells it from the others.
+#[cfg(any(feature = "study", feature = "view"))]
+pub(crate) fn names_of(paths: &[&Path]) -> Vec<String> {
+    let whole = |path: &&Path| path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
+    let whole: Vec<PathBuf> = paths.iter().map(whole).collect();
+    let last = |path: &Path, parts: usize| -> PathBuf {
+        let all: Vec<_> = path.components().collect();
+        all[all.len().saturating_sub(parts)..].iter().collect()
+    };
+    let name = |path: &PathBuf| {
+        let tells_apart = |parts: &usize| {
+            let mut others = whole.iter().filter(|other| *other != path);
+            others.all(|other| last(other, *parts) != last(path, *parts))
+        };
+        let most = path.components().count();
+        let parts = (1..most).find(tells_apart).unwrap_or(most);
+        foreign::one_line(&last(path, parts).to_string_lossy())
+    };
+    whole.iter().map(name).collect()
 }
 
 /// The file of what is named: a model, or a run's of the iteration asked for, or its last.
@@ -296,4 +317,21 @@ pub(crate) fn views_of(dataset: &Dataset, split: Split) -> Result<DatasetViews, 
         ));
     }
     Ok(DatasetViews::new(views.to_vec(), 0, 1))
+}
+
+#[cfg(all(test, any(feature = "study", feature = "view")))]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn paths_are_called_by_as_little_as_tells_them_apart() {
+        let of = |paths: &[&str]| names_of(&paths.iter().map(Path::new).collect::<Vec<_>>());
+        assert_eq!(of(&["/home/me/out/a", "/home/me/out/b"]), ["a", "b"]);
+        assert_eq!(of(&["/x/one/run", "/x/two/run", "/x/b"]), ["one/run", "two/run", "b"]);
+        assert_eq!(of(&["/x/one/run", "/y/one/run"]), ["x/one/run", "y/one/run"]);
+        assert_eq!(of(&["/run", "/x/run"]), ["/run", "x/run"]);
+        // One that is named twice is the same.
+        assert_eq!(of(&["/x/run", "/x/run"]), ["run", "run"]);
+        assert_eq!(of(&["/x/a\u{1b}[1m"]), ["a\\u{1b}[1m"]);
+    }
 }

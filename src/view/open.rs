@@ -17,7 +17,7 @@ use crate::gaussians::{Gaussians, logit};
 use crate::init::{initialise, random_points};
 use crate::output::{CONFIG_FILE, model_path};
 use crate::run::finished::{
-    Machine, is_model, iteration_so_far, load, name_of, or_moved, read_model,
+    Machine, is_model, iteration_so_far, load, name_of, names_of, or_moved, read_model,
 };
 use crate::run::{DataSpec, Observer, RunConfig};
 
@@ -62,6 +62,13 @@ pub(crate) fn open(
     observer: &dyn Observer,
 ) -> Result<Exhibition, Failure> {
     let Looked { what, other, scene, iteration, near, data } = looked;
+    let named: Vec<&Path> = std::iter::once(what).chain(other).collect();
+    if other.is_some()
+        && let Some(path) = named.iter().find(|path| !is_model(path) && !is_run(path))
+    {
+        return Err(not_comparable(path));
+    }
+    let names = names_of(&named);
     if iteration.is_some() && !is_run(what) {
         return Err(Failure::input("--iteration is for a run's folder; leave it out"));
     }
@@ -72,7 +79,7 @@ pub(crate) fn open(
             Some(scene) => of_dataset(machine, what, load(&scene, &data, observer)?, &data),
             None => without_cameras(machine, what, &model, &data)?,
         };
-        shown.show(name_of(what), model, near)?;
+        shown.show(names[0].clone(), model, near)?;
         shown
     } else if is_run(what) {
         let (model, config, iteration) = of_run(what, iteration, observer)?;
@@ -81,16 +88,13 @@ pub(crate) fn open(
         let dataset = load(&path, &config.spec.data, observer)
             .map_err(|failure| if has_moved { failure } else { or_moved(failure, &path) })?;
         let mut shown = of_dataset(machine, what, dataset, &config.spec.data);
-        let called = format!("{}, iteration {iteration}", name_of(what));
+        let called = format!("{}, iteration {iteration}", names[0]);
         shown.show_of_run(called, model, (what, iteration, &config))?;
         first = Some(config);
         shown
     } else {
         if scene.is_some() {
             return Err(no_run(what).and("--scene is for a run or a model"));
-        }
-        if other.is_some() {
-            return Err(no_run(what).and("only runs and models can be compared"));
         }
         let dataset = load(what, &data, observer).map_err(|failure| match builtin::name(what) {
             Some(_) => failure,
@@ -99,7 +103,7 @@ pub(crate) fn open(
         return of_points(machine, what, dataset, &data, near);
     };
     if let Some(other) = other {
-        let called = name_of(other);
+        let called = names[1].clone();
         if is_model(other) {
             shown.show(called, read_model(other, observer)?, near)?;
         } else {
@@ -119,6 +123,19 @@ fn no_run(path: &Path) -> Failure {
     Failure::input(format!(
         "{path} is neither a run (it holds no {CONFIG_FILE}) nor a file of Gaussian splats nor a scene; name the \
          folder that `densify train` wrote, a model, or a dataset"
+    ))
+}
+
+fn not_comparable(path: &Path) -> Failure {
+    let what = match builtin::name(path) {
+        Some(_) => "is a scene".to_owned(),
+        None => {
+            format!("is neither a run (it holds no {CONFIG_FILE}) nor a file of Gaussian splats")
+        }
+    };
+    Failure::input(format!(
+        "{} {what}; two runs or models are compared, not a scene and a run: leave one of them out",
+        path.display()
     ))
 }
 

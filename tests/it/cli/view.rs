@@ -320,9 +320,13 @@ fn a_scene_without_a_model_shows_its_points_and_two_runs_are_compared() {
     assert!(points > 100, "{points}");
     page.frame(&wish("render", "test", 0, SIZE)).picture();
     run_of(&scene, &run);
-    let other = root.path().join("other");
+    // Folders of one name are told apart.
+    let other = root.path().join("above/run");
     train(scene.path(), &other, 4, "--budget 320 --eval --quiet").ok();
     let page = Page::open(&format!("{} {}", text(&run), text(&other)));
+    let described: Value = serde_json::from_slice(&page.get("/scene").body).expect("JSON");
+    let name = |model: usize| described["models"][model]["name"].as_str().expect("a name");
+    assert!(name(1).starts_with("above/run") && name(0).contains("/run"), "{described}");
     let of = |model: u32| {
         let mut wish = wish("render", "test", 0, SIZE);
         wish["model"] = model.into();
@@ -352,14 +356,14 @@ fn what_cannot_be_shown_is_said_with_the_remedy() {
     let port = taken.local_addr().expect("an address").port();
     let empty = root.path().join("empty");
     std::fs::create_dir(&empty).expect("a folder");
-    let model = densify::output::model_path(&run, 40);
-    let model = text(&model);
-    for (words, expected) in [
-        (format!("{run_text} --port {port}"), vec!["--port", "another program", "name none"]),
     let stopped = root.path().join("stopped");
     // Stopped before it had saved a model.
     super::copy_unfinished(&run, &stopped, u32::MAX);
     std::fs::remove_dir_all(stopped.join("point_cloud")).expect("the models");
+    let model = densify::output::model_path(&run, 40);
+    let model = text(&model);
+    for (words, expected) in [
+        (format!("{run_text} --port {port}"), vec!["--port", "another program", "name none"]),
         (format!("{run_text} --port 70000"), vec!["--port"]),
         (format!("{run_text} --host nowhere"), vec!["--host"]),
         (format!("{run_text} --host 192.0.2.1"), vec!["--host 192.0.2.1", "this machine"]),
@@ -375,7 +379,7 @@ fn what_cannot_be_shown_is_said_with_the_remedy() {
         ),
         (text(&empty).to_owned(), vec!["neither a run", "nor a scene"]),
         ("nowhere".to_owned(), vec!["nowhere", "neither a run"]),
-        (format!("{} {run_text}", text(scene.path())), vec!["only runs and models"]),
+        (format!("{} {run_text}", text(scene.path())), vec!["neither a run", "two runs"]),
     ] {
         call(&format!("view {words} --backend cpu")).refused(&words, &expected);
     }
