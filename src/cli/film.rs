@@ -10,7 +10,9 @@ use clap::Args;
 use super::console::Console;
 use super::render::{Extras, write_pictures};
 use crate::animation::{self, Animation};
+use crate::backend::Backend;
 use crate::camera::Camera;
+use crate::dataset::normalise::Normalisation;
 use crate::failure::{DEVICE, Failure, OTHER};
 use crate::flight::{self, SavedFlight};
 use crate::foreign::one_line;
@@ -138,20 +140,39 @@ impl<'a> Film<'a> {
     }
 }
 
+/// What is filmed.
+pub(super) struct Filmed {
+    pub(super) backend: Box<dyn Backend>,
+    pub(super) sh_degree: u8,
+    pub(super) background: [f32; 3],
+    pub(super) normalisation: Normalisation,
+    /// Those of the dataset, in scene coordinates; none of a model alone.
+    pub(super) cameras: Vec<Camera>,
+}
+
+impl From<Opened> for Filmed {
+    fn from(opened: Opened) -> Self {
+        Self {
+            sh_degree: opened.sh_degree,
+            background: opened.data.background.fixed(),
+            normalisation: opened.dataset.normalisation,
+            cameras: opened.dataset.train.iter().map(|view| view.camera).collect(),
+            backend: opened.backend,
+        }
+    }
+}
+
 /// Renders the flight.
 pub(super) fn run(
     args: &FilmArgs,
     route: &Route,
     output: &Path,
     extras: Extras,
-    opened: &mut Opened,
+    filmed: Filmed,
     console: &Console,
 ) -> Result<(), Failure> {
-    let dataset = &opened.dataset;
-    let cameras: Vec<Camera> = dataset.train.iter().map(|view| view.camera).collect();
-    let Some(first) = cameras.first() else {
-        return Err(Failure::input("--path: the dataset has no camera to take it from"));
-    };
+    let Filmed { mut backend, sh_degree, background, normalisation, cameras } = filmed;
+    let first = cameras.first().map(|first| (first.width, first.height));
     let own = |flight| SavedFlight { flight, frames: FRAMES, fps: None, size: None };
     let (saved, in_world) = match route {
         Route::Orbit => (own(flight::orbit(&cameras)), false),
@@ -164,18 +185,21 @@ pub(super) fn run(
     let frames = args.frames.unwrap_or(frames);
     let fps = args.fps.or(fps).unwrap_or(FPS);
     let size = args.size.map(|Size(width, height)| (width, height)).or(size);
-    let size = size.unwrap_or((first.width, first.height));
+    let size = size.or(first).ok_or_else(|| {
+        Failure::input(
+            "--path: the file does not say how large a frame is; say it with --size WIDTHxHEIGHT",
+        )
+    })?;
     has_room(size)?;
     let mut film = args.video.as_deref().map(|path| Film::new(path, size, fps)).transpose()?;
-    let background = opened.data.background.fixed();
-    let mut depths = extras.depths(&dataset.normalisation);
+    let mut depths = extras.depths(&normalisation);
     for frame in 0..frames {
         let camera = flight.frame(frame, frames).camera(size);
         let camera = match in_world {
-            true => opened.dataset.normalisation.scene_from_world_camera(&camera),
+            true => normalisation.scene_from_world_camera(&camera),
             false => camera,
         };
-        let rendering = opened.backend.render(&camera, background, opened.sh_degree)?;
+        let rendering = backend.render(&camera, background, sh_degree)?;
         let name = format!("frame_{frame:05}");
         write_pictures(output, &name, &rendering, extras, &mut depths)?;
         if let Some(Film::WebP(path, animation)) = &mut film {

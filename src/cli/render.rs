@@ -8,7 +8,7 @@ use densify_policies::policy::Needs;
 use image::{DynamicImage, ImageBuffer, Luma};
 
 use super::console::Console;
-use super::film::{self, FilmArgs};
+use super::film::{self, FilmArgs, Filmed, Route};
 use crate::backend::Rendering;
 
 use crate::dataset::images::Image8;
@@ -17,7 +17,9 @@ use crate::evaluate::Split;
 use crate::failure::Failure;
 use crate::output::write_json;
 use crate::pictures::{photograph, picture, side_by_side, to_u8, write_png};
-use crate::run::finished::{Machine, Opened, is_model, iteration, open, open_run};
+use crate::run::finished::{
+    Machine, Opened, is_model, iteration, model_file, open, open_alone, open_run,
+};
 use crate::run::{DataSpec, DeviceSpec, Fraction, RunConfig};
 use crate::views::ViewSource;
 
@@ -35,7 +37,8 @@ pub(super) struct RenderArgs {
     /// Folder that `densify train` wrote, or a file (of SOG also a folder) of Gaussian splats
     #[arg(value_name = "RUN_OR_MODEL")]
     model: PathBuf,
-    /// Folder or ZIP archive of the dataset: needed for a file, and for a run whose dataset has moved
+    /// Folder or ZIP archive of the dataset: needed for a file, unless --path names one of cameras, and for a run whose
+    /// dataset has moved
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
     /// Folder for the pictures
@@ -95,9 +98,18 @@ pub(super) fn run(
     }
     let named =
         Named { model: &args.model, scene: args.scene.as_deref(), iteration: args.iteration };
+    let path = args.film.path.as_ref();
+    // A camera path in a file brings its cameras with it.
+    if let Some(route @ Route::File(_)) = path
+        && args.scene.is_none()
+        && is_model(&args.model)
+    {
+        let filmed = named.alone(&args.rendering, console)?;
+        return film::run(&args.film, route, &args.output, extras, filmed, console);
+    }
     let mut opened = named.open(&args.rendering, Needs::default(), matches, console)?;
-    if let Some(route) = &args.film.path {
-        return film::run(&args.film, route, &args.output, extras, &mut opened, console);
+    if let Some(route) = path {
+        return film::run(&args.film, route, &args.output, extras, opened.into(), console);
     }
     let views = opened.views(args.split)?;
     let background = opened.data.background.fixed();
@@ -223,12 +235,19 @@ impl Named<'_> {
                 self.model.display()
             )));
         };
-        if self.iteration.is_some() {
-            let why = "--iteration is for a run's folder; a file has only one model";
-            return Err(Failure::input(why));
-        }
+        let model = model_file(self.model, self.iteration)?;
         let RenderingArgs { near, data, .. } = rendering;
-        open(self.model, scene, data.clone(), (near.0, machine), needs, console)
+        open(&model, scene, data.clone(), (near.0, machine), needs, console)
+    }
+
+    /// Opens a model without a dataset.
+    fn alone(&self, rendering: &RenderingArgs, console: &Console) -> Result<Filmed, Failure> {
+        let machine = Machine::open(&rendering.device, console)?;
+        let model = model_file(self.model, self.iteration)?;
+        let (backend, normalisation, sh_degree) =
+            open_alone(&model, (rendering.near.0, machine), console)?;
+        let background = rendering.data.background.fixed();
+        Ok(Filmed { backend, sh_degree, background, normalisation, cameras: Vec::new() })
     }
 }
 

@@ -73,6 +73,27 @@ impl Normalisation {
     /// Changes nothing.
     pub const IDENTITY: Self = Self { centre: DVec3::ZERO, scale: 1.0 };
 
+    /// Of a model alone: puts the middle of its rows at the origin, and most of them within distance 1.
+    pub(crate) fn of_model(model: &Gaussians) -> Self {
+        let middle = |axis: usize| {
+            let along = model.means.iter().map(|mean| f64::from(mean[axis]));
+            median(along.collect()).unwrap_or_default()
+        };
+        let centre = DVec3::new(middle(0), middle(1), middle(2));
+        let away = |mean: &[f32; 3]| DVec3::from(mean.map(f64::from)).distance(centre);
+        let mut away: Vec<f64> = model.means.iter().map(away).collect();
+        away.sort_unstable_by(f64::total_cmp);
+        // Backgrounds reach far; most rows are on what was photographed.
+        let most =
+            away.get(away.len().saturating_sub(1) * 4 / 5).copied().filter(|&most| most > 0.0);
+        let all = || away.last().map_or(1.0, |last| last.max(1.0));
+        let scale = 1.0 / most.unwrap_or_else(all);
+        match scale.is_normal() && centre.is_finite() {
+            true => Self { centre, scale },
+            false => Self::IDENTITY,
+        }
+    }
+
     /// Puts the mean of the camera centres at the origin and the farthest of them at distance 1. If
     /// all cameras are at one place, the median distance of the points becomes 1; without points the
     /// unit stays.

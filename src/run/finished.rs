@@ -9,6 +9,7 @@ use crate::backend::{Backend, Device, Setup};
 #[cfg(feature = "view")]
 use crate::backend::{BackendError, MomentStorage, Storage};
 use crate::checkpoint::newest_step;
+use crate::dataset::normalise::{EXTENT, Normalisation};
 use crate::dataset::{Dataset, View, builtin, is_archive};
 use crate::evaluate::Split;
 use crate::failure::Failure;
@@ -93,7 +94,6 @@ impl Machine {
         self.device.backend(model, &Setup { needs, storage, ..self.setup_in_scene(model, near) })
     }
 
-    #[cfg(feature = "view")]
     fn setup_in_scene(&self, model: &Gaussians, near: f32) -> Setup {
         Setup { near, threads: self.threads, ..Setup::new(model.len().max(1)) }
     }
@@ -246,6 +246,21 @@ pub(crate) fn open(
     let near = (near * dataset.extent()) as f32;
     let backend = machine.backend_for(&dataset, model, near, needs)?;
     Ok(Opened { sh_degree, backend, dataset, data })
+}
+
+/// Opens a model alone, for cameras that are in its own coordinates; also where it is, and its degree. The near plane
+/// is a fraction of its extent.
+pub(crate) fn open_alone(
+    model: &Path,
+    (near, machine): (f64, Machine),
+    observer: &dyn Observer,
+) -> Result<(Box<dyn Backend>, Normalisation, u8), Failure> {
+    let model = read_model(model, observer)?;
+    let normalisation = Normalisation::of_model(&model);
+    let model = normalisation.model_from_world(model);
+    let near = (near * EXTENT) as f32;
+    let backend = machine.device.backend(&model, &machine.setup_in_scene(&model, near))?;
+    Ok((backend, normalisation, model.sh_degree))
 }
 
 /// Reads the dataset at `path`; says what there is to say.

@@ -5,11 +5,10 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DVec3};
 
 use super::kinds::Kind;
-use super::paint::ends;
 use super::stage::{Exhibition, NO_MODEL, Shown, Stage};
 use crate::camera::Camera;
 use crate::checkpoint::checkpoint_path;
-use crate::dataset::normalise::{EXTENT, Normalisation, median};
+use crate::dataset::normalise::{EXTENT, Normalisation};
 use crate::dataset::{Dataset, PointCloud, builtin};
 use crate::failure::Failure;
 use crate::flight::Key;
@@ -183,23 +182,7 @@ fn without_cameras(
             "{what} holds no Gaussian: there is nothing to look at"
         )));
     }
-    let middle = |axis: usize| {
-        let along = model.means.iter().map(|mean| f64::from(mean[axis]));
-        median(along.collect()).unwrap_or_default()
-    };
-    let centre = DVec3::new(middle(0), middle(1), middle(2));
-    // Backgrounds reach far; most rows are on what was photographed.
-    let mut away: Vec<f64> =
-        model.means.iter().map(|mean| DVec3::from(mean.map(f64::from)).distance(centre)).collect();
-    let most = (away.len() - 1) * 4 / 5;
-    let radius = *away.select_nth_unstable_by(most, f64::total_cmp).1;
-    let most = || ends(&away.iter().map(|&away| away as f32).collect::<Vec<f32>>()).end.max(1.0);
-    let radius = if radius > 0.0 { radius } else { most().into() };
-    let scale = 1.0 / radius;
-    let normalisation = match scale.is_normal() && centre.is_finite() {
-        true => Normalisation { centre, scale },
-        false => Normalisation::IDENTITY,
-    };
+    let normalisation = Normalisation::of_model(model);
     let none = || [Vec::new(), Vec::new()];
     let points = PointCloud::default();
     let background = data.background.fixed();

@@ -6,7 +6,7 @@ use std::path::Path;
 use image::AnimationDecoder;
 use image::codecs::webp::WebPDecoder;
 
-use super::looking::run_of;
+use super::looking::{ITERATIONS, run_of};
 use super::{Outcome, WITHOUT_GPU, call, files, json, outcome_of, scratch, text};
 use crate::photographs::Photographs;
 
@@ -92,6 +92,14 @@ fn a_camera_path_in_a_file_is_in_the_datasets_coordinates() {
     assert_eq!(frame.dimensions(), view.dimensions());
     let most = frame.iter().zip(view.iter()).map(|(a, b)| a.abs_diff(*b)).max();
     assert!(most.is_some_and(|most| most <= 2), "{most:?}");
+    // A model alone is flown through without its dataset.
+    let (model, alone) = (densify::output::model_path(&run, ITERATIONS), root.path().join("alone"));
+    let words = format!("render {} -o {} --path {}", text(&model), text(&alone), text(&path));
+    call(&words).refused("no size", &["--path", "--size"]);
+    call(&format!("{words} --size {}x{}", view.width(), view.height())).ok();
+    let frame = open(&alone.join("frame_00000.png"));
+    let most = frame.iter().zip(view.iter()).map(|(a, b)| a.abs_diff(*b)).max();
+    assert!(most.is_some_and(|most| most <= 4), "{most:?}");
     // As long and as large as the file says.
     let lasting = serde_json::json!({ "camera_path": [key], "seconds": 0.5, "fps": 8, "render_width": 18,
         "render_height": 10 });

@@ -7,7 +7,7 @@ use safetensors::tensor::{Dtype, TensorView};
 use super::{call, files, json, scratch, text, train};
 use crate::photographs::{Photographs, SIZE, VIEWS, name};
 
-const ITERATIONS: u32 = 40;
+pub(super) const ITERATIONS: u32 = 40;
 
 pub(super) fn run_of(scene: &Photographs, run: &Path) {
     train(scene.path(), run, ITERATIONS, "--budget 320 --eval --quiet").ok();
