@@ -150,6 +150,14 @@ impl Dataset {
         if archive::is_zip(path) {
             return archive::load(path, options);
         }
+        if path.is_file() {
+            let remedy = "name the dataset's folder, or a whole ZIP archive of it: if this was one, it is damaged, or \
+                          its download has failed";
+            return Err(DatasetError(format!(
+                "{}: this file is no dataset and no ZIP archive; {remedy}",
+                path.display()
+            )));
+        }
         Self::in_folder(path, options)
     }
 

@@ -189,8 +189,28 @@ pub(super) fn usual_points(
 fn parse(path: &Path) -> Result<Value, DatasetError> {
     let text = crate::foreign::read_text(path, MAX_JSON).map_err(DatasetError::io(path))?;
     // The message of serde_json has line and column.
-    serde_json::from_str(&text)
-        .map_err(|e| DatasetError::malformed(path, "JSON", e.to_string(), REMEDY))
+    serde_json::from_str(&text).map_err(|error| {
+        let remedy = if is_at_no_number(&text, &error) {
+            "NaN and Infinity, which Python writes, are no numbers of JSON: remove the frame that has them, or make \
+             its pose anew"
+        } else {
+            REMEDY
+        };
+        DatasetError::malformed(path, "JSON", &error, remedy)
+    })
+}
+
+/// Whether JSON could not be read where it has NaN or an infinity.
+fn is_at_no_number(text: &str, error: &serde_json::Error) -> bool {
+    let line = text.lines().nth(error.line().saturating_sub(1)).unwrap_or_default();
+    // The place is that of the first letter, or of the one after a sign.
+    let at = error.column().saturating_sub(2);
+    let rest = line.as_bytes().get(at..).unwrap_or_default();
+    let rest = rest.trim_ascii_start();
+    ["NaN", "Infinity", "-Infinity"].iter().any(|word| {
+        let word = word.as_bytes();
+        rest.starts_with(word) || rest.get(1..).is_some_and(|rest| rest.starts_with(word))
+    })
 }
 
 /// The fields of one frame, with those at the top level as defaults.

@@ -38,8 +38,8 @@ const SAMPLES: u32 = 64;
 /// Cells along each side of a face that are asked whether they were seen.
 const CELLS: usize = 128;
 /// Steepest ray of a single pinhole, x/z: 65 degrees of a fisheye; 80 of a lens that is a pinhole but for its
-/// distortion. Further out a pinhole's pixels see little each, but narrow faces beside the front, which are drawn
-/// as often as it, cost more: docs/data.md has the figures.
+/// distortion. So steep, faces beside the front are as good in narrow views, but cost 4 dB in wide ones; docs/data.md
+/// has the figures.
 const STEEPEST: f64 = 2.15;
 const STEEPEST_PERSPECTIVE: f64 = 5.67;
 /// Least side of a face that is worth a view, x/z.

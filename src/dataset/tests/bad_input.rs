@@ -268,7 +268,17 @@ fn transforms() {
     refused("not UTF-8", &made, &options, "transforms.json, save it as UTF-8");
     let made = Made::transforms(|_| ());
     made.replace("transforms.json", "15.0", "NaN");
-    refused("NaN", &made, &options, "transforms.json, line 1");
+    refused("NaN", &made, &options, "transforms.json, line 1, NaN and Infinity, remove the frame");
+    for (number, is_named) in [("-Infinity", true), ("Infinity", true), ("Nan", false)] {
+        let made = Made::transforms(|_| ());
+        made.replace("transforms.json", "15.0", number);
+        let message = Dataset::load(made.path(), &options).unwrap_err().to_string();
+        assert_eq!(message.contains("NaN and Infinity"), is_named, "{number}: {message}");
+    }
+    let file = made.file("scan.zip");
+    std::fs::write(&file, "<html>404</html>").unwrap();
+    let message = Dataset::load(&file, &options).unwrap_err().to_string();
+    assert!(message.contains("scan.zip") && message.contains("no ZIP archive"), "{message}");
     made.write("transforms.json", "[".repeat(100_000));
     refused("deep", &made, &options, "transforms.json, JSON");
     let made = Made::transforms(|_| ());
