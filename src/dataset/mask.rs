@@ -57,16 +57,19 @@ impl Mask {
 
 /// The values of a mask: its brightness; or its coverage, where that alone makes it.
 fn shape(mask: DynamicImage) -> image::GrayImage {
-    let luma = mask.to_luma8();
-    if !mask.color().has_alpha() || luma.iter().any(|value| Some(value) != luma.first()) {
-        return luma;
+    if !mask.color().has_alpha() {
+        return mask.into_luma8();
     }
-    let alpha = mask.into_luma_alpha8();
-    let is_opaque = alpha.pixels().all(|pixel| pixel.0[1] == 255);
-    if is_opaque {
-        return luma;
-    }
-    image::GrayImage::from_fn(alpha.width(), alpha.height(), |x, y| [alpha[(x, y)].0[1]].into())
+    let both = mask.into_luma_alpha8();
+    let channel = |number: usize| {
+        image::GrayImage::from_fn(both.width(), both.height(), |x, y| {
+            [both[(x, y)].0[number]].into()
+        })
+    };
+    let [luma, coverage] = [0, 1].map(channel);
+    let is_one_colour = luma.iter().all(|value| Some(value) == luma.first());
+    let is_covered = coverage.iter().all(|&value| value == 255);
+    if is_one_colour && !is_covered { coverage } else { luma }
 }
 
 /// Which values of a mask hide a pixel.

@@ -13,6 +13,7 @@ mod exif;
 mod folders;
 pub mod images;
 mod jpeg;
+mod json;
 pub mod lens;
 mod mask;
 mod masks;

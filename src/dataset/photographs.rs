@@ -49,7 +49,7 @@ pub(super) fn photographs(
     let checked: Vec<_> = frames.par_iter().map(|frame| checked(listing, frame)).collect();
     let checked: Vec<Checked> = checked.into_iter().collect::<Result<_, _>>()?;
     notes.extend(turned_note(frames, &checked));
-    notes.extend(unsure_note(frames));
+    notes.extend(unsure_note(frames, &checked));
     notes.extend(masks_note(frames));
     if let (Some(Resolution::Width(width)), Some(first)) = (options.resolution, frames.first())
         && checked.iter().any(|checked| checked.header.width < width)
@@ -87,6 +87,8 @@ struct Checked {
     header: ImageHeader,
     /// At the image's size.
     lens: Lens,
+    /// Whether EXIF turns the image by a quarter, and nothing says whether the poses mean that.
+    is_unsure: bool,
 }
 
 /// Checks an image's header against its camera. An image that lies on its side for this camera, and says so in its
@@ -128,7 +130,8 @@ fn checked(listing: &Path, frame: &Frame) -> Result<Checked, DatasetError> {
         let remedy = "repair the camera or remove the frame";
         return Err(DatasetError::malformed(listing, &frame.name, problem, remedy));
     }
-    Ok(Checked { header, lens })
+    let is_unsure = !frame.is_sized && exif::quarter_turn(&frame.image).is_some();
+    Ok(Checked { header, lens, is_unsure })
 }
 
 /// What is said about photographs that are turned.
@@ -143,15 +146,14 @@ fn turned_note(frames: &[Frame], checked: &[Checked]) -> Option<String> {
 }
 
 /// What is said about photographs that EXIF turns by a quarter while nothing says whether the poses mean that.
-fn unsure_note(frames: &[Frame]) -> Option<String> {
-    let is_unsure = |frame: &&Frame| !frame.is_sized && exif::quarter_turn(&frame.image).is_some();
-    let unsure: Vec<&Frame> = frames.iter().filter(is_unsure).collect();
-    let first = &unsure.first()?.name;
+fn unsure_note(frames: &[Frame], checked: &[Checked]) -> Option<String> {
+    let unsure = || frames.iter().zip(checked).filter(|(_, checked)| checked.is_unsure);
+    let first = &unsure().next()?.0.name;
     Some(format!(
         "{} photographs are to be turned by a quarter, as their EXIF says, but the pose file has no size that would \
          tell whether its poses mean that; they are taken as they are stored ({first} is the first). If the model is \
          poor, turn the files themselves",
-        unsure.len()
+        unsure().count()
     ))
 }
 
@@ -210,7 +212,7 @@ fn cut_notes<'a>(
 /// The views of a frame whose image and lens are checked.
 fn photograph(
     frame: &Frame,
-    Checked { header, lens }: &Checked,
+    Checked { header, lens, .. }: &Checked,
     cut: Option<&Cut>,
     options: &LoadOptions,
 ) -> Result<Photograph, DatasetError> {

@@ -14,6 +14,7 @@ use serde_json::{Map, Value};
 use super::error::DatasetError;
 use super::folders::{Folders, ImageFile};
 use super::images;
+use super::json;
 use super::lens::table::{FISHEYE_FIELDS, OPENCV_FIELDS};
 use super::lens::{Distortion, Lens, Plane};
 use super::masks::MaskFile;
@@ -21,10 +22,9 @@ use super::paths::{DataPath, Root, is_absolute, relative};
 use super::pose::{check_lens, checked_pose};
 use super::{Frame, Scene};
 
-/// Largest JSON file read `[bytes]`. (serde_json bounds the depth to 128.)
-const MAX_JSON: u64 = 64 << 20;
 const MAX_FRAMES: usize = 1_000_000;
 const REMEDY: &str = "correct the file or export it again";
+
 /// File names of initial points that 3DGS and nerfstudio use without naming them in the JSON.
 const POINT_FILES: [&str; 3] = ["points3d.ply", "sparse_pc.ply", "points3D.ply"];
 /// Names of camera models that are a pinhole with OpenCV's distortion.
@@ -65,7 +65,7 @@ pub(super) fn read(
 ) -> Result<Scene, DatasetError> {
     let path = root.path().join(name);
     root.existing(DataPath { file: &path, field: "the file", value: name })?;
-    let Value::Object(top) = parse(&path)? else {
+    let Value::Object(top) = json::read(&path)? else {
         return Err(DatasetError::malformed(&path, "the file", "it is not a JSON object", REMEDY));
     };
     let top = Fields { path: &path, place: String::new(), frame: None, top: &top };
@@ -184,33 +184,6 @@ pub(super) fn usual_points(
         }
     }
     Ok(None)
-}
-
-fn parse(path: &Path) -> Result<Value, DatasetError> {
-    let text = crate::foreign::read_text(path, MAX_JSON).map_err(DatasetError::io(path))?;
-    // The message of serde_json has line and column.
-    serde_json::from_str(&text).map_err(|error| {
-        let remedy = if is_at_no_number(&text, &error) {
-            "NaN and Infinity, which Python writes, are no numbers of JSON: remove the frame that has them, or make \
-             its pose anew"
-        } else {
-            REMEDY
-        };
-        DatasetError::malformed(path, "JSON", &error, remedy)
-    })
-}
-
-/// Whether JSON could not be read where it has NaN or an infinity.
-fn is_at_no_number(text: &str, error: &serde_json::Error) -> bool {
-    let line = text.lines().nth(error.line().saturating_sub(1)).unwrap_or_default();
-    // The place is that of the first letter, or of the one after a sign.
-    let at = error.column().saturating_sub(2);
-    let rest = line.as_bytes().get(at..).unwrap_or_default();
-    let rest = rest.trim_ascii_start();
-    ["NaN", "Infinity", "-Infinity"].iter().any(|word| {
-        let word = word.as_bytes();
-        rest.starts_with(word) || rest.get(1..).is_some_and(|rest| rest.starts_with(word))
-    })
 }
 
 /// The fields of one frame, with those at the top level as defaults.

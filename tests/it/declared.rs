@@ -3,12 +3,10 @@
 
 #![expect(clippy::float_cmp, reason = "what rests does so to the last bit")]
 
-use std::iter;
 use std::ops::Range;
 
-use densify::backend::cpu::{CpuBackend, ModelGradient};
-use densify::backend::gpu::GpuDevice;
-use densify::backend::{self, ImageGradient};
+use densify::backend::ImageGradient;
+use densify::backend::cpu::ModelGradient;
 use densify::backend::{Backend, StepInput};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
@@ -16,14 +14,11 @@ use densify::gaussians::Gaussians;
 use densify::verify::{Differentiable, Setup, Subject, scenes};
 use densify_policies::adc::clone_at;
 use densify_policies::plan::{EditPlan, OpacityRule, Seed, Update};
-use densify_policies::policy::{
-    AuxRequest, Cadence, ErrorScore, LossTerms, MaskTerm, Needs, NoiseTerm, Signal, SignalSet,
-};
+use densify_policies::policy::{Cadence, LossTerms, MaskTerm, Needs, NoiseTerm, Signal, SignalSet};
 use glam::DVec3;
 
 use crate::subject::{
-    RATES, class, devices, make, make_with, normalised, on_each, repeatable, step_input,
-    turned_away,
+    RATES, class, make, make_with, normalised, on_each, repeatable, step_input, turned_away,
 };
 
 const BACKGROUND: [f32; 3] = [0.1, 0.3, 0.2];
@@ -60,53 +55,6 @@ fn step(backend: &mut dyn Backend, camera: &Camera, step: u32, needs: &Needs, ca
         ..step_input(step, camera, &target, sh_degree)
     };
     backend.train_step(&input).expect("a small image is rendered");
-}
-
-/// What takes bytes when declared takes none otherwise.
-#[test]
-fn what_is_not_declared_takes_no_bytes() {
-    let none = Needs::default;
-    let mask = MaskTerm { start: 1.0, rate: 0.01, weight: 5e-4, threshold: 0.01 };
-    let of = |signals: &[Signal]| Needs { signals: signals.iter().copied().collect(), ..none() };
-    let edges = ErrorScore { edge: 1.0, ..ErrorScore::default() };
-    let declared = [
-        Needs { mask: Some(mask), ..none() },
-        Needs { cadence: Cadence { all: 2, sh_rest: 2 }, ..none() },
-        Needs { aux: Some(AuxRequest { points: 3, ..AuxRequest::default() }), ..none() },
-        of(&[Signal::WeightMaxRoot]),
-        of(&[Signal::Support]),
-        of(&[Signal::DepthMin]),
-        of(&[Signal::DominantPixels]),
-        of(&[Signal::ErrorScore]),
-    ];
-    // Beside the sums of errors, edges take their own.
-    let with_edges = Needs { error_score: edges, ..of(&[Signal::ErrorScore]) };
-    let promise = |device: Option<&GpuDevice>, needs: &Needs| {
-        let needs = needs.clone();
-        let setup = backend::Setup { largest_image: (41, 33), needs, ..backend::Setup::new(20) };
-        let ledger = match device {
-            Some(device) => device.promise(1, &setup),
-            None => CpuBackend::promise(1, &setup, 2),
-        };
-        ledger.total()
-    };
-    let all = devices().iter().map(|device| ("GPU", Some(device)));
-    for (name, device) in iter::once(("native", None)).chain(all) {
-        let least = promise(device, &none());
-        for needs in &declared {
-            assert!(promise(device, needs) > least, "{name}: {needs:?}");
-        }
-        let error = promise(device, &of(&[Signal::ErrorScore]));
-        assert!(promise(device, &with_edges) > error, "{name}: edges");
-        // Of what steps compute anyway, and of numbers of the run, nothing is kept.
-        let free = Needs {
-            noise: Some(NoiseTerm { strength: 1.0, sharpness: 100.0, opacity: 0.005 }),
-            loss_terms: LossTerms { opacity: 0.01, scale: 0.01 },
-            error_score: edges,
-            ..none()
-        };
-        assert_eq!(promise(device, &free), least, "{name}: numbers take bytes");
-    }
 }
 
 /// Rows in pairs of one shape, every second one turned by a quarter.

@@ -6,6 +6,7 @@
 //! tested; `exposure` is of photographs that are exposed differently; `agreement` holds every backend to the native
 //! one; `properties` are of any scene; `sameness` and `resuming` compare bits; `edits` applies any plan to a backend
 //! and to a plain vector; `frozen` is about rows that never change, `painted` about rows drawn in other colours;
+//! `undeclared` is about what takes no bytes;
 //! `spatial` is a policy that reads and edits where rows are. `cli` runs the program on photographs of a small scene,
 //! and holds policies to surfaces that are known; `fuzz` damages files; `gpu` is what only the GPU backend has;
 //! `invariants` keeps the walls of ARCHITECTURE.md standing.
@@ -36,3 +37,4 @@ mod signals;
 mod spatial;
 mod storage;
 mod subject;
+mod undeclared;

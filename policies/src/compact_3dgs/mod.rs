@@ -26,8 +26,8 @@
 //! ## Under a budget
 //!
 //! The budget bounds growth and is never exceeded. What the masks free is grown anew until `grow_until`.
-//! Nothing grows after that, so a run ends below the budget, by as much as the masks find needless: at 96 to 100 % of a budget of 8,000 after 7,000
-//! steps at half size (six scenes).
+//! Nothing grows after that, so a run ends below the budget, by as much as the masks find needless: at 96 to
+//! 100 % of a budget of 8,000 after 7,000 steps at half size (six scenes).
 //!
 //! ## Differences from the published code
 //!

@@ -1,5 +1,6 @@
 //! The passes over a view: forward, image loss, backward, optimiser and candidates. They cut the
-//! work into tasks for the pool, at fixed places, and run the stages' kernels on them.
+//! work into tasks for the pool, at fixed places, and run the stages' kernels on them. One piece, as all share a view's
+//! frame.
 
 use std::ops::Range;
 use std::sync::atomic::Ordering::Relaxed;

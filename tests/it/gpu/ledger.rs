@@ -51,6 +51,8 @@ fn what_is_allocated_is_what_the_ledger_says() {
         let mut gpu = GpuBackend::new(&model, &options, device).expect("a small model fits");
         let promised = gpu.promised();
         assert_eq!((gpu.allocated(), gpu.ledger().on_device()), (promised, promised));
+        let has_host_parts = needs.aux.is_some() || needs.error_score.edge > 0.0;
+        assert_eq!(gpu.ledger().on_host() > 0, has_host_parts, "{needs:?}");
         assert_eq!(&device.promise(model.sh_degree, &options), gpu.ledger());
         gpu.render(&camera, GREY, 1).expect("a rendering");
         assert_eq!(gpu.allocated(), promised);

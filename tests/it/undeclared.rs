@@ -1,0 +1,58 @@
+//! What takes bytes when a policy declares it takes none otherwise.
+
+use std::iter;
+
+use densify::backend::Setup;
+use densify::backend::cpu::CpuBackend;
+use densify::backend::gpu::GpuDevice;
+use densify_policies::policy::{
+    AuxRequest, Cadence, ErrorScore, LossTerms, MaskTerm, Needs, NoiseTerm, Signal,
+};
+
+use crate::subject::devices;
+
+#[test]
+fn what_is_not_declared_takes_no_bytes() {
+    let none = Needs::default;
+    let mask = MaskTerm { start: 1.0, rate: 0.01, weight: 5e-4, threshold: 0.01 };
+    let of = |signals: &[Signal]| Needs { signals: signals.iter().copied().collect(), ..none() };
+    let edges = ErrorScore { edge: 1.0, ..ErrorScore::default() };
+    let declared = [
+        Needs { mask: Some(mask), ..none() },
+        Needs { cadence: Cadence { all: 2, sh_rest: 2 }, ..none() },
+        Needs { aux: Some(AuxRequest { points: 3, ..AuxRequest::default() }), ..none() },
+        of(&[Signal::WeightMaxRoot]),
+        of(&[Signal::Support]),
+        of(&[Signal::DepthMin]),
+        of(&[Signal::DominantPixels]),
+        of(&[Signal::ErrorScore]),
+    ];
+    // Beside the sums of errors, edges take their own.
+    let with_edges = Needs { error_score: edges, ..of(&[Signal::ErrorScore]) };
+    let promise = |device: Option<&GpuDevice>, needs: &Needs| {
+        let needs = needs.clone();
+        let setup = Setup { largest_image: (41, 33), needs, ..Setup::new(20) };
+        let ledger = match device {
+            Some(device) => device.promise(1, &setup),
+            None => CpuBackend::promise(1, &setup, 2),
+        };
+        ledger.total()
+    };
+    let all = devices().iter().map(|device| ("GPU", Some(device)));
+    for (name, device) in iter::once(("native", None)).chain(all) {
+        let least = promise(device, &none());
+        for needs in &declared {
+            assert!(promise(device, needs) > least, "{name}: {needs:?}");
+        }
+        let error = promise(device, &of(&[Signal::ErrorScore]));
+        assert!(promise(device, &with_edges) > error, "{name}: edges");
+        // Of what steps compute anyway, and of numbers of the run, nothing is kept.
+        let free = Needs {
+            noise: Some(NoiseTerm { strength: 1.0, sharpness: 100.0, opacity: 0.005 }),
+            loss_terms: LossTerms { opacity: 0.01, scale: 0.01 },
+            error_score: edges,
+            ..none()
+        };
+        assert_eq!(promise(device, &free), least, "{name}: numbers take bytes");
+    }
+}
