@@ -375,6 +375,7 @@ fn a_system_that_grants_too_little_is_named_and_nothing_is_written() {
 /// llvmpipe's device memory is the process's own, so that it can be made to run out where the device's
 /// buffers are created. (SwiftShader's code generator ends the process where it gets no memory.)
 #[test]
+#[ignore = "takes a minute: run by .ci/run"]
 #[cfg(target_os = "linux")]
 fn a_device_that_runs_out_of_memory_is_named_and_nothing_is_written() {
     let is_llvmpipe = |name: &&str| name.contains("llvmpipe");
