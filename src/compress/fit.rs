@@ -52,6 +52,8 @@ pub(super) fn check(options: &Options<'_>, model: &Gaussians) -> Result<(), Fail
             options.model.display(),
             grouped(model.len())
         ))),
+        // Said before anything is trained.
+        Target::Bytes(most) if most < least(options, model).0 => Err(too_small(options, model)),
         _ => Ok(()),
     }
 }
@@ -169,11 +171,16 @@ pub(super) fn trimmed(
     }
 }
 
-/// What to say where not even one Gaussian fits.
-pub(super) fn too_small(options: &Options<'_>, model: &Gaussians) -> Failure {
+/// The least bytes that a Gaussian takes, and in which format.
+fn least(options: &Options<'_>, model: &Gaussians) -> (u64, &'static str) {
     let one = model.gather(&[0]).with_degree(0);
     let sizes = options.formats.iter().filter_map(|it| Some((bytes(it, &one).ok()?, it.name)));
-    let (least, format) = sizes.min().unwrap_or_default();
+    sizes.min().unwrap_or_default()
+}
+
+/// What to say where not even one Gaussian fits.
+pub(super) fn too_small(options: &Options<'_>, model: &Gaussians) -> Failure {
+    let (least, format) = least(options, model);
     Failure::input(format!(
         "--to: no model fits; one Gaussian takes {least} bytes as {format}; give more"
     ))

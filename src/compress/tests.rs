@@ -51,6 +51,19 @@ fn options<'a>(to: Target, scene: &'a Path, formats: &'a [&'static Format]) -> O
     }
 }
 
+#[test]
+fn a_size_that_no_gaussian_fits_is_refused_before_training() {
+    let formats = [sog(), PLY];
+    let check = |to: u64| {
+        let options = options(Target::Bytes(to), Path::new(""), &formats);
+        fit::check(&options, &colourful(3)).map_err(|failure| failure.message)
+    };
+    let one = fit::bytes(PLY, &colourful(1).with_degree(0)).expect("it is written");
+    let refused = check(one - 1).expect_err("too small");
+    assert!(refused.contains(&format!("one Gaussian takes {one} bytes as ply")), "{refused}");
+    assert_eq!(check(one), Ok(()));
+}
+
 /// Less accurate forms take fewer bytes, so that more rows fit; those that hold fewer than four fifths of the most are no
 /// attempt; and where the format holds all as it usually is, the most accurate form is tried if it does too.
 #[test]
