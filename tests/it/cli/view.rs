@@ -1,4 +1,5 @@
-//! `densify view`: the page over a plain connection, what it refuses, and how it ends.
+//! `densify view`: the page over a plain connection, what it refuses, and how it ends. One piece, as all tests share the
+//! page that is being served and its replies.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
