@@ -52,6 +52,7 @@ pub mod import;
 pub mod importance;
 pub mod init;
 pub mod knobs;
+mod likeness;
 pub mod memory;
 pub mod metrics;
 mod number;

@@ -74,6 +74,11 @@ pub(crate) fn percent(value: f64) -> String {
     if value.is_finite() { format!("{:.3} %", 100.0 * value) } else { "–".into() }
 }
 
+/// So many Gaussians.
+pub(crate) fn gaussians(number: usize) -> String {
+    format!("{} Gaussian{}", grouped(number), if number == 1 { "" } else { "s" })
+}
+
 /// 1234567 as 1,234,567.
 pub(crate) fn grouped(number: usize) -> String {
     indicatif::HumanCount(number as u64).to_string()

@@ -21,7 +21,8 @@ use crate::run::{RunConfig, Whole};
 /// Prunes the Gaussians that show least in the training views, at most half of them at once, and trains the others on
 /// in between. For a file it tries the model's degree of colour and lower ones, and coarser colour where the format has
 /// it, which leave room for more Gaussians, and keeps what shows the training views best as the file has it. Views held
-/// out are measured too, and decide nothing.
+/// out are measured too, and decide nothing. The table that it prints is the curve of size against quality: the whole
+/// model, what the file was after each pruning on the way, and what was tried at its size.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct CompressArgs {
@@ -42,7 +43,7 @@ pub(super) struct CompressArgs {
     #[arg(long)]
     overwrite: bool,
     /// Training steps of each attempt
-    #[arg(short, long, value_name = "N", default_value = "2000")]
+    #[arg(short, long, value_name = "N", default_value = "3000")]
     iterations: Whole<1, { u32::MAX }>,
     /// Everything random follows from this number
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
@@ -152,18 +153,18 @@ fn formats(args: &CompressArgs) -> Result<Vec<&'static Format>, Failure> {
     }
 }
 
-/// The curve of size against quality.
+/// The curve of size against quality: the whole, what the file was on the way to its size, and what was tried at that.
 fn table(compressed: &Compressed) -> String {
-    let Compressed { whole, attempts, best, .. } = compressed;
+    let Compressed { whole, way, attempts, best, .. } = compressed;
     let mut text = format!(
-        "\n{:<9} {:>10} {:>7} {:>14} {:>13} {:>11} {:>11}",
+        "\n{:<10} {:>10} {:>7} {:>14} {:>13} {:>11} {:>11}",
         "", "Gaussians", "degree", "format", "bytes", "train [dB]", "test [dB]"
     );
     let mut line = |name: &str, it: &Attempt, of_whole: &str| {
         let test = it.test.map_or_else(|| "–".to_owned(), |test| format!("{test:.2}"));
         let bytes = grouped(usize::try_from(it.bytes).unwrap_or(usize::MAX));
         text += &format!(
-            "\n{name:<9} {:>10} {:>7} {:>14} {bytes:>13} {:>11.2} {test:>11}{of_whole}",
+            "\n{name:<10} {:>10} {:>7} {:>14} {bytes:>13} {:>11.2} {test:>11}{of_whole}",
             grouped(it.rows),
             it.sh_degree,
             it.format,
@@ -171,13 +172,13 @@ fn table(compressed: &Compressed) -> String {
         );
     };
     line("whole PLY", whole, "");
-    for (place, attempt) in attempts.iter().enumerate() {
+    let others = attempts.iter().enumerate().map(|(place, attempt)| match place == *best {
+        true => ("written", attempt),
+        false => ("tried", attempt),
+    });
+    for (name, attempt) in way.iter().map(|attempt| ("on the way", attempt)).chain(others) {
         let share = percent(attempt.bytes as f64 / whole.bytes as f64);
-        line(
-            if place == *best { "written" } else { "tried" },
-            attempt,
-            &format!("  {share} of the PLY"),
-        );
+        line(name, attempt, &format!("  {share} of the PLY"));
     }
     text
 }

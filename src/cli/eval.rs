@@ -11,6 +11,7 @@ use super::limits::{self, Limit};
 use super::render::{Named, RenderingArgs};
 use crate::evaluate::{Comparison, FittedScore, Mean, Split, evaluate};
 use crate::failure::Failure;
+use crate::likeness::Likeness;
 use crate::metrics::Lpips;
 use crate::metrics::geometry::{self, Geometry};
 use crate::number::{grouped, percent};
@@ -96,6 +97,7 @@ pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> R
         console.result(format_args!("{name:width$}  {psnr:9.3}  {ssim:.4}  {flip:.4}{lpips}"));
     };
     let (backend, degree) = (opened.backend.as_mut(), opened.sh_degree);
+    Likeness::of(backend, &views, (background, degree))?.note(model.display(), console);
     let has_exposures = run.as_ref().is_some_and(|(config, _)| config.resolved.has_exposures);
     let fits_exposure = args.fit_exposure || has_exposures;
     let comparison = Comparison { lpips: lpips.as_ref(), fits_exposure };

@@ -196,7 +196,7 @@ pub(super) fn refuse_options_of_a_file(matches: &ArgMatches) -> Result<(), Failu
     match given {
         None => Ok(()),
         Some(name) => Err(Failure::input(format!(
-            "--{} is for a file with --scene; a run brings its own, so leave it out",
+            "--{} is for a file with --scene DIR (a run brings its own); name the dataset of a file, or leave it out",
             name.replace('_', "-")
         ))),
     }

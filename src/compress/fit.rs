@@ -3,8 +3,8 @@
 use std::io::{self, Write};
 
 use super::{Options, Target};
-use crate::export::Format;
-use crate::failure::{Failure, OTHER};
+use crate::export::{Format, is_unfit};
+use crate::failure::{Failure, INPUT, OTHER};
 use crate::gaussians::Gaussians;
 use crate::importance::{footprints, largest};
 use crate::number::grouped;
@@ -35,7 +35,7 @@ impl Write for Counted {
 pub(super) fn bytes(format: &Format, model: &Gaussians) -> Result<u64, Failure> {
     let mut counted = Counted::default();
     format.write(model, &mut counted).map_err(|error| Failure {
-        code: OTHER,
+        code: if is_unfit(&error) { INPUT } else { OTHER },
         message: format!("cannot write the model as {}: {error}", format.name),
     })?;
     Ok(counted.0)
@@ -70,16 +70,21 @@ pub(super) struct Packing {
 /// In which formats to try this model, and how many of its rows, as it is, then make a file of the target: the format
 /// that holds most, the first of equals; where it has several forms all that hold at least four fifths as many as the one
 /// that holds most, or, where it holds all as it is, the most accurate if that does too. None where not even one row fits.
+///
+/// # Errors
+/// When no format has room for the model, or one cannot be written for another reason.
 pub(super) fn packings(options: &Options<'_>, model: &Gaussians) -> Result<Vec<Packing>, Failure> {
-    let mut best = None;
+    let (mut best, mut unfit) = (None, None);
     for &format in options.formats {
         let most = best.map_or(0, |(_, rows)| rows);
-        match rows(options.to, format, model)? {
-            Some(rows) if rows > most => best = Some((format, rows)),
-            _ => {}
+        match rows(options.to, format, model) {
+            Ok(Some(rows)) if rows > most => best = Some((format, rows)),
+            Ok(_) => {}
+            Err(failure) if failure.code == INPUT => unfit = unfit.or(Some(failure)),
+            Err(failure) => return Err(failure),
         }
     }
-    let Some((format, rows)) = best else { return Ok(Vec::new()) };
+    let Some((format, rows)) = best else { return unfit.map_or(Ok(Vec::new()), Err) };
     let as_it_is = Packing { format, rows, is_whole: rows == model.len() };
     let forms = (format.writer)().forms();
     // Without bands above 0 all forms are the same.

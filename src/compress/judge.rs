@@ -1,5 +1,7 @@
 //! How well a model shows the photographs.
 
+use std::path::Path;
+
 use super::{Attempt, Options};
 use crate::dataset::Dataset;
 use crate::evaluate::Split;
@@ -7,6 +9,7 @@ use crate::export::Format;
 use crate::exposure::fitted;
 use crate::failure::Failure;
 use crate::gaussians::Gaussians;
+use crate::likeness::Likeness;
 use crate::metrics::psnr;
 use crate::run::Observer;
 use crate::run::finished::{Machine, load, views_of};
@@ -31,6 +34,20 @@ impl Judge {
         let background = options.data.background.fixed();
         let fits_exposure = options.exposure.is_some();
         Ok(Self { dataset, machine, near, background, fits_exposure })
+    }
+
+    /// Fails where the model is in other coordinates than the dataset.
+    pub(super) fn require(
+        &self,
+        model: &Gaussians,
+        file: &Path,
+        observer: &dyn Observer,
+    ) -> Result<(), Failure> {
+        let degree = model.sh_degree;
+        let mut backend = self.machine.backend(&self.dataset, model.clone(), self.near)?;
+        let views = views_of(&self.dataset, Split::Train)?;
+        let likeness = Likeness::of(backend.as_mut(), &views, (self.background, degree))?;
+        likeness.require(file.display(), observer)
     }
 
     /// Measures a model whose file has this size.

@@ -94,6 +94,8 @@ pub struct Attempt {
 pub struct Compressed {
     /// The model as it was, and the PLY that training writes of it.
     pub whole: Attempt,
+    /// What is in the file, after each stage of its training but the last.
+    pub way: Vec<Attempt>,
     /// What was tried, in that order.
     pub attempts: Vec<Attempt>,
     /// Which of them is in the file.
@@ -116,19 +118,24 @@ pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compre
     }
     let model = read_model(options.model, observer)?;
     fit::check(options, &model)?;
+    judge.require(&model, options.model, observer)?;
     let whole = judge.attempt(model.clone(), PLY, fit::bytes(PLY, &model)?)?;
     let scratch = scratch(options.output)?;
     let search = Search { options, observer, judge, scratch, model };
-    let mut attempts: Vec<Attempt> = Vec::new();
+    let (mut attempts, mut way) = (Vec::<Attempt>::new(), Vec::new());
     let mut best: Option<(usize, &Format, Gaussians)> = None;
     for degree in degrees(search.model.sh_degree, options.to) {
         let packings = fit::packings(options, &search.start(degree))?;
         for packing in &packings {
-            let Some((attempt, small)) = search.attempt(packing, degree)? else { continue };
+            let mut stages = Vec::new();
+            let Some((attempt, small)) = search.attempt(packing, degree, &mut stages)? else {
+                continue;
+            };
             let is_best = best.as_ref().is_none_or(|(at, ..)| attempt.train > attempts[*at].train);
             attempts.push(attempt);
             if is_best {
                 best = Some((attempts.len() - 1, packing.format, small));
+                way = stages;
             }
         }
         if packings.first().is_some_and(|packing| search.loses_nothing(packing, degree)) {
@@ -140,7 +147,7 @@ pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compre
     };
     let file = file(options.output, options.formats, format);
     write_atomically(&file, |out| format.write(&small, out))?;
-    Ok(Compressed { whole, attempts, best, file })
+    Ok(Compressed { whole, way, attempts, best, file })
 }
 
 /// What all attempts share.
@@ -165,26 +172,29 @@ impl Search<'_> {
     }
 
     /// About so many rows of the model with this degree, trained on, and what its file shows; `None` where no row
-    /// fits.
+    /// fits. What it was after each stage but the last is added to `way`.
     fn attempt(
         &self,
         packing: &Packing,
         degree: u8,
+        way: &mut Vec<Attempt>,
     ) -> Result<Option<(Attempt, Gaussians)>, Failure> {
-        let Self { options, observer, judge, scratch, .. } = self;
+        let Self { options, observer, scratch, .. } = self;
         let start = self.start(degree);
         let Packing { format, rows, .. } = *packing;
         let tuned = if self.loses_nothing(packing, degree) {
             start
         } else {
-            tune::tune(start, (format, rows), options, scratch, *observer)?
+            let after_stage = &mut |model: &Gaussians| {
+                way.push(self.measured(model, format, fit::bytes(format, model)?)?);
+                Ok(())
+            };
+            tune::tune(start, (format, rows), options, scratch, *observer, after_stage)?
         };
         let Some((small, bytes)) = fit::trimmed(options.to, format, tuned)? else {
             return Ok(None);
         };
-        // What the file says, not what was written.
-        write_atomically(scratch, |out| format.write(&small, out))?;
-        let attempt = judge.attempt(read_model(scratch, *observer)?, format, bytes)?;
+        let attempt = self.measured(&small, format, bytes)?;
         observer.say(format_args!(
             "tried    {} Gaussians of degree {degree} as {}: {} bytes, {:.2} dB",
             grouped(attempt.rows),
@@ -193,6 +203,12 @@ impl Search<'_> {
             attempt.train
         ));
         Ok(Some((attempt, small)))
+    }
+
+    /// What the file of a model shows: what is read back, not what was written.
+    fn measured(&self, model: &Gaussians, format: &Format, bytes: u64) -> Result<Attempt, Failure> {
+        write_atomically(&self.scratch, |out| format.write(model, out))?;
+        self.judge.attempt(read_model(&self.scratch, self.observer)?, format, bytes)
     }
 }
 

@@ -107,7 +107,8 @@ fn colours_end_as_a_file_has_them() {
     let form = &(sog().writer)().forms()[2];
     let scratch = scratch(&made.path().join("small.sog")).expect("a file");
     let start = colourful(256);
-    let tuned = tune::tune(start.clone(), (form, 256), &options, &scratch, &Silent);
+    let tuned =
+        tune::tune(start.clone(), (form, 256), &options, &scratch, &Silent, &mut |_| Ok(()));
     let tuned = tuned.expect("it trains");
     let palette = |model: &Gaussians| {
         let bands = model.sh.chunks_exact(3 * sh_coefficients(3)).map(|row| &row[3..]);

@@ -22,7 +22,7 @@ const STILL: [&str; 3] =
 /// About so many rows of the model, those that show most, trained on. How many fit a file is estimated once more before
 /// the last stage, as training changes how well rows pack; and where the format rounds, the last half of that stage
 /// trains what a file has made of the model, with its colour by direction as it is there: what the file rounds off most,
-/// the rest can mend.
+/// the rest can mend. `after_stage` is shown the model after each stage but the last.
 ///
 /// # Errors
 /// As a run's, and when the observer asks to stop.
@@ -32,11 +32,15 @@ pub(super) fn tune(
     options: &Options<'_>,
     scratch: &Path,
     observer: &dyn Observer,
+    after_stage: &mut dyn FnMut(&Gaussians) -> Result<(), Failure>,
 ) -> Result<Gaussians, Failure> {
     let least = if matches!(options.to, Target::Bytes(_)) { 2 } else { 1 };
     let rounds = (format.writer)().rounds();
     let stages = stages((model.len(), rows), options.iterations, least);
     for (stage, &(mut budget, iterations)) in stages.iter().enumerate() {
+        if stage > 0 {
+            after_stage(&model)?;
+        }
         if stage > 0 && stage + 1 == stages.len() {
             model = reduced(model, u8::MAX);
             budget = fit::rows(options.to, format, &model)?.unwrap_or(1);

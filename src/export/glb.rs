@@ -50,7 +50,7 @@ impl ModelWriter for GlbWriter {
 
     fn begin(&mut self, Shape { rows, sh_degree }: Shape, _out: &mut dyn Write) -> io::Result<()> {
         if self.held_bytes(Shape { rows, sh_degree }) > u64::from(u32::MAX - (1 << 16)) {
-            let problem = "a GLB has at most 4 GiB; export ply or sog instead";
+            let problem = "a GLB has at most 4 GiB; choose another format, such as ply or sog";
             return Err(io::Error::new(io::ErrorKind::InvalidInput, problem));
         }
         self.sh_degree = sh_degree;

@@ -121,7 +121,7 @@ pub fn find(name: &str) -> Result<&'static Format, FormatError> {
     let found = formats().into_iter().find(|format| format.name == name);
     found.ok_or_else(|| {
         let nearest = nearest(name, formats().iter().map(|format| format.name));
-        let like = nearest.map_or_else(String::new, |name| format!("; did you mean `{name}`?"));
+        let like = nearest.map_or_else(String::new, |name| format!(" (did you mean `{name}`?)"));
         FormatError(format!("there is no format `{name}`{like}"))
     })
 }
@@ -138,6 +138,12 @@ pub fn find_by_extension(path: &Path) -> Result<&'static Format, FormatError> {
     };
     let found = formats().into_iter().filter(fits).max_by_key(|format| format.extension.len());
     found.ok_or_else(|| FormatError(format!("the name {file} has the extension of no format")))
+}
+
+/// Whether an error of a writer says that its format has no room for the model, rather than the disk none for the file.
+#[must_use]
+pub fn is_unfit(error: &io::Error) -> bool {
+    error.raw_os_error().is_none() && error.kind() == io::ErrorKind::InvalidInput
 }
 
 impl Format {

@@ -7,10 +7,15 @@ use std::path::Path;
 
 use crate::dataset::DatasetError;
 use crate::foreign;
-use crate::gaussians::{Gaussians, sh_coefficients};
+use crate::gaussians::{Gaussians, logit, sh_coefficients};
+use crate::output::{model_path, saved_iterations};
 
 /// Fraction of the rows that may be unusable.
 const MAX_BAD_ROWS: f64 = 0.01;
+/// Logarithm of a flat Gaussian's standard deviation, which is −∞: what a compressed PLY has for it.
+const FLAT: f32 = -20.0;
+/// Opacities stay this far from 0 and 1, whose logits are infinite; other readers take the same.
+const MARGIN: f32 = 1e-6;
 /// Squared length below which a quaternion counts as zero: 1e-6 of a unit quaternion.
 const ZERO_QUATERNION: f32 = 1e-12;
 
@@ -41,8 +46,12 @@ pub fn read_model(path: &Path) -> Result<SplatFile, DatasetError> {
     if path.is_dir() {
         let meta = path.join("meta.json");
         if !meta.is_file() {
+            let remedy = match saved_iterations(path).ok().and_then(|saved| saved.last().copied()) {
+                Some(last) => format!("its model is {}", model_path(path, last).display()),
+                None => "name a file of Gaussian splats".to_owned(),
+            };
             return Err(DatasetError(format!(
-                "{} is a folder without meta.json, which a SOG folder has; name a file of Gaussian splats",
+                "{} is a folder without meta.json, which a SOG folder has; {remedy}",
                 path.display()
             )));
         }
@@ -86,7 +95,7 @@ fn other(
         [0x1f, 0x8b, ..] | [b'N', b'G', b'S', b'P', ..] => spz::read(path, input, length),
         [b'P', b'K', 3, 4, ..] => sog::read_zip(path, input, length),
         [b'g', b'l', b'T', b'F', ..] => gltf::read_binary(path, input, length),
-        _ if start.trim_ascii_start().starts_with(b"{") => {
+        _ if without_mark(start).trim_ascii_start().starts_with(b"{") => {
             // Both are JSON: one lists images, the other has an asset.
             let text = foreign::read_text(path, gltf::MAX_JSON).map_err(DatasetError::io(path))?;
             match sog::is_meta(&text) {
@@ -102,6 +111,12 @@ fn other(
 #[cfg(not(feature = "formats"))]
 fn other(path: &Path, _: &[u8], _: BufReader<File>, _: u64) -> Result<SplatFile, DatasetError> {
     Err(absent(path))
+}
+
+/// The start of a text, without the byte-order mark that some editors put before it.
+#[cfg(feature = "formats")]
+fn without_mark(start: &[u8]) -> &[u8] {
+    start.strip_prefix("\u{feff}".as_bytes()).unwrap_or(start)
 }
 
 /// The format is none that this program reads.
@@ -145,9 +160,19 @@ impl Rows {
         Self { file: SplatFile { gaussians, dropped: 0, repaired: 0 }, total: 0 }
     }
 
-    /// Takes a row if its values are finite.
+    /// Takes a row if its values are finite, once those have a number that some programs write as infinite: the size of
+    /// a flat Gaussian, and the opacity of a transparent or an opaque one.
     pub(super) fn push(&mut self, row: Row<'_>) {
         let SplatFile { gaussians, dropped, repaired } = &mut self.file;
+        let row = Row {
+            log_scale: row.log_scale.map(|log| if log == f32::NEG_INFINITY { FLAT } else { log }),
+            opacity_logit: match row.opacity_logit {
+                f32::INFINITY => quantised_logit(1.0),
+                f32::NEG_INFINITY => quantised_logit(0.0),
+                finite => finite,
+            },
+            ..row
+        };
         assert_eq!(row.sh.len(), 3 * sh_coefficients(gaussians.sh_degree), "coefficients of a row");
         self.total += 1;
         let others = row.mean.iter().chain(&row.log_scale).chain(&row.quat).chain(row.sh);
@@ -186,15 +211,12 @@ pub(super) fn from_smallest_three(largest: usize, others: [f32; 3]) -> [f32; 4] 
 }
 
 /// Logit of a quantised opacity in `[0, 1]`.
-#[cfg(feature = "formats")]
 pub(super) fn quantised_logit(opacity: f32) -> f32 {
-    /// Opacities stay this far from 0 and 1, whose logits are infinite; other readers take the same.
-    const MARGIN: f32 = 1e-6;
-    crate::gaussians::logit(opacity.clamp(MARGIN, 1.0 - MARGIN))
+    logit(opacity.clamp(MARGIN, 1.0 - MARGIN))
 }
 
-/// Logarithm of a standard deviation; a flat Gaussian, whose would be −∞, gets that of the compressed PLY, −20.
+/// Logarithm of a standard deviation; that of a flat Gaussian is finite.
 #[cfg(feature = "formats")]
 pub(super) fn log_of_scale(scale: f32) -> f32 {
-    if scale == 0.0 { -20.0 } else { scale.ln() }
+    if scale == 0.0 { FLAT } else { scale.ln() }
 }

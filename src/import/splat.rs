@@ -22,7 +22,10 @@ pub(super) fn is_splat(start: &[u8], length: u64) -> bool {
     let rows = start.as_chunks::<ROW>().0;
     let plausible = |row: &[u8; ROW]| {
         let [x, y, z, scales @ ..] = floats(row);
-        [x, y, z].iter().all(|v| v.abs() < PLAUSIBLE)
+        // A unit quaternion, which neither zeros are nor the head of another format.
+        let length = quaternion(row).map(|v| v * v).iter().sum::<f32>();
+        (0.5..1.5).contains(&length)
+            && [x, y, z].iter().all(|v| v.abs() < PLAUSIBLE)
             && scales.iter().all(|v| (0.0..PLAUSIBLE).contains(v))
     };
     length.is_multiple_of(ROW as u64) && !rows.is_empty() && rows.iter().all(plausible)
@@ -45,7 +48,7 @@ pub(super) fn read(path: &Path, mut input: impl Read) -> Result<SplatFile, Datas
             rows.push(Row {
                 mean: [x, y, z],
                 log_scale: [s0, s1, s2].map(log_of_scale),
-                quat: [row[28], row[29], row[30], row[31]].map(|v| (f32::from(v) - 128.0) / 128.0),
+                quat: quaternion(row),
                 opacity_logit: quantised_logit(f32::from(row[27]) / 255.0),
                 sh: &colour,
             });
@@ -54,6 +57,11 @@ pub(super) fn read(path: &Path, mut input: impl Read) -> Result<SplatFile, Datas
             return rows.finish(path);
         }
     }
+}
+
+/// (w, x, y, z) of a row.
+fn quaternion(row: &[u8; ROW]) -> [f32; 4] {
+    [row[28], row[29], row[30], row[31]].map(|v| (f32::from(v) - 128.0) / 128.0)
 }
 
 /// The first six numbers of a row.

@@ -14,7 +14,7 @@ use ruzstd::decoding::StreamingDecoder;
 
 use super::SplatFile;
 use super::model::{Row, Rows, from_smallest_three, malformed, quantised_logit};
-use super::unfold::{exactly, fault, to_the_end};
+use super::unfold::{DAMAGED, exactly, fault, to_the_end};
 use crate::dataset::DatasetError;
 use crate::foreign::most_unpacked;
 use crate::gaussians::{MAX_SH_DEGREE, sh_coefficients};
@@ -76,7 +76,7 @@ fn header(
         return wrong("it does not begin with `NGSP`".into());
     }
     if version == 1 || !versions.contains(&version) {
-        return wrong(format!("version {version} is none of 2 (in gzip), 3 (in gzip) and 4"));
+        return wrong(format!("densify reads versions 2 and 3, in gzip, and 4, not {version}"));
     }
     if sh_degree > MAX_SH_DEGREE {
         return wrong(format!("colours of degree {sh_degree}, but densify has 0 to 3"));
@@ -141,11 +141,8 @@ fn in_frames(
     for (name, packed, unfolded) in sizes {
         let mut frame = input.take(packed);
         let window = WINDOW.max(unfolded);
-        let bad = |problem: String| {
-            malformed(path, name, format!("it cannot be decompressed: {problem}"))
-        };
         let mut decoder = StreamingDecoder::new_with_max_window_size(&mut frame, window)
-            .map_err(|error| bad(error.to_string()))?;
+            .map_err(|_| malformed(path, name, DAMAGED))?;
         arrays.push(exactly(path, name, &mut decoder, unfolded)?);
         drop(decoder);
         to_the_end(path, name, &mut frame)?;

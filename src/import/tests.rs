@@ -128,6 +128,12 @@ fn nodes_place_what_they_show() {
         let [x, y, z] = [2.0 * z + 1.0, 2.0 * x + 2.0, 2.0 * y + 3.0];
         [-x, -y, z]
     };
+    // Some editors put a byte-order mark before the text.
+    let folder = tempfile::tempdir().unwrap();
+    let marked = folder.path().join("marked.gltf");
+    let text = std::fs::read(corpus("splat_glb/placed.gltf")).unwrap();
+    std::fs::write(&marked, ["\u{feff}".as_bytes(), &text].concat()).unwrap();
+    assert_eq!(read(&marked), placed);
     for row in 0..12 {
         let far = |i: usize| (placed.means[row][i] - expected(plain.means[row])[i]).abs();
         assert!((0..3).all(|i| far(i) < 1e-5), "row {row}: {:?}", placed.means[row]);
@@ -191,9 +197,17 @@ fn what_lies_is_refused_by_name() {
     std::io::Write::write_all(&mut bomb, &vec![0; 80 << 20]).unwrap();
     for (case, contents, words) in [
         ("nothing", Vec::new(), &["PLY, SPZ, SOG, glTF or .splat", "convert"][..]),
+        ("zeros", vec![0; 320], &["convert"]),
+        // The head of a .ksplat: its version, then the number of its sections.
+        (
+            "a ksplat",
+            [&[0, 1, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0][..], &[0; 4084]].concat(),
+            &["convert"],
+        ),
         ("a picture", b"\x89PNG\r\n\x1a\n0123".to_vec(), &["convert"]),
         ("a pointer", b"version https://git-lfs.github.com/spec/v1\n".to_vec(), &["git lfs pull"]),
-        ("version 5", spz(4, 5), &["header", "version 5"]),
+        ("version 5", spz(4, 5), &["header", "2 and 3, in gzip, and 4, not 5"]),
+        ("a damaged frame", spz(96, 0xff), &["compressed data is damaged"]),
         ("degree 4", spz(12, 4), &["degree 4"]),
         ("too many rows", spz(11, 255), &["header", "too many for a file of 497"]),
         ("table in the header", spz(16, 8), &["table"]),

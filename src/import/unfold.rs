@@ -9,6 +9,9 @@ use crate::dataset::DatasetError;
 /// Most bytes after what is expected that are looked at for the checksum behind them.
 const TAIL: u64 = 1 << 20;
 
+/// What is said of data that no decoder takes; what they say themselves are names in their code.
+pub(super) const DAMAGED: &str = "the compressed data is damaged";
+
 /// Reads so many bytes of `field`, compressed or not.
 ///
 /// # Errors
@@ -47,6 +50,6 @@ pub(super) fn fault(path: &Path, field: &str, source: io::Error) -> DatasetError
     match source.kind() {
         _ if source.raw_os_error().is_some() => DatasetError::io(path)(source),
         ErrorKind::UnexpectedEof => malformed(path, field, "the file ends here (truncated?)"),
-        _ => malformed(path, field, format!("it cannot be decompressed: {source}")),
+        _ => malformed(path, field, DAMAGED),
     }
 }

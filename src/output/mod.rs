@@ -114,10 +114,20 @@ impl OutputError {
 
     /// A run's folder lacks this.
     pub(crate) fn no_run(folder: &Path, missing: &str) -> Self {
-        let folder = folder.display();
-        Self::Unfit(format!(
-            "{folder} holds no run: there is no {missing}; name the folder that `densify train` wrote"
-        ))
+        let name = folder.display();
+        Self::Unfit(if folder.is_dir() {
+            format!(
+                "{name} holds no run: there is no {missing}; name the folder that `densify train` wrote"
+            )
+        } else if folder.exists() {
+            format!(
+                "{name} is no model and no run; name a file of Gaussian splats, or the folder that `densify train` wrote"
+            )
+        } else {
+            format!(
+                "{name} does not exist; name a file of Gaussian splats, or the folder that `densify train` wrote"
+            )
+        })
     }
 
     pub(crate) fn malformed(file: &Path, problem: impl Display) -> Self {

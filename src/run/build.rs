@@ -11,7 +11,7 @@ use super::observer::Observer;
 use super::resolve::{self, DECODERS, Inputs, Size, TEST_DECODERS};
 use super::resume::{self, Resumed};
 use super::spec::RunSpec;
-use super::start::{Start, behind_frozen, first_model, fits};
+use super::start::{Start, behind_frozen, first_model, require_likeness};
 use super::values::{Assignment, ImageCache, InitChoice, Rows, ShDegree, assignments};
 use crate::checkpoint::Fingerprint;
 use crate::dataset::PointCloud;
@@ -101,8 +101,8 @@ pub(super) fn build(
     let mut backend = inputs.device.backend(&model, &inputs.backend_options(&setting, needs))?;
     drop(model);
     if let Some(file) = file.as_deref().filter(|_| checkpoint.is_none()) {
-        let view = (spec.data.background.fixed(), setting.sh_degree);
-        fits(file, backend.as_mut(), &inputs.dataset, view, observer)?;
+        let shown = (spec.data.background.fixed(), setting.sh_degree);
+        require_likeness(file, backend.as_mut(), &inputs.dataset, shown, observer)?;
     }
     let options = train_options(&inputs, &setting, rates);
     let exposures = inputs.exposure.first(spec, &inputs.dataset);

@@ -25,7 +25,7 @@
 //!
 //! **Pruning** follows the splits of the same event. What it frees is used by the next growth, and
 //! Gaussians below the limit may be drawn before. It removes those less opaque than `min_opacity` at each
-//! growth before `prune_until`, and none at the last: nothing would take their place. `recover` steps
+//! growth, but none at the last, where nothing would take their place, unless `prune_last` is set. `recover` steps
 //! after each of the first `recoveries` opacity resets it also removes the share `recovery_share` of what
 //! is left, those with the lowest opacity: what has not recovered is not needed. Before all growth, at
 //! step `first_prune_at`, it removes those less opaque than `first_prune_opacity`.
@@ -68,7 +68,7 @@
 //! | final_from | 14500 | >= 0 | step | start of growth by gradient (exclusive) |
 //! | final_divisor | 1.5 | >= 1 | | divides `tau` from then on |
 //! | min_opacity | 0.005 | 0 to 1 | | Gaussians below this opacity are pruned |
-//! | prune_until | 14900 | >= 0 | step | end of pruning at growths (exclusive) |
+//! | prune_last | false | | | prune at the last growth, too |
 //! | first_prune_at | 300 | >= 0 | step | the first pruning; 0: none |
 //! | first_prune_opacity | 0.02 | 0 to 1 | | opacity limit of the first pruning |
 //! | reset_every | 3000 | >= 0 | steps | interval of opacity resets; 0: never |
@@ -142,7 +142,6 @@ impl ConfiguredPolicy for Igs {
         Interval("grow_every"),
         Step("curve_until"),
         Step("final_from"),
-        Step("prune_until"),
         Step("first_prune_at"),
         Interval("reset_every"),
         Step("sum_from"),
@@ -341,7 +340,8 @@ impl Igs {
             after[row as usize] *= self.params.child_opacity as f32;
         }
         let mut least = 0.0;
-        if self.grow.is_due(now.step) && now.step < self.params.prune_until {
+        let is_last = !self.grow.is_due(now.step.saturating_add(self.params.grow_every));
+        if self.grow.is_due(now.step) && (self.params.prune_last || !is_last) {
             least = self.params.min_opacity as f32;
         }
         if self.is_recovery_prune(now.step) {

@@ -138,7 +138,10 @@ fn nothing_is_pruned_at_the_end() {
         run(&faint.with_all(Signal::ScreenGradientAbs, 0.0), set).pruned
     };
     assert_eq!([at(14_800, ""), at(14_900, "")], [vec![1], vec![]]);
-    assert_eq!(at(14_900, "prune_until = 14901"), [1]);
+    assert_eq!(at(14_900, "prune_last = true"), [1]);
+    // Whatever the length of the run: of 7,000 iterations growth ends before step 3,500.
+    let short = "grow_until = 3500\ngrow_from = 117";
+    assert_eq!([at(3_300, short), at(3_400, short)], [vec![1], vec![]]);
     // Nor is what is split: 0.6 · 0.004 is kept. A value that is not a number is not.
     let split = event(14_900, &[1.0; 2], 9).with(Signal::Opacity, &[0.004, f32::NAN]);
     let done = run(&split, "");

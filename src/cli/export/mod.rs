@@ -9,10 +9,10 @@ use clap::{ArgMatches, Args};
 
 use super::console::Console;
 use super::render::{RenderingArgs, refuse_options_of_a_file};
-use crate::export::{Format, find, find_by_extension, formats};
-use crate::failure::Failure;
+use crate::export::{Format, find, find_by_extension, formats, is_unfit};
+use crate::failure::{Failure, INPUT};
 use crate::gaussians::Gaussians;
-use crate::number::grouped;
+use crate::number::gaussians;
 use crate::output::{OutputError, write_atomically};
 use crate::run::finished::{model_file, read_model};
 use table::{Line, Truth};
@@ -86,19 +86,32 @@ pub(super) fn run(
         Some(scene) => Some(Truth::open(args, is_run, scene, &model, console)?),
     };
     let mut lines = Vec::new();
+    let mut unfit = None;
     for (format, path) in &files {
-        write(format, path, &model)?;
+        match write(format, path, &model) {
+            Ok(()) => {}
+            // The other formats may hold it.
+            Err(failure) if failure.code == INPUT && files.len() > 1 => {
+                console.say(format_args!("note: not written: {}", failure.message));
+                unfit = unfit.or(Some(failure));
+                continue;
+            }
+            Err(failure) => return Err(failure),
+        }
         let psnr = match &mut truth {
             None => None,
             Some(truth) => Some(truth.compare(read_model(path, console)?)?),
         };
         console.result(format_args!(
-            "{} Gaussians in {} ({})",
-            grouped(model.len()),
+            "{} in {} ({})",
+            gaussians(model.len()),
             path.display(),
             format.name
         ));
         lines.push(Line::of(format.name, path, psnr)?);
+    }
+    if let Some(failure) = unfit.filter(|_| lines.is_empty()) {
+        return Err(failure);
     }
     if truth.is_some() || lines.len() > 1 {
         console.result(table::table(&lines, model.len()));
@@ -110,8 +123,13 @@ pub(super) fn run(
 fn files(args: &ExportArgs) -> Result<Vec<(&'static Format, PathBuf)>, Failure> {
     match args.format.as_deref() {
         Some(ALL) => {
-            let name = args.model.file_name().unwrap_or("model".as_ref()).to_string_lossy();
-            let stem = name.split('.').next().filter(|stem| !stem.is_empty()).unwrap_or("model");
+            if args.output.exists() && !args.output.is_dir() {
+                let output = args.output.display();
+                return Err(Failure::input(format!(
+                    "-o: {output} is no folder; with --format {ALL} name a folder"
+                )));
+            }
+            let stem = stem(&args.model);
             let file =
                 |format: &'static Format| args.output.join(format!("{stem}.{}", format.extension));
             Ok(formats().into_iter().map(|format| (format, file(format))).collect())
@@ -126,6 +144,20 @@ fn files(args: &ExportArgs) -> Result<Vec<(&'static Format, PathBuf)>, Failure> 
             Ok(vec![(format, args.output.clone())])
         }
     }
+}
+
+/// What the files of a model are called: as its run, or as its file without the extension.
+fn stem(model: &Path) -> String {
+    let name = model.file_name().unwrap_or("model".as_ref()).to_string_lossy().into_owned();
+    if model.is_dir() {
+        return name;
+    }
+    let known = find_by_extension(model).map_or(0, |format| format.extension.len() + 1);
+    let end = match known {
+        0 => name.rfind('.').unwrap_or(name.len()),
+        _ => name.len() - known,
+    };
+    name[..end].to_owned()
 }
 
 /// The format that the name of an output says.
@@ -144,16 +176,16 @@ fn write(format: &Format, path: &Path, model: &Gaussians) -> Result<(), Failure>
     })
 }
 
-fn is_unfit(error: &std::io::Error) -> bool {
-    error.raw_os_error().is_none() && error.kind() == std::io::ErrorKind::InvalidInput
-}
-
 /// Fails where something is in the way of the output.
 pub(super) fn check_output(path: &Path, overwrite: bool) -> Result<(), Failure> {
     let path_text = path.display();
     match path.symlink_metadata() {
         Ok(_) if path.is_dir() => {
             Err(Failure::input(format!("-o: {path_text} is a folder; name a file")))
+        }
+        // To replace a device or a pipe would be to take it from others.
+        Ok(_) if path.exists() && !path.is_file() => {
+            Err(Failure::input(format!("-o: {path_text} is a device or a pipe; name a file")))
         }
         Ok(_) if !overwrite => Err(Failure::input(format!(
             "-o: {path_text} exists; choose another file, or replace it with --overwrite"

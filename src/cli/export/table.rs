@@ -10,6 +10,7 @@ use crate::dataset::Dataset;
 use crate::evaluate::Split;
 use crate::failure::Failure;
 use crate::gaussians::Gaussians;
+use crate::likeness::Likeness;
 use crate::metrics::psnr_between;
 use crate::number::{grouped, percent};
 use crate::output::OutputError;
@@ -61,8 +62,12 @@ impl Truth {
         let machine = Machine::open(&args.rendering.device, console)?;
         let dataset = load(scene, &data, console)?;
         let near = (near * dataset.extent()) as f32;
-        let backend = machine.backend(&dataset, model.clone(), near)?;
+        let mut backend = machine.backend(&dataset, model.clone(), near)?;
         let (background, sh_degree) = (data.background.fixed(), model.sh_degree);
+        let views = views_of(&dataset, Split::Test)?;
+        // Pictures without the model are alike in every format.
+        Likeness::of(backend.as_mut(), &views, (background, sh_degree))?
+            .note(args.model.display(), console);
         Ok(Self { dataset, machine, near, background, sh_degree, backend })
     }
 

@@ -23,7 +23,7 @@ use zip::Archive;
 pub(super) const FORMAT: Format = Format {
     name: "sog",
     extension: "sog",
-    summary: "SOG version 2 of PlayCanvas: quantised pictures in an archive, the smallest",
+    summary: "SOG version 2 of PlayCanvas: quantised pictures in an archive",
     writer: || Box::new(SogWriter::default()),
 };
 
@@ -82,8 +82,9 @@ impl ModelWriter for SogWriter {
 
     fn begin(&mut self, Shape { rows, sh_degree }: Shape, _out: &mut dyn Write) -> io::Result<()> {
         if rows == 0 || rows > MAX_SIDE * (MAX_SIDE / 4 * 4) {
-            let problem =
-                format!("SOG holds 1 to 268 million rows, not {rows}; export ply instead");
+            let problem = format!(
+                "SOG holds 1 to 268 million rows, not {rows}; choose another format, such as ply"
+            );
             return Err(io::Error::new(io::ErrorKind::InvalidInput, problem));
         }
         self.sh_degree = sh_degree;

@@ -25,8 +25,12 @@ impl<'a> Archive<'a> {
 
     /// Writes a file.
     pub(super) fn add(&mut self, name: &str, bytes: &[u8]) -> io::Result<()> {
-        let too_large =
-            |_| io::Error::new(io::ErrorKind::InvalidInput, "an archive has at most 4 GiB");
+        let too_large = |_| {
+            io::Error::new(
+                io::ErrorKind::InvalidInput,
+                "an archive has at most 4 GiB; choose another format, such as ply",
+            )
+        };
         let size = u32::try_from(bytes.len()).map_err(too_large)?;
         let offset = u32::try_from(self.offset).map_err(too_large)?;
         let mut sum = Crc::new();

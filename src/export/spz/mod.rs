@@ -32,6 +32,17 @@ pub(super) const IN_FRAMES: Format = Format {
 inventory::submit! { FORMAT }
 inventory::submit! { IN_FRAMES }
 
+/// The same with fixed steps of coefficients, however large the error of colours: what `compress` may take.
+const FORMS: [Format; 3] = [
+    Format { writer: with_step::<3>, ..FORMAT },
+    Format { writer: with_step::<9>, ..FORMAT },
+    Format { writer: with_step::<17>, ..FORMAT },
+];
+
+fn with_step<const STEP: u8>() -> Box<dyn ModelWriter> {
+    Box::new(SpzWriter { step: Some(STEP), ..SpzWriter::default() })
+}
+
 /// Fractional bits that other writers give positions; ours has as many or, for a small scene, more.
 const FRACTIONAL_BITS: u8 = 12;
 /// Most of them, and the number of bits beside the sign.
@@ -41,13 +52,17 @@ const POSITION_BITS: i32 = 23;
 const STEP_OF_SIZE: f32 = 0.05;
 /// Most error of a colour by rounding coefficients, root mean square over rows and directions: below this the
 /// picture is 45 dB from that of the PLY (measured on room256, cup, chair).
-const COLOUR_ERROR: f64 = 0.012;
+const COLOUR_ERROR: f64 = 0.0165;
+/// Largest step of coefficients, of 256 in `[−1, 1)`.
+const MAX_STEP: u8 = 31;
 
 /// Holds what all rows become but positions, which stay as they are until the fixed point is known.
 #[derive(Default)]
 struct SpzWriter {
     /// Version 4.
     is_in_frames: bool,
+    /// Step of coefficients, if it does not follow from the model.
+    step: Option<u8>,
     sh_degree: u8,
     positions: Vec<[f32; 3]>,
     sizes: Vec<f32>,
@@ -73,9 +88,14 @@ impl ModelWriter for SpzWriter {
         true
     }
 
+    fn forms(&self) -> &'static [Format] {
+        if self.is_in_frames { &[] } else { &FORMS }
+    }
+
     fn begin(&mut self, Shape { rows, sh_degree }: Shape, _out: &mut dyn Write) -> io::Result<()> {
         if u32::try_from(rows).is_err() {
-            let problem = "SPZ counts rows in 32 bits; export fewer";
+            let problem =
+                "SPZ counts rows in 32 bits; export fewer, or choose another format, such as ply";
             return Err(io::Error::new(io::ErrorKind::InvalidInput, problem));
         }
         self.sh_degree = sh_degree;
@@ -141,8 +161,9 @@ impl SpzWriter {
         let reach = self.positions.as_flattened().iter().fold(0f32, |most, v| most.max(v.abs()));
         let room = POSITION_BITS - 1 - reach.max(1e-6).log2().floor() as i32;
         if room < 0 {
-            let problem =
-                format!("SPZ has no room for coordinates up to {reach:e}; export glb instead");
+            let problem = format!(
+                "SPZ has no room for coordinates up to {reach:e}; choose another format, such as glb"
+            );
             return Err(io::Error::new(io::ErrorKind::InvalidInput, problem));
         }
         let wanted = match self.sizes.len() / 2 {
@@ -156,34 +177,38 @@ impl SpzWriter {
         Ok(wanted.min(room) as u8)
     }
 
-    /// Rounds coefficients to as few bits as the error of colours allows, in band 1 to one more than above: equal
-    /// bytes compress.
+    /// Rounds coefficients to steps as large as the error of colours allows, in band 1 to half of them: equal bytes
+    /// compress. Steps are odd, so that no byte lies between two of them, and none is rounded away from 0 more often.
     fn coarsen(&mut self) {
         let row = 3 * (sh_coefficients(self.sh_degree) - 1);
         if row == 0 || self.bands.is_empty() {
             return;
         }
-        let step = |index: usize, bits: u8| 1u32 << (8 - (bits + u8::from(index % row < 9)).min(8));
+        let of = |index: usize, step: u8| if index % row < 9 { (step / 2) | 1 } else { step };
         // Σ over coefficients of a band's mean square, as the basis is orthonormal: ¼π of it is the colour's.
-        let error = |bits: u8| {
+        let error = |step: u8| {
             let squares = self.bands.iter().enumerate().map(|(index, &byte)| {
-                let left = f64::from(byte) - f64::from(coarse(byte, step(index, bits)));
+                let left = f64::from(byte) - f64::from(coarse(byte, of(index, step)));
                 (left / 128.0).powi(2)
             });
             let rows = 3.0 * (self.bands.len() / row) as f64;
             (squares.sum::<f64>() / rows / (4.0 * std::f64::consts::PI)).sqrt()
         };
-        let bits = (3..8).find(|&bits| error(bits) < COLOUR_ERROR).unwrap_or(8);
+        let step = self.step.unwrap_or_else(|| {
+            let fits = |&step: &u8| error(step) < COLOUR_ERROR;
+            (1..=MAX_STEP).step_by(2).take_while(fits).last().unwrap_or(1)
+        });
         for (index, byte) in self.bands.iter_mut().enumerate() {
-            *byte = coarse(*byte, step(index, bits));
+            *byte = coarse(*byte, of(index, step));
         }
     }
 }
 
-/// The nearest multiple of a step; 128, which stands for 0, is one.
-fn coarse(byte: u8, step: u32) -> u8 {
-    let rounded = (u32::from(byte) + step / 2) / step * step;
-    rounded.min(255) as u8
+/// The byte nearest to one that is a whole number of steps from 128, which stands for 0.
+fn coarse(byte: u8, step: u8) -> u8 {
+    let (from, step) = (i32::from(byte) - 128, i32::from(step));
+    let steps = (from.abs() + step / 2) / step;
+    (128 + from.signum() * steps * step).clamp(0, 255) as u8
 }
 
 /// The nearest byte.

@@ -98,6 +98,21 @@ fn damaged_rows_are_dropped_up_to_one_percent() {
     assert!(message.contains("3 of 200") && message.contains("file.ply"), "{message}");
 }
 
+/// Some programs write the logarithm of 0, and the logits of 0 and 1.
+#[test]
+fn infinite_opacities_and_flat_gaussians_are_read() {
+    let mut model = model(10, 0);
+    (model.opacity_logits[0], model.opacity_logits[1]) = (f32::INFINITY, f32::NEG_INFINITY);
+    model.log_scales[2][1] = f32::NEG_INFINITY;
+    let (_folder, path) = saved(written(&model));
+    let read = read_splats(&path).unwrap();
+    assert_eq!((read.dropped, read.gaussians.len()), (0, 10));
+    let [opaque, transparent, other, ..] = read.gaussians.opacity_logits[..] else { panic!("ten") };
+    assert!((13.0..20.0).contains(&opaque) && (-20.0..-13.0).contains(&transparent));
+    assert!(other.to_bits() == model.opacity_logits[2].to_bits());
+    assert!(read.gaussians.log_scales[2][1].to_bits() == (-20f32).to_bits());
+}
+
 #[test]
 fn what_cannot_be_splats_is_refused_by_name() {
     let good = String::from_utf8_lossy(&written(&model(1, 0))).into_owned();

@@ -2,7 +2,9 @@
 
 mod model;
 
-pub(super) use model::{behind_frozen, first_bytes, fits, reading_bytes, size_of_model};
+pub(super) use model::{
+    behind_frozen, first_bytes, reading_bytes, require_likeness, size_of_model,
+};
 
 use super::observer::Observer;
 use super::resolve::{Inputs, ignored, random_count};

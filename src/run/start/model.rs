@@ -7,26 +7,24 @@ use rayon::prelude::*;
 
 use crate::backend::{Backend, MomentStorage, Setup, Storage};
 use crate::dataset::Dataset;
-use crate::dataset::images::Image8;
+use crate::dataset::normalise::EXTENT;
 use crate::evaluate::Split;
 use crate::failure::Failure;
 use crate::gaussians::{Gaussians, sh_coefficients};
 use crate::importance::{importance, largest, needs};
+use crate::likeness::Likeness;
 use crate::memory::RunSize;
-use crate::metrics::psnr;
 use crate::number::grouped;
-use crate::pictures::photograph;
 use crate::run::config::ModelSize;
 use crate::run::finished::{read_model, views_of};
 use crate::run::observer::{Observer, Silent};
 use crate::run::resolve::Inputs;
 use crate::run::values::AbsolutePath;
-use crate::views::ViewSource;
 
 /// A model of which fewer Gaussians than this share lie in any training view is in other coordinates.
 const LEAST_IN_VIEW: f64 = 0.1;
-/// Training views in which a model is compared with the photographs.
-const COMPARED: usize = 4;
+/// Extents of the scene beyond which nothing is counted as in view: some camera looks at whatever is far away.
+const FARTHEST: f64 = 100.0;
 /// Pairs per row while importance is measured; views with more are rendered in bands.
 const PAIRS_PER_ROW: usize = 3;
 
@@ -201,52 +199,25 @@ fn in_view(model: &Gaussians, dataset: &Dataset) -> usize {
             let camera = &view.camera;
             let (pixel, depth) = camera.project(point);
             let within = |x: f64, size: u32| (0.0..f64::from(size)).contains(&x);
-            depth > 0.0 && within(pixel.x, camera.width) && within(pixel.y, camera.height)
+            (0.0..FARTHEST * EXTENT).contains(&depth)
+                && within(pixel.x, camera.width)
+                && within(pixel.y, camera.height)
         })
     };
     model.means.par_iter().filter(|mean| shows(mean)).count()
 }
 
-/// Says so where the model that a run starts from fits the photographs worse than a plain colour does: then it
-/// is hardly in the coordinates of the dataset.
+/// Fails where the model of `--init` shows nothing of the photographs, as one in other coordinates does.
 ///
 /// # Errors
-/// When a view cannot be read or rendered.
-pub(in crate::run) fn fits(
+/// Then, and when a view cannot be read or rendered.
+pub(in crate::run) fn require_likeness(
     file: &Path,
     backend: &mut dyn Backend,
     dataset: &Dataset,
-    (background, sh_degree): ([f32; 3], u8),
+    shown: ([f32; 3], u8),
     observer: &dyn Observer,
 ) -> Result<(), Failure> {
-    let views = views_of(dataset, Split::Train)?;
-    let count = views.count().min(COMPARED);
-    let mut worse = 0;
-    for place in 0..count {
-        let view = place * views.count() / count;
-        let image = views.image(view).map_err(Failure::input)?;
-        let rendering = backend.render(views.camera(view), background, sh_degree)?;
-        let plain = plain(&image, background);
-        let [model, plain] = [&rendering.rgb, &plain].map(|rgb| psnr(rgb, &image, background));
-        worse += usize::from(model.map_err(Failure::input)? < plain.map_err(Failure::input)?);
-    }
-    if 2 * worse > count {
-        observer.say(format_args!(
-            "note: --init {}: in {worse} of {count} training views it fits the photograph worse than a plain colour; \
-             its coordinates may not be those of the dataset (axes, scale, or origin)",
-            file.display()
-        ));
-    }
-    Ok(())
-}
-
-/// An image of the photograph's mean colour. Shape: `[height, width, 3]`.
-fn plain(image: &Image8, background: [f32; 3]) -> Vec<f32> {
-    let shown = photograph(image, background);
-    let pixels = shown.as_raw().len() / 3;
-    let sum = |channel: usize| {
-        shown.as_raw().iter().skip(channel).step_by(3).map(|&v| f64::from(v)).sum::<f64>()
-    };
-    let mean = [0, 1, 2].map(|channel| (sum(channel) / (255.0 * pixels as f64)) as f32);
-    mean.repeat(pixels)
+    let likeness = Likeness::of(backend, &views_of(dataset, Split::Train)?, shown)?;
+    likeness.require(format_args!("--init {}", file.display()), observer)
 }

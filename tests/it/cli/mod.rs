@@ -177,6 +177,13 @@ fn gaussians(file: &Path) -> densify::gaussians::Gaussians {
     densify::import::read_model(file).expect("a model").gaussians
 }
 
+/// Writes a model as PLY.
+fn write_ply(model: &densify::gaussians::Gaussians, file: &Path) {
+    let mut bytes = Vec::new();
+    densify::export::PLY.write(model, &mut bytes).expect("it is written");
+    std::fs::write(file, bytes).expect("it is written");
+}
+
 fn read_text(path: &Path) -> String {
     String::from_utf8(read(path)).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
 }

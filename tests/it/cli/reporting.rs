@@ -293,7 +293,7 @@ fn what_cannot_be_reported_is_said_with_the_remedy() {
     let model = densify::output::model_path(&run, 40);
     for (runs, more, expected) in [
         (vec![&*at("empty")], "", vec!["empty", "holds no run", "config.toml"]),
-        (vec![Path::new("nowhere")], "", vec!["nowhere", "holds no run"]),
+        (vec![Path::new("nowhere")], "", vec!["nowhere does not exist"]),
         (vec![&*unsaved], "", vec!["unsaved", "no saved model"]),
         (vec![&*model], "", vec!["point_cloud.ply", "a model", "densify train"]),
         (vec![&*run, &*run], "", vec!["named twice"]),

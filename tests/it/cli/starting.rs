@@ -3,11 +3,11 @@
 
 use std::path::Path;
 
-use densify::gaussians::Gaussians;
 use densify::output::model_path;
 
 use super::{
     Outcome, call, count, files, gaussians, json, read, records, resume, scratch, text, train,
+    write_ply,
 };
 use crate::photographs::Photographs;
 
@@ -18,13 +18,6 @@ const STILL: &str = "--policy vanilla --policy-set vanilla.grow_every=0 --policy
 /// The loss of a run's first step that is recorded.
 fn first_loss(run: &Path) -> f64 {
     records(&run.join("stats/train.jsonl"))[0]["loss"].as_f64().expect("a loss")
-}
-
-/// Writes a model as PLY.
-fn write(model: &Gaussians, file: &Path) {
-    let mut bytes = Vec::new();
-    densify::export::PLY.write(model, &mut bytes).expect("it is written");
-    std::fs::write(file, bytes).expect("it is written");
 }
 
 fn refused(outcome: &Outcome, root: &Path, words: &[&str]) {
@@ -153,7 +146,7 @@ fn frozen_gaussians_stay_as_they_are_through_a_stop_too() {
     no(&format!("--freeze {}", text(&copy)), &["copy.ply"]);
     let mut above = gaussians(&ply);
     above.means.iter_mut().for_each(|mean| mean[1] += 1e4);
-    write(&above, &copy);
+    write_ply(&above, &copy);
     no(&format!("--freeze {}", text(&copy)), &["copy.ply", "none of its", "coordinates"]);
     resume(scene.path(), &beside, &format!("--freeze {}", text(&ply)))
         .refused("another", &["--freeze"]);
@@ -172,7 +165,7 @@ fn of_too_large_a_model_those_stay_that_show() {
     faint.opacity_logits.fill(-9.0);
     large.append(faint);
     let file = root.path().join("large.ply");
-    write(&large, &file);
+    write_ply(&large, &file);
     let cut = root.path().join("cut");
     let flags = format!("--init {} --budget {seen} {STILL}", text(&file));
     let outcome = train(scene.path(), &cut, 1, &flags).ok();
@@ -213,16 +206,37 @@ fn what_cannot_be_started_from_is_refused_or_named() {
             *mean = map(*mean);
         }
         let path = root.path().join(name);
-        write(&model, &path);
+        write_ply(&model, &path);
         path
     };
     let above = moved("above.ply", |[x, y, z]| [x, y + 1e4, z]);
     refused(&start(&above, ""), root.path(), &["above.ply", "0 of its", "coordinates"]);
     assert!(!files(root.path()).keys().any(|name| name.starts_with("no/")));
-    // Far away, but before some camera: there it is, and it shows nothing of the photographs.
+    // So far away that some camera looks there is as good as out of view.
     let far = moved("far.ply", |[x, y, z]| [x + 1e4, y, z]);
-    let outcome = start(&far, "");
-    assert!(outcome.stdout.contains("worse than a plain colour"), "{outcome:?}");
-    let outcome = start(&file, "--overwrite");
-    assert!(!outcome.ok().stdout.contains("plain colour"));
+    refused(&start(&far, ""), root.path(), &["far.ply", "of its", "coordinates"]);
+    // In view, and nothing like the photographs; whatever the model is taken for, nothing is written.
+    let before = files(root.path());
+    let tenfold = moved("tenfold.ply", |mean| mean.map(|v| 10.0 * v));
+    let expected = ["tenfold.ply", "nothing of the photographs", "coordinates"];
+    refused(&start(&tenfold, ""), root.path(), &expected);
+    let small = root.path().join("small.ply");
+    let on = format!("--scene {} --test-every 2 --backend cpu", text(scene.path()));
+    let compress = format!("compress {} --to 50 -o {} {on}", text(&tenfold), text(&small));
+    call(&compress).refused("compress", &expected);
+    std::fs::remove_file(&tenfold).unwrap();
+    assert!(files(root.path()) == before);
+    // So little like them that it may be elsewhere.
+    let below = moved("below.ply", |[x, y, z]| [x, y + 2.0, z]);
+    let doubt = "may not be those of the dataset";
+    for words in [
+        format!("train {} -o {} -i 2 --init {}", text(scene.path()), text(&small), text(&below)),
+        format!("eval {} {on}", text(&below)),
+        format!("export {} -o {} {on}", text(&below), text(&root.path().join("again.ply"))),
+    ] {
+        let outcome = call(&words).ok();
+        assert!(outcome.stdout.contains(doubt), "{words}: {outcome:?}");
+    }
+    let outcome = start(&file, "").ok();
+    assert!(!outcome.stdout.contains("coordinates"), "{outcome:?}");
 }
