@@ -13,7 +13,7 @@ use super::{
     BLOCK_FILE, Block, Blocks, COARSE_FILE, Cell, Coarse, Ground, PLAN_FILE, block_folder,
 };
 use crate::camera::Camera;
-use crate::dataset::{Dataset, View, builtin};
+use crate::dataset::{Dataset, Part, View, builtin};
 use crate::exposure::ExposureChoice;
 use crate::failure::Failure;
 use crate::gaussians::{MAX_SH_DEGREE, sh_coefficients};
@@ -226,7 +226,7 @@ impl<'a> Planner<'a> {
             let (budget, share) = (of_all(share(&wide)), share(&cell));
             let rows = of_all(share);
             let views = self.views(&wide);
-            let train = views.iter().filter(|(_, is_train)| *is_train).count();
+            let train = views.iter().filter(|(_, part)| part.is_some()).count();
             if train == 0 || rows < LEAST_ROWS {
                 return Err(Failure::input(format!(
                     "{name} of {}x{} would have {train} training views and {rows} Gaussians, which is no model; \
@@ -237,9 +237,9 @@ impl<'a> Planner<'a> {
             let folder = block_folder(staged, &name);
             let written = fs::create_dir_all(&folder);
             written.map_err(OutputError::io("create the folder", &folder))?;
-            let names: String = views.iter().map(|(name, _)| format!("{name}\n")).collect();
+            let lines: String = views.iter().map(|(name, part)| line(name, *part)).collect();
             write_atomically(&folder.join(super::task::VIEWS_FILE), |out| {
-                out.write_all(names.as_bytes())
+                out.write_all(lines.as_bytes())
             })?;
             let share_of_views = train as f64 / self.dataset.train.len() as f64;
             let whole = f64::from(self.spec.schedule.iterations.0);
@@ -270,14 +270,16 @@ impl<'a> Planner<'a> {
         own.unwrap_or_else(cores)
     }
 
-    /// Names of the views that see a part of the ground, and whether they are trained on.
-    fn views(&self, cell: &Cell) -> Vec<(&str, bool)> {
+    /// Names of the views that see a part of the ground, and where those that are trained on do.
+    fn views(&self, cell: &Cell) -> Vec<(&str, Option<Part>)> {
         let enough =
             |[within, all]: [u32; 2]| all > 0 && f64::from(within) >= LEAST_SHARE * f64::from(all);
         let counts = self.sight.counts(self.dataset.train.len(), |at| cell.has(at));
-        let train = self.dataset.train.iter().zip(counts);
-        let train =
-            train.filter(|(_, counts)| enough(*counts)).map(|(view, _)| (&*view.name, true));
+        let parts = self.sight.parts(&self.dataset.train, |at| cell.has(at));
+        let train = self.dataset.train.iter().zip(counts).zip(parts);
+        let train = train
+            .filter(|((_, counts), _)| enough(*counts))
+            .map(|((view, _), part)| (&*view.name, part));
         // Tracks are in training views only.
         let points = &self.dataset.points.positions;
         let some = points.iter().step_by(points.len().div_ceil(2_000).max(1));
@@ -292,7 +294,7 @@ impl<'a> Planner<'a> {
                 [within + u32::from(cell.has(*at)), all + 1]
             }))
         };
-        let test = self.dataset.test.iter().filter(sees).map(|view| (&*view.name, false));
+        let test = self.dataset.test.iter().filter(sees).map(|view| (&*view.name, None));
         train.chain(test).collect()
     }
 
@@ -394,6 +396,16 @@ impl<'a> Planner<'a> {
         put(staged.join("plan.svg"), picture(blocks, &self.sight, &self.dataset))?;
         put(staged.join(PLAN_FILE), toml::to_string(blocks).map_err(Failure::input)?)?;
         Ok(())
+    }
+}
+
+/// A line of a block's list of views.
+fn line(name: &str, part: Option<Part>) -> String {
+    match part {
+        None => format!("{name}\n"),
+        Some(Part { left, top, right, bottom }) => {
+            format!("{name}\t{left:.4} {top:.4} {right:.4} {bottom:.4}\n")
+        }
     }
 }
 

@@ -5,18 +5,22 @@ use rayon::prelude::*;
 
 use super::Ground;
 use crate::camera::Camera;
-use crate::dataset::Dataset;
 use crate::dataset::normalise::median;
+use crate::dataset::{Dataset, Part, View};
 use crate::failure::Failure;
 
 /// Fewer tracks say too little.
 const ENOUGH_TRACKS: usize = 500;
+/// How far a view of a block reaches beyond the block's points, in parts of the image's sides.
+const AROUND: f64 = 0.04;
 /// Most points that are looked at, evenly chosen.
 const MOST_POINTS: usize = 20_000;
 
 /// Points on the ground, and the training views that see each.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Sight {
+    /// In the coordinates of training. Shape: `[points]`.
+    points: Vec<DVec3>,
     /// Shape: `[points]`.
     pub(super) at: Vec<[f64; 2]>,
     /// Numbers of training views. Shape: `[points]`, then views.
@@ -35,6 +39,7 @@ impl Sight {
         let tracks = &dataset.tracks;
         if tracks.positions.len() >= ENOUGH_TRACKS {
             return Ok(Self {
+                points: tracks.positions.clone(),
                 at: tracks.positions.iter().map(|&point| world(point)).collect(),
                 seen_by: tracks.views.clone(),
                 is_tracked: true,
@@ -58,6 +63,7 @@ impl Sight {
         Ok(Self {
             at: some.iter().map(|&point| world(point)).collect(),
             seen_by: some.par_iter().map(views_of).collect(),
+            points: some,
             is_tracked: false,
         })
     }
@@ -76,6 +82,39 @@ impl Sight {
             // Of points that are evenly spread, half lie in the middle half.
             4.0 * middle.and_then(off).unwrap_or_default()
         })
+    }
+
+    /// The part of each view that shows the points that `is_inside`, and a little beside them; `None` where it sees none.
+    pub(super) fn parts(
+        &self,
+        train: &[View],
+        is_inside: impl Fn([f64; 2]) -> bool,
+    ) -> Vec<Option<Part>> {
+        let mut parts = vec![None::<Part>; train.len()];
+        let inside = (0..self.at.len()).filter(|&point| is_inside(self.at[point]));
+        for (point, views) in inside.map(|point| (self.points[point], &self.seen_by[point])) {
+            for &view in views {
+                let camera = &train[view as usize].camera;
+                let pixel = camera.project(point).0;
+                let (x, y) =
+                    (pixel.x / f64::from(camera.width), pixel.y / f64::from(camera.height));
+                let part = &mut parts[view as usize];
+                let old = part.unwrap_or(Part { left: x, top: y, right: x, bottom: y });
+                *part = Some(Part {
+                    left: old.left.min(x),
+                    top: old.top.min(y),
+                    right: old.right.max(x),
+                    bottom: old.bottom.max(y),
+                });
+            }
+        }
+        let widened = |part: Part| Part {
+            left: (part.left - AROUND).clamp(0.0, 1.0 - AROUND),
+            top: (part.top - AROUND).clamp(0.0, 1.0 - AROUND),
+            right: (part.right + AROUND).clamp(AROUND, 1.0),
+            bottom: (part.bottom + AROUND).clamp(AROUND, 1.0),
+        };
+        parts.into_iter().map(|part| part.map(widened)).collect()
     }
 
     /// Of how many of the points that `is_inside` each of so many views sees how many, and how many it sees at all.
@@ -105,4 +144,40 @@ pub(super) fn shows(camera: &Camera, point: DVec3, beside: f64) -> bool {
         (-beside..size + beside).contains(&x)
     };
     depth > 0.0 && within(pixel.x, camera.width) && within(pixel.y, camera.height)
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DMat3;
+
+    use super::*;
+    use crate::dataset::LoadOptions;
+    use crate::dataset::tests::write::Made;
+
+    #[test]
+    fn a_view_has_the_part_that_shows_what_is_inside() {
+        let made = Made::colmap_txt();
+        let mut dataset = Dataset::load(made.path(), &LoadOptions::default()).expect("a dataset");
+        dataset.train.truncate(2);
+        for view in &mut dataset.train {
+            let size = (100, 50);
+            view.camera = Camera::centred(size, (100.0, 100.0), DMat3::IDENTITY, DVec3::ZERO);
+        }
+        // At x = 30, 50 and 90, in the middle of y; the last is outside, and view 1 does not see the first.
+        let sight = Sight {
+            points: vec![DVec3::new(-0.2, 0.0, 1.0), DVec3::Z, DVec3::new(0.4, 0.0, 1.0)],
+            at: vec![[0.0; 2], [0.0; 2], [9.0; 2]],
+            seen_by: vec![vec![0], vec![0, 1], vec![0, 1]],
+            is_tracked: true,
+        };
+        let near = |part: Option<Part>, expected: [f64; 4]| {
+            let Part { left, top, right, bottom } = part.expect("it is seen");
+            let is_near = |(a, b): (f64, f64)| (a - b).abs() < 1e-9;
+            assert!([left, top, right, bottom].into_iter().zip(expected).all(is_near), "{part:?}");
+        };
+        let parts = sight.parts(&dataset.train, |[x, _]| x < 1.0);
+        near(parts[0], [0.26, 0.46, 0.54, 0.54]);
+        near(parts[1], [0.46, 0.46, 0.54, 0.54]);
+        assert_eq!(sight.parts(&dataset.train, |_| false), [None, None]);
+    }
 }

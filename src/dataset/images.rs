@@ -11,6 +11,7 @@ use image::error::ImageFormatHint;
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits};
 
+use super::Window;
 use super::archive::Unpacked;
 pub use super::cache::{ImageCache, ImageDemand};
 use super::error::DatasetError;
@@ -97,9 +98,9 @@ pub struct ImageSource {
     pub file: SourceFile,
     /// What of it is hidden, if there is a file of that.
     pub mask: Option<Mask>,
-    /// Width after loading `[px]`.
+    /// Width after loading, before the window is cut out `[px]`.
     pub width: u32,
-    /// Height after loading `[px]`.
+    /// Height after loading, before the window is cut out `[px]`.
     pub height: u32,
     /// Resampling of the whole file to a pinhole, if the lens has distortion.
     pub undistortion: Option<Undistortion>,
@@ -107,6 +108,8 @@ pub struct ImageSource {
     pub header: ImageHeader,
     /// Pixels already in memory, at the size of the header; then no file is read.
     pub rendered: Option<SharedImage>,
+    /// What of the result is used, if not all.
+    pub window: Option<Window>,
 }
 
 /// The header of an image file.
@@ -134,13 +137,17 @@ impl ImageSource {
         let (width, height) = (header.width, header.height);
         let (mask, undistortion, rendered) = (None, None, None);
         let file = SourceFile::found(path).expect("an image");
-        Self { file, mask, width, height, undistortion, header, rendered }
+        Self { file, mask, width, height, undistortion, header, rendered, window: None }
     }
 
     /// Most bytes of the loaded image.
     #[must_use]
     pub fn loaded_bytes(&self) -> u64 {
-        u64::from(self.width) * u64::from(self.height) * self.channels()
+        let [width, height] = match self.window {
+            Some(window) => [window.width, window.height],
+            None => [self.width, self.height],
+        };
+        u64::from(width) * u64::from(height) * self.channels()
     }
 
     /// Most bytes used while loading, including the result.
@@ -152,9 +159,11 @@ impl ImageSource {
         let pack = self.header.decoded_bytes + packed;
         let whole = bytes(self.whole_size());
         let undistort = if self.undistortion.is_some() { packed + whole } else { packed };
-        let shrink = if self.shrinks() { whole + self.loaded_bytes() } else { whole };
+        let shrunk = bytes((self.width, self.height));
+        let shrink = if self.shrinks() { whole + shrunk } else { whole };
+        let cut = if self.window.is_some() { shrunk + self.loaded_bytes() } else { 0 };
         let turn = if self.header.turn.is_some() { 2 * self.header.decoded_bytes } else { 0 };
-        decode.max(turn).max(pack).max(undistort).max(shrink)
+        decode.max(turn).max(pack).max(undistort).max(shrink).max(cut)
     }
 
     fn channels(&self) -> u64 {
@@ -186,11 +195,19 @@ impl ImageSource {
         (self.width, self.height) != self.whole_size()
     }
 
-    /// Decodes, undistorts and shrinks. A file without a transparent pixel yields no alpha.
+    /// Decodes, undistorts, shrinks, and cuts out the window. A file without a transparent pixel yields no alpha.
     ///
     /// # Errors
     /// When a file is missing, unreadable, over the limits, or not what its header said at first.
     pub fn load(&self) -> Result<Image8, DatasetError> {
+        let image = self.load_whole()?;
+        Ok(match self.window {
+            Some(window) => image.windowed(window),
+            None => image,
+        })
+    }
+
+    fn load_whole(&self) -> Result<Image8, DatasetError> {
         let header = self.header;
         if let Some(image) = &self.rendered {
             return Ok(if self.shrinks() {

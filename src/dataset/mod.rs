@@ -30,6 +30,7 @@ mod tracks;
 mod transforms;
 pub mod undistort;
 mod wanted;
+mod window;
 
 #[cfg(test)]
 #[allow(
@@ -59,6 +60,8 @@ use normalise::Normalisation;
 pub use options::{FarCameras, LoadOptions, MaskMode, Resolution, Split};
 use paths::Root;
 pub use tracks::{MIN_VIEWS, Tracks};
+pub(crate) use window::Part;
+pub use window::Window;
 
 /// A scene ready for training: cameras and points in normalised coordinates.
 #[derive(Debug, Clone)]

@@ -266,6 +266,7 @@ fn photograph(
                 undistortion,
                 header: *header,
                 rendered: None,
+                window: None,
             },
         }
     };

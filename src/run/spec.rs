@@ -114,8 +114,9 @@ run_spec! {
         #[arg(long, value_name = "DIR")]
         images: Option<PathBuf> = None, Free;
 
-        /// Use only the views that this file names, one in each line; the others are split into training and
-        /// test views all the same, and then left out
+        /// Use only the views that this file names, one in each line, and of one that a tab and four numbers follow
+        /// only that part: left, top, right, bottom, from 0 to 1. The others are split into training and test views
+        /// all the same, and then left out
         #[arg(long, value_name = "FILE")]
         views: Option<AbsolutePath> = None, Fixed;
 

@@ -54,8 +54,16 @@ fn posed(image: Image8) -> View {
         file_bytes: 0,
     };
     let (file, rendered) = (SourceFile::rendered("made".into()), Some(Arc::new(image)));
-    let source =
-        ImageSource { file, mask: None, width, height, undistortion: None, header, rendered };
+    let source = ImageSource {
+        file,
+        mask: None,
+        width,
+        height,
+        undistortion: None,
+        header,
+        rendered,
+        window: None,
+    };
     View { name: "made".into(), camera, source }
 }
 

@@ -46,6 +46,8 @@ fn a_scene_in_blocks_becomes_one_model() {
         let views = read_text(&folder.join("blocks").join(name).join("views.txt"));
         assert!((1..=VIEWS).contains(&views.lines().count()), "{views}");
         assert!(views.lines().all(|view| view.starts_with("view_")), "{views}");
+        // Of most only the part that shows the block.
+        assert!(2 * views.matches('\t').count() > views.lines().count(), "{views}");
     }
     let waiting = ["coarse waiting", "block-0-0 waiting", "block-1-0 waiting", "merge waiting"];
     assert_eq!(status(&folder)[..4], waiting);
@@ -250,6 +252,13 @@ fn a_run_uses_only_the_views_that_are_named() {
     assert_eq!((count(&summary, "train_views"), count(&summary, "test_views")), (2, 1));
     train("view_01.png\nno.png\n").refused("an unknown view", &["line 2", "no.png", "views.txt"]);
     train("view_08.png\n").refused("nothing to train on", &["--views", "trained on"]);
+    // A part of a view, of 48 by 40 pixels.
+    let said = train("view_01.png\t0.2 0 0.9 1\n").ok().stdout;
+    assert!(said.contains("up to 35x40 px"), "{said}");
+    for wrong in ["0 0 1", "0.5 0 0.5 1", "0 0 1 1.1", "0 0 a 1"] {
+        let words = ["views.txt", "line 1", "left, top, right and bottom"];
+        train(&format!("view_01.png\t{wrong} \nview_03.png\n")).refused(wrong, &words);
+    }
     std::fs::remove_file(&file).unwrap();
     let flags = format!("--budget 200 --views {} -i 4 --overwrite", text(&file));
     call(&format!("train {} -o {} {flags}", text(scene.path()), text(&run)))

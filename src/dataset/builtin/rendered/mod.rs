@@ -205,6 +205,7 @@ fn dataset_view(name: &str, camera: Camera, frame: Frame, options: &LoadOptions)
             undistortion: None,
             header,
             rendered: Some(Arc::new(image)),
+            window: None,
         },
     }
 }
