@@ -102,7 +102,7 @@ pub(super) fn build(
     drop(model);
     if let Some(file) = file.as_deref().filter(|_| checkpoint.is_none()) {
         let shown = (spec.data.background.fixed(), setting.sh_degree);
-        require_likeness(file, backend.as_mut(), &inputs.dataset, shown, observer)?;
+        require_likeness(file, &inputs, backend.as_mut(), shown, observer)?;
     }
     let options = train_options(&inputs, &setting, rates);
     let exposures = inputs.exposure.first(spec, &inputs.dataset);

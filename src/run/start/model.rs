@@ -207,17 +207,23 @@ fn in_view(model: &Gaussians, dataset: &Dataset) -> usize {
     model.means.par_iter().filter(|mean| shows(mean)).count()
 }
 
-/// Fails where the model of `--init` shows nothing of the photographs, as one in other coordinates does.
+/// Fails where the model of `--init` shows nothing of the photographs, as one in other coordinates does. Beside frozen
+/// Gaussians it may be a small part of what is seen: then says so.
 ///
 /// # Errors
 /// Then, and when a view cannot be read or rendered.
 pub(in crate::run) fn require_likeness(
     file: &Path,
+    inputs: &Inputs<'_>,
     backend: &mut dyn Backend,
-    dataset: &Dataset,
     shown: ([f32; 3], u8),
     observer: &dyn Observer,
 ) -> Result<(), Failure> {
-    let likeness = Likeness::of(backend, &views_of(dataset, Split::Train)?, shown)?;
-    likeness.require(format_args!("--init {}", file.display()), observer)
+    let likeness = Likeness::of(backend, &views_of(&inputs.dataset, Split::Train)?, shown)?;
+    let named = format_args!("--init {}", file.display());
+    if inputs.frozen.is_some() {
+        likeness.note(named, observer);
+        return Ok(());
+    }
+    likeness.require(named, observer)
 }
