@@ -10,19 +10,20 @@ use crate::foreign;
 const MAX_BYTES: u64 = 1 << 30;
 
 /// Those of a photograph's views that are wanted; `None` where none is.
-pub(super) fn of(wanted: &mut Option<Wanted>, mut views: Vec<View>) -> Option<Vec<View>> {
+pub(super) fn of(wanted: &mut Option<Wanted>, views: Vec<View>) -> Option<Vec<View>> {
     let Some(wanted) = wanted else { return Some(views) };
     let cut = |view: View| {
         let part = wanted.part(&view.name)?;
         Some(if let Some(part) = part { view.windowed(&part) } else { view })
     };
-    views = views.into_iter().filter_map(cut).collect();
+    let views: Vec<View> = views.into_iter().filter_map(cut).collect();
     (!views.is_empty()).then_some(views)
 }
 
 /// The names in a file, and which of them are views.
 pub(super) struct Wanted {
     file: PathBuf,
+    /// By name.
     names: HashMap<String, Named>,
 }
 
