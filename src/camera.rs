@@ -56,6 +56,19 @@ impl Camera {
         (DVec2::new(self.fx * p.x / p.z + self.cx, self.fy * p.y / p.z + self.cy), p.z)
     }
 
+    /// The depth of a world point that lies before the camera and in its image, or as near to that as a share `beside` of
+    /// its sides; `None` of another.
+    #[must_use]
+    pub fn depth_in_image(&self, world: DVec3, beside: f64) -> Option<f64> {
+        let (pixel, depth) = self.project(world);
+        let within = |x: f64, size: u32| {
+            let (size, beside) = (f64::from(size), beside * f64::from(size));
+            (-beside..size + beside).contains(&x)
+        };
+        (depth > 0.0 && within(pixel.x, self.width) && within(pixel.y, self.height))
+            .then_some(depth)
+    }
+
     /// The same camera with an image of another size; intrinsics scale per axis.
     #[must_use]
     pub fn resized(&self, width: u32, height: u32) -> Self {

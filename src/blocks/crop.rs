@@ -2,7 +2,6 @@
 
 use glam::DVec3;
 
-use super::sight::shows;
 use super::{Blocks, Cell};
 use crate::camera::Camera;
 use crate::gaussians::Gaussians;
@@ -26,7 +25,7 @@ pub(super) fn beyond(
     let is_beyond = |row: &usize| !cell.has(blocks.on_ground(model.means[*row]));
     let is_seen = |row: &usize| {
         let point = DVec3::from(model.means[*row].map(f64::from));
-        cameras.iter().any(|camera| shows(camera, point, BESIDE))
+        cameras.iter().any(|camera| camera.depth_in_image(point, BESIDE).is_some())
     };
     (0..model.len()).filter(is_beyond).filter(is_seen).collect()
 }

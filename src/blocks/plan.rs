@@ -8,12 +8,12 @@ use tempfile::TempDir;
 use super::divide::cells;
 use super::options::{Grid, MOST, PlanOptions, Size};
 use super::picture::picture;
-use super::sight::{Sight, shows};
+use super::sight::Sight;
 use super::{
     BLOCK_FILE, Block, Blocks, COARSE_FILE, Cell, Coarse, Ground, PLAN_FILE, block_folder,
 };
 use crate::camera::Camera;
-use crate::dataset::{Dataset, Part, View, builtin};
+use crate::dataset::{Dataset, builtin, view_line};
 use crate::exposure::ExposureChoice;
 use crate::failure::Failure;
 use crate::gaussians::{MAX_SH_DEGREE, sh_coefficients};
@@ -25,8 +25,6 @@ use crate::run::{
     promised,
 };
 
-/// A view belongs to a block if at least this share of the points that it sees lie in the block.
-const LEAST_SHARE: f64 = 0.05;
 /// A block with fewer Gaussians is none.
 const LEAST_ROWS: usize = 100;
 /// The coarse run: its share of the rows, at least so many; its share of the iterations; width of its images `[px]`.
@@ -225,7 +223,7 @@ impl<'a> Planner<'a> {
             // As many per unit of work in the margin as in the cell.
             let (budget, share) = (of_all(share(&wide)), share(&cell));
             let rows = of_all(share);
-            let views = self.views(&wide);
+            let views = self.sight.views(&self.dataset, &self.ground, &wide);
             let train = views.iter().filter(|(_, part)| part.is_some()).count();
             if train == 0 || rows < LEAST_ROWS {
                 return Err(Failure::input(format!(
@@ -237,7 +235,7 @@ impl<'a> Planner<'a> {
             let folder = block_folder(staged, &name);
             let written = fs::create_dir_all(&folder);
             written.map_err(OutputError::io("create the folder", &folder))?;
-            let lines: String = views.iter().map(|(name, part)| line(name, *part)).collect();
+            let lines: String = views.iter().map(|(name, part)| view_line(name, *part)).collect();
             write_atomically(&folder.join(super::task::VIEWS_FILE), |out| {
                 out.write_all(lines.as_bytes())
             })?;
@@ -268,34 +266,6 @@ impl<'a> Planner<'a> {
         let own = self.spec.device.threads.map(|threads| threads.0);
         let cores = || rayon::current_num_threads().try_into().unwrap_or(1);
         own.unwrap_or_else(cores)
-    }
-
-    /// Names of the views that see a part of the ground, and where those that are trained on do.
-    fn views(&self, cell: &Cell) -> Vec<(&str, Option<Part>)> {
-        let enough =
-            |[within, all]: [u32; 2]| all > 0 && f64::from(within) >= LEAST_SHARE * f64::from(all);
-        let counts = self.sight.counts(self.dataset.train.len(), |at| cell.has(at));
-        let parts = self.sight.parts(&self.dataset.train, |at| cell.has(at));
-        let train = self.dataset.train.iter().zip(counts).zip(parts);
-        let train = train
-            .filter(|((_, counts), _)| enough(*counts))
-            .map(|((view, _), part)| (&*view.name, part));
-        // Tracks are in training views only.
-        let points = &self.dataset.points.positions;
-        let some = points.iter().step_by(points.len().div_ceil(2_000).max(1));
-        let some: Vec<_> = some
-            .map(|&point| {
-                (point, self.ground.at(self.dataset.normalisation.world_from_scene(point)))
-            })
-            .collect();
-        let sees = |view: &&View| {
-            let seen = some.iter().filter(|(point, _)| shows(&view.camera, *point, 0.0));
-            enough(seen.fold([0, 0], |[within, all], (_, at)| {
-                [within + u32::from(cell.has(*at)), all + 1]
-            }))
-        };
-        let test = self.dataset.test.iter().filter(sees).map(|view| (&*view.name, None));
-        train.chain(test).collect()
     }
 
     /// The description that all tasks share.
@@ -396,16 +366,6 @@ impl<'a> Planner<'a> {
         put(staged.join("plan.svg"), picture(blocks, &self.sight, &self.dataset))?;
         put(staged.join(PLAN_FILE), toml::to_string(blocks).map_err(Failure::input)?)?;
         Ok(())
-    }
-}
-
-/// A line of a block's list of views.
-fn line(name: &str, part: Option<Part>) -> String {
-    match part {
-        None => format!("{name}\n"),
-        Some(Part { left, top, right, bottom }) => {
-            format!("{name}\t{left:.4} {top:.4} {right:.4} {bottom:.4}\n")
-        }
     }
 }
 

@@ -1,9 +1,9 @@
 //! Which views see which points: by the tracks of a reconstruction, or else by what lies in their images.
 
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
-use super::Ground;
+use super::{Cell, Ground};
 use crate::camera::Camera;
 use crate::dataset::normalise::median;
 use crate::dataset::{Dataset, Part, View};
@@ -11,6 +11,8 @@ use crate::failure::Failure;
 
 /// Fewer tracks say too little.
 const ENOUGH_TRACKS: usize = 500;
+/// A view belongs to a block if at least this share of the points that it sees lie in the block.
+const LEAST_SHARE: f64 = 0.05;
 /// How far a view of a block reaches beyond the block's points, in parts of the image's sides.
 const AROUND: f64 = 0.04;
 /// Most points that are looked at, evenly chosen.
@@ -58,7 +60,9 @@ impl Sight {
         let cameras: Vec<Camera> = dataset.train.iter().map(|view| view.camera).collect();
         let views_of = |point: &DVec3| {
             let numbers = (0u32..).zip(&cameras);
-            numbers.filter(|(_, camera)| shows(camera, *point, 0.0)).map(|it| it.0).collect()
+            let numbers =
+                numbers.filter(|(_, camera)| camera.depth_in_image(*point, 0.0).is_some());
+            numbers.map(|it| it.0).collect()
         };
         Ok(Self {
             at: some.iter().map(|&point| world(point)).collect(),
@@ -84,66 +88,88 @@ impl Sight {
         })
     }
 
-    /// The part of each view that shows the points that `is_inside`, and a little beside them; `None` where it sees none.
-    pub(super) fn parts(
+    /// Names of the views of a dataset that see a part of the ground, and where those that are trained on do.
+    pub(super) fn views<'a>(
         &self,
-        train: &[View],
-        is_inside: impl Fn([f64; 2]) -> bool,
-    ) -> Vec<Option<Part>> {
-        let mut parts = vec![None::<Part>; train.len()];
-        let inside = (0..self.at.len()).filter(|&point| is_inside(self.at[point]));
-        for (point, views) in inside.map(|point| (self.points[point], &self.seen_by[point])) {
-            for &view in views {
-                let camera = &train[view as usize].camera;
-                let pixel = camera.project(point).0;
-                let (x, y) =
-                    (pixel.x / f64::from(camera.width), pixel.y / f64::from(camera.height));
-                let part = &mut parts[view as usize];
-                let old = part.unwrap_or(Part { left: x, top: y, right: x, bottom: y });
-                *part = Some(Part {
-                    left: old.left.min(x),
-                    top: old.top.min(y),
-                    right: old.right.max(x),
-                    bottom: old.bottom.max(y),
-                });
-            }
-        }
-        let widened = |part: Part| Part {
-            left: (part.left - AROUND).clamp(0.0, 1.0 - AROUND),
-            top: (part.top - AROUND).clamp(0.0, 1.0 - AROUND),
-            right: (part.right + AROUND).clamp(AROUND, 1.0),
-            bottom: (part.bottom + AROUND).clamp(AROUND, 1.0),
+        dataset: &'a Dataset,
+        ground: &Ground,
+        cell: &Cell,
+    ) -> Vec<(&'a str, Option<Part>)> {
+        let enough =
+            |within: u32, all: u32| all > 0 && f64::from(within) >= LEAST_SHARE * f64::from(all);
+        let seen = self.seen(&dataset.train, |at| cell.has(at));
+        let train = dataset.train.iter().zip(seen);
+        let train = train
+            .filter(|(_, seen)| enough(seen.within, seen.all))
+            .map(|(view, seen)| (&*view.name, seen.part));
+        // Tracks are in training views only.
+        let points = &dataset.points.positions;
+        let some = points.iter().step_by(points.len().div_ceil(2_000).max(1));
+        let some: Vec<_> = some
+            .map(|&point| (point, ground.at(dataset.normalisation.world_from_scene(point))))
+            .collect();
+        let sees = |view: &&View| {
+            let shown =
+                some.iter().filter(|(point, _)| view.camera.depth_in_image(*point, 0.0).is_some());
+            let [within, all] = shown.fold([0, 0], |[within, all], (_, at)| {
+                [within + u32::from(cell.has(*at)), all + 1]
+            });
+            enough(within, all)
         };
-        parts.into_iter().map(|part| part.map(widened)).collect()
+        let test = dataset.test.iter().filter(sees).map(|view| (&*view.name, None));
+        train.chain(test).collect()
     }
 
-    /// Of how many of the points that `is_inside` each of so many views sees how many, and how many it sees at all.
-    pub(super) fn counts(
-        &self,
-        views: usize,
-        is_inside: impl Fn([f64; 2]) -> bool,
-    ) -> Vec<[u32; 2]> {
-        let mut counts = vec![[0; 2]; views];
-        for (at, seen_by) in self.at.iter().zip(&self.seen_by) {
-            let inside = u32::from(is_inside(*at));
-            for &view in seen_by {
-                let [within, all] = &mut counts[view as usize];
-                *within += inside;
-                *all += 1;
+    /// What each training view sees of the points, and of those that `is_inside`.
+    fn seen(&self, train: &[View], is_inside: impl Fn([f64; 2]) -> bool) -> Vec<Seen> {
+        let mut seen = vec![Seen::default(); train.len()];
+        for ((point, at), views) in self.points.iter().zip(&self.at).zip(&self.seen_by) {
+            let is_inside = is_inside(*at);
+            for &view in views {
+                let seen = &mut seen[view as usize];
+                seen.all += 1;
+                if is_inside {
+                    seen.within += 1;
+                    let camera = &train[view as usize].camera;
+                    seen.hold(camera, camera.project(*point).0);
+                }
             }
         }
-        counts
+        for part in seen.iter_mut().filter_map(|seen| seen.part.as_mut()) {
+            *part = Part {
+                left: (part.left - AROUND).clamp(0.0, 1.0 - AROUND),
+                top: (part.top - AROUND).clamp(0.0, 1.0 - AROUND),
+                right: (part.right + AROUND).clamp(AROUND, 1.0),
+                bottom: (part.bottom + AROUND).clamp(AROUND, 1.0),
+            };
+        }
+        seen
     }
 }
 
-/// Whether a point lies in the image of a camera, or as near to it as a share of its sides.
-pub(super) fn shows(camera: &Camera, point: DVec3, beside: f64) -> bool {
-    let (pixel, depth) = camera.project(point);
-    let within = |x: f64, size: u32| {
-        let (size, beside) = (f64::from(size), beside * f64::from(size));
-        (-beside..size + beside).contains(&x)
-    };
-    depth > 0.0 && within(pixel.x, camera.width) && within(pixel.y, camera.height)
+/// What a view sees of the points.
+#[derive(Debug, Clone, Copy, Default)]
+struct Seen {
+    /// How many inside.
+    within: u32,
+    /// How many at all.
+    all: u32,
+    /// The part of the view that shows those inside, and a little beside them; `None` where it sees none.
+    part: Option<Part>,
+}
+
+impl Seen {
+    /// Widens the part to a pixel of the camera.
+    fn hold(&mut self, camera: &Camera, pixel: DVec2) {
+        let [x, y] = [pixel.x / f64::from(camera.width), pixel.y / f64::from(camera.height)];
+        let old = self.part.unwrap_or(Part { left: x, top: y, right: x, bottom: y });
+        self.part = Some(Part {
+            left: old.left.min(x),
+            top: old.top.min(y),
+            right: old.right.max(x),
+            bottom: old.bottom.max(y),
+        });
+    }
 }
 
 #[cfg(test)]
@@ -175,9 +201,11 @@ mod tests {
             let is_near = |(a, b): (f64, f64)| (a - b).abs() < 1e-9;
             assert!([left, top, right, bottom].into_iter().zip(expected).all(is_near), "{part:?}");
         };
-        let parts = sight.parts(&dataset.train, |[x, _]| x < 1.0);
-        near(parts[0], [0.26, 0.46, 0.54, 0.54]);
-        near(parts[1], [0.46, 0.46, 0.54, 0.54]);
-        assert_eq!(sight.parts(&dataset.train, |_| false), [None, None]);
+        let seen = sight.seen(&dataset.train, |[x, _]| x < 1.0);
+        near(seen[0].part, [0.26, 0.46, 0.54, 0.54]);
+        near(seen[1].part, [0.46, 0.46, 0.54, 0.54]);
+        assert_eq!([seen[0].within, seen[0].all, seen[1].within, seen[1].all], [2, 3, 1, 2]);
+        let none = sight.seen(&dataset.train, |_| false);
+        assert_eq!([none[0].part, none[1].part], [None, None]);
     }
 }

@@ -2,17 +2,14 @@
 //!
 //! Files are untrusted: sides, pixels and decoded bytes are checked before anything is allocated.
 
-use std::fs::File;
 use std::io::{BufReader, Cursor, Read};
-use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::path::Path;
 
 use image::error::ImageFormatHint;
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits};
 
 use super::Window;
-use super::archive::Unpacked;
 pub use super::cache::{ImageCache, ImageDemand};
 use super::error::DatasetError;
 use super::jpeg;
@@ -20,6 +17,7 @@ pub use super::mask::{Hides, Mask};
 use super::options::MaskMode;
 pub use super::pixels::{Image8, SharedImage};
 use super::resample;
+pub use super::source_file::SourceFile;
 use super::undistort::Undistortion;
 use crate::foreign;
 
@@ -35,61 +33,6 @@ const MAX_FILE_BYTES: u64 = MAX_DECODED_BYTES;
 const FORMATS: [ImageFormat; 3] = [ImageFormat::Jpeg, ImageFormat::Png, ImageFormat::WebP];
 /// Almost always enough of a file to hold the header.
 const HEADER_BYTES: u64 = 256 << 10;
-
-/// An image file that was found within the folder it may not leave.
-#[derive(Debug, Clone)]
-pub struct SourceFile {
-    /// Where it is, as messages show it.
-    pub path: PathBuf,
-    /// Where links led when it was checked.
-    real: Box<Path>,
-    /// The archive that it is in, if any.
-    archive: Option<Arc<Unpacked>>,
-}
-
-impl SourceFile {
-    /// The file at this path, which has been checked.
-    ///
-    /// # Errors
-    /// When it is no longer there.
-    pub fn found(path: PathBuf) -> Result<Self, DatasetError> {
-        let real = path.canonicalize().map_err(DatasetError::io(&path))?;
-        Ok(Self { path, real: real.into(), archive: None })
-    }
-
-    /// Stands for pixels that no file holds.
-    #[must_use]
-    pub fn rendered(path: PathBuf) -> Self {
-        Self { path, real: Path::new("").into(), archive: None }
-    }
-
-    /// The same, as one of an archive's files, which is named so.
-    pub(super) fn of_archive(self, archive: &Arc<Unpacked>) -> Self {
-        Self {
-            path: archive.shown(&self.path),
-            real: self.real,
-            archive: Some(Arc::clone(archive)),
-        }
-    }
-
-    /// Its length `[bytes]`; 0 if it is no longer there.
-    pub(crate) fn length(&self) -> u64 {
-        self.real.metadata().map_or(0, |data| data.len())
-    }
-
-    /// Opens it, unless links lead elsewhere by now.
-    pub(super) fn open(&self) -> Result<File, DatasetError> {
-        if self.archive.is_some() {
-            return foreign::open(&self.real).map_err(DatasetError::io(&self.path));
-        }
-        let real = self.path.canonicalize().map_err(DatasetError::io(&self.path))?;
-        if *real != *self.real {
-            let problem = "it has become a link to another file since the run began";
-            return Err(DatasetError::malformed(&self.path, "the file", problem, "restore it"));
-        }
-        foreign::open(&real).map_err(DatasetError::io(&self.path))
-    }
-}
 
 /// Where the pixels of a view come from, and how they are processed on load.
 #[derive(Debug, Clone)]
@@ -132,7 +75,7 @@ pub struct ImageHeader {
 impl ImageSource {
     /// An image file as it is.
     #[cfg(test)]
-    pub(super) fn whole(path: PathBuf) -> Self {
+    pub(super) fn whole(path: std::path::PathBuf) -> Self {
         let header = probe(&path).expect("an image");
         let (width, height) = (header.width, header.height);
         let (mask, undistortion, rendered) = (None, None, None);

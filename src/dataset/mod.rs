@@ -26,6 +26,7 @@ mod pose;
 mod prepare;
 mod realitycapture;
 mod resample;
+mod source_file;
 mod tracks;
 mod transforms;
 pub mod undistort;
@@ -60,6 +61,7 @@ use normalise::Normalisation;
 pub use options::{FarCameras, LoadOptions, MaskMode, Resolution, Split};
 use paths::Root;
 pub use tracks::{MIN_VIEWS, Tracks};
+pub(crate) use wanted::view_line;
 pub(crate) use window::Part;
 pub use window::Window;
 

@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::path::Path;
 
-use glam::{DVec2, DVec3};
+use glam::DVec3;
 
 use super::error::DatasetError;
 use super::masks::unused_masks_note;
@@ -131,10 +131,7 @@ pub(super) fn assemble(
     })?;
     // Of several views of a photograph, the one that shows the point.
     let shows = |number: u32, point: DVec3| {
-        let camera = &train[number as usize].camera;
-        let (pixel, depth) = camera.project(point);
-        let size = DVec2::new(f64::from(camera.width), f64::from(camera.height));
-        depth > 0.0 && (pixel.cmpge(DVec2::ZERO) & pixel.cmplt(size)).all()
+        train[number as usize].camera.depth_in_image(point, 0.0).is_some()
     };
     let tracks = tracks.in_training_views(&normalisation, |id, point| {
         let mut numbers = numbers_of.get(&id)?.clone();

@@ -8,6 +8,8 @@ use crate::foreign;
 
 /// Most bytes of such a file: millions of names.
 const MAX_BYTES: u64 = 1 << 30;
+/// What stands between a name and a part.
+const TAB: char = '\t';
 
 /// Those of a photograph's views that are wanted; `None` where none is.
 pub(super) fn of(wanted: &mut Option<Wanted>, views: Vec<View>) -> Option<Vec<View>> {
@@ -44,9 +46,9 @@ impl Wanted {
             .map_err(|error| DatasetError(format!("--views {}: {error}", file.display())))?;
         let lines = text.lines().map(str::trim).zip(1..).filter(|(text, _)| !text.is_empty());
         let named = lines.map(|(text, line)| {
-            let (name, part) = match text.split_once('\t') {
+            let (name, part) = match text.split_once(TAB) {
                 None => (text, None),
-                Some((name, part)) => (name.trim_end(), Some(parse(part).ok_or(line)?)),
+                Some((name, part)) => (name.trim_end(), Some(part.parse().map_err(|_| line)?)),
             };
             Ok((name.to_owned(), Named { line, part, is_there: false }))
         });
@@ -88,10 +90,8 @@ impl Wanted {
     }
 }
 
-/// Four numbers: left, top, right and bottom.
-fn parse(text: &str) -> Option<Part> {
-    let numbers: Vec<f64> =
-        text.split_whitespace().map(str::parse).collect::<Result<_, _>>().ok()?;
-    let [left, top, right, bottom] = numbers[..] else { return None };
-    Some(Part { left, top, right, bottom }).filter(Part::is_valid)
+/// The line that names a view, and the part of it that is used, if not all.
+pub(crate) fn view_line(name: &str, part: Option<Part>) -> String {
+    let part = part.map_or_else(String::new, |part| format!("{TAB}{part}"));
+    format!("{name}{part}\n")
 }

@@ -1,5 +1,8 @@
 //! Parts of images: a view that is a window into a photograph, as a block of a large scene shows in it.
 
+use std::fmt;
+use std::str::FromStr;
+
 use super::View;
 use super::pixels::Image8;
 use crate::camera::Camera;
@@ -29,9 +32,28 @@ pub struct Window {
     pub height: u32,
 }
 
+/// Left, top, right and bottom.
+impl fmt::Display for Part {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { left, top, right, bottom } = self;
+        write!(out, "{left:.4} {top:.4} {right:.4} {bottom:.4}")
+    }
+}
+
+impl FromStr for Part {
+    type Err = ();
+
+    fn from_str(text: &str) -> Result<Self, ()> {
+        let numbers: Result<Vec<f64>, _> = text.split_whitespace().map(str::parse).collect();
+        let [left, top, right, bottom] = numbers.map_err(|_| ())?[..] else { return Err(()) };
+        let part = Self { left, top, right, bottom };
+        if part.is_valid() { Ok(part) } else { Err(()) }
+    }
+}
+
 impl Part {
     /// Whether its sides are in order, and in the image.
-    pub(crate) fn is_valid(&self) -> bool {
+    fn is_valid(&self) -> bool {
         let is_span = |from: f64, to: f64| 0.0 <= from && from < to && to <= 1.0;
         is_span(self.left, self.right) && is_span(self.top, self.bottom)
     }

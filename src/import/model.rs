@@ -8,7 +8,6 @@ use std::path::Path;
 use crate::dataset::DatasetError;
 use crate::foreign;
 use crate::gaussians::{Gaussians, logit, sh_coefficients};
-use crate::output::{model_path, saved_iterations};
 
 /// Fraction of the rows that may be unusable.
 const MAX_BAD_ROWS: f64 = 0.01;
@@ -46,12 +45,8 @@ pub fn read_model(path: &Path) -> Result<SplatFile, DatasetError> {
     if path.is_dir() {
         let meta = path.join("meta.json");
         if !meta.is_file() {
-            let remedy = match saved_iterations(path).ok().and_then(|saved| saved.last().copied()) {
-                Some(last) => format!("its model is {}", model_path(path, last).display()),
-                None => "name a file of Gaussian splats".to_owned(),
-            };
             return Err(DatasetError(format!(
-                "{} is a folder without meta.json, which a SOG folder has; {remedy}",
+                "{} is a folder without meta.json, which a SOG folder has; name a file of Gaussian splats",
                 path.display()
             )));
         }

@@ -157,7 +157,7 @@ fn stem(model: &Path) -> String {
         0 => name.rfind('.').unwrap_or(name.len()),
         _ => name.len() - known,
     };
-    name[..end].to_owned()
+    if end == 0 { "model".to_owned() } else { name[..end].to_owned() }
 }
 
 /// The format that the name of an output says.

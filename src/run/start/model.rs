@@ -16,7 +16,7 @@ use crate::likeness::Likeness;
 use crate::memory::RunSize;
 use crate::number::grouped;
 use crate::run::config::ModelSize;
-use crate::run::finished::{read_model, views_of};
+use crate::run::finished::{model_file, read_model, views_of};
 use crate::run::observer::{Observer, Silent};
 use crate::run::resolve::Inputs;
 use crate::run::values::AbsolutePath;
@@ -48,8 +48,14 @@ pub(in crate::run) fn size_of_model(
 }
 
 fn read(flag: &str, file: &Path, observer: &dyn Observer) -> Result<Gaussians, Failure> {
-    read_model(file, observer)
-        .map_err(|failure| Failure { message: format!("{flag}: {}", failure.message), ..failure })
+    read_model(file, observer).map_err(|failure| {
+        let failure = Failure { message: format!("{flag}: {}", failure.message), ..failure };
+        match model_file(file, None) {
+            // The folder of a run.
+            Ok(model) if model != file => failure.and(&format!("its model is {}", model.display())),
+            _ => failure,
+        }
+    })
 }
 
 /// Bytes of a model's rows as they are read.
@@ -196,12 +202,8 @@ fn in_view(model: &Gaussians, dataset: &Dataset) -> usize {
     let shows = |mean: &[f32; 3]| {
         let point = DVec3::from(mean.map(f64::from));
         dataset.train.iter().any(|view| {
-            let camera = &view.camera;
-            let (pixel, depth) = camera.project(point);
-            let within = |x: f64, size: u32| (0.0..f64::from(size)).contains(&x);
-            (0.0..FARTHEST * EXTENT).contains(&depth)
-                && within(pixel.x, camera.width)
-                && within(pixel.y, camera.height)
+            let depth = view.camera.depth_in_image(point, 0.0);
+            depth.is_some_and(|depth| depth < FARTHEST * EXTENT)
         })
     };
     model.means.par_iter().filter(|mean| shows(mean)).count()

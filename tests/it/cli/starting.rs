@@ -194,6 +194,8 @@ fn what_cannot_be_started_from_is_refused_or_named() {
     refused(&start(&absent, ""), root.path(), &["--init", "absent.ply"]);
     let photograph = scene.file("images/view_00.png");
     refused(&start(&photograph, ""), root.path(), &["--init", "view_00.png"]);
+    let saved = text(&file).to_owned();
+    refused(&start(&run, ""), root.path(), &["--init", "meta.json", &saved]);
     refused(&start(&file, "--init-points 9"), root.path(), &["--init-points 9", "random"]);
     let cut = root.path().join("cut.ply");
     std::fs::write(&cut, &read(&file)[..2_000]).unwrap();
