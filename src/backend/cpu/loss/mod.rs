@@ -5,7 +5,8 @@
 //! SSIM = (1 − μₑ²/A)·(1 − Var(e)/B), A = μₓ² + μᵧ² + C₁, B = Var(x) + Var(y) + C₂.
 //! Where the images agree it is 1 to the last bit; the usual form is off by up to 4e-7 there, and
 //! its gradient is noise. The identity holds for any linear window, also where zero padding takes
-//! part of the window's weight.
+//! part of the window's weight. Var(x) + Var(y) is 2·Cov(x, y) + Var(e), so that four means under the
+//! window are enough: of e, y, e² and x·y.
 //!
 //! Variances do not change when a constant is taken from y, if it is taken from the padding, too. With
 //! y − ½ they lose two bits less to rounding.
@@ -32,7 +33,7 @@ use super::tiles::{Grid, TILE};
 use crate::dataset::images::Image8;
 use pixel_weights::PixelWeights;
 use window::{
-    Line, LinePerRow, Near, Segments, TOGETHER, horizontal, vertical, vertical_of_product,
+    Line, LinePerRow, Near, Segments, TOGETHER, horizontal, vertical, vertical_with_product,
     vertical_with_square,
 };
 
@@ -46,8 +47,8 @@ const MIDDLE: f32 = 0.5;
 const STRIP: usize = TILE;
 /// Rows per strip elsewhere.
 const SHORT_STRIP: usize = TOGETHER;
-/// Lines that are convolved vertically for each row: of e, y, e², y² and e·y.
-const CONVOLVED: usize = 5;
+/// Lines that are convolved vertically for each row: of e, y, e² and x·y.
+const CONVOLVED: usize = 4;
 /// Lines of scratch of a pass, at most: those, and what is outside the image of e and of y.
 const MOST_LINES: usize = CONVOLVED * TOGETHER + 2;
 
@@ -368,7 +369,7 @@ impl WithSimd for Similarity<'_> {
         let [p1, p2, p3] = derivatives;
         let (length, pitch) = (segments.length(), segments.pitch());
         let rows = p1.len() / pitch;
-        let ([no_e, no_y], [mut of_e, mut of_y, mut of_ee, mut of_yy, mut of_ey]) =
+        let ([no_e, no_y], [mut of_e, mut of_y, mut of_ee, mut of_xy]) =
             scratch_lines::<2, CONVOLVED>(scratch, segments);
         no_e.fill([0.0; WIDTH]);
         no_y.fill([-MIDDLE; WIDTH]);
@@ -378,20 +379,18 @@ impl WithSimd for Similarity<'_> {
             if row % TOGETHER == 0 {
                 let near_e = Near::new(segments, e, no_e, first + row);
                 let near_y = Near::new(segments, y, no_y, first + row);
-                // One after the other: all five sums of four rows would not stay in the registers.
+                // One after the other: all four sums of four rows would not stay in the registers.
                 vertical_with_square(s, &near_e, [&mut of_e, &mut of_ee]);
-                vertical_with_square(s, &near_y, [&mut of_y, &mut of_yy]);
-                vertical_of_product(s, [&near_e, &near_y], &mut of_ey);
+                vertical_with_product(s, [&near_y, &near_e], [&mut of_y, &mut of_xy]);
                 for row in 0..TOGETHER {
                     segments.pad(of_e[row], 0.0);
                     segments.pad(of_y[row], -MIDDLE);
                     segments.pad(of_ee[row], 0.0);
-                    segments.pad(of_yy[row], MIDDLE * MIDDLE);
-                    segments.pad(of_ey[row], 0.0);
+                    segments.pad(of_xy[row], MIDDLE * MIDDLE);
                 }
             }
             let n = row % TOGETHER;
-            let lines: [&Line; CONVOLVED] = [of_e[n], of_y[n], of_ee[n], of_yy[n], of_ey[n]];
+            let lines: [&Line; CONVOLVED] = [of_e[n], of_y[n], of_ee[n], of_xy[n]];
             let here = row * pitch;
             let of_row = p1[here..here + length].as_chunks_mut::<2>().0.iter_mut();
             let of_row = of_row.zip(p2[here..here + length].as_chunks_mut::<2>().0);
@@ -400,11 +399,11 @@ impl WithSimd for Similarity<'_> {
             let (mut row_l1, mut row_ssim) = (V::zero(s), V::zero(s));
             for (pair, (((p1, p2), p3), e)) in of_row.enumerate() {
                 for lane in (0..WIDTH).step_by(S::F32_LANES) {
-                    let [mu_e, mu_y, ee, yy, ey] = each!(k in 5 => {
+                    let [mu_e, mu_y, ee, xy] = each!(k in 4 => {
                         horizontal::<S, 2, 12>(s, around(lines[k], 2 * pair), lane)
                     });
                     for n in 0..2 {
-                        let means = [mu_e[n], mu_y[n], ee[n], yy[n], ey[n]];
+                        let means = [mu_e[n], mu_y[n], ee[n], xy[n]];
                         let Similar { ssim, by_mu_e, by_ee, by_ey } = Similar::of(s, means);
                         let i = 2 * pair + n;
                         let inside = (V::load(s, &firsts[lane..]) + i as f32).lt(width);
@@ -445,18 +444,17 @@ struct Similar<S: Simd> {
 }
 
 impl<S: Simd> Similar<S> {
-    /// From μₑ, the mean of y − ½, and those of e², (y − ½)² and e·(y − ½).
+    /// From μₑ, the mean of y − ½, and those of e² and (x − ½)·(y − ½).
     #[inline(always)]
-    fn of(s: S, [mu_e, middle, mean_ee, mean_yy, mean_ey]: [V<S>; 5]) -> Self {
+    fn of(s: S, [mu_e, middle, mean_ee, mean_xy]: [V<S>; 4]) -> Self {
         let c = |x: f32| V::splat(s, x);
         let mu_y = middle + MIDDLE;
         let mu_x = mu_e + mu_y;
         let var_e = (mean_ee - mu_e * mu_e).max(V::zero(s));
-        let var_y = (mean_yy - middle * middle).max(V::zero(s));
-        let cov = mean_ey - mu_e * middle;
-        let var_x = (var_y + cov * 2.0 + var_e).max(V::zero(s));
+        let cov = mean_xy - (middle + mu_e) * middle;
+        let variances = (cov * 2.0 + var_e).max(V::zero(s));
         // One division for both inverses: at least C₁·C₂ = 9e-8 is far from f32's least.
-        let (a, b) = (mu_x * mu_x + mu_y * mu_y + C1, var_x + var_y + C2);
+        let (a, b) = (mu_x * mu_x + mu_y * mu_y + C1, variances + C2);
         let inv_ab = c(1.0) / (a * b);
         let (inv_a, inv_b) = (inv_ab * b, inv_ab * a);
         let luminance = c(1.0) - mu_e * mu_e * inv_a;

@@ -247,18 +247,25 @@ pub(super) fn vertical_with_square<S: Simd>(
     }
 }
 
-/// Convolves the product of two planes vertically.
+/// Convolves a plane vertically, and its product with its sum with another.
 #[inline(always)]
-pub(super) fn vertical_of_product<S: Simd>(s: S, [a, b]: [&Near<'_>; 2], to: &mut LinePerRow<'_>) {
-    let length = a.0[0].len();
-    let (a, b) = (cut!(a, length), cut!(b, length));
-    let to = cut!(mut to, length);
+pub(super) fn vertical_with_product<S: Simd>(
+    s: S,
+    [plane, other]: [&Near<'_>; 2],
+    [to, product]: [&mut LinePerRow<'_>; 2],
+) {
+    let length = plane.0[0].len();
+    let (plane, other) = (cut!(plane, length), cut!(other, length));
+    let (to, product) = (cut!(mut to, length), cut!(mut product, length));
     for i in 0..length {
         for lane in (0..WIDTH).step_by(S::F32_LANES) {
-            let x = near!(d => V::load(s, &a[d][i][lane..]) * V::load(s, &b[d][i][lane..]));
+            let x = near!(d => V::load(s, &plane[d][i][lane..]));
             let sums = convolved(s, &x);
+            let x = near!(d => x[d] * (x[d] + V::load(s, &other[d][i][lane..])));
+            let products = convolved(s, &x);
             for row in 0..TOGETHER {
                 sums[row].store(&mut to[row][i][lane..]);
+                products[row].store(&mut product[row][i][lane..]);
             }
         }
     }
