@@ -12,9 +12,9 @@ use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 use std::time::Duration;
 
-use densify::backend::Backend;
-use densify::backend::Setup;
-use densify::backend::cpu::{CpuBackend, StepTasks};
+use densify::render::Backend;
+use densify::render::Setup;
+use densify::render::cpu::{CpuBackend, StepTasks};
 use densify_policies::policy::{CandidateRequest, DepthMode, ErrorMode, Needs, Signal, SignalSet};
 
 use steps::{median, ms};

@@ -13,9 +13,9 @@ use std::hint::black_box;
 use std::time::{Duration, Instant};
 
 use cpu_time::ProcessTime;
-use densify::backend::cpu::{CpuBackend, InstructionSet};
-use densify::backend::gpu::{GpuBackend, GpuDevice, adapters};
-use densify::backend::{AdapterChoice, AdapterKind, Backend, BackendError, Setup};
+use densify::render::cpu::{CpuBackend, InstructionSet};
+use densify::render::gpu::{GpuBackend, GpuDevice, adapters};
+use densify::render::{AdapterChoice, AdapterKind, Backend, BackendError, Setup};
 use pulp::{Arch, Simd, WithSimd};
 use steps::{median, ms};
 

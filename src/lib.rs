@@ -24,52 +24,29 @@
 //! # }
 //! ```
 //!
-//! Features, all on by default: `formats` (models in other formats than PLY), `gpu` (the GPU backend),
-//! `scenegen` (built-in scenes and known surfaces), `selftest` (the float64 renderer and the command
-//! that compares with it), `study` (`compare`, `trade` and `report`), `view` (a page in the browser).
+//! The layers are packages of their own, and each knows only those below it:
+//!
+//! | package | what it is | may know |
+//! |---|---|---|
+//! | [`cli`] | arguments and words | all below |
+//! | [`blocks`], [`compress`], [`launch`], … | tools over many runs, or after one | `run` and below |
+//! | [`run`] | a run as data: asked, decided, running | all below |
+//! | [`train`] | the loop, schedule, metrics, checkpoints | all below |
+//! | [`render`] | rasterisers, native and on a GPU | `core`, policies, shaders |
+//! | [`data`] | datasets and models as files | `core`, scene generator |
+//! | [`core`] | cameras, Gaussians, ledger, whole files | nothing of this workspace |
+//!
+//! Features, all on by default: `gpu` (the GPU backend), `selftest` (the float64 renderer and the command that
+//! compares with it), `study` (`compare`, `trade` and `report`), `view` (a page in the browser).
 
-mod animation;
-pub mod backend;
-#[cfg(any(feature = "formats", feature = "study"))]
-mod base64;
-pub mod blocks;
-pub mod camera;
-pub mod checkpoint;
-pub mod cli;
-pub mod compress;
-pub mod dataset;
-pub mod engine;
-pub mod evaluate;
-pub mod export;
-pub mod exposure;
-pub mod failure;
-pub mod flight;
-mod foreign;
-pub mod gaussians;
-#[cfg(feature = "study")]
-mod html;
-pub mod import;
-pub mod importance;
-pub mod init;
-pub mod knobs;
-mod likeness;
-pub mod memory;
-pub mod metrics;
-mod number;
-pub mod output;
-mod pictures;
-#[cfg(feature = "study")]
-mod report;
-pub mod run;
-pub mod schedule;
-pub mod sh;
-pub mod spread;
-#[cfg(feature = "study")]
-pub(crate) mod study;
-pub mod trainer;
+pub use densify_blocks as blocks;
+pub use densify_cli as cli;
+pub use densify_compress as compress;
+pub use densify_core as core;
+pub use densify_data as data;
+pub use densify_launch as launch;
+pub use densify_render as render;
+pub use densify_run as run;
 #[cfg(feature = "selftest")]
-pub mod verify;
-#[cfg(feature = "view")]
-pub(crate) mod view;
-pub mod views;
-mod without;
+pub use densify_selftest as selftest;
+pub use densify_train as train;

@@ -2,10 +2,10 @@
 
 use std::time::Duration;
 
-use densify::backend::{LearningRates, StepInput};
-use densify::camera::Camera;
-use densify::dataset::images::Image8;
-use densify::gaussians::{Gaussians, sh_coefficients};
+use densify::core::camera::Camera;
+use densify::core::gaussians::{Gaussians, sh_coefficients};
+use densify::core::image::Image8;
+use densify::render::{LearningRates, StepInput};
 use densify_policies::policy::{Cadence, LossTerms};
 use glam::{DMat3, DVec3};
 use rand::{RngExt, SeedableRng};

@@ -9,14 +9,16 @@ use super::console::Console;
 use super::export::{check_output, format_of};
 use super::flags::words;
 use super::train::Follower;
-use crate::blocks::{
-    self, Block, Blocks, Grid, PlanOptions, Size, State, Task, merge, plan, status, submit,
+use densify_blocks as blocks;
+use densify_blocks::{
+    Block, Blocks, Grid, PlanOptions, Size, State, Task, merge, plan, status, submit,
 };
-use crate::engine::{Engine, SubmissionArgs};
-use crate::failure::Failure;
-use crate::memory::Bytes;
-use crate::number::{self, grouped};
-use crate::run::{ByteCount, Fraction, Rows, Threads};
+use densify_core::memory::Bytes;
+use densify_core::numbers;
+use densify_core::numbers::grouped;
+use densify_launch::{Engine, SubmissionArgs};
+use densify_run::failure::Failure;
+use densify_run::{ByteCount, Fraction, Rows, Threads};
 
 /// Trains a large scene in blocks, on one machine or on a cluster, and merges them.
 ///
@@ -256,7 +258,7 @@ fn run_merge(args: &MergeArgs, console: &Console) -> Result<(), Failure> {
         "{} ({}): {} Gaussians, {}",
         args.output.display(),
         format.name,
-        number::grouped(merged.rows),
+        numbers::grouped(merged.rows),
         Bytes(merged.bytes)
     ));
     Ok(())

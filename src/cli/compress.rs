@@ -9,12 +9,13 @@ use super::console::Console;
 use super::export::{check_output, format_of};
 use super::render::{RenderingArgs, refuse_options_of_a_file};
 use super::train::Follower;
-use crate::compress::{Attempt, Compressed, Options, Target, compress, file};
-use crate::export::{Format, find};
-use crate::failure::Failure;
-use crate::number::{self, grouped, percent};
-use crate::run::finished::{is_model, model_file};
-use crate::run::{RunConfig, Whole};
+use densify_compress::{Attempt, Compressed, Options, Target, compress, file};
+use densify_core::numbers;
+use densify_core::numbers::{grouped, percent};
+use densify_data::export::{Format, find};
+use densify_run::failure::Failure;
+use densify_run::finished::{is_model, model_file};
+use densify_run::{RunConfig, Whole};
 
 /// Makes a trained model smaller: as many Gaussians as asked, or a file no larger than asked.
 ///
@@ -82,8 +83,8 @@ impl FromStr for Size {
     fn from_str(text: &str) -> Result<Self, String> {
         let is_bytes = text.trim_end().ends_with(['b', 'B']);
         let target = match is_bytes {
-            true => number::bytes(text).map(Target::Bytes),
-            false => number::rows(text).map(Target::Rows),
+            true => numbers::bytes(text).map(Target::Bytes),
+            false => numbers::rows(text).map(Target::Rows),
         };
         let wrong = |error| {
             format!("{error}; give a size such as 5MiB, or a number of Gaussians such as 20k")

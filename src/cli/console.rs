@@ -9,9 +9,9 @@ use tracing_subscriber::filter::Targets;
 use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 
-use crate::failure::{Failure, OTHER};
-use crate::foreign;
-use crate::run::Observer;
+use densify_core::files;
+use densify_run::Observer;
+use densify_run::failure::{Failure, OTHER};
 
 /// Shown unless `RUST_LOG` says otherwise: what densify and its policies log.
 const LOG_FILTER: &str = "warn,densify=info,densify_policies=info";
@@ -71,7 +71,7 @@ impl Console {
     pub(super) fn result(&self, line: impl fmt::Display) {
         let written = self.bars.suspend(|| {
             let mut out = io::stdout().lock();
-            writeln!(out, "{}", foreign::lines(&line.to_string())).and_then(|()| out.flush())
+            writeln!(out, "{}", files::lines(&line.to_string())).and_then(|()| out.flush())
         });
         match written {
             // A reader that has gone away wants no more; that is no failure.
@@ -102,7 +102,7 @@ impl Console {
 
     /// What goes wrong, on standard error.
     pub(super) fn error(&self, failure: &Failure) {
-        let message = foreign::lines(&failure.message);
+        let message = files::lines(&failure.message);
         self.bars.suspend(|| {
             let _ = writeln!(io::stderr().lock(), "error: {message}");
         });

@@ -3,12 +3,12 @@
 use clap::Args;
 
 use super::console::Console;
-use crate::backend::AdapterKind;
-use crate::backend::gpu::adapters;
-use crate::failure::Failure;
-use crate::gaussians::MAX_SH_DEGREE;
-use crate::memory::Bytes;
-use crate::number::grouped;
+use densify_core::gaussians::MAX_SH_DEGREE;
+use densify_core::memory::Bytes;
+use densify_core::numbers::grouped;
+use densify_render::AdapterKind;
+use densify_render::gpu::adapters;
+use densify_run::failure::Failure;
 
 /// Lists the adapters that can train and render, with their limits.
 ///

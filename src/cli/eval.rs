@@ -9,15 +9,15 @@ use clap::{ArgMatches, Args};
 use super::console::Console;
 use super::limits::{self, Limit};
 use super::render::{Named, RenderingArgs};
-use crate::evaluate::{Comparison, FittedScore, Mean, Split, evaluate};
-use crate::failure::Failure;
-use crate::likeness::Likeness;
-use crate::metrics::Lpips;
-use crate::metrics::geometry::{self, Geometry};
-use crate::number::{grouped, percent};
-use crate::output::{write_geometry, write_scores};
-use crate::run::RunConfig;
-use crate::run::finished::{is_model, iteration};
+use densify_core::numbers::{grouped, percent};
+use densify_run::RunConfig;
+use densify_run::failure::Failure;
+use densify_run::finished::{is_model, iteration};
+use densify_run::likeness::Likeness;
+use densify_train::evaluate::{Comparison, FittedScore, Mean, Split, evaluate};
+use densify_train::metrics::Lpips;
+use densify_train::metrics::geometry::{self, Geometry};
+use densify_train::output::{write_geometry, write_scores};
 
 /// Measures a model against the photographs of its scene: PSNR, SSIM, FLIP, and LPIPS on request.
 ///

@@ -10,16 +10,17 @@ use clap::Args;
 use super::console::Console;
 use super::render::{Extras, write_pictures};
 use crate::animation::{self, Animation};
-use crate::backend::Backend;
-use crate::camera::Camera;
-use crate::dataset::normalise::Normalisation;
-use crate::failure::{DEVICE, Failure, OTHER};
-use crate::flight::{self, SavedFlight};
-use crate::foreign::one_line;
-use crate::memory::Bytes;
-use crate::output::write_atomically;
-use crate::pictures::picture;
-use crate::run::finished::Opened;
+use densify_core::camera::Camera;
+use densify_core::camera_path;
+use densify_core::camera_path::SavedFlight;
+use densify_core::files::one_line;
+use densify_core::files::write_atomically;
+use densify_core::memory::Bytes;
+use densify_data::dataset::normalise::Normalisation;
+use densify_render::Backend;
+use densify_run::failure::{DEVICE, Failure, OTHER};
+use densify_run::finished::Opened;
+use densify_train::pictures::picture;
 
 /// Most frames of a flight.
 const MOST_FRAMES: u32 = 100_000;
@@ -84,13 +85,15 @@ impl FromStr for Size {
         let sides = text.split_once('x').map(|(width, height)| [width, height].map(str::parse));
         match sides {
             Some([Ok(width), Ok(height)])
-                if [width, height].iter().all(|side| (1..=flight::MOST_SIDE).contains(side)) =>
+                if [width, height]
+                    .iter()
+                    .all(|side| (1..=camera_path::MOST_SIDE).contains(side)) =>
             {
                 Ok(Self(width, height))
             }
             _ => Err(format!(
                 "give WIDTHxHEIGHT, such as 640x480, each from 1 to {}",
-                flight::MOST_SIDE
+                camera_path::MOST_SIDE
             )),
         }
     }
@@ -175,10 +178,10 @@ pub(super) fn run(
     let first = cameras.first().map(|first| (first.width, first.height));
     let own = |flight| SavedFlight { flight, frames: FRAMES, fps: None, size: None };
     let (saved, in_world) = match route {
-        Route::Orbit => (own(flight::orbit(&cameras)), false),
-        Route::Spiral => (own(flight::spiral(&cameras)), false),
+        Route::Orbit => (own(camera_path::orbit(&cameras)), false),
+        Route::Spiral => (own(camera_path::spiral(&cameras)), false),
         Route::File(path) => {
-            (flight::read(path).map_err(|e| Failure::input(format!("--path: {e}")))?, true)
+            (camera_path::read(path).map_err(|e| Failure::input(format!("--path: {e}")))?, true)
         }
     };
     let SavedFlight { flight, frames, fps, size } = saved;

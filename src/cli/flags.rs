@@ -6,8 +6,8 @@ use clap::parser::ValueSource;
 use clap::{Arg, ArgMatches, Args, Command, FromArgMatches};
 use toml::{Table, Value};
 
-use crate::failure::Failure;
-use crate::run::{Partial, RunSpec};
+use densify_run::failure::Failure;
+use densify_run::{Partial, RunSpec};
 
 /// Gives every option of a run in `command` the default that [`RunSpec`] has for it.
 pub(super) fn with_defaults(command: Command) -> Command {
@@ -63,7 +63,7 @@ pub(super) fn check_policy(flags: &Partial, spec: &RunSpec) -> Result<(), Failur
 pub(super) fn markdown() -> String {
     use std::fmt::Write as _;
 
-    use crate::run::{OPTIONS, OnResume};
+    use densify_run::{OPTIONS, OnResume};
 
     let command = with_defaults(RunSpec::augment_args(Command::new("train")));
     let mut text = String::from(

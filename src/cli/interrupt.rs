@@ -7,7 +7,7 @@ use std::sync::{Arc, OnceLock};
 use signal_hook::consts::{SIGINT, SIGTERM};
 use signal_hook::flag;
 
-use crate::run::Interrupt;
+use densify_run::Interrupt;
 
 /// What the shell adds to a signal's number for the exit code of a process that it has ended.
 const BY_SIGNAL: i32 = 128;

@@ -3,9 +3,9 @@
 use clap::Args;
 
 use super::console::Console;
-use crate::backend::BackendKind;
-use crate::failure::Failure;
-use crate::knobs::{Class, KNOBS, Knob, Measured, PRESETS};
+use densify_render::BackendKind;
+use densify_run::failure::Failure;
+use densify_run::knobs::{Class, KNOBS, Knob, Measured, PRESETS};
 
 /// Lists the knobs: every setting that trades speed or memory for accuracy.
 ///

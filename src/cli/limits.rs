@@ -6,10 +6,9 @@ use std::str::FromStr;
 
 use serde_json::Value;
 
-use crate::evaluate::Mean;
-use crate::failure::{Failure, LIMIT};
-use crate::metrics::geometry::{Geometry, ThinRecall};
-use crate::without::without;
+use densify_run::failure::{Failure, LIMIT};
+use densify_train::evaluate::Mean;
+use densify_train::metrics::geometry::{Geometry, ThinRecall};
 
 /// A bound on a measured value.
 #[derive(Debug, Clone, PartialEq)]
@@ -92,12 +91,10 @@ pub(super) fn check_keys(
 fn unknown(flag: &str, key: &str, known: &BTreeMap<String, f64>) -> Failure {
     let names: Vec<&str> = known.keys().map(String::as_str).collect();
     let geometry = match known.contains_key("depth.rmse") {
-        true => String::new(),
-        false if cfg!(feature = "scenegen") => {
+        true => "",
+        false => {
             "; geometry is known of built-in scenes, and of those that `densify scenegen` wrote"
-                .into()
         }
-        false => format!("; {}", without("scenegen", "geometry is not measured")),
     };
     let names = names.join(", ");
     let lpips = if key == "lpips" { "; LPIPS is measured with --lpips FILE" } else { "" };

@@ -4,8 +4,8 @@ use clap::ArgMatches;
 
 use super::console::Console;
 use super::train::{Follower, TrainArgs};
-use crate::failure::Failure;
-use crate::run::plan;
+use densify_run::failure::Failure;
+use densify_run::plan;
 
 /// Prints the ledger of a run, and what else its memory could hold. Writes nothing.
 pub(super) fn run(
@@ -21,7 +21,7 @@ pub(super) fn run(
     }
     let follower = Follower::new(console);
     let (spec, _) = args.describe(matches, &follower)?;
-    let plan = plan(&spec, &follower)?;
+    let plan = plan(&spec, args.companion(), &follower)?;
     for line in &plan.lines {
         console.result(line);
     }

@@ -4,7 +4,7 @@ use clap::Args;
 use densify_policies::registry::{find, policies};
 
 use super::console::Console;
-use crate::failure::Failure;
+use densify_run::failure::Failure;
 
 /// Lists the density-control policies, or explains one.
 ///

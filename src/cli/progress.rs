@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressState, ProgressStyle};
 
 use super::console::Console;
-use crate::number::{duration, grouped};
+use densify_core::numbers::{duration, grouped};
 
 /// Time between two lines where there is no terminal.
 const LINE: Duration = Duration::from_secs(30);

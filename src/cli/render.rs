@@ -9,19 +9,19 @@ use image::{DynamicImage, ImageBuffer, Luma};
 
 use super::console::Console;
 use super::film::{self, FilmArgs, Filmed, Route};
-use crate::backend::Rendering;
+use densify_render::Rendering;
 
-use crate::dataset::images::Image8;
-use crate::dataset::normalise::Normalisation;
-use crate::evaluate::Split;
-use crate::failure::Failure;
-use crate::output::write_json;
-use crate::pictures::{photograph, picture, side_by_side, to_u8, write_png};
-use crate::run::finished::{
+use densify_core::image::Image8;
+use densify_data::dataset::normalise::Normalisation;
+use densify_data::views::ViewSource;
+use densify_run::failure::Failure;
+use densify_run::finished::{
     Machine, Opened, is_model, iteration, model_file, open, open_alone, open_run,
 };
-use crate::run::{DataSpec, DeviceSpec, Fraction, RunConfig};
-use crate::views::ViewSource;
+use densify_run::{DataSpec, DeviceSpec, Fraction, RunConfig};
+use densify_train::evaluate::Split;
+use densify_train::output::write_json;
+use densify_train::pictures::{photograph, picture, side_by_side, to_u8, write_png};
 
 /// Renders a trained scene to PNG files.
 ///

@@ -6,11 +6,12 @@ use clap::Args;
 
 use super::console::Console;
 use super::export::check_output;
-use crate::failure::Failure;
-use crate::memory::Bytes;
-use crate::output::OutputError;
-use crate::report::{self, Wanted};
-use crate::run::DeviceSpec;
+use densify_core::files::OutputError;
+use densify_core::memory::Bytes;
+use densify_report as report;
+use densify_report::Wanted;
+use densify_run::DeviceSpec;
+use densify_run::failure::Failure;
 
 /// Writes what a run, or several, arrived at as one HTML file.
 ///

@@ -4,16 +4,16 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 use densify_scenegen::{
-    Ambient, Error, Lens, Options, PRESETS, PointOptions, RigKind, Scene, Source, check_target,
+    Ambient, Lens, Options, PRESETS, PointOptions, RigKind, Scene, Source, check_target,
     contact_sheet, write,
 };
 use image::{DynamicImage, RgbaImage};
 
 use super::console::Console;
-use crate::failure::{Failure, INPUT, OTHER};
-use crate::number;
-use crate::pictures::write_png;
-use crate::run::{Threads, use_threads};
+use densify_core::numbers;
+use densify_run::failure::{Failure, INPUT, OTHER};
+use densify_run::{Threads, use_threads};
+use densify_train::pictures::write_png;
 
 /// Ray-traces a mesh into posed images of known geometry.
 ///
@@ -171,16 +171,6 @@ fn size(text: &str) -> Result<(u32, u32), String> {
     Ok((width.parse().map_err(wrong)?, height.parse().map_err(wrong)?))
 }
 
-impl From<Error> for Failure {
-    fn from(error: Error) -> Self {
-        let code = match error {
-            Error::Write { .. } => OTHER,
-            _ => INPUT,
-        };
-        Self { code, message: error.to_string() }
-    }
-}
-
 impl ScenegenArgs {
     fn options(&self) -> Options {
         let ambient = match (self.ao, self.bounce) {
@@ -260,7 +250,7 @@ pub(super) fn run(args: &ScenegenArgs, console: &Console) -> Result<(), Failure>
     console.result(format_args!(
         "{} views and {} points in {}",
         written.views,
-        number::grouped(written.points),
+        numbers::grouped(written.points),
         output.display()
     ));
     let wanted = args.points as f64 * (1.0 - args.dropout);
@@ -269,7 +259,7 @@ pub(super) fn run(args: &ScenegenArgs, console: &Console) -> Result<(), Failure>
             "note: of {} points wanted, {:.0} % were found where three views see the surface; to see more \
              of it, add views (--train), widen --fov, or choose another --rig (inside for rooms); or train \
              with --init random",
-            number::grouped(args.points),
+            numbers::grouped(args.points),
             100.0 * written.points as f64 / args.points as f64
         ));
     }
@@ -284,7 +274,7 @@ fn describe(scene: &Scene, console: &Console) {
     console.say(format_args!(
         "scene    {}: {} triangles",
         scene.name,
-        number::grouped(scene.model.triangles.len())
+        numbers::grouped(scene.model.triangles.len())
     ));
     console.say(format_args!(
         "views    {} to train on, {} held out, {}x{} px",
@@ -299,8 +289,8 @@ mod tests {
     use clap::FromArgMatches;
 
     use super::*;
-    use crate::failure::OTHER;
-    use crate::output::disk::{Fault, Operation, with_fault};
+    use densify_core::files::disk::{Fault, Operation, with_fault};
+    use densify_run::failure::OTHER;
 
     #[test]
     fn a_contact_sheet_is_written_whole_or_not_at_all() {

@@ -5,13 +5,13 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::console::Console;
-use crate::backend::cpu::InstructionSet;
-use crate::backend::gpu::{GpuDevice, adapters};
-use crate::backend::{Accumulation, AdapterChoice, Device};
-use crate::failure::{Failure, OTHER};
-use crate::output::write_atomically;
-use crate::run::DeviceSpec;
-use crate::verify::{Case, Finding, Subject, Tested, cases, markdown, table};
+use densify_core::files::write_atomically;
+use densify_render::cpu::InstructionSet;
+use densify_render::gpu::{GpuDevice, adapters};
+use densify_render::{Accumulation, AdapterChoice, Device};
+use densify_run::DeviceSpec;
+use densify_run::failure::{Failure, OTHER};
+use densify_selftest::{Case, Finding, Subject, Tested, cases, markdown, table};
 
 /// Holds this machine against a renderer in float64, where numbers are hardest.
 ///

@@ -2,9 +2,9 @@
 
 use super::console::Console;
 use super::flags::words;
-use crate::failure::Failure;
-use crate::study::Finished;
-pub(super) use crate::study::{Comparison, StudyRun, Trade};
+use densify_run::failure::Failure;
+use densify_study::Finished;
+pub(super) use densify_study::{Comparison, StudyRun, Trade};
 
 pub(super) fn compare(args: &Comparison, console: &Console) -> Result<(), Failure> {
     let train = words(&args.train, "densify compare ... --")?;

@@ -8,10 +8,11 @@ use clap::{ArgMatches, Args};
 use super::console::Console;
 use super::interrupt::Interrupts;
 use super::render::{RenderingArgs, refuse_options_of_a_file};
-use crate::failure::Failure;
-use crate::number::grouped;
-use crate::run::finished::Machine;
-use crate::view::{self, FIRST_PORT, Looked, Place, Server};
+use densify_core::numbers::grouped;
+use densify_run::failure::Failure;
+use densify_run::finished::Machine;
+use densify_view as view;
+use densify_view::{FIRST_PORT, Looked, Place, Server};
 
 /// Shows a model, or a scene, in the browser.
 ///

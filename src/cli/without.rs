@@ -5,8 +5,15 @@ use std::ffi::OsString;
 use clap::Args;
 
 use super::console::Console;
-use crate::failure::Failure;
-use crate::without::without;
+use densify_run::failure::Failure;
+
+/// Why `what` cannot be done.
+pub(super) fn without(feature: &str, what: &str) -> String {
+    format!(
+        "{what}: this program was built without the feature `{feature}` of the crate densify; add it to the \
+         features of densify in Cargo.toml"
+    )
+}
 
 /// Not in this program, which was built without the feature that it needs.
 #[derive(Debug, Args)]
@@ -22,9 +29,9 @@ macro_rules! absent {
         #[cfg(not(feature = $feature))]
         pub(super) mod $module {
             $(
-                pub(in crate::cli) use super::Absent as $args;
+                pub(in crate) use super::Absent as $args;
 
-                pub(in crate::cli) fn $run(
+                pub(in crate) fn $run(
                     _: &$args,
                     $(_: $more,)*
                     _: &super::Console,
@@ -37,7 +44,6 @@ macro_rules! absent {
 }
 
 absent!(devices, "gpu", run(DevicesArgs) "densify devices");
-absent!(scenegen, "scenegen", run(ScenegenArgs) "densify scenegen");
 absent!(report, "study", run(ReportArgs) "densify report");
 absent!(selftest, "selftest", run(SelftestArgs) "densify selftest");
 absent!(study, "study", compare(Comparison) "densify compare", trade(Trade) "densify trade", run(StudyRun) "densify study-run");

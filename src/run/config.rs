@@ -8,10 +8,11 @@ use toml::{Table, Value};
 use super::overlay::{FOUND_OUT, Partial};
 use super::spec::RunSpec;
 use super::values::ShDegree;
-use crate::exposure::evidence::ExposureSpread;
 use crate::failure::Failure;
-use crate::output::{CONFIG_FILE, OutputError, write_atomically};
-use crate::spread::Spread;
+use densify_core::files::{OutputError, write_atomically};
+use densify_data::track_colours::Spread;
+use densify_data::track_colours::exposures::ExposureSpread;
+use densify_train::output::CONFIG_FILE;
 
 /// A prepared run: its options, where all that was open is decided, and what decided it.
 #[derive(Debug, Clone, PartialEq)]
@@ -132,12 +133,10 @@ impl RunConfig {
     /// When there is none, or it does not say what it should.
     pub fn read(run: &Path) -> Result<Self, Failure> {
         let path = run.join(CONFIG_FILE);
-        let text =
-            crate::foreign::read_text(&path, crate::foreign::MAX_OPTIONS).map_err(|error| {
-                match error.kind() {
-                    std::io::ErrorKind::NotFound => OutputError::no_run(run, CONFIG_FILE).into(),
-                    _ => Failure::input(format!("cannot read {}: {error}", path.display())),
-                }
+        let text = densify_core::files::read_text(&path, densify_core::files::MAX_OPTIONS)
+            .map_err(|error| match error.kind() {
+                std::io::ErrorKind::NotFound => OutputError::no_run(run, CONFIG_FILE).into(),
+                _ => Failure::input(format!("cannot read {}: {error}", path.display())),
             })?;
         let malformed = |problem: String| Failure::from(OutputError::malformed(&path, problem));
         let table: Table = text
@@ -157,7 +156,7 @@ impl RunConfig {
     pub fn sh_degree(&self) -> u8 {
         match self.spec.size.sh_degree {
             Some(ShDegree::Fixed(degree) | ShDegree::Auto(Some(degree))) => degree,
-            Some(ShDegree::Auto(None)) | None => crate::gaussians::MAX_SH_DEGREE,
+            Some(ShDegree::Auto(None)) | None => densify_core::gaussians::MAX_SH_DEGREE,
         }
     }
 
@@ -180,10 +179,10 @@ impl RunConfig {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
-    use crate::run::{Assignment, Budget, ByteCount, InitChoice};
-    use crate::schedule::Background;
+    use crate::{Assignment, Budget, ByteCount, InitChoice};
+    use densify_train::schedule::Background;
 
-    pub(in crate::run) fn sample() -> RunConfig {
+    pub(crate) fn sample() -> RunConfig {
         let mut spec = RunSpec::default();
         spec.start.scene = Some("data/room".into());
         spec.start.init = Some(InitChoice::Points);

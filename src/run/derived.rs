@@ -9,10 +9,10 @@ use toml::{Table, Value};
 
 use super::spec::{DataSpec, RunSpec};
 use super::values::{self, InitChoice};
-use crate::dataset::{LoadOptions, Split, builtin};
 use crate::failure::Failure;
 use crate::knobs::Knobs;
-use crate::schedule::{InitRates, RateOptions};
+use densify_data::dataset::{LoadOptions, Split, builtin};
+use densify_train::schedule::{InitRates, RateOptions};
 
 impl DataSpec {
     /// How the dataset is to be read, with tracks if they are wanted.
@@ -163,7 +163,7 @@ mod tests {
     use densify_policies::policy::{Fade, Rate};
 
     use super::*;
-    use crate::run::Partial;
+    use crate::Partial;
 
     fn spec(option: &str, value: &str) -> Result<RunSpec, Failure> {
         let file: Table = format!("{option} = {value}").parse().unwrap();

@@ -5,27 +5,24 @@ use std::path::{Path, PathBuf};
 use densify_policies::policy::Needs;
 
 use super::{DataSpec, DeviceSpec, Observer, RunConfig, use_threads};
-use crate::backend::{Backend, Device, Setup};
-#[cfg(feature = "view")]
-use crate::backend::{BackendError, MomentStorage, Storage};
-use crate::checkpoint::newest_step;
-use crate::dataset::normalise::{EXTENT, Normalisation};
-use crate::dataset::{Dataset, View, builtin, is_archive};
-use crate::evaluate::Split;
 use crate::failure::Failure;
-#[cfg(any(feature = "study", feature = "view"))]
-use crate::foreign;
-use crate::gaussians::Gaussians;
-use crate::import;
-use crate::metrics::geometry::{self, Geometry, KnownScene};
-#[cfg(any(feature = "study", feature = "view"))]
-use crate::output::is_in_use;
-use crate::output::{model_path, saved_iterations};
-use crate::views::DatasetViews;
+use densify_core::files;
+use densify_core::gaussians::Gaussians;
+use densify_data::dataset::normalise::{EXTENT, Normalisation};
+use densify_data::dataset::{Dataset, View, builtin, is_archive};
+use densify_data::import;
+use densify_data::views::DatasetViews;
+use densify_render::{Backend, Device, Setup};
+use densify_render::{BackendError, MomentStorage, Storage};
+use densify_train::checkpoint::newest_step;
+use densify_train::evaluate::Split;
+use densify_train::metrics::geometry::{self, Geometry, KnownScene};
+use densify_train::output::is_in_use;
+use densify_train::output::{model_path, saved_iterations};
 
 /// What a model is rendered on.
 #[derive(Debug, Default)]
-pub(crate) struct Machine {
+pub struct Machine {
     /// Processor threads; all without a number.
     threads: Option<usize>,
     device: Device,
@@ -33,7 +30,7 @@ pub(crate) struct Machine {
 
 impl Machine {
     /// Opens what the options say.
-    pub(crate) fn open(spec: &DeviceSpec, observer: &dyn Observer) -> Result<Self, Failure> {
+    pub fn open(spec: &DeviceSpec, observer: &dyn Observer) -> Result<Self, Failure> {
         let device = Device::open_to_render(spec.backend, spec.gpu.as_deref())?;
         observer.say(format_args!("device   {}", device.describe()));
         use_threads(spec.threads);
@@ -42,7 +39,7 @@ impl Machine {
 
     /// A backend with a model in the dataset's own coordinates, to render its views. `near` is a distance
     /// `[scene units]`.
-    pub(crate) fn backend(
+    pub fn backend(
         &self,
         dataset: &Dataset,
         model: Gaussians,
@@ -70,8 +67,7 @@ impl Machine {
     }
 
     /// A backend with a model in scene coordinates, only to render it.
-    #[cfg(feature = "view")]
-    pub(crate) fn backend_in_scene(
+    pub fn backend_in_scene(
         &self,
         model: &Gaussians,
         near: f32,
@@ -82,8 +78,7 @@ impl Machine {
     }
 
     /// The same, to measure signals by steps that change nothing.
-    #[cfg(feature = "view")]
-    pub(crate) fn backend_to_measure(
+    pub fn backend_to_measure(
         &self,
         model: &Gaussians,
         near: f32,
@@ -100,20 +95,20 @@ impl Machine {
 }
 
 /// A model with the dataset it belongs to, ready to render.
-pub(crate) struct Opened {
-    pub(crate) dataset: Dataset,
-    pub(crate) data: DataSpec,
-    pub(crate) sh_degree: u8,
-    pub(crate) backend: Box<dyn Backend>,
+pub struct Opened {
+    pub dataset: Dataset,
+    pub data: DataSpec,
+    pub sh_degree: u8,
+    pub backend: Box<dyn Backend>,
 }
 
 /// Whether a path is a model by itself: a file that is no archive of a dataset, or a folder of SOG.
-pub(crate) fn is_model(path: &Path) -> bool {
+pub fn is_model(path: &Path) -> bool {
     (path.is_file() && !is_archive(path)) || path.join("meta.json").is_file()
 }
 
 /// The iteration asked for, or the last one saved.
-pub(crate) fn iteration(run: &Path, asked: Option<u32>) -> Result<u32, Failure> {
+pub fn iteration(run: &Path, asked: Option<u32>) -> Result<u32, Failure> {
     let saved = saved_iterations(run).map_err(|error| match newest_step(run) {
         None => error.into(),
         Some(step) => {
@@ -142,8 +137,7 @@ pub(crate) fn iteration(run: &Path, asked: Option<u32>) -> Result<u32, Failure> 
 
 /// The iteration asked for, or the last one saved, of a run that may be training: then says so. Also whether it
 /// is.
-#[cfg(any(feature = "study", feature = "view"))]
-pub(crate) fn iteration_so_far(
+pub fn iteration_so_far(
     run: &Path,
     asked: Option<u32>,
     observer: &dyn Observer,
@@ -167,14 +161,12 @@ pub(crate) fn iteration_so_far(
 }
 
 /// The last part of a path: what lies above is nobody's business.
-#[cfg(any(feature = "study", feature = "view"))]
-pub(crate) fn name_of(path: &Path) -> String {
+pub fn name_of(path: &Path) -> String {
     names_of(&[path]).swap_remove(0)
 }
 
 /// The same of paths that are shown together, each with as much of what lies above as tells it from the others.
-#[cfg(any(feature = "study", feature = "view"))]
-pub(crate) fn names_of(paths: &[&Path]) -> Vec<String> {
+pub fn names_of(paths: &[&Path]) -> Vec<String> {
     let whole = |path: &&Path| path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
     let whole: Vec<PathBuf> = paths.iter().map(whole).collect();
     let last = |path: &Path, parts: usize| -> PathBuf {
@@ -188,13 +180,13 @@ pub(crate) fn names_of(paths: &[&Path]) -> Vec<String> {
         };
         let most = path.components().count();
         let parts = (1..most).find(tells_apart).unwrap_or(most);
-        foreign::one_line(&last(path, parts).to_string_lossy())
+        files::one_line(&last(path, parts).to_string_lossy())
     };
     whole.iter().map(name).collect()
 }
 
 /// The file of what is named: a model, or a run's of the iteration asked for, or its last.
-pub(crate) fn model_file(named: &Path, asked: Option<u32>) -> Result<PathBuf, Failure> {
+pub fn model_file(named: &Path, asked: Option<u32>) -> Result<PathBuf, Failure> {
     match is_model(named) {
         true if asked.is_some() => {
             Err(Failure::input("--iteration is for a run's folder; a file has only one model"))
@@ -205,7 +197,7 @@ pub(crate) fn model_file(named: &Path, asked: Option<u32>) -> Result<PathBuf, Fa
 }
 
 /// Says what to do where the dataset of a run is no longer at `path`, which the user has not named.
-pub(crate) fn or_moved(failure: Failure, path: &Path) -> Failure {
+pub fn or_moved(failure: Failure, path: &Path) -> Failure {
     match path.exists() || builtin::name(path).is_some() {
         true => failure,
         false => failure.and("if the dataset has moved, say where it is with --scene"),
@@ -214,7 +206,7 @@ pub(crate) fn or_moved(failure: Failure, path: &Path) -> Failure {
 
 /// Opens the model of a run with its dataset, or with that dataset at `moved_to`, in a backend for
 /// `needs`.
-pub(crate) fn open_run(
+pub fn open_run(
     run: &Path,
     iteration: u32,
     moved_to: Option<PathBuf>,
@@ -232,7 +224,7 @@ pub(crate) fn open_run(
 }
 
 /// Opens a model, by whatever program, with a dataset. The near plane is a fraction of the extent.
-pub(crate) fn open(
+pub fn open(
     model: &Path,
     dataset: &Path,
     data: DataSpec,
@@ -250,7 +242,7 @@ pub(crate) fn open(
 
 /// Opens a model alone, for cameras that are in its own coordinates; also where it is, and its degree. The near plane
 /// is a fraction of its extent.
-pub(crate) fn open_alone(
+pub fn open_alone(
     model: &Path,
     (near, machine): (f64, Machine),
     observer: &dyn Observer,
@@ -264,11 +256,7 @@ pub(crate) fn open_alone(
 }
 
 /// Reads the dataset at `path`; says what there is to say.
-pub(crate) fn load(
-    path: &Path,
-    data: &DataSpec,
-    observer: &dyn Observer,
-) -> Result<Dataset, Failure> {
+pub fn load(path: &Path, data: &DataSpec, observer: &dyn Observer) -> Result<Dataset, Failure> {
     let dataset = Dataset::load(path, &data.load_options(false))?;
     for note in &dataset.notes {
         observer.say(format_args!("note: {note}"));
@@ -277,7 +265,7 @@ pub(crate) fn load(
 }
 
 /// Reads a file of Gaussian splats by any program, in its own coordinates; says what was wrong with it.
-pub(crate) fn read_model(path: &Path, observer: &dyn Observer) -> Result<Gaussians, Failure> {
+pub fn read_model(path: &Path, observer: &dyn Observer) -> Result<Gaussians, Failure> {
     let file = import::read_model(path)?;
     for (number, what) in [
         (file.dropped, "left out: a value is not finite"),
@@ -296,7 +284,7 @@ impl Opened {
     ///
     /// # Errors
     /// When the surface cannot be read, or as [`geometry::measure`], such as when `is_stopped`.
-    pub(crate) fn geometry(
+    pub fn geometry(
         &mut self,
         views: &DatasetViews,
         is_stopped: &dyn Fn() -> bool,
@@ -314,13 +302,13 @@ impl Opened {
     }
 
     /// The views of a split.
-    pub(crate) fn views(&self, split: Split) -> Result<DatasetViews, Failure> {
+    pub fn views(&self, split: Split) -> Result<DatasetViews, Failure> {
         views_of(&self.dataset, split)
     }
 }
 
 /// The views of a split of a dataset.
-pub(crate) fn views_of(dataset: &Dataset, split: Split) -> Result<DatasetViews, Failure> {
+pub fn views_of(dataset: &Dataset, split: Split) -> Result<DatasetViews, Failure> {
     let views: &[View] = match split {
         Split::Train => &dataset.train,
         Split::Test => &dataset.test,
@@ -334,7 +322,7 @@ pub(crate) fn views_of(dataset: &Dataset, split: Split) -> Result<DatasetViews, 
     Ok(DatasetViews::new(views.to_vec(), 0, 1))
 }
 
-#[cfg(all(test, any(feature = "study", feature = "view")))]
+#[cfg(test)]
 mod tests {
     use super::*;
 

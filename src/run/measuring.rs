@@ -5,13 +5,14 @@ use std::path::Path;
 
 use super::finished::{Opened, read_model};
 use super::session::Session;
-use crate::backend::{Device, Setup};
-use crate::evaluate::Split;
 use crate::failure::Failure;
-use crate::memory::{Bytes, Ledger, Section, grant, peak_resident, resident};
-use crate::metrics::geometry;
-use crate::number::percent;
-use crate::output::{geometry_of, model_path, write_geometry};
+use crate::memory::grant;
+use densify_core::memory::{Bytes, Ledger, Section, peak_resident, resident};
+use densify_core::numbers::percent;
+use densify_render::{Device, Setup};
+use densify_train::evaluate::Split;
+use densify_train::metrics::geometry;
+use densify_train::output::{geometry_of, model_path, write_geometry};
 
 /// How the model is measured in a scene whose surface is known.
 #[derive(Debug, Clone)]

@@ -2,10 +2,10 @@
 
 use std::fmt;
 
-use crate::backend::Backend;
-use crate::evaluate::Mean;
-use crate::output::StepRecord;
-use crate::trainer::{EditEvent, RowHistory};
+use densify_render::Backend;
+use densify_train::evaluate::Mean;
+use densify_train::output::StepRecord;
+use densify_train::trainer::{EditEvent, RowHistory};
 
 /// A signal that asks a run to end in order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -49,7 +49,7 @@ pub trait Observer {
     fn kept(&self, _step: u32, _trouble: Option<&str>) {}
 
     /// Before every step the model may be looked at: what is rendered here changes nothing. Training waits. When rows
-    /// were made and edited is known where there is a [page](super::OutputSpec::view).
+    /// were made and edited is known where there is a [companion](super::Companion).
     fn between(&self, _model: &mut dyn Backend, _rows: Option<&RowHistory>) -> Between {
         Between::Step
     }

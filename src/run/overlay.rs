@@ -7,8 +7,8 @@ use toml::{Table, Value};
 
 use super::spec::{OPTIONS, RunOption, RunSpec};
 use crate::failure::Failure;
-use crate::foreign;
 use crate::knobs::{self, DEFAULT_PRESET};
+use densify_core::files;
 use densify_policies::parameters::{nearest, parse_value};
 use densify_policies::policy::RateOverrides;
 
@@ -50,7 +50,7 @@ impl Partial {
     /// out about that run is passed over.
     pub fn read(path: &Path) -> Result<Self, Failure> {
         let origin = format!("--config {}", path.display());
-        let text = foreign::read_text(path, foreign::MAX_OPTIONS)
+        let text = files::read_text(path, files::MAX_OPTIONS)
             .map_err(|e| Failure::input(e).within(&origin))?;
         let table = text.parse::<Table>();
         let mut table = table.map_err(|e| Failure::input(e.to_string().trim()).within(&origin))?;

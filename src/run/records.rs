@@ -8,9 +8,10 @@ use std::time::{Duration, Instant};
 use cpu_time::ProcessTime;
 use serde::{Deserialize, Serialize};
 
-use crate::backend::StepOutput;
-use crate::memory::{peak_resident, resident};
-use crate::output::{Mean, OutputError, RecordLog, StepRecord, TensorBoard};
+use densify_core::files::OutputError;
+use densify_core::memory::{peak_resident, resident};
+use densify_render::StepOutput;
+use densify_train::output::{Mean, RecordLog, StepRecord, TensorBoard};
 
 /// Sums and scores so far.
 #[derive(Debug, Default, Serialize, Deserialize)]

@@ -1,15 +1,14 @@
 //! `stats/requirements.json`: what a run left out automatically, on what evidence, and at what cost.
 
-#[cfg(feature = "study")]
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
 use super::config::{DegreeSource, ExposureSource, RunConfig};
-use crate::gaussians::MAX_SH_DEGREE;
-#[cfg(feature = "study")]
-use crate::output::{OutputError, read_stats};
-use crate::trainer::{AutoBudget, MIN_GAIN};
+use densify_core::files::OutputError;
+use densify_core::gaussians::MAX_SH_DEGREE;
+use densify_train::output::read_stats;
+use densify_train::trainer::{AutoBudget, MIN_GAIN};
 
 /// The file, in the folder of the run.
 pub(super) const REQUIREMENTS: &str = "stats/requirements.json";
@@ -36,18 +35,16 @@ pub struct Requirements {
 }
 
 /// What `stats/requirements.json` says was left out.
-#[cfg(feature = "study")]
 #[derive(Debug, Clone, PartialEq, Deserialize)]
-pub(crate) struct Reductions {
+pub struct Reductions {
     /// Whether automatic reductions were disabled.
-    pub(crate) full: bool,
-    pub(crate) left_out: Vec<LeftOut>,
+    pub full: bool,
+    pub left_out: Vec<LeftOut>,
 }
 
-#[cfg(feature = "study")]
 impl Reductions {
     /// Of a run; `None` where the file does not exist.
-    pub(crate) fn read(run: &Path) -> Result<Option<Self>, OutputError> {
+    pub fn read(run: &Path) -> Result<Option<Self>, OutputError> {
         read_stats(&run.join(REQUIREMENTS))
     }
 }
@@ -186,10 +183,10 @@ fn unscored(views: usize) -> LeftOut {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::run::ShDegree;
-    use crate::run::config::tests::sample;
-    use crate::spread::Spread;
-    use crate::trainer::{Interval, Removal};
+    use crate::ShDegree;
+    use crate::config::tests::sample;
+    use densify_data::track_colours::Spread;
+    use densify_train::trainer::{Interval, Removal};
 
     fn spread() -> Spread {
         let (median, tenth, twentieth, rms) = (0.0, 0.25, 0.5, 0.125);

@@ -14,11 +14,11 @@ use super::observer::Observer;
 use super::records::SavedSession;
 use super::resolve::{Begun, Known};
 use super::spec::{OnResume, RunOption, RunSpec};
-use crate::checkpoint::{Checkpoint, CheckpointError, Fingerprint, newest};
 use crate::failure::Failure;
-use crate::output::{CONFIG_FILE, RunFolder, saved_iterations};
-use crate::trainer::Trainer;
-use crate::views::DatasetViews;
+use densify_data::views::DatasetViews;
+use densify_train::checkpoint::{Checkpoint, CheckpointError, Fingerprint, newest};
+use densify_train::output::{CONFIG_FILE, RunFolder, saved_iterations};
+use densify_train::trainer::Trainer;
 
 /// A run that goes on.
 pub struct Resumed {

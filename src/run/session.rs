@@ -12,17 +12,18 @@ use super::Run;
 use super::measuring::measure;
 use super::observer::{Between, Interrupt, Observer};
 use super::records::{Logs, Totals};
-use crate::checkpoint::{CheckpointError, Header, checkpoint_path, remove_older, write};
-use crate::evaluate::{Comparison, EvaluateError, Split, evaluate};
-use crate::export::{PLY, Shape};
-use crate::exposure::named_transforms;
 use crate::failure::{Failure, INPUT, OTHER};
-use crate::output::{
-    CHECKPOINTS, CONFIG_FILE, Guard, Mean, OutputError, RunFolder, cameras_json, model_path,
-    saved_iterations, write_atomically, write_json, write_scores,
+use densify_core::files::{OutputError, write_atomically};
+use densify_data::export::{PLY, Shape};
+use densify_data::views::ViewSource;
+use densify_train::checkpoint::{CheckpointError, Header, checkpoint_path, remove_older, write};
+use densify_train::evaluate::{Comparison, EvaluateError, Split, evaluate};
+use densify_train::exposure::named_transforms;
+use densify_train::output::{
+    CHECKPOINTS, CONFIG_FILE, Guard, Mean, RunFolder, cameras_json, model_path, saved_iterations,
+    write_json, write_scores,
 };
-use crate::trainer::{StepReport, TrainError};
-use crate::views::ViewSource;
+use densify_train::trainer::{StepReport, TrainError};
 
 /// Name of the file beside a model that says how its training views were exposed.
 const EXPOSURES: &str = "exposure.json";

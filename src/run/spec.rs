@@ -15,11 +15,11 @@ use super::values::{
     AbsolutePath, Assignment, Budget, ByteCount, Fraction, ImageCache, InitChoice, Rows, ShDegree,
     Threads, Whole, as_table,
 };
-use crate::backend::BackendChoice;
-use crate::dataset::{FarCameras, MaskMode, Resolution};
-use crate::exposure::{ExposureChoice, ExposureModel};
-use crate::schedule::{Background, InitRates, REFERENCE_ITERATIONS};
-use crate::trainer::OnNan;
+use densify_data::dataset::{FarCameras, MaskMode, Resolution};
+use densify_render::BackendChoice;
+use densify_train::exposure::{ExposureChoice, ExposureModel};
+use densify_train::schedule::{Background, InitRates, REFERENCE_ITERATIONS};
+use densify_train::trainer::OnNan;
 
 /// What `--resume` may do with an option.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -338,16 +338,6 @@ run_spec! {
         /// Folder to write to (default: output/SCENE-POLICY)
         #[arg(short, long, value_name = "DIR")]
         output: Option<PathBuf> = None, Free;
-
-        /// Show the run in the browser while it trains: serves a page on this machine alone, with the model,
-        /// curves and edits, that can pause, keep and stop the run (default port: the first free one from 8080
-        /// on). From another machine: ssh -L 8080:127.0.0.1:8080 NAME, then the whole printed address. Its pictures are
-        /// no larger than the largest photograph. The run is the same with it and without; of --memory the page takes
-        /// a part
-        #[arg(
-            long, value_name = "PORT", num_args = 0..=1, require_equals = true, default_missing_value = "0"
-        )]
-        view: Option<u16> = None, Free;
 
         /// Iterations after which to save the model, besides the last
         #[arg(long, value_name = "N", num_args = 1.., value_delimiter = ',')]

@@ -5,11 +5,12 @@ use std::path::Path;
 use super::Run;
 use super::report::{REQUIREMENTS, Requirements};
 use super::session::Session;
-use crate::evaluate::FittedScore;
-use crate::memory::Bytes;
-use crate::number::{duration, grouped};
-use crate::output::{Mean, OutputError, Summary, model_path, write_json};
-use crate::views::ViewSource;
+use densify_core::files::OutputError;
+use densify_core::memory::Bytes;
+use densify_core::numbers::{duration, grouped};
+use densify_data::views::ViewSource;
+use densify_train::evaluate::FittedScore;
+use densify_train::output::{Mean, Summary, model_path, write_json};
 
 impl Session<'_> {
     pub(super) fn write_summary(&self, finished: bool) -> Result<(), OutputError> {

@@ -9,10 +9,10 @@ use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use toml::{Table, Value};
 
-use crate::dataset::Resolution;
-use crate::gaussians::MAX_SH_DEGREE;
-use crate::number;
-use crate::schedule::Background;
+use densify_core::gaussians::MAX_SH_DEGREE;
+use densify_core::numbers;
+use densify_data::dataset::Resolution;
+use densify_train::schedule::Background;
 
 /// A number of rows: `200000`, `28k`, `1.5M`; in a file also a plain number. At least 1.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
@@ -118,7 +118,7 @@ impl FromStr for Rows {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        number::rows(text).map(Self)
+        numbers::rows(text).map(Self)
     }
 }
 
@@ -126,7 +126,7 @@ impl FromStr for ByteCount {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        number::bytes(text).map(Self)
+        numbers::bytes(text).map(Self)
     }
 }
 
@@ -136,7 +136,7 @@ impl FromStr for ImageCache {
     fn from_str(text: &str) -> Result<Self, String> {
         match after_auto(text) {
             Some(None) => Ok(Self::Auto),
-            _ => number::bytes(text).map(Self::Bytes).map_err(|error| format!("{error}, or auto")),
+            _ => numbers::bytes(text).map(Self::Bytes).map_err(|error| format!("{error}, or auto")),
         }
     }
 }
@@ -145,7 +145,7 @@ impl FromStr for Fraction {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        number::fraction(text).map(Self)
+        numbers::fraction(text).map(Self)
     }
 }
 
@@ -165,7 +165,7 @@ impl FromStr for Budget {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let rows = |text| number::rows(text).map_err(|error| format!("{error}, or auto"));
+        let rows = |text| numbers::rows(text).map_err(|error| format!("{error}, or auto"));
         match after_auto(text) {
             Some(None) => Ok(Self::Auto(None)),
             Some(Some(most)) => Ok(Self::Auto(Some(rows(most)?))),
@@ -263,38 +263,22 @@ impl Serialize for ShDegree {
     }
 }
 
-/// Reads from a file what may be a number or a text there, as the command line would read it.
-fn number_or_text<'de, D, T>(deserializer: D) -> Result<T, D::Error>
-where
-    D: Deserializer<'de>,
-    T: FromStr<Err: Display>,
-{
-    let text = match Value::deserialize(deserializer)? {
-        Value::String(text) => text,
-        Value::Float(number) => number.to_string(),
-        other => other.to_string(),
-    };
-    text.parse().map_err(D::Error::custom)
-}
-
 macro_rules! number_or_text {
     ($([$($parameters:tt)*] $type:ty;)*) => {$(
         impl<'de, $($parameters)*> Deserialize<'de> for $type {
             fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-                number_or_text(deserializer)
+                numbers::number_or_text(deserializer)
             }
         }
     )*};
 }
 
 number_or_text! {
-    [] Background;
     [] Rows;
     [] ByteCount;
     [] ImageCache;
     [] Fraction;
     [const LEAST: u32, const MOST: u32] Whole<LEAST, MOST>;
-    [] Resolution;
     [] Budget;
     [] ShDegree;
     [] InitChoice;
@@ -368,14 +352,14 @@ pub(super) mod as_table {
     use super::{Assignment, Deserialize, Deserializer, Serialize, Serializer, Value};
     use serde::de::Error as _;
 
-    pub(in crate::run) fn serialize<S: Serializer>(
+    pub(crate) fn serialize<S: Serializer>(
         all: &[Assignment],
         serializer: S,
     ) -> Result<S::Ok, S::Error> {
         super::table(all).map_err(serde::ser::Error::custom)?.serialize(serializer)
     }
 
-    pub(in crate::run) fn deserialize<'de, D: Deserializer<'de>>(
+    pub(crate) fn deserialize<'de, D: Deserializer<'de>>(
         deserializer: D,
     ) -> Result<Vec<Assignment>, D::Error> {
         match Value::deserialize(deserializer)? {

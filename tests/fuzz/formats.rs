@@ -7,13 +7,13 @@
 
 use std::path::Path;
 
-use densify::backend::Setup;
-use densify::backend::cpu::CpuBackend;
-use densify::checkpoint::Checkpoint;
-use densify::dataset::{Dataset, LoadOptions};
-use densify::import::ply::read_points;
-use densify::import::read_model;
+use densify::data::dataset::{Dataset, LoadOptions};
+use densify::data::import::ply::read_points;
+use densify::data::import::read_model;
+use densify::render::Setup;
+use densify::render::cpu::CpuBackend;
 use densify::run::RunConfig;
+use densify::train::checkpoint::Checkpoint;
 use densify_scenegen::{Options, PointOptions, Scene, Source};
 
 /// A format and what reads it.

@@ -1,11 +1,11 @@
 //! Every backend against the native one: losses, and training step by step. Sums in any order, which
 //! `extremes` leaves out, are among them; `oracle` holds images and gradients of all.
 
-use densify::backend::{Backend, StepInput, StepOutput};
-use densify::camera::Camera;
-use densify::gaussians::Gaussians;
-use densify::verify::compare::{Table, relative_error};
-use densify::verify::{Setup, Subject, scenes};
+use densify::core::camera::Camera;
+use densify::core::gaussians::Gaussians;
+use densify::render::{Backend, StepInput, StepOutput};
+use densify::selftest::compare::{Table, relative_error};
+use densify::selftest::{Setup, Subject, scenes};
 use densify_policies::policy::{
     Cadence, LossTerms, MaskTerm, Needs, NoiseTerm, Signal, SignalKind, SignalSet,
 };

@@ -2,18 +2,18 @@
 
 #![expect(clippy::float_cmp, reason = "colours are carried to the last bit")]
 
-use densify::backend::{AuxInput, AuxOutput, Backend, StepInput};
-use densify::camera::Camera;
-use densify::dataset::images::Image8;
-use densify::gaussians::Gaussians;
+use densify::core::camera::Camera;
+use densify::core::gaussians::Gaussians;
+use densify::core::image::Image8;
+use densify::render::{AuxInput, AuxOutput, Backend, StepInput};
 use densify_policies::policy::{AuxColumn, AuxRequest, Needs, PixelMap, Signal, SignalSet};
 use glam::DVec3;
 
-use densify::verify::compare::{Table, relative_error};
-use densify::verify::reference::blend::each_blended;
-use densify::verify::reference::project::{by_depth, project};
-use densify::verify::reference::{Image, Model, Rules, View, render};
-use densify::verify::{Differentiable, Setup, Subject, scenes};
+use densify::selftest::compare::{Table, relative_error};
+use densify::selftest::reference::blend::each_blended;
+use densify::selftest::reference::project::{by_depth, project};
+use densify::selftest::reference::{Image, Model, Rules, View, render};
+use densify::selftest::{Differentiable, Setup, Subject, scenes};
 
 use crate::subject::{all, make_with, on_each, repeatable, step_input};
 

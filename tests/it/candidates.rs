@@ -1,12 +1,12 @@
 //! Candidates: on a plane, where they are found, by which error mode, and where never; in any scene, the
 //! same on every backend.
 
-use densify::backend::{AdapterKind, Backend, Rendering, StepInput};
-use densify::camera::Camera;
-use densify::dataset::images::Image8;
-use densify::gaussians::{Gaussians, logit, rgb_to_dc};
-use densify::verify::compare::Table;
-use densify::verify::{Differentiable, Setup, Subject, scenes};
+use densify::core::camera::Camera;
+use densify::core::gaussians::{Gaussians, logit, rgb_to_dc};
+use densify::core::image::Image8;
+use densify::render::{AdapterKind, Backend, Rendering, StepInput};
+use densify::selftest::compare::Table;
+use densify::selftest::{Differentiable, Setup, Subject, scenes};
 use densify_policies::policy::{Candidate, CandidateRequest, DepthMode, ErrorMode, Needs};
 use glam::{DMat3, DVec2, DVec3};
 

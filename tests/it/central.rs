@@ -1,17 +1,17 @@
 //! The reference renderer against central differences of itself: step 1e-6, in `f64`, without the steps
 //! that make a render discontinuous, and with the order of the rows held fixed.
 
-use densify::camera::Camera;
+use densify::core::camera::Camera;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use densify::verify::compare::Table;
-use densify::verify::reference::loss::loss;
-use densify::verify::reference::project::{by_depth, project};
-use densify::verify::reference::{
+use densify::selftest::compare::Table;
+use densify::selftest::reference::loss::loss;
+use densify::selftest::reference::project::{by_depth, project};
+use densify::selftest::reference::{
     CLASSES, Model, Rules, Upstream, View, blend, differentiate, render,
 };
-use densify::verify::scenes;
+use densify::selftest::scenes;
 
 /// Half the distance between the two evaluations.
 const STEP: f64 = 1e-6;

@@ -5,13 +5,13 @@
 
 use std::ops::Range;
 
-use densify::backend::ImageGradient;
-use densify::backend::cpu::ModelGradient;
-use densify::backend::{Backend, StepInput};
-use densify::camera::Camera;
-use densify::dataset::images::Image8;
-use densify::gaussians::Gaussians;
-use densify::verify::{Differentiable, Setup, Subject, scenes};
+use densify::core::camera::Camera;
+use densify::core::gaussians::Gaussians;
+use densify::core::image::Image8;
+use densify::render::ImageGradient;
+use densify::render::cpu::ModelGradient;
+use densify::render::{Backend, StepInput};
+use densify::selftest::{Differentiable, Setup, Subject, scenes};
 use densify_policies::adc::clone_at;
 use densify_policies::plan::{EditPlan, OpacityRule, Seed, Update};
 use densify_policies::policy::{Cadence, LossTerms, MaskTerm, Needs, NoiseTerm, Signal, SignalSet};

@@ -1,15 +1,15 @@
 //! Exposures of photographs on every backend: what a step learns of one, and of the rows, against the float64
 //! renderer and central differences; and that nothing is done, or held, where there is none.
 
-use densify::backend::{AuxInput, Differentiable, StepInput, StepOutput};
-use densify::camera::Camera;
-use densify::dataset::images::Image8;
-use densify::exposure::ColourTransform;
-use densify::gaussians::Gaussians;
-use densify::verify::compare::{Table, relative_error};
-use densify::verify::reference::loss::loss;
-use densify::verify::reference::{Model, Rules, Upstream, View, differentiate, render};
-use densify::verify::{Setup, Subject, scenes};
+use densify::core::camera::Camera;
+use densify::core::colour::ColourTransform;
+use densify::core::gaussians::Gaussians;
+use densify::core::image::Image8;
+use densify::render::{AuxInput, Differentiable, StepInput, StepOutput};
+use densify::selftest::compare::{Table, relative_error};
+use densify::selftest::reference::loss::loss;
+use densify::selftest::reference::{Model, Rules, Upstream, View, differentiate, render};
+use densify::selftest::{Setup, Subject, scenes};
 use densify_policies::policy::{AuxColumn, AuxRequest, Candidate, CandidateRequest, DepthMode};
 use densify_policies::policy::{ErrorMode, Needs};
 

@@ -1,4 +1,4 @@
-//! Where numbers are hardest: the cases of the [selftest](densify::verify) on every backend, and where each
+//! Where numbers are hardest: the cases of the [selftest](densify::selftest) on every backend, and where each
 //! extreme is tested.
 //!
 //! A backend is compared with the float64 reference, which `central.rs` checks by central differences;
@@ -41,7 +41,7 @@
 
 use std::path::Path;
 
-use densify::verify::{Subject, cases, table};
+use densify::selftest::{Subject, cases, table};
 
 use crate::subject::others;
 
@@ -54,7 +54,7 @@ fn check(subject: &Subject, but: &[u8]) {
     let mut failed = Vec::new();
     for case in cases().iter().filter(|case| !but.contains(&case.number)) {
         let findings = case.run(subject, false);
-        if !findings.iter().all(densify::verify::Finding::holds) {
+        if !findings.iter().all(densify::selftest::Finding::holds) {
             failed.push(table(case, &findings));
         }
     }

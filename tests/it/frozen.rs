@@ -1,10 +1,10 @@
 //! Frozen rows: whatever a step or a plan does to the others, these keep their bits, and they have no memory for
 //! what only training needs.
 
-use densify::backend::{Attribute, Backend, Kept, StepInput, Storage, Unsound, Values};
-use densify::camera::Camera;
-use densify::gaussians::Gaussians;
-use densify::verify::{Setup, Subject, scenes};
+use densify::core::camera::Camera;
+use densify::core::gaussians::Gaussians;
+use densify::render::{Attribute, Backend, Kept, StepInput, Storage, Unsound, Values};
+use densify::selftest::{Setup, Subject, scenes};
 use densify_policies::adc::split_by;
 use densify_policies::plan::{Decay, EditPlan};
 use densify_policies::policy::{Cadence, LossTerms, MaskTerm, Needs, NoiseTerm, Signal, SignalSet};

@@ -1,7 +1,7 @@
 //! The integration tests: one binary, so that it links once.
 //!
 //! Most run once on each of the backends of `subject`: the native one with every instruction set, and every adapter.
-//! `central` checks the float64 renderer of `densify::verify` by central differences, and `oracle` holds it and the
+//! `central` checks the float64 renderer of `densify::selftest` by central differences, and `oracle` holds it and the
 //! backends against stored float64 renders; `extremes` runs the cases of the selftest and says where every extreme is
 //! tested; `exposure` is of photographs that are exposed differently; `agreement` holds every backend to the native
 //! one; `properties` are of any scene; `sameness` and `resuming` compare bits; `edits` applies any plan to a backend

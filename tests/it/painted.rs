@@ -1,7 +1,7 @@
 //! Rows in other colours than their own: drawn as if they had these, and nothing that training depends on changes.
 
-use densify::gaussians::rgb_to_dc;
-use densify::verify::{Setup, scenes};
+use densify::core::gaussians::rgb_to_dc;
+use densify::selftest::{Setup, scenes};
 
 use crate::subject::{GREY, bits, make_with, on_each, repeatable, saved, step_input};
 

@@ -5,8 +5,8 @@ use std::f64::consts::TAU;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
-use densify::camera::Camera;
-use densify::gaussians::{Gaussians, logit, rgb_to_dc};
+use densify::core::camera::Camera;
+use densify::core::gaussians::{Gaussians, logit, rgb_to_dc};
 use glam::{DMat3, DQuat, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -14,7 +14,7 @@ use serde_json::json;
 use tempfile::TempDir;
 
 use crate::subject::make;
-use densify::verify::{Subject, scenes};
+use densify::selftest::{Subject, scenes};
 
 /// Views taken.
 pub(crate) const VIEWS: usize = 14;
@@ -66,7 +66,7 @@ fn points() -> Vec<([f64; 3], [u8; 3])> {
             f64::from(model.means[row][axis]) + 0.25 * rng.random_range(-1.0_f64..1.0)
         };
         let dc = model.sh_of(row);
-        let colour = [0, 1, 2].map(|c| (255.0 * (0.5 + densify::sh::C0 * dc[c])) as u8);
+        let colour = [0, 1, 2].map(|c| (255.0 * (0.5 + densify::core::sh::C0 * dc[c])) as u8);
         ([0, 1, 2].map(near), colour)
     };
     (0..POINTS).map(point).collect()

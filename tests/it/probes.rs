@@ -2,14 +2,14 @@
 //! as they were: after measurements from which nothing follows, a run has the same bits as one that
 //! measured nothing.
 
-use densify::backend::{Backend, Storage, Tensor};
-use densify::dataset::{Dataset, LoadOptions};
-use densify::gaussians::Gaussians;
-use densify::init::initialise;
-use densify::schedule::{Background, RateOptions};
-use densify::trainer::{AutoChoices, OnNan, TrainOptions, Trainer, growth_signals};
-use densify::verify::{Setup, Subject};
-use densify::views::DatasetViews;
+use densify::core::gaussians::Gaussians;
+use densify::data::dataset::{Dataset, LoadOptions};
+use densify::data::views::DatasetViews;
+use densify::render::{Backend, Storage, Tensor};
+use densify::selftest::{Setup, Subject};
+use densify::train::init::initialise;
+use densify::train::schedule::{Background, RateOptions};
+use densify::train::trainer::{AutoChoices, OnNan, TrainOptions, Trainer, growth_signals};
 use densify_policies::plan::EditPlan;
 use densify_policies::policy::{DensityPolicy, Needs, PolicyError, SceneInfo, Snapshot};
 use densify_policies::rng::PolicyRng;

@@ -1,11 +1,11 @@
 //! What holds for any scene, camera and size.
 
-use densify::backend::Rendering;
-use densify::camera::Camera;
-use densify::gaussians::{Gaussians, sh_coefficients};
-use densify::verify::reference::CLASSES;
-use densify::verify::values::SIZES;
-use densify::verify::{Setup, Subject, scenes};
+use densify::core::camera::Camera;
+use densify::core::gaussians::{Gaussians, sh_coefficients};
+use densify::render::Rendering;
+use densify::selftest::reference::CLASSES;
+use densify::selftest::values::SIZES;
+use densify::selftest::{Setup, Subject, scenes};
 use proptest::prelude::*;
 use proptest::test_runner::{TestCaseResult, TestRunner};
 

@@ -1,11 +1,11 @@
 //! Rows that hold a number that is not finite: every one is found, none is lost sight of, and no other row
 //! notices. That a gradient which cannot be squared is found in a moment is in case 25 of the
-//! [selftest](densify::verify).
+//! [selftest](densify::selftest).
 
-use densify::backend::{Attribute, Backend, Kept, Storage, Unsound, Values};
-use densify::gaussians::Gaussians;
-use densify::verify::values::{POISON, SLOTS, remove, slot_of};
-use densify::verify::{Setup, Subject, scenes};
+use densify::core::gaussians::Gaussians;
+use densify::render::{Attribute, Backend, Kept, Storage, Unsound, Values};
+use densify::selftest::values::{POISON, SLOTS, remove, slot_of};
+use densify::selftest::{Setup, Subject, scenes};
 use densify_policies::plan::EditPlan;
 
 use crate::subject::{make, make_with, on_each, repeatable, step_input, storages};

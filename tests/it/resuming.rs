@@ -1,15 +1,15 @@
 //! What a checkpoint holds of a backend is all that its future depends on.
 
-use densify::backend::{Backend, StepInput, Storage, Tensor, Values};
+use densify::render::{Backend, StepInput, Storage, Tensor, Values};
 use densify_policies::policy::{
     Cadence, CandidateRequest, DepthMode, ErrorMode, ErrorScore, LossTerms, MaskTerm, Needs,
     Signal, SignalSet,
 };
 
 use crate::subject::{make, make_with, repeatable, saved, step_input, storages};
-use densify::camera::Camera;
-use densify::gaussians::Gaussians;
-use densify::verify::{Differentiable, Setup, Subject, scenes};
+use densify::core::camera::Camera;
+use densify::core::gaussians::Gaussians;
+use densify::selftest::{Differentiable, Setup, Subject, scenes};
 
 /// Steps before the state is taken: with sums over several steps, no step is due, and all have some that wait.
 const BEFORE: u32 = 7;

@@ -2,13 +2,13 @@
 //! running twice; for the order of rows, and rows that are not seen, see `properties`. Sums in any order
 //! stay near to those.
 
-use densify::backend::cpu::{InstructionSet, ModelGradient};
-use densify::backend::{Rendering, StepOutput, Storage};
-use densify::camera::Camera;
-use densify::gaussians::Gaussians;
-use densify::verify::compare::{Table, relative_error};
-use densify::verify::reference::CLASSES;
-use densify::verify::{Differentiable, Setup, Subject, scenes};
+use densify::core::camera::Camera;
+use densify::core::gaussians::Gaussians;
+use densify::render::cpu::{InstructionSet, ModelGradient};
+use densify::render::{Rendering, StepOutput, Storage};
+use densify::selftest::compare::{Table, relative_error};
+use densify::selftest::reference::CLASSES;
+use densify::selftest::{Differentiable, Setup, Subject, scenes};
 use densify_policies::plan::EditPlan;
 
 use crate::subject::{

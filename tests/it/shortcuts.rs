@@ -1,14 +1,14 @@
 //! Shortcuts of the backends: with other limits of blending they are held to the reference with these
 //! limits, forward and backward.
 
-use densify::backend::Shortcuts;
-use densify::camera::Camera;
-use densify::gaussians::Gaussians;
+use densify::core::camera::Camera;
+use densify::core::gaussians::Gaussians;
+use densify::render::Shortcuts;
 
 use crate::subject::{GREY, all, make_with};
-use densify::verify::compare::{Limits, Table, class, compare_images, relative_error};
-use densify::verify::reference::{CLASSES, Image, Model, Rules, View, blend, project};
-use densify::verify::{Setup, scenes};
+use densify::selftest::compare::{Limits, Table, class, compare_images, relative_error};
+use densify::selftest::reference::{CLASSES, Image, Model, Rules, View, blend, project};
+use densify::selftest::{Setup, scenes};
 
 /// Gradients, as elsewhere, against the largest of their class.
 const GRADIENT: f64 = 1e-4;
@@ -28,7 +28,7 @@ fn truth(
     model: &Gaussians,
     camera: &Camera,
     rules: &Rules,
-) -> (Image, Model, densify::verify::reference::Upstream) {
+) -> (Image, Model, densify::selftest::reference::Upstream) {
     let view = View { camera, background: GREY.map(f64::from), sh_degree: 1 };
     let exact = Model::of(model);
     let splats = project::project(&exact, view, rules);

@@ -1,24 +1,24 @@
 //! The signals that training accumulates, against the reference's loss gradient. One piece, as
 //! all tests share the views and their references.
 
-use densify::backend::{LearningRates, StepInput, Storage};
-use densify::camera::Camera;
-use densify::dataset::images::Image8;
-use densify::gaussians::{Gaussians, dc_to_rgb};
+use densify::core::camera::Camera;
+use densify::core::gaussians::{Gaussians, dc_to_rgb};
+use densify::core::image::Image8;
+use densify::render::{LearningRates, StepInput, Storage};
 use densify_policies::plan::EditPlan;
 use densify_policies::policy::{
     ErrorMap, ErrorScore, Needs, SUPPORT_WEIGHT, Signal, SignalKind, SignalSet,
 };
 
 use crate::subject::{all, devices, make_with, normalised, repeatable, step_input, storages};
-use densify::verify::compare::{Table, relative_error};
-use densify::verify::reference::blend::each_blended;
-use densify::verify::reference::loss::{Loss, loss};
-use densify::verify::reference::project::{by_depth, project};
-use densify::verify::reference::{
+use densify::selftest::compare::{Table, relative_error};
+use densify::selftest::reference::blend::each_blended;
+use densify::selftest::reference::loss::{Loss, loss};
+use densify::selftest::reference::project::{by_depth, project};
+use densify::selftest::reference::{
     Gradient, Image, Model, Rules, Upstream, View, differentiate, render,
 };
-use densify::verify::{Differentiable, Setup, Subject, scenes};
+use densify::selftest::{Differentiable, Setup, Subject, scenes};
 
 /// A quarter of the loss's gradient jumps with the sign of render − target, and a few pixels are
 /// near a step, so this is the tolerance of gradients, doubled.

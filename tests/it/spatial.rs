@@ -5,15 +5,15 @@
 
 use std::sync::Arc;
 
-use densify::backend::Backend;
-use densify::camera::Camera;
-use densify::dataset::images::SharedImage;
-use densify::gaussians::{Gaussians, dc_to_rgb};
-use densify::schedule::{Background, RateOptions};
-use densify::trainer::{OnNan, TrainOptions, Trainer};
-use densify::verify::reference::View;
-use densify::verify::{Setup, scenes};
-use densify::views::{ViewError, ViewSource};
+use densify::core::camera::Camera;
+use densify::core::gaussians::{Gaussians, dc_to_rgb};
+use densify::core::image::SharedImage;
+use densify::data::views::{ViewError, ViewSource};
+use densify::render::Backend;
+use densify::selftest::reference::View;
+use densify::selftest::{Setup, scenes};
+use densify::train::schedule::{Background, RateOptions};
+use densify::train::trainer::{OnNan, TrainOptions, Trainer};
 use densify_policies::adc::clone_at;
 use densify_policies::conformance::check_policy;
 use densify_policies::parameters::StepParameter;

@@ -2,8 +2,8 @@
 //! in `sameness`, that it goes on to the same bits in `resuming`, that the audit sees what is no number in
 //! `quarantine`, and what a row takes in `cli/memory.rs`.
 
-use densify::backend::Storage;
-use densify::verify::{Setup, Subject, scenes};
+use densify::render::Storage;
+use densify::selftest::{Setup, Subject, scenes};
 
 use crate::subject::{GREY, make, make_with, photograph, step_input, storages};
 

@@ -6,22 +6,22 @@
 
 use std::sync::OnceLock;
 
-use densify::backend::cpu::InstructionSet;
-use densify::backend::gpu::{GpuDevice, adapters};
-use densify::backend::{Accumulation, AdapterChoice, AdapterSummary};
-use densify::backend::{
+use densify::core::camera::Camera;
+use densify::core::gaussians::Gaussians;
+use densify::core::image::Image8;
+use densify::render::cpu::InstructionSet;
+use densify::render::gpu::{GpuDevice, adapters};
+use densify::render::{Accumulation, AdapterChoice, AdapterSummary};
+use densify::render::{
     Backend, MomentStorage, ParameterStorage, Rendering, StateArray, StepInput, Storage, Tensor,
 };
-use densify::camera::Camera;
-use densify::dataset::images::Image8;
-use densify::gaussians::Gaussians;
-use densify::verify::{Differentiable, Setup, Subject};
+use densify::selftest::{Differentiable, Setup, Subject};
 use densify_policies::policy::{Cadence, LossTerms};
 use glam::{DMat3, DVec3};
 use proptest::prelude::ProptestConfig;
 
-pub(crate) use densify::verify::compare::class;
-pub(crate) use densify::verify::values::RATES;
+pub(crate) use densify::selftest::compare::class;
+pub(crate) use densify::selftest::values::RATES;
 
 /// The background of most tests.
 pub(crate) const GREY: [f32; 3] = [0.3, 0.4, 0.6];

@@ -2,9 +2,9 @@
 
 use std::iter;
 
-use densify::backend::Setup;
-use densify::backend::cpu::CpuBackend;
-use densify::backend::gpu::GpuDevice;
+use densify::render::Setup;
+use densify::render::cpu::CpuBackend;
+use densify::render::gpu::GpuDevice;
 use densify_policies::policy::{
     AuxRequest, Cadence, ErrorScore, LossTerms, MaskTerm, Needs, NoiseTerm, Signal,
 };

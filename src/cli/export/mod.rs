@@ -9,12 +9,12 @@ use clap::{ArgMatches, Args};
 
 use super::console::Console;
 use super::render::{RenderingArgs, refuse_options_of_a_file};
-use crate::export::{Format, find, find_by_extension, formats, is_unfit};
-use crate::failure::{Failure, INPUT};
-use crate::gaussians::Gaussians;
-use crate::number::gaussians;
-use crate::output::{OutputError, write_atomically};
-use crate::run::finished::{model_file, read_model};
+use densify_core::files::{OutputError, write_atomically};
+use densify_core::gaussians::Gaussians;
+use densify_core::numbers::gaussians;
+use densify_data::export::{Format, find, find_by_extension, formats, is_unfit};
+use densify_run::failure::{Failure, INPUT};
+use densify_run::finished::{model_file, read_model};
 use table::{Line, Truth};
 
 /// The name that stands for every format.

@@ -4,19 +4,19 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use super::ExportArgs;
-use crate::backend::Backend;
-use crate::cli::console::Console;
-use crate::dataset::Dataset;
-use crate::evaluate::Split;
-use crate::failure::Failure;
-use crate::gaussians::Gaussians;
-use crate::likeness::Likeness;
-use crate::metrics::psnr_between;
-use crate::number::{grouped, percent};
-use crate::output::OutputError;
-use crate::run::RunConfig;
-use crate::run::finished::{Machine, load, views_of};
-use crate::views::ViewSource;
+use crate::console::Console;
+use densify_core::files::OutputError;
+use densify_core::gaussians::Gaussians;
+use densify_core::numbers::{grouped, percent};
+use densify_data::dataset::Dataset;
+use densify_data::views::ViewSource;
+use densify_render::Backend;
+use densify_run::RunConfig;
+use densify_run::failure::Failure;
+use densify_run::finished::{Machine, load, views_of};
+use densify_run::likeness::Likeness;
+use densify_train::evaluate::Split;
+use densify_train::metrics::psnr_between;
 
 /// A format that was written.
 pub(super) struct Line {

@@ -16,9 +16,10 @@ use super::console::Console;
 use super::flags;
 use super::interrupt::Interrupts;
 use super::progress::Progress;
-use crate::failure::Failure;
-use crate::output::RunFolder;
-use crate::run::{self, Interrupt, Observer, Occupied, Partial, Resumed, Run, RunSpec};
+use densify_run as run;
+use densify_run::failure::Failure;
+use densify_run::{Companion, Interrupt, Observer, Occupied, Partial, Resumed, Run, RunSpec};
+use densify_train::output::RunFolder;
 
 /// Trains a scene.
 ///
@@ -41,6 +42,16 @@ pub(super) struct TrainArgs {
     /// Replace the run that is in the output folder, once this one is complete
     #[arg(long, help_heading = "Output")]
     overwrite: bool,
+    /// Show the run in the browser while it trains: serves a page on this machine alone, with the model,
+    /// curves and edits, that can pause, keep and stop the run (default port: the first free one from 8080
+    /// on). From another machine: ssh -L 8080:127.0.0.1:8080 NAME, then the whole printed address. Its pictures are
+    /// no larger than the largest photograph. The run is the same with it and without; of --memory the page takes
+    /// a part
+    #[arg(
+        long, value_name = "PORT", num_args = 0..=1, require_equals = true, default_missing_value = "0",
+        help_heading = "Output"
+    )]
+    pub(super) view: Option<u16>,
     /// Show nothing but errors
     #[arg(short, long, help_heading = "Output")]
     pub(super) quiet: bool,
@@ -59,6 +70,11 @@ Examples:
   densify train data/garden --view            and look at it meanwhile";
 
 impl TrainArgs {
+    /// The page that is to stay beside the run, if there is one.
+    pub(super) fn companion(&self) -> Option<Companion> {
+        self.view.map(|_| page::COMPANION)
+    }
+
     /// The run that this call describes, by file or by flag; with the checkpoint that it goes on from, if it
     /// does.
     pub(super) fn describe(
@@ -94,8 +110,8 @@ pub(super) fn run(
         RunFolder::check(&spec.output_folder()?, args.overwrite)?;
     }
     // The port first: it is known at once, and a scene may take long to read.
-    let page = spec.output.view.map(page::open).transpose()?;
-    let run = Run::prepare_observed(&spec, resumed, &follower)?;
+    let page = args.view.map(page::open).transpose()?;
+    let run = Run::prepare_observed(&spec, resumed, args.companion(), &follower)?;
     if occupied != Occupied::Resume {
         announce_preset(&spec, console)?;
     }
@@ -108,8 +124,8 @@ pub(super) fn run(
 
 /// Says what the preset was measured to cost and gain, where the run is as long as it was then.
 fn announce_preset(spec: &RunSpec, console: &Console) -> Result<(), Failure> {
-    let name = spec.schedule.preset.as_deref().unwrap_or(crate::knobs::DEFAULT_PRESET);
-    let preset = crate::knobs::preset(name).map_err(Failure::input)?;
+    let name = spec.schedule.preset.as_deref().unwrap_or(densify_run::knobs::DEFAULT_PRESET);
+    let preset = densify_run::knobs::preset(name).map_err(Failure::input)?;
     let iterations = spec.schedule.iterations.0.to_string();
     match preset.levels.iter().find(|(name, _)| *name == "iterations") {
         Some((_, own)) if *own != iterations => console.say(format_args!(
@@ -133,7 +149,7 @@ impl<'a> Follower<'a> {
     }
 
     /// From here on a signal stops the run in order.
-    pub(in crate::cli) fn listen(&self) {
+    pub(crate) fn listen(&self) {
         *self.interrupts.borrow_mut() = Some(Interrupts::listen());
     }
 }

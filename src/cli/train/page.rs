@@ -3,10 +3,11 @@
 use std::net::Ipv4Addr;
 
 use super::Follower;
-use crate::cli::console::Console;
-use crate::failure::Failure;
-use crate::run::{Occupied, Run};
-use crate::view::{Place, Server};
+use crate::console::Console;
+use densify_run::failure::Failure;
+use densify_run::{Occupied, Run};
+pub(super) use densify_view::COMPANION;
+use densify_view::{Place, Server};
 
 /// Takes the port; 0 is the first that is free.
 pub(super) fn open(port: u16) -> Result<Server, Failure> {

@@ -7,12 +7,12 @@ use clap::FromArgMatches;
 use tempfile::TempDir;
 
 use super::*;
-use crate::backend::AdapterKind;
-use crate::backend::gpu::{adapters, with_device_lost_after};
-use crate::dataset::tests::write::Made;
-use crate::failure::{DEVICE, INPUT, OTHER};
-use crate::output::disk::{Fault, Operation, with_fault};
-use crate::output::model_path;
+use densify_core::files::disk::{Fault, Operation, with_fault};
+use densify_fixtures::Made;
+use densify_render::AdapterKind;
+use densify_render::gpu::{adapters, with_device_lost_after};
+use densify_run::failure::{DEVICE, INPUT, OTHER};
+use densify_train::output::model_path;
 
 const OPERATIONS: [Operation; 5] =
     [Operation::Create, Operation::Write, Operation::Flush, Operation::Sync, Operation::Rename];
@@ -42,7 +42,7 @@ impl Case {
             .chain(["--iterations", "12", "--budget", "250", "--sh-degree", "0", "--quiet"])
             .chain(["--save-iterations", "5", "--checkpoint-every", "4", "--test-every", "3"])
             .chain(flags.split_whitespace());
-        let matches = crate::cli::command().try_get_matches_from(words).unwrap();
+        let matches = crate::command().try_get_matches_from(words).unwrap();
         let matches = matches.subcommand_matches("train").unwrap();
         run(&TrainArgs::from_arg_matches(matches).unwrap(), matches, &Console::new(true))
     }

@@ -1,10 +1,13 @@
 //! In place of the page of a run in training, in a program that was built without the feature `view`: its refusal.
 
 use super::Follower;
-use crate::cli::console::Console;
-use crate::failure::Failure;
-use crate::run::{Occupied, Run};
+use crate::console::Console;
 use crate::without::without;
+use densify_run::failure::Failure;
+use densify_run::{Companion, Occupied, Run};
+
+/// Never used: [`open`] fails before.
+pub(super) const COMPANION: Companion = Companion { reserve: |_, _| {}, points: 0 };
 
 /// Never made.
 pub(super) enum Page {}

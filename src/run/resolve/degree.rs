@@ -2,31 +2,32 @@
 
 use std::ops::RangeInclusive;
 
-use crate::dataset::Dataset;
-use crate::gaussians::MAX_SH_DEGREE;
-use crate::number::grouped;
-use crate::run::config::{DegreeSource, RunConfig};
-use crate::run::spec::RunSpec;
-use crate::run::values::ShDegree;
-use crate::spread::{self, MIN_TRACKS, TrackColours};
+use crate::config::{DegreeSource, RunConfig};
+use crate::spec::RunSpec;
+use crate::values::ShDegree;
+use densify_core::gaussians::MAX_SH_DEGREE;
+use densify_core::numbers::grouped;
+use densify_data::dataset::Dataset;
+use densify_data::track_colours;
+use densify_data::track_colours::{MIN_TRACKS, TrackColours};
 
 /// The degree of a run, before its memory is known.
 #[derive(Debug, Clone)]
-pub(in crate::run) struct Degree {
+pub(crate) struct Degree {
     /// The highest wanted, and how far memory may lower it.
-    pub(in crate::run) range: RangeInclusive<u8>,
+    pub(crate) range: RangeInclusive<u8>,
     /// Who decided it.
-    pub(in crate::run) source: DegreeSource,
+    pub(crate) source: DegreeSource,
 }
 
 impl Degree {
-    pub(in crate::run) fn highest(&self) -> u8 {
+    pub(crate) fn highest(&self) -> u8 {
         *self.range.end()
     }
 
     /// Decides it: from the configuration of a run that goes on, else as the options say, else from
     /// the colours of the dataset's tracks, where it has enough.
-    pub(in crate::run) fn decide(
+    pub(crate) fn decide(
         spec: &RunSpec,
         saved: Option<&RunConfig>,
         dataset: &Dataset,
@@ -42,7 +43,7 @@ impl Degree {
             None if spec.size.full => given(MAX_SH_DEGREE..=MAX_SH_DEGREE),
             None => given(0..=MAX_SH_DEGREE),
             Some(ShDegree::Auto(None)) => {
-                let found = colours.map(|colours| spread::measure(&dataset.tracks, colours));
+                let found = colours.map(|colours| track_colours::measure(&dataset.tracks, colours));
                 let decided = found.and_then(|found| Some((found.degree()?, found)));
                 let (degree, source) = match decided {
                     Some((degree, spread)) => (degree, DegreeSource::Spread(spread)),
@@ -54,7 +55,7 @@ impl Degree {
     }
 
     /// What there is to say about it, if anything.
-    pub(in crate::run) fn line(&self) -> Option<String> {
+    pub(crate) fn line(&self) -> Option<String> {
         match self.source {
             DegreeSource::Given => None,
             DegreeSource::Spread(found) => Some(format!(

@@ -1,21 +1,21 @@
 //! `--exposure`: whether each photograph has an exposure of its own, and who decides it.
 
-use crate::dataset::{Dataset, ReportedExposures};
-use crate::exposure::evidence::{ExposureSpread, MIN_STOPS};
-use crate::exposure::reported::{Believed, complete, spread};
-use crate::exposure::{ExposureChoice, Exposures};
-use crate::number::grouped;
-use crate::run::config::{ExposureSource, RunConfig};
-use crate::run::spec::RunSpec;
-use crate::spread::{MIN_TRACKS, TrackColours};
+use crate::config::{ExposureSource, RunConfig};
+use crate::spec::RunSpec;
+use densify_core::numbers::grouped;
+use densify_data::dataset::{Dataset, ReportedExposures};
+use densify_data::track_colours::exposures::{ExposureSpread, MIN_STOPS};
+use densify_data::track_colours::{MIN_TRACKS, TrackColours};
+use densify_train::exposure::reported::{Believed, complete, spread};
+use densify_train::exposure::{ExposureChoice, Exposures};
 
 /// The exposures of a run.
 #[derive(Debug, Clone)]
-pub(in crate::run) struct Exposure {
+pub(crate) struct Exposure {
     /// Whether they are learned.
-    pub(in crate::run) is_on: bool,
+    pub(crate) is_on: bool,
     /// Who decided it.
-    pub(in crate::run) source: ExposureSource,
+    pub(crate) source: ExposureSource,
     /// Gains of the training views to begin with; none where all begin alike.
     gains: Vec<[f32; 3]>,
     /// Whether the colours of tracks gave them.
@@ -31,7 +31,7 @@ pub(in crate::run) struct Exposure {
 impl Exposure {
     /// Decides it: from the configuration of a run that goes on from a checkpoint, else as the option says, else
     /// from the colours of tracks. What it begins with is from these, and from EXIF where they say nothing.
-    pub(in crate::run) fn decide(
+    pub(crate) fn decide(
         spec: &RunSpec,
         saved: Option<&RunConfig>,
         colours: Option<&TrackColours>,
@@ -96,19 +96,19 @@ impl Exposure {
     }
 
     /// Notes for the user.
-    pub(in crate::run) fn notes(&self) -> &[String] {
+    pub(crate) fn notes(&self) -> &[String] {
         &self.notes
     }
 
     /// What the run begins with, if exposures are learned.
-    pub(in crate::run) fn first(&self, spec: &RunSpec, dataset: &Dataset) -> Option<Exposures> {
+    pub(crate) fn first(&self, spec: &RunSpec, dataset: &Dataset) -> Option<Exposures> {
         let alike = vec![[1.0; 3]; dataset.train.len()];
         let gains = if self.gains.is_empty() { &alike } else { &self.gains };
         self.is_on.then(|| Exposures::new(spec.schedule.exposure_model, gains))
     }
 
     /// What there is to say about it, if anything.
-    pub(in crate::run) fn line(&self) -> Option<String> {
+    pub(crate) fn line(&self) -> Option<String> {
         let word = if self.is_on { "on" } else { "off" };
         match self.source {
             ExposureSource::Given if self.is_on => Some(match (self.by_tracks, self.believed) {
@@ -160,7 +160,7 @@ impl Exposure {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::exposure::ExposureModel;
+    use densify_train::exposure::ExposureModel;
 
     fn decided(choice: ExposureChoice, reported: &ReportedExposures) -> Exposure {
         let mut spec = RunSpec::default();

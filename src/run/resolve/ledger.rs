@@ -6,19 +6,20 @@ use densify_policies::policy::Needs;
 use glam::DVec3;
 
 use super::{DECODERS, Inputs};
-use crate::backend::{KeptPhotographs, MomentStorage, ROWS_AT_A_TIME, Setup, Shortcuts, Storage};
-use crate::dataset::images::ImageDemand;
-use crate::dataset::{Dataset, View};
-use crate::export::{PLY, Shape};
-use crate::exposure::Exposures;
-use crate::gaussians::sh_coefficients;
-use crate::memory::{Ledger, RunSize, Section};
-use crate::metrics::{geometry, scratch_bytes};
-use crate::run::measuring::Measuring;
-use crate::run::start::{first_bytes, reading_bytes};
-use crate::trainer::AutoChoices;
-#[cfg(feature = "view")]
-use crate::view::live as page;
+use crate::companion::CompanionSize;
+use crate::measuring::Measuring;
+use crate::memory::RunSize;
+use crate::start::{first_bytes, reading_bytes};
+use densify_core::gaussians::sh_coefficients;
+use densify_core::memory::{Ledger, Section};
+use densify_core::pieces::ROWS_AT_A_TIME;
+use densify_data::dataset::images::ImageDemand;
+use densify_data::dataset::{Dataset, View};
+use densify_data::export::{PLY, Shape};
+use densify_render::{KeptPhotographs, MomentStorage, Setup, Shortcuts, Storage};
+use densify_train::exposure::Exposures;
+use densify_train::metrics::{geometry, scratch_bytes};
+use densify_train::trainer::AutoChoices;
 
 /// What the program takes for itself: its code as far as it runs, and the stacks of its threads.
 /// Measured at 10 to 13 MiB, and at about 14 MiB in builds for tests (profile `dev`).
@@ -44,7 +45,7 @@ const POINT: u64 = (size_of::<DVec3>() + 3) as u64;
 
 impl Inputs<'_> {
     /// How the backend is made for a size.
-    pub(in crate::run) fn backend_options(&self, setting: &RunSize, needs: Needs) -> Setup {
+    pub(crate) fn backend_options(&self, setting: &RunSize, needs: Needs) -> Setup {
         Setup {
             frozen: self.frozen_rows(),
             near: (self.spec.start.near.0 * self.dataset.extent()) as f32,
@@ -81,7 +82,7 @@ impl Inputs<'_> {
 
     /// Everything that a run takes with these needs: the one function that tells the bytes of a size,
     /// to which the solver finds the largest size.
-    pub(in crate::run) fn ledger(&self, setting: &RunSize, needs: &Needs) -> Ledger {
+    pub(crate) fn ledger(&self, setting: &RunSize, needs: &Needs) -> Ledger {
         let threads = self.threads().max(THREADS);
         let degree = setting.sh_degree;
         let options = self.backend_options(setting, needs.clone());
@@ -125,15 +126,17 @@ impl Inputs<'_> {
         let piece = budget.min(ROWS_AT_A_TIME as u64);
         let held = PLY.held_bytes(Shape { rows: setting.rows, sh_degree: degree });
         pass("export of the model, checkpoint", 2 * piece * row + held + EXPOSURE_TEXT * exposures);
-        #[cfg(feature = "view")]
-        if self.spec.output.view.is_some() {
-            pass("a picture for the page", page::passing_bytes(budget, &self.device));
-            let photograph =
-                train.held(0).max(test.held(0)) + train.decoding(1).max(test.decoding(1));
-            let (image, views) =
-                (self.dataset.largest_image(), self.dataset.train.len() + self.dataset.test.len());
-            let bytes = page::lasting_bytes(image, photograph, views, budget, threads);
-            ledger.add_to(Section::Renderer, "the page", bytes);
+        if let Some(companion) = self.companion {
+            let size = CompanionSize {
+                budget,
+                device: &self.device,
+                largest_image: self.dataset.largest_image(),
+                photograph: train.held(0).max(test.held(0))
+                    + train.decoding(1).max(test.decoding(1)),
+                views: self.dataset.train.len() + self.dataset.test.len(),
+                threads,
+            };
+            (companion.reserve)(&size, &mut ledger);
         }
         let mut pass = |what: &str, bytes| ledger.add_to(Section::Passing, what, bytes);
         let measures_test = !self.dataset.test.is_empty();
@@ -168,7 +171,7 @@ impl Inputs<'_> {
     }
 
     /// How the model is measured at the end, where views are held out and the surface is known.
-    pub(in crate::run) fn measuring(&self, setting: &RunSize, threads: usize) -> Option<Measuring> {
+    pub(crate) fn measuring(&self, setting: &RunSize, threads: usize) -> Option<Measuring> {
         let surface = self.dataset.surface_bytes.filter(|_| !self.dataset.test.is_empty())?;
         let options = Setup {
             photographs: KeptPhotographs::default(),

@@ -16,32 +16,33 @@ use densify_policies::policy::{Needs, SceneInfo, SignalSet};
 use densify_policies::registry::PolicyEntry;
 use toml::Table;
 
-pub(crate) use plan::promised;
-#[cfg(feature = "study")]
-pub(crate) use plan::promised_bytes;
+pub use plan::promised;
+pub use plan::promised_bytes;
 pub use plan::{Alternatives, Plan, plan};
 pub use size::DEFAULT_BUDGET;
 pub(super) use size::{Size, check, check_grant};
 
+use super::companion::Companion;
 use super::config::{ModelSize, RunConfig};
 use super::observer::Observer;
 use super::spec::{RunSpec, StartSpec};
 use super::start::size_of_model;
 use super::values::{Budget, InitChoice, ShDegree, Threads};
-use crate::backend::Accumulation;
-use crate::backend::{BackendKind, Device};
-use crate::dataset::images::ImageDemand;
-use crate::dataset::{Dataset, ReportedExposures, Tracks, View};
-use crate::exposure::ExposureChoice;
 use crate::failure::Failure;
-use crate::init::usable_points;
 use crate::knobs::Knobs;
-use crate::memory::{peak_resident, resident};
-use crate::number::grouped;
-use crate::schedule::Background;
-use crate::spread::{self, MIN_TRACKS, TrackColours};
-use crate::trainer::{AutoChoices, growth_signals};
 use degree::Degree;
+use densify_core::memory::{peak_resident, resident};
+use densify_core::numbers::grouped;
+use densify_data::dataset::images::ImageDemand;
+use densify_data::dataset::{Dataset, ReportedExposures, Tracks, View};
+use densify_data::track_colours;
+use densify_data::track_colours::{MIN_TRACKS, TrackColours};
+use densify_render::Accumulation;
+use densify_render::{BackendKind, Device};
+use densify_train::exposure::ExposureChoice;
+use densify_train::init::usable_points;
+use densify_train::schedule::Background;
+use densify_train::trainer::{AutoChoices, growth_signals};
 use exposure::Exposure;
 
 /// Most points of a random initialisation, where none is given (Kerbl et al. 2023 use 100,000).
@@ -100,6 +101,8 @@ pub(super) struct Inputs<'a> {
     /// Resident memory with the dataset and a device's driver, and the most before that had its kernels.
     resident: Option<u64>,
     peak: Option<u64>,
+    /// What stays beside the run.
+    companion: Option<Companion>,
 }
 
 impl<'a> Inputs<'a> {
@@ -107,6 +110,7 @@ impl<'a> Inputs<'a> {
     pub(super) fn load(
         spec: &'a RunSpec,
         known: Option<Known<'_>>,
+        companion: Option<Companion>,
         observer: &dyn Observer,
     ) -> Result<Self, Failure> {
         let saved = known.map(|known| known.config);
@@ -150,8 +154,11 @@ impl<'a> Inputs<'a> {
             _ if exposures == Begun::Reckoned => None,
             _ => Some(TrackColours::read(&dataset.tracks, &dataset.train)?),
         };
-        let track_bytes =
-            if with_tracks { dataset.tracks.bytes() + spread::bytes(&dataset.tracks) } else { 0 };
+        let track_bytes = if with_tracks {
+            dataset.tracks.bytes() + track_colours::bytes(&dataset.tracks)
+        } else {
+            0
+        };
         let degree = Degree::decide(spec, saved, &dataset, colours.as_ref());
         let reported = match is_exposed && exposures == Begun::Anew {
             true => ReportedExposures::of(&dataset.train),
@@ -183,6 +190,7 @@ impl<'a> Inputs<'a> {
             usable,
             resident,
             peak,
+            companion,
         };
         let driver = inputs.driver_bytes()?;
         inputs.resident = inputs.resident.map(|bytes| bytes + driver);
@@ -313,7 +321,7 @@ pub(super) fn random_count(budget: usize) -> usize {
 }
 
 /// Limits rayon's common pool, which measuring uses, to the threads the user grants.
-pub(crate) fn use_threads(threads: Option<Threads>) {
+pub fn use_threads(threads: Option<Threads>) {
     if let Some(threads) = threads {
         // It fails only if the pool is in use already; then its size is what it is.
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads.0 as usize);

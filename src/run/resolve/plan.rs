@@ -4,14 +4,15 @@ use std::fmt;
 
 use super::size::{self, MIB, RESOLUTIONS, Size};
 use super::{Begun, Inputs, Known, ModelSize, RunConfig, RunSpec};
-use crate::dataset::Resolution;
-use crate::exposure::ExposureChoice;
+use crate::companion::Companion;
+use crate::config::Resolved;
 use crate::failure::Failure;
-use crate::memory::Ledger;
-use crate::number::grouped;
-use crate::run::config::Resolved;
-use crate::run::observer::Observer;
-use crate::run::values::ByteCount;
+use crate::observer::Observer;
+use crate::values::ByteCount;
+use densify_core::memory::Ledger;
+use densify_core::numbers::grouped;
+use densify_data::dataset::Resolution;
+use densify_train::exposure::ExposureChoice;
 
 /// How large a run would be, and what it would take.
 #[derive(Debug, Clone)]
@@ -36,8 +37,12 @@ pub struct Alternatives {
 }
 
 /// Finds out what a run would take. Trains nothing and writes nothing.
-pub fn plan(spec: &RunSpec, observer: &dyn Observer) -> Result<Plan, Failure> {
-    let inputs = Inputs::load(spec, None, observer)?;
+pub fn plan(
+    spec: &RunSpec,
+    companion: Option<Companion>,
+    observer: &dyn Observer,
+) -> Result<Plan, Failure> {
+    let inputs = Inputs::load(spec, None, companion, observer)?;
     let size = Size::choose(&inputs)?;
     let rows = size.setting.rows;
     let ledger = inputs.ledger(&size.setting, &inputs.needs(rows)?);
@@ -54,7 +59,7 @@ pub fn plan(spec: &RunSpec, observer: &dyn Observer) -> Result<Plan, Failure> {
 ///
 /// # Errors
 /// As [`plan`].
-pub(crate) fn promised(
+pub fn promised(
     spec: &RunSpec,
     [init_model, frozen]: [Option<ModelSize>; 2],
     observer: &dyn Observer,
@@ -63,7 +68,7 @@ pub(crate) fn promised(
     let resolved = Resolved { init_model, frozen, has_exposures, ..Resolved::default() };
     let config = RunConfig { densify: String::new(), spec: spec.clone(), resolved };
     let known = Known { config: &config, exposures: Begun::Reckoned };
-    let inputs = Inputs::load(spec, Some(known), observer)?;
+    let inputs = Inputs::load(spec, Some(known), None, observer)?;
     let setting = Size::choose(&inputs)?.setting;
     let ledger = inputs.ledger(&setting, &inputs.needs(setting.rows)?);
     Ok((setting.rows, ledger))
@@ -73,9 +78,8 @@ pub(crate) fn promised(
 ///
 /// # Errors
 /// As [`plan`].
-#[cfg(feature = "study")]
-pub(crate) fn promised_bytes(spec: &RunSpec, observer: &dyn Observer) -> Result<u64, Failure> {
-    let inputs = Inputs::load(spec, None, observer)?;
+pub fn promised_bytes(spec: &RunSpec, observer: &dyn Observer) -> Result<u64, Failure> {
+    let inputs = Inputs::load(spec, None, None, observer)?;
     let setting = Size::choose(&inputs)?.setting;
     Ok(inputs.ledger(&setting, &inputs.needs(setting.rows)?).on_host())
 }

@@ -1,12 +1,12 @@
 //! What would make a run fit that does not: changes of its options, each tried, the cheapest first.
 
 use super::{Inputs, RunSpec};
-use crate::backend::BackendKind;
-use crate::dataset::Resolution;
 use crate::failure::Failure;
 use crate::knobs::DEFAULT_PRESET;
-use crate::run::overlay::Partial;
-use crate::run::values::{ImageCache, Rows, ShDegree};
+use crate::overlay::Partial;
+use crate::values::{ImageCache, Rows, ShDegree};
+use densify_data::dataset::Resolution;
+use densify_render::BackendKind;
 
 /// The preset of runs that are short of memory.
 const SMALL: &str = "tiny-memory";

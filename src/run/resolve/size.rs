@@ -2,15 +2,15 @@
 
 use super::remedy::{Change, any_of, remedies};
 use super::{DECODERS, Inputs, TEST_DECODERS};
-use crate::backend::BackendKind;
-use crate::dataset::Resolution;
 use crate::failure::{DEVICE, Failure};
 use crate::memory::{
-    Bytes, Fit, IMAGES, Ledger, MemoryLimit, PAIRS, RunSize, SizeRequest, fit, grant, min_memory,
-    most_within, resident,
+    Fit, IMAGES, MemoryLimit, PAIRS, RunSize, SizeRequest, fit, grant, min_memory, most_within,
 };
-use crate::number::grouped;
-use crate::run::values::{Budget, ByteCount, ImageCache};
+use crate::values::{Budget, ByteCount, ImageCache};
+use densify_core::memory::{Bytes, Ledger, resident};
+use densify_core::numbers::grouped;
+use densify_data::dataset::Resolution;
+use densify_render::BackendKind;
 
 /// Most rows, where `--budget` is not given: trains on a laptop in well under 2 GiB, and carries a room or
 /// an object; large outdoor scenes want more.
@@ -28,15 +28,15 @@ pub(super) const RESOLUTIONS: [Resolution; 3] =
     [Resolution::Divisor(1), Resolution::Divisor(2), Resolution::Divisor(4)];
 
 /// The size of a run.
-pub(in crate::run) struct Size {
-    pub(in crate::run) setting: RunSize,
+pub(crate) struct Size {
+    pub(crate) setting: RunSize,
     /// The memory given, and what follows from it.
     solved: Option<(u64, Fit)>,
 }
 
 impl Size {
     /// As the options say, which name rows.
-    pub(in crate::run) fn as_given(inputs: &Inputs<'_>) -> Result<Self, Failure> {
+    pub(crate) fn as_given(inputs: &Inputs<'_>) -> Result<Self, Failure> {
         let rows = inputs.budget().unwrap_or(DEFAULT_BUDGET);
         let most = most_pairs(inputs, rows)?;
         let per_row = inputs.knobs.pairs_per_row.unwrap_or(PAIRS_PER_ROW);
@@ -66,7 +66,7 @@ impl Size {
     ///
     /// # Errors
     /// When nothing fits, with what would.
-    pub(in crate::run) fn choose(inputs: &Inputs<'_>) -> Result<Self, Failure> {
+    pub(crate) fn choose(inputs: &Inputs<'_>) -> Result<Self, Failure> {
         match (solve(inputs)?, inputs.memory()) {
             (Some(size), _) if size.setting.rows <= inputs.frozen_rows() => {
                 Err(Failure::input(format!(
@@ -82,12 +82,12 @@ impl Size {
     }
 
     /// Whether memory has made the degree lower than was wanted.
-    pub(in crate::run) fn is_lowered(&self, inputs: &Inputs<'_>) -> bool {
+    pub(crate) fn is_lowered(&self, inputs: &Inputs<'_>) -> bool {
         self.setting.sh_degree < inputs.degree.highest()
     }
 
     /// What there is to say about it, a line each.
-    pub(in crate::run) fn lines(&self, inputs: &Inputs<'_>) -> Vec<String> {
+    pub(crate) fn lines(&self, inputs: &Inputs<'_>) -> Vec<String> {
         let RunSize { rows, sh_degree, tile_cap, image_cache, .. } = self.setting;
         let said = grouped(rows);
         let Some((memory, fit)) = &self.solved else {
@@ -140,7 +140,7 @@ impl Size {
 
 impl Inputs<'_> {
     /// The ledger, and what it leaves of `--memory`.
-    pub(in crate::run) fn promise(&self, ledger: &Ledger) -> String {
+    pub(crate) fn promise(&self, ledger: &Ledger) -> String {
         let left = self.memory().map(|it| it.saturating_sub(self.device.limited_bytes(ledger)));
         let left = left.map_or_else(String::new, |left| {
             format!("\n  {:<11} {} of --memory", "left", Bytes(left))
@@ -177,7 +177,7 @@ impl Inputs<'_> {
 
 /// Fails where a run would take more than `--memory`. Where that was solved for, it cannot be: of a run
 /// that goes on, tile lists and photographs may have been given anew.
-pub(in crate::run) fn check(
+pub(crate) fn check(
     inputs: &Inputs<'_>,
     setting: &RunSize,
     ledger: &Ledger,
@@ -205,7 +205,7 @@ pub(in crate::run) fn check(
 }
 
 /// Fails where the system does not grant this process what a run takes.
-pub(in crate::run) fn check_grant(
+pub(crate) fn check_grant(
     inputs: &Inputs<'_>,
     setting: &RunSize,
     is_resumed: bool,

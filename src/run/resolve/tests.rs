@@ -7,11 +7,11 @@ use densify_policies::plan::bytes_per_row;
 use proptest::prelude::*;
 
 use super::*;
-use crate::backend::gpu::adapters;
-use crate::dataset::tests::write::Made;
 use crate::knobs::{PRESETS, Preset};
-use crate::memory::Section;
-use crate::run::{ByteCount, Partial, Silent};
+use crate::{ByteCount, Partial, Silent};
+use densify_core::memory::Section;
+use densify_fixtures::Made;
+use densify_render::gpu::adapters;
 
 /// A run of these options.
 fn described(options: &[(&str, toml::Value)]) -> RunSpec {
@@ -57,7 +57,7 @@ fn detailed_edits_are_counted_where_they_are_declared() {
     let made = Made::colmap_txt();
     let scene = made.path().to_str().expect("UTF-8");
     let spec = described(&[("scene", scene.into()), ("backend", "cpu".into())]);
-    let inputs = Inputs::load(&spec, None, &Silent).expect("a scene");
+    let inputs = Inputs::load(&spec, None, None, &Silent).expect("a scene");
     let setting = size::solve(&inputs).expect("it is solved").expect("it fits").setting;
     let declared = [false, true].map(|detailed_edits| {
         let needs = inputs.needs(setting.rows).expect("needs");
@@ -86,7 +86,7 @@ fn plain_ledger(made: &Made, exposure: &str) -> (Vec<(Section, String, u64)>, u6
         ("threads", 1.into()),
         ("exposure", exposure.into()),
     ]);
-    let mut inputs = Inputs::load(&spec, None, &Silent).expect("a scene");
+    let mut inputs = Inputs::load(&spec, None, None, &Silent).expect("a scene");
     (inputs.resident, inputs.peak) = (None, None);
     let setting = size::solve(&inputs).expect("it is solved").expect("it fits").setting;
     let ledger = inputs.ledger(&setting, &inputs.needs(setting.rows).expect("needs"));
@@ -159,7 +159,7 @@ proptest! {
             ];
             shared.extend(given.map(|name| (name, 90_000.into())));
             let spec = described(&shared);
-            let inputs = Inputs::load(&spec, None, &Silent).expect("a scene");
+            let inputs = Inputs::load(&spec, None, None, &Silent).expect("a scene");
             // Both say how long tile lists are.
             let contradicts = |preset: &&Preset| {
                 let sets_pairs = preset.levels.iter().any(|(knob, _)| *knob == "pairs_per_row");

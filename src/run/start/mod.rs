@@ -10,10 +10,10 @@ use super::observer::Observer;
 use super::resolve::{Inputs, ignored, random_count};
 use super::values::InitChoice;
 use crate::failure::Failure;
-use crate::gaussians::Gaussians;
-use crate::init::{initialise, random_points};
 use crate::memory::RunSize;
-use crate::number::grouped;
+use densify_core::gaussians::Gaussians;
+use densify_core::numbers::grouped;
+use densify_train::init::{initialise, random_points};
 
 /// A model in the coordinates of training, and how it was made.
 pub(super) struct Start {

@@ -5,21 +5,21 @@ use std::path::Path;
 use glam::DVec3;
 use rayon::prelude::*;
 
-use crate::backend::{Backend, MomentStorage, Setup, Storage};
-use crate::dataset::Dataset;
-use crate::dataset::normalise::EXTENT;
-use crate::evaluate::Split;
+use crate::config::ModelSize;
 use crate::failure::Failure;
-use crate::gaussians::{Gaussians, sh_coefficients};
-use crate::importance::{importance, largest, needs};
+use crate::finished::{model_file, read_model, views_of};
 use crate::likeness::Likeness;
 use crate::memory::RunSize;
-use crate::number::grouped;
-use crate::run::config::ModelSize;
-use crate::run::finished::{model_file, read_model, views_of};
-use crate::run::observer::{Observer, Silent};
-use crate::run::resolve::Inputs;
-use crate::run::values::AbsolutePath;
+use crate::observer::{Observer, Silent};
+use crate::resolve::Inputs;
+use crate::values::AbsolutePath;
+use densify_core::gaussians::{Gaussians, sh_coefficients};
+use densify_core::numbers::grouped;
+use densify_data::dataset::Dataset;
+use densify_data::dataset::normalise::EXTENT;
+use densify_render::{Backend, MomentStorage, Setup, Storage};
+use densify_train::evaluate::Split;
+use densify_train::importance::{importance, largest, needs};
 
 /// A model of which fewer Gaussians than this share lie in any training view is in other coordinates.
 const LEAST_IN_VIEW: f64 = 0.1;
@@ -32,7 +32,7 @@ const PAIRS_PER_ROW: usize = 3;
 ///
 /// # Errors
 /// When it is no model, or has no row. Names the flag.
-pub(in crate::run) fn size_of_model(
+pub(crate) fn size_of_model(
     flag: &str,
     file: &Path,
     observer: &dyn Observer,
@@ -64,13 +64,13 @@ fn bytes_of(model: ModelSize) -> u64 {
 }
 
 /// Bytes that reading a model takes, into arrays that grow.
-pub(in crate::run) fn reading_bytes(model: ModelSize) -> u64 {
+pub(crate) fn reading_bytes(model: ModelSize) -> u64 {
     3 * bytes_of(model)
 }
 
 /// Bytes that the model of `--init` takes before the run has its own rows: as it is read, or while its importance is
 /// measured where it exceeds the budget.
-pub(in crate::run) fn first_bytes(
+pub(crate) fn first_bytes(
     model: ModelSize,
     inputs: &Inputs<'_>,
     setting: &RunSize,
@@ -85,7 +85,7 @@ pub(in crate::run) fn first_bytes(
     let [train, _] = inputs.images;
     let image = train.held(0) + train.decoding(1);
     // The model beside its copy in the backend, then beside the rows that are kept.
-    reading.max(bytes_of(model) + backend + image + crate::importance::bytes(model.rows))
+    reading.max(bytes_of(model) + backend + image + densify_train::importance::bytes(model.rows))
 }
 
 /// The backend that measures the importance of so many rows.
@@ -163,7 +163,7 @@ fn with_degree(model: Gaussians, degree: u8, observer: &dyn Observer) -> Gaussia
 ///
 /// # Errors
 /// When the file cannot be read, or is not what it was, or no training view shows the model.
-pub(in crate::run) fn behind_frozen(
+pub(crate) fn behind_frozen(
     inputs: &Inputs<'_>,
     sh_degree: u8,
     others: Gaussians,
@@ -214,7 +214,7 @@ fn in_view(model: &Gaussians, dataset: &Dataset) -> usize {
 ///
 /// # Errors
 /// Then, and when a view cannot be read or rendered.
-pub(in crate::run) fn require_likeness(
+pub(crate) fn require_likeness(
     file: &Path,
     inputs: &Inputs<'_>,
     backend: &mut dyn Backend,

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use densify::backend::gpu::GpuDevice;
+use densify::render::gpu::GpuDevice;
 
 use super::{Outcome, config, copy_unfinished, densify, model, scratch, text};
 use crate::photographs::Photographs;

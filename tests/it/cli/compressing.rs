@@ -1,6 +1,6 @@
 //! `densify compress`: files no larger than asked, and what is refused.
 
-use densify::output::model_path;
+use densify::train::output::model_path;
 
 use super::{call, files, gaussians, read, scratch, text, train};
 use crate::photographs::Photographs;

@@ -45,7 +45,7 @@ fn a_file_describes_a_run_and_flags_win_over_it() {
     let library = root.path().join("library");
     let mut spec = Partial::read(&config).and_then(Partial::describe).expect("it is sound");
     spec.output.output = Some(library.clone());
-    spec.device.backend = densify::backend::BackendChoice::Cpu;
+    spec.device.backend = densify::render::BackendChoice::Cpu;
     let run = Run::prepare(&spec).expect("it was prepared before");
     assert_eq!(run.train(Occupied::Refuse, &Silent).expect("it trains"), library);
     assert!(model(&by_flags, ITERATIONS) == model(&library, ITERATIONS));

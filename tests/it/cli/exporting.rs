@@ -10,7 +10,7 @@ fn export_writes_the_model_of_a_run_or_a_file() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
     train(scene.path(), &run, 20, "--budget 320 --save-iterations 10 --quiet").ok();
-    let saved = |iteration| read(&densify::output::model_path(&run, iteration));
+    let saved = |iteration| read(&densify::train::output::model_path(&run, iteration));
     let [newest, early, again] =
         ["new/newest.ply", "early.bin", "again.PLY"].map(|name| root.path().join(name));
     let export = |from: &Path, to: &Path, flags: &str| {
@@ -68,7 +68,7 @@ fn every_format_is_written_compared_and_read_again() {
         let psnr: f64 = line(name).split_whitespace().last().unwrap().parse().unwrap();
         assert!(psnr > least, "{}", line(name));
     }
-    let saved = read(&densify::output::model_path(&run, 20));
+    let saved = read(&densify::train::output::model_path(&run, 20));
     let name = run.file_name().unwrap().to_str().unwrap();
     let at = |ending: &str| folder.join(format!("{name}.{ending}"));
     assert!(read(&at("ply")) == saved);

@@ -84,7 +84,7 @@ fn a_compressed_run_keeps_its_exposures() {
     };
     let (said, with) = compressed(text(&run), "with.ply");
     assert!(said.contains("exposure learned again"), "{said}");
-    let file = densify::output::model_path(&run, 30);
+    let file = densify::train::output::model_path(&run, 30);
     let model = format!("{} --scene {} --eval", text(&file), text(&scene));
     let (said, without) = compressed(&model, "without.ply");
     assert!(!said.contains("exposure"), "{said}");

@@ -125,7 +125,7 @@ fn a_photograph_lost_late_in_a_run_costs_no_step() {
         let mut spec = RunSpec::default();
         spec.start.scene = Some(scene.path().into());
         spec.output.output = Some(run.into());
-        spec.device.backend = densify::backend::BackendChoice::Cpu;
+        spec.device.backend = densify::render::BackendChoice::Cpu;
         spec.size.budget = Some(Budget::Rows(400));
         spec.size.image_cache = Some(ImageCache::Bytes(0));
         spec.schedule.iterations = Whole(48);

@@ -1,8 +1,8 @@
 //! A disk that fills while a model is written: exit code 1, one message with the remedy, and nothing of the file.
 
 use assert_cmd::Command;
-use densify::export::formats;
-use densify::output::model_path;
+use densify::data::export::formats;
+use densify::train::output::model_path;
 
 use super::{Outcome, files, outcome_of, read, scratch, text, train};
 use crate::photographs::Photographs;

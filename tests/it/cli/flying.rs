@@ -93,7 +93,8 @@ fn a_camera_path_in_a_file_is_in_the_datasets_coordinates() {
     let most = frame.iter().zip(view.iter()).map(|(a, b)| a.abs_diff(*b)).max();
     assert!(most.is_some_and(|most| most <= 2), "{most:?}");
     // A model alone is flown through without its dataset.
-    let (model, alone) = (densify::output::model_path(&run, ITERATIONS), root.path().join("alone"));
+    let (model, alone) =
+        (densify::train::output::model_path(&run, ITERATIONS), root.path().join("alone"));
     let words = format!("render {} -o {} --path {}", text(&model), text(&alone), text(&path));
     call(&words).refused("no size", &["--path", "--size"]);
     call(&format!("{words} --size {}x{}", view.width(), view.height())).ok();

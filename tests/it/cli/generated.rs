@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use densify::dataset::{Dataset, LoadOptions};
+use densify::data::dataset::{Dataset, LoadOptions};
 
 use super::{call, files, json, scratch, text, train};
 
@@ -44,7 +44,7 @@ fn written_scenes_load_as_the_built_in_ones_through_all_formats() {
     assert_eq!((colmap.train.len(), colmap.points.len()), (40, built_in.points.len()));
     // Its unit is that of all forty cameras.
     let find = |name: &str| colmap.train.iter().find(|v| v.name.ends_with(name)).expect(name);
-    let world = |set: &Dataset, view: &densify::dataset::View| {
+    let world = |set: &Dataset, view: &densify::data::dataset::View| {
         set.normalisation.world_from_scene_camera(&view.camera).centre()
     };
     for view in &written.train {

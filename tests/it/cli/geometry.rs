@@ -6,7 +6,7 @@
 
 use std::path::PathBuf;
 
-use densify::metrics::geometry::Geometry;
+use densify::train::metrics::geometry::Geometry;
 use densify_policies::registry::policies;
 use tempfile::TempDir;
 

@@ -212,7 +212,7 @@ fn a_run_in_progress_is_neither_resumed_nor_replaced() {
     // One that is killed while it replaces another leaves nothing once a run has ended there.
     let mut child = spawn(&arguments(&scene, &run, 100_000, "--budget 360 --overwrite"));
     let staged = || {
-        let staged = densify::output::RunFolder::staged(&run);
+        let staged = densify::train::output::RunFolder::staged(&run);
         staged.iter().any(|path| path.join("stats/train.jsonl").exists())
     };
     while !staged() {

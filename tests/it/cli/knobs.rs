@@ -2,8 +2,8 @@
 
 use std::path::Path;
 
-use densify::backend::BackendKind;
-use densify::knobs::{Class, KNOBS, PRESETS};
+use densify::render::BackendKind;
+use densify::run::knobs::{Class, KNOBS, PRESETS};
 
 use super::{Outcome, call, config, copy_unfinished, densify, model, resume, scratch, text, train};
 use crate::photographs::Photographs;

@@ -171,7 +171,7 @@ fn a_bare_model_renders_as_its_run() {
         let to = root.path().join(to);
         (call(&format!("render {what} -o {}", text(&to))), to)
     };
-    let ply = densify::output::model_path(&run, ITERATIONS);
+    let ply = densify::train::output::model_path(&run, ITERATIONS);
     let (ply, dataset) = (text(&ply), text(scene.path()));
     let (of_run, from_run) = render(text(&run), "a");
     let (of_file, from_file) = render(&format!("{ply} --scene {dataset} --eval"), "b");

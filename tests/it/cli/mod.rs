@@ -173,14 +173,14 @@ fn read(path: &Path) -> Vec<u8> {
 }
 
 /// The Gaussians of a file.
-fn gaussians(file: &Path) -> densify::gaussians::Gaussians {
-    densify::import::read_model(file).expect("a model").gaussians
+fn gaussians(file: &Path) -> densify::core::gaussians::Gaussians {
+    densify::data::import::read_model(file).expect("a model").gaussians
 }
 
 /// Writes a model as PLY.
-fn write_ply(model: &densify::gaussians::Gaussians, file: &Path) {
+fn write_ply(model: &densify::core::gaussians::Gaussians, file: &Path) {
     let mut bytes = Vec::new();
-    densify::export::PLY.write(model, &mut bytes).expect("it is written");
+    densify::data::export::PLY.write(model, &mut bytes).expect("it is written");
     std::fs::write(file, bytes).expect("it is written");
 }
 
@@ -241,5 +241,5 @@ fn copy_unfinished(run: &Path, to: &Path, iterations: u32) {
 
 /// The model that a run saved after its last iteration.
 fn model(run: &Path, iterations: u32) -> Vec<u8> {
-    read(&densify::output::model_path(run, iterations))
+    read(&densify::train::output::model_path(run, iterations))
 }

@@ -290,7 +290,7 @@ fn what_cannot_be_reported_is_said_with_the_remedy() {
     std::fs::create_dir(at("empty")).expect("a folder");
     let unsaved = at("unsaved");
     super::copy_unfinished(&run, &unsaved, 40);
-    let model = densify::output::model_path(&run, 40);
+    let model = densify::train::output::model_path(&run, 40);
     for (runs, more, expected) in [
         (vec![&*at("empty")], "", vec!["empty", "holds no run", "config.toml"]),
         (vec![Path::new("nowhere")], "", vec!["nowhere does not exist"]),

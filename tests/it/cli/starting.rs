@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use densify::output::model_path;
+use densify::train::output::model_path;
 
 use super::{
     Outcome, call, count, files, gaussians, json, read, records, resume, scratch, text, train,

@@ -2,8 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
-use densify::gaussians::{Gaussians, sigmoid};
-use densify::output::model_path;
+use densify::core::gaussians::{Gaussians, sigmoid};
+use densify::train::output::model_path;
 
 use super::{call, count, gaussians, json, read, scratch, text, train};
 use crate::photographs::Photographs;

@@ -361,7 +361,7 @@ fn what_cannot_be_shown_is_said_with_the_remedy() {
     // Stopped before it had saved a model.
     super::copy_unfinished(&run, &stopped, u32::MAX);
     std::fs::remove_dir_all(stopped.join("point_cloud")).expect("the models");
-    let model = densify::output::model_path(&run, 40);
+    let model = densify::train::output::model_path(&run, 40);
     let model = text(&model);
     for (words, expected) in [
         (format!("{run_text} --port {port}"), vec!["--port", "another program", "name none"]),

@@ -12,10 +12,10 @@ mod plain;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
-use densify::backend::Backend;
-use densify::camera::Camera;
-use densify::trainer::RowHistory;
-use densify::verify::{Differentiable, Setup, Subject, scenes};
+use densify::core::camera::Camera;
+use densify::render::Backend;
+use densify::selftest::{Differentiable, Setup, Subject, scenes};
+use densify::train::trainer::RowHistory;
 use densify_policies::plan::{EditPlan, RowOps, Seed, Update};
 use densify_policies::policy::{Needs, Signal, SignalSet};
 use densify_policies::rng::PolicyRng;

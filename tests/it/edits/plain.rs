@@ -134,7 +134,7 @@ impl Row {
     }
 
     fn paint(&mut self, colour: [f32; 3]) {
-        self.sh[..3].copy_from_slice(&colour.map(|c| (c - 0.5) / densify::sh::C0));
+        self.sh[..3].copy_from_slice(&colour.map(|c| (c - 0.5) / densify::core::sh::C0));
     }
 
     fn sown(seed: &Seed) -> Self {

@@ -1,8 +1,8 @@
 //! What is allocated on a device is what the ledger says.
 
-use densify::backend::gpu::GpuBackend;
-use densify::backend::{Backend, Setup};
-use densify::verify::scenes;
+use densify::render::gpu::GpuBackend;
+use densify::render::{Backend, Setup};
+use densify::selftest::scenes;
 use densify_policies::policy::{AuxColumn, AuxRequest, ErrorScore, MaskTerm, Needs, Signal};
 
 use crate::subject::{GREY, ways};

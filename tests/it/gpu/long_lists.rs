@@ -1,14 +1,14 @@
 //! Tiles with so many splats that some drivers do not go through all of them: llvmpipe ends all loops of an
 //! invocation after 65,535 rounds together, without a word. What comes then must be an error, not a model.
 
-use densify::backend::gpu::GpuDevice;
-use densify::backend::{Accumulation, BackendError, ImageGradient, Shortcuts};
-use densify::camera::Camera;
-use densify::gaussians::Gaussians;
+use densify::core::camera::Camera;
+use densify::core::gaussians::Gaussians;
+use densify::render::gpu::GpuDevice;
+use densify::render::{Accumulation, BackendError, ImageGradient, Shortcuts};
 
 use crate::subject::{GREY, class, make_with, ways};
-use densify::verify::compare::{Table, relative_error};
-use densify::verify::{Differentiable, Setup, Subject, scenes};
+use densify::selftest::compare::{Table, relative_error};
+use densify::selftest::{Differentiable, Setup, Subject, scenes};
 
 /// Rows one behind the other, each of which all pixels of one tile take; what is behind all is still seen.
 fn pile(rows: usize, camera: &Camera) -> Gaussians {

@@ -1,13 +1,13 @@
 //! Photographs that stay on the device.
 
-use densify::backend::gpu::{GpuBackend, GpuDevice};
-use densify::backend::{Backend, KeptPhotographs, Setup, StepInput};
-use densify::camera::Camera;
-use densify::dataset::images::Image8;
-use densify::gaussians::Gaussians;
+use densify::core::camera::Camera;
+use densify::core::gaussians::Gaussians;
+use densify::core::image::Image8;
+use densify::render::gpu::{GpuBackend, GpuDevice};
+use densify::render::{Backend, KeptPhotographs, Setup, StepInput};
 
 use crate::subject::{devices, step_input};
-use densify::verify::scenes;
+use densify::selftest::scenes;
 
 /// A view of this size, with a random image.
 fn view(size: (u32, u32), seed: u64) -> (Camera, Image8) {

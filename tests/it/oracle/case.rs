@@ -3,12 +3,12 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use densify::camera::Camera;
-use densify::gaussians::Gaussians;
+use densify::core::camera::Camera;
+use densify::core::gaussians::Gaussians;
 use glam::{DMat3, DMat4};
 use safetensors::{Dtype, SafeTensors};
 
-use densify::verify::reference::Upstream;
+use densify::selftest::reference::Upstream;
 
 /// One scene with everything that is stored about it.
 #[derive(Debug)]

@@ -4,12 +4,12 @@
 
 mod case;
 
-use densify::backend::cpu::InstructionSet;
-use densify::verify::compare::{Table, relative_error};
-use densify::verify::reference::blend::leeway;
-use densify::verify::reference::project::{by_depth, project};
-use densify::verify::reference::{CLASSES, Model, Rules, ScreenGradient, View, differentiate};
-use densify::verify::{Subject, scenes};
+use densify::render::cpu::InstructionSet;
+use densify::selftest::compare::{Table, relative_error};
+use densify::selftest::reference::blend::leeway;
+use densify::selftest::reference::project::{by_depth, project};
+use densify::selftest::reference::{CLASSES, Model, Rules, ScreenGradient, View, differentiate};
+use densify::selftest::{Subject, scenes};
 
 use crate::subject::{all, class, make, wide};
 use case::{Case, Part, cases};

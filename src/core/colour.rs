@@ -1,0 +1,162 @@
+//! Affine transforms of colours, and their gradients: how a photograph was exposed.
+
+use glam::{DMat3, DVec3};
+use serde::{Deserialize, Serialize};
+
+/// An affine transform of colours.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct ColourTransform {
+    /// Row by row.
+    pub matrix: [[f32; 3]; 3],
+    /// Added to each channel.
+    pub offset: [f32; 3],
+}
+
+/// Derivatives of a loss by the numbers of a [`ColourTransform`].
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ColourGradient {
+    /// Row by row.
+    pub matrix: [[f32; 3]; 3],
+    /// By the offset of each channel.
+    pub offset: [f32; 3],
+}
+
+/// What a backend adds up over the pixels of an exposed image, of the derivative g of the loss by its colours
+/// C' and of its transmittance T.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct ExposureSums {
+    /// Σ gᵢ·C'ⱼ, row by row.
+    pub by_colour: [[f64; 3]; 3],
+    /// Σ gᵢ.
+    pub plain: [f64; 3],
+    /// Σ gᵢ·T.
+    pub behind: [f64; 3],
+}
+
+impl ColourTransform {
+    /// Changes nothing.
+    pub const IDENTITY: Self =
+        Self { matrix: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], offset: [0.0; 3] };
+
+    /// A colour as the photograph shows it.
+    #[must_use]
+    pub fn apply(&self, colour: [f32; 3]) -> [f32; 3] {
+        let [r, g, b] = colour;
+        std::array::from_fn(|i| {
+            let [x, y, z] = self.matrix[i];
+            x * r + y * g + z * b + self.offset[i]
+        })
+    }
+
+    /// The transform that takes this one back; the identity where none does.
+    #[must_use]
+    pub fn inverse(&self) -> Self {
+        let inverse = self.inverse_matrix();
+        let offset = -(inverse * DVec3::from(self.offset.map(f64::from)));
+        let matrix = std::array::from_fn(|i| inverse.row(i).as_vec3().to_array());
+        let back = Self { matrix, offset: offset.as_vec3().to_array() };
+        if back.is_finite() { back } else { Self::IDENTITY }
+    }
+
+    /// The background that becomes `background` when pixels are transformed whole: what is behind the scene
+    /// then looks the same in every photograph.
+    #[must_use]
+    pub fn behind(&self, background: [f32; 3]) -> [f32; 3] {
+        self.inverse().apply(background)
+    }
+
+    /// Whether every number is finite.
+    #[must_use]
+    pub fn is_finite(&self) -> bool {
+        self.matrix.as_flattened().iter().chain(&self.offset).all(|x| x.is_finite())
+    }
+
+    fn inverse_matrix(&self) -> DMat3 {
+        let rows = self.matrix.map(|row| row.map(f64::from));
+        DMat3::from_cols_array_2d(&rows).transpose().inverse()
+    }
+
+    /// Derivatives by the numbers of this transform of an image that was rendered over
+    /// [`behind`](Self::behind) of `background`.
+    #[must_use]
+    pub fn gradient(&self, background: [f32; 3], sums: &ExposureSums) -> ColourGradient {
+        let inverse = self.inverse_matrix();
+        let behind = self.behind(background);
+        let offset = self.offset.map(f64::from);
+        let matrix = std::array::from_fn(|i| {
+            // Σ gᵢ·C of the colours before the transform, then without what shows through.
+            let exposed = DVec3::from(sums.by_colour[i]) - sums.plain[i] * DVec3::from(offset);
+            let plain = inverse * exposed;
+            let through = sums.behind[i] * DVec3::from(behind.map(f64::from));
+            (plain - through).as_vec3().to_array()
+        });
+        let offset = std::array::from_fn(|i| (sums.plain[i] - sums.behind[i]) as f32);
+        ColourGradient { matrix, offset }
+    }
+
+    /// The same as three rows of four, as INRIA's trainer writes it.
+    #[must_use]
+    pub fn rows(&self) -> [[f32; 4]; 3] {
+        std::array::from_fn(|i| {
+            let [x, y, z] = self.matrix[i];
+            [x, y, z, self.offset[i]]
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    pub const SOME: ColourTransform = ColourTransform {
+        matrix: [[1.25, 0.0625, -0.125], [0.0, 0.75, 0.25], [-0.0625, 0.125, 1.5]],
+        offset: [0.03, -0.05, 0.1],
+    };
+
+    #[test]
+    fn the_inverse_takes_colours_back() {
+        let colour = [0.2, 0.9, 0.4];
+        let back = SOME.inverse().apply(SOME.apply(colour));
+        assert!(back.iter().zip(colour).all(|(a, b)| (a - b).abs() < 1e-6), "{back:?}");
+        let flat = ColourTransform { matrix: [[1.0; 3]; 3], ..SOME };
+        assert_eq!(flat.inverse(), ColourTransform::IDENTITY, "nothing takes it back");
+    }
+
+    #[test]
+    fn what_is_behind_looks_the_same() {
+        let background = [0.0, 0.5, 1.0];
+        let seen = SOME.apply(SOME.behind(background));
+        assert!(seen.iter().zip(background).all(|(a, b)| (a - b).abs() < 1e-6), "{seen:?}");
+    }
+
+    /// A pixel of which the scene covers 1 − T: matrix·F + offset·(1 − T) + T·background.
+    #[test]
+    fn gradients_are_those_of_the_foreground_alone() {
+        let (foreground, light, background) = ([0.3, 0.2, 0.6], 0.25_f32, [0.5, 1.0, 0.125]);
+        let upstream = [0.7, -1.1, 0.4];
+        let behind = SOME.behind(background);
+        let pixel: [f32; 3] = std::array::from_fn(|i| foreground[i] + light * behind[i]);
+        let shown = SOME.apply(pixel);
+        let expected: [f32; 3] = std::array::from_fn(|i| {
+            let [x, y, z] = SOME.matrix[i];
+            let [r, g, b] = foreground;
+            x * r + y * g + z * b + SOME.offset[i] * (1.0 - light) + light * background[i]
+        });
+        assert!(shown.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{shown:?}");
+        let g = upstream.map(f64::from);
+        let sums = ExposureSums {
+            by_colour: g.map(|g| shown.map(|colour| g * f64::from(colour))),
+            plain: g,
+            behind: g.map(|g| g * f64::from(light)),
+        };
+        let found = SOME.gradient(background, &sums);
+        for (i, upstream) in upstream.into_iter().enumerate() {
+            for (j, foreground) in foreground.into_iter().enumerate() {
+                let by = upstream * foreground;
+                assert!((found.matrix[i][j] - by).abs() < 1e-6, "{i}, {j}: {found:?}");
+            }
+            let by = upstream * (1.0 - light);
+            assert!((found.offset[i] - by).abs() < 1e-6, "{i}: {found:?}");
+        }
+    }
+}

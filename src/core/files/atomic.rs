@@ -1,0 +1,147 @@
+//! Writes files atomically: complete or not at all.
+
+use std::ffi::OsStr;
+use std::io::{self, BufWriter, Write};
+use std::path::Path;
+
+use super::OutputError;
+use super::disk::{Operation, WatchedFile, attempt};
+
+/// Prefix of the names of incomplete files and folders.
+pub const TEMPORARY: &str = ".densify-";
+
+/// Whether this is the name of an incomplete file or folder.
+pub fn is_temporary(name: &OsStr) -> bool {
+    name.to_string_lossy().starts_with(TEMPORARY)
+}
+
+/// Writes a file under a temporary name in the same folder, syncs it and renames it: readers see the
+/// old or the new content, even after a crash. Creates missing folders.
+///
+/// # Errors
+/// [`OutputError::Io`], also for an error that `write` returns. An existing file is then unchanged and
+/// nothing is left behind.
+pub fn write_atomically(
+    path: &Path,
+    write: impl FnOnce(&mut dyn Write) -> io::Result<()>,
+) -> Result<(), OutputError> {
+    write_atomically_from(path, |out| Ok::<_, WriteError<OutputError>>(write(out)?))
+}
+
+/// Why writing a file was stopped.
+#[derive(Debug)]
+pub enum WriteError<E> {
+    /// The file cannot be written.
+    Io(io::Error),
+    /// Its contents cannot be obtained.
+    Source(E),
+}
+
+impl<E> From<io::Error> for WriteError<E> {
+    fn from(error: io::Error) -> Self {
+        Self::Io(error)
+    }
+}
+
+/// As [`write_atomically`], for contents that may not be obtainable.
+///
+/// # Errors
+/// [`OutputError::Io`], and the error in a [`WriteError::Source`]. An existing file is then unchanged
+/// and nothing is left behind.
+pub fn write_atomically_from<E: From<OutputError>>(
+    path: &Path,
+    write: impl FnOnce(&mut dyn Write) -> Result<(), WriteError<E>>,
+) -> Result<(), E> {
+    let folder = match path.parent() {
+        Some(parent) if !parent.as_os_str().is_empty() => parent,
+        _ => Path::new("."),
+    };
+    std::fs::create_dir_all(folder).map_err(OutputError::io("create the folder", folder))?;
+    replace(folder, path, write).map_err(|error| match error {
+        WriteError::Io(error) => OutputError::io("write", path)(error).into(),
+        WriteError::Source(error) => error,
+    })
+}
+
+fn replace<E>(
+    folder: &Path,
+    path: &Path,
+    write: impl FnOnce(&mut dyn Write) -> Result<(), WriteError<E>>,
+) -> Result<(), WriteError<E>> {
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(TEMPORARY);
+    // Temporary files are private by default; results are to be as readable as other new files.
+    #[cfg(unix)]
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    attempt(Operation::Create, path)?;
+    let mut file = builder.tempfile_in(folder)?;
+    let mut buffered =
+        BufWriter::with_capacity(1 << 16, WatchedFile { file: file.as_file_mut(), path });
+    write(&mut buffered)?;
+    buffered.flush()?;
+    drop(buffered);
+    attempt(Operation::Sync, path)?;
+    file.as_file().sync_all()?;
+    attempt(Operation::Rename, path)?;
+    file.persist(path).map_err(io::Error::from)?;
+    // Syncing the folder makes the rename permanent; not every file system supports it.
+    #[cfg(unix)]
+    let _ = std::fs::File::open(folder).and_then(|folder| folder.sync_all());
+    Ok(())
+}
+
+/// Depth of the folders of a run: `point_cloud/iteration_N`.
+pub const RUN_FOLDER_DEPTH: u32 = 2;
+
+/// Removes incomplete files, down to a depth of `deeper` folders.
+pub fn remove_incomplete(folder: &Path, deeper: u32) {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    for entry in entries {
+        let (name, path) = (entry.file_name(), entry.path());
+        // Links are not followed: their targets belong to the user.
+        match entry.file_type() {
+            Ok(kind) if kind.is_dir() && !is_temporary(&name) && deeper > 0 => {
+                remove_incomplete(&path, deeper - 1);
+            }
+            Ok(kind) if kind.is_file() && is_temporary(&name) => _ = std::fs::remove_file(&path),
+            _ => {}
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn names(folder: &Path) -> Vec<String> {
+        let entries = std::fs::read_dir(folder).unwrap();
+        entries.map(|e| e.unwrap().file_name().into_string().unwrap()).collect()
+    }
+
+    #[test]
+    fn a_failed_write_changes_nothing() {
+        let root = tempfile::tempdir().unwrap();
+        let path = root.path().join("deep/er/file.json");
+        write_atomically(&path, |out| out.write_all(b"first")).unwrap();
+        let error = write_atomically(&path, |out| {
+            out.write_all(&[b'x'; 100_000])?;
+            Err(io::Error::other("disk full"))
+        });
+        let message = error.unwrap_err().to_string();
+        assert!(message.contains("file.json") && message.contains("disk full"), "{message}");
+        assert_eq!(std::fs::read(&path).unwrap(), b"first");
+        assert_eq!(names(path.parent().unwrap()), ["file.json"]);
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn others_may_read_as_with_any_new_file() {
+        use std::os::unix::fs::PermissionsExt;
+        let root = tempfile::tempdir().unwrap();
+        let (ours, plain) = (root.path().join("ours"), root.path().join("plain"));
+        write_atomically(&ours, |out| out.write_all(b"1")).unwrap();
+        std::fs::write(&plain, b"1").unwrap();
+        let mode = |path| std::fs::metadata(path).unwrap().permissions().mode();
+        assert_eq!(mode(&ours), mode(&plain));
+    }
+}

@@ -1,0 +1,104 @@
+//! Lets tests make disk operations fail: everything that a run writes passes through here. Without a requested
+//! fault it costs one look at a variable of the thread.
+
+use std::io::{self, Write};
+use std::path::Path;
+
+/// An operation on a file or folder.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Operation {
+    /// Creates a file or folder.
+    Create,
+    /// Writes to a file.
+    Write,
+    /// Flushes a buffer.
+    Flush,
+    /// Syncs a file to the disk.
+    Sync,
+    /// Renames a complete file.
+    Rename,
+}
+
+pub use faults::{Fault, attempt, with_fault};
+
+/// A file whose operations can be made to fail.
+pub struct WatchedFile<'a, W> {
+    /// What is written to.
+    pub file: W,
+    /// Its path, by which faults are requested.
+    pub path: &'a Path,
+}
+
+impl<W: Write> Write for WatchedFile<'_, W> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        attempt(Operation::Write, self.path)?;
+        let bytes = faults::shortened(bytes);
+        self.file.write(bytes)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        attempt(Operation::Flush, self.path)?;
+        self.file.flush()
+    }
+}
+
+mod faults {
+    //! Faults requested by a test, for its own thread.
+
+    use std::cell::RefCell;
+
+    use super::{Operation, Path, io};
+
+    /// An operation that is to fail.
+    #[derive(Debug, Clone, Copy)]
+    pub struct Fault {
+        pub operation: Operation,
+        /// End of the path.
+        pub file: &'static str,
+        /// How many times it succeeds first.
+        pub spared: u32,
+        pub kind: io::ErrorKind,
+    }
+
+    #[derive(Default)]
+    struct Plan {
+        fault: Option<Fault>,
+        met: u32,
+        /// Whether every write takes one byte at most.
+        short: bool,
+    }
+
+    thread_local! {
+        static PLAN: RefCell<Plan> = RefCell::default();
+    }
+
+    /// Runs `f` with a fault, or with short writes if there is none. Also returns how often the fault
+    /// occurred.
+    pub fn with_fault<T>(fault: Option<Fault>, f: impl FnOnce() -> T) -> (T, u32) {
+        PLAN.replace(Plan { fault, met: 0, short: fault.is_none() });
+        let done = f();
+        (done, PLAN.take().met)
+    }
+
+    pub fn attempt(operation: Operation, path: &Path) -> io::Result<()> {
+        PLAN.with_borrow_mut(|plan| match &mut plan.fault {
+            Some(fault)
+                if fault.operation == operation
+                    && path.to_string_lossy().replace('\\', "/").ends_with(fault.file) =>
+            {
+                if fault.spared > 0 {
+                    fault.spared -= 1;
+                    return Ok(());
+                }
+                plan.met += 1;
+                Err(fault.kind.into())
+            }
+            _ => Ok(()),
+        })
+    }
+
+    pub fn shortened(bytes: &[u8]) -> &[u8] {
+        let short = PLAN.with_borrow(|plan| plan.short);
+        if short { &bytes[..bytes.len().min(1)] } else { bytes }
+    }
+}

@@ -1,0 +1,143 @@
+//! Files and texts that others have made. Only regular files are read, and no more of them than is
+//! sensible; text from them is shown without its control characters.
+
+use std::fs::{File, OpenOptions};
+use std::io::{self, Read};
+use std::path::Path;
+
+/// What is wrong with a text in another encoding, often for a name in it, with the remedy.
+pub const NOT_UTF8: &str = "it is not text in UTF-8; save it as UTF-8, and rename files whose names are in another encoding";
+/// Most bytes of a file of options.
+pub const MAX_OPTIONS: u64 = 4 << 20;
+
+/// Opens a file for reading. A pipe, a socket or a device is refused at once, not waited for.
+///
+/// # Errors
+/// When it cannot be opened, or is no regular file.
+pub fn open(path: &Path) -> io::Result<File> {
+    let mut options = OpenOptions::new();
+    options.read(true);
+    #[cfg(unix)]
+    std::os::unix::fs::OpenOptionsExt::custom_flags(&mut options, libc::O_NONBLOCK);
+    let file = options.open(path)?;
+    let kind = file.metadata()?.file_type();
+    if kind.is_file() {
+        Ok(file)
+    } else if kind.is_dir() {
+        Err(io::ErrorKind::IsADirectory.into())
+    } else {
+        Err(io::Error::other("it is a pipe, a socket or a device, not a file; name a file"))
+    }
+}
+
+/// Reads a text of at most `limit` bytes, without the byte-order mark that some editors put before it.
+///
+/// # Errors
+/// As [`open`]; when it is larger, or no text in UTF-8.
+pub fn read_text(path: &Path, limit: u64) -> io::Result<String> {
+    let mut bytes = Vec::new();
+    open(path)?.take(limit + 1).read_to_end(&mut bytes)?;
+    if bytes.len() as u64 > limit {
+        return Err(io::Error::other(format!(
+            "it is larger than {} MiB; put the right file there",
+            limit >> 20
+        )));
+    }
+    if let Some(problem) = mistaken(&bytes) {
+        return Err(io::Error::other(problem));
+    }
+    let text = String::from_utf8(bytes).map_err(|_| io::Error::other(NOT_UTF8))?;
+    Ok(match text.strip_prefix('\u{feff}') {
+        Some(rest) => rest.to_owned(),
+        None => text,
+    })
+}
+
+/// Most bytes that a packed file of this many may be unpacked to.
+pub fn most_unpacked(packed: u64) -> u64 {
+    /// Most bytes that any file may unpack to.
+    const LEAST: u64 = 64 << 20;
+    /// Most bytes that a byte of a larger file may unpack to: models take 2 to 5, those with little colour up
+    /// to 20, tables of text up to 10.
+    const RATIO: u64 = 100;
+    LEAST.max(packed.saturating_mul(RATIO))
+}
+
+/// What a file is that begins so, if it is often found where data is expected, with the remedy.
+pub fn mistaken(start: &[u8]) -> Option<&'static str> {
+    if start.starts_with(b"version https://git-lfs") {
+        Some("it is a pointer of Git LFS, not the file itself; fetch that with `git lfs pull`")
+    } else if start.starts_with(&[0xff, 0xfe]) || start.starts_with(&[0xfe, 0xff]) {
+        Some("it is text in UTF-16; save it as UTF-8")
+    } else {
+        None
+    }
+}
+
+/// Text with its control characters escaped, so that it stays on one line and no terminal obeys them.
+pub fn one_line(text: &str) -> String {
+    escaped(text, &[])
+}
+
+/// The same for a text of several lines.
+pub fn lines(text: &str) -> String {
+    escaped(text, &['\n', '\t'])
+}
+
+fn escaped(text: &str, kept: &[char]) -> String {
+    let mut shown = String::with_capacity(text.len());
+    for c in text.chars() {
+        match c.is_control() && !kept.contains(&c) {
+            true => shown.extend(c.escape_default()),
+            false => shown.push(c),
+        }
+    }
+    shown
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn text_is_read_within_its_limit_and_what_else_it_is_is_said() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("text");
+        let read = |bytes: &[u8]| {
+            std::fs::write(&path, bytes).unwrap();
+            read_text(&path, 1 << 20).map_err(|error| error.to_string())
+        };
+        assert_eq!(read("\u{feff}{}".as_bytes()).unwrap(), "{}");
+        assert_eq!(read(&vec![b' '; 1 << 20]).unwrap().len(), 1 << 20);
+        for (bytes, words) in [
+            (&vec![b' '; (1 << 20) + 1][..], "larger than 1 MiB"),
+            (b"\xff\xfe{\0}\0", "UTF-16"),
+            (b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
+            (b"\xc3(", "not text in UTF-8"),
+        ] {
+            let error = read(bytes).unwrap_err();
+            assert!(error.contains(words), "{error}");
+        }
+        assert_eq!(open(folder.path()).unwrap_err().kind(), io::ErrorKind::IsADirectory);
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn what_would_be_waited_for_is_refused_at_once() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("pipe");
+        let made = std::process::Command::new("mkfifo").arg(&path).status().unwrap();
+        assert!(made.success());
+        for path in [&path, Path::new("/dev/zero")] {
+            let error = read_text(path, 10).unwrap_err().to_string();
+            assert!(error.contains("not a file"), "{error}");
+        }
+    }
+
+    #[test]
+    fn control_characters_are_escaped() {
+        let text = "a\x1b[31m\r\nü\u{9b}";
+        assert_eq!(one_line(text), "a\\u{1b}[31m\\r\\nü\\u{9b}");
+        assert_eq!(lines(text), "a\\u{1b}[31m\\r\nü\\u{9b}");
+    }
+}

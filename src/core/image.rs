@@ -1,0 +1,100 @@
+//! An image as it is held: eight bits a channel.
+
+use std::sync::Arc;
+
+use crate::resample;
+
+/// A decoded image, packed 8 bits per channel.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Image8 {
+    /// Width `[px]`.
+    pub width: u32,
+    /// Height `[px]`.
+    pub height: u32,
+    /// sRGB-encoded, row-major, RGB interleaved. Shape: `[height, width, 3]`.
+    pub rgb: Vec<u8>,
+    /// Straight alpha for compositing on the background, if the file has any.
+    /// Shape: `[height, width]`.
+    pub alpha: Option<Vec<u8>>,
+    /// Weight of each pixel in the loss: 0 = ignored, 255 = counted, if there is a mask.
+    /// Shape: `[height, width]`.
+    pub mask: Option<Vec<u8>>,
+}
+
+/// A rectangle of pixels in an image.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Window {
+    /// First column `[px]`.
+    pub x: u32,
+    /// First row `[px]`.
+    pub y: u32,
+    /// `[px]`, >= 1.
+    pub width: u32,
+    /// `[px]`, >= 1.
+    pub height: u32,
+}
+
+/// A decoded image shared between cache and user.
+pub type SharedImage = Arc<Image8>;
+
+impl Image8 {
+    /// The colour of a pixel over `background`, in `[0, 1]`.
+    #[must_use]
+    pub fn composited(&self, x: usize, y: usize, background: [f32; 3]) -> [f32; 3] {
+        let pixel = y * self.width as usize + x;
+        let alpha = self.alpha.as_ref().map_or(1.0, |a| f32::from(a[pixel]) / 255.0);
+        std::array::from_fn(|channel| {
+            alpha * f32::from(self.rgb[3 * pixel + channel]) / 255.0
+                + (1.0 - alpha) * background[channel]
+        })
+    }
+
+    /// A smaller copy, each pixel the mean of those that it covers.
+    #[must_use]
+    pub fn shrunk(&self, width: u32, height: u32) -> Self {
+        resample::shrink(self, width, height)
+    }
+
+    /// Size of the pixels `[bytes]`.
+    #[must_use]
+    pub fn bytes(&self) -> u64 {
+        let length = |channel: &Option<Vec<u8>>| channel.as_ref().map_or(0, Vec::len);
+        (self.rgb.len() + length(&self.alpha) + length(&self.mask)) as u64
+    }
+
+    /// An image without pixels yet, with reserved memory and the channels of `like`.
+    pub fn blank(width: u32, height: u32, like: &Self) -> Self {
+        let pixels = width as usize * height as usize;
+        let channel =
+            |channel: &Option<Vec<u8>>| channel.as_ref().map(|_| Vec::with_capacity(pixels));
+        Self {
+            width,
+            height,
+            rgb: Vec::with_capacity(3 * pixels),
+            alpha: channel(&like.alpha),
+            mask: channel(&like.mask),
+        }
+    }
+
+    /// The pixels of a window, which lies in the image.
+    #[must_use]
+    pub fn windowed(&self, window: Window) -> Self {
+        let cut = |values: &[u8], channels: usize| {
+            let row = channels * self.width as usize;
+            let (from, count) = (channels * window.x as usize, channels * window.width as usize);
+            let rows = values.chunks_exact(row).skip(window.y as usize);
+            rows.take(window.height as usize)
+                .flat_map(|row| &row[from..from + count])
+                .copied()
+                .collect()
+        };
+        let channel = |values: &Option<Vec<u8>>| values.as_ref().map(|values| cut(values, 1));
+        Self {
+            width: window.width,
+            height: window.height,
+            rgb: cut(&self.rgb, 3),
+            alpha: channel(&self.alpha),
+            mask: channel(&self.mask),
+        }
+    }
+}

@@ -1,0 +1,340 @@
+//! The ledger: the bytes of every buffer, promised before training; and the memory measured.
+//!
+//! Every buffer is allocated once, at the size of the budget. The ledger lists them, so that users
+//! learn before training whether a run fits.
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+use crate::numbers::grouped;
+
+/// All buffers of a run.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Ledger {
+    /// One line per buffer.
+    pub lines: Vec<LedgerLine>,
+}
+
+/// One buffer.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LedgerLine {
+    /// Part of the program that it belongs to.
+    pub section: Section,
+    /// What it holds.
+    pub what: String,
+    /// Its size `[bytes]`.
+    pub bytes: u64,
+    /// Whether it is in the memory of a GPU.
+    #[serde(default, skip_serializing_if = "is_false")]
+    pub on_device: bool,
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref, reason = "serde's interface")]
+fn is_false(flag: &bool) -> bool {
+    !flag
+}
+
+/// Part of the program, in the order of the table.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Section {
+    /// Parameters, moments, age.
+    Model,
+    /// Gradients of the parameters.
+    Gradients,
+    /// Lists of (row, tile) pairs and what belongs to each pair.
+    Tiles,
+    /// Buffers of the renderer that belong to no other section.
+    Renderer,
+    /// Signals, candidates and plans of the policy.
+    Policy,
+    /// Decoded images.
+    Images,
+    /// Held only for a moment, one at a time: evaluation, export.
+    Passing,
+    /// Held only while loading, and freed before any of the above is allocated.
+    Before,
+    /// Held only once training has ended and all of the above is freed.
+    After,
+    /// The program itself before any of the above.
+    Process,
+}
+
+impl Section {
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Model => "model",
+            Self::Gradients => "gradients",
+            Self::Tiles => "tile lists",
+            Self::Renderer => "renderer",
+            Self::Policy => "policy",
+            Self::Images => "images",
+            Self::Passing => "in passing",
+            Self::Before => "before",
+            Self::After => "after",
+            Self::Process => "process",
+        }
+    }
+}
+
+impl Ledger {
+    /// Adds a buffer to a section.
+    pub fn add_to(&mut self, section: Section, what: impl Into<String>, bytes: u64) {
+        self.lines.push(LedgerLine { section, what: what.into(), bytes, on_device: false });
+    }
+
+    /// Adds a buffer in the memory of a GPU, or adds its bytes to the line of that name.
+    pub fn add_on_device(&mut self, section: Section, what: &str, bytes: u64) {
+        let same =
+            |line: &&mut LedgerLine| line.on_device && line.section == section && line.what == what;
+        match self.lines.iter_mut().find(same) {
+            Some(line) => line.bytes = line.bytes.saturating_add(bytes),
+            None => {
+                let what = what.to_owned();
+                self.lines.push(LedgerLine { section, what, bytes, on_device: true });
+            }
+        }
+    }
+
+    /// The most memory held at a time `[bytes]`: the sum of the lines held when the most is: of training,
+    /// loading and measuring at the end those of the largest, and always those of the process.
+    #[must_use]
+    pub fn total(&self) -> u64 {
+        most_at_a_time(&self.lines.iter().collect::<Vec<_>>())
+    }
+
+    /// The same without the memory of a GPU, until training has ended `[bytes]`.
+    #[must_use]
+    pub fn on_host(&self) -> u64 {
+        let lines = self.lines.iter();
+        let lines = lines.filter(|line| !line.on_device && line.section != Section::After);
+        most_at_a_time(&lines.collect::<Vec<_>>())
+    }
+
+    /// Sum of the buffers in the memory of a GPU, which are all held throughout `[bytes]`.
+    #[must_use]
+    pub fn on_device(&self) -> u64 {
+        sum(self.lines.iter().filter(|line| line.on_device).map(|line| line.bytes))
+    }
+}
+
+fn sum(bytes: impl Iterator<Item = u64>) -> u64 {
+    bytes.fold(0, u64::saturating_add)
+}
+
+fn most_at_a_time(lines: &[&LedgerLine]) -> u64 {
+    let counts = counted(lines).into_iter();
+    sum(lines.iter().zip(counts).filter(|(_, counts)| *counts).map(|(line, _)| line.bytes))
+}
+
+/// Which lines are held when the most is: of training, loading and measuring at the end, those of the one
+/// that takes most, and always those of the process. Of [`Section::Passing`], [`Section::Before`] and
+/// [`Section::After`] only the largest line counts, as they are never held together. A device's memory is
+/// held beside [`Section::After`], not beside [`Section::Before`].
+fn counted(lines: &[&LedgerLine]) -> Vec<bool> {
+    let largest = |section| {
+        let of = (0..lines.len()).filter(|&i| lines[i].section == section);
+        of.rev().max_by_key(|&i| lines[i].bytes)
+    };
+    let [passing, before, after] = [Section::Passing, Section::Before, Section::After].map(largest);
+    let is_lasting = |i: usize| lines[i].section < Section::Passing;
+    let held: [&dyn Fn(usize) -> bool; 3] = [
+        &|i| Some(i) == before,
+        &|i| after.is_some() && (Some(i) == after || lines[i].on_device),
+        &|i| Some(i) == passing || is_lasting(i),
+    ];
+    let bytes = |held: &&dyn Fn(usize) -> bool| {
+        sum((0..lines.len()).filter(|&i| held(i)).map(|i| lines[i].bytes))
+    };
+    // The last of equals: training.
+    let most = held.iter().copied().max_by_key(bytes);
+    let counts = |i: usize| lines[i].section == Section::Process || most.is_some_and(|it| it(i));
+    (0..lines.len()).map(counts).collect()
+}
+
+/// A table: section, buffer, size; the total below. In brackets is what is not held when the most is;
+/// the other lines add up to the total, to the last digit.
+impl fmt::Display for Ledger {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut lines: Vec<_> = self.lines.iter().collect();
+        lines.sort_by_key(|line| line.section);
+        let least = if self.on_device() > 0 { "on the device".len() } else { 5 };
+        let what_width =
+            lines.iter().map(|line| line.what.chars().count()).max().unwrap_or(0).max(least);
+        let (mut previous, mut sum) = (None, 0_u64);
+        for (line, counts) in lines.iter().zip(counted(&lines)) {
+            let name = if previous == Some(line.section) { "" } else { line.section.name() };
+            previous = Some(line.section);
+            let before = sum;
+            let size = if counts {
+                sum = sum.saturating_add(line.bytes);
+                // The difference of two rounded sums, so that the lines add up.
+                format!("{:>14}", mebibytes(tenths(sum) - tenths(before)))
+            } else {
+                format!("{:>15}", format!("({})", mebibytes(tenths(line.bytes))))
+            };
+            writeln!(f, "  {name:<11} {:<what_width$} {size}", line.what)?;
+        }
+        let row = |name: &str, what: &str, bytes| {
+            format!("  {name:<11} {what:<what_width$} {:>14}", mebibytes(tenths(bytes)))
+        };
+        f.write_str(&row("total", "", self.total()))?;
+        match self.on_device() {
+            0 => Ok(()),
+            bytes => write!(f, "\n{}", row("", "on the device", bytes)),
+        }
+    }
+}
+
+/// Tenths of a mebibyte, rounded.
+fn tenths(bytes: u64) -> u64 {
+    ((u128::from(bytes) * 10 + (1 << 19)) >> 20) as u64
+}
+
+fn mebibytes(tenths: u64) -> String {
+    let whole = usize::try_from(tenths / 10).unwrap_or(usize::MAX);
+    format!("{}.{} MiB", grouped(whole), tenths % 10)
+}
+
+/// A number of bytes, displayed with a binary unit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Bytes(pub u64);
+
+impl fmt::Display for Bytes {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        const UNITS: [&str; 4] = ["KiB", "MiB", "GiB", "TiB"];
+        if self.0 < 1024 {
+            return write!(f, "{} B", self.0);
+        }
+        let mut value = self.0 as f64 / 1024.0;
+        let mut unit = 0;
+        // 1,023.95 would print as 1024.0.
+        while value >= 1023.95 && unit + 1 < UNITS.len() {
+            value /= 1024.0;
+            unit += 1;
+        }
+        write!(f, "{value:.1} {}", UNITS[unit])
+    }
+}
+
+/// Resident memory of this process now `[bytes]`; `None` if unknown.
+#[must_use]
+pub fn resident() -> Option<u64> {
+    status_line("VmRSS:")
+}
+
+/// Largest resident memory of this process so far `[bytes]`; `None` if unknown.
+#[must_use]
+pub fn peak_resident() -> Option<u64> {
+    status_line("VmHWM:")
+}
+
+pub fn status_line(key: &str) -> Option<u64> {
+    parse_status(&std::fs::read_to_string("/proc/self/status").ok()?, key)
+}
+
+/// Reads a line of `/proc/<pid>/status`, "VmRSS:     1234 kB" (proc(5): kB means 1,024 bytes).
+pub fn parse_status(status: &str, key: &str) -> Option<u64> {
+    let value = status.lines().find_map(|line| line.strip_prefix(key))?;
+    let kibibytes: u64 = value.trim().strip_suffix("kB")?.trim().parse().ok()?;
+    kibibytes.checked_mul(1024)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn sample() -> Ledger {
+        let mut ledger = Ledger::default();
+        ledger.add_to(Section::Process, "program", 3 << 20);
+        ledger.add_to(Section::Model, "parameters", 10 << 20);
+        ledger.add_to(Section::Model, "moments", 20 << 20);
+        ledger.add_to(Section::Renderer, "projections", 1536);
+        ledger.add_to(Section::Passing, "evaluation", 5 << 20);
+        ledger.add_to(Section::Passing, "export", 7 << 20);
+        ledger
+    }
+
+    #[test]
+    fn of_passing_buffers_only_the_largest_counts() {
+        assert_eq!(sample().total(), (40 << 20) + 1536);
+        let mut full = Ledger::default();
+        full.add_to(Section::Renderer, "a", u64::MAX);
+        full.add_to(Section::Renderer, "b", 1);
+        assert_eq!(full.total(), u64::MAX);
+    }
+
+    #[test]
+    fn buffers_freed_before_training_count_only_if_they_are_the_most() {
+        let mut ledger = sample();
+        let total = ledger.total();
+        ledger.add_to(Section::Before, "loading", 30 << 20);
+        ledger.add_to(Section::Before, "measuring", 37 << 20);
+        assert_eq!(ledger.total(), total);
+        ledger.add_to(Section::Before, "measuring more", 38 << 20);
+        assert_eq!(ledger.total(), 41 << 20);
+        // What comes after has a device's memory beside it.
+        ledger.add_to(Section::After, "measuring the model", 39 << 20);
+        assert_eq!(ledger.total(), 42 << 20);
+        ledger.add_on_device(Section::Renderer, "on the device", 2 << 20);
+        assert_eq!((ledger.total(), ledger.on_host()), (44 << 20, 41 << 20));
+    }
+
+    #[test]
+    fn the_host_holds_the_buffers_that_are_not_on_the_device() {
+        let mut ledger = sample();
+        let total = ledger.total();
+        ledger.add_on_device(Section::Model, "more moments", 50 << 20);
+        ledger.add_to(Section::Before, "loading", 39 << 20);
+        assert_eq!(ledger.on_device(), 50 << 20);
+        assert_eq!(ledger.total(), total + (50 << 20));
+        assert_eq!(ledger.on_host(), 42 << 20);
+    }
+
+    #[test]
+    fn the_table_is_aligned_and_adds_up() {
+        let mut ledger = sample();
+        // Each would be rounded down, and the sum up.
+        for what in ["a", "b", "c"] {
+            ledger.add_to(Section::Policy, what, 40 << 10);
+        }
+        let expected = "  model       parameters        10.0 MiB
+              moments           20.0 MiB
+  renderer    projections        0.0 MiB
+  policy      a                  0.0 MiB
+              b                  0.1 MiB
+              c                  0.0 MiB
+  in passing  evaluation        (5.0 MiB)
+              export             7.0 MiB
+  process     program            3.0 MiB
+  total                         40.1 MiB";
+        assert_eq!(ledger.to_string(), expected);
+        ledger.add_to(Section::Before, "loading", 1 << 30);
+        let table = ledger.to_string();
+        for words in ["(10.0 MiB)", "(7.0 MiB)", " 1,024.0 MiB", " 1,027.0 MiB"] {
+            assert!(table.contains(words), "{words}: {table}");
+        }
+    }
+
+    #[test]
+    fn bytes_read_well() {
+        let shown = |n| Bytes(n).to_string();
+        assert_eq!(
+            [0, 1023, 1024, 1536, (1 << 20) - 1, 1 << 20, 1 << 30].map(shown),
+            ["0 B", "1023 B", "1.0 KiB", "1.5 KiB", "1.0 MiB", "1.0 MiB", "1.0 GiB"]
+        );
+    }
+
+    #[test]
+    fn status_lines() {
+        let status = "Name:\tx\nVmHWM:\t   2048 kB\nVmRSS:\t     10 kB\n";
+        assert_eq!(parse_status(status, "VmHWM:"), Some(2 << 20));
+        assert_eq!(parse_status(status, "VmRSS:"), Some(10 << 10));
+        assert_eq!(parse_status(status, "VmPeak:"), None);
+        assert_eq!(parse_status("VmHWM: many kB", "VmHWM:"), None);
+        if let (Some(now), Some(peak)) = (resident(), peak_resident()) {
+            assert!(now > 0 && peak > 0);
+        }
+    }
+}

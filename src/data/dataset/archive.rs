@@ -1,0 +1,263 @@
+//! Datasets in ZIP archives: unpacked into a temporary folder, which is removed with the last view of it.
+//!
+//! All readers then see a folder, and photographs are decoded as fast as from one. Nothing of an archive is
+//! trusted: no name leads out of the folder, no link is made, and what is unpacked is bounded beforehand and
+//! while it is written.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, BufReader, Read};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use tempfile::TempDir;
+use zip::ZipArchive;
+use zip::result::ZipError;
+
+use super::error::DatasetError;
+use super::paths::{lexical_fault, relative};
+use super::{Dataset, LoadOptions, View};
+use densify_core::files;
+use densify_core::memory::Bytes;
+
+/// Most files of an archive.
+const MAX_FILES: usize = 4_000_000;
+/// Most folders around a dataset that hold nothing else.
+const MAX_AROUND: usize = 8;
+/// What systems add to archives, by the first part of its path or its name.
+const NOT_DATA: [&str; 4] = ["__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini"];
+const REMEDY: &str = "pack the folder again, or unpack it and name that";
+
+/// An archive's files in a folder of their own, as long as this lives.
+#[derive(Debug)]
+pub(super) struct Unpacked {
+    archive: PathBuf,
+    /// Holds the files, and removes them.
+    all: TempDir,
+    /// The dataset's folder in it.
+    folder: PathBuf,
+    bytes: u64,
+}
+
+/// Whether a file is a whole ZIP archive that is not a model (SOG), by its contents.
+pub fn is_archive(path: &Path) -> bool {
+    is_zip(path) && open(path).is_ok_and(|archive| archive.index_for_name("meta.json").is_none())
+}
+
+/// Whether a file begins as a ZIP archive, which may be damaged.
+pub(super) fn is_zip(path: &Path) -> bool {
+    let mut start = [0; 2];
+    path.is_file()
+        && files::open(path)
+            .is_ok_and(|mut file| file.read_exact(&mut start).is_ok() && start == *b"PK")
+}
+
+/// Loads the dataset in an archive.
+///
+/// # Errors
+/// When the archive is damaged or not to be trusted, there is no room for it, or as [`Dataset::load`].
+pub(super) fn load(path: &Path, options: &LoadOptions) -> Result<Dataset, DatasetError> {
+    let unpacked = Arc::new(Unpacked::new(path)?);
+    let mut dataset = Dataset::in_folder(&unpacked.folder, options)
+        .map_err(|error| DatasetError(unpacked.named(&error.0)))?;
+    for note in &mut dataset.notes {
+        *note = unpacked.named(note);
+    }
+    let (bytes, place) = (Bytes(unpacked.bytes), unpacked.all.path().display());
+    dataset.notes.push(format!(
+        "{} is unpacked in {place} ({bytes}) while this command runs",
+        path.display()
+    ));
+    for View { source, .. } in dataset.train.iter_mut().chain(&mut dataset.test) {
+        source.file = source.file.clone().of_archive(&unpacked);
+        if let Some(mask) = &mut source.mask {
+            mask.file = mask.file.clone().of_archive(&unpacked);
+        }
+    }
+    path.clone_into(&mut dataset.root);
+    dataset.unpacked = Some(unpacked);
+    Ok(dataset)
+}
+
+impl Unpacked {
+    fn new(path: &Path) -> Result<Self, DatasetError> {
+        let mut archive = open(path)?;
+        let most = most_bytes(path)?;
+        let bytes = check(path, &mut archive, most)?;
+        let all = tempfile::Builder::new()
+            .prefix("densify-zip-")
+            .tempdir()
+            .map_err(|error| no_room(path, &std::env::temp_dir(), bytes, &error))?;
+        let mut left = most;
+        for index in 0..archive.len() {
+            let mut file = archive.by_index(index).map_err(|error| broken(path, &error))?;
+            let Some(name) = data_name(path, &file)? else { continue };
+            let target = all.path().join(&name);
+            let made = target.parent().map_or(Ok(()), fs::create_dir_all);
+            // A second file of the same name does not replace the first.
+            let made =
+                made.and_then(|()| OpenOptions::new().write(true).create_new(true).open(&target));
+            let mut output = made.map_err(|error| match error.kind() {
+                io::ErrorKind::AlreadyExists | io::ErrorKind::NotADirectory => {
+                    malformed(path, &name, "another file has this name")
+                }
+                _ => no_room(path, all.path(), bytes, &error),
+            })?;
+            // Its length in the table of contents is only a claim.
+            let mut input = (&mut file).take(left + 1);
+            let copied = copy(&mut input, &mut output).map_err(|error| match error {
+                Copying::Reading(error) => {
+                    malformed(path, &name, format!("it cannot be unpacked: {error}"))
+                }
+                Copying::Writing(error) => no_room(path, all.path(), bytes, &error),
+            })?;
+            left = left.checked_sub(copied).ok_or_else(|| bomb(path, most))?;
+        }
+        let folder = inmost(all.path());
+        Ok(Self { archive: path.to_owned(), all, folder, bytes })
+    }
+
+    /// The dataset's folder.
+    pub(super) fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// A text in which files are named by their place in the archive.
+    pub(super) fn named(&self, text: &str) -> String {
+        let archive = self.archive.to_string_lossy();
+        [&*self.folder, self.all.path()].iter().fold(text.to_owned(), |text, folder| {
+            text.replace(&*folder.to_string_lossy(), &archive)
+        })
+    }
+
+    /// The same of a path.
+    pub(super) fn shown(&self, path: &Path) -> PathBuf {
+        let inside =
+            path.strip_prefix(&self.folder).or_else(|_| path.strip_prefix(self.all.path()));
+        inside.map_or_else(|_| path.to_owned(), |inside| self.archive.join(inside))
+    }
+}
+
+fn open(path: &Path) -> Result<ZipArchive<BufReader<File>>, DatasetError> {
+    let file = files::open(path).map_err(DatasetError::io(path))?;
+    ZipArchive::new(BufReader::new(file)).map_err(|error| broken(path, &error))
+}
+
+/// Most bytes that an archive may be unpacked to.
+fn most_bytes(path: &Path) -> Result<u64, DatasetError> {
+    let packed = fs::metadata(path).map_err(DatasetError::io(path))?.len();
+    Ok(files::most_unpacked(packed))
+}
+
+/// Checks all that the table of contents says; returns the bytes of the files.
+fn check<R: Read + io::Seek>(
+    path: &Path,
+    archive: &mut ZipArchive<R>,
+    most: u64,
+) -> Result<u64, DatasetError> {
+    if archive.len() > MAX_FILES {
+        return Err(malformed(path, "archive", format!("it has more than {MAX_FILES} files")));
+    }
+    let mut bytes = 0_u64;
+    for index in 0..archive.len() {
+        let file = archive.by_index_raw(index).map_err(|error| broken(path, &error))?;
+        if data_name(path, &file)?.is_some() {
+            bytes = bytes.saturating_add(file.size());
+        }
+    }
+    if bytes > most { Err(bomb(path, most)) } else { Ok(bytes) }
+}
+
+/// The path of a file in the archive; `None` where it is a folder, or something that systems add.
+fn data_name<R: Read>(
+    path: &Path,
+    file: &zip::read::ZipFile<'_, R>,
+) -> Result<Option<String>, DatasetError> {
+    // Many programs write UTF-8 without saying so.
+    let name = match std::str::from_utf8(file.name_raw()) {
+        Ok(name) => name.to_owned(),
+        Err(_) => file.name().map_err(|error| broken(path, &error))?.into_owned(),
+    };
+    // Some write the separators of Windows.
+    let name = name.replace('\\', "/");
+    let shown: String = name.chars().take(200).collect();
+    if let Some(problem) = lexical_fault(&name) {
+        return Err(malformed(path, &shown, format!("the path {problem}")));
+    }
+    if file.is_symlink() {
+        return Err(malformed(path, &shown, "it is a symbolic link, which is not followed"));
+    }
+    let is_data = |part: &str| !NOT_DATA.contains(&part);
+    if name.ends_with('/') || file.is_dir() || !relative(&name).split('/').all(is_data) {
+        return Ok(None);
+    }
+    if file.encrypted() {
+        let problem = "it is encrypted";
+        return Err(DatasetError::malformed(
+            path,
+            shown,
+            problem,
+            "pack it again without a password",
+        ));
+    }
+    Ok(Some(relative(&name)))
+}
+
+/// The folder inside which all is.
+fn inmost(folder: &Path) -> PathBuf {
+    let mut folder = folder.to_owned();
+    for _ in 0..MAX_AROUND {
+        let mut entries = fs::read_dir(&folder).into_iter().flatten().flatten();
+        match (entries.next(), entries.next()) {
+            (Some(only), None) if only.path().is_dir() => folder = only.path(),
+            _ => break,
+        }
+    }
+    folder
+}
+
+enum Copying {
+    Reading(io::Error),
+    Writing(io::Error),
+}
+
+/// Copies all there is; tells a damaged archive from a full disk.
+fn copy(input: &mut impl Read, output: &mut File) -> Result<u64, Copying> {
+    let mut buffer = vec![0; 1 << 16];
+    let mut copied = 0;
+    loop {
+        let read = input.read(&mut buffer).map_err(Copying::Reading)?;
+        if read == 0 {
+            return Ok(copied);
+        }
+        io::Write::write_all(output, &buffer[..read]).map_err(Copying::Writing)?;
+        copied += read as u64;
+    }
+}
+
+fn malformed(path: &Path, place: &str, problem: impl std::fmt::Display) -> DatasetError {
+    DatasetError::malformed(path, place, problem, REMEDY)
+}
+
+fn broken(path: &Path, error: &ZipError) -> DatasetError {
+    malformed(path, "archive", error)
+}
+
+fn bomb(path: &Path, most: u64) -> DatasetError {
+    let problem = format!("it unpacks to more than {}, which no photographs do", Bytes(most));
+    DatasetError::malformed(
+        path,
+        "archive",
+        problem,
+        "unpack it yourself if you trust it, and name the folder",
+    )
+}
+
+fn no_room(path: &Path, place: &Path, bytes: u64, error: &io::Error) -> DatasetError {
+    DatasetError(format!(
+        "cannot unpack {} into {}: {error}; set TMPDIR to a folder with room for {}, or unpack it yourself and name \
+         that folder",
+        path.display(),
+        place.display(),
+        Bytes(bytes)
+    ))
+}

@@ -1,0 +1,243 @@
+//! Renders built-in scenes in memory, or takes them from the cache.
+
+mod scene_cache;
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+pub use densify_scenegen::GroundTruth;
+use densify_scenegen::{
+    AskedPreset, Frame, InitPoints, Options, Scene, Source, Split, View as RenderedView,
+};
+use serde::{Deserialize, Serialize};
+
+use super::PREFIX;
+use crate::dataset::images::{ImageHeader, ImageSource, SourceFile};
+use crate::dataset::photographs::{Photograph, target_size};
+use crate::dataset::prepare::assemble;
+use crate::dataset::tracks::TrackSampler;
+use crate::dataset::{self, Dataset, DatasetError, LoadOptions, PointCloud, View};
+use densify_core::camera::Camera;
+use densify_core::image::Image8;
+use scene_cache::Entry;
+pub use scene_cache::folder;
+
+/// Bytes of a scene's surface while its tree is built, for each byte of it in the end or in a file: a
+/// triangle takes 86 bytes in the file, up to 200 while its tree is built, and 100 in the end.
+const BUILDING: u64 = 4;
+
+/// A built-in scene as it was rendered.
+#[derive(Debug, PartialEq)]
+struct Rendered {
+    about: About,
+    /// The images of all views, in order.
+    frames: Vec<Frame>,
+    points: InitPoints,
+}
+
+/// What there is to know of a scene without building it.
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+struct About {
+    views: Vec<RenderedView>,
+    notes: Vec<String>,
+    /// As [`Dataset::surface_bytes`].
+    surface_bytes: u64,
+}
+
+/// Renders a built-in scene, or takes it from the cache.
+///
+/// # Errors
+/// When there is no such scene, or the options leave no view to train on.
+pub(in crate::dataset) fn load(
+    path: &Path,
+    name: &str,
+    options: &LoadOptions,
+) -> Result<Dataset, DatasetError> {
+    let (source, parameters) = (Source::Preset(name.to_owned()), Options::default());
+    // Of an unknown one no file is named.
+    let asked: AskedPreset = name.parse()?;
+    let entry = options.cache.as_deref();
+    let entry = entry.and_then(|folder| Entry::of(folder, &asked.to_string(), &parameters));
+    let kept = entry.as_ref().and_then(Entry::read);
+    // A scene has as many images as views, unless somebody else has made the entry.
+    if let Some(kept) = kept.filter(|kept| kept.frames.len() == kept.about.views.len()) {
+        return dataset(path, kept, options);
+    }
+    let scene = Scene::prepare(&source, &parameters)?;
+    let (frames, points) = render(&scene);
+    let surface_bytes = BUILDING * scene.surface.bytes() as u64;
+    let about = About { views: scene.views, notes: scene.model.notes, surface_bytes };
+    let rendered = Rendered { about, frames, points };
+    if let Some(entry) = entry {
+        entry.write(&rendered);
+    }
+    dataset(path, rendered, options)
+}
+
+/// The images of all views, without the depths and normals that only the points need.
+fn render(scene: &Scene) -> (Vec<Frame>, InitPoints) {
+    let mut collector = scene.point_collector();
+    let mut frames = Vec::with_capacity(scene.views.len());
+    for (i, view) in scene.views.iter().enumerate() {
+        let frame = scene.render(i);
+        if view.split == Split::Train {
+            collector.observe(i, &frame);
+        }
+        let (depth, normals, triangles) = (Vec::new(), Vec::new(), Vec::new());
+        frames.push(Frame { depth, normals, triangles, ..frame });
+    }
+    let points = collector.finish();
+    (frames, points)
+}
+
+impl Dataset {
+    /// The geometry that the images were rendered from, in the dataset's own coordinates. Known for
+    /// built-in scenes and for folders that `densify scenegen` wrote.
+    ///
+    /// # Errors
+    /// When it exists but cannot be read.
+    pub fn ground_truth(&self) -> Result<Option<GroundTruth>, DatasetError> {
+        if let Some(unpacked) = &self.unpacked {
+            let found = GroundTruth::open(unpacked.folder());
+            return found.map_err(|error| DatasetError(unpacked.named(&error.to_string())));
+        }
+        let Some(name) = super::name(&self.root) else { return Ok(GroundTruth::open(&self.root)?) };
+        let scene = Scene::prepare(&Source::Preset(name.to_owned()), &Options::default())?;
+        Ok(Some(GroundTruth::of_scene(scene)))
+    }
+}
+
+/// What the surface in a folder takes at most while it is read `[bytes]`; `None` where there is none.
+pub(in crate::dataset) fn surface_bytes(root: &Path) -> Option<u64> {
+    let mesh = std::fs::metadata(root.join("mesh.ply"));
+    GroundTruth::is_in(root).then(|| BUILDING * mesh.map_or(0, |mesh| mesh.len()))
+}
+
+impl From<densify_scenegen::Error> for DatasetError {
+    fn from(error: densify_scenegen::Error) -> Self {
+        Self(error.to_string())
+    }
+}
+
+/// A rendered scene as a dataset named `path`.
+///
+/// # Errors
+/// When the options leave no view to train on.
+fn dataset(
+    path: &Path,
+    Rendered { about, frames, points }: Rendered,
+    options: &LoadOptions,
+) -> Result<Dataset, DatasetError> {
+    let mut photographs: Vec<Photograph> = (0..)
+        .zip(&about.views)
+        .zip(frames)
+        .map(|((number, view), frame)| {
+            let camera = camera(&view.camera);
+            let held_out = view.split == Split::Test;
+            let views = vec![dataset_view(&view.name, camera, frame, options)];
+            Photograph { views, hidden: Vec::new(), held_out, id: Some(number) }
+        })
+        .collect();
+    let name = |photograph: &Photograph| photograph.views[0].name.clone();
+    photographs.sort_by_cached_key(name);
+    let mut sampler = TrackSampler::new();
+    let found = points.positions.iter().zip(&points.colours);
+    for ((&position, &colour), seen_by) in found.zip(&points.seen_by) {
+        if options.tracks && sampler.wants(seen_by.len() as u64) {
+            sampler.add(position, colour, seen_by.iter().copied());
+        }
+    }
+    let read = dataset::Scene {
+        points: PointCloud { positions: points.positions, colours: points.colours },
+        tracks: sampler.finish(),
+        own_split: true,
+        surface_bytes: Some(about.surface_bytes),
+        notes: about.notes,
+        ..dataset::Scene::default()
+    };
+    assemble(path, photographs, read, options)
+}
+
+/// The trainer's camera of a rendered view.
+fn camera(from: &densify_scenegen::Camera) -> Camera {
+    let rotation = from.world_from_camera.transpose();
+    Camera {
+        width: from.width,
+        height: from.height,
+        fx: from.fx,
+        fy: from.fy,
+        cx: from.cx,
+        cy: from.cy,
+        rotation,
+        translation: -(rotation * from.centre),
+    }
+}
+
+fn dataset_view(name: &str, camera: Camera, frame: Frame, options: &LoadOptions) -> View {
+    let pixels = frame.rgba.chunks_exact(4);
+    let rgb = pixels.clone().flat_map(|pixel| [pixel[0], pixel[1], pixel[2]]).collect();
+    let alpha: Vec<u8> = pixels.map(|pixel| pixel[3]).collect();
+    let has_alpha = alpha.iter().any(|&a| a < 255);
+    let image = Image8 {
+        width: frame.width,
+        height: frame.height,
+        rgb,
+        alpha: has_alpha.then_some(alpha),
+        mask: None,
+    };
+    let header = ImageHeader {
+        width: frame.width,
+        height: frame.height,
+        has_alpha,
+        turn: None,
+        decoded_bytes: image.bytes(),
+        file_bytes: 0,
+    };
+    let (width, height) =
+        target_size((header.width, header.height), header.width, options.resolution, false);
+    View {
+        name: format!("{name}.png"),
+        camera: camera.resized(width, height),
+        source: ImageSource {
+            file: SourceFile::rendered(PathBuf::from(format!("{PREFIX}{name}"))),
+            mask: None,
+            width,
+            height,
+            undistortion: None,
+            header,
+            rendered: Some(Arc::new(image)),
+            window: None,
+        },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::{DVec2, DVec3};
+
+    use super::*;
+
+    #[test]
+    fn pixels_and_rays_agree_with_the_trainers_projection() {
+        let turned = densify_scenegen::Camera::looking(
+            DVec3::new(3.0, -2.0, 5.5),
+            DVec3::new(0.1, 0.4, -0.3),
+            DVec3::new(0.1, 1.0, 0.2),
+            0.9,
+            (1920, 1080),
+        );
+        let shifted =
+            densify_scenegen::Camera { cx: 900.5, cy: 500.25, fy: turned.fx * 1.1, ..turned };
+        for from in [turned, shifted] {
+            let camera = camera(&from);
+            for (x, y, depth) in
+                [(0.5, 0.5, 0.01), (1919.5, 3.5, 1.0), (7.25, 1079.9, 1e4), (960.0, 540.0, 7.0)]
+            {
+                let world = from.centre + depth * from.direction(DVec2::new(x, y));
+                let (pixel, z) = camera.project(world);
+                assert!((pixel - DVec2::new(x, y)).length() < 1e-4, "{pixel} for {x}, {y}");
+                assert!((z / depth - 1.0).abs() < 1e-9, "{z} for {depth}");
+            }
+        }
+    }
+}

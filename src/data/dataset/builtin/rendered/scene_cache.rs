@@ -1,0 +1,265 @@
+//! Keeps built-in scenes as they were rendered, in the user's cache folder: ray tracing takes longer than
+//! many a run. An entry is of one program file and one set of parameters, so that a new build renders anew.
+
+use std::collections::HashMap;
+use std::fs::{self, File};
+use std::io::{self, Read};
+use std::path::{Path, PathBuf};
+use std::time::SystemTime;
+
+use densify_scenegen::{Frame, InitPoints, Options};
+use etcetera::BaseStrategy;
+use glam::DVec3;
+use safetensors::SafeTensors;
+use safetensors::tensor::{Dtype, TensorView};
+
+use super::{About, Rendered};
+use densify_core::files::write_atomically;
+
+/// Most bytes of all entries. The longest unused go first.
+const MOST_BYTES: u64 = 1 << 30;
+const ENDING: &str = "safetensors";
+const CHECKSUM: &str = "crc32c";
+
+/// The folder for entries in the user's cache folder, if there is one.
+pub fn folder() -> Option<PathBuf> {
+    let base = etcetera::choose_base_strategy().ok()?;
+    Some(base.cache_dir().join("densify").join("scenes"))
+}
+
+/// The place of a scene in the cache.
+pub(super) struct Entry {
+    path: PathBuf,
+}
+
+impl Entry {
+    /// The entry of a built-in scene of this name; `None` where this program's file cannot be read.
+    pub(super) fn of(folder: &Path, name: &str, options: &Options) -> Option<Self> {
+        let program = fingerprint(&std::env::current_exe().ok()?).ok()?;
+        let parameters = crc32c::crc32c(format!("{options:?}").as_bytes());
+        // Some systems keep the colon of `town:4` out of names.
+        let name = name.replace(':', "-");
+        let name = format!("{name}-{program:08x}-{parameters:08x}.{ENDING}");
+        Some(Self { path: folder.join(name) })
+    }
+
+    /// The scene, if it is there and whole.
+    pub(super) fn read(&self) -> Option<Rendered> {
+        let mut bytes = Vec::new();
+        File::open(&self.path).ok()?.take(MOST_BYTES).read_to_end(&mut bytes).ok()?;
+        // It has been used just now. A cache that others share may be read only.
+        let file = File::options().write(true).open(&self.path);
+        let _ = file.and_then(|file| file.set_modified(SystemTime::now()));
+        let (_, metadata) = SafeTensors::read_metadata(&bytes).ok()?;
+        let tensors = SafeTensors::deserialize(&bytes).ok()?;
+        let checksum = metadata.metadata().as_ref()?.get(CHECKSUM)?;
+        (*checksum == checksum_of(tensors.tensors())).then(|| decode(&tensors))?
+    }
+
+    /// Writes it. A cache that cannot be written is none; the run goes on.
+    pub(super) fn write(&self, scene: &Rendered) {
+        if let Err(error) = self.try_write(scene) {
+            tracing::debug!(%error, "the scene is not kept");
+        }
+    }
+
+    fn try_write(
+        &self,
+        Rendered { about, frames, points }: &Rendered,
+    ) -> Result<(), Box<dyn std::error::Error>> {
+        let about = serde_json::to_vec(about)?;
+        let flat: Vec<f64> = points.positions.iter().flat_map(DVec3::to_array).collect();
+        let counts: Vec<u32> = points.seen_by.iter().map(|views| views.len() as u32).collect();
+        let seen_by = points.seen_by.concat();
+        let number = points.positions.len();
+        let mut tensors = Vec::new();
+        for (index, frame) in frames.iter().enumerate() {
+            let shape = vec![frame.height as usize, frame.width as usize, 4];
+            tensors.push((image_name(index), TensorView::new(Dtype::U8, shape, &frame.rgba)?));
+        }
+        for (name, kind, shape, bytes) in [
+            ("about", Dtype::U8, vec![about.len()], &about[..]),
+            ("positions", Dtype::F64, vec![number, 3], bytemuck::cast_slice(&flat)),
+            ("colours", Dtype::U8, vec![number, 3], points.colours.as_flattened()),
+            ("views", Dtype::U32, vec![number], bytemuck::cast_slice(&counts)),
+            ("seen_by", Dtype::U32, vec![seen_by.len()], bytemuck::cast_slice(&seen_by)),
+        ] {
+            tensors.push((name.to_owned(), TensorView::new(kind, shape, bytes)?));
+        }
+        let metadata = HashMap::from([(CHECKSUM.to_owned(), checksum_of(tensors.clone()))]);
+        let bytes = safetensors::serialize(tensors, Some(metadata))?;
+        write_atomically(&self.path, |out| out.write_all(&bytes))?;
+        self.path.parent().map_or(Ok(()), |folder| bound(folder, MOST_BYTES))?;
+        Ok(())
+    }
+}
+
+fn image_name(index: usize) -> String {
+    format!("image_{index:05}")
+}
+
+/// Of all values, in the order of their names.
+fn checksum_of(mut tensors: Vec<(String, TensorView<'_>)>) -> String {
+    tensors.sort_by(|(a, _), (b, _)| a.cmp(b));
+    let sum = tensors.iter().fold(0, |sum, (name, tensor)| {
+        let sum = crc32c::crc32c_append(sum, format!("{name}{:?}", tensor.shape()).as_bytes());
+        crc32c::crc32c_append(sum, tensor.data())
+    });
+    format!("{sum:08x}")
+}
+
+/// The contents of an entry whose checksum is right.
+fn decode(tensors: &SafeTensors<'_>) -> Option<Rendered> {
+    let frames = (0..).map_while(|index| tensors.tensor(&image_name(index)).ok());
+    let frames: Option<Vec<Frame>> = frames.map(|image| frame(&image)).collect();
+    let bytes = |name: &str| Some(tensors.tensor(name).ok()?.data());
+    let u32s = |name: &str| -> Option<Vec<u32>> {
+        let words = bytes(name)?.as_chunks().0.iter();
+        Some(words.map(|&word| u32::from_le_bytes(word)).collect())
+    };
+    let numbers = bytes("positions")?.as_chunks().0.iter().map(|&word| f64::from_le_bytes(word));
+    let numbers: Vec<f64> = numbers.collect();
+    let positions = numbers.as_chunks().0.iter().map(|&point| DVec3::from_array(point)).collect();
+    let colours = bytes("colours")?.as_chunks().0.to_vec();
+    let mut seen = u32s("seen_by")?.into_iter();
+    let views = u32s("views")?.into_iter();
+    let seen_by = views.map(|count| seen.by_ref().take(count as usize).collect()).collect();
+    // A dataset tells neither where points were found nor how many outliers there are.
+    let points = InitPoints { positions, colours, seen_by, ..InitPoints::default() };
+    let about: About = serde_json::from_slice(bytes("about")?).ok()?;
+    Some(Rendered { about, frames: frames?, points })
+}
+
+fn frame(image: &TensorView<'_>) -> Option<Frame> {
+    let &[height, width, 4] = image.shape() else { return None };
+    Some(Frame {
+        width: u32::try_from(width).ok()?,
+        height: u32::try_from(height).ok()?,
+        rgba: image.data().to_vec(),
+        exposed: None,
+        mask: None,
+        depth: Vec::new(),
+        normals: Vec::new(),
+        triangles: Vec::new(),
+    })
+}
+
+/// The checksum of a file.
+fn fingerprint(path: &Path) -> io::Result<u32> {
+    let mut file = File::open(path)?;
+    let mut buffer = vec![0; 1 << 16];
+    let mut sum = 0;
+    loop {
+        match file.read(&mut buffer)? {
+            0 => return Ok(sum),
+            read => sum = crc32c::crc32c_append(sum, &buffer[..read]),
+        }
+    }
+}
+
+/// Removes the longest unused entries until all together have at most `most` bytes.
+fn bound(folder: &Path, most: u64) -> io::Result<()> {
+    let mut entries = Vec::new();
+    for entry in fs::read_dir(folder)? {
+        let entry = entry?;
+        let known = entry.metadata()?;
+        // What a killed process has left of writing is as good as an entry that nobody uses.
+        let is_entry = entry.path().extension().is_some_and(|ending| ending == ENDING);
+        if is_entry || entry.file_name().as_encoded_bytes().starts_with(b".densify-") {
+            entries.push((known.modified()?, known.len(), entry.path()));
+        }
+    }
+    entries.sort();
+    let mut total: u64 = entries.iter().map(|(_, bytes, _)| bytes).sum();
+    for (_, bytes, path) in entries {
+        if total <= most {
+            break;
+        }
+        fs::remove_file(path)?;
+        total -= bytes;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use densify_scenegen::{Camera, Split, View};
+
+    use super::*;
+
+    fn sample() -> Rendered {
+        let frame = |value: u8| Frame {
+            width: 2,
+            height: 1,
+            rgba: vec![value; 8],
+            exposed: None,
+            mask: None,
+            depth: Vec::new(),
+            normals: Vec::new(),
+            triangles: Vec::new(),
+        };
+        let points = InitPoints {
+            positions: vec![DVec3::new(1.0, -0.1, 1e-9), DVec3::splat(7.25)],
+            colours: vec![[1, 2, 3], [4, 5, 6]],
+            seen_by: vec![vec![0, 2], vec![1]],
+            ..InitPoints::default()
+        };
+        let camera = Camera::looking(DVec3::new(0.1, 0.2, 0.3), DVec3::X, DVec3::Y, 0.7, (2, 1));
+        let view = |name: &str, split| View { name: name.to_owned(), split, camera };
+        let views = vec![view("train/r_000", Split::Train), view("test/r_000", Split::Test)];
+        let about = About { views, notes: vec!["a note".to_owned()], surface_bytes: 5 };
+        Rendered { about, frames: vec![frame(3), frame(250)], points }
+    }
+
+    fn has_colon(path: &Path) -> bool {
+        path.file_name().is_some_and(|name| name.to_string_lossy().contains(':'))
+    }
+
+    fn same(read: Option<Rendered>) -> bool {
+        read.is_some_and(|read| read == sample())
+    }
+
+    #[test]
+    fn what_is_kept_is_read_back_and_nothing_else() {
+        let folder = tempfile::tempdir().unwrap();
+        let entry = |options: &Options| Entry::of(folder.path(), "spheres", options).unwrap();
+        let default = entry(&Options::default());
+        assert!(default.read().is_none());
+        default.write(&sample());
+        assert!(same(default.read()));
+        // Other parameters are another scene.
+        assert!(entry(&Options { seed: 9, ..Options::default() }).read().is_none());
+        // So is one of another size.
+        let sized = |name| Entry::of(folder.path(), name, &Options::default()).unwrap();
+        let [town, larger] = ["town", "town:4"].map(sized);
+        town.write(&sample());
+        assert!(same(town.read()) && larger.read().is_none() && !has_colon(&larger.path));
+        // A damaged entry is none.
+        let whole = fs::read(&default.path).unwrap();
+        for at in (0..whole.len()).step_by(7) {
+            let mut damaged = whole.clone();
+            damaged[at] ^= 16;
+            fs::write(&default.path, &damaged).unwrap();
+            let read = default.read();
+            assert!(read.is_none() || same(read), "byte {at}");
+        }
+        fs::write(&default.path, &whole[..whole.len() - 1]).unwrap();
+        assert!(default.read().is_none());
+    }
+
+    #[test]
+    fn the_longest_unused_entries_go_first() {
+        let folder = tempfile::tempdir().unwrap();
+        for (name, age) in [("a", 30), ("b", 10), ("c", 20)] {
+            let path = folder.path().join(name).with_extension(ENDING);
+            fs::write(&path, [0; 100]).unwrap();
+            let then = SystemTime::now() - std::time::Duration::from_secs(age);
+            File::options().write(true).open(&path).unwrap().set_modified(then).unwrap();
+        }
+        fs::write(folder.path().join("other.txt"), [0; 900]).unwrap();
+        bound(folder.path(), 200).unwrap();
+        let there = |name: &str| folder.path().join(name).with_extension(ENDING).exists();
+        assert_eq!(["a", "b", "c"].map(there), [false, true, true]);
+        assert!(folder.path().join("other.txt").exists());
+    }
+}

@@ -1,0 +1,212 @@
+//! Reads COLMAP's binary files: little endian, no padding, counts first.
+//!
+//! A count is checked against the size of the file before anything is allocated from it.
+
+use std::collections::HashMap;
+use std::fmt::Display;
+use std::fs::File;
+use std::io::{BufReader, Read};
+use std::path::Path;
+
+use glam::DVec3;
+
+use super::super::PointCloud;
+use super::super::error::DatasetError;
+use super::super::lens::Lens;
+use super::super::lens::table::LensModel;
+use super::super::paths::MAX_NAME;
+use super::super::tracks::{MAX_VIEWS, TrackSampler};
+use super::camera;
+use super::{Image, MAX_IMAGES, MAX_POINTS, REMEDY, RENAME};
+use densify_core::files;
+
+/// A file and the number of bytes left.
+struct Reader<'a> {
+    path: &'a Path,
+    input: BufReader<File>,
+    length: u64,
+    left: u64,
+}
+
+impl<'a> Reader<'a> {
+    fn open(path: &'a Path) -> Result<Self, DatasetError> {
+        let file = files::open(path).map_err(DatasetError::io(path))?;
+        let length = file.metadata().map_err(DatasetError::io(path))?.len();
+        Ok(Self { path, input: BufReader::with_capacity(1 << 16, file), length, left: length })
+    }
+
+    fn fault(&self, field: &str, problem: impl Display) -> DatasetError {
+        self.mended_by(REMEDY, field, problem)
+    }
+
+    fn mended_by(&self, remedy: &str, field: &str, problem: impl Display) -> DatasetError {
+        let place = format!("byte {}: {field}", self.length - self.left);
+        DatasetError::malformed(self.path, place, problem, remedy)
+    }
+
+    /// Counts bytes as read; an error if the file has fewer.
+    fn claim(&mut self, field: &str, bytes: u64) -> Result<(), DatasetError> {
+        if bytes > self.left {
+            let problem = format!(
+                "the file ends here: {bytes} bytes needed, {} left (truncated?)",
+                self.left
+            );
+            return Err(self.fault(field, problem));
+        }
+        self.left -= bytes;
+        Ok(())
+    }
+
+    fn bytes<const N: usize>(&mut self, field: &str) -> Result<[u8; N], DatasetError> {
+        self.claim(field, N as u64)?;
+        let mut bytes = [0; N];
+        self.input.read_exact(&mut bytes).map_err(DatasetError::io(self.path))?;
+        Ok(bytes)
+    }
+
+    fn u64(&mut self, field: &str) -> Result<u64, DatasetError> {
+        self.bytes(field).map(u64::from_le_bytes)
+    }
+
+    fn u32(&mut self, field: &str) -> Result<u32, DatasetError> {
+        self.bytes(field).map(u32::from_le_bytes)
+    }
+
+    fn f64(&mut self, field: &str) -> Result<f64, DatasetError> {
+        self.bytes(field).map(f64::from_le_bytes)
+    }
+
+    fn f64s<const N: usize>(&mut self, field: &str) -> Result<[f64; N], DatasetError> {
+        let mut values = [0.0; N];
+        for value in &mut values {
+            *value = self.f64(field)?;
+        }
+        Ok(values)
+    }
+
+    /// Skips `count` records of `size` bytes.
+    fn skip(&mut self, field: &str, count: u64, size: u64) -> Result<(), DatasetError> {
+        let bytes = count.saturating_mul(size);
+        self.claim(field, bytes)?;
+        // `claim` bounds it by the file's length, which fits.
+        let bytes = i64::try_from(bytes).map_err(|_| self.fault(field, "too long"))?;
+        self.input.seek_relative(bytes).map_err(DatasetError::io(self.path))
+    }
+
+    /// Reads a count of records that take at least `size` bytes each.
+    fn count(&mut self, what: &str, size: u64, most: u64) -> Result<u64, DatasetError> {
+        let count = self.u64(what)?;
+        if count > most || count > self.left / size {
+            let problem = format!(
+                "the file says {count}, but the {} bytes that follow hold at most {}",
+                self.left,
+                self.left / size
+            );
+            return Err(self.fault(what, problem));
+        }
+        Ok(count)
+    }
+
+    fn name(&mut self, field: &str) -> Result<String, DatasetError> {
+        let mut name = Vec::new();
+        loop {
+            match self.bytes::<1>(field)? {
+                [0] => break,
+                [byte] if name.len() < MAX_NAME => name.push(byte),
+                _ => return Err(self.fault(field, "the name is longer than 4 KiB")),
+            }
+        }
+        let text = String::from_utf8(name);
+        text.map_err(|_| self.mended_by(RENAME, field, "the name is not UTF-8"))
+    }
+
+    fn end(&self, what: &str, count: u64) -> Result<(), DatasetError> {
+        if self.left == 0 {
+            return Ok(());
+        }
+        Err(self.fault(
+            what,
+            format!("{} bytes follow the {count} records the file announced", self.left),
+        ))
+    }
+}
+
+/// Reads cameras.bin.
+pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, Lens>, DatasetError> {
+    let mut reader = Reader::open(path)?;
+    // id, model, size, and three parameters at least.
+    let count = reader.count("number of cameras", 4 + 4 + 16 + 24, MAX_IMAGES)?;
+    let mut cameras = HashMap::new();
+    for _ in 0..count {
+        let id = reader.u32("camera id")?;
+        let field = format!("camera {id}");
+        let model = i32::from_le_bytes(reader.bytes(&field)?);
+        let model = LensModel::numbered(path, &field, model)?;
+        let size = [reader.u64(&field)?, reader.u64(&field)?];
+        let lens = camera::lens(model, path, &field, size, || reader.f64(&field))?;
+        if cameras.insert(id, lens).is_some() {
+            return Err(reader.fault(&field, "the id occurs twice"));
+        }
+    }
+    reader.end("cameras", count)?;
+    Ok(cameras)
+}
+
+/// Reads images.bin; the observations in it are skipped.
+pub(super) fn images(path: &Path) -> Result<Vec<Image>, DatasetError> {
+    let mut reader = Reader::open(path)?;
+    // id, pose, camera, an empty name's NUL, number of observations.
+    let count = reader.count("number of images", 4 + 56 + 4 + 1 + 8, MAX_IMAGES)?;
+    let mut images = Vec::new();
+    for _ in 0..count {
+        let id = reader.u32("image id")?;
+        let field = format!("image id {id}");
+        let q = reader.f64s::<4>(&field)?;
+        let t = reader.f64s::<3>(&field)?;
+        let camera = reader.u32(&field)?;
+        let name = reader.name(&field)?;
+        let observations = reader.u64(&field)?;
+        reader.skip(&field, observations, 24)?;
+        images.push(Image::checked(path, id, name, camera, q, t)?);
+    }
+    reader.end("images", count)?;
+    Ok(images)
+}
+
+/// Reads points3D.bin, and its tracks into `tracks`.
+pub(super) fn points(
+    path: &Path,
+    mut tracks: Option<&mut TrackSampler>,
+) -> Result<PointCloud, DatasetError> {
+    let mut reader = Reader::open(path)?;
+    // id, position, colour, error, length of the track.
+    let count = reader.count("number of points", 8 + 24 + 3 + 8 + 8, MAX_POINTS)?;
+    let mut points = PointCloud::default();
+    for _ in 0..count {
+        let field = "point";
+        reader.skip(field, 1, 8)?;
+        let position = reader.f64s::<3>(field)?;
+        let colour = reader.bytes::<3>(field)?;
+        reader.skip(field, 1, 8)?;
+        let position = DVec3::from(position);
+        let views = reader.u64(field)?;
+        // Pairs of image id and observation index.
+        let mut left = views;
+        if let Some(tracks) = tracks.as_deref_mut()
+            && tracks.wants(views)
+        {
+            let mut ids = Vec::new();
+            for _ in 0..views.min(MAX_VIEWS) {
+                ids.push(reader.u32(field)?);
+                reader.skip(field, 1, 4)?;
+            }
+            left -= ids.len() as u64;
+            tracks.add(position, colour, ids);
+        }
+        reader.skip(field, left, 8)?;
+        points.positions.push(position);
+        points.colours.push(colour);
+    }
+    reader.end("points", count)?;
+    Ok(points)
+}

@@ -1,0 +1,358 @@
+//! Decodes photographs, and shrinks and undistorts them.
+//!
+//! Files are untrusted: sides, pixels and decoded bytes are checked before anything is allocated.
+
+use std::io::{BufReader, Cursor, Read};
+use std::path::Path;
+
+use image::error::ImageFormatHint;
+use image::metadata::Orientation;
+use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits};
+
+pub use super::cache::{ImageCache, ImageDemand};
+use super::error::DatasetError;
+use super::jpeg;
+pub use super::mask::{Hides, Mask};
+use super::options::MaskMode;
+pub use super::source_file::SourceFile;
+use super::undistort::Undistortion;
+use densify_core::files;
+use densify_core::image::Window;
+pub use densify_core::image::{Image8, SharedImage};
+use densify_core::resample;
+
+/// Longest side accepted `[px]`.
+pub const MAX_SIDE: u32 = 16_384;
+/// Most pixels accepted.
+pub const MAX_PIXELS: u64 = 1 << 28;
+/// Most bytes of one image as decoded.
+const MAX_DECODED_BYTES: u64 = 1 << 30;
+/// Most bytes of an image file that are read: no JPEG of [`MAX_PIXELS`] has more.
+const MAX_FILE_BYTES: u64 = MAX_DECODED_BYTES;
+/// Supported formats.
+const FORMATS: [ImageFormat; 3] = [ImageFormat::Jpeg, ImageFormat::Png, ImageFormat::WebP];
+/// Almost always enough of a file to hold the header.
+const HEADER_BYTES: u64 = 256 << 10;
+
+/// Where the pixels of a view come from, and how they are processed on load.
+#[derive(Debug, Clone)]
+pub struct ImageSource {
+    /// The image file.
+    pub file: SourceFile,
+    /// What of it is hidden, if there is a file of that.
+    pub mask: Option<Mask>,
+    /// Width after loading, before the window is cut out `[px]`.
+    pub width: u32,
+    /// Height after loading, before the window is cut out `[px]`.
+    pub height: u32,
+    /// Resampling of the whole file to a pinhole, if the lens has distortion.
+    pub undistortion: Option<Undistortion>,
+    /// Header of the image file.
+    pub header: ImageHeader,
+    /// Pixels already in memory, at the size of the header; then no file is read.
+    pub rendered: Option<SharedImage>,
+    /// What of the result is used, if not all.
+    pub window: Option<Window>,
+}
+
+/// The header of an image file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ImageHeader {
+    /// Width `[px]`.
+    pub width: u32,
+    /// Height `[px]`.
+    pub height: u32,
+    /// Whether there is an alpha channel.
+    pub has_alpha: bool,
+    /// How the image is turned before anything else. Width and height are those afterwards.
+    pub turn: Option<Orientation>,
+    /// Size as decoded `[bytes]`.
+    pub decoded_bytes: u64,
+    /// Size of the file `[bytes]`.
+    pub file_bytes: u64,
+}
+
+impl ImageSource {
+    /// An image file as it is.
+    #[cfg(test)]
+    pub(super) fn whole(path: std::path::PathBuf) -> Self {
+        let header = probe(&path).expect("an image");
+        let (width, height) = (header.width, header.height);
+        let (mask, undistortion, rendered) = (None, None, None);
+        let file = SourceFile::found(path).expect("an image");
+        Self { file, mask, width, height, undistortion, header, rendered, window: None }
+    }
+
+    /// Most bytes of the loaded image.
+    #[must_use]
+    pub fn loaded_bytes(&self) -> u64 {
+        let [width, height] = match self.window {
+            Some(window) => [window.width, window.height],
+            None => [self.width, self.height],
+        };
+        u64::from(width) * u64::from(height) * self.channels()
+    }
+
+    /// Most bytes used while loading, including the result.
+    #[must_use]
+    pub fn working_bytes(&self) -> u64 {
+        let bytes = |(width, height)| u64::from(width) * u64::from(height) * self.channels();
+        let packed = bytes((self.header.width, self.header.height));
+        let decode = self.header.file_bytes + self.header.decoded_bytes;
+        let pack = self.header.decoded_bytes + packed;
+        let whole = bytes(self.whole_size());
+        let undistort = if self.undistortion.is_some() { packed + whole } else { packed };
+        let shrunk = bytes((self.width, self.height));
+        let shrink = if self.shrinks() { whole + shrunk } else { whole };
+        let cut = if self.window.is_some() { shrunk + self.loaded_bytes() } else { 0 };
+        let turn = if self.header.turn.is_some() { 2 * self.header.decoded_bytes } else { 0 };
+        decode.max(turn).max(pack).max(undistort).max(shrink).max(cut)
+    }
+
+    fn channels(&self) -> u64 {
+        3 + u64::from(self.header.has_alpha || self.is_carved()) + u64::from(self.is_masked())
+    }
+
+    /// Whether its images have a mask, of their own or of what their lens saw.
+    #[must_use]
+    pub fn is_masked(&self) -> bool {
+        let is_ignored = |mask: &Mask| mask.mode == MaskMode::Ignore;
+        self.mask.as_ref().is_some_and(is_ignored)
+            || self.undistortion.as_ref().is_some_and(Undistortion::is_masked)
+    }
+
+    /// Whether a mask makes its images transparent.
+    fn is_carved(&self) -> bool {
+        self.mask.as_ref().is_some_and(|mask| mask.mode == MaskMode::Background)
+    }
+
+    /// Width and height before it is shrunk `[px]`.
+    fn whole_size(&self) -> (u32, u32) {
+        match &self.undistortion {
+            Some(undistortion) => (undistortion.pinhole().width, undistortion.pinhole().height),
+            None => (self.header.width, self.header.height),
+        }
+    }
+
+    fn shrinks(&self) -> bool {
+        (self.width, self.height) != self.whole_size()
+    }
+
+    /// Decodes, undistorts, shrinks, and cuts out the window. A file without a transparent pixel yields no alpha.
+    ///
+    /// # Errors
+    /// When a file is missing, unreadable, over the limits, or not what its header said at first.
+    pub fn load(&self) -> Result<Image8, DatasetError> {
+        let image = self.load_whole()?;
+        Ok(match self.window {
+            Some(window) => image.windowed(window),
+            None => image,
+        })
+    }
+
+    fn load_whole(&self) -> Result<Image8, DatasetError> {
+        let header = self.header;
+        if let Some(image) = &self.rendered {
+            return Ok(if self.shrinks() {
+                resample::shrink(image, self.width, self.height)
+            } else {
+                Image8::clone(image)
+            });
+        }
+        let mut decoded = decode(&self.file)?;
+        if let Some(turn) = header.turn {
+            decoded.apply_orientation(turn);
+        }
+        if (decoded.width(), decoded.height()) != (header.width, header.height) {
+            let found = (decoded.width(), decoded.height());
+            return Err(DatasetError::size(&self.file.path, found, (header.width, header.height)));
+        }
+        let mut image = pack(decoded);
+        if let Some(mask) = &self.mask {
+            mask.put_on(&mut image)?;
+        }
+        if let Some(undistortion) = &self.undistortion {
+            image = undistortion.apply(&image);
+        }
+        if self.shrinks() {
+            image = resample::shrink(&image, self.width, self.height);
+        }
+        Ok(image)
+    }
+}
+
+/// Converts to 8 bits per channel, without a copy if it is RGB already.
+fn pack(decoded: DynamicImage) -> Image8 {
+    let (width, height) = (decoded.width(), decoded.height());
+    if !decoded.color().has_alpha() {
+        return Image8 {
+            width,
+            height,
+            rgb: decoded.into_rgb8().into_raw(),
+            alpha: None,
+            mask: None,
+        };
+    }
+    let rgba = decoded.into_rgba8();
+    let pixels = width as usize * height as usize;
+    let mut rgb = Vec::with_capacity(3 * pixels);
+    let mut alpha = Vec::with_capacity(pixels);
+    for pixel in rgba.as_raw().chunks_exact(4) {
+        rgb.extend_from_slice(&pixel[..3]);
+        alpha.push(pixel[3]);
+    }
+    let opaque = alpha.iter().all(|&a| a == 255);
+    Image8 { width, height, rgb, alpha: (!opaque).then_some(alpha), mask: None }
+}
+
+fn limits() -> Limits {
+    let mut limits = Limits::no_limits();
+    limits.max_image_width = Some(MAX_SIDE);
+    limits.max_image_height = Some(MAX_SIDE);
+    limits.max_alloc = Some(MAX_DECODED_BYTES);
+    limits
+}
+
+/// Reads the header of an image file, without decoding it, and checks it against the limits.
+pub(super) fn probe(path: &Path) -> Result<ImageHeader, DatasetError> {
+    let mut file = files::open(path).map_err(DatasetError::io(path))?;
+    let file_bytes = file.metadata().map_err(DatasetError::io(path))?.len();
+    let mut start = Vec::new();
+    file.by_ref().take(HEADER_BYTES).read_to_end(&mut start).map_err(DatasetError::io(path))?;
+    if let Some(problem) = files::mistaken(&start) {
+        return Err(DatasetError::malformed(path, "the image", problem, "put the image there"));
+    }
+    let header = read_header(ImageReader::new(Cursor::new(&start)), file_bytes);
+    let header = match header {
+        // The header may follow a long preview or colour profile.
+        Err(_) if file_bytes > HEADER_BYTES => {
+            let file = files::open(path).map_err(DatasetError::io(path))?;
+            read_header(ImageReader::new(BufReader::new(file)), file_bytes)
+        }
+        header => header,
+    }
+    .map_err(|problem| DatasetError::image(path, problem))?;
+    let pixels = u64::from(header.width) * u64::from(header.height);
+    if pixels == 0 {
+        return Err(DatasetError::image(path, "it has no pixels"));
+    }
+    if pixels > MAX_PIXELS || header.decoded_bytes > MAX_DECODED_BYTES {
+        let problem = format!("{}x{} px are more than supported", header.width, header.height);
+        return Err(DatasetError::image(path, problem));
+    }
+    Ok(header)
+}
+
+fn read_header<R: std::io::BufRead + std::io::Seek>(
+    reader: ImageReader<R>,
+    file_bytes: u64,
+) -> Result<ImageHeader, image::ImageError> {
+    let mut reader = reader.with_guessed_format().map_err(image::ImageError::IoError)?;
+    // Other crates of the build may enable more decoders.
+    if let Some(format) = reader.format().filter(|format| !FORMATS.contains(format)) {
+        let hint = ImageFormatHint::Exact(format);
+        return Err(image::ImageError::Unsupported(hint.into()));
+    }
+    reader.limits(limits());
+    let decoder = reader.into_decoder()?;
+    let (width, height) = decoder.dimensions();
+    let has_alpha = decoder.color_type().has_alpha();
+    let decoded_bytes = decoder.total_bytes();
+    Ok(ImageHeader { width, height, has_alpha, turn: None, decoded_bytes, file_bytes })
+}
+
+pub(super) fn decode(source: &SourceFile) -> Result<DynamicImage, DatasetError> {
+    let path = &source.path;
+    let mut reader = ImageReader::new(BufReader::new(source.open()?))
+        .with_guessed_format()
+        .map_err(DatasetError::io(path))?;
+    if reader.format() == Some(ImageFormat::Jpeg) {
+        let mut bytes = Vec::new();
+        let mut input = reader.into_inner().take(MAX_FILE_BYTES);
+        input.read_to_end(&mut bytes).map_err(DatasetError::io(path))?;
+        return jpeg::decode(&bytes).map_err(|problem| DatasetError::image(path, problem));
+    }
+    reader.limits(limits());
+    reader.decode().map_err(|problem| DatasetError::image(path, problem))
+}
+
+#[cfg(test)]
+mod tests {
+    use image::{ImageBuffer, RgbImage};
+
+    use super::*;
+
+    #[test]
+    fn every_colour_type_packs_to_eight_bits() {
+        let folder = tempfile::tempdir().unwrap();
+        let rgba = |alpha| ImageBuffer::from_pixel(3, 2, image::Rgba([1_u8, 2, 3, alpha]));
+        let deep = ImageBuffer::from_pixel(3, 2, image::Rgb([257_u16, 65535, 0]));
+        let cases: [(&str, DynamicImage, [u8; 3], Option<u8>); 5] = [
+            ("l8.png", ImageBuffer::from_pixel(3, 2, image::Luma([7_u8])).into(), [7; 3], None),
+            ("rgb16.png", deep.into(), [1, 255, 0], None),
+            ("rgba.png", rgba(4).into(), [1, 2, 3], Some(4)),
+            ("opaque.png", rgba(255).into(), [1, 2, 3], None),
+            ("rgb.webp", RgbImage::from_pixel(3, 2, [9, 8, 7].into()).into(), [9, 8, 7], None),
+        ];
+        for (name, image, rgb, alpha) in cases {
+            let path = folder.path().join(name);
+            image.save(&path).unwrap();
+            let loaded = ImageSource::whole(path).load().unwrap();
+            assert_eq!((loaded.width, loaded.height), (3, 2), "{name}");
+            assert_eq!(loaded.rgb, rgb.repeat(6), "{name}");
+            assert_eq!(loaded.alpha, alpha.map(|a| vec![a; 6]), "{name}");
+        }
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_photograph_that_becomes_a_link_is_not_followed() {
+        let folder = tempfile::tempdir().unwrap();
+        let [path, other] = ["a.png", "b.png"].map(|name| folder.path().join(name));
+        RgbImage::from_pixel(4, 4, [10, 20, 30].into()).save(&path).unwrap();
+        std::fs::copy(&path, &other).unwrap();
+        let source = ImageSource::whole(path.clone());
+        source.load().unwrap();
+        std::fs::remove_file(&path).unwrap();
+        std::os::unix::fs::symlink(&other, &path).unwrap();
+        let message = source.load().unwrap_err().to_string();
+        assert!(message.contains("a.png") && message.contains("link"), "{message}");
+    }
+
+    #[test]
+    fn broken_and_oversized_files_are_errors_that_name_them() {
+        let folder = tempfile::tempdir().unwrap();
+        let good = folder.path().join("good.png");
+        RgbImage::from_fn(64, 64, |x, y| [x as u8, y as u8, (x * y) as u8].into())
+            .save(&good)
+            .unwrap();
+        let bytes = std::fs::read(&good).unwrap();
+        let cut = folder.path().join("cut.png");
+        std::fs::write(&cut, &bytes[..bytes.len() / 2]).unwrap();
+        let message = ImageSource::whole(cut).load().unwrap_err().to_string();
+        assert!(message.contains("cut.png"), "{message}");
+        // A header that promises 100,000 x 100,000 px.
+        let mut huge = bytes.clone();
+        huge[16..24].copy_from_slice(&[0, 1, 0x86, 0xa0, 0, 1, 0x86, 0xa0]);
+        let crc = crc32(&huge[12..29]);
+        huge[29..33].copy_from_slice(&crc.to_be_bytes());
+        for (name, contents) in
+            [("huge.png", huge), ("text.jpg", b"not an image".to_vec()), ("empty.png", vec![])]
+        {
+            let path = folder.path().join(name);
+            std::fs::write(&path, contents).unwrap();
+            let message = probe(&path).unwrap_err().to_string();
+            assert!(message.contains(name), "{message}");
+        }
+        let message = probe(&folder.path().join("none.png")).unwrap_err().to_string();
+        assert!(message.contains("cannot read"), "{message}");
+    }
+
+    fn crc32(bytes: &[u8]) -> u32 {
+        !bytes.iter().fold(!0u32, |crc, &byte| {
+            (0..8).fold(crc ^ u32::from(byte), |crc, _| {
+                (crc >> 1) ^ (0xedb8_8320 & (crc & 1).wrapping_neg())
+            })
+        })
+    }
+}

@@ -1,0 +1,289 @@
+//! Moves scenes to normalised coordinates, in f64: remote and tiny scenes lose no precision in f32.
+//!
+//! The unit of the scene is the largest distance of a training camera from their mean, as in nerf++
+//! (Zhang et al. 2020, §4); 3DGS calls 1.1 times that the extent. Rotations do not change, and so
+//! neither do quaternions and spherical harmonics.
+
+use glam::DVec3;
+use serde::{Deserialize, Serialize};
+
+use densify_core::camera::Camera;
+use densify_core::gaussians::Gaussians;
+
+/// Extent of every normalised scene `[scene units]`: the factor between the radius of the cameras and the
+/// extent (3DGS, `getNerfppNorm`).
+pub const EXTENT: f64 = 1.1;
+/// Cameras are at one place if their radius is below this fraction of their distance from the origin:
+/// the precision of f64 is 2.2e-16, and poses from other programs have a few digits less.
+const SAME_PLACE: f64 = 1e-12;
+/// Distance from the origin, in extents, beyond which f32 world coordinates are too coarse: at 1e4
+/// about half a pixel at a focal length of 1,500 px and distance 10.
+const F32_OFFSET: f64 = 1e4;
+
+/// A camera is far if its distance from the median of the cameras is more than this many times the median
+/// of these distances. Drone flights and walks around an object stay below 5.
+const FAR: f64 = 10.0;
+/// Far cameras are a part of the scene if there are more than this share of all.
+const MOST_FAR: f64 = 0.05;
+
+/// scene = (world − centre) · scale.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Normalisation {
+    /// The world point at the origin of the scene.
+    pub centre: DVec3,
+    /// Scene units per world unit, > 0.
+    pub scale: f64,
+}
+
+/// Mean of the centres and their largest distance from it.
+fn rig(centres: &[DVec3]) -> (DVec3, f64) {
+    let centre = centres.iter().sum::<DVec3>() / centres.len().max(1) as f64;
+    (centre, centres.iter().map(|c| c.distance(centre)).fold(0.0, f64::max))
+}
+
+/// The middle of these values, the upper one of two.
+pub fn median(mut values: Vec<f64>) -> Option<f64> {
+    let middle = values.len() / 2;
+    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
+/// Fewer cameras than this do not show what is usual.
+const FEW: usize = 10;
+
+/// Which cameras are so far from the others, and so few, that their poses are hardly right.
+#[must_use]
+pub(super) fn far(centres: &[DVec3]) -> Vec<bool> {
+    let along = |axis: usize| {
+        median(centres.iter().map(|centre| centre[axis]).collect()).unwrap_or_default()
+    };
+    let middle = DVec3::new(along(0), along(1), along(2));
+    let distances: Vec<f64> = centres.iter().map(|centre| centre.distance(middle)).collect();
+    let unit = median(distances.clone()).unwrap_or_default();
+    let is_one_place = unit <= SAME_PLACE * middle.length();
+    if is_one_place || centres.len() < FEW {
+        return vec![false; centres.len()];
+    }
+    let far: Vec<bool> = distances.iter().map(|&distance| distance > FAR * unit).collect();
+    let count = far.iter().filter(|&&far| far).count();
+    let most = ((MOST_FAR * centres.len() as f64) as usize).max(1);
+    if count > most { vec![false; centres.len()] } else { far }
+}
+
+impl Normalisation {
+    /// Changes nothing.
+    pub const IDENTITY: Self = Self { centre: DVec3::ZERO, scale: 1.0 };
+
+    /// Of a model alone: puts the middle of its rows at the origin, and most of them within distance 1.
+    pub fn of_model(model: &Gaussians) -> Self {
+        let middle = |axis: usize| {
+            let along = model.means.iter().map(|mean| f64::from(mean[axis]));
+            median(along.collect()).unwrap_or_default()
+        };
+        let centre = DVec3::new(middle(0), middle(1), middle(2));
+        let away = |mean: &[f32; 3]| DVec3::from(mean.map(f64::from)).distance(centre);
+        let mut away: Vec<f64> = model.means.iter().map(away).collect();
+        away.sort_unstable_by(f64::total_cmp);
+        // Backgrounds reach far; most rows are on what was photographed.
+        let most =
+            away.get(away.len().saturating_sub(1) * 4 / 5).copied().filter(|&most| most > 0.0);
+        let all = || away.last().map_or(1.0, |last| last.max(1.0));
+        let scale = 1.0 / most.unwrap_or_else(all);
+        match scale.is_normal() && centre.is_finite() {
+            true => Self { centre, scale },
+            false => Self::IDENTITY,
+        }
+    }
+
+    /// Puts the mean of the camera centres at the origin and the farthest of them at distance 1. If
+    /// all cameras are at one place, the median distance of the points becomes 1; without points the
+    /// unit stays.
+    #[must_use]
+    pub fn fit(centres: &[DVec3], points: &[DVec3]) -> Self {
+        let (centre, mut unit) = rig(centres);
+        if unit <= SAME_PLACE * centre.length() {
+            unit = median(points.iter().map(|p| p.distance(centre)).collect()).unwrap_or(1.0);
+        }
+        let scale = 1.0 / unit;
+        // Zero, and numbers without a normal inverse, cannot be the unit.
+        Self { centre, scale: if scale.is_normal() { scale } else { 1.0 } }
+    }
+
+    /// A point from world to scene coordinates.
+    #[must_use]
+    pub fn scene_from_world(&self, world: DVec3) -> DVec3 {
+        (world - self.centre) * self.scale
+    }
+
+    /// A point from scene to world coordinates.
+    #[must_use]
+    pub fn world_from_scene(&self, scene: DVec3) -> DVec3 {
+        scene / self.scale + self.centre
+    }
+
+    /// A camera from world to scene coordinates.
+    #[must_use]
+    pub fn scene_from_world_camera(&self, world: &Camera) -> Camera {
+        let translation = (world.rotation * self.centre + world.translation) * self.scale;
+        Camera { translation, ..*world }
+    }
+
+    /// A camera from scene to world coordinates.
+    #[must_use]
+    pub fn world_from_scene_camera(&self, scene: &Camera) -> Camera {
+        let translation = scene.translation / self.scale - scene.rotation * self.centre;
+        Camera { translation, ..*scene }
+    }
+
+    /// A model from scene to world coordinates, computed in f64.
+    #[must_use]
+    pub fn world_from_model(&self, scene: Gaussians) -> Gaussians {
+        self.mapped(scene, -self.scale.ln(), |mean| self.world_from_scene(mean))
+    }
+
+    /// A model from world to scene coordinates, computed in f64.
+    #[must_use]
+    pub fn model_from_world(&self, world: Gaussians) -> Gaussians {
+        self.mapped(world, self.scale.ln(), |mean| self.scene_from_world(mean))
+    }
+
+    /// In place: the model may be most of the memory.
+    fn mapped(
+        &self,
+        mut model: Gaussians,
+        ln_scale: f64,
+        point: impl Fn(DVec3) -> DVec3,
+    ) -> Gaussians {
+        if *self != Self::IDENTITY {
+            for mean in &mut model.means {
+                *mean = point(DVec3::from(mean.map(f64::from))).as_vec3().to_array();
+            }
+            for value in model.log_scales.as_flattened_mut() {
+                *value = (f64::from(*value) + ln_scale) as f32;
+            }
+        }
+        model
+    }
+
+    /// A warning if world coordinates lose precision in f32.
+    #[must_use]
+    pub fn f32_warning(&self) -> Option<String> {
+        let offset = self.centre.length() * self.scale / EXTENT;
+        (offset > F32_OFFSET).then(|| {
+            format!(
+                "the scene is {offset:.1e} times its extent from the origin: f32 coordinates in the exported \
+                 model are only precise to {:.1e} of the extent; move the reconstruction near the \
+                 origin before training",
+                offset * f64::from(f32::EPSILON)
+            )
+        })
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::float_cmp, reason = "results are exact")]
+mod tests {
+    use glam::DMat3;
+
+    use super::*;
+
+    #[test]
+    fn a_few_cameras_far_from_all_others_are_told() {
+        let ring = |count: usize, radius: f64| -> Vec<DVec3> {
+            let angle = |number: usize| number as f64 / count as f64 * std::f64::consts::TAU;
+            (0..count).map(|n| DVec3::new(angle(n).cos(), angle(n).sin(), 0.2) * radius).collect()
+        };
+        let far_of = |near: usize, lonely: &[f64]| -> Vec<usize> {
+            let mut centres = ring(near, 3.0);
+            centres.extend(lonely.iter().map(|&x| DVec3::new(x, 0.0, 0.0)));
+            let far = far(&centres).into_iter().enumerate().filter(|(_, far)| *far);
+            far.map(|(number, _)| number).collect()
+        };
+        assert_eq!(far_of(39, &[500.0]), [39]);
+        assert_eq!(far_of(39, &[40.0, -1e30]), [39, 40]);
+        assert_eq!(far_of(39, &[25.0]), [0; 0]);
+        // More than a few are a part of the scene, and a handful of cameras says nothing.
+        assert_eq!(far_of(38, &[500.0, 510.0, 520.0]), [0; 0]);
+        assert_eq!(far_of(8, &[500.0]), [0; 0]);
+        assert_eq!(far(&vec![DVec3::ONE; 30]), [false; 30]);
+    }
+
+    fn camera(centre: DVec3) -> Camera {
+        let rotation = DMat3::from_rotation_y(0.4) * DMat3::from_rotation_x(0.9);
+        Camera::centred((200, 160), (200.0, 210.0), rotation, centre)
+    }
+
+    #[test]
+    fn the_farthest_camera_is_at_distance_one() {
+        let offset = DVec3::new(4e6, -5e6, 300.0);
+        let centres = [DVec3::X * 3.0, DVec3::Y * 5.0, DVec3::Z * -2.0].map(|c| c + offset);
+        let n = Normalisation::fit(&centres, &[]);
+        let scene = centres.map(|c| n.scene_from_world_camera(&camera(c)).centre());
+        assert!((rig(&scene).1 - 1.0).abs() < 1e-8);
+        assert!((scene.iter().sum::<DVec3>()).length() < 1e-8);
+        assert!(n.f32_warning().is_some());
+        assert!(Normalisation::fit(&[DVec3::X, DVec3::Y], &[]).f32_warning().is_none());
+    }
+
+    #[test]
+    fn projections_do_not_change_and_depths_scale() {
+        let n = Normalisation { centre: DVec3::new(10.0, 20.0, -30.0), scale: 0.25 };
+        let world = camera(DVec3::new(9.0, 18.0, -33.0));
+        let point = DVec3::new(10.0, 21.0, -29.0);
+        let ((a, za), (b, zb)) = (
+            world.project(point),
+            n.scene_from_world_camera(&world).project(n.scene_from_world(point)),
+        );
+        assert!((a - b).length() < 1e-9 && (za * 0.25 - zb).abs() < 1e-12);
+        let back = n.world_from_scene_camera(&n.scene_from_world_camera(&world));
+        assert!((back.translation - world.translation).length() < 1e-12);
+        assert!((n.world_from_scene(n.scene_from_world(point)) - point).length() < 1e-12);
+    }
+
+    #[test]
+    fn a_rig_at_one_place_falls_back_to_the_points_then_to_one() {
+        let centre = DVec3::new(1e6, 0.1, 7.0);
+        let points: Vec<_> = [2.0, 4.0, 1000.0].iter().map(|&d| centre + DVec3::Y * d).collect();
+        assert!((Normalisation::fit(&[centre; 3], &points).scale - 0.25).abs() < 1e-9);
+        assert_eq!(Normalisation::fit(&[centre], &[]).scale.to_bits(), 1f64.to_bits());
+        assert_eq!(Normalisation::fit(&[centre], &[centre]).scale.to_bits(), 1f64.to_bits());
+    }
+
+    #[test]
+    fn powers_of_two_change_no_bit_of_the_scene() {
+        let centres =
+            [DVec3::new(0.3, 1.7, -2.0), DVec3::new(1.1, 0.2, 0.9), DVec3::new(-0.7, 0.4, 0.1)];
+        let points = [DVec3::new(0.123, 4.5, -6.7)];
+        let scene = |k: i32| {
+            let by = 2f64.powi(k);
+            let n = Normalisation::fit(&centres.map(|c| c * by), &[]);
+            (
+                n.scene_from_world(points[0] * by),
+                n.scene_from_world_camera(&camera(centres[1] * by)).translation,
+            )
+        };
+        for k in [-20, -3, 5, 20] {
+            assert_eq!(scene(k), scene(0));
+        }
+    }
+
+    #[test]
+    fn models_go_to_the_world_and_back() {
+        let model = Gaussians {
+            means: vec![[0.5, -0.25, 1.0]],
+            log_scales: vec![[-3.0, -4.0, 0.5]],
+            quats: vec![[1.0, 0.0, 0.0, 0.0]],
+            opacity_logits: vec![0.3],
+            sh: vec![0.1, 0.2, 0.3],
+            sh_degree: 0,
+        };
+        let n = Normalisation { centre: DVec3::new(100.0, 200.0, 300.0), scale: 0.125 };
+        let world = n.world_from_model(model.clone());
+        assert_eq!(world.means, [[104.0, 198.0, 308.0]]);
+        assert!((world.log_scales[0][0] - (-3.0 + 8f32.ln())).abs() < 1e-6);
+        let back = n.model_from_world(world);
+        assert_eq!(back.means, model.means);
+        assert!((back.log_scales[0][2] - 0.5).abs() < 1e-6);
+        assert_eq!((back.quats, back.sh), (model.quats.clone(), model.sh.clone()));
+        assert_eq!(Normalisation::IDENTITY.world_from_model(model.clone()), model);
+    }
+}

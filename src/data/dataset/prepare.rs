@@ -1,0 +1,208 @@
+//! Turns the frames of any format into a dataset: sorts, splits, normalises.
+
+use std::collections::HashMap;
+use std::path::Path;
+
+use glam::DVec3;
+
+use super::error::DatasetError;
+use super::masks::unused_masks_note;
+use super::normalise::{self, Normalisation};
+use super::photographs::{Photograph, photographs};
+use super::pose::POSE_REMEDY;
+use super::wanted::{self, Wanted};
+use super::{Dataset, FarCameras, Frame, LoadOptions, PointCloud, Scene, Split, View};
+use densify_core::files::one_line;
+
+/// Fraction of the points that may be unusable.
+const MAX_BAD_POINTS: f64 = 0.01;
+
+/// Checks every frame of a format's reader, splits, and moves all into normalised coordinates.
+pub(super) fn prepare(
+    path: &Path,
+    mut scene: Scene,
+    options: &LoadOptions,
+) -> Result<Dataset, DatasetError> {
+    let mut frames = std::mem::take(&mut scene.frames);
+    // Bytewise, as other trainers sort names for their test splits.
+    frames.sort_by(|a, b| (a.name.as_bytes(), a.held_out).cmp(&(b.name.as_bytes(), b.held_out)));
+    refuse_duplicates(&scene.listing, &frames)?;
+    let mut notes = std::mem::take(&mut scene.notes);
+    let all = photographs(&scene.listing, &frames, options, &mut notes)?;
+    if frames.iter().all(|frame| frame.mask.is_none()) {
+        notes.extend(unused_masks_note(path));
+    }
+    scene.notes = notes;
+    assemble(path, all, scene, options)
+}
+
+/// Splits photographs, which are sorted by name, and moves all into normalised coordinates.
+pub(super) fn assemble(
+    path: &Path,
+    photographs: Vec<Photograph>,
+    scene: Scene,
+    options: &LoadOptions,
+) -> Result<Dataset, DatasetError> {
+    let Scene {
+        listing, mut points, points_file, tracks, own_split, surface_bytes, mut notes, ..
+    } = scene;
+    let surface_bytes = surface_bytes.or_else(|| super::builtin::surface_bytes(path));
+    let centres: Vec<_> =
+        photographs.iter().map(|photograph| photograph.views[0].camera.centre()).collect();
+    let is_far = normalise::far(&centres);
+    let far = photographs.iter().zip(&is_far).filter(|(_, is_far)| **is_far);
+    let far: Vec<&str> = far.map(|(photograph, _)| &*photograph.views[0].name).collect();
+    notes.extend(far_note(&far, options.far_cameras));
+    let every = match options.split {
+        Split::Every(every) => Some(every.get() as usize),
+        Split::Eval if !own_split => Some(Split::EVAL_EVERY as usize),
+        Split::None | Split::Eval => None,
+    };
+    let mut wanted = options.views.as_deref().map(Wanted::read).transpose()?;
+    // Numbers of the training views of a photograph, by the id that tracks use.
+    let mut numbers_of = HashMap::new();
+    let (mut train, mut test) = (Vec::<View>::new(), Vec::new());
+    let mut hidden_names = Vec::new();
+    // Centres of the training cameras that are not far from all others.
+    let mut near = Vec::new();
+    for (index, photograph) in photographs.into_iter().enumerate() {
+        // It keeps its place in the order: the others are split as without it.
+        if is_far[index] && options.far_cameras == FarCameras::LeaveOut {
+            continue;
+        }
+        let Photograph { views, hidden, held_out, id } = photograph;
+        let hidden = hidden.into_iter().chain(std::iter::repeat(false));
+        let (out, views): (Vec<_>, Vec<_>) =
+            views.into_iter().zip(hidden).partition(|(_, hidden)| *hidden);
+        hidden_names.extend(out.into_iter().map(|(view, _)| view.name));
+        let views: Vec<View> = views.into_iter().map(|(view, _)| view).collect();
+        let Some(views) = wanted::of(&mut wanted, views) else { continue };
+        if every.map_or(held_out, |every| index % every == 0) {
+            test.extend(views);
+        } else {
+            let first = train.len() as u32;
+            numbers_of.extend(id.map(|id| (id, first..first + views.len() as u32)));
+            near.extend((!is_far[index]).then(|| centres[index]));
+            train.extend(views);
+        }
+    }
+    wanted.map_or(Ok(()), |wanted| wanted.check(&train))?;
+    if train.is_empty() && test.is_empty() && !hidden_names.is_empty() {
+        let (ignored, remedy) = match options.invert_masks {
+            true => ("white", "leave --invert-masks out"),
+            false => ("black", "give --invert-masks"),
+        };
+        return Err(DatasetError(format!(
+            "no view is left to train on: masks hide every pixel of all {} ({ignored} is ignored); {remedy}, or \
+             remove the masks",
+            hidden_names.len()
+        )));
+    }
+    if let Some(shown) = named(&hidden_names) {
+        notes.push(format!(
+            "masks hide every pixel of {} views, which are left out: {shown}",
+            hidden_names.len()
+        ));
+    }
+    if train.is_empty() {
+        return Err(DatasetError(format!(
+            "no view is left to train on: the test split takes all {}; use a larger --test-every, or leave it \
+             out",
+            test.len()
+        )));
+    }
+    let points_path = points_file.as_deref().unwrap_or(path);
+    drop_bad(points_path, &mut points, &mut notes, "finite", DVec3::is_finite)?;
+    let normalisation = Normalisation::fit(&near, &points.positions);
+    for view in train.iter_mut().chain(&mut test) {
+        view.camera = normalisation.scene_from_world_camera(&view.camera);
+        if !view.camera.translation.as_vec3().is_finite() {
+            let problem = "the camera is too far from the others";
+            return Err(DatasetError::malformed(&listing, &view.name, problem, POSE_REMEDY));
+        }
+    }
+    for position in &mut points.positions {
+        *position = normalisation.scene_from_world(*position);
+    }
+    drop_bad(points_path, &mut points, &mut notes, "within reach of f32", |p| {
+        p.as_vec3().is_finite()
+    })?;
+    // Of several views of a photograph, the one that shows the point.
+    let shows = |number: u32, point: DVec3| {
+        train[number as usize].camera.depth_in_image(point, 0.0).is_some()
+    };
+    let tracks = tracks.in_training_views(&normalisation, |id, point| {
+        let mut numbers = numbers_of.get(&id)?.clone();
+        if numbers.len() == 1 { numbers.next() } else { numbers.find(|&view| shows(view, point)) }
+    });
+    let root = path.to_owned();
+    let unpacked = None;
+    Ok(Dataset { root, unpacked, train, test, points, tracks, normalisation, surface_bytes, notes })
+}
+
+/// Names the views whose camera is far from all others.
+fn far_note(names: &[&str], what: FarCameras) -> Option<String> {
+    let shown = named(names)?;
+    let fate = match what {
+        FarCameras::LeaveOut => "left out (use --far-cameras keep to train on them)",
+        FarCameras::Keep => "kept, but not counted for the extent of the scene",
+    };
+    Some(format!("cameras far from all others, {} {fate}: {shown}", names.len()))
+}
+
+/// The first names of a list, and how many more there are; `None` if it is empty.
+fn named(names: &[impl AsRef<str>]) -> Option<String> {
+    const SHOWN: usize = 5;
+    let shown: Vec<&str> = names.iter().take(SHOWN).map(AsRef::as_ref).collect();
+    let more = names.len().saturating_sub(SHOWN);
+    let more = if more > 0 { format!(" and {more} more") } else { String::new() };
+    (!names.is_empty()).then(|| shown.join(", ") + &more)
+}
+
+fn refuse_duplicates(listing: &Path, frames: &[Frame]) -> Result<(), DatasetError> {
+    // Of a path only its end may count, which another path may have too; one that is trained on would be held out.
+    let mut by_image = HashMap::new();
+    for frame in frames {
+        let first = *by_image.entry(&frame.image).or_insert(frame);
+        if first.listed != frame.listed {
+            return Err(DatasetError(one_line(&format!(
+                "{} and {} are the same file, {}; name with --images a folder that has both, as they lay, or remove one \
+                 of the two",
+                first.origin,
+                frame.origin,
+                frame.image.display()
+            ))));
+        }
+    }
+    for pair in frames.windows(2) {
+        if pair[0].name == pair[1].name && pair[0].held_out == pair[1].held_out {
+            let (problem, remedy) = ("the image is listed twice", "remove one of the two");
+            return Err(DatasetError::malformed(listing, &pair[0].name, problem, remedy));
+        }
+    }
+    Ok(())
+}
+
+fn drop_bad(
+    path: &Path,
+    points: &mut PointCloud,
+    notes: &mut Vec<String>,
+    what: &str,
+    keep: impl Fn(DVec3) -> bool,
+) -> Result<(), DatasetError> {
+    let total = points.len();
+    let bad = points.retain(keep);
+    if bad as f64 > MAX_BAD_POINTS * total as f64 {
+        let path = path.display();
+        return Err(DatasetError(format!(
+            "{path}: {bad} of {total} points are not finite, more than 1 %; repair the reconstruction"
+        )));
+    }
+    if bad > 0 {
+        notes.push(format!(
+            "{}: {bad} of {total} points are not {what} and are dropped",
+            path.display()
+        ));
+    }
+    Ok(())
+}

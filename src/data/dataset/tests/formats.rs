@@ -1,0 +1,377 @@
+//! The same scene in every format loads as the same dataset; options do what they say.
+
+use std::num::NonZeroU32;
+use std::path::PathBuf;
+
+use super::super::*;
+use densify_fixtures::{Made, NAMES, SIZE, image};
+
+fn load(made: &Made) -> Dataset {
+    load_with(made, LoadOptions::default())
+}
+
+fn load_with(made: &Made, options: LoadOptions) -> Dataset {
+    Dataset::load(made.path(), &options).unwrap_or_else(|e| panic!("{e}"))
+}
+
+fn names(views: &[View]) -> Vec<&str> {
+    views.iter().map(|view| view.name.as_str()).collect()
+}
+
+#[test]
+fn all_formats_agree() {
+    let made = Made::colmap_txt();
+    let text = load(&made);
+    let binary = load(&Made::colmap_bin());
+    let json = load(&Made::transforms(|_| ()));
+    assert_eq!(names(&text.train), NAMES);
+    assert_eq!(names(&json.train), NAMES.map(|name| format!("images/{name}")));
+    for other in [&binary, &json] {
+        assert_eq!(other.points.colours, text.points.colours);
+        for (a, b) in text.points.positions.iter().zip(&other.points.positions) {
+            assert!((*a - *b).length() < 1e-12);
+        }
+        assert_eq!(other.train.len(), 3);
+        for (a, b) in text.train.iter().zip(&other.train) {
+            let (a, b) = (&a.camera, &b.camera);
+            assert!((a.rotation - b.rotation).to_cols_array().iter().all(|e| e.abs() < 1e-12));
+            assert!((a.translation - b.translation).length() < 1e-12);
+            assert_eq!(
+                (a.width, a.height, a.fx, a.fy, a.cx, a.cy),
+                (b.width, b.height, b.fx, b.fy, b.cx, b.cy)
+            );
+        }
+    }
+    let world = text.normalisation.world_from_scene_camera(&text.train[0].camera);
+    assert!((world.centre() - glam::DVec3::new(0.0, 0.0, -4.0)).length() < 1e-12);
+    let image = text.train[1].source.load().unwrap();
+    assert_eq!((image.width, image.height), SIZE);
+    assert_eq!(image.rgb[..3], [40, 100, 200]);
+}
+
+#[test]
+fn the_model_may_lie_directly_under_sparse() {
+    let made = Made::colmap_bin();
+    std::fs::rename(made.file("sparse/0"), made.file("moved")).unwrap();
+    std::fs::remove_dir(made.file("sparse")).unwrap();
+    std::fs::rename(made.file("moved"), made.file("sparse")).unwrap();
+    assert_eq!(load(&made).train.len(), 3);
+}
+
+#[test]
+fn splits() {
+    let every = |k| LoadOptions {
+        split: Split::Every(NonZeroU32::new(k).unwrap()),
+        ..LoadOptions::default()
+    };
+    let eval = LoadOptions { split: Split::Eval, ..LoadOptions::default() };
+    let made = Made::colmap_txt();
+    let data = load_with(&made, every(2));
+    assert_eq!((names(&data.train), names(&data.test)), (vec!["b.png"], vec!["a.png", "c.png"]));
+    let data = load_with(&made, eval.clone());
+    assert_eq!((names(&data.train), names(&data.test)), (vec!["b.png", "c.png"], vec!["a.png"]));
+
+    // A test file of its own decides, unless every K-th is asked for.
+    let made = Made::transforms(|_| ());
+    let json: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(made.file("transforms.json")).unwrap()).unwrap();
+    for (file, frames) in [("transforms_train.json", 0..2), ("transforms_test.json", 2..3)] {
+        let mut part = json.clone();
+        part["frames"] = json["frames"].as_array().unwrap()[frames].to_vec().into();
+        made.write(file, part.to_string());
+    }
+    for options in [LoadOptions::default(), eval] {
+        let data = load_with(&made, options);
+        assert_eq!(
+            (names(&data.train), names(&data.test)),
+            (vec!["images/a.png", "images/b.png"], vec!["images/c.png"])
+        );
+        assert_eq!(data.points.len(), 200);
+    }
+    assert_eq!(names(&load_with(&made, every(3)).test), ["images/a.png"]);
+
+    // So do the names that nerfstudio's file lists, with "./" before them or without.
+    for field in ["test_filenames", "val_filenames"] {
+        let made = Made::transforms(|json| json[field] = serde_json::json!(["images/b.png"]));
+        let data = load(&made);
+        assert_eq!(names(&data.train), ["images/a.png", "images/c.png"]);
+        assert_eq!(names(&data.test), ["images/b.png"]);
+    }
+}
+
+#[test]
+fn resolutions() {
+    let options =
+        |resolution| LoadOptions { resolution: Some(resolution), ..LoadOptions::default() };
+    for made in [Made::colmap_txt(), Made::transforms(|_| ())] {
+        for (resolution, size) in [
+            (Resolution::Divisor(1), SIZE),
+            (Resolution::Divisor(2), (10, 6)),
+            (Resolution::Divisor(8), (3, 2)),
+            (Resolution::Width(15), (15, 9)),
+            (Resolution::Width(400), SIZE),
+        ] {
+            let data = load_with(&made, options(resolution));
+            for view in &data.train {
+                let image = view.source.load().unwrap();
+                assert_eq!((image.width, image.height), size, "{resolution:?}");
+                assert_eq!((view.camera.width, view.camera.height), size, "{resolution:?}");
+                assert!((view.camera.fx / f64::from(size.0) - 15.0 / 20.0).abs() < 1e-12);
+            }
+        }
+        // The ready-made folder, where there is one; one image is not in it.
+        for name in &NAMES[1..] {
+            image(&made.file("images_2").join(name), (10, 6), 7);
+        }
+        let data = load_with(&made, options(Resolution::Divisor(2)));
+        let first = |view: &View| view.source.load().unwrap().rgb[0];
+        assert_eq!(data.train.iter().map(first).collect::<Vec<_>>(), [0, 7, 7]);
+        assert!(data.train.iter().all(|view| view.camera.width == 10));
+        assert!(data.notes.iter().any(|note| note.contains("images_2")), "{:?}", data.notes);
+        // Not for another divisor.
+        assert_eq!(first(&load_with(&made, options(Resolution::Divisor(4))).train[1]), 40);
+    }
+}
+
+#[test]
+fn another_folder_of_images() {
+    let elsewhere = tempfile::tempdir().unwrap();
+    for made in [Made::colmap_txt(), Made::transforms(|_| ())] {
+        for name in NAMES {
+            image(&made.file("small").join(name), (10, 6), 9);
+            image(&elsewhere.path().join(name), (10, 6), 11);
+        }
+        for (folder, value) in [(PathBuf::from("small"), 9), (elsewhere.path().to_owned(), 11)] {
+            let data =
+                load_with(&made, LoadOptions { images: Some(folder), ..LoadOptions::default() });
+            assert_eq!(data.train[2].source.load().unwrap().rgb[0], value);
+            assert!((data.train[2].camera.fx - 7.5).abs() < 1e-12);
+        }
+    }
+}
+
+#[test]
+fn masks_are_found() {
+    for (made, mask) in [
+        (Made::colmap_txt(), "masks/b.png.png"),
+        (Made::colmap_txt(), "masks/b.png"),
+        (Made::transforms(|_| ()), "masks/b.png"),
+        (Made::colmap_txt(), "masks/b.mask.png"),
+        (Made::colmap_txt(), "mask/b.png"),
+        (Made::transforms(|_| ()), "segmentation/b.png.png"),
+        (Made::colmap_txt(), "dynamic_masks/b.png"),
+        (Made::realitycapture(), "masks/b.png.mask.png"),
+        (Made::realitycapture(), "images/b.png.mask.png"),
+        (Made::colmap_txt(), "images/b.mask.png"),
+        (Made::transforms(|_| ()), "images/.mask/b.png"),
+        (
+            Made::transforms(|json| json["frames"][1]["mask_path"] = "elsewhere/m.png".into()),
+            "elsewhere/m.png",
+        ),
+    ] {
+        std::fs::create_dir_all(made.file(mask).parent().unwrap()).unwrap();
+        image::GrayImage::from_fn(20, 12, |x, _| [if x < 10 { 0 } else { 255 }].into())
+            .save(made.file(mask))
+            .unwrap();
+        let data = load(&made);
+        let said = |note: &String| note.contains("1 of 3 photographs have a mask");
+        assert!(data.notes.iter().any(said), "{mask}: {:?}", data.notes);
+        assert_eq!(data.train[0].source.load().unwrap().mask, None, "{mask}");
+        let found = data.train[1].source.load().unwrap().mask.unwrap();
+        assert_eq!((found[0], found[19]), (0, 255), "{mask}");
+        let inverted = LoadOptions { invert_masks: true, ..LoadOptions::default() };
+        let data = load_with(&made, inverted);
+        let found = data.train[1].source.load().unwrap().mask.unwrap();
+        assert_eq!((found[0], found[19]), (255, 0), "{mask}");
+        let carves = LoadOptions { mask_mode: MaskMode::Background, ..LoadOptions::default() };
+        let source = &load_with(&made, carves).train[1].source;
+        let found = source.load().unwrap();
+        let alpha = found.alpha.as_ref().unwrap();
+        assert_eq!((alpha[0], alpha[19], &found.mask), (0, 255, &None), "{mask}");
+        assert_eq!(found.bytes(), source.loaded_bytes());
+    }
+}
+
+#[test]
+fn masks_of_no_photograph_are_named() {
+    for file in ["masks/other.png", "images/masks/b.png", "segmentation/other.png"] {
+        let made = Made::colmap_txt();
+        std::fs::create_dir_all(made.file(file).parent().unwrap()).unwrap();
+        image(&made.file(file), SIZE, 200);
+        let folder = file.rsplit_once('/').unwrap().0;
+        let notes = load(&made).notes;
+        let said =
+            |note: &String| note.contains(folder) && note.contains("the mask of no photograph");
+        assert!(notes.iter().any(said), "{file}: {notes:?}");
+    }
+    assert!(!load(&Made::colmap_txt()).notes.iter().any(|note| note.contains("mask")));
+}
+
+/// instant-ngp hides where its masks are anything but black.
+#[test]
+fn dynamic_masks_are_found_beside_photographs() {
+    for (made, mask) in [
+        (Made::colmap_txt(), "images/dynamic_mask_b.png"),
+        (Made::transforms(|_| ()), "images/dynamic_mask_b.png"),
+    ] {
+        image::GrayImage::from_fn(20, 12, |x, _| [if x < 10 { 0 } else { 1 }].into())
+            .save(made.file(mask))
+            .unwrap();
+        for (invert_masks, expected) in [(false, (255, 0)), (true, (0, 1))] {
+            let options = LoadOptions { invert_masks, ..LoadOptions::default() };
+            let data = load_with(&made, options);
+            assert_eq!(data.train[0].source.load().unwrap().mask, None);
+            let found = data.train[1].source.load().unwrap().mask.unwrap();
+            assert_eq!((found[0], found[19]), expected, "{invert_masks}");
+        }
+    }
+}
+
+/// Masks lie in `masks/` of the dataset or beside the photographs, wherever these are; none is taken for a photograph.
+#[test]
+fn masks_are_found_in_the_folder_that_is_named() {
+    // The first is preferred, and removed for the next.
+    let masks = [
+        "masks/b.png.png",
+        "masks/b.png",
+        "masks/b.jpg",
+        "masks/b.jpeg",
+        "masks/b.png.mask.png",
+        "masks/b.mask.png",
+        "moved/b.png.mask.png",
+        "moved/b.mask.png",
+        "moved/.mask/b.png",
+        "moved/dynamic_mask_b.png",
+    ];
+    for made in [Made::colmap_txt(), Made::transforms(|_| ()), Made::realitycapture()] {
+        std::fs::rename(made.file("images"), made.file("moved")).unwrap();
+        masks.iter().for_each(|mask| image(&made.file(mask), SIZE, 200));
+        // All but black is hidden by this one.
+        image::GrayImage::new(SIZE.0, SIZE.1).save(made.file(masks[9])).unwrap();
+        let options = LoadOptions { images: Some("moved".into()), ..LoadOptions::default() };
+        for mask in masks {
+            let data = load_with(&made, options.clone());
+            let found = data.train[1].source.mask.clone().expect(mask);
+            assert!(found.file.path.ends_with(mask), "{mask}: {}", found.file.path.display());
+            let dynamic = found.hides == images::Hides::AllButBlack;
+            assert_eq!(dynamic, mask.contains("dynamic"), "{mask}");
+            assert!(data.train[0].source.mask.is_none() && data.train.len() == 3);
+            assert!(!data.notes.iter().any(|note| note.contains("poses")), "{:?}", data.notes);
+            made.remove(mask);
+        }
+    }
+    // Beside the smaller photographs, or the whole ones.
+    let made = Made::colmap_txt();
+    for name in NAMES {
+        image(&made.file("images_2").join(name), (10, 6), 7);
+    }
+    let half = LoadOptions { resolution: Some(Resolution::Divisor(2)), ..LoadOptions::default() };
+    for mask in ["images/b.png.mask.png", "images_2/b.png.mask.png"] {
+        image(&made.file(mask), (10, 6), 200);
+        let found = load_with(&made, half.clone()).train[1].source.mask.clone().expect(mask);
+        assert!(found.file.path.ends_with(mask), "{mask}");
+    }
+}
+
+/// Transparent photographs are composited on the background, whatever lists them.
+#[test]
+fn transparency_is_the_same_in_every_format() {
+    for ending in ["png", "webp"] {
+        for (made, listing) in [
+            (Made::colmap_txt(), "sparse/0/images.txt"),
+            (Made::transforms(|_| ()), "transforms.json"),
+            (Made::realitycapture(), "cameras.csv"),
+        ] {
+            for name in NAMES {
+                made.remove(&format!("images/{name}"));
+                let renamed = name.replace("png", ending);
+                made.replace(listing, name, &renamed);
+                let alpha = |x, _| image::Rgba([255, 102, 0, if x < 10 { 51 } else { 255 }]);
+                let image = image::RgbaImage::from_fn(SIZE.0, SIZE.1, alpha);
+                image.save(made.file(&format!("images/{renamed}"))).unwrap();
+            }
+            let data = load(&made);
+            assert_eq!(data.train.len(), 3);
+            for view in &data.train {
+                assert!(view.source.header.has_alpha, "{}", view.name);
+                let image = view.source.load().unwrap();
+                for (x, expected) in [(0, [0.2, 0.88, 0.8]), (10, [1.0, 0.4, 0.0])] {
+                    let found = image.composited(x, 0, [0.0, 1.0, 1.0]);
+                    let near = found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6);
+                    assert!(near, "{listing}, {}: {found:?}", view.name);
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn frames_override_the_intrinsics_at_the_top() {
+    let data = load(&Made::transforms(|json| json["frames"][1]["fl_x"] = 12.0.into()));
+    let fx: Vec<f64> = data.train.iter().map(|view| view.camera.fx).collect();
+    assert_eq!(fx, [15.0, 12.0, 15.0]);
+    // NeRF-synthetic: a field of view and nothing else.
+    let data = load(&Made::transforms(|json| {
+        for field in ["w", "h", "fl_x", "fl_y", "cx", "cy"] {
+            json.as_object_mut().unwrap().remove(field);
+        }
+        json["camera_angle_x"] = 1.0.into();
+    }));
+    let camera = &data.train[0].camera;
+    assert!(
+        (camera.fx - 10.0 / 0.5f64.tan()).abs() < 1e-12 && (camera.fy - camera.fx).abs() < 1e-12
+    );
+    assert!((camera.cx - 10.0).abs() < 1e-12 && (camera.cy - 6.0).abs() < 1e-12);
+}
+
+#[test]
+fn distorted_cameras_become_pinholes() {
+    let made = Made::colmap_txt();
+    made.replace(
+        "sparse/0/cameras.txt",
+        "PINHOLE 20 12 15 16 10 6",
+        "OPENCV 20 12 15 16 10 6 0.05 -0.01 0.001 0.002",
+    );
+    let data = load(&made);
+    let view = &data.train[0];
+    assert!(view.source.undistortion.is_some());
+    assert!((view.camera.fx - 15.0).abs() > 1e-3);
+    assert_eq!(view.source.load().unwrap().rgb, [0, 100, 200].repeat(20 * 12));
+}
+
+#[test]
+fn missing_frames_and_bad_points_are_noted() {
+    let made = Made::transforms(|_| ());
+    std::fs::remove_file(made.file("images/b.png")).unwrap();
+    made.replace("points.ply", "\n3 0 0.5", "\nnan 0 0.5");
+    let data = load(&made);
+    assert_eq!((data.train.len(), data.points.len()), (2, 199));
+    assert!(data.notes.iter().any(|note| note.contains("images/b.png")), "{:?}", data.notes);
+    assert!(data.notes.iter().any(|note| note.contains("1 of 200 points")), "{:?}", data.notes);
+}
+
+#[test]
+fn a_far_off_scene_keeps_its_precision() {
+    let made = Made::colmap_txt();
+    let data = load(&made);
+    let far = Made::colmap_txt();
+    // All cameras and points moved by (1e6, 0, 0): t − R·offset.
+    far.replace("sparse/0/images.txt", "1 0 0 0 0 0 4 ", "1 0 0 0 -1000000 0 4 ");
+    far.replace("sparse/0/images.txt", "0.8 0 0.6 0 0.5 0 4 ", "0.8 0 0.6 0 -279999.5 0 960004 ");
+    far.replace("sparse/0/images.txt", "0 0 1 0 0 0.25 5 ", "0 0 1 0 1000000 0.25 5 ");
+    let text = std::fs::read_to_string(far.file("sparse/0/points3D.txt")).unwrap();
+    let moved = text.lines().skip(1).map(|line| {
+        let mut words: Vec<String> = line.split(' ').map(str::to_owned).collect();
+        words[1] = format!("{}", 1e6 + words[1].parse::<f64>().unwrap());
+        words.join(" ") + "\n"
+    });
+    far.write("sparse/0/points3D.txt", moved.collect::<String>());
+    let far = load(&far);
+    for (a, b) in data.points.positions.iter().zip(&far.points.positions) {
+        assert!((*a - *b).length() < 1e-8, "{a} {b}");
+    }
+    for (a, b) in data.train.iter().zip(&far.train) {
+        assert!((a.camera.translation - b.camera.translation).length() < 1e-8);
+    }
+    assert!(far.normalisation.f32_warning().is_some());
+}

@@ -1,0 +1,199 @@
+//! Datasets of other lenses than pinholes: every format has them, and what they saw becomes views.
+
+use glam::DVec3;
+
+use super::super::*;
+use densify_fixtures::{Made, NAMES, SIZE};
+
+const PINHOLE: &str = "PINHOLE 20 12 15 16 10 6";
+
+fn load(made: &Made, options: &LoadOptions) -> Dataset {
+    Dataset::load(made.path(), options).unwrap_or_else(|e| panic!("{e}"))
+}
+
+fn colmap(camera: &str) -> Made {
+    let made = Made::colmap_txt();
+    made.replace("sparse/0/cameras.txt", PINHOLE, camera);
+    made
+}
+
+#[test]
+fn nerfstudio_and_colmap_mean_the_same_lenses() {
+    type Fields = &'static [(&'static str, f64)];
+    let cases: [(&str, &str, Fields); 3] = [
+        (
+            "OPENCV_FISHEYE 20 12 15 16 10 6 0.02 -0.01 0.003 0.0004",
+            "OPENCV_FISHEYE",
+            &[("k1", 0.02), ("k2", -0.01), ("k3", 0.003), ("k4", 0.0004), ("p1", 0.0)],
+        ),
+        (
+            "FULL_OPENCV 20 12 15 16 10 6 0.02 -0.01 0.001 0.002 0.003 0.01 0.02 0.03",
+            "OPENCV",
+            &[
+                ("k1", 0.02),
+                ("k2", -0.01),
+                ("p1", 0.001),
+                ("p2", 0.002),
+                ("k3", 0.003),
+                ("k4", 0.01),
+                ("k5", 0.02),
+                ("k6", 0.03),
+            ],
+        ),
+        ("SIMPLE_RADIAL_FISHEYE 20 12 15 10 6 0.02", "is_fisheye", &[("fl_y", 15.0), ("k1", 0.02)]),
+    ];
+    for (camera, model, fields) in cases {
+        let made = Made::transforms(|json| {
+            match model {
+                "is_fisheye" => json["is_fisheye"] = true.into(),
+                _ => json["camera_model"] = model.into(),
+            }
+            for (field, value) in fields {
+                json[*field] = (*value).into();
+            }
+        });
+        let options = LoadOptions::default();
+        let [a, b] = [load(&colmap(camera), &options), load(&made, &options)];
+        for (a, b) in a.train.iter().zip(&b.train) {
+            assert_eq!(a.source.undistortion, b.source.undistortion, "{camera}");
+            assert!(a.source.undistortion.is_some());
+            assert_eq!((a.camera.fx, a.camera.cx), (b.camera.fx, b.camera.cx), "{camera}");
+        }
+    }
+}
+
+#[test]
+fn views_of_one_photograph_share_it_and_its_split() {
+    // 191 by 115 degrees.
+    let made = colmap("OPENCV_FISHEYE 20 12 6 6 10 6 0 0 0 0");
+    let every = Split::Every(std::num::NonZeroU32::new(2).unwrap());
+    let options = LoadOptions { split: every, tracks: true, ..LoadOptions::default() };
+    let data = load(&made, &options);
+    let faces = |name: &str| {
+        let stem = name.trim_end_matches(".png");
+        ["front", "left", "right", "up", "down"].map(|face| format!("{stem}@{face}.png")).to_vec()
+    };
+    let names = |views: &[View]| views.iter().map(|view| view.name.clone()).collect::<Vec<_>>();
+    assert_eq!(names(&data.train), faces("b.png"));
+    assert_eq!(names(&data.test), [faces("a.png"), faces("c.png")].concat());
+    assert!(
+        data.notes.iter().any(|note| note.contains("3 photographs") && note.contains("5 views"))
+    );
+    // All from one place, and at right angles to the front.
+    let front = &data.train[0].camera;
+    for view in &data.train[1..] {
+        assert!(view.camera.centre().distance(front.centre()) < 1e-12);
+        assert!(view.camera.forward().dot(front.forward()).abs() < 1e-12);
+        assert_eq!(view.source.file.path, data.train[0].source.file.path);
+    }
+    let [left, right] = [1, 2].map(|face| data.train[face].camera.forward());
+    assert!(left.dot(front.rotation.row(0)) < -0.99 && right.dot(front.rotation.row(0)) > 0.99);
+    assert!(data.train[3].camera.forward().dot(front.rotation.row(1)) < -0.99, "up is −y");
+    // Every image has the size of its camera, and the colour of its photograph.
+    for (resolution, divisor) in [(None, 1), (Some(Resolution::Divisor(2)), 2)] {
+        let data = load(&made, &LoadOptions { resolution, ..options.clone() });
+        for view in data.train.iter().chain(&data.test) {
+            let image = view.source.load().unwrap();
+            assert_eq!((image.width, image.height), (view.camera.width, view.camera.height));
+            assert!(image.bytes() <= view.source.loaded_bytes() && image.mask.is_none());
+            let colour = match &view.name[..1] {
+                "a" => 0,
+                "b" => 40,
+                _ => 80,
+            };
+            assert_eq!(image.rgb, [colour, 100, 200].repeat(image.rgb.len() / 3));
+            assert!(view.camera.width <= 12_u32.div_ceil(divisor), "{}", view.camera.width);
+        }
+    }
+}
+
+#[test]
+fn a_track_is_in_the_view_that_shows_its_point() {
+    let made = colmap("OPENCV_FISHEYE 20 12 6 6 10 6 0 0 0 0");
+    // Four photographs see each point; the fourth is a copy of the first from another place.
+    densify_fixtures::image(&made.file("images/d.png"), SIZE, 9);
+    let images = std::fs::read_to_string(made.file("sparse/0/images.txt")).unwrap();
+    made.write("sparse/0/images.txt", images + "4 1 0 0 0 0.1 0 4 1 d.png\n1 1 -1\n");
+    let points = std::fs::read_to_string(made.file("sparse/0/points3D.txt")).unwrap();
+    made.write("sparse/0/points3D.txt", points.replace(" 0.1 1 2\n", " 0.1 1 0 2 0 3 0 4 0\n"));
+    let data = load(&made, &LoadOptions { tracks: true, ..LoadOptions::default() });
+    assert!(data.tracks.positions.len() >= 10, "{}", data.tracks.positions.len());
+    for (point, views) in data.tracks.positions.iter().zip(&data.tracks.views) {
+        for &view in views {
+            let camera = &data.train[view as usize].camera;
+            let (pixel, depth) = camera.project(*point);
+            assert!(depth > 0.0 && pixel.x >= 0.0 && pixel.x < f64::from(camera.width));
+        }
+        let photographs: Vec<_> =
+            views.iter().map(|&v| &data.train[v as usize].name[..1]).collect();
+        assert_eq!(photographs, ["a", "b", "c", "d"]);
+    }
+}
+
+#[test]
+fn what_is_cropped_is_said_and_can_be_kept() {
+    let made = colmap("SIMPLE_RADIAL 20 12 15 10 6 -0.2");
+    let [cropped, kept] = [false, true]
+        .map(|keep_fov| load(&made, &LoadOptions { keep_fov, ..LoadOptions::default() }));
+    assert!(cropped.notes.iter().any(|note| note.contains("--keep-fov")), "{:?}", cropped.notes);
+    assert!(!kept.notes.iter().any(|note| note.contains("crop")), "{:?}", kept.notes);
+    let [small, large] = [&cropped, &kept].map(|data| data.train[0].source.load().unwrap());
+    assert_eq!((small.width, small.height, small.mask), (SIZE.0, SIZE.1, None));
+    let mask = large.mask.unwrap();
+    assert!(large.width > SIZE.0 && mask.contains(&0) && mask.contains(&255));
+    assert_eq!(mask.len(), (large.width * large.height) as usize);
+    assert!(kept.train[0].source.loaded_bytes() >= 4 * mask.len() as u64);
+    for (pixel, weight) in large.rgb.chunks_exact(3).zip(&mask) {
+        assert!(*weight == 0 || pixel == [0, 100, 200], "{pixel:?} {weight}");
+    }
+    // A ray that only the wider one shows.
+    let [narrow, wide] = [&cropped, &kept].map(|data| data.train[0].camera.project(DVec3::ZERO).1);
+    assert_eq!((narrow, cropped.train.len()), (wide, NAMES.len()));
+    // A distortion that folds within the image is trained on where it does not.
+    let folding = colmap("RADIAL 20 12 15 10 6 -3 0");
+    let kept = load(&folding, &LoadOptions { keep_fov: true, ..LoadOptions::default() });
+    assert!(kept.notes.iter().any(|note| note.contains("beyond what")), "{:?}", kept.notes);
+}
+
+#[test]
+fn views_that_a_mask_hides_are_named_and_left_out() {
+    let grey = |made: &Made, name: &str, weight: fn(u32) -> u8| {
+        std::fs::create_dir_all(made.file("masks")).unwrap();
+        let mask = image::GrayImage::from_fn(SIZE.0, SIZE.1, |x, _| [weight(x)].into());
+        mask.save(made.file(&format!("masks/{name}"))).unwrap();
+    };
+    let options = LoadOptions {
+        split: Split::Every(std::num::NonZeroU32::new(2).unwrap()),
+        ..LoadOptions::default()
+    };
+    let names = |views: &[View]| views.iter().map(|view| view.name.clone()).collect::<Vec<_>>();
+    // One photograph; the others are split as with it.
+    let made = Made::colmap_txt();
+    grey(&made, "a.png", |_| 0);
+    let data = load(&made, &options);
+    assert_eq!(
+        (names(&data.train), names(&data.test)),
+        (vec!["b.png".into()], vec!["c.png".into()])
+    );
+    let said = |data: &Dataset, name: &str| {
+        data.notes.iter().any(|note| note.contains("masks hide") && note.contains(name))
+    };
+    assert!(said(&data, "a.png") && !said(&data, "b.png"), "{:?}", data.notes);
+    for name in ["b.png", "c.png"] {
+        grey(&made, name, |_| 0);
+    }
+    let message = Dataset::load(made.path(), &options).unwrap_err().to_string();
+    assert!(message.contains("all 3") && message.contains("give --invert-masks"), "{message}");
+    let inverted = LoadOptions { invert_masks: true, ..options.clone() };
+    assert_eq!(load(&made, &inverted).train.len(), 1);
+    // One face of a wide photograph: what lies left of its middle is hidden.
+    let made = colmap("OPENCV_FISHEYE 20 12 6 6 10 6 0 0 0 0");
+    grey(&made, "b.png", |x| if x < 10 { 0 } else { 255 });
+    let data = load(&made, &options);
+    let faces = ["front", "right", "up", "down"].map(|face| format!("b@{face}.png"));
+    assert_eq!(names(&data.train), faces);
+    assert!(said(&data, "b@left.png"), "{:?}", data.notes);
+    for view in &data.train {
+        assert!(view.source.load().unwrap().mask.unwrap().iter().any(|&weight| weight > 0));
+    }
+}

@@ -1,0 +1,153 @@
+//! Tracks: the views in which a reconstruction has found a point.
+//!
+//! They are read only on request, and sampled while they are read: a statistic over points needs
+//! some thousands, and a reconstruction may have millions.
+
+use glam::DVec3;
+
+use super::normalise::Normalisation;
+
+/// Between this and twice as many tracks are kept, or all if there are fewer.
+const MAX_TRACKS: usize = 1 << 15;
+/// Most views kept per track.
+pub(super) const MAX_VIEWS: u64 = 64;
+/// Tracks in fewer views are ignored: they do not show how a colour changes with the view.
+pub const MIN_VIEWS: usize = 4;
+
+/// Points with the views that show them, in structure of arrays.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Tracks {
+    /// Positions. Shape: `[tracks]`.
+    pub positions: Vec<DVec3>,
+    /// sRGB colours of the reconstruction. Shape: `[tracks]`.
+    pub colours: Vec<[u8; 3]>,
+    /// Numbers of training views, ascending, each once, at least [`MIN_VIEWS`]. Shape: `[tracks]`,
+    /// then views.
+    pub views: Vec<Vec<u32>>,
+}
+
+impl Tracks {
+    /// Number of tracks.
+    pub fn len(&self) -> usize {
+        self.positions.len()
+    }
+
+    /// Their size `[bytes]`.
+    pub fn bytes(&self) -> u64 {
+        let track = size_of::<DVec3>() + 3 + size_of::<Vec<u32>>();
+        let views: usize = self.views.iter().map(Vec::len).sum();
+        (self.len() * track + views * size_of::<u32>()) as u64
+    }
+
+    /// The tracks in normalised coordinates and in training views only: `view_of` returns the number of the
+    /// training view that shows a point, from the id of its photograph in the file.
+    pub(super) fn in_training_views(
+        self,
+        normalisation: &Normalisation,
+        view_of: impl Fn(u32, DVec3) -> Option<u32>,
+    ) -> Self {
+        let mut kept = Self::default();
+        let points = self.positions.into_iter().zip(self.colours);
+        for ((position, colour), views) in points.zip(self.views) {
+            let position = normalisation.scene_from_world(position);
+            let mut views: Vec<u32> =
+                views.into_iter().filter_map(|id| view_of(id, position)).collect();
+            views.sort_unstable();
+            views.dedup();
+            if position.as_vec3().is_finite() && views.len() >= MIN_VIEWS {
+                kept.positions.push(position);
+                kept.colours.push(colour);
+                kept.views.push(views);
+            }
+        }
+        kept
+    }
+}
+
+/// Samples tracks while a file is read: all, or every second, fourth, … if there are too many.
+#[derive(Debug)]
+pub(super) struct TrackSampler {
+    tracks: Tracks,
+    /// Every so many-th track is kept.
+    stride: usize,
+    seen: usize,
+}
+
+impl TrackSampler {
+    pub(super) fn new() -> Self {
+        Self { tracks: Tracks::default(), stride: 1, seen: 0 }
+    }
+
+    /// Counts the next track, which has so many views; says whether it is to be [added](Self::add).
+    pub(super) fn wants(&mut self, views: u64) -> bool {
+        if views < MIN_VIEWS as u64 {
+            return false;
+        }
+        self.seen += 1;
+        (self.seen - 1).is_multiple_of(self.stride)
+    }
+
+    /// Adds a track, with the ids of its views; at most [`MAX_VIEWS`] of them are kept.
+    pub(super) fn add(
+        &mut self,
+        position: DVec3,
+        colour: [u8; 3],
+        views: impl IntoIterator<Item = u32>,
+    ) {
+        self.tracks.positions.push(position);
+        self.tracks.colours.push(colour);
+        self.tracks.views.push(views.into_iter().take(MAX_VIEWS as usize).collect());
+        if self.tracks.len() >= 2 * MAX_TRACKS {
+            self.stride *= 2;
+            keep_every_second(&mut self.tracks.positions);
+            keep_every_second(&mut self.tracks.colours);
+            keep_every_second(&mut self.tracks.views);
+        }
+    }
+
+    pub(super) fn finish(self) -> Tracks {
+        self.tracks
+    }
+}
+
+fn keep_every_second<T>(values: &mut Vec<T>) {
+    let mut place = 0;
+    values.retain(|_| {
+        place += 1;
+        place % 2 == 1
+    });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn many_tracks_are_thinned_evenly_and_short_ones_left_out() {
+        let mut sampler = TrackSampler::new();
+        for i in 0..5 * MAX_TRACKS {
+            let views = if i % 2 == 0 { 5 } else { 3 };
+            if sampler.wants(views) {
+                sampler.add(DVec3::splat(i as f64), [0; 3], 0..views as u32);
+            }
+        }
+        let tracks = sampler.finish();
+        assert!((MAX_TRACKS..2 * MAX_TRACKS).contains(&tracks.len()), "{}", tracks.len());
+        let gaps: Vec<f64> =
+            tracks.positions.windows(2).map(|pair| pair[1].x - pair[0].x).collect();
+        assert!(gaps.iter().all(|gap| (gap - 4.0).abs() < 1e-9), "{:?}", &gaps[..4]);
+        assert!(tracks.views.iter().all(|views| views.len() == 5));
+    }
+
+    #[test]
+    fn only_training_views_count() {
+        let tracks = Tracks {
+            positions: vec![DVec3::ZERO, DVec3::ONE, DVec3::NAN],
+            colours: vec![[1; 3], [2; 3], [3; 3]],
+            views: vec![vec![9, 7, 5, 3, 3], vec![9, 7, 5, 4], vec![1, 3, 5, 7]],
+        };
+        let odd = |id: u32, _| (id % 2 == 1).then_some(id / 2);
+        let kept = tracks.in_training_views(&Normalisation::IDENTITY, odd);
+        assert_eq!(kept.views, [vec![1, 2, 3, 4]], "the second has three training views");
+    }
+}

@@ -1,0 +1,390 @@
+//! Reads `transforms.json` (nerfstudio, instant-ngp) and `transforms_{train,test}.json`
+//! (NeRF-synthetic).
+//!
+//! Poses are `world_from_camera` with OpenGL axes (x right, y up, looking along −z). Intrinsics are
+//! at the top level or in the frame; those in the frame take precedence.
+
+use std::collections::HashSet;
+use std::fmt::Display;
+use std::path::{Path, PathBuf};
+
+use glam::{DMat3, DVec2, DVec3};
+use serde_json::{Map, Value};
+
+use super::error::DatasetError;
+use super::folders::{Folders, ImageFile};
+use super::images;
+use super::json;
+use super::lens::table::{FISHEYE_FIELDS, OPENCV_FIELDS};
+use super::lens::{Distortion, Lens, Plane};
+use super::masks::MaskFile;
+use super::paths::{DataPath, Root, is_absolute, relative};
+use super::pose::{check_lens, checked_pose};
+use super::{Frame, Scene};
+
+const MAX_FRAMES: usize = 1_000_000;
+const REMEDY: &str = "correct the file or export it again";
+
+/// File names of initial points that 3DGS and nerfstudio use without naming them in the JSON.
+const POINT_FILES: [&str; 3] = ["points3d.ply", "sparse_pc.ply", "points3D.ply"];
+/// Names of camera models that are a pinhole with OpenCV's distortion.
+const PINHOLES: [&str; 7] = [
+    "OPENCV",
+    "FULL_OPENCV",
+    "PINHOLE",
+    "SIMPLE_PINHOLE",
+    "RADIAL",
+    "SIMPLE_RADIAL",
+    "PERSPECTIVE",
+];
+/// The name of the one that is a fisheye with k1 to k4.
+const FISHEYE: &str = "OPENCV_FISHEYE";
+
+/// The pair of files that defines its own test split.
+pub(super) const PAIR: [&str; 2] = ["transforms_train.json", "transforms_test.json"];
+/// The single file.
+pub(super) const SINGLE: &str = "transforms.json";
+
+/// Reads `transforms_train.json` and `transforms_test.json`.
+pub(super) fn read_pair(root: &Root, folders: &Folders) -> Result<Scene, DatasetError> {
+    let mut scene = read(root, folders, PAIR[0], false)?;
+    let test = read(root, folders, PAIR[1], true)?;
+    scene.frames.extend(test.frames);
+    scene.notes.extend(test.notes);
+    scene.own_split = true;
+    Ok(scene)
+}
+
+/// Reads the file `name`. Its own test split, if any, is under `test_filenames`, or under `val_filenames`
+/// if there is no other, as in nerfstudio.
+pub(super) fn read(
+    root: &Root,
+    folders: &Folders,
+    name: &str,
+    held_out: bool,
+) -> Result<Scene, DatasetError> {
+    let path = root.path().join(name);
+    root.existing(DataPath { file: &path, field: "the file", value: name })?;
+    let Value::Object(top) = json::read(&path)? else {
+        return Err(DatasetError::malformed(&path, "the file", "it is not a JSON object", REMEDY));
+    };
+    let top = Fields { path: &path, place: String::new(), frame: None, top: &top };
+    let Some(Value::Array(list)) = top.top.get("frames") else {
+        return Err(top.fault("frames", "the list is missing"));
+    };
+    if list.len() > MAX_FRAMES {
+        return Err(top.fault("frames", "there are more than a million"));
+    }
+    let mut own_split = false;
+    let tests = match top.held_out(folders, "test_filenames")? {
+        Some(names) => Some(names),
+        None => top.held_out(folders, "val_filenames")?,
+    };
+    let (mut frames, mut missing, mut fell_back) = (Vec::new(), Vec::new(), 0);
+    let mut first_missing = None;
+    for (index, entry) in list.iter().enumerate() {
+        let place = format!("frames[{index}].");
+        let Value::Object(entry) = entry else {
+            return Err(top.fault(&format!("frames[{index}]"), "it is not an object"));
+        };
+        let fields = Fields { path: &path, place, frame: Some(entry), top: top.top };
+        let Some(file) = fields.text("file_path")? else {
+            return Err(fields.fault("file_path", "it is missing"));
+        };
+        let field = fields.full("file_path");
+        let named = DataPath { file: &path, field: &field, value: file };
+        let Some(found) = folders.image(named)? else {
+            first_missing.get_or_insert_with(|| folders.place(named));
+            missing.push(file.to_owned());
+            continue;
+        };
+        fell_back += usize::from(found.fell_back);
+        let (rotation, translation) = fields.pose(file)?;
+        let mask = match fields.text("mask_path")? {
+            Some(value) => Some(fields.mask(root, folders, &found, value)?),
+            None => folders.mask(&found, named)?,
+        };
+        let lens = fields.lens(&found.path, found.reduced)?;
+        let is_test = |tests: &HashSet<String>| {
+            tests.contains(&relative(file)) || tests.contains(&found.name)
+        };
+        let held_out = held_out || tests.as_ref().is_some_and(is_test);
+        own_split |= held_out;
+        frames.push(Frame {
+            name: found.name,
+            id: None,
+            origin: format!("{}: frame {file}", path.display()),
+            listed: relative(file),
+            image: found.path,
+            reduced: found.reduced,
+            mask,
+            lens,
+            is_sized: fields.size()?.is_some(),
+            rotation,
+            translation,
+            held_out,
+        });
+    }
+    let mut notes = Vec::new();
+    if let Some(first) = missing.first() {
+        let count = missing.len();
+        notes.push(format!("{name}: {count} of {} frames have no image file and are skipped ({first} is the first)", list.len()));
+    }
+    if fell_back > 0 {
+        notes.push(folders.fell_back_note(fell_back));
+    }
+    let points_file = points_file((root, folders), &top, held_out, &mut notes)?;
+    let listing = path.clone();
+    let rest = Scene::default();
+    let mut scene = Scene { frames, first_missing, notes, points_file, listing, own_split, ..rest };
+    if !held_out && let Some(file) = &scene.points_file {
+        scene.points = crate::import::ply::read_points(file)?;
+    }
+    Ok(scene)
+}
+
+/// The file of the initial points: the one that the JSON names, or one of [`POINT_FILES`].
+fn points_file(
+    (root, folders): (&Root, &Folders),
+    top: &Fields<'_>,
+    held_out: bool,
+    notes: &mut Vec<String>,
+) -> Result<Option<PathBuf>, DatasetError> {
+    if let Some(value) = top.text("ply_file_path")? {
+        let named = DataPath { file: top.path, field: "ply_file_path", value };
+        if folders.elsewhere(value).is_none() {
+            let missing =
+                || top.fault("ply_file_path", format!("the file {value:?} does not exist"));
+            return Ok(Some(root.listed(named)?.ok_or_else(missing)?));
+        }
+        // Of another machine: as the photographs, it may have come along.
+        for value in named.ends()? {
+            if let Some(found) = root.existing(DataPath { value: &value, ..named })? {
+                return Ok(Some(found));
+            }
+        }
+        let file = top.path.file_name().unwrap_or_default().display();
+        notes.push(densify_core::files::one_line(&format!(
+            "{file}: the initial points {value:?} are not in the dataset's folder, and are left out"
+        )));
+    }
+    if held_out { Ok(None) } else { usual_points(root, top.path, notes) }
+}
+
+/// The file of initial points under one of the [usual names](POINT_FILES), which `file` does not name.
+pub(super) fn usual_points(
+    root: &Root,
+    file: &Path,
+    notes: &mut Vec<String>,
+) -> Result<Option<PathBuf>, DatasetError> {
+    for value in POINT_FILES {
+        if let Some(found) = root.existing(DataPath { file, field: "initial points", value })? {
+            notes.push(format!("initial points are taken from {value}"));
+            return Ok(Some(found));
+        }
+    }
+    Ok(None)
+}
+
+/// The fields of one frame, with those at the top level as defaults.
+struct Fields<'a> {
+    path: &'a Path,
+    /// Prefix of field names in messages: the frame.
+    place: String,
+    frame: Option<&'a Map<String, Value>>,
+    top: &'a Map<String, Value>,
+}
+
+impl<'a> Fields<'a> {
+    fn full(&self, field: &str) -> String {
+        format!("{}{field}", self.place)
+    }
+
+    fn fault(&self, field: &str, problem: impl Display) -> DatasetError {
+        DatasetError::malformed(self.path, self.full(field), problem, REMEDY)
+    }
+
+    /// A field of the frame itself, or of the top where there is no frame.
+    fn own(&self, field: &str) -> Option<&'a Value> {
+        self.frame.unwrap_or(self.top).get(field).filter(|value| !value.is_null())
+    }
+
+    fn text(&self, field: &str) -> Result<Option<&'a str>, DatasetError> {
+        match self.own(field) {
+            None => Ok(None),
+            Some(Value::String(text)) => Ok(Some(text)),
+            Some(_) => Err(self.fault(field, "it is not a string")),
+        }
+    }
+
+    /// A list of file names, each as it is listed and as the view is named whose image it is.
+    fn held_out(
+        &self,
+        folders: &Folders,
+        field: &str,
+    ) -> Result<Option<HashSet<String>>, DatasetError> {
+        let Some(value) = self.own(field) else {
+            return Ok(None);
+        };
+        let fault = || self.fault(field, "it is not a list of file names");
+        let mut names = HashSet::new();
+        for name in value.as_array().ok_or_else(fault)? {
+            let value = name.as_str().ok_or_else(fault)?;
+            names.insert(relative(value));
+            // Only such names may be written otherwise than in the frame.
+            if is_absolute(value) || value.contains('\\') {
+                let named = DataPath { file: self.path, field, value };
+                names.extend(folders.image(named)?.map(|found| found.name));
+            }
+        }
+        Ok(Some(names))
+    }
+
+    /// The mask of a frame whose file names it.
+    fn mask(
+        &self,
+        root: &Root,
+        folders: &Folders,
+        image: &ImageFile,
+        value: &str,
+    ) -> Result<MaskFile, DatasetError> {
+        let field = self.full("mask_path");
+        let named = DataPath { file: self.path, field: &field, value };
+        if folders.elsewhere(value).is_none() {
+            let missing = || {
+                let place = root.path().join(relative(value));
+                DatasetError::missing_image(self.path, &field, &place)
+            };
+            return Ok(MaskFile::of(root.listed(named)?.ok_or_else(missing)?));
+        }
+        // Of another machine: where it lay, but below this folder, or where masks are looked for. Its name alone
+        // may be that of a photograph.
+        for value in named.ends()?.filter(|end| end.contains('/')) {
+            if let Some(found) = root.existing(DataPath { value: &value, ..named })? {
+                return Ok(MaskFile::of(found));
+            }
+        }
+        folders.mask(image, named)?.ok_or_else(|| {
+            let problem = format!("the mask {value:?} is not in the dataset's folder");
+            let remedy =
+                "put it into `masks/` there, under the photograph's name, or remove the field";
+            DatasetError::malformed(self.path, &field, problem, remedy)
+        })
+    }
+
+    fn inherited(&self, field: &str) -> Option<&'a Value> {
+        self.own(field).or_else(|| self.top.get(field)).filter(|value| !value.is_null())
+    }
+
+    fn number(&self, field: &str) -> Result<Option<f64>, DatasetError> {
+        let Some(value) = self.inherited(field) else {
+            return Ok(None);
+        };
+        value.as_f64().map(Some).ok_or_else(|| self.fault(field, "it is not a number"))
+    }
+
+    fn side(&self, field: &str) -> Result<Option<u32>, DatasetError> {
+        let Some(value) = self.number(field)? else {
+            return Ok(None);
+        };
+        if value >= 1.0 && value <= f64::from(u32::MAX) && value.fract().abs() < f64::EPSILON {
+            return Ok(Some(value as u32));
+        }
+        Err(self.fault(field, format!("{value} px is not an image size")))
+    }
+
+    /// camera_from_world with OpenCV axes.
+    fn pose(&self, file: &str) -> Result<(DMat3, DVec3), DatasetError> {
+        const FIELD: &str = "transform_matrix";
+        let shape = || self.fault(FIELD, "it is not a matrix of 3 or 4 rows of 4 numbers");
+        let rows = self.own(FIELD).and_then(Value::as_array).ok_or_else(shape)?;
+        let mut m = [[0.0; 4]; 3];
+        if !(3..=4).contains(&rows.len()) {
+            return Err(shape());
+        }
+        for (row, values) in m.iter_mut().zip(rows) {
+            let values = values.as_array().filter(|values| values.len() == 4).ok_or_else(shape)?;
+            for (entry, value) in row.iter_mut().zip(values) {
+                *entry = value.as_f64().ok_or_else(shape)?;
+            }
+        }
+        // In OpenCV y and z point the opposite way.
+        let column = |j: usize| DVec3::new(m[0][j], m[1][j], m[2][j]);
+        let world_from_camera = DMat3::from_cols(column(0), -column(1), -column(2));
+        let frame = format!("{} ({file})", self.full(FIELD));
+        let (rotation, centre) =
+            checked_pose(self.path, &frame, world_from_camera.transpose(), column(3))?;
+        Ok((rotation, -(rotation * centre)))
+    }
+
+    /// The lens, at the size stated in the file, or else at that of the image.
+    /// The size that intrinsics are for, if the file says it.
+    fn size(&self) -> Result<Option<(u32, u32)>, DatasetError> {
+        Ok(self.side("w")?.zip(self.side("h")?))
+    }
+
+    fn lens(&self, image: &Path, reduced: Option<u32>) -> Result<Lens, DatasetError> {
+        let distortion = self.distortion()?;
+        let (width, height) = match self.size()? {
+            Some(size) => size,
+            None => {
+                // Without a size, the intrinsics are those of the image at full size.
+                let header = images::probe(image)?;
+                let k = reduced.unwrap_or(1);
+                (header.width * k, header.height * k)
+            }
+        };
+        let from_angle = |side: u32, angle: f64| 0.5 * f64::from(side) / (0.5 * angle).tan();
+        let fx = match (self.number("fl_x")?, self.number("camera_angle_x")?) {
+            (Some(fx), _) => fx,
+            (None, Some(angle)) => from_angle(width, angle),
+            (None, None) => {
+                return Err(self.fault("fl_x", "both fl_x and camera_angle_x are missing"));
+            }
+        };
+        let fy = match (self.number("fl_y")?, self.number("camera_angle_y")?) {
+            (Some(fy), _) => fy,
+            (None, Some(angle)) if self.inherited("fl_x").is_none() => from_angle(height, angle),
+            _ => fx,
+        };
+        let cx = self.number("cx")?.unwrap_or(0.5 * f64::from(width));
+        let cy = self.number("cy")?.unwrap_or(0.5 * f64::from(height));
+        let (focal, principal) = (DVec2::new(fx, fy), DVec2::new(cx, cy));
+        let lens = Lens::new((width, height), focal, principal, distortion);
+        check_lens(self.path, &self.full("intrinsics"), &lens)?;
+        Ok(lens)
+    }
+
+    /// The plane and its distortion.
+    fn distortion(&self) -> Result<Distortion, DatasetError> {
+        let named = match self.inherited("camera_model") {
+            None => None,
+            Some(Value::String(model)) => Some(model.as_str()),
+            Some(_) => return Err(self.fault("camera_model", "it is not a string")),
+        };
+        let is_fisheye = named == Some(FISHEYE)
+            || self.inherited("is_fisheye").is_some_and(|value| value.as_bool() != Some(false));
+        if let Some(model) = named.filter(|model| *model != FISHEYE && !PINHOLES.contains(model)) {
+            let problem = format!("{model:?} is not one of {}, {FISHEYE}", PINHOLES.join(", "));
+            return Err(DatasetError::lens(self.path, &self.full("camera_model"), problem));
+        }
+        let (plane, fields) = match is_fisheye {
+            true => (Plane::Equidistant, &FISHEYE_FIELDS[..]),
+            false => (Plane::Perspective, &OPENCV_FIELDS[..]),
+        };
+        let mut distortion = Distortion::of(plane);
+        for (field, _) in OPENCV_FIELDS {
+            let value = self.number(field)?.unwrap_or(0.0);
+            match fields.iter().find(|(name, _)| *name == field) {
+                Some(&(_, term)) => distortion.set(term, value),
+                // nerfstudio writes all fields, with zeros for those that a model lacks.
+                None if value == 0.0 => {}
+                None => {
+                    let problem = format!("a fisheye has k1 to k4, but no {field} = {value}");
+                    return Err(DatasetError::lens(self.path, &self.full(field), problem));
+                }
+            }
+        }
+        Ok(distortion)
+    }
+}

@@ -1,0 +1,161 @@
+//! Parts of images: a view that is a window into a photograph, as a block of a large scene shows in it.
+
+use std::fmt;
+use std::str::FromStr;
+
+use super::View;
+use densify_core::camera::Camera;
+pub use densify_core::image::Window;
+
+/// Fewest pixels along a side of a window: below it, most of what is rendered lies outside.
+const LEAST_SIDE: u32 = 32;
+
+/// A part of an image, each side in `[0, 1]` of its width and height.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Part {
+    pub left: f64,
+    pub top: f64,
+    pub right: f64,
+    pub bottom: f64,
+}
+
+/// Left, top, right and bottom.
+impl fmt::Display for Part {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { left, top, right, bottom } = self;
+        write!(out, "{left:.4} {top:.4} {right:.4} {bottom:.4}")
+    }
+}
+
+impl FromStr for Part {
+    type Err = ();
+
+    fn from_str(text: &str) -> Result<Self, ()> {
+        let numbers: Result<Vec<f64>, _> = text.split_whitespace().map(str::parse).collect();
+        let [left, top, right, bottom] = numbers.map_err(|_| ())?[..] else { return Err(()) };
+        let part = Self { left, top, right, bottom };
+        if part.is_valid() { Ok(part) } else { Err(()) }
+    }
+}
+
+impl Part {
+    /// Whether its sides are in order, and in the image.
+    fn is_valid(&self) -> bool {
+        let is_span = |from: f64, to: f64| 0.0 <= from && from < to && to <= 1.0;
+        is_span(self.left, self.right) && is_span(self.top, self.bottom)
+    }
+
+    /// Its pixels in an image of this size; `None` where they are all.
+    fn window(&self, width: u32, height: u32) -> Option<Window> {
+        let [x, across] = span(self.left, self.right, width);
+        let [y, down] = span(self.top, self.bottom, height);
+        let window = Window { x, y, width: across, height: down };
+        (window != Window { x: 0, y: 0, width, height }).then_some(window)
+    }
+}
+
+/// First pixel and number of pixels of a span, of at least [`LEAST_SIDE`] as far as there are so many.
+fn span(from: f64, to: f64, size: u32) -> [u32; 2] {
+    let (from, to) = (from * f64::from(size), to * f64::from(size));
+    let least = f64::from(LEAST_SIDE.min(size));
+    let middle = 0.5 * (from + to);
+    let (from, to) = (from.min(middle - 0.5 * least), to.max(middle + 0.5 * least));
+    // Back into the image where it was widened beyond.
+    let back = (-from).max(0.0) - (to - f64::from(size)).max(0.0);
+    let first = (from + back).max(0.0).floor() as u32;
+    let last = ((to + back).ceil() as u32).min(size);
+    [first, last - first]
+}
+
+impl View {
+    /// The view as a window into itself.
+    pub(crate) fn windowed(mut self, part: &Part) -> Self {
+        if let Some(window) = part.window(self.camera.width, self.camera.height) {
+            self.camera = Camera {
+                width: window.width,
+                height: window.height,
+                cx: self.camera.cx - f64::from(window.x),
+                cy: self.camera.cy - f64::from(window.y),
+                ..self.camera
+            };
+            self.source.window = Some(window);
+        }
+        self
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::float_cmp, reason = "exact values")]
+mod tests {
+    use super::*;
+    use crate::dataset::{Dataset, LoadOptions};
+    use densify_core::image::Image8;
+    use densify_fixtures::Made;
+
+    #[test]
+    fn windows_hold_their_part_and_stay_in_the_image() {
+        let part = |left, right| Part { left, right, top: 0.25, bottom: 0.75 };
+        let of = |left, right| part(left, right).window(200, 100);
+        assert_eq!(of(0.5, 0.9), Some(Window { x: 100, y: 25, width: 80, height: 50 }));
+        // Too narrow: widened evenly, or inwards at a border.
+        assert_eq!(of(0.5, 0.52), Some(Window { x: 86, y: 25, width: 32, height: 50 }));
+        assert_eq!(of(0.0, 0.01).map(|it| (it.x, it.width)), Some((0, 32)));
+        assert_eq!(of(0.99, 1.0).map(|it| (it.x, it.width)), Some((168, 32)));
+        let whole = Part { left: 0.0, top: 0.0, right: 1.0, bottom: 1.0 };
+        assert_eq!(whole.window(200, 100), None);
+        // So small an image is its own window.
+        assert_eq!(part(0.4, 0.6).window(30, 30), None);
+        assert!(
+            part(0.1, 0.2).is_valid() && !part(0.2, 0.1).is_valid() && !part(0.5, 1.1).is_valid()
+        );
+        assert!(!part(f64::NAN, 1.0).is_valid());
+    }
+
+    #[test]
+    fn a_windowed_view_shows_what_it_showed_there() {
+        let made = Made::colmap_txt();
+        let dataset = Dataset::load(made.path(), &LoadOptions::default()).expect("a dataset");
+        let (width, height) = (60, 40);
+        let rgb = (0..3 * width * height).map(|i| (i * 7 % 251) as u8).collect();
+        let pixels = Image8 { width, height, rgb, alpha: None, mask: None };
+        let mut view = dataset.train[0].clone();
+        view.camera = view.camera.resized(width, height);
+        (view.source.width, view.source.height) = (width, height);
+        (view.source.header.width, view.source.header.height) = (width, height);
+        view.source.rendered = Some(std::sync::Arc::new(pixels));
+        let view = &view;
+        let part = Part { left: 0.3, top: 0.0, right: 0.9, bottom: 1.0 };
+        let cut = view.clone().windowed(&part);
+        let window = cut.source.window.expect("a part");
+        assert!(window.x > 0 && window.width < width && cut.camera.height == height, "{window:?}");
+        let [whole, image] = [view, &cut].map(|view| view.source.load().expect("an image"));
+        assert_eq!((image.width, image.height), (cut.camera.width, cut.camera.height));
+        assert!(image.bytes() <= cut.source.loaded_bytes());
+        let point = view.camera.centre() + view.camera.forward();
+        let [before, after] = [view, &cut].map(|view| view.camera.project(point).0);
+        assert_eq!(before.x - after.x, f64::from(window.x));
+        for y in 0..height as usize {
+            let black = [0.0; 3];
+            let x = image.width as usize - 1;
+            assert_eq!(
+                image.composited(x, y, black),
+                whole.composited(x + window.x as usize, y, black)
+            );
+        }
+    }
+
+    #[test]
+    fn a_window_has_the_pixels_of_its_place() {
+        let image = Image8 {
+            width: 5,
+            height: 4,
+            rgb: (0..60).collect(),
+            alpha: None,
+            mask: Some((0..20).collect()),
+        };
+        let cut = image.windowed(Window { x: 1, y: 2, width: 2, height: 2 });
+        assert_eq!((cut.width, cut.height), (2, 2));
+        assert_eq!(cut.rgb, [33, 34, 35, 36, 37, 38, 48, 49, 50, 51, 52, 53]);
+        assert_eq!(cut.mask, Some(vec![11, 12, 16, 17]));
+    }
+}

@@ -1,0 +1,51 @@
+//! The order in which formats want the rows that pack neighbours together: along a Z-curve through space.
+
+use densify_core::curve;
+use densify_core::gaussians::Gaussians;
+
+/// Rows of a model from one end of the curve to the other. Remote ones do not matter to its scale.
+pub(super) fn along_a_curve(model: &Gaussians) -> Vec<usize> {
+    let middle = model.len() / 2;
+    let mut frame = [(0.0, 1.0); 3];
+    let mut values = Vec::with_capacity(model.len());
+    for (axis, (centre, spread)) in frame.iter_mut().enumerate() {
+        values.clear();
+        values.extend(model.means.iter().map(|mean| f64::from(mean[axis])));
+        if values.is_empty() {
+            return Vec::new();
+        }
+        *centre = *values.select_nth_unstable_by(middle, f64::total_cmp).1;
+        values.iter_mut().for_each(|value| *value = (*value - *centre).abs());
+        // A scene where half of all rows are equal in a coordinate has no extent there.
+        *spread = values.select_nth_unstable_by(middle, f64::total_cmp).1.max(f64::MIN_POSITIVE);
+    }
+    let place = |row: usize| {
+        let mean = model.means[row].map(f64::from);
+        curve::place(std::array::from_fn(|i| (mean[i] - frame[i].0) / (2.0 * frame[i].1)))
+    };
+    let mut rows: Vec<usize> = (0..model.len()).collect();
+    rows.sort_by_cached_key(|&row| (place(row), row));
+    rows
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn neighbours_come_together_whatever_the_unit() {
+        for unit in [1e-6, 1.0, 1e6] {
+            let mut model = Gaussians::zeros(64, 0);
+            // Two clusters, their rows in turn.
+            for (row, mean) in model.means.iter_mut().enumerate() {
+                let x = if row % 2 == 0 { -1.0 } else { 1.0 };
+                *mean = [unit * (x + 0.001 * row as f32), 0.0, 0.0];
+            }
+            let rows = along_a_curve(&model);
+            assert!(rows[..32].iter().all(|row| row % 2 == 0), "{rows:?}");
+            assert!(rows[32..].iter().all(|row| row % 2 == 1), "{rows:?}");
+        }
+        assert_eq!(along_a_curve(&Gaussians::default()), Vec::<usize>::new());
+        assert_eq!(along_a_curve(&Gaussians::zeros(3, 1)), [0, 1, 2]);
+    }
+}

@@ -1,0 +1,109 @@
+//! Measures how much colours change with the view, in the photographs and before training, to choose
+//! the degree of spherical harmonics.
+//!
+//! Each track of the reconstruction is a surface point with the views that show it. Its colour is
+//! read in each of them. Photographs differ in exposure and white balance, so a gain per view and
+//! channel is fitted first. Three other causes of differences must not count:
+//!
+//! - Reconstructed points lie on edges and corners, where one pixel changes the colour more than any
+//!   highlight. So the difference is the distance of the track's colour (the median over its views)
+//!   from the range of *all* colours within a pixel.
+//! - The point may be hidden in some views. The quarter of its views that differ most is ignored.
+//! - The point may not lie on a surface. It does if most views show the colour that the
+//!   reconstruction gives it; if less than half of all points do, tracks decide nothing.
+//!
+//! The spread of a track is the root mean square over its remaining views. Highlights may cover a
+//! small part of a scene, so the 95th percentile of the tracks decides. Only photographs, poses and
+//! the reconstruction are read.
+//!
+//! This differs from the per-Gaussian rule of Reduced-3DGS (Papantonakis et al. 2024, section 4.2),
+//! which needs a trained model and therefore cannot save memory while training.
+
+mod colours;
+pub mod exposures;
+
+use serde::{Deserialize, Serialize};
+
+use crate::dataset::Tracks;
+pub use colours::median;
+pub use colours::{TrackColours, bytes};
+
+/// With fewer measured tracks, the degree is not decided.
+pub const MIN_TRACKS: usize = 500;
+/// From these 95th percentiles on, degrees 1, 2 and 3 are chosen `[1/255]`. `docs/tradeoffs.md` lists
+/// the scenes that they were fitted to.
+pub const THRESHOLDS: [f64; 3] = [1.0, 2.0, 3.0];
+/// Largest difference between the reconstruction's colour of a point and its colour in a view for
+/// the point to count as on a surface `[1/255]`.
+const SAME_COLOUR: f64 = 4.0;
+/// Fraction of a track's views that count: those that differ least.
+const AGREEING: f64 = 0.75;
+
+/// How much the colours of tracks change with the view.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Spread {
+    /// Number of tracks measured in enough views.
+    pub tracks: usize,
+    /// Fraction of them that lie on a surface.
+    pub on_surface: f64,
+    /// Median over the tracks `[1/255]`.
+    pub median: f64,
+    /// 90th percentile of the tracks `[1/255]`.
+    pub tenth: f64,
+    /// 95th percentile of the tracks `[1/255]`.
+    pub twentieth: f64,
+    /// Root mean square over all tracks `[1/255]`.
+    pub rms: f64,
+}
+
+impl Spread {
+    /// The degree to train with; `None` if too few tracks were measured, or too few of them lie on
+    /// surfaces.
+    #[must_use]
+    pub fn degree(&self) -> Option<u8> {
+        let above = THRESHOLDS.iter().filter(|&&from| self.twentieth >= from).count();
+        (self.tracks >= MIN_TRACKS && self.on_surface >= 0.5).then_some(above as u8)
+    }
+}
+
+/// Measures how much the colours of tracks change with the view, where exposures do not account for it.
+#[must_use]
+pub fn measure(tracks: &Tracks, colours: &TrackColours) -> Spread {
+    let (mut each, mut on_surface, mut buffer) = (Vec::new(), 0, Vec::new());
+    for (place, seen) in colours.by_track().enumerate() {
+        let Some(first) = seen.first() else { continue };
+        let own = tracks.colours[first.track as usize].map(f32::from);
+        let mut differences = |from: [f32; 3]| -> Vec<f64> {
+            buffer.clear();
+            buffer.extend(seen.iter().map(|colour| {
+                colour.squared_difference(from, colours.gains(colour.view as usize))
+            }));
+            buffer.sort_unstable_by(f64::total_cmp);
+            buffer.clone()
+        };
+        let to_own = differences(own);
+        on_surface += usize::from(to_own[(to_own.len() - 1) / 2] < SAME_COLOUR * SAME_COLOUR);
+        let to_reference = differences(colours.reference(place));
+        let counted = ((to_reference.len() as f64 * AGREEING).round() as usize).max(1);
+        let sum: f64 = to_reference.iter().take(counted).sum();
+        each.push((sum / counted as f64).sqrt());
+    }
+    each.sort_unstable_by(f64::total_cmp);
+    let percentile = |fraction: f64| {
+        let place = (fraction * each.len().saturating_sub(1) as f64).round() as usize;
+        each.get(place).copied().unwrap_or(0.0)
+    };
+    let tracks = each.len().max(1) as f64;
+    Spread {
+        tracks: each.len(),
+        on_surface: f64::from(on_surface as u32) / tracks,
+        median: percentile(0.5),
+        tenth: percentile(0.9),
+        twentieth: percentile(0.95),
+        rms: (each.iter().map(|difference| difference * difference).sum::<f64>() / tracks).sqrt(),
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,168 @@
+//! Colours of tracks in made-up views: what makes them disagree, and what must not.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use glam::{DMat3, DVec3};
+
+use super::exposures::ExposureSpread;
+use super::*;
+use crate::dataset::builtin::PREFIX;
+use crate::dataset::images::{ImageHeader, ImageSource, SourceFile};
+use crate::dataset::{Dataset, DatasetError, LoadOptions, View};
+use densify_core::camera::Camera;
+use densify_core::image::Image8;
+
+const SIZE: u32 = 60;
+const VIEWS: usize = 8;
+
+fn measured(tracks: &Tracks, views: &[View]) -> Result<Spread, DatasetError> {
+    Ok(measure(tracks, &TrackColours::read(tracks, views)?))
+}
+
+/// Views of a wall of 20 x 20 coloured squares, 3 px wide each, from one place; `shade` is what a view
+/// makes of a square's colour.
+fn scene(shade: impl Fn(usize, usize, f32) -> f32) -> (Tracks, Vec<View>) {
+    let squares = (SIZE / 3) as usize;
+    let colour =
+        |square: usize| [square * 37, square * 59, square * 83].map(|v| (40 + v % 120) as f32);
+    let mut tracks = Tracks::default();
+    // Not those at the border, where a pixel's neighbours end.
+    for square in (0..squares * squares).filter(|s| s / squares > 0 && s / squares < squares - 1) {
+        let (x, y) = (3 * (square % squares) + 1, 3 * (square / squares) + 1);
+        tracks.positions.push(DVec3::new(x as f64 + 0.5, y as f64 + 0.5, 1.0));
+        tracks.colours.push(colour(square).map(|v| v as u8));
+        tracks.views.push((0..VIEWS as u32).collect());
+    }
+    let views = (0..VIEWS).map(|view| {
+        let pixels = (0..SIZE * SIZE).map(|p| (p % SIZE / 3 + p / SIZE / 3 * (SIZE / 3)) as usize);
+        let rgb = pixels.flat_map(|s| colour(s).map(|v| shade(view, s, v).clamp(0.0, 255.0) as u8));
+        posed(Image8 { width: SIZE, height: SIZE, rgb: rgb.collect(), alpha: None, mask: None })
+    });
+    (tracks, views.collect())
+}
+
+fn posed(image: Image8) -> View {
+    let (width, height) = (image.width, image.height);
+    let camera = Camera::centred((width, height), (1.0, 1.0), DMat3::IDENTITY, DVec3::ZERO);
+    let camera = Camera { cx: 0.0, cy: 0.0, ..camera };
+    let header = ImageHeader {
+        width,
+        height,
+        has_alpha: false,
+        turn: None,
+        decoded_bytes: image.bytes(),
+        file_bytes: 0,
+    };
+    let (file, rendered) = (SourceFile::rendered("made".into()), Some(Arc::new(image)));
+    let source = ImageSource {
+        file,
+        mask: None,
+        width,
+        height,
+        undistortion: None,
+        header,
+        rendered,
+        window: None,
+    };
+    View { name: "made".into(), camera, source }
+}
+
+#[test]
+fn colours_that_stay_ask_for_degree_0_whatever_the_exposure() {
+    for exposures in [[1.0; VIEWS], [1.0, 0.8, 1.1, 0.7, 1.0, 1.2, 0.9, 1.05]] {
+        let (tracks, views) = scene(|view, _, value| value * exposures[view]);
+        let found = measured(&tracks, &views).unwrap();
+        assert_eq!(found.tracks, tracks.len());
+        assert!(found.twentieth < 0.75, "rounding to whole steps: {found:?}");
+    }
+}
+
+/// The gains of the views are found, and decide that exposures are learned; colours that change by view
+/// without a common factor do not.
+#[test]
+fn exposures_are_found_where_gains_explain_the_colours() {
+    let exposures = [1.0, 0.8, 1.1, 0.7, 1.0, 1.2, 0.9, 1.05];
+    let found = |shade: &dyn Fn(usize, usize, f32) -> f32| {
+        let (tracks, views) = scene(shade);
+        let (found, gains) = ExposureSpread::measure(&TrackColours::read(&tracks, &views).unwrap());
+        assert_eq!((found.tracks, found.views), (tracks.len(), VIEWS));
+        // As many tracks as decide.
+        (ExposureSpread { tracks: MIN_TRACKS, ..found }, gains)
+    };
+    let (differ, gains) = found(&|view, _, value| value * exposures[view]);
+    assert_eq!(differ.decides(VIEWS), Some(true), "{differ:?}");
+    assert!((differ.stops - 0.6).abs() < 0.05 && differ.with_gains < 1.0, "{differ:?}");
+    let mean = exposures.iter().map(|e: &f32| e.ln()).sum::<f32>() / VIEWS as f32;
+    for (gains, exposure) in gains.iter().zip(exposures) {
+        assert!(gains.iter().all(|gain| (gain - exposure / mean.exp()).abs() < 0.01), "{gains:?}");
+    }
+    // Half of the colours are clipped in the brightest view, and say nothing of its gain.
+    let (_, gains) = found(&|view, _, value| 2.2 * value * exposures[view]);
+    let brightest = exposures[5] / mean.exp();
+    assert!(gains[5].iter().all(|gain| (gain - brightest).abs() < 0.01), "{gains:?}");
+    let (alike, gains) = found(&|_, _, value| value);
+    assert_eq!(alike.decides(VIEWS), Some(false), "{alike:?}");
+    assert!(gains.iter().flatten().all(|gain| (gain - 1.0).abs() < 1e-6), "{gains:?}");
+    // Each square has a factor of its own in each view.
+    let (noise, _) = found(&|view, square, value| {
+        value * (0.6 + 0.1 * ((view * 31 + square * 17 + view * square * 7) % 9) as f32)
+    });
+    assert_eq!(noise.decides(VIEWS), Some(false), "{noise:?}");
+    assert_eq!(differ.decides(2 * VIEWS), None, "of half of the views nothing is known");
+    assert_eq!(ExposureSpread { tracks: 499, ..differ }.decides(VIEWS), None);
+}
+
+#[test]
+fn colours_that_change_with_the_view_ask_for_more() {
+    for (strength, degree) in [(0.0, 0), (2.0, 1), (5.0, 2), (30.0, 3)] {
+        // A tenth of the squares shine in half of the views.
+        let shade = |view: usize, square: usize, value: f32| match square % 10 {
+            0 if view.is_multiple_of(2) => value + strength,
+            _ => value,
+        };
+        let (tracks, views) = scene(shade);
+        let found = Spread { tracks: MIN_TRACKS, ..measured(&tracks, &views).unwrap() };
+        assert_eq!(found.degree(), Some(degree), "{strength}: {found:?}");
+    }
+}
+
+#[test]
+fn what_stands_before_a_point_in_a_quarter_of_its_views_is_left_out() {
+    let hidden = |share: usize| {
+        let (tracks, views) =
+            scene(|view, _, value| if view < share { 255.0 - value } else { value });
+        measured(&tracks, &views).unwrap().twentieth
+    };
+    assert!(hidden(2) < 0.75, "{}", hidden(2));
+    assert!(hidden(4) > 4.0, "{}", hidden(4));
+}
+
+#[test]
+fn points_that_are_not_on_a_surface_decide_nothing() {
+    let (mut tracks, views) = scene(|_, _, value| value);
+    let on = measured(&tracks, &views).unwrap();
+    assert!(on.on_surface > 0.99, "{on:?}");
+    for colour in tracks.colours.iter_mut().step_by(3) {
+        *colour = colour.map(|value| 255 - value);
+    }
+    let some = Spread { tracks: MIN_TRACKS, ..measured(&tracks, &views).unwrap() };
+    assert!(some.degree().is_some(), "{some:?}");
+    let none = Spread { on_surface: 0.49, ..some };
+    assert_eq!(none.degree(), None);
+    assert_eq!(Spread { tracks: MIN_TRACKS - 1, ..some }.degree(), None);
+    assert_eq!(measured(&Tracks::default(), &views).unwrap().degree(), None);
+}
+
+#[test]
+#[ignore = "takes minutes: run by .ci/run"]
+fn built_in_scenes_ask_for_what_their_materials_need() {
+    for (name, degrees) in [("spheres", 0..=0), ("room", 0..=0), ("glossy", 2..=3)] {
+        let options = LoadOptions { tracks: true, ..LoadOptions::default() };
+        let path = format!("{PREFIX}{name}");
+        let loaded = Dataset::load(Path::new(&path), &options).unwrap();
+        let found = measured(&loaded.tracks, &loaded.train).unwrap();
+        let degree = found.degree();
+        assert!(degree.is_some_and(|degree| degrees.contains(&degree)), "{name}: {found:?}");
+    }
+}

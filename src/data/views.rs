@@ -1,0 +1,77 @@
+//! Views by number: the part of a dataset that training and evaluation use.
+
+use std::error::Error;
+
+use crate::dataset::View;
+use crate::dataset::images::ImageCache;
+use densify_core::camera::Camera;
+use densify_core::image::SharedImage;
+
+/// The error of a source of views.
+pub type ViewError = Box<dyn Error + Send + Sync>;
+
+/// Views by number.
+pub trait ViewSource: Send {
+    /// Number of views, >= 1.
+    fn count(&self) -> usize;
+
+    /// Name of a view, for messages.
+    fn name(&self, view: usize) -> &str;
+
+    /// Camera of a view.
+    fn camera(&self, view: usize) -> &Camera;
+
+    /// Pixels of a view, of the camera's size.
+    fn image(&self, view: usize) -> Result<SharedImage, ViewError>;
+
+    /// Announces the next views, soonest first.
+    fn prefetch(&self, upcoming: &[usize]) {
+        let _ = upcoming;
+    }
+
+    /// Announces the views after this one, for whoever takes all in their order.
+    fn prefetch_after(&self, view: usize) {
+        let ahead: Vec<usize> = (view + 1..self.count().min(view + 3)).collect();
+        self.prefetch(&ahead);
+    }
+}
+
+/// Views of a dataset, with a cache of decoded images.
+#[derive(Debug)]
+pub struct DatasetViews {
+    views: Vec<View>,
+    cache: ImageCache,
+}
+
+impl DatasetViews {
+    /// Serves `views` with a cache of about `cache_bytes` of decoded images, which `threads` threads
+    /// fill ahead of use.
+    #[must_use]
+    pub fn new(views: Vec<View>, cache_bytes: u64, threads: usize) -> Self {
+        let sources = views.iter().map(|view| view.source.clone()).collect();
+        let cache = ImageCache::new(sources, cache_bytes, threads);
+        Self { views, cache }
+    }
+}
+
+impl ViewSource for DatasetViews {
+    fn count(&self) -> usize {
+        self.views.len()
+    }
+
+    fn name(&self, view: usize) -> &str {
+        &self.views[view].name
+    }
+
+    fn camera(&self, view: usize) -> &Camera {
+        &self.views[view].camera
+    }
+
+    fn image(&self, view: usize) -> Result<SharedImage, ViewError> {
+        Ok(self.cache.get(view)?)
+    }
+
+    fn prefetch(&self, upcoming: &[usize]) {
+        self.cache.prefetch(upcoming);
+    }
+}

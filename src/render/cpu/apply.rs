@@ -1,0 +1,249 @@
+//! Stage 9: executes a compiled plan in place. The only code that changes the number of rows.
+
+use std::ops::Range;
+
+use densify_policies::plan::{
+    Decay, OPACITY_LEAST, Offspring, OpacityRule, ParentFate, Placement, RowOps, ScaleRule, Seed,
+    UNTURNED,
+};
+use densify_policies::policy::Signal;
+use densify_policies::rng::{PolicyRng, Purpose};
+
+use super::blocks::{Blocks, plane, planes};
+use super::mask::Masks;
+use super::moments::Moments;
+use super::parameters::Parameters;
+use super::signals::Accumulators;
+use super::summed::Summed;
+use super::threads::Threads;
+use densify_core::gaussians::{logit, rgb_to_dc, sigmoid};
+
+/// The buffers that are re-indexed together.
+pub(super) struct Model<'a> {
+    pub(super) params: &'a mut Parameters,
+    pub(super) moments: &'a mut Moments,
+    pub(super) ages: &'a mut Blocks<u16>,
+    pub(super) masks: &'a mut Masks,
+    pub(super) signals: &'a mut Accumulators,
+    pub(super) summed: &'a mut Summed,
+    pub(super) threads: &'a Threads,
+}
+
+/// Executes `ops`; the order and the invariants are those of [`RowOps`].
+pub(super) fn apply(model: &mut Model<'_>, ops: &RowOps, rng: &PolicyRng) {
+    for family in &ops.families {
+        model.breed(family.parent, &ops.offspring(family), ops.children(family), rng);
+    }
+    for &(row, update) in &ops.updates {
+        let row = row as usize;
+        let scales = scales_of(model.params.get_n(row, plane::LOG_SCALE), update.scale);
+        model.params.set_n(row, plane::LOG_SCALE, scales);
+        model.set_opacity(row, update.opacity, 1);
+        if let Some(position) = update.position {
+            model.params.set_n(row, plane::MEAN, position);
+        }
+        if let Some(colour) = update.colour {
+            model.params.set_n(row, plane::SH, colour.map(rgb_to_dc));
+        }
+        if let Some(degree) = update.sh_degree {
+            model.drop_bands(row, degree);
+        }
+        if !update.keep_moments {
+            model.reborn(row);
+        }
+    }
+    for &(row, seed) in &ops.seeds {
+        model.sow(row as usize, &seed);
+    }
+    for &(from, to) in &ops.moves {
+        model.relocate(from as usize, to as usize);
+    }
+    model.reorder(&ops.order());
+    if let Some(decay) = ops.decay {
+        model.decay(decay, ops.first_row..ops.rows_after);
+    }
+    if let Some(most) = ops.clamp_opacity {
+        for row in ops.first_row..ops.rows_after {
+            let clamped = model.params.get(row, plane::OPACITY).min(logit(most));
+            model.params.set(row, plane::OPACITY, clamped);
+            model.moments.forget(row, plane::OPACITY);
+            model.summed.forget(row, plane::OPACITY);
+        }
+    }
+    model.signals.reset(ops.reset_signals, model.threads, ops.rows_after);
+}
+
+impl Model<'_> {
+    /// Writes a parent's children, then the parent itself.
+    fn breed(&mut self, row: u32, offspring: &Offspring, children: &[u32], rng: &PolicyRng) {
+        let parent = row as usize;
+        let mean: [f32; 3] = self.params.get_n(parent, plane::MEAN);
+        let log_scale: [f32; 3] = self.params.get_n(parent, plane::LOG_SCALE);
+        let quat: [f32; 4] = self.params.get_n(parent, plane::QUAT);
+        let scales = scales_of(log_scale, offspring.scale);
+        let turned = turned(quat, offspring.turn);
+        let siblings = offspring.siblings();
+        let stand = |child: u32| -> [f32; 3] {
+            let offset = match offspring.placement {
+                Placement::Offset(_) if child == 0 => [0.0; 3],
+                Placement::Offset(offset) => offset,
+                Placement::Sampled => {
+                    let xi = rng.normal3(row, Purpose::Place, child);
+                    let local = [0, 1, 2].map(|i| log_scale[i].exp() * xi[i]);
+                    rotate(quat, local)
+                }
+                Placement::LongAxis { sigmas } => {
+                    let long = longest(log_scale);
+                    let mut local = [0.0; 3];
+                    let sign = if child.is_multiple_of(2) { 1.0 } else { -1.0 };
+                    local[long] = sign * sigmas * log_scale[long].exp();
+                    rotate(quat, local)
+                }
+                Placement::Axes(sigmas) => {
+                    let sign = if child.is_multiple_of(2) { 1.0 } else { -1.0 };
+                    rotate(quat, [0, 1, 2].map(|i| sign * sigmas[i] * log_scale[i].exp()))
+                }
+            };
+            [0, 1, 2].map(|i| mean[i] + offset[i])
+        };
+        for (i, &slot) in children.iter().enumerate() {
+            let slot = slot as usize;
+            self.params.copy_row(parent, slot);
+            self.masks.inherit(parent, slot);
+            self.params.set_n(slot, plane::MEAN, stand(i as u32 + 1));
+            self.params.set_n(slot, plane::LOG_SCALE, scales);
+            self.params.set_n(slot, plane::QUAT, turned);
+            self.set_opacity(slot, offspring.opacity, siblings);
+            self.reborn(slot);
+        }
+        if offspring.parent == ParentFate::BecomesChild {
+            self.params.set_n(parent, plane::MEAN, stand(0));
+            self.params.set_n(parent, plane::LOG_SCALE, scales);
+            self.params.set_n(parent, plane::QUAT, turned);
+            self.set_opacity(parent, offspring.opacity, siblings);
+            self.reborn(parent);
+        }
+    }
+
+    fn sow(&mut self, row: usize, seed: &Seed) {
+        self.params.clear_row(row);
+        self.masks.clear_row(row);
+        self.params.set_n(row, plane::MEAN, seed.position);
+        self.params.set_n(row, plane::LOG_SCALE, seed.scales.map(f32::ln));
+        self.params.set_n(row, plane::QUAT, turned(UNTURNED, seed.orientation));
+        self.params.set(row, plane::OPACITY, logit(seed.opacity));
+        self.params.set_n(row, plane::SH, seed.colour.map(rgb_to_dc));
+        self.reborn(row);
+    }
+
+    fn set_opacity(&mut self, row: usize, rule: OpacityRule, siblings: u32) {
+        let was = self.params.get(row, plane::OPACITY);
+        let opacity = sigmoid(was);
+        let logit = match rule {
+            OpacityRule::Same => was,
+            OpacityRule::Set(o) => logit(o),
+            OpacityRule::Scaled(factor) => logit(opacity * factor),
+            // 1 − o from the logit, so that it does not round to 0.
+            OpacityRule::Conserved => logit(1.0 - sigmoid(-was).powf(1.0 / siblings.max(1) as f32)),
+        };
+        self.params.set(row, plane::OPACITY, logit);
+    }
+
+    /// No colour beyond a degree, nor moments of it.
+    fn drop_bands(&mut self, row: usize, degree: u8) {
+        for plane in planes(degree)..self.params.planes() {
+            self.params.set(row, plane, 0.0);
+            self.moments.forget(row, plane);
+            self.summed.forget(row, plane);
+        }
+    }
+
+    fn decay(&mut self, decay: Decay, rows: Range<usize>) {
+        let seen = self.signals.planes().current(Signal::VisibleCount);
+        let shrunk = (1.0 - decay.scale).ln();
+        for row in rows {
+            let was_seen = seen.is_some_and(|plane| self.signals.blocks.get(row, plane) > 0.0);
+            if decay.seen_only && !was_seen {
+                continue;
+            }
+            let was = self.params.get(row, plane::OPACITY);
+            // What is not finite is left to the audit, and no loss must not change a bit.
+            if decay.opacity > 0.0 && was.is_finite() {
+                let opacity = sigmoid(was);
+                let left = (opacity - decay.opacity).max(OPACITY_LEAST);
+                // 1 − o from the logit, so that nothing cancels.
+                let off = sigmoid(-was) + (opacity - left);
+                self.params.set(row, plane::OPACITY, was.min((left / off).ln()));
+            }
+            if decay.scale > 0.0 {
+                let scales = self.params.get_n::<3>(row, plane::LOG_SCALE).map(|x| x + shrunk);
+                self.params.set_n(row, plane::LOG_SCALE, scales);
+            }
+        }
+    }
+
+    /// Zero moments, age 0, no past.
+    fn reborn(&mut self, row: usize) {
+        self.moments.clear_row(row);
+        self.masks.forget(row);
+        self.ages.clear_row(row);
+        self.signals.blocks.clear_row(row);
+        self.summed.clear_row(row);
+    }
+
+    fn relocate(&mut self, from: usize, to: usize) {
+        self.params.copy_row(from, to);
+        self.moments.copy_row(from, to);
+        self.masks.copy_row(from, to);
+        self.ages.copy_row(from, to);
+        self.signals.blocks.copy_row(from, to);
+        self.summed.copy_row(from, to);
+    }
+
+    fn reorder(&mut self, order: &[u32]) {
+        self.params.reorder(order);
+        self.moments.reorder(order);
+        self.masks.reorder(order);
+        self.ages.reorder(order);
+        self.signals.blocks.reorder(order);
+        self.summed.reorder(order);
+    }
+}
+
+fn longest(log_scale: [f32; 3]) -> usize {
+    (1..3).fold(0, |best, i| if log_scale[i] > log_scale[best] { i } else { best })
+}
+
+fn scales_of(log_scale: [f32; 3], rule: ScaleRule) -> [f32; 3] {
+    match rule {
+        // A factor of 1 must not change a bit.
+        ScaleRule::Uniform(factor) => log_scale.map(|x| x + factor.ln()),
+        ScaleRule::LongAxis { long, other } => {
+            let longest = longest(log_scale);
+            let mut scales = log_scale.map(|x| x + other.ln());
+            scales[longest] = log_scale[longest] + long.ln();
+            scales
+        }
+        ScaleRule::Axes(factors) => [0, 1, 2].map(|i| log_scale[i] + factors[i].ln()),
+        ScaleRule::Set(scale) => [scale.ln(); 3],
+    }
+}
+
+fn quaternion([w, x, y, z]: [f32; 4]) -> glam::Quat {
+    glam::Quat::from_xyzw(x, y, z, w)
+}
+
+/// The orientation that is turned about its own axes; it keeps its length.
+fn turned(quat: [f32; 4], turn: [f32; 4]) -> [f32; 4] {
+    // No turn must not change a bit.
+    if turn.map(f32::to_bits) == UNTURNED.map(f32::to_bits) {
+        return quat;
+    }
+    let [x, y, z, w] = (quaternion(quat) * quaternion(turn).normalize()).to_array();
+    [w, x, y, z]
+}
+
+/// R(q)·v for a quaternion (w, x, y, z) of any length but 0.
+fn rotate(quat: [f32; 4], v: [f32; 3]) -> [f32; 3] {
+    (quaternion(quat).normalize() * glam::Vec3::from(v)).to_array()
+}

@@ -1,0 +1,56 @@
+//! Finds rows with a number that is not finite; see [`audit`](crate::audit).
+
+use super::blocks::{Scratch, planes};
+use super::simd::WIDTH;
+use super::{BLOCKS_PER_TASK, CpuBackend};
+use crate::{Attribute, Kept, Unsound};
+
+impl CpuBackend {
+    /// The rows with a number that is not finite, in order.
+    pub(super) fn unsound(&self) -> Vec<Unsound> {
+        let rows = self.rows;
+        let first_block = self.moments.first() / WIDTH;
+        let (params, moments) = (self.params.view(rows), self.moments.view(rows));
+        let planes = planes(self.sh_degree);
+        let find = |row: usize| {
+            let first = |get: &dyn Fn(usize) -> f32, kept| {
+                let number = (0..planes).position(|plane| !get(plane).is_finite())?;
+                Some(Unsound { row: row as u32, attribute: Attribute::of(number), kept })
+            };
+            let moment = |which: usize| {
+                let of_row = |plane| self.moments.get(row, plane)[which];
+                (row >= self.moments.first()).then(|| first(&of_row, Kept::Moment))?
+            };
+            first(&|plane| self.params.get(row, plane), Kept::Parameter)
+                .or_else(|| moment(0))
+                .or_else(|| moment(1))
+        };
+        let blocks = rows.div_ceil(WIDTH);
+        let is_suspect = |block: usize| {
+            let mut scratch = [Scratch::ZERO; 2];
+            let have_unsound = |block: usize, scratch| {
+                !moments.open(block, planes, scratch).into_iter().all(is_sound)
+            };
+            !is_sound(params.open(block, planes, &mut scratch[0]))
+                || block.checked_sub(first_block).is_some_and(|it| have_unsound(it, &mut scratch))
+        };
+        let of_task = |task: usize| -> Vec<Unsound> {
+            let blocks = task * BLOCKS_PER_TASK..blocks.min((task + 1) * BLOCKS_PER_TASK);
+            let suspects = blocks.filter(|&block| is_suspect(block));
+            suspects.flat_map(|b| b * WIDTH..rows.min((b + 1) * WIDTH)).filter_map(find).collect()
+        };
+        let tasks = 0..blocks.div_ceil(BLOCKS_PER_TASK);
+        let found = self.threads.install(|| self.threads.collect("audit", tasks, of_task));
+        found.into_iter().flatten().collect()
+    }
+}
+
+/// Whether all numbers of some planes are finite.
+fn is_sound(numbers: &[f32]) -> bool {
+    // 0 · x is 0 but for NaN and infinity; sixteen sums go side by side.
+    let mut sums = [0.0_f32; WIDTH];
+    for numbers in numbers.chunks_exact(WIDTH) {
+        sums.iter_mut().zip(numbers).for_each(|(sum, x)| *sum += 0.0 * x);
+    }
+    sums.iter().all(|&sum| sum == 0.0)
+}

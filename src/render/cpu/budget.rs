@@ -1,0 +1,214 @@
+//! The memory of the native backend: bytes per buffer, and the reservation before training.
+
+use std::ops::Range;
+
+use super::ROWS_PER_TASK;
+use super::adam::BiasCorrection;
+use super::blocks::{Blocks, planes};
+use super::loss::LossBuffers;
+use super::mask::Masks;
+use super::moments::Moments;
+use super::observe;
+use super::parameters::Parameters;
+use super::project::Splat;
+use super::rasterize::TileCanvas;
+use super::rasterize_bwd::{Blended, TileGradient};
+use super::signals::Accumulators;
+use super::simd::WIDTH;
+use super::summed::Summed;
+use super::tiles::{Grid, TileLists};
+use crate::candidates::Candidates;
+use crate::signals::{Field, counts_dominant};
+use crate::{BackendError, Setup};
+use densify_core::memory::{Ledger, Section};
+
+/// A single tile's list holds each row at most once, so that the budget is always enough.
+pub(super) fn tile_cap(options: &Setup) -> usize {
+    let cap = options.tile_cap.unwrap_or(options.budget.saturating_mul(16));
+    cap.max(options.budget).max(1).min(u32::MAX as usize)
+}
+
+/// As many as there are entries, at most.
+pub(super) fn record_cap(options: &Setup) -> usize {
+    if options.only_renders { 1 } else { options.record_cap.clamp(1, tile_cap(options)) }
+}
+
+/// The rows that may be trained, from a whole task on: those before them are frozen, and have nothing but what
+/// rendering needs.
+pub(super) fn trained(options: &Setup) -> Range<usize> {
+    match options.only_renders {
+        true => 0..0,
+        false => {
+            let budget = options.budget.max(1);
+            options.frozen.min(budget) / ROWS_PER_TASK * ROWS_PER_TASK..budget
+        }
+    }
+}
+
+/// Rows for which there is room where gradients of splats are summed in a step, frozen or not.
+pub(super) fn summed_rows(options: &Setup) -> usize {
+    if options.only_renders { 0 } else { options.budget.max(1).next_multiple_of(WIDTH) }
+}
+
+/// Bytes per buffer for these options.
+pub(super) fn ledger(sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
+    let budget = options.budget.max(1);
+    let cap = tile_cap(options) as u64;
+    let needs = &options.needs;
+    let signals = Accumulators::new(0..1, needs);
+    let stride = signals.layout().stride();
+    let per_row = planes(sh_degree);
+    let padded = budget.next_multiple_of(WIDTH) as u64;
+    let trained = trained(options);
+    let (width, height) = options.largest_image;
+    let grid = Grid::new(width, height);
+    let float = size_of::<f32>() as u64;
+    let mut ledger = Ledger::default();
+    let parameters = Parameters::bytes(budget, per_row, options.storage.parameters);
+    ledger.add_to(Section::Model, "parameters", parameters);
+    let moments = Moments::bytes(trained.clone(), per_row, options.storage.moments);
+    ledger.add_to(Section::Model, "optimiser moments", moments);
+    ledger.add_to(
+        Section::Model,
+        "optimiser ages and bias tables",
+        Blocks::<u16>::bytes(trained.clone(), 1) + BiasCorrection::bytes(),
+    );
+    if Summed::is_wanted(needs.cadence) {
+        let bytes = Summed::bytes(trained.clone(), per_row, needs.cadence);
+        ledger.add_to(Section::Gradients, "gradients summed between steps", bytes);
+    }
+    if let Some(request) = &needs.aux {
+        let bytes = observe::bytes(request, grid.width * grid.height);
+        ledger.add_to(Section::Policy, "auxiliary views", bytes);
+    }
+    ledger.add_to(Section::Policy, "signals", Accumulators::bytes(trained.clone(), needs));
+    if needs.mask.is_some() {
+        ledger.add_to(Section::Policy, "masks", Masks::bytes(trained));
+    }
+    if counts_dominant(needs) {
+        ledger.add_to(Section::Policy, "dominated pixels", 4 * budget as u64);
+    }
+    ledger.add_to(
+        Section::Policy,
+        "candidates",
+        Candidates::bytes(needs.candidates, grid.width * grid.height),
+    );
+    ledger.add_to(
+        Section::Renderer,
+        "projected splats",
+        budget as u64 * size_of::<Splat>() as u64 + padded / WIDTH as u64 * 2,
+    );
+    let sums = (summed_rows(options) * signals.sums()) as u64 * float;
+    ledger.add_to(Section::Gradients, "splat gradients, signals at events", sums);
+    ledger.add_to(Section::Tiles, "entries", TileLists::bytes(budget, cap as usize, grid.tiles()));
+    let records = record_cap(options) as u64 * stride as u64 * float;
+    ledger.add_to(Section::Tiles, "gradients per entry", records);
+    let by_pixel = signals.layout().has(Field::Error).then_some(needs.error_score);
+    let loss = LossBuffers::bytes(grid.width, grid.height, threads, by_pixel);
+    let per_tile = size_of::<TileCanvas>() + size_of::<TileGradient>();
+    ledger.add_to(Section::Renderer, "image and image gradient", (grid.tiles() * per_tile) as u64);
+    let of_threads = loss + (threads * size_of::<Blended>()) as u64;
+    let what = format!("loss and backward pass, for up to {threads} threads");
+    ledger.add_to(Section::Renderer, what, of_threads);
+    ledger
+}
+
+/// Asks for all of the ledger at once and gives it back, so that a refusal is an error before
+/// training and not an abort within it.
+pub(super) fn reserve(ledger: &Ledger) -> Result<(), BackendError> {
+    let bytes = ledger.total();
+    let failed = BackendError::OutOfMemory { what: "the training buffers", bytes };
+    let Ok(size) = usize::try_from(bytes) else {
+        return Err(failed);
+    };
+    Vec::<u8>::new().try_reserve_exact(size).map_err(|_| failed)
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::{DMat3, DVec3};
+
+    use super::*;
+    use crate::cpu::CpuBackend;
+    use crate::{Backend, MomentStorage, ParameterStorage, Storage};
+    use densify_core::camera::Camera;
+    use densify_core::gaussians::Gaussians;
+
+    #[test]
+    fn what_is_allocated_is_what_the_ledger_says() {
+        let formats = [
+            (ParameterStorage::F32, MomentStorage::F32, 59 * 4, 2 * 59 * 4),
+            (ParameterStorage::F16, MomentStorage::Both8, 3 * 4 + 56 * 2, 2 * 59),
+        ];
+        for (parameters, moments, of_parameters, of_moments) in formats {
+            let options = Setup {
+                storage: Storage { parameters, moments },
+                tile_cap: Some(300),
+                record_cap: 70,
+                threads: Some(1),
+                ..Setup::new(110)
+            };
+            let model = Gaussians { sh_degree: 3, ..Gaussians::default() };
+            let backend = CpuBackend::new(&model, &options).unwrap();
+            let line = |what: &str| {
+                let line = backend.ledger.lines.iter().find(|line| line.what == what);
+                line.map(|line| line.bytes)
+            };
+            // 110 rows are seven blocks of sixteen.
+            assert_eq!(line("parameters"), Some(112 * of_parameters), "{parameters:?}");
+            assert_eq!(line("optimiser moments"), Some(112 * of_moments), "{moments:?}");
+            assert_eq!(line("gradients per entry"), Some(70 * 9 * 4));
+            let CpuBackend { params, moments, records, sums, splats, visible, .. } = &backend;
+            assert_eq!(line("parameters"), Some(params.held()));
+            assert_eq!(line("optimiser moments"), Some(moments.held()));
+            let bytes = |of: usize| Some(of as u64);
+            assert_eq!(line("gradients per entry"), bytes(size_of_val(&records[..])));
+            assert_eq!(line("splat gradients, signals at events"), bytes(size_of_val(&sums[..])));
+            let seen = size_of_val(&visible[..]);
+            assert_eq!(line("projected splats"), bytes(size_of_val(&splats[..]) + seen));
+        }
+    }
+
+    #[test]
+    fn what_only_renders_has_no_room_for_training_and_draws_the_same() {
+        let model = Gaussians {
+            sh_degree: 0,
+            means: vec![[0.0, 0.1, 2.0], [0.3, 0.0, 3.0]],
+            log_scales: vec![[-1.5; 3]; 2],
+            quats: vec![[1.0, 0.0, 0.0, 0.0]; 2],
+            opacity_logits: vec![2.0; 2],
+            sh: vec![0.5, 0.1, -0.4, -0.2, 0.9, 0.3],
+        };
+        let camera = Camera::centred((40, 30), (30.0, 30.0), DMat3::IDENTITY, DVec3::ZERO);
+        let made = [false, true].map(|only_renders| {
+            let options = Setup { only_renders, threads: Some(1), ..Setup::new(2) };
+            let mut backend = CpuBackend::new(&model, &options).unwrap();
+            let bytes = backend.moments.held() as usize
+                + backend.ages.held() as usize
+                + size_of_val(&backend.sums[..])
+                + size_of_val(&backend.records[..]);
+            (bytes, backend.ledger.total(), backend.render(&camera, [0.1; 3], 0).unwrap())
+        });
+        let [(trains, promised, expected), (bytes, less, found)] = made;
+        assert!(bytes < 64 && trains - bytes == (promised - less) as usize, "{bytes} of {trains}");
+        assert!(found == expected);
+    }
+
+    /// Around 2³¹ and 2³² rows, and as many as a slot can name and more.
+    #[test]
+    fn huge_budgets_are_refused_and_do_not_wrap() {
+        let model = Gaussians { sh_degree: 3, ..Gaussians::default() };
+        for budget in [1 << 31, (1_usize << 32) - 1, 1 << 32, 1 << 40] {
+            let options = Setup { threads: Some(1), ..Setup::new(budget) };
+            let ledger = ledger(3, &options, 1);
+            // Parameters and moments: 59 numbers of four bytes, three times.
+            let model_bytes = 3 * 59 * 4 * budget as u128;
+            assert!(u128::from(ledger.total()) >= model_bytes, "{budget} rows");
+            assert!(tile_cap(&options) <= u32::MAX as usize, "a slot is a u32");
+        }
+        // More than there are addresses for: refused before anything is allocated.
+        let options = Setup { threads: Some(1), ..Setup::new(1 << 40) };
+        let refused = CpuBackend::new(&model, &options).expect_err("a petabyte");
+        assert!(matches!(refused, BackendError::OutOfMemory { .. }), "{refused}");
+    }
+}

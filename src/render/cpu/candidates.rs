@@ -1,0 +1,165 @@
+//! The surface points of a view's worst pixels, which are candidates for new rows (*Gaussians on a
+//! Diet*, arXiv 2604.20046, "compensation").
+//!
+//! Only the chosen pixels are looked at again: each walks its tile's list once more, in plain
+//! scalar code, to find the Gaussian that stands for its surface. That is a few thousand
+//! operations per step, where a per-pixel record of the whole image would burden every pixel.
+
+use std::sync::atomic::AtomicU64;
+
+use densify_policies::policy::DepthMode;
+use glam::{Quat, Vec3};
+use rayon::prelude::*;
+
+use super::blocks::plane;
+use super::parameters::Parameters;
+use super::project::{Splat, ViewParams};
+use super::rasterize::ALPHA_MAX;
+use super::threads::Threads;
+use super::tiles::Entry;
+use crate::Shortcuts;
+use crate::candidates::{Ranked, keep_worst};
+
+/// Image rows that one task ranks.
+const LINES: usize = 2;
+/// Lists that one task makes into one.
+const LISTS: usize = 8;
+
+/// Writes the `most` worst pixels of an image to the head of `ranking`, in any order; returns how many
+/// they are. Each task keeps its own worst, and these are joined until one list is left.
+pub(super) fn rank(
+    threads: &Threads,
+    ranking: &mut Vec<Ranked>,
+    [width, height]: [usize; 2],
+    most: usize,
+    error: impl Fn(usize, usize) -> Option<f32> + Send + Sync,
+) -> usize {
+    let pixels = width * height;
+    if ranking.len() < pixels {
+        ranking.resize(pixels, (0.0, 0));
+    }
+    let ranking = &mut ranking[..pixels];
+    let mut part = LINES * width.max(1);
+    let tasks = ranking.par_chunks_mut(part).enumerate();
+    let mut kept = threads.collect("rank", tasks, |(task, ranking)| {
+        let mut found = 0;
+        for at in 0..ranking.len() {
+            let (x, y) = (at % width, task * LINES + at / width);
+            if let Some(error) = error(x, y).filter(|&error| error > 0.0) {
+                ranking[found] = (error, (y * width + x) as u32);
+                found += 1;
+            }
+        }
+        keep_worst(&mut ranking[..found], most)
+    });
+    while kept.len() > 1 {
+        let tasks = ranking.par_chunks_mut(LISTS * part).zip(kept.par_chunks(LISTS));
+        kept = threads.collect("rank", tasks, |(ranking, kept)| {
+            let mut found = 0;
+            for (i, &kept) in kept.iter().enumerate() {
+                ranking.copy_within(i * part..i * part + kept, found);
+                found += kept;
+            }
+            keep_worst(&mut ranking[..found], most)
+        });
+        part *= LISTS;
+    }
+    kept.first().copied().unwrap_or(0)
+}
+
+/// The row that stands for the surface at pixel centre `at`: the one with the largest blend weight
+/// or the one at which half the light is gone.
+pub(super) fn surface_row(
+    splats: &[Splat],
+    list: &[AtomicU64],
+    at: [f32; 2],
+    shortcuts: Shortcuts,
+    mode: DepthMode,
+) -> Option<usize> {
+    let mut light = 1.0_f32;
+    let mut best = None;
+    let mut most = 0.0;
+    for entry in list {
+        let row = Entry::load(entry).row;
+        let splat = &splats[row];
+        let (dx, dy) = (at[0] - splat.mean[0], at[1] - splat.mean[1]);
+        let u = splat.l1 * (dx - splat.shear * dy);
+        let z = splat.l3 * dy;
+        let alpha = (splat.log2_opacity - u * u - z * z).exp2().min(ALPHA_MAX);
+        if alpha.is_nan() || alpha < shortcuts.alpha_min {
+            continue;
+        }
+        let weight = alpha * light;
+        light -= weight;
+        match mode {
+            DepthMode::MaxWeight if weight > most => (most, best) = (weight, Some(row)),
+            DepthMode::Median if light < 0.5 => return Some(row),
+            _ => {}
+        }
+        if light <= shortcuts.transmittance_min {
+            break;
+        }
+    }
+    best
+}
+
+/// Where the ray through pixel centre `at` comes closest to the Gaussian of `row`, in its
+/// Mahalanobis metric, with the depth there. `None` where that is not in front of `near`.
+pub(super) fn closest_approach(
+    params: &Parameters,
+    row: usize,
+    view: &ViewParams,
+    at: [f32; 2],
+) -> Option<(Vec3, f32)> {
+    let r = view.rotation.map(Vec3::from);
+    let x = (at[0] - view.principal[0]) / view.focal[0];
+    let y = (at[1] - view.principal[1]) / view.focal[1];
+    // Camera z along this vector is 1, so that the parameter of the ray is the depth.
+    let ray = r[0] * x + r[1] * y + r[2];
+    let centre = Vec3::from(view.centre);
+    let mean = Vec3::from(params.get_n::<3>(row, plane::MEAN));
+    let scale = Vec3::from(params.get_n::<3>(row, plane::LOG_SCALE).map(f32::exp));
+    let [qw, qx, qy, qz] = params.get_n::<4>(row, plane::QUAT);
+    let turn = Quat::from_xyzw(qx, qy, qz, qw).normalize().inverse();
+    let direction = turn * ray / scale;
+    let offset = turn * (centre - mean) / scale;
+    let depth = -direction.dot(offset) / direction.length_squared();
+    (depth.is_finite() && depth > view.near).then(|| (centre + ray * depth, depth))
+}
+
+#[cfg(test)]
+mod tests {
+    use densify_policies::policy::{CandidateRequest, ErrorMode};
+
+    use super::*;
+    use crate::candidates::Candidates;
+
+    /// Of images of one line, of a few tasks, and of several rounds; with equal errors.
+    #[test]
+    fn the_worst_are_those_of_a_list_of_all() {
+        let threads = Threads::new(Some(2)).expect("threads");
+        let request = CandidateRequest {
+            from: 0,
+            until: 1,
+            rows_per_candidate: 1,
+            capacity: 1,
+            error: ErrorMode::L1,
+            depth: DepthMode::Median,
+            min_alpha: 0.0,
+            spaced: true,
+        };
+        for size in [[7, 1], [5, 6], [31, 150]] {
+            let error = |x: usize, y: usize| {
+                let hash = (x * 31 + y * 57) * 7919 % 97;
+                (hash != 5).then_some(hash as f32 - 10.0)
+            };
+            for (count, spaced) in [(1, true), (3, false), (40, true), (9999, false)] {
+                let [mut all, mut some] = [(); 2].map(|()| Candidates::new(Some(request)));
+                let rank = |ranking: &mut Vec<_>, most| rank(&threads, ranking, size, most, error);
+                let expected = all.worst(size[0], size[1], count, spaced, error);
+                assert!(!expected.is_empty());
+                assert_eq!(some.worst_by(size, count, spaced, rank, error), expected);
+            }
+        }
+    }
+}

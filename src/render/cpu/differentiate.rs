@@ -1,0 +1,81 @@
+//! Gradients and losses on their own: tools for tests and for research, not part of training.
+
+use super::loss::ImageTerms;
+use super::optimise::Differentiate;
+use super::rasterize::{Beside, DARK};
+use super::tiles::Grid;
+use super::{CpuBackend, ModelGradient, for_each_pixel, scalars};
+use crate::signals::RecordLayout;
+use crate::{BackendError, Differentiable, ImageGradient, Rendering, StepOutput};
+use densify_core::camera::Camera;
+use densify_core::image::Image8;
+
+impl Differentiable for CpuBackend {
+    fn differentiate(
+        &mut self,
+        camera: &Camera,
+        background: [f32; 3],
+        sh_degree: u8,
+        upstream: &ImageGradient,
+    ) -> Result<(Rendering, ModelGradient), BackendError> {
+        upstream.assert_size(camera);
+        let records = self.record_cap * RecordLayout::MOST;
+        if self.records.len() < records {
+            self.records = bytemuck::zeroed_vec(records);
+        }
+        let frame = self.forward(camera, background, sh_degree, Beside::Depth)?;
+        let rendering = self.rendering(&frame);
+        for (tile, gradient) in self.gradient[..frame.grid.tiles()].iter_mut().enumerate() {
+            gradient.planes = [DARK; 5];
+            for_each_pixel(&frame.grid, tile, |patch, lane, at| {
+                for channel in 0..3 {
+                    gradient.planes[channel][patch][lane] = upstream.rgb[3 * at + channel];
+                }
+                gradient.planes[3][patch][lane] = upstream.alpha[at];
+                gradient.planes[4][patch][lane] = upstream.depth[at];
+            });
+        }
+        self.backward(&frame, RecordLayout::ALL);
+        let mut gradient = ModelGradient::zeros(self.rows, self.sh_degree);
+        self.arch.dispatch(Differentiate {
+            params: self.params.view(self.rows),
+            sums: &self.sums,
+            visible: &self.visible,
+            view: &frame.view,
+            out: &mut gradient,
+        });
+        Ok((rendering, gradient))
+    }
+
+    fn loss(
+        &mut self,
+        rendering: &Rendering,
+        target: &Image8,
+        background: [f32; 3],
+    ) -> Result<(StepOutput, Vec<f32>), BackendError> {
+        let grid = Grid::new(rendering.width, rendering.height);
+        assert_eq!(
+            grid,
+            Grid::new(target.width, target.height),
+            "rendering and target differ in size"
+        );
+        self.resize_images(&grid);
+        for (tile, canvas) in self.canvas[..grid.tiles()].iter_mut().enumerate() {
+            for_each_pixel(&grid, tile, |patch, lane, at| {
+                for channel in 0..3 {
+                    canvas.planes[channel][patch][lane] = rendering.rgb[3 * at + channel];
+                }
+            });
+        }
+        let value = self.image_loss(&grid, target, background, ImageTerms::default());
+        let mut gradient = vec![0.0; rendering.rgb.len()];
+        for (tile, from) in self.gradient[..grid.tiles()].iter().enumerate() {
+            for_each_pixel(&grid, tile, |patch, lane, at| {
+                for channel in 0..3 {
+                    gradient[3 * at + channel] = from.planes[channel][patch][lane];
+                }
+            });
+        }
+        Ok((scalars(value), gradient))
+    }
+}

@@ -1,0 +1,557 @@
+//! Stage 4: the image loss 0.8·L1 + 0.2·(1 − SSIM) and its gradient (Kerbl et al. 2023, section 5.1;
+//! SSIM of Wang et al. 2004 with an 11×11 Gaussian window of σ = 1.5 and zero padding).
+//!
+//! SSIM is written in terms of the difference e = x − y, by an exact identity:
+//! SSIM = (1 − μₑ²/A)·(1 − Var(e)/B), A = μₓ² + μᵧ² + C₁, B = Var(x) + Var(y) + C₂.
+//! Where the images agree it is 1 to the last bit; the usual form is off by up to 4e-7 there, and
+//! its gradient is noise. The identity holds for any linear window, also where zero padding takes
+//! part of the window's weight. Var(x) + Var(y) is 2·Cov(x, y) + Var(e), so that four means under the
+//! window are enough: of e, y, e² and x·y.
+//!
+//! Variances do not change when a constant is taken from y, if it is taken from the padding, too. With
+//! y − ½ they lose two bits less to rounding.
+//!
+//! The file is one piece because the passes share their planes and their strips. Each pass runs over
+//! strips of rows, which write nothing that others of the same pass read. Rows of the image are
+//! convolved vertically straight from the planes, into a few lines that stay in the cache, and these
+//! horizontally: nothing is computed twice, however the image is cut. How the pixels of a line are arranged
+//! for that, [`Segments`] says.
+
+mod pixel_weights;
+mod window;
+
+use densify_policies::policy::ErrorScore;
+use pulp::{Arch, Simd, WithSimd};
+use rayon::prelude::*;
+
+use super::blocks::parts;
+use super::rasterize::{DARK, TileCanvas, copy_row_of_plane, set_row_of_plane};
+use super::rasterize_bwd::TileGradient;
+use super::simd::{V, WIDTH, each};
+use super::threads::Threads;
+use super::tiles::{Grid, TILE};
+use densify_core::image::Image8;
+use pixel_weights::PixelWeights;
+use window::{
+    Line, LinePerRow, Near, Segments, TOGETHER, horizontal, vertical, vertical_with_product,
+    vertical_with_square,
+};
+
+const C1: f32 = 0.01 * 0.01;
+const C2: f32 = 0.03 * 0.03;
+/// Weight of 1 − SSIM; L1 has the rest.
+const SSIM_WEIGHT: f32 = 0.2;
+/// What is taken from y.
+const MIDDLE: f32 = 0.5;
+/// Rows per strip where tiles are written: a row of tiles.
+const STRIP: usize = TILE;
+/// Rows per strip elsewhere.
+const SHORT_STRIP: usize = TOGETHER;
+/// Lines that are convolved vertically for each row: of e, y, e² and x·y.
+const CONVOLVED: usize = 4;
+/// Lines of scratch of a pass, at most: those, and what is outside the image of e and of y.
+const MOST_LINES: usize = CONVOLVED * TOGETHER + 2;
+
+/// Planes of image size that the loss keeps between its passes: e, y − ½, and three derivatives.
+#[derive(Debug)]
+pub(super) struct LossBuffers {
+    /// Shape: `[rows, pitch]` each.
+    planes: [Vec<[f32; WIDTH]>; 5],
+    /// Errors per pixel, the mean over channels, if asked for. Same shape.
+    errors: [Vec<[f32; WIDTH]>; 2],
+    segments: Segments,
+    weights: PixelWeights,
+}
+
+/// What of a loss is asked for.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct ImageTerms {
+    /// Weights of |e| and of 1 − SSIM in the error of each pixel, if that is asked for.
+    pub(super) error: Option<[f32; 2]>,
+    /// Whether an error of each pixel goes to the last plane of the gradient, weighed like this.
+    pub(super) by_pixel: Option<ErrorScore>,
+}
+
+/// The scalars of a loss.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct LossValue {
+    pub(super) l1: f64,
+    pub(super) ssim: f64,
+}
+
+impl LossValue {
+    pub(super) fn loss(self) -> f64 {
+        (1.0 - f64::from(SSIM_WEIGHT)) * self.l1 + f64::from(SSIM_WEIGHT) * (1.0 - self.ssim)
+    }
+}
+
+impl LossBuffers {
+    /// Bytes for an image of this size, and for the strips of so many threads.
+    pub(super) fn bytes(
+        width: usize,
+        height: usize,
+        threads: usize,
+        by_pixel: Option<ErrorScore>,
+    ) -> u64 {
+        let segments = Segments::of(width);
+        let weights = by_pixel.map_or(0, |score| PixelWeights::bytes(width * height, &score));
+        let planes = (6 + usize::from(by_pixel.is_some())) * segments.pitch() * WIDTH * height;
+        let lines = threads * MOST_LINES * segments.padded() * WIDTH;
+        ((planes + lines) * size_of::<f32>()) as u64 + weights
+    }
+
+    pub(super) fn new() -> Self {
+        Self {
+            planes: Default::default(),
+            errors: Default::default(),
+            segments: Segments::of(0),
+            weights: PixelWeights::default(),
+        }
+    }
+
+    /// Makes room for an image; returns the vectors of its planes. Images of one size, or smaller ones,
+    /// allocate nothing more. What is there is left: clearing it would be work for one thread, and all of
+    /// it is written before it is read.
+    fn resize(&mut self, grid: &Grid, asked: [bool; 2]) -> usize {
+        self.segments = Segments::of(grid.width);
+        let vectors = self.segments.pitch() * grid.height;
+        let errors = self.errors.iter_mut().zip(asked).filter_map(|(e, asked)| asked.then_some(e));
+        for plane in self.planes.iter_mut().chain(errors) {
+            if plane.len() < vectors {
+                plane.resize(vectors, [0.0; WIDTH]);
+            }
+        }
+        vectors
+    }
+
+    /// Computes the loss of `canvas` against `target`, and dL/dpixel into `gradient`; with weights
+    /// also the error of each pixel, as the mean over channels of their combination of |e| and
+    /// 1 − SSIM.
+    #[expect(clippy::too_many_arguments, reason = "a kernel: each is a buffer of its own")]
+    pub(super) fn run(
+        &mut self,
+        threads: &Threads,
+        arch: Arch,
+        grid: &Grid,
+        canvas: &[TileCanvas],
+        target: &Image8,
+        background: [f32; 3],
+        gradient: &mut [TileGradient],
+        terms: ImageTerms,
+    ) -> LossValue {
+        let ImageTerms { error: error_weights, by_pixel } = terms;
+        let asked = [error_weights.is_some(), by_pixel.is_some()];
+        let vectors = self.resize(grid, asked);
+        let Self { planes, errors, segments, .. } = self;
+        let segments = *segments;
+        let [e, y, p1, p2, p3] = planes.each_mut().map(|plane| &mut plane[..vectors]);
+        let [ranking, errors_by_pixel] = errors;
+        // Of those that are not asked for, nothing.
+        let ranking = &mut ranking[..if asked[0] { vectors } else { 0 }];
+        let errors_by_pixel = &mut errors_by_pixel[..if asked[1] { vectors } else { 0 }];
+        let by_map = by_pixel.map(|score| score.map.weights());
+        let error_weights = [error_weights, by_map].map(Option::unwrap_or_default);
+        let short = SHORT_STRIP * segments.pitch();
+        let samples = (3 * grid.width * grid.height) as f64;
+        let (mut l1, mut ssim) = (0.0_f64, 0.0_f64);
+        for channel in 0..3 {
+            let source = Source { grid, canvas, target, background, channel };
+            let tasks = (e.par_chunks_mut(short), y.par_chunks_mut(short));
+            let tasks = tasks.into_par_iter().enumerate();
+            threads.each_with("loss lines", tasks, Vec::new, |scratch, (i, (e, y))| {
+                arch.dispatch(Lines { source, segments, first: i * SHORT_STRIP, scratch, e, y });
+            });
+            let strips = grid.height.div_ceil(SHORT_STRIP);
+            let tasks = (
+                p1.par_chunks_mut(short),
+                p2.par_chunks_mut(short),
+                p3.par_chunks_mut(short),
+                parts(ranking, short, strips),
+                parts(errors_by_pixel, short, strips),
+            );
+            let sums = threads.collect_with(
+                "loss similarity",
+                tasks.into_par_iter().enumerate(),
+                Vec::new,
+                |scratch, (i, (p1, p2, p3, ranking, by_pixel))| {
+                    arch.dispatch(Similarity {
+                        width: grid.width,
+                        segments,
+                        first: i * SHORT_STRIP,
+                        scratch,
+                        e,
+                        y,
+                        derivatives: [p1, p2, p3],
+                        errors: [ranking, by_pixel],
+                        first_channel: channel == 0,
+                        error_weights: error_weights.map(|weights| weights.map(|w| w / 3.0)),
+                    })
+                },
+            );
+            for part in sums {
+                l1 += part.l1;
+                ssim += part.ssim;
+            }
+            let tasks = gradient.par_chunks_mut(grid.columns).enumerate();
+            threads.each_with("loss gradient", tasks, Vec::new, |scratch, (i, tiles)| {
+                arch.dispatch(Gradient {
+                    grid,
+                    segments,
+                    channel,
+                    first: i * STRIP,
+                    scratch,
+                    e,
+                    y,
+                    derivatives: [p1, p2, p3],
+                    scale: 1.0 / samples as f32,
+                    mask: target.mask.as_deref(),
+                    tiles,
+                });
+            });
+        }
+        if let Some(score) = by_pixel {
+            self.weights.measure(threads, target, background, &score);
+            self.spread_over_tiles(threads, grid, gradient, &score);
+        }
+        LossValue { l1: l1 / samples, ssim: ssim / samples }
+    }
+
+    /// Writes the second error to the last plane of the gradient, as rows are scored by it.
+    fn spread_over_tiles(
+        &self,
+        threads: &Threads,
+        grid: &Grid,
+        gradient: &mut [TileGradient],
+        score: &ErrorScore,
+    ) {
+        let segments = self.segments;
+        let tasks = gradient.par_chunks_mut(grid.columns).enumerate();
+        let line = || vec![0.0; segments.stride()];
+        threads.each_with("loss by pixel", tasks, line, |pixels, (i, tiles)| {
+            for tile in tiles.iter_mut() {
+                tile.planes[4] = DARK;
+            }
+            for row in 0..TILE.min(grid.height - i * TILE) {
+                let y = i * TILE + row;
+                segments.restore(segments.line(&self.errors[1], y), pixels);
+                self.weights.apply(score, y, &mut pixels[..grid.width]);
+                for (tile, errors) in tiles.iter_mut().zip(pixels.as_chunks::<TILE>().0) {
+                    set_row_of_plane(&mut tile.planes[4], row, errors);
+                }
+            }
+        });
+    }
+
+    /// Error of a pixel after a run with error weights.
+    pub(super) fn error_at(&self, x: usize, y: usize) -> f32 {
+        let [vector, lane] = self.segments.place(x);
+        self.segments.line(&self.errors[0], y)[vector][lane]
+    }
+}
+
+/// Multiplies a line by the weights of a mask's row.
+#[inline(always)]
+fn masked(line: &mut [f32], mask: &[u8]) {
+    for (x, &m) in line.iter_mut().zip(mask) {
+        *x *= f32::from(m) * (1.0 / 255.0);
+    }
+}
+
+/// One channel of rendering and target.
+#[derive(Clone, Copy)]
+struct Source<'a> {
+    grid: &'a Grid,
+    canvas: &'a [TileCanvas],
+    target: &'a Image8,
+    background: [f32; 3],
+    channel: usize,
+}
+
+/// The planes' lines of one strip of one channel: e = rendering − target, 0 where masked, and y − ½ of the
+/// target; right of the image as outside of it.
+struct Lines<'a> {
+    source: Source<'a>,
+    segments: Segments,
+    first: usize,
+    scratch: &'a mut Vec<f32>,
+    /// The strip's lines.
+    e: &'a mut Line,
+    y: &'a mut Line,
+}
+
+impl WithSimd for Lines<'_> {
+    type Output = ();
+
+    /// Plain loops, which the compiler turns into vectors of the dispatched instruction set.
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) {
+        let Self { source, segments, first, scratch, e: to_e, y: to_y } = self;
+        let Source { grid, canvas, target, background, channel } = source;
+        let (width, stride, length) = (grid.width, segments.stride(), segments.length());
+        let pitch = segments.pitch();
+        scratch.resize(2 * stride, 0.0);
+        let (e, y) = scratch.split_at_mut(stride);
+        let lines = to_e.chunks_exact_mut(pitch).zip(to_y.chunks_exact_mut(pitch));
+        for (row, (to_e, to_y)) in (first..).zip(lines) {
+            let pixels = row * width..(row + 1) * width;
+            let bytes = &target.rgb[3 * pixels.start..3 * pixels.end];
+            for (y, rgb) in y.iter_mut().zip(bytes.as_chunks::<3>().0) {
+                *y = f32::from(rgb[channel]) * (1.0 / 255.0);
+            }
+            if let Some(alpha) = &target.alpha {
+                for (y, &a) in y.iter_mut().zip(&alpha[pixels.clone()]) {
+                    let a = f32::from(a) * (1.0 / 255.0);
+                    *y = a * *y + (1.0 - a) * background[channel];
+                }
+            }
+            let tiles = &canvas[row / TILE * grid.columns..][..grid.columns];
+            for (tile, e) in tiles.iter().zip(e.as_chunks_mut::<TILE>().0) {
+                copy_row_of_plane(&tile.planes[channel], row % TILE, e);
+            }
+            for (e, y) in e.iter_mut().zip(&mut *y).take(width) {
+                *e -= *y;
+                *y -= MIDDLE;
+            }
+            e[width..].fill(0.0);
+            y[width..].fill(-MIDDLE);
+            if let Some(mask) = &target.mask {
+                masked(&mut e[..width], &mask[pixels]);
+            }
+            segments.arrange(e, &mut to_e[..length]);
+            segments.arrange(y, &mut to_y[..length]);
+        }
+    }
+}
+
+/// `A` lines of scratch, and `B` padded ones for each of some rows.
+fn scratch_lines<const A: usize, const B: usize>(
+    scratch: &mut Vec<[f32; WIDTH]>,
+    segments: Segments,
+) -> ([&mut Line; A], [LinePerRow<'_>; B]) {
+    let (length, padded) = (segments.length(), segments.padded());
+    scratch.resize(A * length + B * TOGETHER * padded, [0.0; WIDTH]);
+    let (lines, per_row) = scratch.split_at_mut(A * length);
+    let mut lines = lines.chunks_exact_mut(length);
+    let mut per_row = per_row.chunks_exact_mut(padded);
+    let mut next = || per_row.next().unwrap_or_default();
+    (
+        std::array::from_fn(|_| lines.next().unwrap_or_default()),
+        std::array::from_fn(|_| std::array::from_fn(|_| next())),
+    )
+}
+
+/// First pass over one strip of one channel: SSIM and its derivatives by μₑ, E[e²] and E[e·(y − ½)].
+struct Similarity<'a> {
+    width: usize,
+    segments: Segments,
+    first: usize,
+    scratch: &'a mut Vec<[f32; WIDTH]>,
+    e: &'a Line,
+    y: &'a Line,
+    /// The strip's lines.
+    derivatives: [&'a mut Line; 3],
+    /// The strip's lines; empty unless asked for.
+    errors: [&'a mut Line; 2],
+    /// Weights of |e| and of 1 − SSIM in each of them.
+    error_weights: [[f32; 2]; 2],
+    /// Whether errors are written, not added.
+    first_channel: bool,
+}
+
+impl WithSimd for Similarity<'_> {
+    /// Sums over the strip's pixels.
+    type Output = LossValue;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, s: S) -> LossValue {
+        let Self { width, segments, first, scratch, e, y, derivatives, .. } = self;
+        let Self { mut errors, error_weights, first_channel, .. } = self;
+        let [p1, p2, p3] = derivatives;
+        let (length, pitch) = (segments.length(), segments.pitch());
+        let rows = p1.len() / pitch;
+        let ([no_e, no_y], [mut of_e, mut of_y, mut of_ee, mut of_xy]) =
+            scratch_lines::<2, CONVOLVED>(scratch, segments);
+        no_e.fill([0.0; WIDTH]);
+        no_y.fill([-MIDDLE; WIDTH]);
+        let (firsts, width) = (segments.firsts(), V::splat(s, width as f32));
+        let mut total = LossValue::default();
+        for row in 0..rows {
+            if row % TOGETHER == 0 {
+                let near_e = Near::new(segments, e, no_e, first + row);
+                let near_y = Near::new(segments, y, no_y, first + row);
+                // One after the other: all four sums of four rows would not stay in the registers.
+                vertical_with_square(s, &near_e, [&mut of_e, &mut of_ee]);
+                vertical_with_product(s, [&near_y, &near_e], [&mut of_y, &mut of_xy]);
+                for row in 0..TOGETHER {
+                    segments.pad(of_e[row], 0.0);
+                    segments.pad(of_y[row], -MIDDLE);
+                    segments.pad(of_ee[row], 0.0);
+                    segments.pad(of_xy[row], MIDDLE * MIDDLE);
+                }
+            }
+            let n = row % TOGETHER;
+            let lines: [&Line; CONVOLVED] = [of_e[n], of_y[n], of_ee[n], of_xy[n]];
+            let here = row * pitch;
+            let of_row = p1[here..here + length].as_chunks_mut::<2>().0.iter_mut();
+            let of_row = of_row.zip(p2[here..here + length].as_chunks_mut::<2>().0);
+            let of_row = of_row.zip(p3[here..here + length].as_chunks_mut::<2>().0);
+            let of_row = of_row.zip(segments.line(e, first + row).as_chunks::<2>().0);
+            let (mut row_l1, mut row_ssim) = (V::zero(s), V::zero(s));
+            for (pair, (((p1, p2), p3), e)) in of_row.enumerate() {
+                for lane in (0..WIDTH).step_by(S::F32_LANES) {
+                    let [mu_e, mu_y, ee, xy] = each!(k in 4 => {
+                        horizontal::<S, 2, 12>(s, around(lines[k], 2 * pair), lane)
+                    });
+                    for n in 0..2 {
+                        let means = [mu_e[n], mu_y[n], ee[n], xy[n]];
+                        let Similar { ssim, by_mu_e, by_ee, by_ey } = Similar::of(s, means);
+                        let i = 2 * pair + n;
+                        let inside = (V::load(s, &firsts[lane..]) + i as f32).lt(width);
+                        inside.keep(by_mu_e).store(&mut p1[n][lane..]);
+                        inside.keep(by_ee).store(&mut p2[n][lane..]);
+                        inside.keep(by_ey).store(&mut p3[n][lane..]);
+                        let abs = V::load(s, &e[n][lane..]).abs();
+                        let ssim = inside.keep(ssim);
+                        row_l1 = row_l1 + abs;
+                        row_ssim = row_ssim + ssim;
+                        for (error, [by_abs, by_dssim]) in errors.iter_mut().zip(error_weights) {
+                            if let Some(error) = error.get_mut(here + i) {
+                                let dssim = inside.keep(V::splat(s, 1.0) - ssim);
+                                let add = abs * by_abs + dssim * by_dssim;
+                                let sum = match first_channel {
+                                    true => add,
+                                    false => V::load(s, &error[lane..]) + add,
+                                };
+                                sum.store(&mut error[lane..]);
+                            }
+                        }
+                    }
+                }
+            }
+            total.l1 += f64::from(row_l1.sum());
+            total.ssim += f64::from(row_ssim.sum());
+        }
+        total
+    }
+}
+
+/// SSIM of some pixels, and its derivatives by μₑ, E[e²] and E[e·(y − ½)].
+struct Similar<S: Simd> {
+    ssim: V<S>,
+    by_mu_e: V<S>,
+    by_ee: V<S>,
+    by_ey: V<S>,
+}
+
+impl<S: Simd> Similar<S> {
+    /// From μₑ, the mean of y − ½, and those of e² and (x − ½)·(y − ½).
+    #[inline(always)]
+    fn of(s: S, [mu_e, middle, mean_ee, mean_xy]: [V<S>; 4]) -> Self {
+        let c = |x: f32| V::splat(s, x);
+        let mu_y = middle + MIDDLE;
+        let mu_x = mu_e + mu_y;
+        let var_e = (mean_ee - mu_e * mu_e).max(V::zero(s));
+        let cov = mean_xy - (middle + mu_e) * middle;
+        let variances = (cov * 2.0 + var_e).max(V::zero(s));
+        // One division for both inverses: at least C₁·C₂ = 9e-8 is far from f32's least.
+        let (a, b) = (mu_x * mu_x + mu_y * mu_y + C1, variances + C2);
+        let inv_ab = c(1.0) / (a * b);
+        let (inv_a, inv_b) = (inv_ab * b, inv_ab * a);
+        let luminance = c(1.0) - mu_e * mu_e * inv_a;
+        let contrast = c(1.0) - var_e * inv_b;
+        let by_luminance = mu_e * inv_a * -2.0 * (c(1.0) - mu_e * mu_x * inv_a);
+        let two_ve_bb = var_e * inv_b * inv_b * 2.0;
+        let by_contrast = mu_e * contrast * inv_b * 2.0 - middle * two_ve_bb;
+        Self {
+            ssim: luminance * contrast,
+            by_mu_e: contrast * by_luminance + luminance * by_contrast,
+            by_ee: -(luminance * contrast * inv_b),
+            by_ey: luminance * two_ve_bb,
+        }
+    }
+}
+
+/// What the window reaches from some vectors of a padded line, from one on.
+#[inline(always)]
+fn around<const M: usize>(line: &Line, first: usize) -> &[[f32; WIDTH]; M] {
+    line[first..].first_chunk().expect("a padded line")
+}
+
+/// Second pass over one strip of one channel: dL/dpixel.
+struct Gradient<'a> {
+    grid: &'a Grid,
+    segments: Segments,
+    channel: usize,
+    first: usize,
+    scratch: &'a mut Vec<[f32; WIDTH]>,
+    e: &'a Line,
+    y: &'a Line,
+    derivatives: [&'a Line; 3],
+    /// 1 / number of samples.
+    scale: f32,
+    mask: Option<&'a [u8]>,
+    /// The strip's tiles.
+    tiles: &'a mut [TileGradient],
+}
+
+impl WithSimd for Gradient<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, s: S) {
+        let Self { grid, segments, channel, first, scratch, e, y, derivatives, scale, .. } = self;
+        let Self { mask, tiles, .. } = self;
+        let rows = STRIP.min(grid.height - first);
+        let ([zeros, out, pixels], mut lines) = scratch_lines::<3, 3>(scratch, segments);
+        zeros.fill([0.0; WIDTH]);
+        let pixels = pixels.as_flattened_mut();
+        let l1_scale = (1.0 - SSIM_WEIGHT) * scale;
+        let ssim_scale = -SSIM_WEIGHT * scale;
+        let zero = V::zero(s);
+        if rows < STRIP {
+            for tile in tiles.iter_mut() {
+                tile.planes[channel] = DARK;
+            }
+        }
+        for row in 0..rows {
+            if row % TOGETHER == 0 {
+                for (plane, lines) in derivatives.into_iter().zip(&mut lines) {
+                    vertical(s, &Near::new(segments, plane, zeros, first + row), lines);
+                    for line in lines {
+                        segments.pad(line, 0.0);
+                    }
+                }
+            }
+            let of_row = out.as_chunks_mut::<TOGETHER>().0.iter_mut();
+            let of_row = of_row.zip(segments.line(e, first + row).as_chunks::<TOGETHER>().0);
+            let of_row = of_row.zip(segments.line(y, first + row).as_chunks::<TOGETHER>().0);
+            for (group, ((out, e), y)) in of_row.enumerate() {
+                for lane in (0..WIDTH).step_by(S::F32_LANES) {
+                    let [by_mu_e, by_ee, by_ey] = each!(k in 3 => {
+                        let line = &*lines[k][row % TOGETHER];
+                        horizontal::<S, TOGETHER, 14>(s, around(line, TOGETHER * group), lane)
+                    });
+                    for n in 0..TOGETHER {
+                        let (e, y) = (V::load(s, &e[n][lane..]), V::load(s, &y[n][lane..]));
+                        let by_ssim = by_mu_e[n] + e * 2.0 * by_ee[n] + y * by_ey[n];
+                        let positive = zero.lt(e).keep(V::splat(s, l1_scale));
+                        let negative = e.lt(zero).keep(V::splat(s, l1_scale));
+                        let g = by_ssim * ssim_scale + (positive - negative);
+                        g.store(&mut out[n][lane..]);
+                    }
+                }
+            }
+            segments.restore(out, pixels);
+            // The loss sees e·mask, so the chain rule has the mask once more.
+            if let Some(mask) = mask {
+                masked(pixels, &mask[(first + row) * grid.width..][..grid.width]);
+            }
+            for (tile, g) in tiles.iter_mut().zip(pixels.as_chunks::<TILE>().0) {
+                set_row_of_plane(&mut tile.planes[channel], row % TILE, g);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

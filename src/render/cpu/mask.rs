@@ -1,0 +1,143 @@
+//! A number per row that learns whether the row is worth its place (*Compact 3D Gaussian Representation*,
+//! Lee et al. 2024, section 3.1): between stages 6 and 7, where a policy declares it.
+
+use std::ops::Range;
+
+use densify_policies::policy::MaskTerm;
+use rayon::prelude::*;
+
+use super::adam::{BETA1, BETA2, BiasCorrection, EPSILON, LOGIT_MAX};
+use super::blocks::{BlockTask, Blocks, plane};
+use super::simd::WIDTH;
+use crate::{StateError, Tensor};
+use densify_core::gaussians::{logit, sigmoid};
+
+/// Planes: how far the mask's logit is from where it began, so that 0 is a fresh mask; its two moments.
+const OFFSET: usize = 0;
+const FIRST: usize = 1;
+const SECOND: usize = 2;
+const PLANES: usize = 3;
+
+/// The masks of the rows that may be trained; nothing where none are declared.
+#[derive(Debug)]
+pub(super) struct Masks {
+    term: Option<MaskTerm>,
+    blocks: Blocks<f32>,
+}
+
+/// The masks of one task, and how they step.
+#[derive(Debug)]
+pub(super) struct MaskTask<'a> {
+    term: MaskTerm,
+    /// Derivative of the term by σ(m), per row.
+    weight: f32,
+    blocks: BlockTask<'a, f32>,
+}
+
+impl Masks {
+    pub(super) fn new(rows: Range<usize>, term: Option<MaskTerm>) -> Self {
+        Self { term, blocks: Blocks::zeros(rows, if term.is_some() { PLANES } else { 0 }) }
+    }
+
+    pub(super) fn bytes(rows: Range<usize>) -> u64 {
+        Blocks::<f32>::bytes(rows, PLANES)
+    }
+
+    pub(super) fn is_declared(&self) -> bool {
+        self.term.is_some()
+    }
+
+    /// σ(m) of a row.
+    pub(super) fn value(&self, row: usize) -> f32 {
+        self.term.map_or(0.0, |term| sigmoid(term.start + self.blocks.get(row, OFFSET)))
+    }
+
+    /// Cut for the optimiser's tasks; the term is the mean over the rows that are `trained`.
+    pub(super) fn tasks(
+        &mut self,
+        rows: usize,
+        trained: usize,
+    ) -> impl IndexedParallelIterator<Item = Option<MaskTask<'_>>> {
+        let term = self.term;
+        self.blocks.tasks(rows).map(move |blocks| {
+            let weight = term?.weight / trained.max(1) as f32;
+            Some(MaskTask { term: term?, weight, blocks })
+        })
+    }
+
+    /// A newborn row has its parent's mask.
+    pub(super) fn inherit(&mut self, parent: usize, row: usize) {
+        if self.is_declared() {
+            self.blocks.set(row, OFFSET, self.blocks.get(parent, OFFSET));
+        }
+    }
+
+    /// Zero moments.
+    pub(super) fn forget(&mut self, row: usize) {
+        if self.is_declared() {
+            self.blocks.set(row, FIRST, 0.0);
+            self.blocks.set(row, SECOND, 0.0);
+        }
+    }
+
+    pub(super) fn clear_row(&mut self, row: usize) {
+        self.blocks.clear_row(row);
+    }
+
+    pub(super) fn copy_row(&mut self, from: usize, to: usize) {
+        self.blocks.copy_row(from, to);
+    }
+
+    pub(super) fn reorder(&mut self, order: &[u32]) {
+        self.blocks.reorder(order);
+    }
+
+    pub(super) fn tensor(&self, name: &str, rows: Range<usize>) -> Tensor {
+        let shape = [rows.len(), PLANES];
+        Tensor::f32(name, &shape, self.blocks.to_rows(rows, 0..PLANES))
+    }
+
+    pub(super) fn restore(&mut self, rows: Range<usize>, tensor: Tensor) -> Result<(), StateError> {
+        let values = tensor.into_f32(&[rows.len(), PLANES])?;
+        self.blocks.set_rows(rows, 0..PLANES, &values);
+        Ok(())
+    }
+}
+
+impl MaskTask<'_> {
+    /// One step of Adam for the masks of a block, from the gradient of the image loss; `ages` are those
+    /// before the step. A row whose mask is at the threshold becomes transparent.
+    pub(super) fn step(
+        &mut self,
+        block: usize,
+        params: &mut [f32],
+        gradient: &[f32],
+        ages: &[u16],
+        bias: &BiasCorrection,
+    ) {
+        let masks = self.blocks.block(block);
+        let MaskTerm { start, rate, threshold, .. } = self.term;
+        let least = logit(threshold);
+        for (lane, &age) in ages.iter().enumerate() {
+            let of = |plane: usize| plane * WIDTH + lane;
+            // The row renders with its opacity and its scales times 1[σ(m) > threshold], whose derivative is
+            // taken to be that of σ(m).
+            let transparency = sigmoid(-params[of(plane::OPACITY)]);
+            let by_scales: f32 = (plane::LOG_SCALE..plane::QUAT).map(|p| gradient[of(p)]).sum();
+            let by_factor = gradient[of(plane::OPACITY)] / transparency + by_scales;
+            let m = start + masks[of(OFFSET)];
+            let slope = sigmoid(m) * sigmoid(-m);
+            let g = (by_factor + self.weight) * slope;
+            let first = masks[of(FIRST)] * BETA1 + g * (1.0 - BETA1);
+            let second = masks[of(SECOND)] * BETA2 + g * g * (1.0 - BETA2);
+            let [of_first, of_second] = bias.of(age.saturating_add(1));
+            let step = first * of_first * rate / (second.sqrt() * of_second + EPSILON);
+            masks[of(OFFSET)] -= step;
+            masks[of(FIRST)] = first;
+            masks[of(SECOND)] = second;
+            if start + masks[of(OFFSET)] <= least {
+                params[of(plane::OPACITY)] = -LOGIT_MAX;
+            }
+        }
+    }
+}

@@ -1,0 +1,387 @@
+//! The native backend: rayon over tiles and rows, SIMD with run-time dispatch, one file per stage.
+//!
+//! It is the default on machines without a GPU and the reference for the shaders. The same inputs
+//! and the same seed give the same bytes at any thread count: work is cut at fixed places, every
+//! sum has a fixed order, and nothing is accumulated from two threads.
+//!
+//! All buffers are allocated once, at the budget; the ledger lists them.
+
+mod adam;
+mod apply;
+mod audit;
+mod batch;
+mod blocks;
+mod budget;
+mod candidates;
+mod differentiate;
+mod exposure;
+mod footprint;
+mod instructions;
+mod loss;
+mod mask;
+mod moments;
+mod narrow;
+mod observe;
+mod optimise;
+mod parameters;
+mod passes;
+mod project;
+mod project_bwd;
+mod rasterize;
+mod rasterize_bwd;
+mod records;
+mod regularise;
+mod signals;
+mod simd;
+mod stage_clock;
+mod state;
+mod summed;
+mod threads;
+mod tiles;
+
+use std::ops::Range;
+use std::sync::Arc;
+use std::sync::atomic::AtomicU32;
+use std::time::Duration;
+
+use densify_policies::plan::RowOps;
+use densify_policies::policy::{Candidate, SignalSet, Signals};
+use densify_policies::rng::PolicyRng;
+use pulp::Arch;
+
+use super::candidates::{Candidates, Shown, error_weights};
+use super::signals::{Field, counts_dominant};
+use super::{
+    AuxInput, AuxOutput, Backend, BackendError, Rendering, Setup, Shortcuts, StateArray,
+    StateError, StepInput, StepOutput, Tensor, Unsound, assert_fits, assert_same_size,
+};
+use adam::BiasCorrection;
+use blocks::{Blocks, planes};
+use densify_core::camera::Camera;
+use densify_core::gaussians::{Gaussians, ModelArray};
+use densify_core::memory::Ledger;
+use loss::{ImageTerms, LossBuffers};
+use mask::Masks;
+use moments::Moments;
+use parameters::Parameters;
+use passes::{for_each_pixel, scalars};
+use project::Splat;
+use rasterize::{Beside, TileCanvas};
+use rasterize_bwd::TileGradient;
+use signals::Accumulators;
+use simd::WIDTH;
+use stage_clock::StageClock;
+use summed::Summed;
+use threads::Threads;
+use tiles::TileLists;
+
+pub use instructions::InstructionSet;
+pub use optimise::ModelGradient;
+pub use threads::StepTasks;
+
+/// Largest image side [y][x]; at this size every index of the stages still fits its type.
+const MAX_SIDE: u32 = 16_384;
+/// Blocks per task: 128 rows, a hundred kilobytes of parameters and moments at degree 3. Of 50,000 rows
+/// that is six tasks for each of 64 threads.
+const BLOCKS_PER_TASK: usize = 8;
+const ROWS_PER_TASK: usize = BLOCKS_PER_TASK * WIDTH;
+
+/// The native backend.
+#[derive(Debug)]
+pub struct CpuBackend {
+    arch: Arch,
+    threads: Arc<Threads>,
+    ledger: Ledger,
+    budget: usize,
+    /// Rows at the front that never change.
+    frozen: usize,
+    rows: usize,
+    sh_degree: u8,
+    near: f32,
+    shortcuts: Shortcuts,
+    params: Parameters,
+    moments: Moments,
+    /// Steps of each row that may be trained: one plane.
+    ages: Blocks<u16>,
+    bias: BiasCorrection,
+    summed: Summed,
+    masks: Masks,
+    signals: Accumulators,
+    candidates: Candidates,
+    /// Pixels that each row dominates in the view at hand. Shape: `[budget]`, or empty if they are not
+    /// counted.
+    dominant: Vec<AtomicU32>,
+    /// Shape: `[budget]`.
+    splats: Vec<Splat>,
+    /// Bit per lane: on screen in the view at hand. Shape: `[blocks]`.
+    visible: Vec<u16>,
+    lists: TileLists,
+    /// Shape: `[tiles]`.
+    canvas: Vec<TileCanvas>,
+    /// Shape: `[tiles]`.
+    gradient: Vec<TileGradient>,
+    loss: LossBuffers,
+    /// Bits of one record per entry, as far as there is room. Shape: `[record cap, stride of the
+    /// records]`.
+    records: Vec<AtomicU32>,
+    record_cap: usize,
+    /// One record per row. Between steps it is lent to the host's copy of the signals, and has room
+    /// for these. Shape: `[budget, stride of the records]`, or more.
+    sums: Vec<f32>,
+    clock: StageClock,
+}
+
+impl CpuBackend {
+    /// Bytes per buffer of a backend made with these options for models of this degree, on so many
+    /// threads; [`Setup::threads`] is not looked at.
+    #[must_use]
+    pub fn promise(sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
+        budget::ledger(sh_degree, options, threads)
+    }
+
+    /// Takes over `model` and allocates everything for `options.budget` rows.
+    ///
+    /// # Errors
+    /// [`BackendError::OutOfMemory`] when the memory cannot be had.
+    ///
+    /// # Panics
+    /// When the model has more rows than the budget: the caller subsamples before.
+    pub fn new(model: &Gaussians, options: &Setup) -> Result<Self, BackendError> {
+        let budget = options.budget.max(1);
+        assert!(model.len() <= budget, "{} rows over a budget of {budget}", model.len());
+        let threads = Threads::new(options.threads)?;
+        let ledger = budget::ledger(model.sh_degree, options, threads.count());
+        budget::reserve(&ledger)?;
+        let trained = budget::trained(options);
+        let signals = Accumulators::new(trained.clone(), &options.needs);
+        let (stride, sums) = (signals.layout().stride(), signals.sums());
+        let (cap, record_cap) = (budget::tile_cap(options), budget::record_cap(options));
+        let per_row = planes(model.sh_degree);
+        let storage = options.storage;
+        let mut params = Parameters::zeros(budget, per_row, storage.parameters);
+        params.pack(model);
+        Ok(Self {
+            arch: options.instructions.arch(),
+            threads: Arc::new(threads),
+            ledger,
+            budget,
+            frozen: options.frozen,
+            rows: model.len(),
+            sh_degree: model.sh_degree,
+            near: options.near,
+            shortcuts: options.shortcuts,
+            params,
+            moments: Moments::zeros(trained.clone(), per_row, storage.moments),
+            ages: Blocks::zeros(trained.clone(), 1),
+            bias: BiasCorrection::new(),
+            summed: Summed::new(trained.clone(), per_row, options.needs.cadence),
+            masks: Masks::new(trained, options.needs.mask),
+            signals,
+            candidates: Candidates::new(options.needs.candidates),
+            dominant: bytemuck::zeroed_vec(if counts_dominant(&options.needs) {
+                budget
+            } else {
+                0
+            }),
+            splats: vec![Splat::default(); budget],
+            visible: vec![0; budget.div_ceil(WIDTH)],
+            lists: TileLists::new(budget, cap),
+            canvas: Vec::new(),
+            gradient: Vec::new(),
+            loss: LossBuffers::new(),
+            records: bytemuck::zeroed_vec(record_cap * stride),
+            record_cap,
+            sums: vec![0.0; budget::summed_rows(options) * sums],
+            clock: StageClock::default(),
+        })
+    }
+
+    /// Records what the tasks of training steps take, from now on. Only on one thread: several would
+    /// slow each other down.
+    ///
+    /// # Panics
+    /// When the backend has more than one thread.
+    pub fn record_tasks(&mut self) {
+        self.threads.record();
+    }
+
+    /// The tasks of the last training step; none unless they are [recorded](Self::record_tasks).
+    #[must_use]
+    pub fn recorded_tasks(&self) -> StepTasks {
+        self.threads.recorded()
+    }
+
+    /// One training step, on a thread of the pool.
+    fn step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
+        let StepInput { camera, target, background, exposure, .. } = *input;
+        let behind = exposure.map_or(background, |exposure| exposure.behind(background));
+        let frame = self.forward(camera, behind, input.sh_degree, Beside::Nothing)?;
+        if let Some(exposure) = exposure {
+            self.expose(&frame.grid, exposure);
+        }
+        let picks = self.candidates.open(input.step, self.rows);
+        let weights = picks.and_then(|(request, _)| error_weights(request.error));
+        let by_pixel =
+            self.signals.layout().has(Field::Error).then_some(self.signals.planes().score);
+        let terms = ImageTerms { error: weights, by_pixel };
+        let value = self.image_loss(&frame.grid, target, background, terms);
+        let by_exposure =
+            exposure.map(|exposure| self.exposure_bwd(&frame.grid, exposure, background));
+        if let Some((request, count)) = picks {
+            let shown = Shown { target, background, exposure };
+            self.collect_candidates(&frame, shown, &request, count);
+        }
+        self.backward(&frame, self.signals.layout());
+        self.optimise(&frame, input);
+        self.clock.lap("project_bwd + adam");
+        Ok(StepOutput {
+            visible: frame.visible,
+            entries: frame.entries,
+            bands: frame.bands.len() as u32,
+            exposure: by_exposure,
+            ..scalars(value)
+        })
+    }
+}
+
+impl Backend for CpuBackend {
+    fn rows(&self) -> usize {
+        self.rows
+    }
+
+    fn sh_degree(&self) -> u8 {
+        self.sh_degree
+    }
+
+    fn budget(&self) -> usize {
+        self.budget
+    }
+
+    fn ledger(&self) -> &Ledger {
+        &self.ledger
+    }
+
+    fn begin_epoch(&mut self) {
+        self.signals.begin_epoch(&self.threads, self.rows);
+    }
+
+    fn train_step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
+        assert_same_size(input.camera, input.target);
+        let threads = Arc::clone(&self.threads);
+        threads.step(|| self.step(input))
+    }
+
+    fn observe(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {
+        self.observe_view(input)
+    }
+
+    fn take_signals(&mut self, wanted: SignalSet) -> Result<Signals, BackendError> {
+        // The sums are not used between two steps.
+        let memory = std::mem::take(&mut self.sums);
+        let mut signals = Signals::within(memory, self.rows, wanted);
+        let of_rows = (&self.params, &self.masks, &self.ages);
+        self.signals.read(&self.threads, &mut signals, wanted, of_rows);
+        Ok(signals)
+    }
+
+    fn give_back(&mut self, signals: Signals) {
+        if self.sums.is_empty() {
+            self.sums = signals.into_values();
+        }
+    }
+
+    fn candidates(&self) -> &[Candidate] {
+        self.candidates.list()
+    }
+
+    fn apply(&mut self, ops: &RowOps, seed: u64, step: u32) -> Result<(), BackendError> {
+        assert_fits(ops, self.frozen, self.rows, self.budget);
+        let mut model = apply::Model {
+            params: &mut self.params,
+            moments: &mut self.moments,
+            ages: &mut self.ages,
+            masks: &mut self.masks,
+            signals: &mut self.signals,
+            summed: &mut self.summed,
+            threads: &self.threads,
+        };
+        apply::apply(&mut model, ops, &PolicyRng::new(seed, step));
+        self.rows = ops.rows_after;
+        if ops.reset_candidates {
+            self.candidates.clear();
+        }
+        Ok(())
+    }
+
+    fn audit(&mut self) -> Result<Vec<Unsound>, BackendError> {
+        Ok(self.unsound())
+    }
+
+    fn render(
+        &mut self,
+        camera: &Camera,
+        background: [f32; 3],
+        sh_degree: u8,
+    ) -> Result<Rendering, BackendError> {
+        let frame = self.forward(camera, background, sh_degree, Beside::Depth)?;
+        Ok(self.rendering(&frame))
+    }
+
+    fn counts_rows(&self) -> bool {
+        true
+    }
+
+    fn render_counts(&mut self, camera: &Camera) -> Result<Rendering, BackendError> {
+        let frame = self.forward(camera, [0.0; 3], 0, Beside::Count)?;
+        Ok(self.rendering(&frame))
+    }
+
+    fn render_painted(
+        &mut self,
+        camera: &Camera,
+        background: [f32; 3],
+        colours: &[[f32; 3]],
+    ) -> Result<Rendering, BackendError> {
+        assert_eq!(colours.len(), self.rows, "colours of other rows");
+        let frame = self.forward_painted(camera, background, 0, Beside::Depth, Some(colours))?;
+        Ok(self.rendering(&frame))
+    }
+
+    fn download_array(
+        &self,
+        array: ModelArray,
+        rows: Range<usize>,
+    ) -> Result<Vec<f32>, BackendError> {
+        assert!(rows.end <= self.rows, "rows {rows:?} of {}", self.rows);
+        Ok(self.params.to_rows(rows, array.parameters(self.sh_degree)))
+    }
+
+    fn upload_array(
+        &mut self,
+        array: ModelArray,
+        rows: Range<usize>,
+        values: &[f32],
+    ) -> Result<(), BackendError> {
+        assert!(rows.end <= self.rows, "rows {rows:?} of {}", self.rows);
+        self.params.set_rows(rows, array.parameters(self.sh_degree), values);
+        Ok(())
+    }
+
+    fn state(&self) -> Vec<StateArray> {
+        self.state_arrays()
+    }
+
+    fn save_rows(&self, name: &str, rows: Range<usize>) -> Result<Tensor, BackendError> {
+        assert!(rows.end <= self.rows, "rows {rows:?} of {}", self.rows);
+        Ok(self.state_tensor(name, rows))
+    }
+
+    fn restore_rows(&mut self, tensor: Tensor, rows: Range<usize>) -> Result<(), StateError> {
+        assert!(rows.end <= self.rows, "rows {rows:?} of {}", self.rows);
+        self.restore_tensor(tensor, rows)
+    }
+
+    fn stage_times(&self) -> &[(&'static str, Duration)] {
+        &self.clock.laps
+    }
+}

@@ -1,0 +1,265 @@
+//! Adam's two moments: as f32, or in a byte each; see [`MomentStorage`].
+//!
+//! The first moment is at most 7.3 roots of the second, whatever the gradients were: what a step
+//! uses is that ratio, and [`MomentStorage::Both8`] stores nothing else of it, in steps of 0.057.
+//! Noise alone gives ratios of about 0.23, to whose variance the rounding adds a twentieth; it has no
+//! scale that neighbours would share, and so none that a neighbour could spoil.
+
+use std::ops::Range;
+
+use rayon::prelude::*;
+
+use super::blocks::{BlockTask, BlockView, Blocks, Scratch};
+use super::narrow::{Draws, F8, Narrow, first_moment, first_moments, narrow, ratios, widen};
+use super::simd::WIDTH;
+use crate::{MomentStorage, StateError, Tensor};
+
+/// The moments of the rows that may be trained.
+#[derive(Debug)]
+pub(super) struct Moments {
+    /// The first and the second, or none.
+    wide: [Blocks; 2],
+    /// None, or the first as multiples of the roots of the second.
+    ratios: Blocks<i8>,
+    /// None, or the second.
+    seconds: Blocks<F8>,
+}
+
+/// Planes of f32, and in bytes.
+fn split(planes: usize, storage: MomentStorage) -> [usize; 2] {
+    match storage {
+        MomentStorage::F32 => [planes, 0],
+        MomentStorage::Both8 => [0, planes],
+    }
+}
+
+impl Moments {
+    pub(super) fn zeros(rows: Range<usize>, planes: usize, storage: MomentStorage) -> Self {
+        let [wide, narrow] = split(planes, storage);
+        Self {
+            wide: [0, 1].map(|_| Blocks::zeros(rows.clone(), wide)),
+            ratios: Blocks::zeros(rows.clone(), narrow),
+            seconds: Blocks::zeros(rows, narrow),
+        }
+    }
+
+    /// Bytes for these rows.
+    pub(super) fn bytes(rows: Range<usize>, planes: usize, storage: MomentStorage) -> u64 {
+        let [wide, narrow] = split(planes, storage);
+        2 * (Blocks::<f32>::bytes(rows.clone(), wide) + Blocks::<F8>::bytes(rows, narrow))
+    }
+
+    /// Bytes that are there.
+    #[cfg(test)]
+    pub(super) fn held(&self) -> u64 {
+        let wide: u64 = self.wide.iter().map(Blocks::held).sum();
+        wide + self.ratios.held() + self.seconds.held()
+    }
+
+    /// The first row that has moments.
+    pub(super) fn first(&self) -> usize {
+        self.ratios.first()
+    }
+
+    fn is_narrow(&self) -> bool {
+        self.ratios.planes() > 0
+    }
+
+    pub(super) fn clear_row(&mut self, row: usize) {
+        self.wide.iter_mut().for_each(|blocks| blocks.clear_row(row));
+        self.ratios.clear_row(row);
+        self.seconds.clear_row(row);
+    }
+
+    /// Copies what is stored, to the bit.
+    pub(super) fn copy_row(&mut self, from: usize, to: usize) {
+        self.wide.iter_mut().for_each(|blocks| blocks.copy_row(from, to));
+        self.ratios.copy_row(from, to);
+        self.seconds.copy_row(from, to);
+    }
+
+    pub(super) fn reorder(&mut self, order: &[u32]) {
+        self.wide.iter_mut().for_each(|blocks| blocks.reorder(order));
+        self.ratios.reorder(order);
+        self.seconds.reorder(order);
+    }
+
+    /// Zero moments of one parameter.
+    pub(super) fn forget(&mut self, row: usize, plane: usize) {
+        if self.is_narrow() {
+            self.ratios.set(row, plane, 0);
+            self.seconds.set(row, plane, F8::default());
+        } else {
+            self.wide.iter_mut().for_each(|blocks| blocks.set(row, plane, 0.0));
+        }
+    }
+
+    /// The first and the second moment of one parameter.
+    pub(super) fn get(&self, row: usize, plane: usize) -> [f32; 2] {
+        if !self.is_narrow() {
+            return self.wide.each_ref().map(|blocks| blocks.get(row, plane));
+        }
+        let second = self.seconds.get(row, plane).to_f32();
+        [first_moment(self.ratios.get(row, plane), second), second]
+    }
+
+    /// The blocks of the first `rows` rows, to read.
+    pub(super) fn view(&self, rows: usize) -> MomentView<'_> {
+        MomentView {
+            is_narrow: self.is_narrow(),
+            wide: self.wide.each_ref().map(|blocks| blocks.view(rows)),
+            ratios: self.ratios.view(rows),
+            seconds: self.seconds.view(rows),
+        }
+    }
+
+    /// The blocks of the first `rows` rows, cut for the optimiser's tasks.
+    pub(super) fn tasks(
+        &mut self,
+        rows: usize,
+    ) -> impl IndexedParallelIterator<Item = MomentTask<'_>> {
+        let is_narrow = self.is_narrow();
+        let Self { wide: [first, second], ratios, seconds } = self;
+        let all = (first.tasks(rows), second.tasks(rows), ratios.tasks(rows), seconds.tasks(rows));
+        all.into_par_iter().map(move |(first, second, ratios, seconds)| MomentTask {
+            is_narrow,
+            wide: [first, second],
+            ratios,
+            seconds,
+        })
+    }
+
+    /// The first (0) or second (1) moments of some rows, as they are stored: numbers; or ratios in
+    /// two's complement, and codes of [`F8`]. Shape: `[rows.len(), planes]`.
+    pub(super) fn tensor(
+        &self,
+        which: usize,
+        name: &str,
+        rows: Range<usize>,
+        planes: usize,
+    ) -> Tensor {
+        let (shape, planes) = ([rows.len(), planes], 0..planes);
+        if !self.is_narrow() {
+            return Tensor::f32(name, &shape, self.wide[which].to_rows(rows, planes));
+        }
+        let codes = if which == 0 {
+            self.ratios.to_rows(rows, planes).into_iter().map(i8::cast_unsigned).collect()
+        } else {
+            self.seconds.to_rows(rows, planes).into_iter().map(|code| code.0).collect()
+        };
+        Tensor::u8(name, &shape, codes)
+    }
+
+    /// Takes back what [`tensor`](Self::tensor) returned.
+    pub(super) fn restore(
+        &mut self,
+        which: usize,
+        rows: Range<usize>,
+        planes: usize,
+        tensor: Tensor,
+    ) -> Result<(), StateError> {
+        let (shape, planes) = ([rows.len(), planes], 0..planes);
+        if !self.is_narrow() {
+            self.wide[which].set_rows(rows, planes, &tensor.into_f32(&shape)?);
+            return Ok(());
+        }
+        let codes = tensor.into_u8(&shape)?.into_iter();
+        if which == 0 {
+            let ratios: Vec<i8> = codes.map(u8::cast_signed).collect();
+            self.ratios.set_rows(rows, planes, &ratios);
+        } else {
+            self.seconds.set_rows(rows, planes, &codes.map(F8).collect::<Vec<F8>>());
+        }
+        Ok(())
+    }
+}
+
+/// The moments of some blocks, to read.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct MomentView<'a> {
+    is_narrow: bool,
+    wide: [BlockView<'a, f32>; 2],
+    ratios: BlockView<'a, i8>,
+    seconds: BlockView<'a, F8>,
+}
+
+impl<'a> MomentView<'a> {
+    /// The first `planes` planes, or more, of a block, of both moments.
+    pub(super) fn open<'b>(
+        self,
+        block: usize,
+        planes: usize,
+        scratch: &'b mut [Scratch; 2],
+    ) -> [&'b [f32]; 2]
+    where
+        'a: 'b,
+    {
+        if !self.is_narrow {
+            return self.wide.map(|blocks| blocks.block(block));
+        }
+        to_scratch(self.ratios.block(block), self.seconds.block(block), planes, scratch);
+        let [m, v] = scratch;
+        [&m.0, &v.0]
+    }
+}
+
+/// The moments of some blocks, to change.
+#[derive(Debug)]
+pub(super) struct MomentTask<'a> {
+    is_narrow: bool,
+    wide: [BlockTask<'a, f32>; 2],
+    ratios: BlockTask<'a, i8>,
+    seconds: BlockTask<'a, F8>,
+}
+
+impl MomentTask<'_> {
+    /// The first `planes` planes, or more, of a block, of both moments.
+    #[inline(always)]
+    pub(super) fn open<'b>(
+        &'b mut self,
+        block: usize,
+        planes: usize,
+        scratch: &'b mut [Scratch; 2],
+    ) -> [&'b mut [f32]; 2] {
+        if !self.is_narrow {
+            let [first, second] = &mut self.wide;
+            return [first.block(block), second.block(block)];
+        }
+        to_scratch(self.ratios.block(block), self.seconds.block(block), planes, scratch);
+        let [m, v] = scratch;
+        [&mut m.0, &mut v.0]
+    }
+
+    /// Stores the planes that were opened, where they are not what is stored: the first moments as
+    /// multiples of what is stored of the second.
+    #[inline(always)]
+    pub(super) fn close(
+        &mut self,
+        block: usize,
+        planes: usize,
+        [m, v]: &[Scratch; 2],
+        [of_m, of_v]: [&mut Draws; 2],
+    ) {
+        if !self.is_narrow {
+            return;
+        }
+        let used = planes * WIDTH;
+        let second = &mut self.seconds.block(block)[..used];
+        narrow(&v.0[..used], second, of_v);
+        ratios(&m.0[..used], second, &mut self.ratios.block(block)[..used], of_m);
+    }
+
+    /// Whether what is stored is not what was computed.
+    #[inline(always)]
+    pub(super) fn is_narrow(&self) -> bool {
+        self.is_narrow
+    }
+}
+
+#[inline(always)]
+fn to_scratch(ratios: &[i8], seconds: &[F8], planes: usize, [m, v]: &mut [Scratch; 2]) {
+    let used = planes * WIDTH;
+    let v = &mut v.0[..used];
+    widen(&seconds[..used], v);
+    first_moments(&ratios[..used], v, &mut m.0[..used]);
+}

@@ -1,0 +1,244 @@
+//! Auxiliary views: training views that are rendered for a policy's event, and measured row by row.
+//!
+//! Blending is replayed front to back, with the arithmetic of the forward pass, and each row's sums
+//! over the pixels that it is blended into, and its largest weight, are written to one record per
+//! (row, tile); these are added in order of tile number. Records and sums borrow the backward pass's
+//! buffers, and the pixel map the plane of the image gradient that belongs to alpha.
+
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
+
+use densify_policies::policy::{AuxColumn, AuxRequest, Candidate, DepthMode, PixelMap};
+use pulp::{Simd, WithSimd};
+
+use super::batch::{BATCH, Batch, CORNER_X, CORNER_Y, LANE_X, LANE_Y};
+use super::loss::ImageTerms;
+use super::passes::{Frame, for_each_pixel, scalars};
+use super::project::Splat;
+use super::rasterize::{
+    ALPHA_MAX, Beside, Blending, DARK, PATCHES, Plane, TRANSMITTANCE, TilePlace,
+};
+use super::rasterize_bwd::gather_all;
+use super::records::{Sums, TileRecords, parts};
+use super::simd::{V, WIDTH};
+use super::tiles::{Entry, Grid, Visible};
+use super::{AuxInput, AuxOutput, BackendError, CpuBackend};
+use crate::assert_same_size;
+use crate::candidates::Shown;
+use crate::pixel_map::{draw_pixels, pixel_map, radius_px};
+use densify_core::image::Image8;
+
+/// Numbers per record: sums of the map, of pixels, of weights, of distances; the largest weight.
+const STRIDE: usize = 5;
+/// The last, which is no sum.
+const MAXIMUM: usize = STRIDE - 1;
+/// The plane of a tile's gradient that holds the pixel map meanwhile.
+const MAP: usize = 3;
+
+/// Bytes for an image of so many pixels: its colours, error, edge and luma, and the drawing of points.
+pub(super) fn bytes(request: &AuxRequest, pixels: usize) -> u64 {
+    let drawing =
+        if request.points > 0 { 2 * size_of::<f32>() + size_of::<(f64, u32)>() } else { 0 };
+    (pixels * (5 * size_of::<f32>() + 1 + drawing)) as u64
+        + u64::from(request.points) * size_of::<Candidate>() as u64
+}
+
+impl CpuBackend {
+    /// Measures one view.
+    pub(super) fn observe_view(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {
+        let AuxInput { camera, target, background, exposure, request, .. } = *input;
+        let behind = exposure.map_or(background, |exposure| exposure.behind(background));
+        assert_same_size(camera, target);
+        // Stage times stay those of training.
+        let clock = std::mem::take(&mut self.clock);
+        let frame = self.forward(camera, behind, input.sh_degree, Beside::Nothing);
+        let measured = frame.map(|frame| {
+            if let Some(exposure) = exposure {
+                self.expose(&frame.grid, exposure);
+            }
+            let loss =
+                scalars(self.image_loss(&frame.grid, target, background, ImageTerms::default()))
+                    .loss;
+            let points = self.draw_points(&frame, input);
+            let columns = if request.columns.is_empty() {
+                Vec::new()
+            } else {
+                self.write_map(&frame.grid, target, background, request.map);
+                let columns = self.columns(&frame, &request.columns);
+                for gradient in &mut self.gradient {
+                    gradient.planes[MAP] = DARK;
+                }
+                columns
+            };
+            AuxOutput { loss, columns, points }
+        });
+        self.clock = clock;
+        measured
+    }
+
+    /// Surface points of pixels drawn in proportion to their alpha.
+    fn draw_points(&mut self, frame: &Frame, input: &AuxInput<'_>) -> Vec<Candidate> {
+        if input.request.points == 0 {
+            return Vec::new();
+        }
+        let grid = &frame.grid;
+        let mut alpha = vec![0.0; grid.width * grid.height];
+        for (tile, canvas) in self.canvas[..grid.tiles()].iter().enumerate() {
+            for_each_pixel(grid, tile, |patch, lane, at| {
+                alpha[at] = 1.0 - canvas.planes[TRANSMITTANCE][patch][lane];
+            });
+        }
+        let pixels = draw_pixels(&alpha, grid.width, input);
+        let AuxInput { target, background, exposure, .. } = *input;
+        let shown = Shown { target, background, exposure };
+        self.surface_points(frame, shown, &pixels, DepthMode::MaxWeight)
+    }
+
+    /// Writes the pixel map to its plane.
+    fn write_map(&mut self, grid: &Grid, target: &Image8, background: [f32; 3], map: PixelMap) {
+        let mut rgb = vec![[0.0; 3]; grid.width * grid.height];
+        for (tile, canvas) in self.canvas[..grid.tiles()].iter().enumerate() {
+            for_each_pixel(grid, tile, |patch, lane, at| {
+                rgb[at] = [0, 1, 2].map(|i| canvas.planes[i][patch][lane]);
+            });
+        }
+        let values = pixel_map(&rgb, target, background, map);
+        for (tile, gradient) in self.gradient[..grid.tiles()].iter_mut().enumerate() {
+            gradient.planes[MAP] = DARK;
+            for_each_pixel(grid, tile, |patch, lane, at| {
+                gradient.planes[MAP][patch][lane] = values[at];
+            });
+        }
+    }
+
+    /// The columns of the view at hand.
+    fn columns(&mut self, frame: &Frame, wanted: &[AuxColumn]) -> Vec<(AuxColumn, Vec<f32>)> {
+        let Frame { grid, bands, .. } = frame;
+        let blending = self.shortcuts.into();
+        self.have_sums(self.signals.layout());
+        let Self { threads, arch, lists, splats, records, sums, visible, gradient, rows, .. } =
+            self;
+        let rows = *rows;
+        let sums = &mut sums[..rows * STRIDE];
+        let dominant = &self.dominant;
+        let is_seen = |row: usize| visible[row / WIDTH] >> (row % WIDTH) & 1 == 1;
+        threads.install(|| {
+            let visible = &visible[..rows.div_ceil(WIDTH)];
+            for band in bands {
+                if bands.len() > 1 {
+                    let visible = Visible { splats: &splats[..rows], seen: visible };
+                    lists.refill(threads, visible, grid, band);
+                }
+                let mut fresh = band.start == 0;
+                for part in parts(threads, lists, band.len(), records.len() / STRIDE) {
+                    threads.each("replay", part.tiles.clone(), |i| {
+                        let tile = band.start + i;
+                        arch.dispatch(Replay {
+                            splats,
+                            list: lists.of_tile(i),
+                            place: TilePlace::new(grid, tile),
+                            blending,
+                            map: &gradient[tile].planes[MAP],
+                            records: part.records(lists, i, records, STRIDE),
+                        });
+                    });
+                    let to = Sums { sums, stride: STRIDE, fresh, visible };
+                    let add = |sums: &mut [f32], records: &[AtomicU32]| {
+                        gather_all::<STRIDE>(sums, true, records);
+                    };
+                    part.gather(threads, lists, records, to, add);
+                    fresh = false;
+                }
+            }
+        });
+        let value = |column: AuxColumn, row: usize| match column {
+            _ if !is_seen(row) => 0.0,
+            AuxColumn::MapSum => sums[row * STRIDE],
+            AuxColumn::PixelCount => sums[row * STRIDE + 1],
+            AuxColumn::WeightSum => sums[row * STRIDE + 2],
+            AuxColumn::DistanceSum => sums[row * STRIDE + 3],
+            AuxColumn::WeightMax => sums[row * STRIDE + MAXIMUM],
+            AuxColumn::DominantPixels => dominant[row].load(Relaxed) as f32,
+            AuxColumn::Depth => splats[row].depth,
+            AuxColumn::Radius => radius(&splats[row]),
+        };
+        wanted.iter().map(|&c| (c, (0..rows).map(|row| value(c, row)).collect())).collect()
+    }
+}
+
+/// [`radius_px`] of a splat.
+fn radius(splat: &Splat) -> f32 {
+    let unfold = super::project::FOLD;
+    radius_px(unfold / splat.l1, splat.shear, unfold / splat.l3)
+}
+
+/// Replays the blending of one tile.
+struct Replay<'a> {
+    splats: &'a [Splat],
+    /// Sorted.
+    list: &'a [AtomicU64],
+    place: TilePlace,
+    /// Those of the forward pass.
+    blending: Blending,
+    map: &'a Plane,
+    /// This tile writes the records of its own entries, those that are held.
+    records: TileRecords<'a>,
+}
+
+impl WithSimd for Replay<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, s: S) {
+        let Self { splats, list, place, blending, map, records } = self;
+        let c = |x: f32| V::splat(s, x);
+        let least_light = c(blending.transmittance_min);
+        let zero = V::zero(s);
+        // Transmittance while a pixel takes light; 0 once it has stopped, and outside the image.
+        let (mut light, mut alive) = place.inside();
+        let mut batch = Batch::new();
+        for (n, chunk) in list.chunks(BATCH).enumerate() {
+            batch.set(s, splats, chunk, &place);
+            for (i, entry) in chunk.iter().enumerate() {
+                let splat = &batch.splats[i];
+                let (mx, my) = (splat.mean[0] - place.x, splat.mean[1] - place.y);
+                let mut todo = batch.patches_of[i] & alive;
+                let mut sums = [zero; STRIDE];
+                while todo != 0 {
+                    let p = todo.trailing_zeros() as usize % PATCHES;
+                    todo &= todo - 1;
+                    for at in (0..WIDTH).step_by(S::F32_LANES) {
+                        let [u, z] = batch.u_and_z(s, i, p, at);
+                        let e = u.neg_mul_add(u, z.neg_mul_add(z, c(splat.log2_opacity)));
+                        let seen = c(-blending.log2_reach).le(e);
+                        let alpha = e.exp2().min(c(ALPHA_MAX));
+                        let t = V::load(s, &light[p][at..]);
+                        let next = alpha.neg_mul_add(t, t);
+                        let blends = least_light.lt(next).and(seen);
+                        let dx = V::load(s, &LANE_X[at..]) + (CORNER_X[p] - mx);
+                        let dy = V::load(s, &LANE_Y[at..]) + (CORNER_Y[p] - my);
+                        let distance = (dx * dx + dy * dy).sqrt();
+                        sums[0] = sums[0] + blends.keep(V::load(s, &map[p][at..]));
+                        sums[1] = sums[1] + blends.keep(c(1.0));
+                        let weight = blends.keep(alpha * t);
+                        sums[2] = sums[2] + weight;
+                        sums[3] = sums[3] + blends.keep(distance);
+                        sums[MAXIMUM] = sums[MAXIMUM].max(weight);
+                        let stopped = next.le(least_light).and(seen);
+                        let left = stopped.select(zero, blends.select(next, t));
+                        left.store(&mut light[p][at..]);
+                    }
+                    #[expect(clippy::float_cmp, reason = "who has stopped has exactly none")]
+                    let all_stopped = light[p] == [0.0; WIDTH];
+                    if all_stopped {
+                        alive &= !(1 << p);
+                    }
+                }
+                let record = records.of(Entry::load(entry), n * BATCH + i);
+                for (i, (to, sum)) in record.into_iter().flatten().zip(sums).enumerate() {
+                    let total = if i == MAXIMUM { sum.max_lane() } else { sum.sum() };
+                    to.store(total.to_bits(), Relaxed);
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,312 @@
+//! The model's parameters in blocks: all as f32, or all but the means in 16 bits.
+//!
+//! In 16 bits, colour is f16. Log-scales, quaternions and opacity logits, which the optimiser keeps
+//! within bounds, are in fixed point: around −5 the values of f16 are 0.004 apart, four times an
+//! ordinary step of a log-scale.
+//!
+//! Kernels read and write planes of f32. Where a block is f32 they get the block itself; else its
+//! planes are widened to an array ([`open`](ParameterTask::open)) and stored from it, rounded at
+//! random ([`close`](ParameterTask::close)). Edits, which happen once, are rounded to the nearest.
+
+use std::ops::Range;
+
+use rayon::prelude::*;
+
+use super::BLOCKS_PER_TASK;
+use super::blocks::{BlockTask, BlockView, Blocks, Scratch, plane};
+use super::narrow::{Draws, F16, Narrow, fixed, narrow, narrow_fixed, widen, widen_fixed};
+use super::simd::WIDTH;
+use crate::ParameterStorage;
+use densify_core::gaussians::Gaussians;
+
+/// Planes of means: the ones that are f32 in any case.
+const MEANS: usize = plane::LOG_SCALE;
+/// Planes of what is bounded.
+const BOUNDED: usize = plane::SH - plane::LOG_SCALE;
+
+/// Digits after the point of the bounded planes: from −16 to 16, and quaternions from −2 to 2.
+const fn digits(bounded: usize) -> u32 {
+    match bounded + MEANS {
+        plane::QUAT..plane::OPACITY => 14,
+        _ => 11,
+    }
+}
+
+/// The parameters of all rows.
+#[derive(Debug)]
+pub(super) struct Parameters {
+    /// All planes, or the means.
+    wide: Blocks,
+    /// None, or the bounded planes.
+    fixed: Blocks<i16>,
+    /// None, or the planes of colour.
+    half: Blocks<F16>,
+}
+
+/// Planes of f32, in fixed point, and of f16.
+fn split(planes: usize, storage: ParameterStorage) -> [usize; 3] {
+    match storage {
+        ParameterStorage::F32 => [planes, 0, 0],
+        ParameterStorage::F16 => [MEANS, BOUNDED, planes - plane::SH],
+    }
+}
+
+impl Parameters {
+    pub(super) fn zeros(capacity: usize, planes: usize, storage: ParameterStorage) -> Self {
+        let [wide, fixed, half] = split(planes, storage);
+        Self {
+            wide: Blocks::zeros(0..capacity, wide),
+            fixed: Blocks::zeros(0..capacity, fixed),
+            half: Blocks::zeros(0..capacity, half),
+        }
+    }
+
+    /// Bytes for `capacity` rows.
+    pub(super) fn bytes(capacity: usize, planes: usize, storage: ParameterStorage) -> u64 {
+        let [wide, fixed, half] = split(planes, storage);
+        Blocks::<f32>::bytes(0..capacity, wide)
+            + Blocks::<i16>::bytes(0..capacity, fixed)
+            + Blocks::<F16>::bytes(0..capacity, half)
+    }
+
+    /// Bytes that are there.
+    #[cfg(test)]
+    pub(super) fn held(&self) -> u64 {
+        self.wide.held() + self.fixed.held() + self.half.held()
+    }
+
+    /// Numbers per row.
+    pub(super) fn planes(&self) -> usize {
+        self.wide.planes() + self.fixed.planes() + self.half.planes()
+    }
+
+    fn is_narrow(&self) -> bool {
+        self.fixed.planes() > 0
+    }
+
+    fn is_wide(&self, plane: usize) -> bool {
+        plane < MEANS || !self.is_narrow()
+    }
+
+    pub(super) fn get(&self, row: usize, plane: usize) -> f32 {
+        match plane.checked_sub(plane::SH) {
+            _ if self.is_wide(plane) => self.wide.get(row, plane),
+            None => {
+                let bounded = plane - MEANS;
+                fixed::to_f32(self.fixed.get(row, bounded), digits(bounded))
+            }
+            Some(colour) => self.half.get(row, colour).to_f32(),
+        }
+    }
+
+    pub(super) fn set(&mut self, row: usize, plane: usize, value: f32) {
+        match plane.checked_sub(plane::SH) {
+            _ if self.is_wide(plane) => self.wide.set(row, plane, value),
+            None => {
+                let bounded = plane - MEANS;
+                self.fixed.set(row, bounded, fixed::nearest(value, digits(bounded)));
+            }
+            Some(colour) => self.half.set(row, colour, F16::nearest(value)),
+        }
+    }
+
+    /// The values of `N` planes of one row, from `plane` on.
+    pub(super) fn get_n<const N: usize>(&self, row: usize, plane: usize) -> [f32; N] {
+        std::array::from_fn(|i| self.get(row, plane + i))
+    }
+
+    pub(super) fn set_n<const N: usize>(&mut self, row: usize, plane: usize, values: [f32; N]) {
+        for (i, value) in values.into_iter().enumerate() {
+            self.set(row, plane + i, value);
+        }
+    }
+
+    /// Copies what is stored, to the bit.
+    pub(super) fn copy_row(&mut self, from: usize, to: usize) {
+        self.wide.copy_row(from, to);
+        self.fixed.copy_row(from, to);
+        self.half.copy_row(from, to);
+    }
+
+    pub(super) fn reorder(&mut self, order: &[u32]) {
+        self.wide.reorder(order);
+        self.fixed.reorder(order);
+        self.half.reorder(order);
+    }
+
+    pub(super) fn clear_row(&mut self, row: usize) {
+        self.wide.clear_row(row);
+        self.fixed.clear_row(row);
+        self.half.clear_row(row);
+    }
+
+    /// Packs a host model; `self` must have room and the model's planes.
+    pub(super) fn pack(&mut self, model: &Gaussians) {
+        for row in 0..model.len() {
+            self.set_n(row, plane::MEAN, model.means[row]);
+            self.set_n(row, plane::LOG_SCALE, model.log_scales[row]);
+            self.set_n(row, plane::QUAT, model.quats[row]);
+            self.set(row, plane::OPACITY, model.opacity_logits[row]);
+            for (i, &x) in model.sh_of(row).iter().enumerate() {
+                self.set(row, plane::SH + i, x);
+            }
+        }
+    }
+
+    /// Some planes of some rows, row after row.
+    pub(super) fn to_rows(&self, rows: Range<usize>, planes: Range<usize>) -> Vec<f32> {
+        let mut values = Vec::with_capacity(rows.len() * planes.len());
+        for row in rows {
+            values.extend(planes.clone().map(|plane| self.get(row, plane)));
+        }
+        values
+    }
+
+    /// Takes back what [`to_rows`](Self::to_rows) returned.
+    pub(super) fn set_rows(&mut self, rows: Range<usize>, planes: Range<usize>, values: &[f32]) {
+        for (row, values) in rows.zip(values.chunks_exact(planes.len())) {
+            for (plane, &value) in planes.clone().zip(values) {
+                self.set(row, plane, value);
+            }
+        }
+    }
+
+    /// The blocks of the first `rows` rows, to read.
+    pub(super) fn view(&self, rows: usize) -> ParameterView<'_> {
+        ParameterView {
+            blocks: rows.div_ceil(WIDTH),
+            is_narrow: self.is_narrow(),
+            wide: self.wide.view(rows),
+            fixed: self.fixed.view(rows),
+            half: self.half.view(rows),
+        }
+    }
+
+    /// The blocks of the first `rows` rows, cut for the optimiser's tasks.
+    pub(super) fn tasks(
+        &mut self,
+        rows: usize,
+    ) -> impl IndexedParallelIterator<Item = ParameterTask<'_>> {
+        let is_narrow = self.is_narrow();
+        let Self { wide, fixed, half } = self;
+        let all = (wide.tasks(rows), fixed.tasks(rows), half.tasks(rows)).into_par_iter();
+        all.map(move |(wide, fixed, half)| ParameterTask { is_narrow, wide, fixed, half })
+    }
+}
+
+/// Some blocks, to read.
+#[derive(Debug, Clone)]
+pub(super) struct ParameterView<'a> {
+    blocks: usize,
+    is_narrow: bool,
+    wide: BlockView<'a, f32>,
+    fixed: BlockView<'a, i16>,
+    half: BlockView<'a, F16>,
+}
+
+impl<'a> ParameterView<'a> {
+    /// The blocks of task `i`.
+    pub(super) fn task(&self, i: usize) -> Self {
+        let first = (i * BLOCKS_PER_TASK).min(self.blocks);
+        let part = first..self.blocks.min(first + BLOCKS_PER_TASK);
+        Self {
+            blocks: part.len(),
+            is_narrow: self.is_narrow,
+            wide: self.wide.part(part.clone()),
+            fixed: self.fixed.part(part.clone()),
+            half: self.half.part(part),
+        }
+    }
+
+    pub(super) fn blocks(&self) -> usize {
+        self.blocks
+    }
+
+    /// The first `planes` planes, or more, of a block. Whole planes, one after the other.
+    #[inline(always)]
+    pub(super) fn open<'b>(
+        &self,
+        block: usize,
+        planes: usize,
+        scratch: &'b mut Scratch,
+    ) -> &'b [f32]
+    where
+        'a: 'b,
+    {
+        if !self.is_narrow {
+            return self.wide.block(block);
+        }
+        let narrow = (self.fixed.block(block), self.half.block(block));
+        to_scratch(self.wide.block(block), narrow, planes, scratch);
+        &scratch.0
+    }
+}
+
+/// Some blocks, to change.
+#[derive(Debug)]
+pub(super) struct ParameterTask<'a> {
+    is_narrow: bool,
+    wide: BlockTask<'a, f32>,
+    fixed: BlockTask<'a, i16>,
+    half: BlockTask<'a, F16>,
+}
+
+impl ParameterTask<'_> {
+    /// Whether what is stored is not what was computed.
+    #[inline(always)]
+    pub(super) fn is_narrow(&self) -> bool {
+        self.is_narrow
+    }
+
+    /// The first `planes` planes, or more, of a block.
+    #[inline(always)]
+    pub(super) fn open<'b>(
+        &'b mut self,
+        block: usize,
+        planes: usize,
+        scratch: &'b mut Scratch,
+    ) -> &'b mut [f32] {
+        if !self.is_narrow {
+            return self.wide.block(block);
+        }
+        let narrow = (&*self.fixed.block(block), &*self.half.block(block));
+        to_scratch(self.wide.block(block), narrow, planes, scratch);
+        &mut scratch.0
+    }
+
+    /// Stores the planes that were opened, where they are not what is stored.
+    #[inline(always)]
+    pub(super) fn close(
+        &mut self,
+        block: usize,
+        planes: usize,
+        scratch: &Scratch,
+        draws: &mut Draws,
+    ) {
+        if !self.is_narrow {
+            return;
+        }
+        let all = &scratch.0[..planes * WIDTH];
+        let (means, rest) = all.split_at(MEANS * WIDTH);
+        let (bounded, colour) = rest.split_at(BOUNDED * WIDTH);
+        self.wide.block(block).copy_from_slice(means);
+        let to = self.fixed.block(block).as_chunks_mut().0;
+        for (i, (from, to)) in bounded.as_chunks().0.iter().zip(to).enumerate() {
+            narrow_fixed(from, to, digits(i), draws);
+        }
+        narrow(colour, &mut self.half.block(block)[..colour.len()], draws);
+    }
+}
+
+#[inline(always)]
+fn to_scratch(wide: &[f32], narrow: (&[i16], &[F16]), planes: usize, scratch: &mut Scratch) {
+    let all = &mut scratch.0[..planes * WIDTH];
+    let (means, rest) = all.split_at_mut(MEANS * WIDTH);
+    let (bounded, colour) = rest.split_at_mut(BOUNDED * WIDTH);
+    means.copy_from_slice(wide);
+    let (fixed, half) = narrow;
+    for (i, (from, to)) in fixed.as_chunks().0.iter().zip(bounded.as_chunks_mut().0).enumerate() {
+        widen_fixed(from, to, digits(i));
+    }
+    widen(&half[..colour.len()], colour);
+}

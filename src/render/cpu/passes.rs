@@ -1,0 +1,418 @@
+//! The passes over a view: forward, image loss, backward, optimiser and candidates. They cut the
+//! work into tasks for the pool, at fixed places, and run the stages' kernels on them. One piece, as all share a view's
+//! frame.
+
+use std::ops::Range;
+use std::sync::atomic::Ordering::Relaxed;
+
+use densify_policies::policy::{Candidate, CandidateRequest, DepthMode, ErrorMode};
+use densify_policies::rng::PolicyRng;
+use rayon::prelude::*;
+
+use super::blocks::parts;
+use super::candidates;
+use super::loss::{ImageTerms, LossValue};
+use super::optimise::Optimise;
+use super::project::{Project, ViewParams};
+use super::rasterize::{
+    Beside, Blending, CANVAS_PLANES, DARK, DEPTH, Rasterize, TRANSMITTANCE, TileCanvas, TilePlace,
+    in_plane,
+};
+use super::rasterize_bwd::{Blended, RasterizeBwd, TileGradient, gather};
+use super::records::{Sums, parts as parts_of_records};
+use super::regularise::{Noise, Terms};
+use super::simd::WIDTH;
+use super::tiles::{Grid, TILE, Visible};
+use super::{BLOCKS_PER_TASK, CpuBackend, MAX_SIDE, ROWS_PER_TASK};
+use crate::candidates::Shown;
+use crate::signals::RecordLayout;
+use crate::{BackendError, Rendering, StepInput, StepOutput};
+use densify_core::camera::Camera;
+use densify_core::image::Image8;
+
+/// One view between its forward and its backward pass.
+pub(super) struct Frame {
+    pub(super) view: ViewParams,
+    pub(super) grid: Grid,
+    pub(super) background: [f32; 3],
+    pub(super) bands: Vec<Range<usize>>,
+    pub(super) entries: u64,
+    pub(super) visible: usize,
+}
+
+impl CpuBackend {
+    pub(super) fn resize_images(&mut self, grid: &Grid) {
+        let tiles = grid.tiles();
+        // A smaller view leaves the rest as it is, so that views of two sizes do not fill it in turn.
+        if self.canvas.len() < tiles {
+            self.canvas.resize(tiles, TileCanvas::EMPTY);
+            self.gradient.resize(tiles, TileGradient { planes: [DARK; 5] });
+        }
+    }
+
+    pub(super) fn image_loss(
+        &mut self,
+        grid: &Grid,
+        target: &Image8,
+        background: [f32; 3],
+        terms: ImageTerms,
+    ) -> LossValue {
+        let Self { threads, loss, arch, canvas, gradient, clock, .. } = self;
+        let (canvas, gradient) = (&canvas[..grid.tiles()], &mut gradient[..grid.tiles()]);
+        let value = threads.install(|| {
+            loss.run(threads, *arch, grid, canvas, target, background, gradient, terms)
+        });
+        clock.lap("loss");
+        value
+    }
+
+    /// Stages 1–3. Afterwards the canvas holds the image and, if there is one band only, the
+    /// lists hold its entries.
+    pub(super) fn forward(
+        &mut self,
+        camera: &Camera,
+        background: [f32; 3],
+        sh_degree: u8,
+        beside: Beside,
+    ) -> Result<Frame, BackendError> {
+        self.forward_painted(camera, background, sh_degree, beside, None)
+    }
+
+    /// The same, with the rows in other colours than their own, where there are some.
+    pub(super) fn forward_painted(
+        &mut self,
+        camera: &Camera,
+        background: [f32; 3],
+        sh_degree: u8,
+        beside: Beside,
+        colours: Option<&[[f32; 3]]>,
+    ) -> Result<Frame, BackendError> {
+        if camera.width > MAX_SIDE || camera.height > MAX_SIDE {
+            return Err(BackendError::ImageTooLarge {
+                width: camera.width,
+                height: camera.height,
+                max: MAX_SIDE,
+            });
+        }
+        let grid = Grid::new(camera.width, camera.height);
+        self.resize_images(&grid);
+        let view = ViewParams::new(camera, self.near, sh_degree.min(self.sh_degree));
+        let blending = Blending::from(self.shortcuts);
+        let Self {
+            threads,
+            arch,
+            lists,
+            splats,
+            visible: seen,
+            params,
+            dominant,
+            canvas,
+            rows,
+            clock,
+            ..
+        } = self;
+        let dominant = &dominant[..];
+        clock.start();
+        let (rows, arch) = (*rows, *arch);
+        let params = &params.view(rows);
+        threads.install(|| {
+            let seen = &mut seen[..rows.div_ceil(WIDTH)];
+            let parts = (
+                splats[..rows].par_chunks_mut(ROWS_PER_TASK),
+                seen.par_chunks_mut(BLOCKS_PER_TASK),
+            );
+            let tasks = parts.into_par_iter().enumerate();
+            let visible_rows = threads.sum("project", tasks, |(task, (splats, seen))| {
+                let (params, rows) = (params.task(task), splats.len());
+                for pixels in dominant.iter().skip(task * ROWS_PER_TASK).take(rows) {
+                    pixels.store(0, Relaxed);
+                }
+                let (view, log2_reach) = (&view, blending.log2_reach);
+                let lanes = &mut *seen;
+                let kernel =
+                    Project { view, log2_reach, params, rows, splats: &mut *splats, seen: lanes };
+                arch.dispatch(kernel);
+                if let Some(colours) = colours {
+                    let own = &colours[task * ROWS_PER_TASK..];
+                    splats.iter_mut().zip(own).for_each(|(splat, &own)| splat.colour = own);
+                }
+                seen.iter().map(|seen| seen.count_ones() as usize).sum()
+            });
+            clock.lap("project");
+            let visible = Visible { splats: &splats[..rows], seen };
+            let (bands, entries) = lists.bands(threads, visible, &grid);
+            for band in &bands {
+                lists.fill(threads, visible, &grid, band.clone(), bands.len() == 1);
+                clock.lap("tiles");
+                let tiles = canvas[band.clone()].par_iter_mut().enumerate();
+                threads.each_with("rasterize", tiles, Vec::new, |scratch, (i, canvas)| {
+                    lists.sort(i, scratch);
+                    arch.dispatch(Rasterize {
+                        splats,
+                        list: lists.of_tile(i),
+                        place: TilePlace::new(&grid, band.start + i),
+                        background,
+                        beside,
+                        dominant,
+                        blending,
+                        canvas,
+                    });
+                });
+                clock.lap("rasterize");
+            }
+            Ok(Frame { view, grid, background, bands, entries, visible: visible_rows })
+        })
+    }
+
+    /// Stage 5: from `self.gradient` to one record per row in `self.sums`.
+    pub(super) fn backward(&mut self, frame: &Frame, layout: RecordLayout) {
+        let Frame { grid, background, bands, .. } = frame;
+        let blending = self.shortcuts.into();
+        self.have_sums(layout);
+        let Self {
+            threads,
+            arch,
+            lists,
+            splats,
+            records,
+            sums,
+            visible,
+            canvas,
+            gradient,
+            clock,
+            rows,
+            ..
+        } = self;
+        let stride = layout.stride();
+        threads.install(|| {
+            // Slots of rows that are gone are those of an older frame.
+            let visible = &visible[..rows.div_ceil(WIDTH)];
+            for band in bands {
+                if bands.len() > 1 {
+                    let visible = Visible { splats: &splats[..*rows], seen: visible };
+                    lists.refill(threads, visible, grid, band);
+                }
+                let mut fresh = band.start == 0;
+                let cap = records.len() / stride;
+                for part in parts_of_records(threads, lists, band.len(), cap) {
+                    let tiles = part.tiles.clone();
+                    threads.each_with("rasterize_bwd", tiles, Blended::boxed, |blended, i| {
+                        let tile = band.start + i;
+                        arch.dispatch(RasterizeBwd {
+                            splats,
+                            list: lists.of_tile(i),
+                            place: TilePlace::new(grid, tile),
+                            background: *background,
+                            blending,
+                            canvas: &canvas[tile],
+                            upstream: &gradient[tile],
+                            layout,
+                            records: part.records(lists, i, records, stride),
+                            blended,
+                        });
+                    });
+                    clock.lap("rasterize_bwd");
+                    let add = |sum: &mut [f32], records: &[_]| gather(sum, layout, records);
+                    let to = Sums { sums, stride, fresh, visible };
+                    part.gather(threads, lists, records, to, add);
+                    fresh = false;
+                    clock.lap("gather");
+                }
+            }
+        });
+    }
+
+    /// Allocates the sums anew where they were lent, or are too few for these records.
+    pub(super) fn have_sums(&mut self, layout: RecordLayout) {
+        let whole = self.visible.len() * WIDTH * layout.stride();
+        if self.sums.len() < whole {
+            self.sums.resize(whole, 0.0);
+        }
+    }
+
+    /// Adds the worst pixels of the view to the candidates.
+    pub(super) fn collect_candidates(
+        &mut self,
+        frame: &Frame,
+        shown: Shown<'_>,
+        request: &CandidateRequest,
+        count: usize,
+    ) {
+        let Frame { grid, .. } = frame;
+        let Self { threads, canvas, gradient, loss, candidates, .. } = self;
+        let place =
+            |x: usize, y: usize| (y / TILE * grid.columns + x / TILE, in_plane(x % TILE, y % TILE));
+        let error = |x: usize, y: usize| {
+            let (tile, (patch, lane)) = place(x, y);
+            let alpha = 1.0 - canvas[tile].planes[TRANSMITTANCE][patch][lane];
+            (alpha >= request.min_alpha).then(|| match request.error {
+                ErrorMode::Gradient => {
+                    let g = |channel: usize| gradient[tile].planes[channel][patch][lane];
+                    (g(0) * g(0) + g(1) * g(1) + g(2) * g(2)).sqrt()
+                }
+                ErrorMode::L1 | ErrorMode::L1Dssim => loss.error_at(x, y),
+            })
+        };
+        let size = [grid.width, grid.height];
+        let rank = |ranking: &mut Vec<_>, most| {
+            threads.install(|| candidates::rank(threads, ranking, size, most, error))
+        };
+        let worst = candidates.worst_by(size, count, request.spaced, rank, error);
+        for candidate in self.surface_points(frame, shown, &worst, request.depth) {
+            self.candidates.push(candidate);
+        }
+    }
+
+    /// The surface points of some pixels (x, y, error) of the view, in their order; none for a pixel
+    /// that shows no surface.
+    pub(super) fn surface_points(
+        &mut self,
+        frame: &Frame,
+        shown: Shown<'_>,
+        pixels: &[(usize, usize, f32)],
+        mode: DepthMode,
+    ) -> Vec<Candidate> {
+        let Frame { grid, bands, view, .. } = frame;
+        let colour = shown.colours();
+        let shortcuts = self.shortcuts;
+        let Self { threads, lists, splats, params, visible, .. } = self;
+        let visible = Visible { splats: &splats[..self.rows], seen: visible };
+        let tile = |x: usize, y: usize| y / TILE * grid.columns + x / TILE;
+        let focal = 0.5 * (view.focal[0] + view.focal[1]);
+        let mut found: Vec<Option<Candidate>> = vec![None; pixels.len()];
+        for band in bands {
+            let here = |x: usize, y: usize| band.contains(&tile(x, y));
+            if bands.len() > 1 && pixels.iter().any(|&(x, y, _)| here(x, y)) {
+                threads.install(|| lists.refill(threads, visible, grid, band));
+            }
+            let lists = &*lists;
+            let tasks = found.par_iter_mut().zip(pixels);
+            let point_of =
+                |(slot, &(x, y, error)): (&mut Option<Candidate>, &(usize, usize, f32))| {
+                    if !here(x, y) {
+                        return;
+                    }
+                    let at = [x as f32 + 0.5, y as f32 + 0.5];
+                    let list = lists.of_tile(tile(x, y) - band.start);
+                    let surface = candidates::surface_row(splats, list, at, shortcuts, mode)
+                        .and_then(|row| candidates::closest_approach(params, row, view, at));
+                    *slot = surface.map(|(position, depth)| Candidate {
+                        position: position.to_array(),
+                        colour: colour(x, y),
+                        pixel_size: depth / focal,
+                        error,
+                    });
+                };
+            threads.install(|| threads.each("surface points", tasks, point_of));
+        }
+        found.into_iter().flatten().collect()
+    }
+
+    pub(super) fn rendering(&self, frame: &Frame) -> Rendering {
+        let grid = &frame.grid;
+        let pixels = grid.width * grid.height;
+        let mut out = Rendering {
+            width: grid.width as u32,
+            height: grid.height as u32,
+            rgb: vec![0.0; 3 * pixels],
+            alpha: vec![0.0; pixels],
+            depth: vec![0.0; pixels],
+        };
+        for (tile, canvas) in self.canvas[..grid.tiles()].iter().enumerate() {
+            for_each_pixel(grid, tile, |patch, lane, at| {
+                for channel in 0..3 {
+                    out.rgb[3 * at + channel] = canvas.planes[channel][patch][lane];
+                }
+                out.alpha[at] = 1.0 - canvas.planes[TRANSMITTANCE][patch][lane];
+                out.depth[at] = canvas.planes[DEPTH][patch][lane];
+            });
+        }
+        out
+    }
+
+    /// Stages 6–8 in one sweep over the rows, so that gradients never leave the cache.
+    pub(super) fn optimise(&mut self, frame: &Frame, input: &StepInput<'_>) {
+        let Self {
+            threads, arch, params, moments, masks, ages, signals, sums, visible, bias, ..
+        } = self;
+        let dominant = &self.dominant[..self.rows.min(self.dominant.len())];
+        let (rows, frozen, arch) = (self.rows, self.frozen, *arch);
+        let terms = Terms::new(input.loss_terms, rows - frozen);
+        let noise = input.noise.map(|term| Noise::new(term, input));
+        let due = self.summed.advance(input);
+        let (planes, layout) = (signals.planes(), signals.layout());
+        let signal_stride = signals.blocks.stride();
+        let storing = PolicyRng::new(input.seed, input.step);
+        // Whole tasks of frozen rows have nothing to do.
+        let first_row = moments.first();
+        let blocks = first_row / WIDTH..rows.div_ceil(WIDTH);
+        let tasks = blocks.len().div_ceil(BLOCKS_PER_TASK);
+        let per_task = signal_stride * BLOCKS_PER_TASK;
+        let sums = &sums[first_row * layout.stride()..blocks.end * WIDTH * layout.stride()];
+        let parts = (
+            params.tasks(rows).skip(first_row / ROWS_PER_TASK),
+            moments.tasks(rows),
+            masks.tasks(rows, rows - frozen),
+            ages.of_rows_mut(rows).par_chunks_mut(ROWS_PER_TASK),
+            parts(signals.blocks.of_rows_mut(rows), per_task, tasks),
+            sums.par_chunks(ROWS_PER_TASK * layout.stride()),
+            visible[blocks].par_chunks(BLOCKS_PER_TASK),
+            self.summed.tasks(rows, tasks).enumerate(),
+        );
+        threads.install(|| {
+            threads.each(
+                "project_bwd + adam",
+                parts,
+                |(params, moments, masks, ages, signals, sums, visible, (task, summed))| {
+                    let first_row = first_row + task * ROWS_PER_TASK;
+                    arch.dispatch(Optimise {
+                        params,
+                        moments,
+                        masks,
+                        storing: &storing,
+                        ages,
+                        signals,
+                        planes,
+                        dominant,
+                        sums,
+                        layout,
+                        visible,
+                        view: &frame.view,
+                        rates: &input.rates,
+                        bias,
+                        summed,
+                        due,
+                        terms,
+                        noise,
+                        first_row,
+                        frozen: frozen.saturating_sub(first_row),
+                        rows: rows - first_row,
+                    });
+                },
+            );
+        });
+    }
+}
+
+/// Calls `f(patch, lane, pixel of the image)` for every pixel of a tile inside the image.
+pub(super) fn for_each_pixel(grid: &Grid, tile: usize, mut f: impl FnMut(usize, usize, usize)) {
+    let place = TilePlace::new(grid, tile);
+    for y in 0..place.height {
+        for x in 0..place.width {
+            let at = (place.y as usize + y) * grid.width + place.x as usize + x;
+            let (patch, lane) = in_plane(x, y);
+            f(patch, lane, at);
+        }
+    }
+}
+
+pub(super) fn scalars(value: LossValue) -> StepOutput {
+    StepOutput {
+        loss: value.loss() as f32,
+        l1: value.l1 as f32,
+        ssim: value.ssim as f32,
+        ..StepOutput::default()
+    }
+}
+
+const _: () = assert!(CANVAS_PLANES == 5, "a tile's gradient mirrors its canvas");

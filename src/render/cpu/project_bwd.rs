@@ -1,0 +1,210 @@
+//! Stage 6: splat gradients to parameter gradients.
+//!
+//! The forward projection is evaluated again rather than stored. With the sums of stage 5 in
+//! whitened coordinates, M = Σ q·[u z]ᵀ[u z], the covariance's gradient is G = ½·L·M·Lᵀ. It is not
+//! formed: for a needle 1,000 px long its entries cancel when they meet the needle's axis. With
+//! W = Lᵀ·V, whose entries are at most 1, and wₖ its columns (one per axis of the Gaussian),
+//! - dL/d(log sₖ) = wₖᵀ·M·wₖ,
+//! - the gradient by a rotation about local axis x is nᵧᵀ·M·n_z·(sᵧ² − s_z²), wₖ = sₖ·nₖ, and so
+//!   around; it vanishes exactly for a sphere, and maps to the quaternion as 2/|q|·q̂⊗(0, g), which
+//!   is orthogonal to q,
+//! - dL/dV = L·M·W leads on to J and the mean.
+//!
+//! Derived from Σ = V·Vᵀ + 0.3·I, dL/dV = 2·G·V; checked against the float64 reference.
+
+use pulp::Simd;
+
+use super::blocks::plane;
+use super::project::{
+    FOLD, Geometry, ViewParams, conic, direction, dot, geometry, lanes, raw_colour, rotation,
+    sh_basis,
+};
+use super::rasterize_bwd::field;
+use super::simd::{V, WIDTH, each};
+use crate::signals::{BASE, Field, RecordLayout};
+use densify_core::gaussians::sh_coefficients;
+use densify_core::sh;
+
+/// Gradients of the sixteen rows of a block for one view.
+#[repr(align(64))]
+pub(super) struct BlockGradient {
+    /// dL/d(parameter), in the planes of the block.
+    pub(super) params: [f32; plane::MOST * WIDTH],
+    /// dL/d(projected mean) `[1/px]`, and the sum over pixels of its absolute value.
+    pub(super) mean2d: [[f32; WIDTH]; 2],
+    pub(super) mean2d_abs: [[f32; WIDTH]; 2],
+    /// 1 / depth in the camera `[1/scene unit]`.
+    pub(super) inv_z: [f32; WIDTH],
+    /// The record sums, number after number; those that records do not have are of no use.
+    pub(super) sums: [[f32; WIDTH]; RecordLayout::MOST],
+    /// 1 for visible rows, 0 for others.
+    pub(super) visible: [f32; WIDTH],
+    /// Pixels in which the row has the largest blend weight, where they are counted.
+    pub(super) dominant: [f32; WIDTH],
+}
+
+impl BlockGradient {
+    pub(super) const ZERO: Self = Self {
+        params: [0.0; plane::MOST * WIDTH],
+        mean2d: [[0.0; WIDTH]; 2],
+        mean2d_abs: [[0.0; WIDTH]; 2],
+        inv_z: [0.0; WIDTH],
+        sums: [[0.0; WIDTH]; RecordLayout::MOST],
+        visible: [0.0; WIDTH],
+        dominant: [0.0; WIDTH],
+    };
+
+    /// Differentiates the rows of `block` that are set in `visible`; the others get 0.
+    ///
+    /// `sums` has one record per row. Shape: `[WIDTH, layout.stride()]`.
+    #[inline(always)]
+    pub(super) fn compute<S: Simd>(
+        &mut self,
+        s: S,
+        block: &[f32],
+        sums: &[f32],
+        layout: RecordLayout,
+        visible: u16,
+        view: &ViewParams,
+    ) {
+        if visible == 0 {
+            *self = Self::ZERO;
+            return;
+        }
+        for (lane, record) in sums.chunks_exact(layout.stride()).enumerate() {
+            let seen = visible >> lane & 1 == 1;
+            self.visible[lane] = f32::from(u8::from(seen));
+            let (base, extras) = record.split_at(BASE);
+            for (line, &x) in self.sums.iter_mut().zip(base) {
+                line[lane] = if seen { x } else { 0.0 };
+            }
+            for (&number, &x) in layout.extras().iter().zip(extras) {
+                self.sums[usize::from(number)][lane] = if seen { x } else { 0.0 };
+            }
+        }
+        for at in (0..WIDTH).step_by(S::F32_LANES) {
+            self.lanes(s, block, at, layout, view);
+        }
+    }
+
+    #[inline(always)]
+    fn lanes<S: Simd>(
+        &mut self,
+        s: S,
+        block: &[f32],
+        at: usize,
+        layout: RecordLayout,
+        view: &ViewParams,
+    ) {
+        let degree = view.sh_degree;
+        let c = |x: f32| V::splat(s, x);
+        let zero = V::zero(s);
+        let seen = zero.lt(V::load(s, &self.visible[at..]));
+        let params = &mut self.params;
+        macro_rules! put {
+            ($p:expr, $x:expr) => {{
+                let p = $p;
+                seen.keep($x).store(&mut params[p * WIDTH + at..(p + 1) * WIDTH]);
+            }};
+        }
+        macro_rules! sum {
+            ($field:expr) => {
+                V::load(s, &self.sums[$field][at..])
+            };
+        }
+
+        let g = geometry(s, block, at, view);
+        let [l1, shear, l3] = conic(&g);
+        // Out of the folded units of the rasteriser.
+        let unfold = 1.0 / FOLD;
+        let (q, qu, qz) = (sum!(field::Q), sum!(field::U) * unfold, sum!(field::Z) * unfold);
+        let unfold2 = unfold * unfold;
+        let (muu, muz, mzz) =
+            (sum!(field::UU) * unfold2, sum!(field::UZ) * unfold2, sum!(field::ZZ) * unfold2);
+
+        seen.keep(g.inv_z).store(&mut self.inv_z[at..]);
+        // Projected mean: L·Σ q·(u, z).
+        let dm = [l1 * qu, l3 * qz - l1 * shear * qu];
+        for (slot, x) in self.mean2d.iter_mut().zip(dm) {
+            seen.keep(x).store(&mut slot[at..]);
+        }
+        if layout.has(Field::AbsX) {
+            // The sums hold Σ|q·u'| and Σ|q·(l3'·z' − l1'·shear·u')| with folded u', z', l'.
+            let abs =
+                [l1 * sum!(Field::AbsX.number()) * unfold, sum!(Field::AbsY.number()) * unfold2];
+            for (slot, x) in self.mean2d_abs.iter_mut().zip(abs) {
+                seen.keep(x).store(&mut slot[at..]);
+            }
+        }
+        // Columns of W without their scales, M·n, and so on.
+        let n0 = each!(k in 3 => l1 * (g.n[0][k] - shear * g.n[1][k]));
+        let n1 = each!(k in 3 => l3 * g.n[1][k]);
+        let mn0 = each!(k in 3 => muu * n0[k] + muz * n1[k]);
+        let mn1 = each!(k in 3 => muz * n0[k] + mzz * n1[k]);
+        let scale2 = each!(k in 3 => g.scale[k] * g.scale[k]);
+        for k in 0..3 {
+            put!(plane::LOG_SCALE + k, (n0[k] * mn0[k] + n1[k] * mn1[k]) * scale2[k]);
+        }
+        let turn = each!(i in 3 => {
+            let (j, k) = ((i + 1) % 3, (i + 2) % 3);
+            (n0[j] * mn0[k] + n1[j] * mn1[k]) * (scale2[j] - scale2[k])
+        });
+        let [w, x, y, z] = g.quat;
+        let two = g.quat_inv_norm * 2.0;
+        let [tx, ty, tz] = turn;
+        put!(plane::QUAT, -(x * tx + y * ty + z * tz) * two);
+        put!(plane::QUAT + 1, (w * tx + y * tz - z * ty) * two);
+        put!(plane::QUAT + 2, (w * ty + z * tx - x * tz) * two);
+        put!(plane::QUAT + 3, (w * tz + x * ty - y * tx) * two);
+
+        // dL/d(row i of J·W) = Σ_k (L·M·n)[i][k]·sₖ²·axisₖ.
+        let d0 = each!(k in 3 => l1 * mn0[k] * scale2[k]);
+        let d1 = each!(k in 3 => (l3 * mn1[k] - l1 * shear * mn0[k]) * scale2[k]);
+        let [a0, a1, a2] = g.axes;
+        let db0 = each!(i in 3 => d0[0] * a0[i] + d0[1] * a1[i] + d0[2] * a2[i]);
+        let db1 = each!(i in 3 => d1[0] * a0[i] + d1[1] * a1[i] + d1[2] * a2[i]);
+        let rot = rotation(s, view);
+        let (fx, fy) = (c(view.focal[0]), c(view.focal[1]));
+        let (j00, j02) = (dot(db0, rot[0]), dot(db0, rot[2]));
+        let (j11, j12) = (dot(db1, rot[1]), dot(db1, rot[2]));
+        let Geometry { inv_z, ratio, clamped, .. } = g;
+        // J = f/z·[1, 0, −x/z; 0, 1, −y/z], its x/z and y/z constant where clamped.
+        let by_inv_z = fx * (j00 - clamped[0] * j02) + fy * (j11 - clamped[1] * j12);
+        let (focal, j_2) = ([fx, fy], [j02, j12]);
+        let by_ratio = each!(i in 2 => {
+            let free = clamped[i].le(ratio[i]).and(ratio[i].le(clamped[i]));
+            focal[i] * (dm[i] - free.keep(inv_z * j_2[i]))
+        });
+        let by_depth = if layout.has(Field::Depth) { sum!(Field::Depth.number()) } else { zero };
+        let dp = [
+            by_ratio[0] * inv_z,
+            by_ratio[1] * inv_z,
+            by_depth - inv_z * (by_ratio[0] * ratio[0] + by_ratio[1] * ratio[1] + inv_z * by_inv_z),
+        ];
+
+        // Colour: through the clamp at 0 to the coefficients, and through the direction to the mean.
+        let (dir, inv_distance) = direction(s, block, at, view);
+        let basis = sh_basis(s, degree, dir);
+        let raw = raw_colour(s, block, at, degree, &basis);
+        let dc = each!(i in 3 => zero.lt(raw[i]).keep(sum!(field::COLOUR + i)));
+        let mut weights = [zero; 16];
+        for k in 0..sh_coefficients(degree) {
+            for (channel, &dc) in dc.iter().enumerate() {
+                let p = plane::SH + 3 * k + channel;
+                weights[k] = dc.mul_add(lanes(s, block, p, at), weights[k]);
+                put!(p, basis[k] * dc);
+            }
+        }
+        let by_dir = sh::basis_gradient(degree, dir, &weights, zero);
+        let radial = dot(by_dir, dir);
+        for i in 0..3 {
+            let from_p = rot[0][i] * dp[0] + rot[1][i] * dp[1] + rot[2][i] * dp[2];
+            let from_dir = (by_dir[i] - radial * dir[i]) * inv_distance;
+            put!(plane::MEAN + i, from_p + from_dir);
+        }
+
+        // dα/d(logit) = α(1 − o); 1 − o = σ(−logit) keeps its precision near o = 1.
+        let logit = lanes(s, block, plane::OPACITY, at);
+        put!(plane::OPACITY, q / (c(1.0) + logit.exp()));
+    }
+}

@@ -1,0 +1,334 @@
+//! Stage 3: tile lists to pixels. Front to back alpha blending (Kerbl et al. 2023, section 3 and
+//! appendix C): alpha = min(0.99, o·exp(−p)), skipped below 1/255; a pixel stops, without that
+//! splat, where its transmittance would fall to 1e-4 or below. Both limits are knobs ([`Blending`]).
+//!
+//! One tile at a time, one batch of its splats at a time, and of these one patch of 4×4 pixels at a
+//! time: a vector, which stays in registers while the batch is blended into it. Most splats are a few
+//! pixels wide, and patches cover them with a third fewer vectors than rows of sixteen pixels do. In
+//! the coordinates (u, z) = Lᵀ·d the exponent is e = log₂o − u² − z²; from patch to patch u and z only
+//! move by a constant each. A bit per patch says whether the splat reaches it, another whether any of
+//! its pixels still takes light.
+
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
+
+use pulp::{Simd, WithSimd};
+
+use super::batch::{BATCH, Batch};
+use super::project::Splat;
+use super::simd::{V, WIDTH, exp2_of, load_of, store_of};
+use super::tiles::{Entry, Grid, TILE};
+use crate::Shortcuts;
+
+/// Largest alpha: keeps 1 − alpha, and so the transmittance, recoverable.
+pub(super) const ALPHA_MAX: f32 = 0.99;
+/// What blending takes and where it ends; forward and backward pass must have the same.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Blending {
+    /// A splat is blended where its exponent is at least minus this.
+    pub(super) log2_reach: f32,
+    /// A pixel stops before its transmittance reaches this.
+    pub(super) transmittance_min: f32,
+}
+
+impl From<Shortcuts> for Blending {
+    fn from(shortcuts: Shortcuts) -> Self {
+        let transmittance_min = shortcuts.transmittance_min;
+        Self { log2_reach: shortcuts.log2_reach(), transmittance_min }
+    }
+}
+
+/// What is summed over the rows of a pixel beside its colour, in the plane of depth.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Beside {
+    /// Nothing.
+    Nothing,
+    /// Depth, by the weights of blending.
+    Depth,
+    /// One for each.
+    Count,
+}
+
+/// Planes of a rendered tile: red, green, blue, final transmittance, depth.
+pub(super) const CANVAS_PLANES: usize = 5;
+pub(super) const TRANSMITTANCE: usize = 3;
+pub(super) const DEPTH: usize = 4;
+
+/// Side of a patch `[px]`: its pixels are one vector, row by row.
+pub(super) const PATCH: usize = 4;
+/// Patches along a tile's side, and, as it happens, in a vector: a tile has as many patches as a
+/// patch has pixels.
+const ACROSS: usize = TILE / PATCH;
+pub(super) const PATCHES: usize = ACROSS * ACROSS;
+const _: () = assert!(PATCH * PATCH == WIDTH && PATCHES == WIDTH);
+
+/// The pixels of one tile, patch by patch, both row by row; see [`in_plane`].
+pub(super) type Plane = [[f32; WIDTH]; PATCHES];
+
+/// Patch and lane of a tile's pixel.
+#[inline(always)]
+pub(super) const fn in_plane(x: usize, y: usize) -> (usize, usize) {
+    (y / PATCH * ACROSS + x / PATCH, y % PATCH * PATCH + x % PATCH)
+}
+
+/// Copies row `y` of a tile out of its plane. Patch by patch, straight to where it is wanted: loading it
+/// whole right afterwards would wait for all four stores.
+#[inline(always)]
+pub(super) fn copy_row_of_plane(plane: &Plane, y: usize, row: &mut [f32; TILE]) {
+    for (x, pixels) in (0..TILE).step_by(PATCH).zip(row.as_chunks_mut::<PATCH>().0) {
+        let (patch, lane) = in_plane(x, y);
+        pixels.copy_from_slice(&plane[patch][lane..lane + PATCH]);
+    }
+}
+
+/// Copies row `y` of a tile into its plane.
+#[inline(always)]
+pub(super) fn set_row_of_plane(plane: &mut Plane, y: usize, row: &[f32; TILE]) {
+    for (x, pixels) in (0..TILE).step_by(PATCH).zip(row.as_chunks::<PATCH>().0) {
+        let (patch, lane) = in_plane(x, y);
+        plane[patch][lane..lane + PATCH].copy_from_slice(pixels);
+    }
+}
+
+/// A plane of zeros.
+pub(super) const DARK: Plane = [[0.0; WIDTH]; PATCHES];
+
+/// One rendered tile.
+#[derive(Debug, Clone)]
+#[repr(C, align(64))]
+pub(super) struct TileCanvas {
+    /// Red, green, blue (background included), final transmittance, depth.
+    pub(super) planes: [Plane; CANVAS_PLANES],
+    /// Place in the tile's list at which each pixel stopped; `u32::MAX` if it did not, 0 outside the
+    /// image.
+    pub(super) stop: [[u32; WIDTH]; PATCHES],
+}
+
+impl TileCanvas {
+    pub(super) const EMPTY: Self =
+        Self { planes: [DARK; CANVAS_PLANES], stop: [[u32::MAX; WIDTH]; PATCHES] };
+}
+
+/// Where a tile lies in the image.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct TilePlace {
+    /// Its upper left corner `[px]`.
+    pub(super) x: f32,
+    pub(super) y: f32,
+    /// Its pixels inside the image.
+    pub(super) width: usize,
+    pub(super) height: usize,
+}
+
+impl TilePlace {
+    pub(super) fn new(grid: &Grid, tile: usize) -> Self {
+        let (x, y) = (tile % grid.columns * TILE, tile / grid.columns * TILE);
+        Self {
+            x: x as f32,
+            y: y as f32,
+            width: TILE.min(grid.width - x),
+            height: TILE.min(grid.height - y),
+        }
+    }
+
+    /// 1 for the pixels inside the image, 0 for others, and a bit for each patch that has any.
+    pub(super) fn inside(&self) -> (Plane, u32) {
+        if self.width == TILE && self.height == TILE {
+            return ([[1.0; WIDTH]; PATCHES], (1 << PATCHES) - 1);
+        }
+        let (mut plane, mut patches) = (DARK, 0);
+        for y in 0..self.height {
+            for x in 0..self.width {
+                let (patch, lane) = in_plane(x, y);
+                plane[patch][lane] = 1.0;
+                patches |= 1 << patch;
+            }
+        }
+        (plane, patches)
+    }
+}
+
+/// Renders one tile.
+pub(super) struct Rasterize<'a> {
+    pub(super) splats: &'a [Splat],
+    /// Sorted.
+    pub(super) list: &'a [AtomicU64],
+    pub(super) place: TilePlace,
+    pub(super) background: [f32; 3],
+    pub(super) beside: Beside,
+    /// Pixels of each row in which none has a larger blend weight, to which the tile adds its own; empty
+    /// if they are not counted. Whole numbers, so that it does not matter which tile is first.
+    pub(super) dominant: &'a [AtomicU32],
+    pub(super) blending: Blending,
+    pub(super) canvas: &'a mut TileCanvas,
+}
+
+impl WithSimd for Rasterize<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, s: S) {
+        // Halves or quarters of a patch go in twos: what is the same for both is loaded once. One kernel
+        // has all that is rarely wanted.
+        let with_more = self.beside != Beside::Nothing || !self.dominant.is_empty();
+        match (with_more, matches!(S::F32_LANES, 4 | 8)) {
+            (true, true) => self.run::<S, true, 2>(s),
+            (true, false) => self.run::<S, true, 1>(s),
+            (false, true) => self.run::<S, false, 2>(s),
+            (false, false) => self.run::<S, false, 1>(s),
+        }
+    }
+}
+
+impl Rasterize<'_> {
+    /// `N` vectors of a patch at a time.
+    #[inline(always)]
+    #[expect(clippy::too_many_lines, reason = "a numeric kernel")]
+    fn run<S: Simd, const WITH_MORE: bool, const N: usize>(self, s: S) {
+        let Self { splats, list, place, background, dominant, canvas, blending, beside } = self;
+        let counts = beside == Beside::Count;
+        let c = |x: f32| V::splat(s, x);
+        let (faintest, least_light) = (c(-blending.log2_reach), c(blending.transmittance_min));
+        let (zero, never) = (V::zero(s), c(-1.0));
+        let TileCanvas { planes, stop } = canvas;
+        let [red, green, blue, finished, depth] = planes;
+        for plane in [&mut *red, &mut *green, &mut *blue, &mut *finished, &mut *depth] {
+            *plane = DARK;
+        }
+        // Transmittance while the pixel takes light; 0 once it has stopped (its last value is then
+        // in `finished`) and from the start outside the image.
+        let (inside, mut alive) = place.inside();
+        let mut light = Aligned(inside);
+        let light = &mut light.0;
+        for (stop, light) in stop.as_flattened_mut().iter_mut().zip(light.as_flattened()) {
+            *stop = if *light > 0.0 { u32::MAX } else { 0 };
+        }
+        // The largest weight of each pixel, and the place of its splat in the list.
+        let mut largest = Aligned(DARK);
+        let mut largest_at = [[0_u32; WIDTH]; PATCHES];
+        let mut batch = Batch::new();
+        for (first, chunk) in (0..).step_by(BATCH).zip(list.chunks(BATCH)) {
+            if alive == 0 {
+                break;
+            }
+            batch.set(s, splats, chunk, &place);
+            for p in 0..PATCHES {
+                let reached = batch.splats_of[p];
+                if alive >> p & 1 == 0 || reached == 0 {
+                    continue;
+                }
+                let mut takes_light = false;
+                for at in (0..WIDTH).step_by(N * S::F32_LANES) {
+                    let mut t = load_of::<S, N>(s, &light[p][at..]);
+                    // Pixels without light have stopped, and must not do so again.
+                    let mut least = t;
+                    for n in 0..N {
+                        least[n] = zero.lt(t[n]).select(least_light, never);
+                    }
+                    let mut r = load_of::<S, N>(s, &red[p][at..]);
+                    let mut g = load_of::<S, N>(s, &green[p][at..]);
+                    let mut b = load_of::<S, N>(s, &blue[p][at..]);
+                    let mut at_depth = load_of::<S, N>(s, &depth[p][at..]);
+                    let mut most = load_of::<S, N>(s, &largest.0[p][at..]);
+                    let mut todo = reached;
+                    while todo != 0 {
+                        // 32 bits; saying so again spares every load its bounds check.
+                        let i = todo.trailing_zeros() as usize % BATCH;
+                        todo &= todo - 1;
+                        let splat = &batch.splats[i];
+                        let mut e = t;
+                        for (n, e) in e.iter_mut().enumerate() {
+                            let [u, z] = batch.u_and_z(s, i, p, at + n * S::F32_LANES);
+                            *e = u.neg_mul_add(u, z.neg_mul_add(z, c(splat.log2_opacity)));
+                        }
+                        let mut alpha = exp2_of(e);
+                        let mut next = t;
+                        for n in 0..N {
+                            alpha[n] = faintest.le(e[n]).keep(alpha[n].min(c(ALPHA_MAX)));
+                            next[n] = alpha[n].neg_mul_add(t[n], t[n]);
+                        }
+                        let mut some_stop = next[0].le(least[0]);
+                        for n in 1..N {
+                            some_stop = some_stop.or(next[n].le(least[n]));
+                        }
+                        if some_stop.any() {
+                            let here = s.splat_u32s(first + i as u32);
+                            let mut all_stopped = true;
+                            for n in 0..N {
+                                let stops = next[n].le(least[n]);
+                                let at = at + n * S::F32_LANES;
+                                let finished = &mut finished[p][at..];
+                                stops.select(t[n], V::load(s, finished)).store(finished);
+                                let stop = &mut S::as_mut_simd_u32s(&mut stop[p][at..]).0[0];
+                                *stop = stops.select_u32s(here, *stop);
+                                t[n] = stops.select(zero, t[n]);
+                                least[n] = stops.select(never, least[n]);
+                                next[n] = alpha[n].neg_mul_add(t[n], t[n]);
+                                all_stopped &= !zero.lt(t[n]).any();
+                            }
+                            if all_stopped {
+                                todo = 0;
+                            }
+                        }
+                        for n in 0..N {
+                            let w = alpha[n] * t[n];
+                            r[n] = w.mul_add(c(splat.colour[0]), r[n]);
+                            g[n] = w.mul_add(c(splat.colour[1]), g[n]);
+                            b[n] = w.mul_add(c(splat.colour[2]), b[n]);
+                            if WITH_MORE {
+                                at_depth[n] = match counts {
+                                    false => w.mul_add(c(splat.depth), at_depth[n]),
+                                    true => at_depth[n] + zero.lt(w).keep(c(1.0)),
+                                };
+                                let here = s.splat_u32s(first + i as u32);
+                                let largest_at = &mut largest_at[p][at + n * S::F32_LANES..];
+                                let largest_at = &mut S::as_mut_simd_u32s(largest_at).0[0];
+                                *largest_at = most[n].lt(w).select_u32s(here, *largest_at);
+                                most[n] = most[n].max(w);
+                            }
+                        }
+                        t = next;
+                    }
+                    store_of(t, &mut light[p][at..]);
+                    store_of(r, &mut red[p][at..]);
+                    store_of(g, &mut green[p][at..]);
+                    store_of(b, &mut blue[p][at..]);
+                    if WITH_MORE {
+                        store_of(at_depth, &mut depth[p][at..]);
+                        store_of(most, &mut largest.0[p][at..]);
+                    }
+                    for t in t {
+                        takes_light |= zero.lt(t).any();
+                    }
+                }
+                if !takes_light {
+                    alive &= !(1 << p);
+                }
+            }
+        }
+        for p in 0..PATCHES {
+            for at in (0..WIDTH).step_by(S::F32_LANES) {
+                let t = V::load(s, &light[p][at..]).max(V::load(s, &finished[p][at..]));
+                t.store(&mut finished[p][at..]);
+                blend(s, t, c(background[0]), &mut red[p][at..]);
+                blend(s, t, c(background[1]), &mut green[p][at..]);
+                blend(s, t, c(background[2]), &mut blue[p][at..]);
+            }
+        }
+        if WITH_MORE && !dominant.is_empty() {
+            let pixels = largest.0.as_flattened().iter().zip(largest_at.as_flattened());
+            for (_, &at) in pixels.filter(|(weight, _)| **weight > 0.0) {
+                let row = Entry::load(&list[at as usize]).row;
+                dominant[row].fetch_add(1, Relaxed);
+            }
+        }
+    }
+}
+
+/// plane += w·x.
+#[inline(always)]
+fn blend<S: Simd>(s: S, w: V<S>, x: V<S>, plane: &mut [f32]) {
+    w.mul_add(x, V::load(s, plane)).store(plane);
+}
+
+#[repr(align(64))]
+pub(super) struct Aligned(pub(super) Plane);

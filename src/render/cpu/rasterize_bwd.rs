@@ -1,0 +1,391 @@
+//! Stage 5: pixel gradients to splat gradients, one record per (row, tile) entry.
+//!
+//! Each tile's list is walked back to front. For pixel x and splat i with blend weight w = α·T,
+//! the derivative of Σ g·C is dL/dα = T·(c·g − b), where b is the gradient-weighted colour of
+//! everything behind the splat, background included, normalised by the transmittance there. b is
+//! a running convex combination, b ← b + α(c·g − b): nothing is subtracted from a total, so that
+//! nothing cancels however little light is left.
+//!
+//! A batch of splats is walked twice. Front to back, one patch at a time as in the forward pass: each
+//! alpha, its weight as if nothing were in front of the batch, and at last the product of all 1 − α, by
+//! which the light behind the batch is divided to have that in front of it. Back to front, one splat at
+//! a time: what depends on the gradient, whose sums so stay in registers.
+//!
+//! In the whitened coordinates (u, z) = Lᵀ·d of the forward pass, all that the parameters need of
+//! a tile are sums of q, q·u, q·z, q·u², q·u·z, q·z² with q = α·dL/dα (and of w·g for the colour):
+//! the covariance's gradient is ½·L·M·Lᵀ with M the matrix of second moments, and it is never
+//! formed; see `project_bwd`.
+//!
+//! Records are summed per row in order of tile number, so the sum does not depend on threads.
+
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
+
+use bytemuck::Zeroable;
+use pulp::{Simd, WithSimd};
+
+use super::batch::{BATCH, Batch};
+use super::project::Splat;
+use super::rasterize::{
+    ALPHA_MAX, Aligned, Blending, DARK, PATCHES, Plane, TRANSMITTANCE, TileCanvas, TilePlace,
+};
+use super::records::TileRecords;
+use super::simd::{V, WIDTH, each, sums_of_four};
+use super::tiles::Entry;
+use crate::signals::{BASE, Field, RecordLayout};
+
+/// The numbers that every record has.
+pub(super) mod field {
+    pub(in super::super) const Q: usize = 0;
+    pub(in super::super) const U: usize = 1;
+    pub(in super::super) const Z: usize = 2;
+    pub(in super::super) const UU: usize = 3;
+    pub(in super::super) const UZ: usize = 4;
+    pub(in super::super) const ZZ: usize = 5;
+    pub(in super::super) const COLOUR: usize = 6;
+}
+
+/// What the kernel is compiled for, beside the base of a record.
+mod extra {
+    /// The absolute gradients.
+    pub(super) const ABS: u8 = 1;
+    /// The sum of weights and the number of pixels.
+    pub(super) const WEIGHTS: u8 = 2;
+    /// The largest weight.
+    pub(super) const LARGEST: u8 = 4;
+    /// The sum of the weighted error, beside the two above.
+    pub(super) const ERROR: u8 = 8 | WEIGHTS | LARGEST;
+    pub(super) const ERROR_ABS: u8 = ERROR | ABS;
+    /// Everything but the error, with the gradients of alpha and depth.
+    pub(super) const ALL: u8 = 16 | ABS | WEIGHTS | LARGEST;
+}
+
+/// dL/dpixel of one tile: red, green, blue, alpha, depth. The last two are read for records with
+/// [`Field::Depth`] only; with [`Field::Error`], the last one is the error of the pixels.
+#[derive(Debug, Clone)]
+#[repr(C, align(64))]
+pub(super) struct TileGradient {
+    pub(super) planes: [Plane; 5],
+}
+
+/// Differentiates one tile.
+pub(super) struct RasterizeBwd<'a> {
+    pub(super) splats: &'a [Splat],
+    /// Sorted.
+    pub(super) list: &'a [AtomicU64],
+    pub(super) place: TilePlace,
+    pub(super) background: [f32; 3],
+    /// Those of the forward pass.
+    pub(super) blending: Blending,
+    pub(super) canvas: &'a TileCanvas,
+    pub(super) upstream: &'a TileGradient,
+    pub(super) layout: RecordLayout,
+    /// This tile writes the records of its own entries, those that are held.
+    pub(super) records: TileRecords<'a>,
+    /// Scratch.
+    pub(super) blended: &'a mut Blended,
+}
+
+impl WithSimd for RasterizeBwd<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, s: S) {
+        let has = |field| self.layout.has(field);
+        // Where there are no vectors, records are not worth a kernel of their own: eleven, unrolled lane by
+        // lane, would be a tenth of the program, and what is not asked for is not written.
+        if const { S::F32_LANES == 1 } {
+            return match has(Field::Depth) {
+                false => self.run::<S, { extra::ERROR_ABS }>(s),
+                true => self.run::<S, { extra::ALL }>(s),
+            };
+        }
+        let mut extras = 0;
+        if has(Field::AbsX) {
+            extras |= extra::ABS;
+        }
+        if has(Field::WeightSum) || has(Field::PixelCount) {
+            extras |= extra::WEIGHTS;
+        }
+        if has(Field::WeightMax) {
+            extras |= extra::LARGEST;
+        }
+        if has(Field::Error) {
+            extras |= extra::ERROR;
+        }
+        if has(Field::Depth) {
+            extras = extra::ALL;
+        }
+        match extras {
+            0 => self.run::<S, 0>(s),
+            1 => self.run::<S, 1>(s),
+            2 => self.run::<S, 2>(s),
+            3 => self.run::<S, 3>(s),
+            4 => self.run::<S, 4>(s),
+            5 => self.run::<S, 5>(s),
+            6 => self.run::<S, 6>(s),
+            7 => self.run::<S, 7>(s),
+            extra::ERROR => self.run::<S, { extra::ERROR }>(s),
+            extra::ERROR_ABS => self.run::<S, { extra::ERROR_ABS }>(s),
+            _ => self.run::<S, { extra::ALL }>(s),
+        }
+    }
+}
+
+/// Pairs of a splat and a patch in a batch, at most.
+const PAIRS: usize = BATCH * PATCHES;
+
+/// What the first walk over a batch leaves for the second: pair after pair, patch by patch.
+#[derive(Zeroable)]
+#[repr(C, align(64))]
+pub(super) struct Blended {
+    alpha: [[f32; WIDTH]; PAIRS],
+    /// α·Π(1 − α) over the splats of the batch in front.
+    weight: [[f32; WIDTH]; PAIRS],
+}
+
+impl Blended {
+    pub(super) fn boxed() -> Box<Self> {
+        bytemuck::zeroed_box()
+    }
+}
+
+/// Sums of one entry, lane by lane.
+struct Sums<S: Simd> {
+    base: [V<S>; BASE],
+    abs: [V<S>; 2],
+    weight: V<S>,
+    pixels: V<S>,
+    /// Of weights times the last plane of the gradient.
+    map: V<S>,
+    weight_max: V<S>,
+}
+
+impl RasterizeBwd<'_> {
+    /// The first walk over a batch, whose first splat is entry `first` of the list. `light` is moved from
+    /// behind the batch to its front. Returns the end of each patch's pairs.
+    #[inline(always)]
+    fn blend_again<S: Simd>(
+        &mut self,
+        s: S,
+        batch: &Batch,
+        first: usize,
+        light: &mut Plane,
+    ) -> [usize; PATCHES] {
+        let c = |x: f32| V::splat(s, x);
+        let faintest = c(-self.blending.log2_reach);
+        let Blended { alpha: alphas, weight: weights } = &mut *self.blended;
+        let mut ends = [0; PATCHES];
+        let mut start = 0;
+        for p in 0..PATCHES {
+            let reached = batch.splats_of[p];
+            if reached == 0 {
+                continue;
+            }
+            for at in (0..WIDTH).step_by(S::F32_LANES) {
+                let stop = S::as_simd_u32s(&self.canvas.stop[p][at..]).0[0];
+                let mut product = c(1.0);
+                let (mut pair, mut todo) = (start, reached);
+                while todo != 0 {
+                    // The mask has 32 bits; saying so again spares every load its bounds check.
+                    let i = todo.trailing_zeros() as usize % BATCH;
+                    todo &= todo - 1;
+                    let [u, z] = batch.u_and_z(s, i, p, at);
+                    let log2_opacity = c(batch.splats[i].log2_opacity);
+                    let e = u.neg_mul_add(u, z.neg_mul_add(z, log2_opacity));
+                    let here = s.splat_u32s((first + i) as u32);
+                    let seen = faintest.le(e).and(super::simd::before(s, here, stop));
+                    let alpha = seen.keep(e.exp2().min(c(ALPHA_MAX)));
+                    alpha.store(&mut alphas[pair % PAIRS][at..]);
+                    (alpha * product).store(&mut weights[pair % PAIRS][at..]);
+                    product = alpha.neg_mul_add(product, product);
+                    pair += 1;
+                }
+                // Where the product leaves f32, the light behind has done so, too.
+                let light = &mut light[p][at..];
+                (V::load(s, light) / product.max(c(f32::MIN_POSITIVE))).store(light);
+            }
+            start += reached.count_ones() as usize;
+            ends[p] = start;
+        }
+        ends
+    }
+
+    #[inline(always)]
+    #[expect(clippy::too_many_lines, reason = "a numeric kernel")]
+    fn run<S: Simd, const EXTRAS: u8>(mut self, s: S) {
+        let Self { splats, list, place, background, canvas, upstream, layout, records, .. } = self;
+        let c = |x: f32| V::splat(s, x);
+        let [gr, gg, gb, ga, map] = &upstream.planes;
+
+        // State per pixel, as it is behind the splat at hand.
+        let mut light = Aligned(canvas.planes[TRANSMITTANCE]);
+        let mut behind = Aligned(DARK);
+        let (light, behind) = (&mut light.0, &mut behind.0);
+        // One past the last list entry that any pixel of the patch takes.
+        let mut patch_end = [0_u32; WIDTH];
+        for (p, end) in patch_end.iter_mut().enumerate() {
+            for at in (0..WIDTH).step_by(S::F32_LANES) {
+                let b = V::load(s, &gr[p][at..]) * background[0]
+                    + V::load(s, &gg[p][at..]) * background[1]
+                    + V::load(s, &gb[p][at..]) * background[2];
+                b.store(&mut behind[p][at..]);
+            }
+            *end = canvas.stop[p].iter().copied().max().unwrap_or(0).min(list.len() as u32);
+        }
+        let list_end = patch_end.iter().copied().max().unwrap_or(0) as usize;
+        for (i, entry) in list[list_end..].iter().enumerate() {
+            let record = records.of(Entry::load(entry), list_end + i);
+            write(record, &[0.0; RecordLayout::MOST], layout);
+        }
+
+        let mut batch = Batch::new();
+        let batches = list_end.div_ceil(BATCH);
+        for n in (0..batches).rev() {
+            let first = n * BATCH;
+            let chunk = &list[first..list_end.min(first + BATCH)];
+            batch.set(s, splats, chunk, &place);
+            for (p, &end) in patch_end.iter().enumerate() {
+                batch.cut(p, (end as usize).saturating_sub(first));
+            }
+            let mut ends = self.blend_again(s, &batch, first, light);
+            for (i, splat) in batch.splats[..chunk.len()].iter().enumerate().rev() {
+                let mut todo = batch.patches_of[i];
+                let colour = each!(i in 3 => c(splat.colour[i]));
+                let at_depth = c(splat.depth);
+                let y2_u = c(-splat.l1 * splat.shear);
+                let zero = V::zero(s);
+                let mut sums = Sums {
+                    base: [zero; BASE],
+                    abs: [zero; 2],
+                    weight: zero,
+                    pixels: zero,
+                    map: zero,
+                    weight_max: zero,
+                };
+                while todo != 0 {
+                    // The mask has sixteen bits; saying so again spares every load its bounds check.
+                    let p = todo.trailing_zeros() as usize % WIDTH;
+                    todo &= todo - 1;
+                    ends[p] -= 1;
+                    let pair = ends[p] % PAIRS;
+                    for at in (0..WIDTH).step_by(S::F32_LANES) {
+                        let [u, z] = batch.u_and_z(s, i, p, at);
+                        let alpha = V::load(s, &self.blended.alpha[pair][at..]);
+                        let part = V::load(s, &self.blended.weight[pair][at..]);
+                        let w = part * V::load(s, &light[p][at..]);
+                        let (r, g, b) = (
+                            V::load(s, &gr[p][at..]),
+                            V::load(s, &gg[p][at..]),
+                            V::load(s, &gb[p][at..]),
+                        );
+                        let mut own = colour[0].mul_add(r, colour[1].mul_add(g, colour[2] * b));
+                        if EXTRAS >= extra::ERROR {
+                            let m = V::load(s, &map[p][at..]);
+                            sums.map = w.mul_add(m, sums.map);
+                            if EXTRAS == extra::ALL {
+                                own = at_depth.mul_add(m, own + V::load(s, &ga[p][at..]));
+                            }
+                        }
+                        let was = V::load(s, &behind[p][at..]);
+                        let ahead = own - was;
+                        alpha.mul_add(ahead, was).store(&mut behind[p][at..]);
+                        // No gradient where alpha is at its clamp.
+                        let q = alpha.lt(c(ALPHA_MAX)).keep(w * ahead);
+                        let qu = q * u;
+                        let qz = q * z;
+                        let base = &mut sums.base;
+                        base[field::Q] = base[field::Q] + q;
+                        base[field::U] = base[field::U] + qu;
+                        base[field::Z] = base[field::Z] + qz;
+                        base[field::UU] = qu.mul_add(u, base[field::UU]);
+                        base[field::UZ] = qu.mul_add(z, base[field::UZ]);
+                        base[field::ZZ] = qz.mul_add(z, base[field::ZZ]);
+                        base[field::COLOUR] = w.mul_add(r, base[field::COLOUR]);
+                        base[field::COLOUR + 1] = w.mul_add(g, base[field::COLOUR + 1]);
+                        base[field::COLOUR + 2] = w.mul_add(b, base[field::COLOUR + 2]);
+                        if EXTRAS & extra::LARGEST != 0 {
+                            sums.weight_max = sums.weight_max.max(w);
+                        }
+                        if EXTRAS & extra::ABS != 0 {
+                            sums.abs[0] = sums.abs[0] + qu.abs();
+                            let y2 = y2_u.mul_add(qu, qz * splat.l3);
+                            sums.abs[1] = sums.abs[1] + y2.abs();
+                        }
+                        if EXTRAS & extra::WEIGHTS != 0 {
+                            sums.weight = sums.weight + w;
+                            sums.pixels = sums.pixels + zero.lt(w).keep(c(1.0));
+                        }
+                    }
+                }
+                let mut record = [0.0; RecordLayout::MOST];
+                let [q, u, z, uu, uz, zz, red, green, blue] = sums.base;
+                record[..4].copy_from_slice(&sums_of_four([q, u, z, uu]));
+                record[4..8].copy_from_slice(&sums_of_four([uz, zz, red, green]));
+                record[field::COLOUR + 2] = blue.sum();
+                if EXTRAS & extra::ABS != 0 {
+                    record[Field::AbsX.number()] = sums.abs[0].sum();
+                    record[Field::AbsY.number()] = sums.abs[1].sum();
+                }
+                if EXTRAS & extra::WEIGHTS != 0 {
+                    record[Field::WeightSum.number()] = sums.weight.sum();
+                    record[Field::PixelCount.number()] = sums.pixels.sum();
+                }
+                if EXTRAS >= extra::ERROR {
+                    record[Field::Error.number()] = sums.map.sum();
+                }
+                if EXTRAS & extra::LARGEST != 0 {
+                    record[Field::WeightMax.number()] = sums.weight_max.max_lane();
+                }
+                write(records.of(Entry::load(&chunk[i]), first + i), &record, layout);
+            }
+        }
+    }
+}
+
+/// Writes those numbers that the records have.
+#[inline(always)]
+fn write(to: Option<&[AtomicU32]>, all: &[f32; RecordLayout::MOST], layout: RecordLayout) {
+    let Some((base, extras)) = to.and_then(|to| to.split_at_checked(BASE)) else { return };
+    for (to, x) in base.iter().zip(all) {
+        to.store(x.to_bits(), Relaxed);
+    }
+    for (to, &number) in extras.iter().zip(layout.extras()) {
+        to.store(all[usize::from(number)].to_bits(), Relaxed);
+    }
+}
+
+/// The sums over the records of one row, which lie side by side, in order. `sums` has the shape of a
+/// record.
+pub(super) fn gather(sums: &mut [f32], layout: RecordLayout, records: &[AtomicU32]) {
+    let maximum = layout.has(Field::WeightMax);
+    match sums.len() {
+        9 => gather_all::<9>(sums, maximum, records),
+        10 => gather_all::<10>(sums, maximum, records),
+        11 => gather_all::<11>(sums, maximum, records),
+        12 => gather_all::<12>(sums, maximum, records),
+        13 => gather_all::<13>(sums, maximum, records),
+        14 => gather_all::<14>(sums, maximum, records),
+        _ => gather_all::<{ RecordLayout::MOST }>(sums, maximum, records),
+    }
+}
+
+/// Adds to what `sums` holds; the last number may be a maximum.
+#[inline(always)]
+pub(super) fn gather_all<const STRIDE: usize>(
+    sums: &mut [f32],
+    maximum: bool,
+    records: &[AtomicU32],
+) {
+    let mut total: [f32; STRIDE] = std::array::from_fn(|i| sums[i]);
+    for record in records.as_chunks::<STRIDE>().0 {
+        for i in 0..STRIDE {
+            let x = f32::from_bits(record[i].load(Relaxed));
+            let is_maximum = maximum && i == STRIDE - 1;
+            total[i] = if is_maximum { total[i].max(x) } else { total[i] + x };
+        }
+    }
+    sums.copy_from_slice(&total);
+}
+
+const _: () = assert!(BASE == 9 && RecordLayout::MOST == 15, "`gather` knows each length");
+const _: () = assert!(Field::Error.number() == Field::Depth.number(), "one sum for both");

@@ -1,0 +1,93 @@
+//! Terms of the loss and noise that a policy adds for every row, visible or not; noise is added to
+//! the means (*3D Gaussian Splatting as Markov Chain Monte Carlo*, Kheradmand et al. 2024).
+
+use densify_policies::policy::{LossTerms, NoiseTerm};
+use densify_policies::rng::{PolicyRng, Purpose};
+use glam::{Quat, Vec3};
+use pulp::Simd;
+
+use super::blocks::plane;
+use super::project::lanes;
+use super::simd::{V, WIDTH};
+use crate::StepInput;
+use densify_core::gaussians::sigmoid;
+
+/// The derivatives of the loss terms, per row.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Terms {
+    /// Coefficient / rows.
+    opacity: f32,
+    /// Coefficient / (3 · rows).
+    scale: f32,
+}
+
+impl Terms {
+    pub(super) fn new(terms: LossTerms, rows: usize) -> Option<Self> {
+        let n = rows.max(1) as f32;
+        let per_row = Self { opacity: terms.opacity / n, scale: terms.scale / (3.0 * n) };
+        (!terms.is_none()).then_some(per_row)
+    }
+
+    /// Adds to the gradient of a block: d o/d(logit) = o·(1 − o), d s/d(log s) = s.
+    #[inline(always)]
+    pub(super) fn add<S: Simd>(&self, s: S, params: &[f32], gradient: &mut [f32]) {
+        let one = V::splat(s, 1.0);
+        for at in (0..WIDTH).step_by(S::F32_LANES) {
+            let mut put = |p: usize, x: V<S>| {
+                let to = &mut gradient[p * WIDTH + at..(p + 1) * WIDTH];
+                (V::load(s, to) + x).store(to);
+            };
+            // e^x / (1 + e^x)² for x <= 0, and it is even: nothing cancels at either end.
+            let e = (V::zero(s) - lanes(s, params, plane::OPACITY, at).abs()).exp();
+            let sum = one + e;
+            put(plane::OPACITY, e / (sum * sum) * self.opacity);
+            for p in plane::LOG_SCALE..plane::QUAT {
+                put(p, lanes(s, params, p, at).exp() * self.scale);
+            }
+        }
+    }
+}
+
+/// Shares of the noise below this are left out: 2⁻²⁴. At the published strength (5e5 times a step
+/// size of 1.6e-4) that is 5e-6 σ² per step, and after 30,000 steps a way of 1e-3 σ².
+const LEAST_SHARE: f32 = 5.960_464_5e-8;
+
+/// The noise of one step.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Noise {
+    term: NoiseTerm,
+    /// Strength times step size.
+    factor: f32,
+    rng: PolicyRng,
+}
+
+impl Noise {
+    pub(super) fn new(term: NoiseTerm, input: &StepInput<'_>) -> Self {
+        let rng = PolicyRng::new(input.seed, input.step);
+        Self { term, factor: term.strength * input.rates.noise, rng }
+    }
+
+    /// Moves the means of the first `rows` rows of a block, the first of which is `first_row`. Draws
+    /// are keyed by row, so that it does not matter who makes them.
+    pub(super) fn add(&self, params: &mut [f32], first_row: usize, rows: usize) {
+        for lane in 0..rows {
+            let get = |p: usize| params[p * WIDTH + lane];
+            let share = self.term.share(sigmoid(get(plane::OPACITY)));
+            if share < LEAST_SHARE {
+                continue;
+            }
+            let xi = self.rng.normal3((first_row + lane) as u32, Purpose::Noise, 0);
+            let [w, x, y, z] = [0, 1, 2, 3].map(|i| get(plane::QUAT + i));
+            let turn = Quat::from_xyzw(x, y, z, w).normalize();
+            let scale = Vec3::from([0, 1, 2].map(|i| get(plane::LOG_SCALE + i).exp()));
+            // Σ·ξ = R·S²·Rᵀ·ξ.
+            let step = turn * (scale * scale * (turn.inverse() * Vec3::from(xi)));
+            let step = step * (self.factor * share);
+            if step.is_finite() {
+                for (i, x) in step.to_array().into_iter().enumerate() {
+                    params[(plane::MEAN + i) * WIDTH + lane] += x;
+                }
+            }
+        }
+    }
+}

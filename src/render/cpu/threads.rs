@@ -1,0 +1,252 @@
+//! The threads of the native backend. Each loop that they share is a *region*: it has a name, and tasks
+//! that are cut at fixed places. What each task takes can be recorded, on one thread; the benchmark
+//! computes from it how a step would do on many cores.
+
+use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
+use std::time::{Duration, Instant};
+
+use rayon::prelude::*;
+
+use crate::BackendError;
+
+/// The threads, and the recorder of their tasks once it is asked for.
+#[derive(Debug)]
+pub(super) struct Threads {
+    pool: rayon::ThreadPool,
+    recorder: OnceLock<Recorder>,
+}
+
+/// What one training step took, on one thread.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct StepTasks {
+    /// The whole step.
+    pub total: Duration,
+    /// The tasks of each region, in the order in which they ran. What of `total` is in none of them
+    /// would run on one thread however many there are.
+    pub regions: Vec<(&'static str, Vec<Duration>)>,
+}
+
+#[derive(Debug, Default)]
+struct Recorder(Mutex<Record>);
+
+/// Its vectors are kept from step to step: a step that allocated would not be the one to measure.
+#[derive(Debug, Default)]
+struct Record {
+    total: Duration,
+    /// Names, and the number of their first task.
+    regions: Vec<(&'static str, usize)>,
+    tasks: Vec<Duration>,
+    /// When the last task ended, or its region began.
+    last: Option<Instant>,
+}
+
+impl Threads {
+    /// So many threads; `None`: as many as the machine has.
+    pub(super) fn new(count: Option<usize>) -> Result<Self, BackendError> {
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(count.unwrap_or(0))
+            .thread_name(|i| format!("densify-{i}"))
+            .build()
+            .map_err(|error| BackendError::Threads(error.to_string()))?;
+        Ok(Self { pool, recorder: OnceLock::new() })
+    }
+
+    pub(super) fn count(&self) -> usize {
+        self.pool.current_num_threads()
+    }
+
+    /// Records tasks from now on.
+    pub(super) fn record(&self) {
+        assert_eq!(self.count(), 1, "tasks are recorded on one thread");
+        self.recorder.get_or_init(Recorder::default);
+    }
+
+    /// The tasks of the last step; none unless they are recorded.
+    pub(super) fn recorded(&self) -> StepTasks {
+        self.recorder.get().map(Recorder::tasks).unwrap_or_default()
+    }
+
+    /// Runs a whole step on one of the threads. Its regions then find it there, and need not be handed
+    /// over one by one.
+    pub(super) fn step<R: Send>(&self, run: impl FnOnce() -> R + Send) -> R {
+        self.install(|| {
+            let Some(recorder) = self.recorder.get() else { return run() };
+            let start = recorder.begin_step();
+            let result = run();
+            recorder.end_step(start);
+            result
+        })
+    }
+
+    /// Runs what has regions on one of the threads.
+    pub(super) fn install<R: Send>(&self, run: impl FnOnce() -> R + Send) -> R {
+        self.pool.install(run)
+    }
+
+    /// A region: runs all tasks.
+    pub(super) fn each<T>(
+        &self,
+        region: &'static str,
+        tasks: T,
+        run: impl Fn(T::Item) + Send + Sync,
+    ) where
+        T: IntoParallelIterator<Iter: IndexedParallelIterator>,
+    {
+        self.each_with(region, tasks, || (), |(), task| run(task));
+    }
+
+    /// A region whose tasks need scratch memory, which some of them share one after the other.
+    pub(super) fn each_with<T, S>(
+        &self,
+        region: &'static str,
+        tasks: T,
+        scratch: impl Fn() -> S + Send + Sync,
+        run: impl Fn(&mut S, T::Item) + Send + Sync,
+    ) where
+        T: IntoParallelIterator<Iter: IndexedParallelIterator>,
+    {
+        let tasks = tasks.into_par_iter();
+        let recorder = self.begin(region, tasks.len());
+        tasks.for_each_init(scratch, |scratch, task| timed(recorder, || run(scratch, task)));
+    }
+
+    /// A region whose tasks return something, in their order.
+    pub(super) fn collect<T, R: Send>(
+        &self,
+        region: &'static str,
+        tasks: T,
+        run: impl Fn(T::Item) -> R + Send + Sync,
+    ) -> Vec<R>
+    where
+        T: IntoParallelIterator<Iter: IndexedParallelIterator>,
+    {
+        self.collect_with(region, tasks, || (), |(), task| run(task))
+    }
+
+    /// Both.
+    pub(super) fn collect_with<T, S, R: Send>(
+        &self,
+        region: &'static str,
+        tasks: T,
+        scratch: impl Fn() -> S + Send + Sync,
+        run: impl Fn(&mut S, T::Item) -> R + Send + Sync,
+    ) -> Vec<R>
+    where
+        T: IntoParallelIterator<Iter: IndexedParallelIterator>,
+    {
+        let tasks = tasks.into_par_iter();
+        let recorder = self.begin(region, tasks.len());
+        tasks.map_init(scratch, |scratch, task| timed(recorder, || run(scratch, task))).collect()
+    }
+
+    /// A region whose tasks count something. The order of adding whole numbers does not matter.
+    pub(super) fn sum<T>(
+        &self,
+        region: &'static str,
+        tasks: T,
+        run: impl Fn(T::Item) -> usize + Send + Sync,
+    ) -> usize
+    where
+        T: IntoParallelIterator<Iter: IndexedParallelIterator>,
+    {
+        let tasks = tasks.into_par_iter();
+        let recorder = self.begin(region, tasks.len());
+        tasks.map(|task| timed(recorder, || run(task))).sum()
+    }
+
+    /// Begins a region; returns what records the ends of its tasks, if they are recorded.
+    fn begin(&self, region: &'static str, tasks: usize) -> Option<&Recorder> {
+        self.recorder.get().inspect(|recorder| recorder.begin_region(region, tasks))
+    }
+}
+
+/// Runs a task, and records its end.
+fn timed<R>(recorder: Option<&Recorder>, run: impl FnOnce() -> R) -> R {
+    let result = run();
+    if let Some(recorder) = recorder {
+        recorder.end_task();
+    }
+    result
+}
+
+impl Recorder {
+    fn record(&self) -> MutexGuard<'_, Record> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn begin_step(&self) -> Instant {
+        let mut record = self.record();
+        record.regions.clear();
+        record.tasks.clear();
+        Instant::now()
+    }
+
+    fn end_step(&self, start: Instant) {
+        self.record().total = start.elapsed();
+    }
+
+    fn begin_region(&self, region: &'static str, tasks: usize) {
+        let mut record = self.record();
+        let first = record.tasks.len();
+        record.regions.push((region, first));
+        record.tasks.reserve(tasks);
+        record.last = Some(Instant::now());
+    }
+
+    /// One reading of the clock per task: what lies between two tasks is counted to the second. It is the
+    /// wall's clock, as the processor's takes twenty times as long to read.
+    fn end_task(&self) {
+        let mut record = self.record();
+        let now = Instant::now();
+        let task = record.last.replace(now).map_or(Duration::ZERO, |last| now - last);
+        record.tasks.push(task);
+    }
+
+    fn tasks(&self) -> StepTasks {
+        let record = self.record();
+        let mut rest = &record.tasks[..];
+        let mut regions: Vec<_> = record
+            .regions
+            .iter()
+            .rev()
+            .map(|&(name, first)| {
+                let (before, tasks) = rest.split_at(first);
+                rest = before;
+                (name, tasks.to_vec())
+            })
+            .collect();
+        regions.reverse();
+        StepTasks { total: record.total, regions }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tasks_are_recorded_by_region_and_change_nothing() {
+        let threads = Threads::new(Some(1)).expect("a thread");
+        let run = || {
+            threads.step(|| {
+                let mut squares = [0; 3];
+                threads.each("each", squares.par_iter_mut().enumerate(), |(i, to)| *to = i * i);
+                let doubled = threads.collect("collect", 0..2, |i| 2 * i);
+                let sum = threads.sum("sum", 0..5_usize, |i| i);
+                threads.each("nothing", 0..0, |_| {});
+                (squares, doubled, sum)
+            })
+        };
+        let expected = ([0, 1, 4], vec![0, 2], 10);
+        assert_eq!(run(), expected);
+        assert_eq!(threads.recorded(), StepTasks::default());
+        threads.record();
+        for _ in 0..2 {
+            assert_eq!(run(), expected);
+            let StepTasks { total, regions } = threads.recorded();
+            let counts: Vec<_> = regions.iter().map(|(name, tasks)| (*name, tasks.len())).collect();
+            assert_eq!(counts, [("each", 3), ("collect", 2), ("sum", 5), ("nothing", 0)]);
+            assert!(regions.iter().flat_map(|(_, tasks)| tasks).sum::<Duration>() <= total);
+        }
+    }
+}

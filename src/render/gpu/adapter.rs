@@ -1,0 +1,273 @@
+//! The available adapters: what they are, what they lack, and which one is chosen.
+
+use wgpu::{
+    Adapter, Backends, DeviceType, Features, Instance, InstanceDescriptor, InstanceFlags, Limits,
+};
+
+use super::device::wait;
+use super::rows::widest_row;
+use crate::{Accumulation, AdapterChoice, AdapterKind, AdapterSummary, BackendError};
+
+/// What a device must have to add up gradients in this way, beside what all kernels need.
+pub(super) fn features_for(way: Accumulation) -> Features {
+    match way {
+        Accumulation::Slots => Features::empty(),
+        Accumulation::SubgroupCas => Features::SUBGROUP,
+        Accumulation::SubgroupAtomics => Features::SUBGROUP | Features::SHADER_FLOAT32_ATOMIC,
+    }
+}
+
+/// The features that an adapter lacks for it, in words.
+pub(super) fn missing_for(way: Accumulation, there: Features) -> Vec<&'static str> {
+    let lacking = features_for(way).difference(there);
+    let names = [
+        (Features::SUBGROUP, "subgroup operations (SUBGROUP)"),
+        (Features::SHADER_FLOAT32_ATOMIC, "atomic addition of f32 (SHADER_FLOAT32_ATOMIC)"),
+    ];
+    names.into_iter().filter(|(one, _)| lacking.contains(*one)).map(|(_, name)| name).collect()
+}
+
+impl AdapterSummary {
+    fn new(adapter: &Adapter) -> Self {
+        let info = adapter.get_info();
+        let (limits, features) = (adapter.limits(), adapter.features());
+        let has = |way: &Accumulation| missing_for(*way, features).is_empty();
+        Self {
+            kind: match info.device_type {
+                DeviceType::DiscreteGpu => AdapterKind::Discrete,
+                DeviceType::IntegratedGpu => AdapterKind::Integrated,
+                DeviceType::VirtualGpu => AdapterKind::Virtual,
+                DeviceType::Cpu => AdapterKind::Software,
+                DeviceType::Other => AdapterKind::Unknown,
+            },
+            driver: format!("{} {}", info.driver, info.driver_info).trim().to_owned(),
+            interface: info.backend.to_string(),
+            name: info.name,
+            largest_binding: limits.max_storage_buffer_binding_size,
+            largest_buffer: limits.max_buffer_size,
+            missing: missing(&limits, features),
+            accumulations: Accumulation::ALL.into_iter().filter(has).collect(),
+        }
+    }
+
+    /// Largest budget whose parameters this adapter can hold in one piece each, at a degree: one
+    /// band of the coefficients, or the geometry, or the gradients of a row.
+    #[must_use]
+    pub fn largest_budget(&self, sh_degree: u8) -> u64 {
+        let largest = self.largest_binding.min(self.largest_buffer);
+        (largest / widest_row(sh_degree)).min(MOST_ROWS)
+    }
+}
+
+/// Whether there may be a GPU: on Linux, whether the kernel shows a device. To ask the drivers costs
+/// time, and memory that is never given back, software drivers' included.
+#[must_use]
+pub fn may_be_present() -> bool {
+    const NODES: [&str; 6] =
+        ["/dev/dri", "/dev/nvidiactl", "/dev/dxg", "/dev/kgsl-3d0", "/dev/mali0", "/dev/kfd"];
+    !cfg!(target_os = "linux") || NODES.iter().any(|node| std::path::Path::new(node).exists())
+}
+
+/// Most rows whose numbers, times their width, fit the shaders' 32-bit indices.
+const MOST_ROWS: u64 = 1 << 25;
+
+/// The limits that every kernel is written for: WebGPU promises them everywhere.
+const STORAGE_BUFFERS: u32 = 8;
+const INVOCATIONS: u32 = 256;
+const SHARED_BYTES: u32 = 16_384;
+const GROUPS: u32 = 65_535;
+const IMMEDIATE_BYTES: u32 = 16;
+
+fn missing(limits: &Limits, features: Features) -> Vec<String> {
+    let mut missing = Vec::new();
+    let mut need = |what: &str, has: u32, needs: u32| {
+        if has < needs {
+            missing.push(format!("{what}: {needs} needed, {has} there"));
+        }
+    };
+    need(
+        "storage buffers per kernel",
+        limits.max_storage_buffers_per_shader_stage,
+        STORAGE_BUFFERS,
+    );
+    need("invocations per workgroup", limits.max_compute_invocations_per_workgroup, INVOCATIONS);
+    need("bytes of workgroup memory", limits.max_compute_workgroup_storage_size, SHARED_BYTES);
+    need("workgroups per dimension", limits.max_compute_workgroups_per_dimension, GROUPS);
+    need("bytes of immediate data", limits.max_immediate_size, IMMEDIATE_BYTES);
+    if !features.contains(Features::IMMEDIATES) {
+        missing.push("immediate data (push constants)".into());
+    }
+    missing
+}
+
+fn instance() -> Instance {
+    let mut descriptor = InstanceDescriptor::new_without_display_handle();
+    descriptor.backends =
+        Backends::from_env().unwrap_or(Backends::VULKAN | Backends::METAL | Backends::DX12);
+    // Indirect dispatches take numbers that our own kernels have bounded.
+    descriptor.flags = InstanceFlags::empty();
+    Instance::new(descriptor)
+}
+
+pub(super) fn enumerate() -> Vec<(Adapter, AdapterSummary)> {
+    let all = wait(instance().enumerate_adapters(Backends::all()));
+    all.into_iter()
+        .map(|a| {
+            let s = AdapterSummary::new(&a);
+            (a, s)
+        })
+        .collect()
+}
+
+/// All adapters, as `WGPU_BACKEND` and the drivers' own variables let them be seen.
+#[must_use]
+pub fn adapters() -> Vec<AdapterSummary> {
+    enumerate().into_iter().map(|(_, summary)| summary).collect()
+}
+
+impl AdapterChoice {
+    /// How the adapter that was taken adds up gradients.
+    ///
+    /// # Errors
+    /// [`BackendError::NoAdapter`] where it does not support the way: what it lacks, and what it supports.
+    pub(super) fn accumulation(
+        &self,
+        adapter: &AdapterSummary,
+        features: Features,
+    ) -> Result<Accumulation, BackendError> {
+        let Some(wanted) = self.accumulation else { return Ok(adapter.accumulation()) };
+        let missing = missing_for(wanted, features);
+        if missing.is_empty() {
+            return Ok(wanted);
+        }
+        let can: Vec<String> =
+            adapter.accumulations.iter().map(|way| format!("accumulation={way}")).collect();
+        Err(BackendError::NoAdapter(format!(
+            "accumulation={wanted}: {} lacks {}; what works there is {}",
+            adapter.name,
+            missing.join(" and "),
+            can.join(" or ")
+        )))
+    }
+
+    fn matches(&self, summary: &AdapterSummary) -> bool {
+        let Some(name) = &self.name else { return true };
+        let name = name.to_lowercase();
+        [&summary.name, &summary.driver].iter().any(|s| s.to_lowercase().contains(&name))
+    }
+}
+
+/// The place of the adapter to take: the best of those that match and lack nothing. Software comes
+/// last.
+///
+/// # Errors
+/// [`BackendError::NoAdapter`] with the adapters found and what they lack.
+pub(super) fn choose(
+    all: &[AdapterSummary],
+    choice: &AdapterChoice,
+) -> Result<usize, BackendError> {
+    let rank = |kind: AdapterKind| match kind {
+        AdapterKind::Discrete => 0,
+        AdapterKind::Integrated => 1,
+        AdapterKind::Virtual => 2,
+        AdapterKind::Unknown => 3,
+        AdapterKind::Software => 4,
+    };
+    let matching: Vec<usize> = (0..all.len()).filter(|&i| choice.matches(&all[i])).collect();
+    let usable = matching.iter().copied().filter(|&i| all[i].missing.is_empty());
+    if let Some(best) = usable.min_by_key(|&i| (rank(all[i].kind), i)) {
+        return Ok(best);
+    }
+    let describe = |i: &usize| {
+        let AdapterSummary { name, missing, .. } = &all[*i];
+        format!("{name} ({})", missing.join("; "))
+    };
+    let names: Vec<&str> = all.iter().map(|s| &*s.name).collect();
+    Err(BackendError::NoAdapter(match (&choice.name, matching.is_empty()) {
+        (_, false) => {
+            let lacking: Vec<String> = matching.iter().map(describe).collect();
+            format!("no adapter can do what is needed: {}", lacking.join(", "))
+        }
+        (Some(name), true) if !all.is_empty() => {
+            format!("no adapter is called `{name}`; there are: {}", names.join(", "))
+        }
+        _ => "no adapter was found; install a Vulkan, Metal or DX12 driver".into(),
+    }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn adapter(name: &str, kind: AdapterKind, missing: &[&str]) -> AdapterSummary {
+        AdapterSummary {
+            name: name.into(),
+            interface: "vulkan".into(),
+            driver: "mesa".into(),
+            kind,
+            largest_binding: 128 << 20,
+            largest_buffer: 256 << 20,
+            missing: missing.iter().map(|&m| m.to_owned()).collect(),
+            accumulations: vec![Accumulation::Slots],
+        }
+    }
+
+    #[test]
+    fn gradients_are_added_up_as_the_adapter_can() {
+        use Accumulation::{Slots, SubgroupAtomics, SubgroupCas};
+        let subgroups = Features::SUBGROUP;
+        let both = subgroups | Features::SHADER_FLOAT32_ATOMIC;
+        let of = |features| AdapterSummary {
+            accumulations: Accumulation::ALL
+                .into_iter()
+                .filter(|way| missing_for(*way, features).is_empty())
+                .collect(),
+            ..adapter("Card", AdapterKind::Discrete, &[])
+        };
+        let chosen = |features, accumulation| {
+            let choice = AdapterChoice { name: None, accumulation };
+            choice.accumulation(&of(features), features)
+        };
+        // By default the fastest.
+        for (features, expected) in [
+            (Features::empty(), Slots),
+            (subgroups, SubgroupCas),
+            (both, SubgroupCas),
+            // Sums over tiles want subgroups, too.
+            (Features::SHADER_FLOAT32_ATOMIC, Slots),
+        ] {
+            assert_eq!(chosen(features, None).unwrap(), expected, "{features:?}");
+        }
+        // What is asked for, or a refusal; `tests/it/cli/accumulation.rs` has its words.
+        for wanted in Accumulation::ALL {
+            assert_eq!(chosen(both, Some(wanted)).unwrap(), wanted);
+            assert_eq!(Accumulation::of_name(wanted.name()), Some(wanted));
+        }
+        let told = |features, wanted| chosen(features, Some(wanted)).unwrap_err().to_string();
+        let without = told(subgroups, SubgroupAtomics);
+        assert!(without.contains("accumulation=slots or accumulation=cas"), "{without}");
+        assert!(!told(Features::empty(), SubgroupCas).contains("FLOAT32"));
+    }
+
+    #[test]
+    fn the_best_adapter_that_matches_is_taken() {
+        let all = [
+            adapter("llvmpipe (LLVM 15)", AdapterKind::Software, &[]),
+            adapter("Old Card", AdapterKind::Discrete, &["workgroups per dimension"]),
+            adapter("Shared", AdapterKind::Integrated, &[]),
+            adapter("Card", AdapterKind::Discrete, &[]),
+        ];
+        let named = |name: &str| AdapterChoice { name: Some(name.into()), accumulation: None };
+        assert_eq!(choose(&all, &AdapterChoice::default()).unwrap(), 3);
+        assert_eq!(choose(&all[..3], &AdapterChoice::default()).unwrap(), 2);
+        assert_eq!(choose(&all[..2], &AdapterChoice::default()).unwrap(), 0);
+        assert_eq!(choose(&all, &named("LLVMPIPE")).unwrap(), 0);
+        let told = |all: &[AdapterSummary], choice| choose(all, &choice).unwrap_err().to_string();
+        assert!(told(&all, named("old")).contains("workgroups per dimension"));
+        assert!(told(&all, named("geforce")).contains("Shared"));
+        assert!(told(&[], named("x")).contains("install"));
+        assert!(all[3].is_gpu() && !all[0].is_gpu() && !all[1].is_gpu());
+        // 128 MiB: the seven coefficients of band 3 decide.
+        assert_eq!(all[0].largest_budget(3), (128 << 20) / 84);
+    }
+}

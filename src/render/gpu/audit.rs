@@ -1,0 +1,33 @@
+//! Looks for rows with a number that is not finite; see [`audit`](crate::audit). A mark per
+//! row comes back, no parameter.
+
+use super::GpuBackend;
+use super::launches::{Audit, MOMENTS};
+use super::passes::Recorder;
+use crate::{Attribute, BackendError, Kept, Unsound};
+
+impl GpuBackend {
+    /// The rows with a number that is not finite, in order.
+    pub(super) fn unsound(&self) -> Result<Vec<Unsound>, BackendError> {
+        let rows = self.rows as u32;
+        let bytes = 4 * u64::from(rows);
+        let mut encoder = self.device.device.create_command_encoder(&Default::default());
+        encoder.clear_buffer(self.buffers.get("sums"), 0, Some(bytes.next_multiple_of(16)));
+        let pass = encoder.begin_compute_pass(&Default::default());
+        let mut to = Recorder::new(pass);
+        for Audit { launch, first_row, numbers, place } in &self.launches.audits {
+            let groups = rows.saturating_sub(*first_row).div_ceil(256);
+            to.run(launch, [rows, *numbers, *place, *first_row], groups);
+        }
+        drop(to);
+        self.device.queue.submit([encoder.finish()]);
+        let marks = self.read("sums", 0, bytes)?;
+        let marked = (0..).zip(&marks).filter_map(|(row, mark)| {
+            let place = mark.to_bits().checked_sub(1)?;
+            let kept = if place < MOMENTS { Kept::Parameter } else { Kept::Moment };
+            let attribute = Attribute::of((place % MOMENTS) as usize);
+            Some(Unsound { row, attribute, kept })
+        });
+        Ok(marked.collect())
+    }
+}

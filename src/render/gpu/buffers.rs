@@ -1,0 +1,112 @@
+//! The device's buffers, by name: allocated at the sizes that the ledger promises.
+
+use std::collections::HashMap;
+
+use wgpu::{Buffer, BufferDescriptor};
+
+use super::device::Device;
+use super::sizes::{MATURE, Planned, Sizes};
+use crate::BackendError;
+use densify_core::memory::Bytes;
+
+/// The buffers, by name.
+#[derive(Debug)]
+pub(super) struct Buffers {
+    named: HashMap<&'static str, Buffer>,
+    nothing: Buffer,
+}
+
+impl Buffers {
+    /// Allocates everything, or nothing that lasts.
+    pub(super) fn new(device: &Device, sizes: &Sizes) -> Result<Self, BackendError> {
+        let planned = sizes.planned();
+        check_sizes(device, &planned, sizes)?;
+        let total = planned.iter().map(|p| p.bytes).sum();
+        let named = device.guarded("the training buffers", total, |device| {
+            planned
+                .iter()
+                .map(|p| (p.name, create(device, p)))
+                .collect::<HashMap<&'static str, Buffer>>()
+        })?;
+        let nothing = named["nothing"].clone();
+        Ok(Self { named, nothing })
+    }
+
+    /// Reallocates the buffers whose size has changed.
+    pub(super) fn resize(&mut self, device: &Device, sizes: &Sizes) -> Result<(), BackendError> {
+        let planned = sizes.planned();
+        check_sizes(device, &planned, sizes)?;
+        let changed: Vec<_> = planned
+            .into_iter()
+            .filter(|p| self.named.get(p.name).is_none_or(|b| b.size() != p.bytes))
+            .collect();
+        for p in &changed {
+            if let Some(old) = self.named.remove(p.name) {
+                old.destroy();
+            }
+        }
+        let total = changed.iter().map(|p| p.bytes).sum();
+        let new = device.guarded("larger images", total, |device| {
+            changed.iter().map(|p| (p.name, create(device, p))).collect::<Vec<_>>()
+        })?;
+        self.named.extend(new);
+        Ok(())
+    }
+
+    /// The buffer of this name; where there is none, such as for bands beyond the model's degree, a few
+    /// bytes that are never read.
+    pub(super) fn get(&self, name: &str) -> &Buffer {
+        self.named.get(name).unwrap_or(&self.nothing)
+    }
+
+    /// What is allocated now `[bytes]`.
+    pub(super) fn bytes(&self) -> u64 {
+        self.named.values().map(Buffer::size).sum()
+    }
+}
+
+fn create(device: &wgpu::Device, planned: &Planned) -> Buffer {
+    device.create_buffer(&BufferDescriptor {
+        label: Some(planned.name),
+        size: planned.bytes,
+        usage: planned.usage,
+        mapped_at_creation: false,
+    })
+}
+
+/// Refuses what this device could not bind: a driver may take it and fail later.
+fn check_sizes(device: &Device, planned: &[Planned], sizes: &Sizes) -> Result<(), BackendError> {
+    let most = device.largest_binding();
+    // Photographs that are kept are copied only, and as many as a buffer holds.
+    let bound = planned.iter().filter(|p| p.name != "photographs");
+    let Some(worst) = bound.max_by_key(|p| p.bytes).filter(|p| p.bytes > most) else {
+        return Ok(());
+    };
+    let name = &device.summary.name;
+    let (needs, has) = (Bytes(worst.bytes), Bytes(most));
+    let remedy = match worst.name {
+        "records" | "keys 0" | "sums" => {
+            format!("use --tile-cap {}", most / (worst.bytes / sizes.cap).max(1))
+        }
+        "canvas" | "finish" | "pixel gradient" | "derivatives" => {
+            "shrink the images with --resolution".into()
+        }
+        _ => format!("use --budget {}", device.summary.largest_budget(sizes.sh_degree)),
+    };
+    Err(BackendError::OverLimit(format!(
+        "{}: {needs} in one buffer, but {name} takes {has} at most; {remedy}",
+        worst.line
+    )))
+}
+
+/// 1/(1 − β₁^age) and √(1/(1 − β₂^age)), by age.
+pub(super) fn bias_table() -> Vec<[f32; 2]> {
+    (0..=MATURE as i32)
+        .map(|age| {
+            let age = age.max(1);
+            let first = 1.0 / (1.0 - f64::from(0.9_f32).powi(age));
+            let second = 1.0 / (1.0 - f64::from(0.999_f32).powi(age));
+            [first as f32, second.sqrt() as f32]
+        })
+        .collect()
+}

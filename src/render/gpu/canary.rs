@@ -1,0 +1,179 @@
+//! The canary: before a device trains anything, two steps on a fixed small scene are compared with the
+//! native backend. A driver that miscompiles a kernel is then an error instead of a bad model.
+
+use densify_policies::policy::{Cadence, LossTerms, Needs};
+use densify_policies::rng::{PolicyRng, Purpose};
+use glam::{DMat3, DVec3};
+
+use super::{GpuBackend, GpuDevice};
+use crate::cpu::CpuBackend;
+use crate::signals::RecordLayout;
+use crate::{Backend, BackendError, LearningRates, Setup, StepInput, StepOutput};
+use densify_core::camera::Camera;
+use densify_core::gaussians::{Gaussians, sh_coefficients};
+use densify_core::image::Image8;
+
+const ROWS: u32 = 60;
+const SIZE: u32 = 40;
+const BACKGROUND: [f32; 3] = [0.1, 0.2, 0.4];
+/// How far colours and losses may differ: rounding stays below 1e-5, and a pixel in which a splat
+/// is at the threshold of 1/255 may gain or lose it.
+const TOLERANCE: f32 = 6e-3;
+const LOSS_TOLERANCE: f32 = 1e-3;
+
+/// Rows of all sizes and opacities before a camera, some beyond its image and behind it.
+fn scene() -> (Gaussians, Camera, Image8) {
+    let rng = PolicyRng::new(17, 1);
+    let draw = |row, counter| rng.normal3(row, Purpose::Noise, counter);
+    let per_row = 3 * sh_coefficients(1) as u32;
+    let model = Gaussians {
+        sh_degree: 1,
+        means: (0..ROWS).map(|row| draw(row, 0)).map(|[x, y, z]| [0.6 * x, 0.6 * y, z]).collect(),
+        log_scales: (0..ROWS).map(|row| draw(row, 1).map(|s| 0.5 * s - 2.0)).collect(),
+        quats: (0..ROWS)
+            .map(|row| draw(row, 2))
+            .map(|[x, y, z]| [1.0, 0.5 * x, 0.5 * y, 0.5 * z])
+            .collect(),
+        opacity_logits: (0..ROWS).map(|row| draw(row, 3)[0]).collect(),
+        sh: (0..ROWS)
+            .flat_map(|row| (0..per_row).map(move |k| (row, k)))
+            .map(|(row, k)| 0.3 * draw(row, 4 + k)[0])
+            .collect(),
+    };
+    let camera = Camera {
+        width: SIZE,
+        height: SIZE - 7,
+        fx: 45.0,
+        fy: 43.0,
+        cx: 19.0,
+        cy: 17.0,
+        rotation: DMat3::IDENTITY,
+        translation: DVec3::new(0.1, -0.1, 2.5),
+    };
+    let rgb = (0..3 * camera.width * camera.height).map(|i| (i * 31 % 253) as u8).collect();
+    let target =
+        Image8 { width: camera.width, height: camera.height, rgb, alpha: None, mask: None };
+    (model, camera, target)
+}
+
+fn run(
+    backend: &mut dyn Backend,
+    camera: &Camera,
+    target: &Image8,
+) -> Result<(Vec<StepOutput>, Vec<f32>), BackendError> {
+    let rates = LearningRates {
+        mean: 5e-3,
+        noise: 5e-3,
+        log_scale: 0.05,
+        quat: 0.01,
+        opacity: 0.3,
+        sh_dc: 0.1,
+        sh_rest: 0.02,
+    };
+    let mut outputs = Vec::new();
+    for step in 1..=2 {
+        outputs.push(backend.train_step(&StepInput {
+            step,
+            view: 0,
+            camera,
+            target,
+            background: BACKGROUND,
+            exposure: None,
+            sh_degree: 1,
+            rates,
+            loss_terms: LossTerms::default(),
+            noise: None,
+            cadence: Cadence::default(),
+            seed: 1,
+        })?);
+    }
+    Ok((outputs, backend.render(camera, BACKGROUND, 1)?.rgb))
+}
+
+impl GpuBackend {
+    /// Takes over `model` and allocates everything for `options.budget` rows, after the device has
+    /// shown on a small scene that it computes what the native backend does.
+    ///
+    /// # Errors
+    /// [`BackendError`]: a limit of the device, its memory, or a driver that computes wrongly.
+    ///
+    /// # Panics
+    /// When the model has more rows than the budget: the caller subsamples before.
+    pub fn new(
+        model: &Gaussians,
+        options: &Setup,
+        device: &GpuDevice,
+    ) -> Result<Self, BackendError> {
+        device.prove(&options.needs)?;
+        Self::without_canary(model, options, device)
+    }
+}
+
+impl GpuDevice {
+    /// Has the device show, once, that it computes what the native backend does with the kernels that these
+    /// needs take. Afterwards the process holds what its driver takes.
+    ///
+    /// # Errors
+    /// As [`GpuBackend::new`].
+    pub fn prove(&self, needs: &Needs) -> Result<(), BackendError> {
+        self.0.prove(RecordLayout::new(needs.signals), || check(self, needs))
+    }
+}
+
+/// Compares the device with the native backend, with the kernels that these needs take.
+///
+/// # Errors
+/// [`BackendError::Device`] with what differs.
+fn check(device: &GpuDevice, needs: &Needs) -> Result<(), BackendError> {
+    let (model, camera, target) = scene();
+    let mut options = Setup { threads: Some(1), ..Setup::new(model.len()) };
+    let mut cpu = CpuBackend::new(&model, &options)?;
+    options.largest_image = (camera.width, camera.height);
+    options.needs.signals = needs.signals;
+    let mut gpu = GpuBackend::without_canary(&model, &options, device)?;
+    let (expected, image) = run(&mut cpu, &camera, &target)?;
+    let (found, rendered) = run(&mut gpu, &camera, &target)?;
+    let wrong = |what: String| BackendError::Device {
+        device: device.adapter().name.clone(),
+        why: format!("its driver computes wrongly: {what}"),
+    };
+    for (step, (found, expected)) in found.iter().zip(&expected).enumerate() {
+        // Not `>`: a NaN is wrong, too.
+        let is_close = (found.loss - expected.loss).abs() <= LOSS_TOLERANCE;
+        if !is_close || found.visible != expected.visible {
+            return Err(wrong(format!(
+                "at step {} of a test scene, loss {} with {} rows on screen instead of {} with {}",
+                step + 1,
+                found.loss,
+                found.visible,
+                expected.loss,
+                expected.visible
+            )));
+        }
+    }
+    let off = rendered.iter().zip(&image).filter(|(a, b)| {
+        let is_close = (**a - **b).abs() <= TOLERANCE;
+        !is_close
+    });
+    match off.count() {
+        0 => Ok(()),
+        n => Err(wrong(format!("{n} of {} colours of a test image differ", image.len()))),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_scene_exercises_what_it_should() {
+        let (model, camera, target) = scene();
+        let options = Setup { threads: Some(1), ..Setup::new(model.len()) };
+        let mut cpu = CpuBackend::new(&model, &options).unwrap();
+        let (outputs, _) = run(&mut cpu, &camera, &target).unwrap();
+        // Rows on screen and off it, several tiles, and steps that matter beyond the tolerance.
+        assert!(outputs[0].visible > 30 && outputs[0].visible < model.len(), "{outputs:?}");
+        assert!(outputs[0].entries > 100, "{outputs:?}");
+        assert!(outputs[0].loss - outputs[1].loss > 3.0 * LOSS_TOLERANCE, "{outputs:?}");
+    }
+}

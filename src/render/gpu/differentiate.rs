@@ -1,0 +1,119 @@
+//! Gradients and losses without a training step: tools for tests and research.
+
+use super::GpuBackend;
+use super::frame::{Frame, State, grid};
+use crate::cpu::ModelGradient;
+use crate::signals::{Field, RecordLayout};
+use crate::{BackendError, Differentiable, ImageGradient, Rendering, StepOutput};
+use densify_core::camera::Camera;
+use densify_core::gaussians::sh_coefficients;
+use densify_core::image::Image8;
+use densify_core::sh;
+
+/// √(½·log₂ e): folded into the splats' factors.
+const FOLD: f32 = 0.849_321_8;
+
+impl GpuBackend {
+    /// What stages 5 and 6 have left.
+    fn model_gradient(&self, degree: u8) -> Result<ModelGradient, BackendError> {
+        let n = self.rows as u64;
+        let gradient = self.read("gradient", 0, 80 * n)?;
+        let sums = self.read("row sums", 0, 4 * RecordLayout::MOST as u64 * n)?;
+        let splats = self.read("splats", 0, 48 * n)?;
+        let depths = self.read("depths", 0, 4 * n)?;
+        let planes = self.sizes.sh_numbers();
+        let mut out = ModelGradient { sh: vec![0.0; planes * self.rows], ..Default::default() };
+        let rows =
+            gradient.as_chunks::<20>().0.iter().zip(sums.as_chunks::<{ RecordLayout::MOST }>().0);
+        let rest = splats.as_chunks::<12>().0.iter().zip(depths);
+        for (row, ((g, sums), (splat, depth))) in rows.zip(rest).enumerate() {
+            let seen = depth.to_bits() != u32::MAX;
+            let sums = if seen { *sums } else { [0.0; RecordLayout::MOST] };
+            let l1 = if seen { splat[2] } else { 0.0 };
+            let unfold = 1.0 / FOLD;
+            out.means.push([g[0], g[1], g[2]]);
+            out.log_scales.push([g[3], g[4], g[5]]);
+            out.quats.push([g[6], g[7], g[8], g[9]]);
+            out.opacity_logits.push(g[10]);
+            out.mean2d.push([g[11], g[15]]);
+            let sum = |field: Field| sums[field.number()];
+            out.mean2d_abs.push([
+                l1 * unfold * unfold * sum(Field::AbsX),
+                unfold * unfold * sum(Field::AbsY),
+            ]);
+            out.colour.push([sums[6], sums[7], sums[8]]);
+            out.max_weight.push(sum(Field::WeightMax));
+            out.sum_weight.push(sum(Field::WeightSum));
+            out.pixel_count.push(sum(Field::PixelCount) as u32);
+            out.visible.push(seen);
+            let mut y = [0.0_f32; 16];
+            y[0] = sh::C0;
+            sh::basis(degree, [g[16], g[17], g[18]], &mut y);
+            for (k, basis) in y.iter().enumerate().take(sh_coefficients(degree)) {
+                for channel in 0..3 {
+                    out.sh[row * planes + 3 * k + channel] = basis * g[12 + channel];
+                }
+            }
+        }
+        Ok(out)
+    }
+}
+
+impl Differentiable for GpuBackend {
+    fn differentiate(
+        &mut self,
+        camera: &Camera,
+        background: [f32; 3],
+        sh_degree: u8,
+        upstream: &ImageGradient,
+    ) -> Result<(Rendering, ModelGradient), BackendError> {
+        upstream.assert_size(camera);
+        assert_eq!(self.sizes.frozen, 0, "frozen rows have no gradients");
+        if !self.sizes.more {
+            (self.sizes.more, self.sizes.records) = (true, RecordLayout::ALL);
+            self.rebuild()?;
+        }
+        self.fit_image(camera.width, camera.height)?;
+        let channel = |c: usize| upstream.rgb.iter().skip(c).step_by(3).copied();
+        let planes = (0..3).flat_map(channel).chain(upstream.alpha.iter().copied());
+        let planes: Vec<f32> = planes.chain(upstream.depth.iter().copied()).collect();
+        self.write("pixel gradient", bytemuck::cast_slice(&planes));
+        let frame = self.frame(camera, background, sh_degree);
+        self.run(&frame, |passes, to| {
+            passes.forward(to);
+            passes.backward(to);
+            passes.differentiate(to);
+        })?;
+        let rendering = self.rendering(camera.width, camera.height)?;
+        Ok((rendering, self.model_gradient(frame.model[1] as u8)?))
+    }
+
+    fn loss(
+        &mut self,
+        rendering: &Rendering,
+        target: &Image8,
+        background: [f32; 3],
+    ) -> Result<(StepOutput, Vec<f32>), BackendError> {
+        let (width, height) = (rendering.width, rendering.height);
+        assert_eq!((width, height), (target.width, target.height), "sizes differ");
+        self.fit_image(width, height)?;
+        let pixels = rendering.rgb.as_chunks::<3>().0;
+        let canvas: Vec<[f32; 4]> = pixels.iter().map(|&[r, g, b]| [r, g, b, 0.0]).collect();
+        self.write("canvas", bytemuck::cast_slice(&canvas));
+        let [columns, tiles] = grid(width, height);
+        let [r, g, b] = background;
+        let frame = Frame {
+            background: [r, g, b, 0.0],
+            image: [width, height, columns, tiles],
+            draw: [0, 0, 0, self.upload_target(target)],
+            ..bytemuck::Zeroable::zeroed()
+        };
+        // Nothing was counted in this run, so that there is nothing for which bands might not do.
+        self.write("state", bytemuck::bytes_of(&<State as bytemuck::Zeroable>::zeroed()));
+        let (state, _) = self.run(&frame, |passes, to| passes.loss(to, [[0.0; 2]; 2]))?;
+        let planes = self.read("pixel gradient", 0, 12 * pixels.len() as u64)?;
+        let n = pixels.len();
+        let gradient = (0..3 * n).map(|i| planes[i % 3 * n + i / 3]).collect();
+        Ok((state.output(), gradient))
+    }
+}

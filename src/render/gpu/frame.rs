@@ -1,0 +1,167 @@
+//! The uniform buffer that all stages read and the scalars that they return: the Rust side of
+//! `shaders/shared/view.wgsl`. A test compares both sides field by field.
+
+use bytemuck::{Pod, Zeroable};
+use densify_policies::policy::{ErrorScore, Signal};
+
+use crate::signals::SignalPlanes;
+use crate::{StepInput, StepOutput};
+use densify_core::camera::Camera;
+
+/// Side of a tile `[px]`.
+pub(super) const TILE: u32 = 16;
+/// Margin of the image beyond which the direction used in J is clamped, as a fraction of its size.
+const FOV_MARGIN: f64 = 0.15;
+/// Weight of 1 − SSIM in the loss; L1 has the rest.
+const SSIM_WEIGHT: f32 = 0.2;
+
+/// See `Frame` in `shaders/shared/view.wgsl`.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub(super) struct Frame {
+    pub(super) rotation: [[f32; 4]; 3],
+    pub(super) centre: [f32; 4],
+    pub(super) lens: [f32; 4],
+    pub(super) ratio: [f32; 4],
+    pub(super) background: [f32; 4],
+    pub(super) image: [u32; 4],
+    pub(super) model: [u32; 4],
+    pub(super) rates: [f32; 4],
+    pub(super) more_rates: [f32; 4],
+    pub(super) noise: [f32; 4],
+    pub(super) score: [f32; 4],
+    pub(super) draw: [u32; 4],
+    pub(super) frozen: [u32; 4],
+    pub(super) planes: [[u32; 4]; 8],
+}
+
+/// See `State` in `shaders/shared/view.wgsl`; the cuts of the bands follow it.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub(super) struct State {
+    pub(super) visible: u32,
+    pub(super) total: u32,
+    pub(super) bands: u32,
+    pub(super) short: u32,
+    pub(super) entries_low: u32,
+    pub(super) entries_high: u32,
+    pub(super) held: u32,
+    pub(super) broken_off: u32,
+    pub(super) l1: f32,
+    pub(super) ssim: f32,
+    pub(super) spare_f: [f32; 2],
+}
+
+impl State {
+    /// (row, tile) pairs of all bands.
+    pub(super) fn entries(&self) -> u64 {
+        u64::from(self.entries_high) << 32 | u64::from(self.entries_low)
+    }
+
+    /// What comes back of a step.
+    pub(super) fn output(&self) -> StepOutput {
+        let Self { l1, ssim, visible, bands, .. } = *self;
+        StepOutput {
+            loss: (1.0 - SSIM_WEIGHT) * l1 + SSIM_WEIGHT * (1.0 - ssim),
+            l1,
+            ssim,
+            visible: visible as usize,
+            entries: self.entries(),
+            bands,
+            exposure: None,
+        }
+    }
+}
+
+/// Bits of `Frame::draw[2]`: what steps, what waited for it, what policies add.
+pub(super) mod due {
+    pub(in super::super) const MAIN_STEPS: u32 = 1;
+    pub(in super::super) const REST_STEPS: u32 = 2;
+    pub(in super::super) const MAIN_WAITED: u32 = 4;
+    pub(in super::super) const REST_WAITED: u32 = 8;
+    pub(in super::super) const REST_AGES: u32 = 16;
+    pub(in super::super) const TERMS: u32 = 32;
+    pub(in super::super) const NOISE: u32 = 64;
+}
+
+/// Bits of `Frame::draw[3]`: what the target has, whether the error per pixel is wanted for candidates and for
+/// signals, and whether the image is exposed.
+pub(super) mod target {
+    pub(in super::super) const HAS_ALPHA: u32 = 1;
+    pub(in super::super) const HAS_MASK: u32 = 2;
+    pub(in super::super) const WITH_ERROR: u32 = 4;
+    pub(in super::super) const BY_PIXEL: u32 = 8;
+    pub(in super::super) const EXPOSED: u32 = 16;
+}
+
+const _: () = assert!(Signal::ALL.len() <= 4 * 8, "a place in `Frame::planes` for each signal");
+
+/// An image as a grid of tiles: columns and tiles.
+pub(super) fn grid(width: u32, height: u32) -> [u32; 2] {
+    let columns = width.div_ceil(TILE);
+    [columns, columns * height.div_ceil(TILE)]
+}
+
+impl Frame {
+    /// A view of a model; nothing steps.
+    pub(super) fn of_view(
+        camera: &Camera,
+        background: [f32; 3],
+        near: f32,
+        [rows, sh_degree, cap, trained]: [u32; 4],
+    ) -> Self {
+        let c = camera;
+        let low = |p: f64, size: f64, f: f64| ((-FOV_MARGIN * size - p) / f) as f32;
+        let high = |p: f64, size: f64, f: f64| (((1.0 + FOV_MARGIN) * size - p) / f) as f32;
+        let (w, h) = (f64::from(c.width), f64::from(c.height));
+        let row = |i: usize| {
+            let [x, y, z] = c.rotation.row(i).as_vec3().to_array();
+            [x, y, z, c.translation[i] as f32]
+        };
+        let [x, y, z] = c.centre().as_vec3().to_array();
+        let [columns, tiles] = grid(c.width, c.height);
+        let [r, g, b] = background;
+        Self {
+            rotation: [row(0), row(1), row(2)],
+            centre: [x, y, z, near],
+            lens: [c.fx as f32, c.fy as f32, c.cx as f32, c.cy as f32],
+            ratio: [
+                low(c.cx, w, c.fx),
+                low(c.cy, h, c.fy),
+                high(c.cx, w, c.fx),
+                high(c.cy, h, c.fy),
+            ],
+            background: [r, g, b, 0.0],
+            image: [c.width, c.height, columns, tiles],
+            model: [rows, sh_degree, cap, trained],
+            ..Self::zeroed()
+        }
+    }
+
+    /// Adds what an optimiser step needs.
+    pub(super) fn for_step(&mut self, input: &StepInput<'_>, due: u32, planes: &SignalPlanes) {
+        let StepInput { rates, loss_terms: terms, noise, .. } = input;
+        let rows = (self.model[0] - self.frozen[0]).max(1) as f32;
+        self.rates = [rates.mean, rates.log_scale, rates.quat, rates.opacity];
+        self.more_rates =
+            [rates.sh_dc, rates.sh_rest, terms.opacity / rows, terms.scale / (3.0 * rows)];
+        if let Some(noise) = noise {
+            self.noise = [noise.strength * rates.noise, noise.sharpness, noise.opacity, 0.0];
+        }
+        let adds = (if terms.is_none() { 0 } else { due::TERMS })
+            | (if noise.is_some() { due::NOISE } else { 0 });
+        self.draw = [folded_seed(input.seed), input.step, due | adds, self.draw[3]];
+        self.background[3] = planes.full_depth;
+        let ErrorScore { power, edge, footprint, view_power, .. } = planes.score;
+        self.score = [power, edge, footprint, view_power];
+        // To which planes the view adds.
+        for (signal, plane) in Signal::ALL.into_iter().zip(self.planes.as_flattened_mut()) {
+            *plane = planes.current(signal).map_or(u32::MAX, |plane| plane as u32);
+        }
+    }
+}
+
+/// The seed as the draws take it; see `PolicyRng::new`.
+pub(super) fn folded_seed(seed: u64) -> u32 {
+    (seed ^ (seed >> 32).wrapping_mul(0x9e37_79b9)) as u32
+}

@@ -1,0 +1,179 @@
+//! Shaders and their kernels, offline. What they compute is compared in `tests/it`.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use wgpu::naga::AddressSpace;
+use wgpu::naga::valid::{Capabilities, ValidationFlags, Validator};
+
+use densify_policies::policy::{
+    Cadence, CandidateRequest, DepthMode, ErrorMode, Needs, Signal, SignalSet,
+};
+
+use super::super::adapter::features_for;
+use super::super::launches::{Instead, Launches, plain, rebound};
+use super::super::pipelines::Variant;
+use super::super::sizes::Sizes;
+use super::*;
+use crate::KeptPhotographs;
+use crate::Shortcuts;
+use crate::signals::RecordLayout;
+use densify_shaders::{Accumulation, STAGES};
+
+/// What naga must allow, beside what WebGPU has everywhere.
+fn capabilities(accumulation: Accumulation) -> Capabilities {
+    let needed = features_for(accumulation);
+    [
+        (wgpu::Features::SUBGROUP, Capabilities::SUBGROUP),
+        (wgpu::Features::SHADER_FLOAT32_ATOMIC, Capabilities::SHADER_FLOAT32_ATOMIC),
+    ]
+    .into_iter()
+    .filter(|(feature, _)| needed.contains(*feature))
+    .fold(Capabilities::IMMEDIATES, |all, (_, capability)| all | capability)
+}
+
+#[test]
+fn every_shader_is_valid_and_within_the_portable_limits() {
+    let mut seen = BTreeSet::new();
+    for accumulation in Accumulation::ALL {
+        for stage in STAGES {
+            if let Some(text) = stage.text(accumulation) {
+                check_stage(stage, &text, capabilities(accumulation));
+                seen.insert(stage.name);
+            }
+        }
+    }
+    assert_eq!(seen.len(), STAGES.len(), "stages that no device has");
+}
+
+/// Every device has the portable limits of WebGPU.
+fn check_stage(stage: &Stage, text: &str, capabilities: Capabilities) {
+    let module = parse(stage, text);
+    let info = Validator::new(ValidationFlags::all(), capabilities)
+        .validate(&module)
+        .unwrap_or_else(|e| panic!("{}: {}", stage.name, e.emit_to_string(text)));
+    for (i, entry) in module.entry_points.iter().enumerate() {
+        let uses = info.get_entry_point(i);
+        let (mut storage, mut shared) = (0, 0);
+        for (handle, variable) in module.global_variables.iter() {
+            if uses[handle].is_empty() {
+                continue;
+            }
+            storage += u32::from(matches!(variable.space, AddressSpace::Storage { .. }));
+            if variable.space == AddressSpace::WorkGroup {
+                shared += module.types[variable.ty].inner.size(module.to_ctx());
+            }
+        }
+        assert!(storage <= 8, "{}: {storage} storage buffers", entry.name);
+        assert!(shared <= 16_384, "{}: {shared} bytes of shared memory", entry.name);
+        assert!(entry.workgroup_size.iter().product::<u32>() <= 256, "{}", entry.name);
+    }
+}
+
+/// A shader's `override` is given its value by name, and a signal that the shader does not know would
+/// be 0 for good.
+#[test]
+fn every_override_has_a_value_and_every_signal_a_number() {
+    let variant = Variant {
+        records: RecordLayout::ALL,
+        more: true,
+        shortcuts: Shortcuts::default(),
+        accumulation: Accumulation::Slots,
+        dominant: true,
+    };
+    let constants: BTreeSet<String> =
+        variant.constants().into_iter().map(|(name, _)| name).collect();
+    let mut declared = BTreeSet::new();
+    for stage in STAGES {
+        for accumulation in Accumulation::ALL {
+            let Some(text) = stage.text(accumulation) else { continue };
+            let module = parse(stage, &text);
+            declared.extend(module.overrides.iter().filter_map(|(_, o)| o.name.clone()));
+        }
+    }
+    assert_eq!(declared, constants);
+}
+
+/// The sizes of a backend that has every buffer there is.
+fn largest_sizes(accumulation: Accumulation) -> Sizes {
+    let candidates = CandidateRequest {
+        from: 0,
+        until: 1,
+        rows_per_candidate: 1,
+        capacity: 1,
+        error: ErrorMode::L1,
+        depth: DepthMode::Median,
+        min_alpha: 0.0,
+        spaced: false,
+    };
+    let needs = Needs {
+        signals: SignalSet::from(Signal::ALL),
+        candidates: Some(candidates),
+        cadence: Cadence { all: 2, sh_rest: 2 },
+        ..Needs::default()
+    };
+    let mut sizes = Sizes::new(10, 100, 3, (32, 32), &needs, accumulation);
+    sizes.photographs = KeptPhotographs { count: 1, with_masks: true };
+    sizes.exposures = true;
+    sizes
+}
+
+/// A kernel that nothing dispatches is a stage that is left out; a name that no shader has ends a run.
+#[test]
+fn every_kernel_is_dispatched_by_its_name() {
+    let mut found_kernels = BTreeSet::new();
+    for (stage, accumulation) in STAGES.iter().flat_map(|s| Accumulation::ALL.map(|a| (s, a))) {
+        let Some(text) = stage.text(accumulation) else { continue };
+        let found = kernels(stage, &text, &parse(stage, &text));
+        found_kernels.extend(found.into_iter().map(|kernel| plain(&kernel.entry).to_owned()));
+    }
+    for kernel in rebound().keys() {
+        assert!(
+            found_kernels.contains(*kernel),
+            "`rebound` has buffers for `{kernel}`, which is no kernel"
+        );
+    }
+    // These are bound to each array of rows.
+    let mut dispatched = BTreeSet::from(["copy_rows", "swap_rows", "audit"].map(str::to_owned));
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/src/backend/gpu");
+    for entry in std::fs::read_dir(folder).expect("the sources") {
+        let path = entry.expect("a file").path();
+        let Ok(text) = std::fs::read_to_string(path) else { continue };
+        for call in ["l.get(\"", "l.nth(\"", "launches.get(\"", "launches.nth(\""] {
+            let names = text.split(call).skip(1).filter_map(|rest| rest.split('"').next());
+            dispatched.extend(names.map(str::to_owned));
+        }
+    }
+    assert_eq!(dispatched, found_kernels);
+}
+
+/// A variable that no buffer has the name of would be bound to nothing.
+#[test]
+fn every_variable_has_a_buffer() {
+    for accumulation in Accumulation::ALL {
+        let mut found_kernels = BTreeMap::new();
+        for stage in STAGES {
+            let Some(text) = stage.text(accumulation) else { continue };
+            for Kernel { entry, bindings } in kernels(stage, &text, &parse(stage, &text)) {
+                assert!(
+                    found_kernels.insert(entry.clone(), bindings).is_none(),
+                    "two kernels `{entry}`"
+                );
+            }
+        }
+        let sizes = largest_sizes(accumulation);
+        let buffers: BTreeSet<_> = sizes.planned().into_iter().map(|p| p.name).collect();
+        let bind = |kernel: &str, instead: &[Instead]| {
+            let bindings = &found_kernels[kernel];
+            for (variable, buffer) in instead {
+                let is_used = bindings.iter().any(|binding| binding.name == *variable);
+                assert!(is_used, "{kernel}: it uses no `{variable}`");
+                assert!(buffers.contains(buffer), "{kernel}: there is no `{buffer}`");
+            }
+            for Binding { name, .. } in bindings {
+                let is_given = instead.iter().any(|(variable, _)| variable == name);
+                assert!(is_given || buffers.contains(&**name), "{kernel}: `{name}`");
+            }
+        };
+        let _ = Launches::new(found_kernels.keys().map(|name| &**name), &bind, &sizes);
+    }
+}

@@ -1,0 +1,355 @@
+//! The GPU backend: the native backend's stages as WGSL, through wgpu, on Vulkan, Metal and DX12.
+//!
+//! Parameters stay on the device. A step is encoded once and submitted once; what differs between
+//! views (rows on screen, entries, bands) is counted there and drives indirect dispatches, and a few
+//! scalars come back with the loss. Where a view has more tile entries than the cap, the image is
+//! processed in bands. As many are encoded as the step before needed; a step that needs more changes
+//! nothing, reports it, and is repeated with enough.
+//!
+//! With [`Accumulation::Slots`](super::Accumulation::Slots) every sum has a fixed order, so that runs
+//! on the same device are reproducible byte for byte. Otherwise the order of a row's sums over tiles
+//! varies.
+
+mod adapter;
+mod audit;
+mod buffers;
+mod canary;
+mod clock;
+mod device;
+mod differentiate;
+mod edits;
+mod exposure;
+mod frame;
+mod kernels;
+mod launches;
+mod observe;
+mod passes;
+mod pipelines;
+mod promise;
+mod readback;
+mod rows;
+mod sizes;
+mod state;
+mod step;
+mod submit;
+mod transfer;
+
+use std::collections::HashMap;
+use std::ops::Range;
+use std::sync::Arc;
+use std::time::Duration;
+
+use densify_policies::plan::RowOps;
+use densify_policies::policy::{Cadence, Candidate, MaskTerm, SignalKind, SignalSet, Signals};
+
+use super::candidates::Candidates;
+use super::signals::{ParameterSignal, SignalPlanes, as_read};
+use super::{
+    AdapterSummary, AuxInput, AuxOutput, Backend, BackendError, Rendering, Setup, Shortcuts,
+    StateArray, StateError, StepInput, StepOutput, Tensor, Unsound, assert_fits,
+};
+use densify_core::camera::Camera;
+use densify_core::gaussians::{Gaussians, ModelArray, rgb_to_dc};
+use densify_core::memory::Ledger;
+
+pub use adapter::{adapters, may_be_present};
+use buffers::{Buffers, bias_table};
+use device::Device;
+pub use device::GpuDevice;
+pub use device::faults::with_device_lost_after;
+use frame::Frame;
+use launches::Launches;
+use pipelines::Variant;
+use promise::MAX_SIDE;
+use sizes::Sizes;
+
+/// Whether gradients wait for an optimiser step: of bands 1–3, and of all else.
+#[derive(Debug, Clone, Copy, Default)]
+struct Waiting {
+    main: bool,
+    rest: bool,
+}
+
+/// The GPU backend.
+#[derive(Debug)]
+pub struct GpuBackend {
+    device: Arc<Device>,
+    sizes: Sizes,
+    buffers: Buffers,
+    launches: Launches,
+    ledger: Ledger,
+    budget: usize,
+    rows: usize,
+    near: f32,
+    shortcuts: Shortcuts,
+    planes: SignalPlanes,
+    mask: Option<MaskTerm>,
+    cadence: Cadence,
+    waiting: Waiting,
+    candidates: Candidates,
+    /// Photographs on the device, the first ones seen; the others are uploaded at every step. The choice is
+    /// never changed: views come in a new random order in each epoch, so that the newest ones would be gone
+    /// before they are needed again. By view: place among those kept, size, and the bits that say what it
+    /// has.
+    kept: HashMap<usize, (u64, [u32; 2], u32)>,
+    /// Sums of the last step by its exposure, if it had one; see `shaders/exposure.wgsl`.
+    exposure_sums: [[f32; 4]; 4],
+    /// Bands that are encoded for the next view.
+    bands: u32,
+    laps: Vec<(&'static str, Duration)>,
+}
+
+impl GpuBackend {
+    fn without_canary(
+        model: &Gaussians,
+        options: &Setup,
+        device: &GpuDevice,
+    ) -> Result<Self, BackendError> {
+        let shortcuts = options.shortcuts;
+        let budget = options.budget.max(1);
+        assert!(model.len() <= budget, "{} rows over a budget of {budget}", model.len());
+        let device = device.0.clone();
+        let most = device.summary.largest_budget(model.sh_degree);
+        if budget as u64 > most {
+            return Err(BackendError::OverLimit(format!(
+                "a budget of {budget} rows: {} takes {most} at degree {}; use --budget {most}",
+                device.summary.name, model.sh_degree
+            )));
+        }
+        let planes = SignalPlanes::new(&options.needs);
+        let sizes = promise::sizes(&device, model.sh_degree, options);
+        let buffers = Buffers::new(&device, &sizes)?;
+        let launches = launches(&device, &sizes, shortcuts, &buffers)?;
+        let ledger = promise::ledger(&sizes, &options.needs);
+        let gpu = Self {
+            ledger,
+            device,
+            sizes,
+            buffers,
+            launches,
+            budget,
+            rows: model.len(),
+            near: options.near,
+            shortcuts,
+            planes,
+            mask: options.needs.mask,
+            cadence: options.needs.cadence,
+            waiting: Waiting::default(),
+            candidates: Candidates::new(options.needs.candidates),
+            kept: HashMap::new(),
+            exposure_sums: [[0.0; 4]; 4],
+            bands: 1,
+            laps: Vec::new(),
+        };
+        gpu.write("bias", bytemuck::cast_slice(&bias_table()));
+        gpu.upload(model);
+        gpu.device.check()?;
+        Ok(gpu)
+    }
+
+    /// The adapter that was taken.
+    #[must_use]
+    pub fn adapter(&self) -> &AdapterSummary {
+        &self.device.summary
+    }
+
+    /// Bytes of the ledger that are on the device.
+    #[must_use]
+    pub fn promised(&self) -> u64 {
+        self.sizes.planned().iter().map(|planned| planned.bytes).sum()
+    }
+
+    /// Bytes allocated on the device now.
+    #[must_use]
+    pub fn allocated(&self) -> u64 {
+        self.buffers.bytes()
+    }
+
+    /// Makes room for images of this size.
+    fn fit_image(&mut self, width: u32, height: u32) -> Result<(), BackendError> {
+        if width > MAX_SIDE || height > MAX_SIDE {
+            return Err(BackendError::ImageTooLarge { width, height, max: MAX_SIDE });
+        }
+        let (most_wide, most_high) = self.sizes.image;
+        if width > most_wide || height > most_high {
+            self.sizes.image = (most_wide.max(width), most_high.max(height));
+            // Their places have moved.
+            self.kept.clear();
+            self.rebuild()?;
+        }
+        Ok(())
+    }
+
+    /// Allocates buffers whose size has changed, and binds all of them anew.
+    fn rebuild(&mut self) -> Result<(), BackendError> {
+        self.buffers.resize(&self.device, &self.sizes)?;
+        self.launches = launches(&self.device, &self.sizes, self.shortcuts, &self.buffers)?;
+        Ok(())
+    }
+
+    fn frame(&self, camera: &Camera, background: [f32; 3], sh_degree: u8) -> Frame {
+        let degree = u32::from(sh_degree.min(self.sizes.sh_degree));
+        let Sizes { cap, frozen, .. } = self.sizes;
+        let of_model = [self.rows as u32, degree, cap as u32, self.sizes.trained() as u32];
+        let mut frame = Frame::of_view(camera, background, self.near, of_model);
+        frame.frozen[0] = frozen as u32;
+        frame
+    }
+}
+
+/// The kernels for these sizes, bound to these buffers.
+fn launches(
+    device: &Device,
+    sizes: &Sizes,
+    shortcuts: Shortcuts,
+    buffers: &Buffers,
+) -> Result<Launches, BackendError> {
+    let &Sizes { records, more, accumulation, dominant, .. } = sizes;
+    let variant = Variant { records, more, shortcuts, accumulation, dominant };
+    let pipelines = device.pipelines(variant)?;
+    device.guarded("the kernels", 0, |device| Launches::bound(device, &pipelines, buffers, sizes))
+}
+
+impl Backend for GpuBackend {
+    fn rows(&self) -> usize {
+        self.rows
+    }
+
+    fn sh_degree(&self) -> u8 {
+        self.sizes.sh_degree
+    }
+
+    fn budget(&self) -> usize {
+        self.budget
+    }
+
+    fn ledger(&self) -> &Ledger {
+        &self.ledger
+    }
+
+    fn begin_epoch(&mut self) {
+        let cleared = self.planes.begin_epoch();
+        self.clear_planes(&cleared);
+    }
+
+    fn train_step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
+        self.step(input)
+    }
+
+    fn observe(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {
+        self.observe_view(input)
+    }
+
+    fn take_signals(&mut self, wanted: SignalSet) -> Result<Signals, BackendError> {
+        let mut signals = Signals::zeros(self.rows, wanted);
+        for signal in wanted.iter() {
+            if let Some(attribute) = ParameterSignal::of(signal) {
+                self.read_attribute(&attribute, signals.get_mut(signal).unwrap_or_default())?;
+                continue;
+            }
+            let values = if signal.kind() == SignalKind::Present {
+                self.present(signal)?
+            } else {
+                let planes = self.planes.of(signal);
+                let columns: Result<Vec<_>, _> =
+                    planes.map(|plane| self.column(plane, 0..self.rows)).collect();
+                let most =
+                    |a: Vec<f32>, b: Vec<f32>| a.iter().zip(&b).map(|(a, b)| a.max(*b)).collect();
+                let mut kept =
+                    columns?.into_iter().reduce(most).unwrap_or_else(|| vec![0.0; self.rows]);
+                kept.iter_mut().for_each(|value| *value = as_read(signal, *value));
+                kept
+            };
+            if let Some(column) = signals.get_mut(signal) {
+                column.copy_from_slice(&values);
+            }
+        }
+        Ok(signals)
+    }
+
+    fn candidates(&self) -> &[Candidate] {
+        self.candidates.list()
+    }
+
+    fn apply(&mut self, ops: &RowOps, seed: u64, step: u32) -> Result<(), BackendError> {
+        assert_fits(ops, self.sizes.frozen as usize, self.rows, self.budget);
+        self.edit(ops, seed, step);
+        if ops.reset_candidates {
+            self.candidates.clear();
+        }
+        self.device.check()
+    }
+
+    fn audit(&mut self) -> Result<Vec<Unsound>, BackendError> {
+        self.unsound()
+    }
+
+    fn render(
+        &mut self,
+        camera: &Camera,
+        background: [f32; 3],
+        sh_degree: u8,
+    ) -> Result<Rendering, BackendError> {
+        self.fit_image(camera.width, camera.height)?;
+        let frame = self.frame(camera, background, sh_degree);
+        self.run(&frame, |passes, to| {
+            passes.forward(to);
+        })?;
+        self.rendering(camera.width, camera.height)
+    }
+
+    fn render_painted(
+        &mut self,
+        camera: &Camera,
+        background: [f32; 3],
+        colours: &[[f32; 3]],
+    ) -> Result<Rendering, BackendError> {
+        assert_eq!(colours.len(), self.rows, "colours of other rows");
+        // The colours take the place of band 0 meanwhile, which costs the device no memory.
+        let (band, rows) = (ModelArray::Sh.parameters(0), 0..self.rows);
+        let own = self.parameters_of(&band, rows.clone())?;
+        let painted: Vec<f32> = colours.as_flattened().iter().copied().map(rgb_to_dc).collect();
+        self.set_parameters(&band, rows.clone(), &painted)?;
+        let made = self.render(camera, background, 0);
+        // If that fails the device has: it takes no step with these colours.
+        self.set_parameters(&band, rows, &own)?;
+        made
+    }
+
+    fn download_array(
+        &self,
+        array: ModelArray,
+        rows: Range<usize>,
+    ) -> Result<Vec<f32>, BackendError> {
+        assert!(rows.end <= self.rows, "rows {rows:?} of {}", self.rows);
+        self.parameters_of(&array.parameters(self.sizes.sh_degree), rows)
+    }
+
+    fn upload_array(
+        &mut self,
+        array: ModelArray,
+        rows: Range<usize>,
+        values: &[f32],
+    ) -> Result<(), BackendError> {
+        assert!(rows.end <= self.rows, "rows {rows:?} of {}", self.rows);
+        self.set_model_array(array, rows, values)
+    }
+
+    fn state(&self) -> Vec<StateArray> {
+        self.state_arrays()
+    }
+
+    fn save_rows(&self, name: &str, rows: Range<usize>) -> Result<Tensor, BackendError> {
+        assert!(rows.end <= self.rows, "rows {rows:?} of {}", self.rows);
+        self.state_tensor(name, rows)
+    }
+
+    fn restore_rows(&mut self, tensor: Tensor, rows: Range<usize>) -> Result<(), StateError> {
+        assert!(rows.end <= self.rows, "rows {rows:?} of {}", self.rows);
+        self.restore_tensor(tensor, rows)
+    }
+
+    fn stage_times(&self) -> &[(&'static str, Duration)] {
+        &self.laps
+    }
+}

@@ -1,0 +1,227 @@
+//! Measures single views for a policy: candidates for new rows while training, and auxiliary views at
+//! its events. The device lists the worst pixels of a view, of which the host takes
+//! those that are spaced; of auxiliary views the host chooses them, from a copy of the image. The
+//! device then finds their surface points, and the sums over each row's pixels.
+
+use densify_policies::policy::{
+    AuxColumn, AuxRequest, Candidate, CandidateRequest, DepthMode, ErrorMode,
+};
+
+use super::GpuBackend;
+use super::frame::Frame;
+use super::passes::{Search, Shape};
+use super::rows::GRADIENT;
+use super::sizes::OPS_BYTES;
+use crate::candidates::{Shown, ranked};
+use crate::pixel_map::{draw_pixels, pixel_map, radius_px};
+use crate::{AuxInput, AuxOutput, BackendError, assert_same_size};
+
+/// √(½·log₂ e): folded into the splats' factors.
+const FOLD: f32 = 0.849_321_8;
+
+/// A view whose passes have run, so that its lists and its image are on the device.
+pub(super) struct DrawnView<'a> {
+    pub(super) frame: Frame,
+    pub(super) shape: Shape,
+    pub(super) shown: Shown<'a>,
+}
+
+impl GpuBackend {
+    /// The search for candidates in a view of this size; `None` if the device lacks room for the result.
+    pub(super) fn search(
+        &self,
+        request: &CandidateRequest,
+        count: usize,
+        [width, height, ..]: [u32; 4],
+    ) -> Option<Search> {
+        let room = self.found_room();
+        let wanted = ranked(count, request.spaced);
+        (wanted <= room).then_some(Search {
+            pixels: width * height,
+            wanted: wanted as u32,
+            room: room as u32,
+            min_alpha: request.min_alpha,
+            of_gradient: request.error == ErrorMode::Gradient,
+        })
+    }
+
+    /// Pixels of which the gradients of the rows have room, beside their number.
+    fn found_room(&self) -> usize {
+        (GRADIENT / 2 * self.sizes.trained() as usize - 1).min(u32::MAX as usize)
+    }
+
+    /// Adds the worst pixels of the view to the candidates; `search` is what was looked for, if it was.
+    pub(super) fn collect_candidates(
+        &mut self,
+        drawn: &DrawnView<'_>,
+        request: &CandidateRequest,
+        count: usize,
+        search: Option<Search>,
+    ) -> Result<(), BackendError> {
+        let found = match search {
+            Some(search) => self.found(&search)?,
+            None => None,
+        };
+        let worst = match found {
+            Some(found) => {
+                let [width, height, ..] = drawn.frame.image.map(|n| n as usize);
+                self.candidates.worst_of([width, height], count, request.spaced, found)
+            }
+            None => self.worst_of_all(drawn, request, count)?,
+        };
+        for candidate in self.surface_points(drawn, &worst, request.depth)? {
+            self.candidates.push(candidate);
+        }
+        Ok(())
+    }
+
+    /// The pixels that a search has found, with their errors; `None` if there are more than fit, as in an
+    /// image with the same error everywhere.
+    fn found(&self, search: &Search) -> Result<Option<Vec<(f32, u32)>>, BackendError> {
+        // As many as are wanted, and a few that are as bad as the last.
+        let likely = (search.wanted + 63).min(search.room);
+        let mut read = self.read("gradient", 0, 8 * (1 + u64::from(likely)))?;
+        let count = read[0].to_bits();
+        if count > search.room {
+            return Ok(None);
+        }
+        if count > likely {
+            read = self.read("gradient", 0, 8 * (1 + u64::from(count)))?;
+        }
+        let pairs = read.as_chunks::<2>().0[1..].iter().take(count as usize);
+        Ok(Some(pairs.map(|[error, pixel]| (*error, pixel.to_bits())).collect()))
+    }
+
+    /// The worst pixels, chosen on the host from a copy of all errors.
+    fn worst_of_all(
+        &mut self,
+        drawn: &DrawnView<'_>,
+        request: &CandidateRequest,
+        count: usize,
+    ) -> Result<Vec<(usize, usize, f32)>, BackendError> {
+        let [width, height, ..] = drawn.frame.image.map(|n| n as usize);
+        let pixels = width * height;
+        let finish = self.read("finish", 0, 8 * pixels as u64)?;
+        let error: Vec<f32> = match request.error {
+            ErrorMode::Gradient => {
+                let planes = self.read("pixel gradient", 0, 12 * pixels as u64)?;
+                let square = |i: usize| planes[i] * planes[i];
+                (0..pixels)
+                    .map(|i| (square(i) + square(pixels + i) + square(2 * pixels + i)).sqrt())
+                    .collect()
+            }
+            ErrorMode::L1 | ErrorMode::L1Dssim => self.read("error", 0, 4 * pixels as u64)?,
+        };
+        let at = |x: usize, y: usize| {
+            let pixel = y * width + x;
+            (1.0 - finish[2 * pixel] >= request.min_alpha).then(|| error[pixel])
+        };
+        Ok(self.candidates.worst(width, height, count, request.spaced, at))
+    }
+
+    /// The surface points of some pixels (x, y, error) of the view, in their order; none for a pixel
+    /// that shows no surface.
+    fn surface_points(
+        &self,
+        drawn: &DrawnView<'_>,
+        pixels: &[(usize, usize, f32)],
+        mode: DepthMode,
+    ) -> Result<Vec<Candidate>, BackendError> {
+        let DrawnView { frame, shape, shown } = drawn;
+        let colour = shown.colours();
+        let [width, ..] = frame.image;
+        let focal = 0.5 * (frame.lens[0] + frame.lens[1]);
+        let which = u32::from(mode == DepthMode::Median);
+        let mut found = Vec::new();
+        // What fits the upload, and the points, of four numbers each, that come back.
+        let room = (OPS_BYTES as usize / 4).min(GRADIENT / 4 * self.sizes.trained() as usize);
+        for chunk in pixels.chunks(room) {
+            let numbers: Vec<u32> =
+                chunk.iter().map(|&(x, y, _)| y as u32 * width + x as u32).collect();
+            self.write("ops", bytemuck::cast_slice(&numbers));
+            self.go_on(*shape, |passes, to| passes.surface(to, numbers.len() as u32, which, 0));
+            let points = self.read("gradient", 0, 16 * chunk.len() as u64)?;
+            for (&(x, y, error), &[px, py, pz, depth]) in
+                chunk.iter().zip(points.as_chunks::<4>().0)
+            {
+                if depth > 0.0 {
+                    found.push(Candidate {
+                        position: [px, py, pz],
+                        colour: colour(x, y),
+                        pixel_size: depth / focal,
+                        error,
+                    });
+                }
+            }
+        }
+        Ok(found)
+    }
+
+    /// Measures one view.
+    pub(super) fn observe_view(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {
+        let AuxInput { camera, target, background, exposure, request, .. } = *input;
+        assert_same_size(camera, target);
+        self.fit_image(camera.width, camera.height)?;
+        let mut frame = self.frame(camera, background, input.sh_degree);
+        frame.draw[3] = self.bring_photograph(input.view, target);
+        self.bring_exposure(&mut frame, exposure);
+        let (state, shape) = self.run(&frame, |passes, to| {
+            passes.forward(to);
+            if exposure.is_some() {
+                passes.expose(to, camera.width * camera.height);
+            }
+            passes.loss(to, [[0.0; 2]; 2]);
+        })?;
+        let loss = state.output().loss;
+        let image = self.rendering(camera.width, camera.height)?;
+        let shown = Shown { target, background, exposure };
+        let drawn = DrawnView { frame, shape, shown };
+        let points = if request.points == 0 {
+            Vec::new()
+        } else {
+            let pixels = draw_pixels(&image.alpha, camera.width as usize, input);
+            self.surface_points(&drawn, &pixels, DepthMode::MaxWeight)?
+        };
+        let columns = if request.columns.is_empty() {
+            Vec::new()
+        } else {
+            let map = pixel_map(image.rgb.as_chunks::<3>().0, target, background, request.map);
+            self.write("pixel gradient", bytemuck::cast_slice(&map));
+            self.go_on(shape, |passes, to| {
+                passes.columns(to);
+            });
+            self.columns(request)?
+        };
+        Ok(AuxOutput { loss, columns, points })
+    }
+
+    /// The columns that the last passes have left.
+    fn columns(&self, request: &AuxRequest) -> Result<Vec<(AuxColumn, Vec<f32>)>, BackendError> {
+        let n = self.rows as u64;
+        let sums = self.read("row sums", 0, 20 * n)?;
+        let splats = self.read("splats", 0, 48 * n)?;
+        let depths = self.read("depths", 0, 4 * n)?;
+        let counted = if self.sizes.dominant { n } else { 0 };
+        let dominant = self.read("dominant", 0, 4 * counted)?;
+        let value = |column: AuxColumn, row: usize| {
+            if depths[row].to_bits() == u32::MAX {
+                return 0.0;
+            }
+            match column {
+                AuxColumn::MapSum => sums[5 * row],
+                AuxColumn::PixelCount => sums[5 * row + 1],
+                AuxColumn::WeightSum => sums[5 * row + 2],
+                AuxColumn::DistanceSum => sums[5 * row + 3],
+                AuxColumn::WeightMax => sums[5 * row + 4],
+                AuxColumn::DominantPixels => dominant[row].to_bits() as f32,
+                AuxColumn::Depth => depths[row],
+                AuxColumn::Radius => {
+                    let [_, _, l1, shear, l3] = [0, 1, 2, 3, 4].map(|i| splats[12 * row + i]);
+                    radius_px(FOLD / l1, shear, FOLD / l3)
+                }
+            }
+        };
+        let of = |c: AuxColumn| (c, (0..self.rows).map(|row| value(c, row)).collect());
+        Ok(request.columns.iter().map(|&c| of(c)).collect())
+    }
+}

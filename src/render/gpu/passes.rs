@@ -1,0 +1,318 @@
+//! Encodes the passes of a view: forward, image loss, backward, optimiser. What is encoded depends only
+//! on the image's size and the number of bands; everything else is counted on the device.
+
+use densify_policies::policy::MaskTerm;
+use wgpu::ComputePass;
+
+use super::clock::Stages;
+use super::exposure::groups;
+use super::launches::{Launch, Launches};
+use super::sizes::BLOCK;
+use densify_core::gaussians::logit;
+
+/// Workgroups in the first of two dimensions; see `shaders/shared/view.wgsl`.
+const ACROSS: u32 = 32_768;
+/// Places of indirect dispatches `[bytes]`; see `shaders/tiles.wgsl`.
+mod args {
+    pub(super) const ROWS: u64 = 0;
+    pub(super) const ROW_BLOCKS: u64 = 12;
+    pub(super) const ROW_DIGITS: u64 = 24;
+    pub(super) const ENTRY_BLOCKS: u64 = 36;
+    pub(super) const ENTRY_DIGITS: u64 = 48;
+}
+/// What is summed; see `shaders/tiles.wgsl`.
+const FLAGS: u32 = 0;
+const COUNTS_ALL: u32 = 1;
+const COUNTS_BAND: u32 = 2;
+const COUNTS_AGAIN: u32 = 3;
+const DIGITS_OF_ROWS: u32 = 4;
+const DIGITS_OF_ENTRIES: u32 = 5;
+/// The launch of `scatter` that writes the order of rows.
+const TO_ORDER: usize = 2;
+/// In place of a band: the whole image.
+const WHOLE: u32 = u32::MAX;
+
+/// Numbers per row of an auxiliary view.
+const COLUMNS: u32 = 5;
+
+/// What decides which commands are encoded.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Shape {
+    pub(super) rows: u32,
+    pub(super) tiles: u32,
+    /// Bands to encode; more than needed do nothing.
+    pub(super) bands: u32,
+}
+
+impl Shape {
+    /// Passes of four bits that sort the entries by tile.
+    fn tile_passes(&self) -> u32 {
+        (u32::BITS - (self.tiles - 1).leading_zeros()).div_ceil(4).max(1)
+    }
+}
+
+/// Which pixels of a view are looked for.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Search {
+    /// Of the image.
+    pub(super) pixels: u32,
+    pub(super) wanted: u32,
+    /// Most that can be written down.
+    pub(super) room: u32,
+    /// Least alpha of a pixel.
+    pub(super) min_alpha: f32,
+    /// Whether the error is the length of the loss's gradient.
+    pub(super) of_gradient: bool,
+}
+
+/// Encodes dispatches into one pass.
+pub(super) struct Recorder<'e> {
+    pass: ComputePass<'e>,
+    pub(super) stages: Stages<'e>,
+}
+
+impl<'e> Recorder<'e> {
+    pub(super) fn new(pass: ComputePass<'e>) -> Self {
+        Self { pass, stages: Stages::default() }
+    }
+
+    /// Encodes the beginning of a stage.
+    fn stage(&mut self, name: &'static str) {
+        self.stages.begin(&mut self.pass, name);
+    }
+
+    /// Ends the pass, and returns its stages, of which the last is the end.
+    pub(super) fn end(mut self) -> Vec<&'static str> {
+        self.stage("");
+        self.stages.names
+    }
+
+    fn set(&mut self, launch: &Launch, now: [u32; 4]) {
+        self.pass.set_pipeline(&launch.pipeline);
+        self.pass.set_bind_group(0, &launch.bindings, &[]);
+        self.pass.set_immediates(0, bytemuck::bytes_of(&now));
+    }
+
+    /// Dispatches so many workgroups.
+    pub(super) fn run(&mut self, launch: &Launch, now: [u32; 4], groups: u32) {
+        if groups > 0 {
+            self.set(launch, now);
+            self.pass.dispatch_workgroups(groups.min(ACROSS), groups.div_ceil(ACROSS), 1);
+        }
+    }
+
+    /// Dispatches as many workgroups as the device has counted.
+    fn run_counted(&mut self, launch: &Launch, now: [u32; 4], groups: &wgpu::Buffer, at: u64) {
+        self.set(launch, now);
+        self.pass.dispatch_workgroups_indirect(groups, at);
+    }
+}
+
+/// The passes of one view.
+pub(super) struct Passes<'a> {
+    pub(super) launches: &'a Launches,
+    pub(super) groups: &'a wgpu::Buffer,
+    pub(super) shape: Shape,
+}
+
+impl Passes<'_> {
+    /// One digit of a stable sort. `items` is 1 for entries and 0 for rows.
+    fn sort_digit(&self, to: &mut Recorder<'_>, pass: u32, items: u32, scatter: &Launch) {
+        let l = self.launches;
+        let source = (pass % 2) as usize;
+        let (blocks, digits, what) = if items == 1 {
+            (args::ENTRY_BLOCKS, args::ENTRY_DIGITS, DIGITS_OF_ENTRIES)
+        } else {
+            (args::ROW_BLOCKS, args::ROW_DIGITS, DIGITS_OF_ROWS)
+        };
+        let now = [4 * pass, items, u32::from(items == 1 && pass == 0), 0];
+        to.run_counted(l.nth("count_digits", source), now, self.groups, blocks);
+        to.run_counted(l.get("scan_blocks"), [what, 0, 0, 0], self.groups, digits);
+        to.run(l.get("scan_sums"), [what, 0, 0, 0], 1);
+        to.run_counted(scatter, now, self.groups, blocks);
+    }
+
+    /// Stages 1–3. Afterwards the canvas holds the image and, if there is one band, the lists hold
+    /// its entries.
+    pub(super) fn forward(&self, to: &mut Recorder<'_>) {
+        let l = self.launches;
+        let Shape { rows, bands, .. } = self.shape;
+        to.stage("project");
+        to.run(l.get("project"), [0; 4], rows.div_ceil(256));
+        if l.counts_dominant {
+            to.run(l.get("clear_dominant"), [0; 4], rows.div_ceil(256));
+        }
+        to.run(l.get("scan_blocks"), [FLAGS, 0, 0, 0], rows.div_ceil(BLOCK as u32));
+        to.run(l.get("scan_sums"), [FLAGS, bands, 0, 0], 1);
+        to.run(l.get("compact"), [0; 4], rows.div_ceil(256));
+        to.stage("sort by depth");
+        for pass in 0..8 {
+            let number = if pass == 7 { TO_ORDER } else { pass as usize % 2 };
+            self.sort_digit(to, pass, 0, l.nth("scatter", number));
+        }
+        to.stage("tiles");
+        self.count(to, WHOLE, COUNTS_ALL);
+        if bands > 1 {
+            to.run_counted(l.get("count_tiles"), [0; 4], self.groups, args::ROWS);
+            to.run(l.get("cut_bands"), [0, bands, 0, 0], 1);
+        }
+        for band in 0..bands {
+            self.lists(to, band, COUNTS_BAND);
+            to.stage("rasterize");
+            to.run(l.nth("rasterize", self.sorted()), [band, 0, 0, 0], self.shape.tiles);
+        }
+    }
+
+    fn count(&self, to: &mut Recorder<'_>, band: u32, what: u32) {
+        let l = self.launches;
+        to.run_counted(l.get("count_entries"), [band, 0, 0, 0], self.groups, args::ROWS);
+        to.run_counted(l.get("scan_blocks"), [what, 0, 0, 0], self.groups, args::ROW_BLOCKS);
+        to.run(l.get("scan_sums"), [what, self.shape.bands, 0, 0], 1);
+    }
+
+    /// Which of the two key buffers holds the sorted entries.
+    fn sorted(&self) -> usize {
+        (self.shape.tile_passes() % 2) as usize
+    }
+
+    /// The lists of a band. With one band its entries are counted already.
+    fn lists(&self, to: &mut Recorder<'_>, band: u32, what: u32) {
+        let l = self.launches;
+        to.stage("tiles");
+        let several = self.shape.bands > 1;
+        if several {
+            self.count(to, band, what);
+        }
+        let tiles = if several { band } else { WHOLE };
+        to.run_counted(l.get("emit_entries"), [tiles, 0, 0, 0], self.groups, args::ROWS);
+        for pass in 0..self.shape.tile_passes() {
+            self.sort_digit(to, pass, 1, l.nth("scatter", pass as usize % 2));
+        }
+        let groups = (self.shape.tiles + 1).div_ceil(256);
+        to.run(l.nth("find_tiles", self.sorted()), [0; 4], groups);
+    }
+
+    /// Gives the rendered image, of so many pixels, the photograph's exposure.
+    pub(super) fn expose(&self, to: &mut Recorder<'_>, pixels: u32) {
+        to.run(self.launches.get("expose"), [0; 4], groups(pixels.into()) as u32);
+    }
+
+    /// Takes the gradients of an exposed image back, and adds up those by the exposure.
+    pub(super) fn expose_bwd(&self, to: &mut Recorder<'_>, pixels: u32) {
+        let l = self.launches;
+        to.run(l.get("expose_bwd"), [0; 4], groups(pixels.into()) as u32);
+        to.run(l.get("total_exposure"), [0; 4], 1);
+    }
+
+    /// Stage 4, with the weights of |e| and 1 − SSIM in the errors per pixel, for candidates and for signals.
+    pub(super) fn loss(&self, to: &mut Recorder<'_>, error_weights: [[f32; 2]; 2]) {
+        let l = self.launches;
+        let [[a, b], [c, d]] = error_weights.map(|weights| weights.map(f32::to_bits));
+        to.stage("loss");
+        to.run(l.get("similarity"), [a, b, c, d], self.shape.tiles);
+        to.run(l.get("pixel_gradient"), [0; 4], self.shape.tiles);
+        to.run(l.get("total"), [0; 4], 1);
+    }
+
+    /// Stage 5: from the pixels' gradients to one sum per row.
+    pub(super) fn backward(&self, to: &mut Recorder<'_>) {
+        let l = self.launches;
+        let Shape { rows, tiles, bands } = self.shape;
+        let groups = rows.div_ceil(256);
+        to.stage("rasterize_bwd");
+        if !l.in_slots {
+            to.run(l.get("clear_sums"), [l.record, 0, 0, 0], groups);
+        }
+        for band in 0..bands {
+            if bands > 1 {
+                self.lists(to, band, COUNTS_AGAIN);
+                to.stage("rasterize_bwd");
+            }
+            to.run(l.nth("rasterize_bwd", self.sorted()), [band, 0, 0, 0], tiles);
+            if l.in_slots {
+                to.run(l.get("gather"), [band, 0, 0, 0], groups);
+            }
+        }
+    }
+
+    /// Stage 6.
+    pub(super) fn differentiate(&self, to: &mut Recorder<'_>) {
+        to.stage("project_bwd");
+        to.run(self.launches.get("project_bwd"), [0; 4], self.shape.rows.div_ceil(256));
+    }
+
+    /// Stages 6 to 8. Colour steps before the geometry, on which its gradient depends. Of `mask` the weight is that
+    /// of one row.
+    pub(super) fn optimise(
+        &self,
+        to: &mut Recorder<'_>,
+        sh_degree: u8,
+        signals: bool,
+        mask: Option<MaskTerm>,
+    ) {
+        let l = self.launches;
+        let groups = self.shape.rows.div_ceil(256);
+        self.differentiate(to);
+        if signals {
+            to.run(l.get("accumulate"), [0; 4], groups);
+        }
+        if let Some(MaskTerm { start, rate, weight, threshold }) = mask {
+            let now = [start, rate, weight, logit(threshold)].map(f32::to_bits);
+            to.run(l.get("step_masks"), now, groups);
+        }
+        to.stage("adam");
+        for band in 0..=usize::from(sh_degree) {
+            let [first, coefficients] = [(band * band) as u32, (2 * band + 1) as u32];
+            let numbers = self.shape.rows * 3 * coefficients;
+            let now = [first, coefficients, 0, 0];
+            to.run(l.nth("adam_band", band), now, numbers.div_ceil(256));
+        }
+        to.run(l.get("adam_geometry"), [0; 4], groups);
+    }
+
+    /// Writes the `wanted` worst pixels, and those as bad as the last of them, to the gradients of the
+    /// rows: their number, then error bits and pixel number of each, as many as fit.
+    pub(super) fn worst(&self, to: &mut Recorder<'_>, search: &Search) {
+        let l = self.launches;
+        let &Search { pixels, wanted, room, min_alpha, of_gradient } = search;
+        let (groups, map) = (pixels.div_ceil(256), usize::from(of_gradient));
+        let of_pixel = [min_alpha.to_bits(), u32::from(of_gradient)];
+        let now = |a, b| [a, b, of_pixel[0], of_pixel[1]];
+        to.run(l.get("narrow"), [0, wanted, 0, 0], 1);
+        for shift in [24, 16, 8, 0] {
+            to.run(l.nth("count_errors", map), now(shift, u32::from(shift == 24)), groups);
+            to.run(l.get("narrow"), [1, 0, 0, 0], 1);
+        }
+        to.run(l.nth("write_worst", map), now(0, room), groups);
+        to.run(l.get("narrow"), [2, 0, 0, 0], 1);
+    }
+
+    /// Surface points of the pixels whose numbers are uploaded, from place `first` on.
+    pub(super) fn surface(&self, to: &mut Recorder<'_>, pixels: u32, mode: u32, first: u32) {
+        for band in 0..self.shape.bands {
+            if self.shape.bands > 1 {
+                self.lists(to, band, COUNTS_AGAIN);
+            }
+            let now = [band, pixels, mode, first];
+            to.run(self.launches.nth("surface", self.sorted()), now, pixels.div_ceil(256));
+        }
+    }
+
+    /// Each row's sums over the pixels of a view that it is blended into.
+    pub(super) fn columns(&self, to: &mut Recorder<'_>) {
+        let l = self.launches;
+        let groups = self.shape.rows.div_ceil(256);
+        if !l.in_slots {
+            to.run(l.get("clear_sums"), [COLUMNS, 0, 0, 0], groups);
+        }
+        for band in 0..self.shape.bands {
+            if self.shape.bands > 1 {
+                self.lists(to, band, COUNTS_AGAIN);
+            }
+            to.run(l.nth("replay", self.sorted()), [band, 0, 0, 0], self.shape.tiles);
+            if l.in_slots {
+                to.run(l.get("gather_columns"), [band, 0, 0, 0], groups);
+            }
+        }
+    }
+}

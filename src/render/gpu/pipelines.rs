@@ -1,0 +1,125 @@
+//! The compute pipelines of a device. wgpu derives their layouts from the shaders.
+
+use std::collections::HashMap;
+
+use densify_policies::policy::Signal;
+use wgpu::{ComputePipeline, Device, ShaderModule};
+
+use super::kernels::{Binding, kernels, parse};
+use crate::Accumulation;
+use crate::Shortcuts;
+use crate::signals::{Field, ParameterSignal, RecordLayout};
+use densify_shaders::STAGES;
+
+/// What kernels are compiled for.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Variant {
+    pub(super) records: RecordLayout,
+    /// Whether alpha and depth have gradients.
+    pub(super) more: bool,
+    pub(super) shortcuts: Shortcuts,
+    pub(super) accumulation: Accumulation,
+    /// Whether pixels are counted for the row that dominates them.
+    pub(super) dominant: bool,
+}
+
+impl Variant {
+    /// The shaders' `override` constants; a module is given those that it declares.
+    pub(super) fn constants(&self) -> Vec<(String, f64)> {
+        let mut all = vec![
+            ("RECORD".to_owned(), self.records.stride() as f64),
+            ("MORE".to_owned(), f64::from(u8::from(self.more))),
+            ("COUNTS_DOMINANT".to_owned(), f64::from(u8::from(self.dominant))),
+            ("ALPHA_MIN".to_owned(), f64::from(self.shortcuts.alpha_min)),
+            ("LOG2_REACH".to_owned(), f64::from(self.shortcuts.log2_reach())),
+            ("TRANSMITTANCE_MIN".to_owned(), f64::from(self.shortcuts.transmittance_min)),
+        ];
+        let place = |field| self.records.at(field).unwrap_or(0) as f64;
+        all.extend(Field::ALL.map(|field| (field.constant().to_owned(), place(field))));
+        let is_computed = |signal: &Signal| ParameterSignal::of(*signal).is_none();
+        let computed = Signal::ALL.into_iter().filter(is_computed);
+        all.extend(computed.map(|signal| (constant(signal), f64::from(signal as u32))));
+        all
+    }
+}
+
+/// The name of a signal's number in shaders: `WEIGHT_MAX`.
+pub(super) fn constant(signal: Signal) -> String {
+    let mut name = String::new();
+    for c in format!("{signal:?}").chars() {
+        if c.is_uppercase() && !name.is_empty() {
+            name.push('_');
+        }
+        name.push(c.to_ascii_uppercase());
+    }
+    name
+}
+
+/// A compiled kernel and the buffers that it uses.
+#[derive(Debug)]
+pub(super) struct Compiled {
+    pub(super) pipeline: ComputePipeline,
+    pub(super) bindings: Vec<Binding>,
+}
+
+/// The kernels of a device, by name.
+#[derive(Debug)]
+pub(super) struct Pipelines {
+    kernels: HashMap<String, Compiled>,
+}
+
+impl Pipelines {
+    /// Builds every kernel of the variant.
+    pub(super) fn new(device: &Device, variant: Variant) -> Self {
+        let mut compiled = HashMap::new();
+        for stage in STAGES {
+            let Some(text) = stage.text(variant.accumulation) else { continue };
+            let parsed = parse(stage, &text);
+            let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
+                label: Some(stage.name),
+                source: wgpu::ShaderSource::Wgsl((&text).into()),
+            });
+            let is_declared =
+                |name: &str| parsed.overrides.iter().any(|(_, o)| o.name.as_deref() == Some(name));
+            let constants = variant.constants();
+            let declared = constants.iter().filter(|(name, _)| is_declared(name));
+            let constants: Vec<_> = declared.map(|(name, value)| (&**name, *value)).collect();
+            for kernel in kernels(stage, &text, &parsed) {
+                let pipeline = compile(device, &module, &kernel.entry, &constants);
+                compiled.insert(kernel.entry, Compiled { pipeline, bindings: kernel.bindings });
+            }
+        }
+        Self { kernels: compiled }
+    }
+
+    pub(super) fn names(&self) -> impl Iterator<Item = &str> {
+        self.kernels.keys().map(String::as_str)
+    }
+
+    /// # Panics
+    /// When the device does not have the kernel: a bug in the caller.
+    pub(super) fn get(&self, kernel: &str) -> &Compiled {
+        let found = self.kernels.get(kernel);
+        found.unwrap_or_else(|| panic!("this device has no kernel `{kernel}`"))
+    }
+}
+
+fn compile(
+    device: &Device,
+    module: &ShaderModule,
+    entry: &str,
+    constants: &[(&str, f64)],
+) -> ComputePipeline {
+    device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+        label: Some(entry),
+        layout: None,
+        module,
+        entry_point: Some(entry),
+        compilation_options: wgpu::PipelineCompilationOptions {
+            constants,
+            // Every kernel writes what it reads.
+            zero_initialize_workgroup_memory: false,
+        },
+        cache: None,
+    })
+}

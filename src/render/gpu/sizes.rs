@@ -1,0 +1,216 @@
+//! The sizes of all buffers, known before the first is allocated; the ledger is the list of them.
+
+use densify_policies::policy::{Cadence, ErrorMode, Needs};
+use wgpu::BufferUsages;
+
+use super::exposure;
+use super::frame::{Frame, State, grid};
+use super::rows::{Holds, RowArray, row_arrays};
+use crate::Accumulation;
+use crate::KeptPhotographs;
+use crate::signals::{Field, RecordLayout, SignalPlanes, counts_dominant};
+use densify_core::gaussians::sh_coefficients;
+use densify_core::memory::{Ledger, Section};
+
+/// Bytes of an edit's operations that are uploaded at a time.
+pub(super) const OPS_BYTES: u64 = 1 << 18;
+/// Most bytes read back at a time.
+pub(super) const READ_BYTES: u64 = 1 << 20;
+/// Items per group of the sums and sorts; see `shaders/tiles.wgsl`.
+pub(super) const BLOCK: u64 = 2048;
+/// Ages at which the bias correction is tabulated; older rows have none left: ln(2⁻²⁵)/ln(0.999).
+pub(super) const MATURE: usize = 17_400;
+/// Most entries at a time: sums saturate beyond it.
+pub(super) const MOST_ENTRIES: u64 = 1 << 28;
+
+/// What decides all sizes.
+#[derive(Debug, Clone)]
+pub(super) struct Sizes {
+    pub(super) budget: u64,
+    /// Rows at the front that never change.
+    pub(super) frozen: u64,
+    pub(super) cap: u64,
+    pub(super) sh_degree: u8,
+    pub(super) image: (u32, u32),
+    pub(super) photographs: KeptPhotographs,
+    /// Planes of the signals.
+    pub(super) planes: usize,
+    /// Of the records and their sums.
+    pub(super) records: RecordLayout,
+    /// How gradients are added up: only slots need records.
+    pub(super) accumulation: Accumulation,
+    /// Whether gradients of alpha and depth are given as well.
+    pub(super) more: bool,
+    pub(super) cadence: Cadence,
+    /// Whether pixels are counted for the row that dominates them.
+    pub(super) dominant: bool,
+    /// Whether rows have masks.
+    pub(super) masks: bool,
+    pub(super) with_error: bool,
+    /// Whether pixels weigh more at edges.
+    pub(super) with_edges: bool,
+    /// Whether photographs have exposures.
+    pub(super) exposures: bool,
+}
+
+/// A buffer to allocate.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Planned {
+    pub(super) name: &'static str,
+    pub(super) section: Section,
+    pub(super) line: &'static str,
+    pub(super) bytes: u64,
+    pub(super) usage: BufferUsages,
+}
+
+impl Sizes {
+    pub(super) fn new(
+        budget: usize,
+        cap: u64,
+        sh_degree: u8,
+        image: (u32, u32),
+        needs: &Needs,
+        accumulation: Accumulation,
+    ) -> Self {
+        let records = RecordLayout::new(needs.signals);
+        Self {
+            budget: budget as u64,
+            frozen: 0,
+            cap,
+            sh_degree,
+            image,
+            photographs: KeptPhotographs::default(),
+            planes: SignalPlanes::new(needs).count,
+            records,
+            accumulation,
+            more: false,
+            cadence: needs.cadence,
+            dominant: counts_dominant(needs),
+            masks: needs.mask.is_some(),
+            with_edges: records.has(Field::Error) && needs.error_score.edge > 0.0,
+            with_error: needs.candidates.is_some_and(|r| r.error != ErrorMode::Gradient),
+            exposures: false,
+        }
+    }
+
+    /// Whether the gradients of the geometry and of band 0, and those of bands 1–3, may wait.
+    pub(super) fn waits(&self) -> [bool; 2] {
+        let Cadence { all, sh_rest } = self.cadence;
+        [all > 1, all > 1 || sh_rest > 1]
+    }
+
+    /// Most rows that are not frozen, >= 1.
+    pub(super) fn trained(&self) -> u64 {
+        self.budget.saturating_sub(self.frozen).max(1)
+    }
+
+    /// The first row that has a place in an array, and how many have one at most.
+    pub(super) fn places(&self, array: &RowArray) -> [u64; 2] {
+        match array.holds.traits().is_for_training {
+            true => [self.frozen, self.trained()],
+            false => [0, self.budget],
+        }
+    }
+
+    /// Every array with an entry per row.
+    pub(super) fn row_arrays(&self) -> Vec<RowArray> {
+        let [counts, masks] = [self.dominant, self.masks].map(usize::from);
+        let others = [self.planes, self.records.stride(), counts, masks];
+        row_arrays(self.sh_degree, self.waits(), others)
+    }
+
+    /// The arrays that hold the model.
+    pub(super) fn parameters(&self) -> Vec<RowArray> {
+        let mut arrays = self.row_arrays();
+        arrays.retain(|array| matches!(array.holds, Holds::Geometry | Holds::Colour));
+        arrays
+    }
+
+    /// Every buffer.
+    pub(super) fn planned(&self) -> Vec<Planned> {
+        let storage = BufferUsages::STORAGE | BufferUsages::COPY_SRC | BufferUsages::COPY_DST;
+        let mut all = Vec::new();
+        let mut add = |section, line, name, bytes: u64| {
+            let bytes = bytes.max(16).next_multiple_of(16);
+            all.push(Planned { name, section, line, bytes, usage: storage });
+        };
+        let (b, cap) = (self.budget, self.cap);
+        for array in self.row_arrays() {
+            let traits = array.holds.traits();
+            let [_, rows] = self.places(&array);
+            add(traits.section, traits.line, array.name, rows * array.row_bytes());
+        }
+        add(Section::Model, Holds::Ages.traits().line, "bias", 8 * (MATURE as u64 + 1));
+        for name in ["keys 0", "keys 1", "values 0", "values 1", "row of slot"] {
+            add(Section::Tiles, "entries", name, 4 * cap);
+        }
+        if self.accumulation == Accumulation::Slots {
+            let bytes = 4 * self.records.stride() as u64 * cap;
+            add(Section::Tiles, "gradients per entry", "records", bytes);
+        }
+        let sums = b.max(16 * cap.div_ceil(BLOCK));
+        add(Section::Tiles, "sums", "sums", 4 * sums);
+        add(Section::Tiles, "sums", "block sums", 4 * sums.div_ceil(BLOCK));
+        let (width, height) = self.image;
+        let pixels = u64::from(width) * u64::from(height);
+        let tiles = u64::from(grid(width, height)[1]);
+        add(Section::Tiles, "tiles", "state", size_of::<State>() as u64 + 4 * (tiles + 2));
+        add(Section::Tiles, "tiles", "tile starts", 4 * (tiles + 1));
+        add(Section::Tiles, "tiles", "tile counts", 4 * tiles);
+        add(Section::Renderer, "image and image gradient", "canvas", 16 * pixels);
+        add(Section::Renderer, "image and image gradient", "finish", 8 * pixels);
+        let errors = u64::from(self.records.has(Field::Error));
+        let channels = if self.more { 5 } else { 3 + errors * (1 + u64::from(self.with_edges)) };
+        add(Section::Renderer, "image and image gradient", "pixel gradient", 4 * channels * pixels);
+        add(Section::Renderer, "loss", "derivatives", 36 * pixels);
+        add(Section::Renderer, "loss", "tile sums", 8 * tiles);
+        if self.with_error {
+            add(Section::Renderer, "loss", "error", 4 * pixels);
+        }
+        // Without exposures too: the loss binds it, and one buffer cannot stand for all that are missing where a
+        // kernel writes to some of them.
+        add(Section::Renderer, "small buffers", "exposure", exposure::TRANSFORM);
+        if self.exposures {
+            let sums = exposure::SUMS * exposure::groups(pixels);
+            add(Section::Renderer, "exposure", "exposure sums", sums);
+            add(Section::Renderer, "exposure", "exposure total", exposure::SUMS);
+        }
+        add(Section::Images, "photograph on the device", "truth", 4 * pixels);
+        add(Section::Images, "photograph on the device", "mask", pixels.next_multiple_of(4));
+        let kept = self.photographs.count as u64 * self.photograph_bytes().iter().sum::<u64>();
+        if kept > 0 {
+            add(Section::Images, "photographs kept on the device", "photographs", kept);
+        }
+        add(Section::Policy, "operations of an edit", "ops", OPS_BYTES);
+        add(Section::Renderer, "small buffers", "nothing", 16);
+        add(Section::Renderer, "small buffers", "selection", 4 * (4 + 256));
+        let mut add_as = |line, name, bytes, usage| {
+            all.push(Planned { name, section: Section::Renderer, line, bytes, usage });
+        };
+        let frame = size_of::<Frame>() as u64;
+        add_as("small buffers", "frame", frame, BufferUsages::UNIFORM | BufferUsages::COPY_DST);
+        add_as("small buffers", "groups", 64, BufferUsages::STORAGE | BufferUsages::INDIRECT);
+        let staging = BufferUsages::MAP_READ | BufferUsages::COPY_DST;
+        add_as("copies to the host", "read", READ_BYTES, staging);
+        all
+    }
+
+    /// Bytes of each photograph that is kept, and of its mask.
+    pub(super) fn photograph_bytes(&self) -> [u64; 2] {
+        KeptPhotographs::bytes(self.image, self.photographs.with_masks)
+    }
+
+    /// Bytes per purpose.
+    pub(super) fn ledger(&self) -> Ledger {
+        let mut ledger = Ledger::default();
+        for Planned { section, line, bytes, .. } in self.planned() {
+            ledger.add_on_device(section, line, bytes);
+        }
+        ledger
+    }
+
+    /// Numbers per row of all parameters but the geometry.
+    pub(super) fn sh_numbers(&self) -> usize {
+        3 * sh_coefficients(self.sh_degree)
+    }
+}

@@ -1,0 +1,109 @@
+//! The GPU backend's state as named arrays: its buffers row by row, as the device holds them; zeros of frozen rows that
+//! have no place there.
+//!
+//! They are named after the device, so that the native backend, whose sums have another order, does
+//! not go on from them unasked.
+
+use std::ops::Range;
+
+use super::GpuBackend;
+use super::rows::{Holds, RowArray};
+use super::transfer::held;
+use crate::{BackendError, StateArray, StateError, Tensor};
+
+/// Before the name of a buffer.
+const BUFFER: &str = "device.";
+/// Before the name of a signal.
+const SIGNAL: &str = "device.signals.";
+const WAITS: &str = "device.waits";
+const CANDIDATES: &str = "candidates";
+
+impl GpuBackend {
+    /// The arrays that outlive a step, beside the model and the signals.
+    fn saved(&self) -> impl Iterator<Item = RowArray> {
+        self.sizes.row_arrays().into_iter().filter(|array| array.holds.traits().is_saved)
+    }
+
+    fn array(&self, name: &str) -> Option<RowArray> {
+        let name = name.strip_prefix(BUFFER)?;
+        self.saved().find(|array| array.name == name)
+    }
+
+    fn signal(&self, name: &str) -> Option<usize> {
+        let name = name.strip_prefix(SIGNAL)?;
+        self.planes.kept().into_iter().find(|(known, _)| known == name).map(|(_, plane)| plane)
+    }
+
+    pub(super) fn state_arrays(&self) -> Vec<StateArray> {
+        let buffers = self.saved().map(|array| format!("{BUFFER}{}", array.name));
+        let signals = self.planes.kept().into_iter().map(|(name, _)| format!("{SIGNAL}{name}"));
+        let mut arrays: Vec<StateArray> = buffers.chain(signals).map(StateArray::of_rows).collect();
+        arrays.push(StateArray::small(WAITS));
+        if self.candidates.is_wanted() {
+            arrays.push(StateArray::small(CANDIDATES));
+        }
+        arrays
+    }
+
+    /// # Panics
+    /// When there is no such array: a bug in the caller.
+    pub(super) fn state_tensor(
+        &self,
+        name: &str,
+        rows: Range<usize>,
+    ) -> Result<Tensor, BackendError> {
+        if name == WAITS {
+            let waits = [self.waiting.main, self.waiting.rest].map(u8::from);
+            return Ok(Tensor::u8(name, &[2], waits.to_vec()));
+        }
+        if name == CANDIDATES {
+            return Ok(self.candidates.tensor(name));
+        }
+        if let Some(plane) = self.signal(name) {
+            return Ok(Tensor::f32(name, &[rows.len()], self.column(plane, rows)?));
+        }
+        let array = self.array(name);
+        let array = array.unwrap_or_else(|| panic!("there is no `{name}` in this backend's state"));
+        let values = self.read_rows(&array, rows.clone())?;
+        if array.holds == Holds::Ages {
+            // Whole numbers in the same four bytes.
+            let bytes = bytemuck::cast_slice(&values).to_vec();
+            return Ok(Tensor::u8(name, &[rows.len(), 4], bytes));
+        }
+        Ok(Tensor::f32(name, &[rows.len(), array.numbers], values))
+    }
+
+    pub(super) fn restore_tensor(
+        &mut self,
+        tensor: Tensor,
+        rows: Range<usize>,
+    ) -> Result<(), StateError> {
+        let name = tensor.name.clone();
+        if name == WAITS {
+            let waits = tensor.into_u8(&[2])?;
+            let [main, rest] = [0, 1].map(|i| waits[i] != 0);
+            self.waiting = super::Waiting { main, rest };
+        } else if name == CANDIDATES && self.candidates.is_wanted() {
+            self.candidates.restore(tensor)?;
+        } else if let Some(plane) = self.signal(&name) {
+            let values = tensor.into_f32(&[rows.len()])?;
+            let (first, without) = held(self.sizes.frozen, &rows);
+            let start = plane as u64 * self.sizes.trained() + first;
+            self.write_at("signals", 4 * start, &values[without..]);
+        } else if let Some(array) = self.array(&name) {
+            let [first_row, _] = self.sizes.places(&array);
+            let (first, without) = held(first_row, &rows);
+            let at = array.row_bytes() * first;
+            if array.holds == Holds::Ages {
+                let values = tensor.into_u8(&[rows.len(), 4])?;
+                self.write_at(array.name, at, &values[4 * without..]);
+            } else {
+                let values = tensor.into_f32(&[rows.len(), array.numbers])?;
+                self.write_at(array.name, at, &values[array.numbers * without..]);
+            }
+        } else {
+            return Err(tensor.error("this run keeps nothing of that name"));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,105 @@
+//! One training step: fills the uniform buffer and runs the passes.
+
+use std::time::Instant;
+
+use densify_policies::policy::MaskTerm;
+
+use super::frame::{due, target as of_target};
+use super::observe::DrawnView;
+use super::passes::{Passes, Recorder};
+use super::{GpuBackend, Waiting};
+use crate::candidates::{Shown, error_weights};
+use crate::pixel_map::edge_weights;
+use crate::signals::Field;
+use crate::{BackendError, StepInput, StepOutput, assert_same_size};
+
+impl GpuBackend {
+    /// Which parameter groups step now and which have waited, as bits of the frame, and which wait
+    /// afterwards.
+    fn cadence_bits(&self, input: &StepInput<'_>) -> (u32, Waiting) {
+        let (step, cadence) = (input.step, input.cadence);
+        assert!(cadence.is_within(self.cadence), "step {step}: {cadence:?} was not declared");
+        let [main, rest] = cadence.steps_at(step);
+        let bits = [
+            (main, due::MAIN_STEPS),
+            (rest, due::REST_STEPS),
+            (self.waiting.main, due::MAIN_WAITED),
+            (self.waiting.rest, due::REST_WAITED),
+            (self.cadence.sh_rest > 1, due::REST_AGES),
+        ];
+        let bits = bits.iter().filter(|(on, _)| *on).fold(0, |all, (_, bit)| all | bit);
+        (bits, Waiting { main: !main, rest: !rest })
+    }
+
+    /// Forward pass, loss, backward pass and optimiser.
+    pub(super) fn step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
+        let StepInput { camera, target, background, exposure, .. } = *input;
+        assert_same_size(camera, target);
+        let start = Instant::now();
+        self.fit_image(camera.width, camera.height)?;
+        let (due, waiting) = self.cadence_bits(input);
+        let mut frame = self.frame(camera, background, input.sh_degree);
+        frame.draw[3] = self.bring_photograph(input.view, target);
+        self.bring_exposure(&mut frame, exposure);
+        frame.for_step(input, due, &self.planes);
+        if self.sizes.records.has(Field::Error) {
+            frame.draw[3] |= of_target::BY_PIXEL;
+            let score = &self.planes.score;
+            if score.edge > 0.0 {
+                let pixels = u64::from(camera.width) * u64::from(camera.height);
+                let weights = edge_weights(target, background, score);
+                self.write_at("pixel gradient", 4 * size_of::<f32>() as u64 * pixels, &weights);
+            }
+        }
+        let (degree, signals) = (frame.model[1] as u8, self.planes.count > 0);
+        let trained = (self.rows - self.sizes.frozen as usize).max(1) as f32;
+        let mask = self.mask.map(|mask| MaskTerm { weight: mask.weight / trained, ..mask });
+        let pixels = camera.width * camera.height;
+        let by_map = self.planes.score.map.weights();
+        // Up to dL/dpixel.
+        let compare = |passes: &Passes<'_>, to: &mut Recorder<'_>, weights| {
+            passes.forward(to);
+            if exposure.is_some() {
+                passes.expose(to, pixels);
+            }
+            passes.loss(to, [weights, by_map]);
+            if exposure.is_some() {
+                passes.expose_bwd(to, pixels);
+            }
+        };
+        let step = |passes: &Passes<'_>, to: &mut Recorder<'_>| {
+            passes.backward(to);
+            passes.optimise(to, degree, signals, mask);
+        };
+        let state = if let Some((request, count)) = self.candidates.open(input.step, self.rows) {
+            let weights = error_weights(request.error);
+            if weights.is_some() {
+                frame.draw[3] |= of_target::WITH_ERROR;
+            }
+            let search = self.search(&request, count, frame.image);
+            let (state, shape) = self.run(&frame, |passes, to| {
+                compare(passes, to, weights.unwrap_or_default());
+                if let Some(search) = &search {
+                    passes.worst(to, search);
+                }
+            })?;
+            let shown = Shown { target, background, exposure };
+            let drawn = DrawnView { frame, shape, shown };
+            self.collect_candidates(&drawn, &request, count, search)?;
+            self.go_on(shape, step);
+            state
+        } else {
+            let run = self.run(&frame, |passes, to| {
+                compare(passes, to, [0.0; 2]);
+                step(passes, to);
+            })?;
+            run.0
+        };
+        self.waiting = waiting;
+        if self.device.clock.is_none() {
+            self.laps = vec![("device", start.elapsed())];
+        }
+        let by_exposure = exposure.map(|exposure| self.exposure_gradient(exposure, background));
+        Ok(StepOutput { exposure: by_exposure, ..state.output() })
+    }
+}

@@ -1,0 +1,252 @@
+//! Transfers between host and device: the model, photographs, rendered images and columns of numbers.
+
+use std::ops::Range;
+
+use densify_policies::policy::Signal;
+
+use super::frame::target;
+use super::rows::{Holds, RowArray};
+use super::{GpuBackend, readback};
+use crate::signals::ParameterSignal;
+use crate::{BackendError, Rendering};
+use densify_core::gaussians::{Gaussians, ModelArray};
+use densify_core::image::Image8;
+use densify_core::pieces::pieces;
+
+impl GpuBackend {
+    pub(super) fn write(&self, name: &str, bytes: &[u8]) {
+        self.write_at(name, 0, bytes);
+    }
+
+    /// Writes numbers from byte `at` on.
+    pub(super) fn write_at(&self, name: &str, at: u64, values: &[impl bytemuck::NoUninit]) {
+        if !values.is_empty() {
+            let bytes = bytemuck::cast_slice(values);
+            self.device.queue.write_buffer(self.buffers.get(name), at, bytes);
+        }
+    }
+
+    pub(super) fn upload(&self, model: &Gaussians) {
+        for array in self.sizes.parameters() {
+            let mut values = Vec::with_capacity(array.numbers * model.len());
+            for i in 0..model.len() {
+                if array.holds == Holds::Geometry {
+                    values.extend_from_slice(&model.means[i]);
+                    values.extend_from_slice(&model.log_scales[i]);
+                    values.extend_from_slice(&model.quats[i]);
+                    values.extend_from_slice(&[model.opacity_logits[i], 0.0]);
+                } else {
+                    let Range { start, end } = array.parameters;
+                    let first = ModelArray::Sh.parameters(model.sh_degree).start;
+                    values.extend_from_slice(&model.sh_of(i)[start - first..end - first]);
+                }
+            }
+            self.write(array.name, bytemuck::cast_slice(&values));
+        }
+    }
+
+    pub(super) fn read(&self, name: &str, from: u64, bytes: u64) -> Result<Vec<f32>, BackendError> {
+        let staging = self.buffers.get("read");
+        let bytes = readback::read(&self.device, staging, self.buffers.get(name), from, bytes)?;
+        Ok(bytemuck::pod_collect_to_vec(&bytes))
+    }
+
+    /// Packs a photograph and uploads it; returns the bits that say what it has.
+    pub(super) fn upload_target(&self, image: &Image8) -> u32 {
+        let pixels = image.width as usize * image.height as usize;
+        let mut words = vec![0_u32; pixels];
+        for (word, rgb) in words.iter_mut().zip(image.rgb.as_chunks::<3>().0) {
+            *word = u32::from_le_bytes([rgb[0], rgb[1], rgb[2], 255]);
+        }
+        if let Some(alpha) = &image.alpha {
+            for (word, &a) in words.iter_mut().zip(alpha) {
+                *word = *word & 0x00ff_ffff | u32::from(a) << 24;
+            }
+        }
+        self.write("truth", bytemuck::cast_slice(&words));
+        if let Some(mask) = &image.mask {
+            let mut mask = mask.clone();
+            mask.resize(mask.len().next_multiple_of(4), 0);
+            self.write("mask", &mask);
+        }
+        (if image.alpha.is_some() { target::HAS_ALPHA } else { 0 })
+            | (if image.mask.is_some() { target::HAS_MASK } else { 0 })
+    }
+
+    /// Brings a view's photograph to where the loss reads it; returns the bits that say what it has.
+    /// Views keep their photographs.
+    pub(super) fn bring_photograph(&mut self, view: usize, image: &Image8) -> u32 {
+        let size = [image.width, image.height];
+        if let Some(&(place, kept, bits)) = self.kept.get(&view)
+            && kept == size
+        {
+            self.copy_photograph(place, size, bits, false);
+            return bits;
+        }
+        let bits = self.upload_target(image);
+        let room = self.sizes.photographs;
+        // A view whose image has another size now keeps its place.
+        let own = self.kept.get(&view).map(|&(place, ..)| place);
+        let place = own.unwrap_or(self.kept.len() as u64);
+        if place < room.count as u64 && (bits & target::HAS_MASK == 0 || room.with_masks) {
+            self.copy_photograph(place, size, bits, true);
+            self.kept.insert(view, (place, size, bits));
+        }
+        bits
+    }
+
+    /// Copies between a place and where the loss reads.
+    fn copy_photograph(&self, place: u64, [width, height]: [u32; 2], bits: u32, keeps: bool) {
+        let pixels = u64::from(width) * u64::from(height);
+        let [truth_bytes, mask_bytes] = self.sizes.photograph_bytes();
+        let truth = place * (truth_bytes + mask_bytes);
+        let mut parts = vec![("truth", truth, 4 * pixels)];
+        if bits & target::HAS_MASK != 0 {
+            parts.push(("mask", truth + truth_bytes, pixels.next_multiple_of(4)));
+        }
+        let all = self.buffers.get("photographs");
+        let mut encoder = self.device.device.create_command_encoder(&Default::default());
+        for (name, at, bytes) in parts {
+            let one = self.buffers.get(name);
+            match keeps {
+                true => encoder.copy_buffer_to_buffer(one, 0, all, at, bytes),
+                false => encoder.copy_buffer_to_buffer(all, at, one, 0, bytes),
+            }
+        }
+        self.device.queue.submit([encoder.finish()]);
+    }
+
+    /// The image of the last view rendered.
+    pub(super) fn rendering(&self, width: u32, height: u32) -> Result<Rendering, BackendError> {
+        let pixels = width as usize * height as usize;
+        let canvas = self.read("canvas", 0, 16 * pixels as u64)?;
+        let finish = self.read("finish", 0, 8 * pixels as u64)?;
+        let canvas = canvas.as_chunks::<4>().0;
+        Ok(Rendering {
+            width,
+            height,
+            rgb: canvas.iter().flat_map(|[r, g, b, _]| [*r, *g, *b]).collect(),
+            alpha: finish.as_chunks::<2>().0.iter().map(|[light, _]| 1.0 - light).collect(),
+            depth: canvas.iter().map(|[.., depth]| *depth).collect(),
+        })
+    }
+
+    /// Some rows of an array; zeros of those that it does not have.
+    pub(super) fn read_rows(
+        &self,
+        array: &RowArray,
+        rows: Range<usize>,
+    ) -> Result<Vec<f32>, BackendError> {
+        let (place, without) = held(self.sizes.places(array)[0], &rows);
+        let (bytes, count) = (array.row_bytes(), rows.len() - without);
+        let mut values = vec![0.0; array.numbers * without];
+        values.extend(self.read(array.name, bytes * place, bytes * count as u64)?);
+        Ok(values)
+    }
+
+    /// Some parameters of some rows, row after row.
+    pub(super) fn parameters_of(
+        &self,
+        wanted: &Range<usize>,
+        rows: Range<usize>,
+    ) -> Result<Vec<f32>, BackendError> {
+        let mut all = vec![0.0; wanted.len() * rows.len()];
+        for from in self.sizes.parameters() {
+            if let Some((here, there)) = shared(wanted, &from.parameters) {
+                let read = self.read_rows(&from, rows.clone())?;
+                let to = all.chunks_exact_mut(wanted.len());
+                for (to, from) in to.zip(read.chunks_exact(from.numbers)) {
+                    to[here.clone()].copy_from_slice(&from[there.clone()]);
+                }
+            }
+        }
+        Ok(all)
+    }
+
+    /// Reads an attribute of all rows, some at a time.
+    pub(super) fn read_attribute(
+        &self,
+        attribute: &ParameterSignal,
+        column: &mut [f32],
+    ) -> Result<(), BackendError> {
+        let width = attribute.parameters.len();
+        for rows in pieces(self.rows) {
+            let values = self.parameters_of(&attribute.parameters, rows.clone())?;
+            for (to, from) in column[width * rows.start..].iter_mut().zip(values) {
+                *to = (attribute.shown)(from);
+            }
+        }
+        Ok(())
+    }
+
+    /// Writes what [`parameters_of`](Self::parameters_of) returned of one of the model's arrays.
+    pub(super) fn set_model_array(
+        &self,
+        array: ModelArray,
+        rows: Range<usize>,
+        values: &[f32],
+    ) -> Result<(), BackendError> {
+        self.set_parameters(&array.parameters(self.sizes.sh_degree), rows, values)
+    }
+
+    /// Writes what [`parameters_of`](Self::parameters_of) returned.
+    pub(super) fn set_parameters(
+        &self,
+        given: &Range<usize>,
+        rows: Range<usize>,
+        values: &[f32],
+    ) -> Result<(), BackendError> {
+        for to in self.sizes.parameters() {
+            if let Some((here, there)) = shared(given, &to.parameters) {
+                let mut all = match there.len() == to.numbers {
+                    true => vec![0.0; to.numbers * rows.len()],
+                    false => self.read_rows(&to, rows.clone())?,
+                };
+                let of_rows = all.chunks_exact_mut(to.numbers);
+                for (to, from) in of_rows.zip(values.chunks_exact(given.len())) {
+                    to[there.clone()].copy_from_slice(&from[here.clone()]);
+                }
+                self.write_at(to.name, to.row_bytes() * rows.start as u64, &all);
+            }
+        }
+        Ok(())
+    }
+
+    /// Some rows, zeros of frozen ones, of the column of one plane of numbers.
+    pub(super) fn column(
+        &self,
+        plane: usize,
+        rows: Range<usize>,
+    ) -> Result<Vec<f32>, BackendError> {
+        let (place, without) = held(self.sizes.frozen, &rows);
+        let start = plane as u64 * self.sizes.trained() + place;
+        let mut values = vec![0.0; without];
+        values.extend(self.read("signals", 4 * start, 4 * (rows.len() - without) as u64)?);
+        Ok(values)
+    }
+
+    /// A column of present values, zeros of frozen rows; see `present` in `shaders/signals.wgsl`.
+    pub(super) fn present(&self, signal: Signal) -> Result<Vec<f32>, BackendError> {
+        let (rows, launch) = (self.rows as u32, self.launches.get("present"));
+        let start = self.mask.map_or(0.0, |mask| mask.start);
+        let frozen = self.sizes.frozen as usize;
+        let now = [signal as u32, rows, start.to_bits(), frozen as u32];
+        self.submit(|to| to.run(launch, now, rows.div_ceil(256)));
+        let mut values = vec![0.0; frozen];
+        values.extend(self.read("sums", 0, 4 * (self.rows - frozen) as u64)?);
+        Ok(values)
+    }
+}
+
+/// Where two ranges of parameters have the ones that they share; `None` where they share none.
+fn shared(a: &Range<usize>, b: &Range<usize>) -> Option<(Range<usize>, Range<usize>)> {
+    let (start, end) = (a.start.max(b.start), a.end.min(b.end));
+    (start < end).then(|| (start - a.start..end - a.start, start - b.start..end - b.start))
+}
+
+/// Of an array whose first row is `first`: the place of the first of some rows that it has, and how many of them it
+/// does not have.
+pub(super) fn held(first: u64, rows: &Range<usize>) -> (u64, usize) {
+    let held = (first as usize).clamp(rows.start, rows.end);
+    ((held as u64).saturating_sub(first), held - rows.start)
+}

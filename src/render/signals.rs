@@ -1,0 +1,292 @@
+//! The memory layout of signals, for both backends: fields of gradient records and planes of
+//! accumulators.
+//!
+//! A signal is one entry in the policies' table ([`Signal`]); record layouts, strides, planes and the
+//! shaders' constants follow from it. Only requested signals have memory.
+
+use std::ops::Range;
+
+use densify_policies::policy::{
+    AuxColumn, AuxRequest, ErrorScore, Needs, PixelSum, Signal, SignalKind, SignalSet,
+};
+
+use densify_core::gaussians::{ModelArray, dc_to_rgb};
+
+/// Numbers of a record that training itself needs: Σq, Σq·u, Σq·z, Σq·u², Σq·u·z, Σq·z² and the
+/// gradients by colour.
+pub(super) const BASE: usize = 9;
+
+/// An optional number of a record, in the order in which records have them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Field {
+    /// Σ|q·u|; with the next one, the absolute gradients of the projected mean.
+    AbsX,
+    /// Σ|q·(l3·z − l1·shear·u)|.
+    AbsY,
+    /// Σw.
+    WeightSum,
+    /// Number of pixels with w > 0.
+    PixelCount,
+    /// Σw·(gradient by depth): for given gradients of an image, never in training.
+    Depth,
+    /// Σw·(error of the pixel): in training, and never beside [`Depth`](Self::Depth).
+    Error,
+    /// max w; the last one, as it is the only one that is not a sum.
+    WeightMax,
+}
+
+impl Field {
+    pub(super) const ALL: [Self; 7] = [
+        Self::AbsX,
+        Self::AbsY,
+        Self::WeightSum,
+        Self::PixelCount,
+        Self::Depth,
+        Self::Error,
+        Self::WeightMax,
+    ];
+
+    const fn of(sum: PixelSum) -> &'static [Self] {
+        match sum {
+            PixelSum::AbsGradient => &[Self::AbsX, Self::AbsY],
+            PixelSum::Weight => &[Self::WeightSum],
+            PixelSum::Count => &[Self::PixelCount],
+            PixelSum::LargestWeight => &[Self::WeightMax],
+            PixelSum::WeightedError => &[Self::Error],
+        }
+    }
+
+    /// The place of this number among all that a record can have; one place for depth and error.
+    pub(super) const fn number(self) -> usize {
+        let is_late = self as usize >= Self::Error as usize;
+        BASE + self as usize - is_late as usize
+    }
+
+    /// The shaders' constant for its place in a record.
+    #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "only the GPU backend asks"))]
+    pub(super) const fn constant(self) -> &'static str {
+        match self {
+            Self::AbsX => "ABS_X_AT",
+            Self::AbsY => "ABS_Y_AT",
+            Self::WeightSum => "WEIGHT_SUM_AT",
+            Self::PixelCount => "PIXEL_COUNT_AT",
+            Self::Depth => "DEPTH_AT",
+            Self::Error => "ERROR_AT",
+            Self::WeightMax => "WEIGHT_MAX_AT",
+        }
+    }
+}
+
+/// Which numbers the records of a backend have: the base, and the fields that its signals need.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct RecordLayout {
+    /// A bit per [`Field`].
+    fields: u8,
+    /// The optional fields by their place among all numbers that a record can have, in order.
+    extras: [u8; RecordLayout::MOST - BASE],
+}
+
+impl RecordLayout {
+    /// Every field but the error: what [`Differentiable`](super::Differentiable) needs.
+    pub(super) const ALL: Self =
+        Self::with(((1 << Field::ALL.len()) - 1) & !(1 << Field::Error as u8));
+    /// Most numbers of a record.
+    pub(super) const MOST: usize = Field::WeightMax.number() + 1;
+
+    pub(super) fn new(signals: SignalSet) -> Self {
+        let fields = signals.iter().flat_map(Signal::pixel_sums).flat_map(|&sum| Field::of(sum));
+        Self::with(fields.fold(0, |bits, &field| bits | 1 << field as u8))
+    }
+
+    const fn with(fields: u8) -> Self {
+        let mut extras = [0; Self::MOST - BASE];
+        let (mut field, mut place) = (0, 0);
+        while field < Field::ALL.len() {
+            if fields >> field & 1 == 1 {
+                extras[place] = Field::ALL[field].number() as u8;
+                place += 1;
+            }
+            field += 1;
+        }
+        Self { fields, extras }
+    }
+
+    pub(super) const fn has(self, field: Field) -> bool {
+        self.fields >> field as u8 & 1 == 1
+    }
+
+    /// Numbers per record.
+    pub(super) const fn stride(self) -> usize {
+        BASE + self.fields.count_ones() as usize
+    }
+
+    /// Where in a record the field is.
+    #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "only the GPU backend asks"))]
+    pub(super) fn at(self, field: Field) -> Option<usize> {
+        let before = self.fields & ((1 << field as u8) - 1);
+        self.has(field).then(|| BASE + before.count_ones() as usize)
+    }
+
+    /// For each number of a record beyond the base, its place among all that a record can have.
+    pub(super) fn extras(&self) -> &[u8] {
+        &self.extras[..self.stride() - BASE]
+    }
+}
+
+/// Whether pixels must be counted for the row with their largest blend weight.
+pub(super) fn counts_dominant(needs: &Needs) -> bool {
+    let in_views = |aux: &AuxRequest| aux.columns.contains(&AuxColumn::DominantPixels);
+    needs.signals.contains(Signal::DominantPixels) || needs.aux.as_ref().is_some_and(in_views)
+}
+
+/// What a plane holds of a signal, as the policy reads it. Of the smallest values the largest inverse is
+/// kept, which starts at 0 like all others.
+pub(super) fn as_read(signal: Signal, kept: f32) -> f32 {
+    if signal.kind() == SignalKind::Minimum { 1.0 / kept } else { kept }
+}
+
+/// The planes of the requested signals.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct SignalPlanes {
+    /// First plane of each signal, in the order of [`Signal::ALL`].
+    first: [Option<usize>; Signal::ALL.len()],
+    /// Number of planes.
+    pub(super) count: usize,
+    /// See [`Needs::full_depth`].
+    pub(super) full_depth: f32,
+    /// See [`Needs::error_score`].
+    pub(super) score: ErrorScore,
+    /// Whether the current epoch's plane is the first of two, rather than the second.
+    swapped: bool,
+}
+
+/// How many planes a signal has.
+const fn planes(kind: SignalKind) -> usize {
+    match kind {
+        SignalKind::Sum | SignalKind::Count | SignalKind::Maximum | SignalKind::Minimum => 1,
+        // The previous epoch, and the current one.
+        SignalKind::EpochMaximum => 2,
+        SignalKind::Present | SignalKind::Attribute(_) => 0,
+    }
+}
+
+impl SignalPlanes {
+    pub(super) fn new(needs: &Needs) -> Self {
+        let mut count = 0;
+        let first = Signal::ALL.map(|signal| {
+            let own = planes(signal.kind());
+            let first = (own > 0 && needs.signals.contains(signal)).then_some(count);
+            count += if first.is_some() { own } else { 0 };
+            first
+        });
+        let (full_depth, score) = (needs.full_depth, needs.error_score);
+        Self { first, count, full_depth, score, swapped: false }
+    }
+
+    /// The planes of a signal; its value is the largest of theirs.
+    pub(super) fn of(&self, signal: Signal) -> Range<usize> {
+        self.first[signal as usize].map_or(0..0, |first| first..first + planes(signal.kind()))
+    }
+
+    /// The plane to which a view adds.
+    #[inline(always)]
+    pub(super) fn current(&self, signal: Signal) -> Option<usize> {
+        let is_second = matches!(signal.kind(), SignalKind::EpochMaximum) && !self.swapped;
+        self.first[signal as usize].map(|first| first + usize::from(is_second))
+    }
+
+    /// Those of some signals, which start anew when a policy resets them.
+    pub(super) fn of_all(&self, signals: SignalSet) -> Vec<usize> {
+        signals.iter().flat_map(|signal| self.of(signal)).collect()
+    }
+
+    /// The current epoch becomes the previous one: planes change places. Returns those to clear.
+    pub(super) fn begin_epoch(&mut self) -> Vec<usize> {
+        self.swapped = !self.swapped;
+        let by_epoch = |signal: &Signal| matches!(signal.kind(), SignalKind::EpochMaximum);
+        Signal::ALL.into_iter().filter(by_epoch).filter_map(|s| self.current(s)).collect()
+    }
+
+    /// The planes that checkpoints save, by name.
+    pub(super) fn kept(&self) -> Vec<(String, usize)> {
+        let mut kept = Vec::new();
+        for signal in Signal::ALL {
+            let Some(current) = self.current(signal) else { continue };
+            match signal.kind() {
+                SignalKind::Sum | SignalKind::Count | SignalKind::Maximum | SignalKind::Minimum => {
+                    kept.push((format!("{signal:?}"), current));
+                }
+                SignalKind::EpochMaximum => {
+                    let both = self.of(signal);
+                    let previous = both.start + both.end - 1 - current;
+                    kept.push((format!("{signal:?}.previous"), previous));
+                    kept.push((format!("{signal:?}.current"), current));
+                }
+                SignalKind::Present | SignalKind::Attribute(_) => {}
+            }
+        }
+        kept
+    }
+}
+
+/// A signal that some of the rows' parameters are: which ones, and what makes a parameter a number of the
+/// signal.
+pub(super) struct ParameterSignal {
+    pub(super) parameters: Range<usize>,
+    pub(super) shown: fn(f32) -> f32,
+}
+
+impl ParameterSignal {
+    /// `None` for signals that are computed.
+    pub(super) fn of(signal: Signal) -> Option<Self> {
+        let as_stored = |x| x;
+        let (array, shown): (_, fn(f32) -> f32) = match signal {
+            Signal::Position => (ModelArray::Means, as_stored),
+            Signal::LogScale => (ModelArray::LogScales, as_stored),
+            Signal::Orientation => (ModelArray::Quats, as_stored),
+            Signal::Colour => (ModelArray::Sh, dc_to_rgb),
+            Signal::VisibleCount
+            | Signal::ScreenGradient
+            | Signal::ScreenGradientAbs
+            | Signal::ColourGradient
+            | Signal::MeanGradientX
+            | Signal::MeanGradientY
+            | Signal::MeanGradientZ
+            | Signal::MeanGradientNorm
+            | Signal::WeightMax
+            | Signal::WeightSum
+            | Signal::PixelCount
+            | Signal::WeightedError
+            | Signal::ErrorScore
+            | Signal::WeightMaxRoot
+            | Signal::Support
+            | Signal::DepthMin
+            | Signal::PixelSizeMin
+            | Signal::DominantPixels
+            | Signal::Opacity
+            | Signal::ScaleMax
+            | Signal::ScaleProduct
+            | Signal::Mask
+            | Signal::Age => return None,
+        };
+        // Of the coefficients, those of band 0.
+        Some(Self { parameters: array.parameters(0), shown })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn attributes_and_no_others_are_parameters_as_many_as_they_are_wide() {
+        for signal in Signal::ALL {
+            let found = ParameterSignal::of(signal).map(|found| found.parameters.len());
+            let width = match signal.kind() {
+                SignalKind::Attribute(width) => Some(width),
+                _ => None,
+            };
+            assert_eq!(found, width, "{signal:?}");
+        }
+    }
+}

@@ -1,0 +1,231 @@
+//! A backend's state beside the model, as named arrays: how it is saved in checkpoints and restored.
+//!
+//! An array has one entry per row in use, in the order of the rows, however a backend lays them out
+//! itself. Parameters of a row stand in this order: mean 3, log-scale 3, quaternion (w, x, y, z) 4,
+//! opacity logit 1, then three per spherical-harmonic coefficient (red, green, blue).
+
+use std::io;
+use std::ops::Range;
+
+/// Values that are converted to bytes at a time.
+const ENCODED: usize = 1 << 14;
+
+/// An array that a backend keeps beside the model.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct StateArray {
+    /// Its name, unique among a backend's.
+    pub name: String,
+    /// Whether its first side is that of the rows, so that it can be taken in pieces. All others are
+    /// small.
+    pub by_rows: bool,
+}
+
+impl StateArray {
+    /// An array with one entry per row.
+    pub(super) fn of_rows(name: impl Into<String>) -> Self {
+        Self { name: name.into(), by_rows: true }
+    }
+
+    /// An array of another shape.
+    pub(super) fn small(name: impl Into<String>) -> Self {
+        Self { name: name.into(), by_rows: false }
+    }
+}
+
+/// A named array.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Tensor {
+    /// Its name, unique within a checkpoint.
+    pub name: String,
+    /// Its sides; row-major.
+    pub shape: Vec<usize>,
+    /// As many values as the sides say.
+    pub values: Values,
+}
+
+impl Tensor {
+    /// Whether an array of this name has the optimiser's [ages](Self::ages).
+    pub fn has_ages(name: &str) -> bool {
+        // Of the native and of the GPU backend.
+        matches!(name, "ages" | "device.ages")
+    }
+
+    /// Steps since each row was made or rewritten last, if this is the array that has them. Shape: `[rows]`.
+    #[must_use]
+    pub fn ages(&self) -> Option<Vec<u32>> {
+        match &self.values {
+            _ if !Self::has_ages(&self.name) => None,
+            Values::U16(ages) => Some(ages.iter().map(|&age| age.into()).collect()),
+            // A word per row, whose upper half is that of colours that step on their own.
+            Values::U8(bytes) => {
+                let words = bytes.as_chunks::<4>().0.iter();
+                Some(words.map(|&[low, high, ..]| u16::from_le_bytes([low, high]).into()).collect())
+            }
+            Values::F32(_) => None,
+        }
+    }
+}
+
+/// The values of a [`Tensor`].
+#[derive(Debug, Clone, PartialEq)]
+pub enum Values {
+    /// Numbers.
+    F32(Vec<f32>),
+    /// Counts.
+    U16(Vec<u16>),
+    /// Flags and small numbers.
+    U8(Vec<u8>),
+}
+
+/// An array that is not what it should be.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("tensor `{name}`: {problem}")]
+pub struct StateError {
+    /// The array's name.
+    pub name: String,
+    /// What is wrong with it.
+    pub problem: String,
+}
+
+impl Values {
+    /// Number of values.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        match self {
+            Self::F32(values) => values.len(),
+            Self::U16(values) => values.len(),
+            Self::U8(values) => values.len(),
+        }
+    }
+
+    /// Whether there is none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Passes the values on as little-endian bytes, some at a time.
+    pub fn encode(&self, mut sink: impl FnMut(&[u8]) -> io::Result<()>) -> io::Result<()> {
+        let mut bytes = Vec::new();
+        match self {
+            Self::F32(values) => values.chunks(ENCODED).try_for_each(|chunk| {
+                bytes.clear();
+                bytes.extend(chunk.iter().flat_map(|value| value.to_le_bytes()));
+                sink(&bytes)
+            }),
+            Self::U16(values) => values.chunks(ENCODED).try_for_each(|chunk| {
+                bytes.clear();
+                bytes.extend(chunk.iter().flat_map(|value| value.to_le_bytes()));
+                sink(&bytes)
+            }),
+            Self::U8(values) => sink(values),
+        }
+    }
+
+    /// The type's name, as safetensors has it.
+    #[must_use]
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Self::F32(_) => "F32",
+            Self::U16(_) => "U16",
+            Self::U8(_) => "U8",
+        }
+    }
+}
+
+impl Tensor {
+    /// An array of numbers.
+    #[must_use]
+    pub fn f32(name: impl Into<String>, shape: &[usize], values: Vec<f32>) -> Self {
+        Self::new(name, shape, Values::F32(values))
+    }
+
+    /// An array of counts.
+    #[must_use]
+    pub fn u16(name: impl Into<String>, shape: &[usize], values: Vec<u16>) -> Self {
+        Self::new(name, shape, Values::U16(values))
+    }
+
+    /// An array of flags.
+    #[must_use]
+    pub fn u8(name: impl Into<String>, shape: &[usize], values: Vec<u8>) -> Self {
+        Self::new(name, shape, Values::U8(values))
+    }
+
+    fn new(name: impl Into<String>, shape: &[usize], values: Values) -> Self {
+        debug_assert_eq!(shape.iter().product::<usize>(), values.len(), "values of a tensor");
+        Self { name: name.into(), shape: shape.to_owned(), values }
+    }
+
+    /// The numbers, if this is an array of this shape.
+    ///
+    /// # Errors
+    /// [`StateError`] with both shapes, or both types.
+    pub fn into_f32(self, shape: &[usize]) -> Result<Vec<f32>, StateError> {
+        self.check(shape)?;
+        match self.values {
+            Values::F32(values) => Ok(values),
+            other => Err(wrong_kind(self.name, "F32", &other)),
+        }
+    }
+
+    /// The counts, if this is an array of this shape.
+    ///
+    /// # Errors
+    /// [`StateError`] with both shapes, or both types.
+    pub fn into_u16(self, shape: &[usize]) -> Result<Vec<u16>, StateError> {
+        self.check(shape)?;
+        match self.values {
+            Values::U16(values) => Ok(values),
+            other => Err(wrong_kind(self.name, "U16", &other)),
+        }
+    }
+
+    /// The flags, if this is an array of this shape.
+    ///
+    /// # Errors
+    /// [`StateError`] with both shapes, or both types.
+    pub fn into_u8(self, shape: &[usize]) -> Result<Vec<u8>, StateError> {
+        self.check(shape)?;
+        match self.values {
+            Values::U8(values) => Ok(values),
+            other => Err(wrong_kind(self.name, "U8", &other)),
+        }
+    }
+
+    /// A complaint about this array.
+    #[must_use]
+    pub fn error(&self, problem: impl Into<String>) -> StateError {
+        StateError { name: self.name.clone(), problem: problem.into() }
+    }
+
+    fn check(&self, shape: &[usize]) -> Result<(), StateError> {
+        if self.shape == shape && shape.iter().product::<usize>() == self.values.len() {
+            return Ok(());
+        }
+        Err(self.error(format!("its shape is {:?}; this run needs {shape:?}", self.shape)))
+    }
+}
+
+fn wrong_kind(name: String, expected: &str, values: &Values) -> StateError {
+    let problem = format!("its type is {}; this run needs {expected}", values.kind());
+    StateError { name, problem }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shapes_and_types_are_checked() {
+        let ages = || Tensor::u16("ages", &[2], vec![1, 2]);
+        assert_eq!(ages().into_u16(&[2]), Ok(vec![1, 2]));
+        let message = ages().into_u16(&[3]).unwrap_err().to_string();
+        assert!(message.contains("`ages`") && message.contains("[2]; this run needs [3]"));
+        let message = ages().into_f32(&[2]).unwrap_err().to_string();
+        assert!(message.contains("U16; this run needs F32"), "{message}");
+        assert!(ages().into_u8(&[2]).is_err());
+        let short = Tensor { shape: vec![3], ..ages() };
+        assert!(short.into_u16(&[3]).is_err(), "two values are not three");
+    }
+}

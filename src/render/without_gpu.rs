@@ -1,0 +1,67 @@
+//! In place of the GPU backend where a program is built without the feature `gpu`: there is no adapter.
+
+use densify_policies::policy::Needs;
+
+use super::{Accumulation, AdapterChoice, AdapterSummary, BackendError, Differentiable, Setup};
+use densify_core::gaussians::Gaussians;
+use densify_core::memory::Ledger;
+
+/// An open device, of which there is none.
+#[derive(Debug, Clone)]
+pub enum GpuDevice {}
+
+#[expect(missing_docs, clippy::missing_errors_doc, reason = "as with the feature `gpu`")]
+impl GpuDevice {
+    pub fn open(_: &AdapterChoice) -> Result<Self, BackendError> {
+        Err(BackendError::OverLimit(
+            "--backend gpu and --gpu NAME: this program was built without the feature `gpu` of the crate densify; add \
+             it to the features of densify in Cargo.toml"
+                .into(),
+        ))
+    }
+
+    #[must_use]
+    pub fn adapter(&self) -> &AdapterSummary {
+        match *self {}
+    }
+
+    #[must_use]
+    pub fn accumulation(&self) -> Accumulation {
+        match *self {}
+    }
+
+    pub(super) fn largest_budget(&self, _: u8) -> u64 {
+        match *self {}
+    }
+
+    pub(super) fn most_pairs(&self, _: &Needs) -> u64 {
+        match *self {}
+    }
+
+    pub(super) fn promise(&self, _: u8, _: &Setup) -> Ledger {
+        match *self {}
+    }
+
+    pub(super) fn prove(&self, _: &Needs) -> Result<(), BackendError> {
+        match *self {}
+    }
+
+    pub fn backend(
+        &self,
+        _: &Gaussians,
+        _: &Setup,
+    ) -> Result<Box<dyn Differentiable>, BackendError> {
+        match *self {}
+    }
+}
+
+/// All adapters: none.
+#[must_use]
+pub fn adapters() -> Vec<AdapterSummary> {
+    Vec::new()
+}
+
+/// Whether there may be a GPU.
+pub(super) fn may_be_present() -> bool {
+    false
+}

@@ -1,0 +1,83 @@
+//! The knobs of a run, with what follows from them for backends and for the trainer.
+
+use std::collections::BTreeMap;
+
+use toml::{Table, Value};
+
+use super::{KNOBS, Knob, KnobError, find};
+use densify_render::Accumulation;
+use densify_render::{Shortcuts, Storage};
+
+/// All knobs, each set.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Knobs {
+    /// Where a backend computes less than it could.
+    pub shortcuts: Shortcuts,
+    /// How parameters and moments are stored.
+    pub storage: Storage,
+    /// (Row, tile) pairs held per row of the budget; `None`: as `--tile-cap` and `--memory` say.
+    pub pairs_per_row: Option<usize>,
+    /// How a GPU adds up gradients; `None`: the fastest way that it has.
+    pub accumulation: Option<Accumulation>,
+    /// Values that were set, by name, as the table spells them.
+    values: BTreeMap<&'static str, String>,
+}
+
+impl Default for Knobs {
+    fn default() -> Self {
+        let mut knobs = Self {
+            shortcuts: Shortcuts::default(),
+            storage: Storage::default(),
+            pairs_per_row: None,
+            accumulation: None,
+            values: BTreeMap::new(),
+        };
+        for knob in KNOBS {
+            (knob.set)(&mut knobs, knob.default);
+        }
+        knobs
+    }
+}
+
+impl Knobs {
+    /// The defaults, with these values by name.
+    ///
+    /// # Errors
+    /// When there is no such knob, or its value is outside its domain.
+    pub fn from_table(table: &Table) -> Result<Self, KnobError> {
+        let mut knobs = Self::default();
+        for (name, value) in table {
+            let text = match value {
+                Value::String(text) => text.clone(),
+                other => other.to_string(),
+            };
+            knobs.set(name, &text)?;
+        }
+        Ok(knobs)
+    }
+
+    /// Sets a knob.
+    pub fn set(&mut self, name: &str, value: &str) -> Result<(), KnobError> {
+        let knob = find(name)?;
+        let value = knob.canonical(value)?;
+        (knob.set)(self, &value);
+        self.values.insert(knob.name, value);
+        Ok(())
+    }
+
+    /// Each knob with its value.
+    pub fn iter(&self) -> impl Iterator<Item = (&'static Knob, &str)> {
+        KNOBS.iter().map(|knob| (knob, self.values.get(knob.name).map_or(knob.default, |it| it)))
+    }
+
+    /// Each knob that is not as it is by default.
+    pub fn changed(&self) -> impl Iterator<Item = (&'static Knob, &str)> {
+        self.iter().filter(|(knob, value)| *value != knob.default)
+    }
+
+    /// Every knob by name, as a file has them.
+    #[must_use]
+    pub fn table(&self) -> Table {
+        self.iter().map(|(knob, value)| (knob.name.to_owned(), value.into())).collect()
+    }
+}

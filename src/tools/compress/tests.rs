@@ -1,0 +1,121 @@
+//! What is tried, and what becomes of a model on the way.
+
+use std::collections::HashSet;
+
+use super::*;
+use densify_core::gaussians::sh_coefficients;
+use densify_fixtures::Made;
+use densify_render::BackendChoice;
+use densify_run::Silent;
+
+#[test]
+fn degrees_are_tried_from_the_models_own_down() {
+    assert_eq!(degrees(3, Target::Bytes(1)), [3, 2, 1, 0]);
+    assert_eq!(degrees(1, Target::Bytes(1)), [1, 0]);
+    assert_eq!(degrees(0, Target::Bytes(1)), [0]);
+    assert_eq!(degrees(3, Target::Rows(1)), [3]);
+}
+
+/// Rows of which no two have the same colours.
+fn colourful(rows: usize) -> Gaussians {
+    let mut model = Gaussians::zeros(rows, 3);
+    let share = |index: usize| (index * 7919 % 4093) as f32 / 4093.0;
+    for row in 0..rows {
+        model.means[row] = [0, 1, 2].map(|axis| 2.0 * share(3 * row + axis) - 1.0);
+        model.log_scales[row] = [-2.0; 3];
+        model.quats[row] = [1.0, 0.0, 0.0, 0.0];
+    }
+    for (index, value) in model.sh.iter_mut().enumerate() {
+        *value = share(index) - 0.5;
+    }
+    model
+}
+
+fn sog() -> &'static Format {
+    densify_data::export::find("sog").expect("a format")
+}
+
+fn options<'a>(to: Target, scene: &'a Path, formats: &'a [&'static Format]) -> Options<'a> {
+    Options {
+        model: Path::new("model.ply"),
+        scene,
+        data: DataSpec::default(),
+        exposure: None,
+        near: Fraction(0.04),
+        device: DeviceSpec { backend: BackendChoice::Cpu, ..DeviceSpec::default() },
+        to,
+        iterations: 12,
+        seed: 0,
+        formats,
+        output: Path::new("small.sog"),
+    }
+}
+
+#[test]
+fn a_size_that_no_gaussian_fits_is_refused_before_training() {
+    let formats = [sog(), PLY];
+    let check = |to: u64| {
+        let options = options(Target::Bytes(to), Path::new(""), &formats);
+        fit::check(&options, &colourful(3)).map_err(|failure| failure.message)
+    };
+    let one = fit::bytes(PLY, &colourful(1).with_degree(0)).expect("it is written");
+    let refused = check(one - 1).expect_err("too small");
+    assert!(refused.contains(&format!("one Gaussian takes {one} bytes as ply")), "{refused}");
+    assert_eq!(check(one), Ok(()));
+}
+
+/// Less accurate forms take fewer bytes, so that more rows fit; those that hold fewer than four fifths of the most are no
+/// attempt; and where the format holds all as it usually is, the most accurate form is tried if it does too.
+#[test]
+fn forms_of_a_format_are_tried_that_hold_enough_rows() {
+    let model = colourful(2_000);
+    let sizes: Vec<u64> = (sog().writer)()
+        .forms()
+        .iter()
+        .map(|form| fit::bytes(form, &model).expect("it is written"))
+        .collect();
+    assert!(sizes.len() > 2 && sizes.windows(2).all(|pair| pair[0] > pair[1]), "{sizes:?}");
+    let formats = [sog()];
+    let packed = |to: u64| {
+        let found = fit::packings(&options(Target::Bytes(to), Path::new(""), &formats), &model);
+        found.expect("it fits").iter().map(|it| (it.rows, it.is_whole)).collect::<Vec<_>>()
+    };
+    let size_of_whole = |to: u64| {
+        let found = fit::packings(&options(Target::Bytes(to), Path::new(""), &formats), &model);
+        let [whole] = found.expect("it fits")[..] else { panic!("several attempts at {to}") };
+        assert!(whole.is_whole && whole.rows == 2_000, "{whole:?}");
+        fit::bytes(whole.format, &model).expect("it is written")
+    };
+    let usual = fit::bytes(sog(), &model).expect("it is written");
+    assert!(sizes[2] < usual && usual < sizes[0], "{usual}, {sizes:?}");
+    assert_eq!(size_of_whole(sizes[0]), sizes[0]);
+    assert_eq!(size_of_whole(sizes[0] - 1), usual);
+    let tight = packed(usual - 1);
+    assert!(tight.len() > 1 && tight.is_sorted() && tight.iter().all(|it| !it.1), "{tight:?}");
+    assert!(tight.iter().all(|(rows, _)| 5 * rows >= 4 * tight[tight.len() - 1].0), "{tight:?}");
+    let few = fit::packings(&options(Target::Rows(500), Path::new(""), &formats), &model);
+    assert_eq!(few.expect("they fit").iter().map(|it| it.rows).collect::<Vec<_>>(), [500]);
+}
+
+/// The last steps train a model whose colour by direction is as the file has it, an entry of a palette for many rows,
+/// and leave that as it is.
+#[test]
+fn colours_end_as_a_file_has_them() {
+    let made = Made::colmap_txt();
+    let formats = [sog()];
+    let options = options(Target::Rows(256), made.path(), &formats);
+    let form = &(sog().writer)().forms()[2];
+    let scratch = scratch(&made.path().join("small.sog")).expect("a file");
+    let start = colourful(256);
+    let tuned =
+        tune::tune(start.clone(), (form, 256), &options, &scratch, &Silent, &mut |_| Ok(()));
+    let tuned = tuned.expect("it trains");
+    let palette = |model: &Gaussians| {
+        let bands = model.sh.chunks_exact(3 * sh_coefficients(3)).map(|row| &row[3..]);
+        let text = |row: &[f32]| format!("{row:.6?}").replace("-0.000000", "0.000000");
+        bands.map(text).collect::<HashSet<_>>().len()
+    };
+    assert_eq!((tuned.len(), palette(&start)), (256, 256));
+    assert!(palette(&tuned) <= 256 / 4, "{} entries", palette(&tuned));
+    assert_ne!(tuned.opacity_logits, [0.0; 256], "the rest is trained");
+}

@@ -1,0 +1,78 @@
+//! HyperQueue: one job file, whose tasks know what they wait for.
+
+use serde::Serialize;
+use toml::Table;
+
+use super::{Batch, EngineFile, asked};
+use densify_run::failure::Failure;
+
+const REMEDY: &str = "HyperQueue's `hq` must be on this machine's PATH, with a server that runs; else choose --engine local or slurm";
+/// A task that has taken its worker down so often is given up.
+const CRASH_LIMIT: u32 = 5;
+
+#[derive(Serialize)]
+struct HqJob {
+    name: String,
+    task: Vec<JobTask>,
+}
+
+#[derive(Serialize)]
+struct JobTask {
+    id: u32,
+    command: Vec<String>,
+    stdout: String,
+    stderr: String,
+    crash_limit: u32,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    deps: Vec<u32>,
+    request: Vec<Request>,
+}
+
+#[derive(Serialize)]
+struct Request {
+    resources: Table,
+}
+
+/// The job file.
+pub(super) fn file(batch: &Batch, with_memory: bool) -> Result<EngineFile, Failure> {
+    let words = batch.words()?;
+    let mut tasks = Vec::new();
+    let mut before = 0..0;
+    for stage in &batch.stages {
+        let first = number(tasks.len());
+        for (id, job) in (first..).zip(&stage.jobs) {
+            let log = |kind: &str| batch.logs().join(format!("{}.{kind}", job.name));
+            let [out, error] = ["out", "err"].map(|kind| log(kind).to_string_lossy().into_owned());
+            let mut resources = Table::new();
+            resources.insert("cpus".into(), i64::from(job.threads).into());
+            if with_memory {
+                let bytes = i64::try_from(job.memory).unwrap_or(i64::MAX);
+                resources.insert("mem".into(), bytes.into());
+            }
+            tasks.push(JobTask {
+                id,
+                command: words.iter().chain([&job.name]).cloned().collect(),
+                stdout: out,
+                stderr: error,
+                crash_limit: CRASH_LIMIT,
+                deps: before.clone().collect(),
+                request: vec![Request { resources }],
+            });
+        }
+        before = first..number(tasks.len());
+    }
+    let text = toml::to_string(&HqJob { name: "densify".to_owned(), task: tasks });
+    let text = text.map_err(Failure::input)?;
+    Ok(EngineFile { path: batch.folder.join("hq").join("job.toml"), text })
+}
+
+fn number(count: usize) -> u32 {
+    u32::try_from(count).unwrap_or(u32::MAX)
+}
+
+/// Hands the job in; returns its number.
+pub(super) fn hand_in(file: &EngineFile) -> Result<String, Failure> {
+    let path = file.path.to_string_lossy();
+    let arguments = ["--output-mode=quiet", "job", "submit-file", &path];
+    asked("hq", &arguments, REMEDY)
+}

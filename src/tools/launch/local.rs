@@ -1,0 +1,155 @@
+//! This machine: every task in a process of its own, as many at once as memory allows.
+
+use std::fs::{self, File, TryLockError};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::thread::sleep;
+use std::time::Duration;
+
+use super::{Batch, Job, Stage};
+use densify_core::files::OutputError;
+use densify_core::memory::Bytes;
+use densify_run::Observer;
+use densify_run::failure::{Failure, OTHER};
+use densify_run::memory::grant;
+
+/// How often it is looked whether a task has ended.
+const LOOK: Duration = Duration::from_millis(100);
+const LOCK_FILE: &str = "local.lock";
+
+/// How many tasks of a stage run at once, and on how many threads each.
+fn at_once(jobs: &[Job]) -> (usize, u32) {
+    let cores = u32::try_from(rayon::current_num_threads()).unwrap_or(u32::MAX);
+    let memory = jobs.iter().map(|job| job.memory).max().unwrap_or(1);
+    let threads = jobs.iter().map(|job| job.threads).max().unwrap_or(1).max(1);
+    let room = grant(cores as usize).map_or(1, |limit| limit.left / memory.max(1));
+    let is_fixed = jobs.iter().any(|job| !job.may_have_fewer_threads);
+    let by_cores = if is_fixed { cores / threads } else { cores };
+    let most = usize::try_from(room).unwrap_or(usize::MAX).min(by_cores as usize).min(jobs.len());
+    let count = most.max(1);
+    let share = cores / u32::try_from(count).unwrap_or(u32::MAX);
+    (count, if is_fixed { threads } else { share.min(threads).max(1) })
+}
+
+/// Says what would be started.
+pub(super) fn show(batch: &Batch, observer: &dyn Observer) -> Result<(), Failure> {
+    let words = batch.words()?.join(" ");
+    for Stage { name, jobs, .. } in &batch.stages {
+        let (count, threads) = at_once(jobs);
+        observer.say(format_args!("# {name}: {count} at once, on {threads} threads each"));
+        for Job { name, memory, .. } in jobs {
+            observer.say(format_args!("{words} {name}    # at most {}", Bytes(*memory)));
+        }
+    }
+    Ok(())
+}
+
+/// Runs tasks to their end.
+///
+/// # Errors
+/// When one fails, the first that did; others that were running then have ended, and none is started after it.
+pub(super) fn run(batch: &Batch, observer: &dyn Observer) -> Result<(), Failure> {
+    let _lock = lock(batch)?;
+    let logs = batch.logs();
+    fs::create_dir_all(&logs).map_err(OutputError::io("create the folder", &logs))?;
+    batch.stages.iter().try_for_each(|stage| run_stage(batch, &stage.jobs, &logs, observer))
+}
+
+fn run_stage(
+    batch: &Batch,
+    jobs: &[Job],
+    logs: &Path,
+    observer: &dyn Observer,
+) -> Result<(), Failure> {
+    let (count, threads) = at_once(jobs);
+    let mut waiting = jobs.iter();
+    let mut running: Vec<(&str, Child)> = Vec::new();
+    let mut failed: Option<Failure> = None;
+    loop {
+        let mut ended = Vec::new();
+        for (place, (name, child)) in running.iter_mut().enumerate() {
+            if let Some(status) = child.try_wait().map_err(cannot_wait)? {
+                ended.push(place);
+                if status.success() {
+                    observer.say(format_args!("ended    {name}"));
+                } else {
+                    let log = log_of(logs, name);
+                    let code = status.code().and_then(|code| u8::try_from(code).ok());
+                    let message = format!(
+                        "{name} has failed: {}; the same command goes on from here ({})",
+                        last_line(&log),
+                        log.display()
+                    );
+                    failed.get_or_insert(Failure { code: code.unwrap_or(OTHER), message });
+                }
+            }
+        }
+        for place in ended.into_iter().rev() {
+            running.remove(place);
+        }
+        if let Some(interrupt) = observer.interrupt() {
+            // The same signal has reached the tasks, which end in order.
+            let message = format!("stopped by {}; the same command goes on", interrupt.name);
+            failed.get_or_insert(Failure { code: interrupt.exit_code, message });
+        }
+        while failed.is_none() && running.len() < count {
+            let Some(next) = waiting.next() else { break };
+            observer.say(format_args!("started  {}", next.name));
+            running.push((&next.name, started(batch, next, threads, logs)?));
+        }
+        if running.is_empty() {
+            return failed.map_or(Ok(()), Err);
+        }
+        sleep(LOOK);
+    }
+}
+
+fn log_of(logs: &Path, name: &str) -> PathBuf {
+    logs.join(format!("{name}.log"))
+}
+
+fn started(batch: &Batch, job: &Job, threads: u32, logs: &Path) -> Result<Child, Failure> {
+    let words = batch.words()?;
+    let path = log_of(logs, &job.name);
+    let log = File::options().create(true).append(true).open(&path);
+    let log = log.map_err(OutputError::io("write", &path))?;
+    let copy = log.try_clone().map_err(OutputError::io("write", &path))?;
+    let mut command = Command::new(&words[0]);
+    command.args(&words[1..]).arg(&job.name);
+    if job.may_have_fewer_threads {
+        command.args(["--threads", &threads.to_string()]);
+    }
+    command.stdin(Stdio::null()).stdout(log).stderr(copy);
+    let child = command.spawn();
+    child.map_err(|error| Failure {
+        code: OTHER,
+        message: format!("cannot start {}: {error}", job.name),
+    })
+}
+
+/// Held while tasks run here: they are not run twice at a time.
+fn lock(batch: &Batch) -> Result<File, Failure> {
+    let path = batch.folder.join(LOCK_FILE);
+    let file = File::options().create(true).append(true).open(&path);
+    let file = file.map_err(OutputError::io("write", &path))?;
+    match file.try_lock() {
+        Ok(()) => Ok(file),
+        Err(TryLockError::WouldBlock) => Err(Failure::input(format!(
+            "another process runs the tasks of {}; see {}",
+            batch.folder.display(),
+            batch.status
+        ))),
+        Err(TryLockError::Error(error)) => Err(OutputError::io("lock", &path)(error).into()),
+    }
+}
+
+/// What a task said last.
+fn last_line(log: &Path) -> String {
+    let text = fs::read_to_string(log).unwrap_or_default();
+    let line = text.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or("no word");
+    line.trim().trim_start_matches("error: ").to_owned()
+}
+
+fn cannot_wait(error: std::io::Error) -> Failure {
+    Failure { code: OTHER, message: format!("cannot wait for a task: {error}") }
+}

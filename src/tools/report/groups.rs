@@ -1,0 +1,164 @@
+//! Which runs belong together: those of the same photographs, and among these those that differ by their seed
+//! alone.
+
+use std::path::{Path, PathBuf};
+
+use toml::Table;
+
+use super::options::flat;
+use super::runs::Told;
+use densify_core::files;
+use densify_data::dataset::builtin;
+use densify_run::failure::Failure;
+use densify_run::finished::name_of;
+use densify_run::{DataSpec, OnResume, Partial, RunOption};
+
+/// Runs whose pictures can be laid over each other: of the same photographs, read the same way.
+pub(super) struct Scene {
+    pub(super) label: String,
+    /// Where it was when the first of its runs was started.
+    pub(super) path: PathBuf,
+    pub(super) data: DataSpec,
+    pub(super) groups: Vec<Group>,
+}
+
+/// Runs that differ by their seed alone.
+pub(super) struct Group {
+    /// What tells it from the others.
+    pub(super) label: String,
+    /// Their numbers, by seed.
+    pub(super) runs: Vec<usize>,
+}
+
+/// All runs, by scene and settings.
+pub(super) struct Groups {
+    pub(super) scenes: Vec<Scene>,
+}
+
+impl Scene {
+    /// The runs that are shown for their groups: those of the smallest seeds.
+    pub(super) fn shown(&self) -> impl Iterator<Item = usize> {
+        self.groups.iter().filter_map(|group| group.runs.first().copied())
+    }
+}
+
+/// The name of a scene without what lies above it.
+pub(super) fn scene_name(path: &Path) -> String {
+    let name = match builtin::name(path) {
+        Some(name) => name.to_owned(),
+        None => name_of(path),
+    };
+    files::one_line(&name)
+}
+
+impl Groups {
+    pub(super) fn of(runs: &[Told]) -> Result<Self, Failure> {
+        // Each with what its runs must agree in.
+        let mut scenes: Vec<(Scene, PathBuf, Vec<Table>)> = Vec::new();
+        for (number, run) in runs.iter().enumerate() {
+            let path = run.config.scene_path();
+            let place = path.canonicalize().unwrap_or_else(|_| path.clone());
+            let data = DataSpec { no_cache: false, ..run.config.spec.data.clone() };
+            let settings = settings(run)?;
+            let found = scenes
+                .iter()
+                .position(|(scene, other, _)| *other == place && scene.data == data)
+                .unwrap_or_else(|| {
+                    let label = scene_name(&path);
+                    let same = scenes.iter().filter(|(scene, ..)| scene.label.starts_with(&label));
+                    let label = match same.count() {
+                        0 => label,
+                        others => format!("{label}, read another way ({})", others + 1),
+                    };
+                    scenes.push((
+                        Scene { label, path, data, groups: Vec::new() },
+                        place,
+                        Vec::new(),
+                    ));
+                    scenes.len() - 1
+                });
+            let (scene, _, known) = &mut scenes[found];
+            match known.iter().position(|other| *other == settings) {
+                Some(at) => scene.groups[at].runs.push(number),
+                None => {
+                    known.push(settings);
+                    scene.groups.push(Group { label: String::new(), runs: vec![number] });
+                }
+            }
+        }
+        let mut done = Vec::new();
+        for (mut scene, _, known) in scenes {
+            for (group, label) in scene.groups.iter_mut().zip(labels(&known)) {
+                group.runs.sort_by_key(|&run| runs[run].config.spec.schedule.seed);
+                group.label = label;
+            }
+            done.push(scene);
+        }
+        Ok(Self { scenes: done })
+    }
+}
+
+/// What decides the result of a run, but for scene and seed.
+fn settings(run: &Told) -> Result<Table, Failure> {
+    let mut all = Partial::all(&run.config.spec)?.into_table();
+    let decides = |name: &str| {
+        name != "seed"
+            && RunOption::find(name).is_some_and(|option| option.on_resume != OnResume::Free)
+    };
+    all.retain(|name, _| decides(name));
+    all.insert("densify".into(), run.config.densify.clone().into());
+    all.insert("model of iteration".into(), run.iteration.into());
+    let adapter = run.config.resolved.adapter.as_deref().unwrap_or("processor");
+    all.insert("computed on".into(), adapter.into());
+    Ok(all)
+}
+
+/// What tells groups apart, in words: the policy, and whatever else differs of the options that all have.
+fn labels(known: &[Table]) -> Vec<String> {
+    const MOST: usize = 3;
+    let all: Vec<_> = known.iter().map(flat).collect();
+    let Some((first, others)) = all.split_first() else { return Vec::new() };
+    let differs = |name: &&String| {
+        name.as_str() != "policy"
+            && others.iter().any(|other| other.get(*name) != first.get(*name))
+            && others.iter().all(|other| other.contains_key(*name))
+    };
+    let differing: Vec<&String> = first.keys().filter(differs).collect();
+    let label = |(number, options): (usize, &std::collections::BTreeMap<String, String>)| {
+        let policy = options.get("policy").cloned().unwrap_or_default();
+        let some = differing.iter().take(MOST);
+        let some = some.map(|name| format!(", {name} {}", options[*name])).collect::<String>();
+        let more =
+            if differing.len() > MOST { format!(" … ({})", number + 1) } else { String::new() };
+        files::one_line(&format!("{policy}{some}{more}"))
+    };
+    all.iter().enumerate().map(label).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn groups_are_called_by_what_differs() {
+        let of = |tables: &[&str]| {
+            labels(&tables.iter().map(|text| text.parse().unwrap()).collect::<Vec<Table>>())
+        };
+        assert_eq!(of(&["policy = 'diet'\nbudget = 9"]), ["diet"]);
+        assert_eq!(
+            of(&["policy = 'diet'\nbudget = 9", "policy = 'mcmc'\nbudget = 9"]),
+            ["diet", "mcmc"]
+        );
+        assert_eq!(
+            of(&[
+                "policy = 'a'\nbudget = 9\nknob.x = '1/9'",
+                "policy = 'a'\nbudget = 8\nknob.x = '1/8'"
+            ]),
+            ["a, budget 9, knob.x 1/9", "a, budget 8, knob.x 1/8"]
+        );
+        let many = |n: u32| format!("policy = 'a'\nb = {n}\nc = {n}\nd = {n}\ne = {n}");
+        assert_eq!(of(&[&many(1), &many(2)])[1], "a, b 2, c 2, d 2 … (2)");
+        // What only one of them has is not what they differ in.
+        assert_eq!(of(&["policy = 'a'\np.x = 1", "policy = 'b'\np.y = 1"]), ["a", "b"]);
+    }
+}

@@ -1,0 +1,140 @@
+//! Rows at the camera, around the near plane, and at depths that are equal or nearly so.
+
+use super::{GREY, UPRIGHT, flat_colour, straight};
+use crate::compare::class;
+use crate::reference::CLASSES;
+use crate::scenes;
+use crate::trial::{Trial, bits, count_broken, count_different};
+use densify_core::gaussians::Gaussians;
+use densify_render::BackendError;
+
+/// The near plane of a backend's default options.
+const NEAR: f32 = 0.01;
+
+pub(super) fn near(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+    let camera = scenes::camera(30, 26, 6);
+    let mut model = Gaussians { sh_degree: 1, ..Gaussians::default() };
+    // Left-out rows first: an index among the visible ones is not a row's index.
+    for z in [-3.0, -0.5, -0.02, 0.0, 0.004, 0.0099, 0.0101, 0.02, 0.3, 1e3] {
+        let colour = |k| if k < 3 { 0.5 - 0.2 * k as f32 } else { 0.05 };
+        let mean = scenes::world(&camera, [0.1 * z, -0.05 * z, z]);
+        // At most a third of its distance wide, as else a row at 0.01 fills the screen.
+        let scale = [0.3, 0.2, 0.1].map(|s: f32| s * (z.abs() as f32).clamp(1e-3, 3.0));
+        scenes::push(&mut model, mean, scale, [0.8, 0.2, -0.5, 0.1], 0.3, colour);
+    }
+    let cloud = scenes::cloud(20, 1, &camera, 7);
+    model.means.extend(cloud.means);
+    model.log_scales.extend(cloud.log_scales);
+    model.quats.extend(cloud.quats);
+    model.opacity_logits.extend(cloud.opacity_logits);
+    model.sh.extend(cloud.sh);
+    trial.check("behind and near", &model, &camera, GREY, 1)?;
+
+    // A bit to either side; with no rotation the camera's z is the mean's to the bit.
+    let camera = straight(16, 16);
+    for z in [NEAR.next_down(), NEAR, NEAR.next_up()] {
+        let mut model = Gaussians::default();
+        scenes::push(&mut model, [0.0, 0.0, z], [z / 20.0; 3], UPRIGHT, 2.0, flat_colour);
+        let image = trial.subject.backend(&model)?.render(&camera, GREY, 0)?;
+        let is_drawn = image.alpha.iter().any(|a| *a > 0.5);
+        let wrong = is_drawn != (z > NEAR);
+        trial.never(&format!("z = {z:.9}"), "rows on the wrong side", usize::from(wrong));
+    }
+    Ok(())
+}
+
+pub(super) fn inside(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+    let camera = straight(40, 30);
+    for times in [1.0_f32, 10.0, 100.0] {
+        let mut model = Gaussians::default();
+        for (row, z) in [0.02_f32, 0.3, 1.0].into_iter().enumerate() {
+            let shade = |k: usize| 0.5 - 0.2 * (k + row) as f32;
+            scenes::push(&mut model, [0.0, 0.1 * z, z], [times * z; 3], UPRIGHT, -1.0, shade);
+        }
+        let mut back = scenes::cloud(10, 0, &camera, 34);
+        back.means.extend(&model.means);
+        back.log_scales.extend(&model.log_scales);
+        back.quats.extend(&model.quats);
+        back.opacity_logits.extend(&model.opacity_logits);
+        back.sh.extend(&model.sh);
+        let what = format!("{times} times as wide as far");
+        trial.check(&what, &back, &camera, GREY, 0)?;
+    }
+    Ok(())
+}
+
+pub(super) fn coincident(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+    for (what, offset) in [("0", 0.0), ("1e-20", 1e-20_f32), ("0.001", 1e-3)] {
+        let camera = straight(33, 30);
+        let mut model = scenes::cloud(10, 2, &camera, 34);
+        for (row, direction) in
+            [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].iter().enumerate()
+        {
+            model.means[row] = direction.map(|d: f32| d * offset);
+            model.log_scales[row] = [0.7, 0.0, 2.0];
+        }
+        let mut backend = trial.subject.backend(&model)?;
+        let upstream = scenes::narrowed(&scenes::upstream(&camera, 5));
+        let (image, gradient) = backend.differentiate(&camera, GREY, 2, &upstream)?;
+        let gradients = CLASSES.map(|name| class(&gradient, name));
+        let mut broken = count_broken(&[&image.rgb, &image.alpha, &image.depth]);
+        broken += count_broken(&gradients);
+        let what = format!("{what} from the camera");
+        trial.never(&what, "NaN or infinity", broken);
+        let pulled = gradient.sh[..3 * 27].iter().filter(|g| **g != 0.0).count();
+        trial.never(&what, "gradients of colours without a direction", pulled);
+        trial.train(&what, &mut *backend, &camera, GREY, 2)?;
+    }
+    Ok(())
+}
+
+pub(super) fn ties(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+    let camera = scenes::camera(32, 24, 36);
+    let mut model = scenes::cloud(1000, 0, &camera, 45);
+    let place = scenes::world(&camera, [0.0, 0.0, 3.0]);
+    model.means.fill(place);
+    trial.check("1000 rows at one place", &model, &camera, GREY, 0)?;
+    let upstream = scenes::narrowed(&scenes::upstream(&camera, 12));
+    let run = || trial.subject.backend(&model)?.differentiate(&camera, GREY, 0, &upstream);
+    let first = bits(&run()?);
+    let mut different = 0;
+    for _ in 0..3 {
+        different += count_different(&bits(&run()?), &first);
+    }
+    trial.never("1000 rows at one place", "bits that differ between runs", different);
+    Ok(())
+}
+
+pub(super) fn order(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+    let camera = straight(16, 16);
+    // Red in front of green; which of them is the first row must not matter.
+    let (red, green) = ([1.5, -2.0, -2.0], [-2.0, 1.5, -2.0]);
+    let (mut wrong, mut looks) = (0, 0);
+    let mut z = NEAR.next_up();
+    while z <= 1e6 {
+        let pair = [(z, red), (z.next_up(), green)];
+        for order in [[0, 1], [1, 0]] {
+            let mut model = Gaussians::default();
+            for (z, colour) in order.map(|i| pair[i]) {
+                let scale = [z * 0.1; 3];
+                scenes::push(&mut model, [0.0, 0.0, z], scale, UPRIGHT, 4.0, |k| colour[k]);
+            }
+            let image = trial.subject.backend(&model)?.render(&camera, [0.0; 3], 0)?;
+            let middle = 3 * (8 * 16 + 8);
+            wrong += usize::from(image.rgb[middle] <= 2.0 * image.rgb[middle + 1]);
+            looks += 1;
+        }
+        z *= 7.3;
+    }
+    trial.never(&format!("{looks} pairs"), "rows in the wrong order", wrong);
+    // Zero, with either sign, and the smallest numbers lie before the near plane.
+    let mut drawn = 0;
+    for z in [0.0, -0.0, 1e-45, -1e-45, 1e-38, f32::MIN_POSITIVE] {
+        let mut model = Gaussians::default();
+        scenes::push(&mut model, [0.0, 0.0, z], [1e-3; 3], UPRIGHT, 4.0, flat_colour);
+        let image = trial.subject.backend(&model)?.render(&camera, GREY, 0)?;
+        drawn += image.alpha.iter().filter(|a| **a != 0.0).count();
+    }
+    trial.never("depths around zero", "pixels of rows that are too near", drawn);
+    Ok(())
+}

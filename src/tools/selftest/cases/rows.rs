@@ -1,0 +1,75 @@
+//! Few rows, rows in one place, and rows that nobody sees.
+
+use densify_policies::plan::EditPlan;
+
+use super::{GREY, UPRIGHT, flat_colour, straight};
+use crate::compare::class;
+use crate::reference::CLASSES;
+use crate::scenes;
+use crate::trial::{Trial, count_broken, step};
+use densify_core::gaussians::Gaussians;
+use densify_render::BackendError;
+use densify_render::Setup;
+
+const BACKGROUND: [f32; 3] = [0.25, 0.5, 0.75];
+
+/// Pixels that do not show the bare background, and values of alpha and depth other than zero.
+fn drawn(image: &densify_render::Rendering) -> usize {
+    let coloured = image.rgb.chunks_exact(3).filter(|rgb| **rgb != BACKGROUND).count();
+    coloured + image.alpha.iter().chain(&image.depth).filter(|v| v.to_bits() != 0).count()
+}
+
+pub(super) fn none(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+    let camera = scenes::camera(21, 13, 1);
+    let model = Gaussians { sh_degree: 2, ..Gaussians::default() };
+    let mut backend = trial.subject.with(&model, Setup { budget: 3, ..Setup::default() })?;
+    let upstream = scenes::narrowed(&scenes::upstream(&camera, 1));
+    let (image, gradient) = backend.differentiate(&camera, BACKGROUND, 2, &upstream)?;
+    trial.never("0 rows", "pixels other than the background", drawn(&image));
+    let numbers = CLASSES.iter().map(|name| class(&gradient, name).len()).sum();
+    trial.never("0 rows", "gradients of nothing", numbers);
+    let target = scenes::target(&camera);
+    let output = step(&mut *backend, 1, &camera, &target, BACKGROUND, 2)?;
+    backend.apply(&EditPlan::new(0, 3).compile(), 1, 1)?;
+    let unsound = backend.audit()?.len() + count_broken(&[&[output.loss, output.ssim]]);
+    trial.never("0 rows", "rows after a step and an edit", backend.rows() + unsound);
+    Ok(())
+}
+
+pub(super) fn one(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+    let camera = straight(64, 64);
+    for scale in [0.01, 0.1, 1.0] {
+        let mut model = Gaussians::default();
+        scenes::push(&mut model, [0.0, 0.0, 2.0], [scale; 3], UPRIGHT, 0.0, flat_colour);
+        trial.check(&format!("standard deviation {scale}"), &model, &camera, GREY, 0)?;
+    }
+    Ok(())
+}
+
+pub(super) fn duplicates(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+    let camera = scenes::camera(24, 18, 2);
+    let place = scenes::world(&camera, [0.05, -0.02, 2.0]);
+    for rows in [2_usize, 3, 10_000] {
+        let mut model = Gaussians::default();
+        for row in 0..rows {
+            let shade = |k: usize| ((row * 7 + k * 5) % 11) as f32 * 0.1 - 0.5;
+            scenes::push(&mut model, place, [0.3, 0.2, 0.4], UPRIGHT, -2.0, shade);
+        }
+        trial.check(&format!("{rows} rows"), &model, &camera, GREY, 0)?;
+    }
+    Ok(())
+}
+
+pub(super) fn invisible(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+    let camera = scenes::camera(40, 30, 3);
+    let mut model = scenes::cloud(20, 1, &camera, 4);
+    // σ(−5.6) = 0.0037, below 1/255.
+    model.opacity_logits.fill(-5.6);
+    let mut backend = trial.subject.backend(&model)?;
+    let upstream = scenes::narrowed(&scenes::upstream(&camera, 1));
+    let (image, gradient) = backend.differentiate(&camera, BACKGROUND, 1, &upstream)?;
+    trial.never("all rows", "pixels other than the background", drawn(&image));
+    let pulled = |name: &&str| class(&gradient, name).iter().filter(|g| **g != 0.0).count();
+    trial.never("all rows", "gradients of what is not seen", CLASSES.iter().map(pulled).sum());
+    trial.train("all rows", &mut *backend, &camera, BACKGROUND, 1)
+}

@@ -1,0 +1,128 @@
+//! Images of awkward sizes, lenses at their ends, and rows that fill the image.
+
+use super::{GREY, UPRIGHT, straight};
+use crate::reference::{Model, Rules, View, blend, project};
+use crate::scenes;
+use crate::trial::{Trial, count_broken, step};
+use crate::values::{LARGE_SIZES, SIZES};
+use densify_core::camera::Camera;
+use densify_core::gaussians::Gaussians;
+use densify_core::memory::resident;
+use densify_render::BackendError;
+use densify_render::Setup;
+
+const BACKGROUNDS: [[f32; 3]; 3] = [[0.0; 3], [1.0; 3], [0.2, 0.7, 0.4]];
+
+pub(super) fn images(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+    for (seed, (width, height)) in SIZES.into_iter().enumerate() {
+        let camera = scenes::camera(width, height, seed as u64);
+        let model = scenes::cloud(37, 1, &camera, 50 + seed as u64);
+        let what = format!("{width}x{height}");
+        trial.check(&what, &model, &camera, BACKGROUNDS[seed % 3], 1)?;
+    }
+    for (width, height) in LARGE_SIZES {
+        large(trial, width, height)?;
+    }
+    Ok(())
+}
+
+/// The reference's pixels at corners, at the seams of tiles, and here and there.
+fn large(trial: &mut Trial<'_>, width: u32, height: u32) -> Result<(), BackendError> {
+    let camera = scenes::camera(width, height, 60);
+    let model = scenes::cloud(40, 1, &camera, 61);
+    let what = format!("{width}x{height}");
+    let image = match trial.subject.backend(&model)?.render(&camera, GREY, 1) {
+        // A device with small buffers refuses such an image; there is nothing to compare then.
+        Err(BackendError::OverLimit(_)) => return Ok(()),
+        other => other?,
+    };
+    let view = View { camera: &camera, background: GREY.map(f64::from), sh_degree: 1 };
+    let splats = project::project(&Model::of(&model), view, &Rules::STANDARD);
+    let order = project::by_depth(&splats);
+    let ends = |size: u32| [0, 15, 16, size / 2, size - 17, size - 16, size - 1];
+    let seams = ends(height).into_iter().flat_map(|y| ends(width).map(|x| [x, y]));
+    let spread = (0..500_u32).map(|i| [i * 2_654_435 % width, i * 40_503 % height]);
+    let mut worst = 0.0_f64;
+    for [x, y] in seams.chain(spread) {
+        let exact = blend::sample(&splats, &order, view, &Rules::STANDARD, [x, y]);
+        let at = 3 * (y as usize * width as usize + x as usize);
+        for (found, exact_value) in image.rgb[at..at + 3].iter().zip(exact.rgb) {
+            let off = (f64::from(*found) - exact_value).abs();
+            worst = if off.is_nan() || exact.boundary { worst } else { worst.max(off) };
+        }
+    }
+    let broken = count_broken(&[&image.rgb, &image.alpha, &image.depth]);
+    trial.never(&what, "NaN or infinity", broken);
+    let tolerance = trial.limits.interior;
+    trial.figure(&format!("{what}: rgb of 549 pixels"), "image", worst, tolerance);
+    Ok(())
+}
+
+pub(super) fn lenses(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+    let base = scenes::camera(40, 32, 3);
+    let focal = |degrees: f64| 20.0 / (0.5 * degrees).to_radians().tan();
+    let wide = |degrees| Camera { fx: focal(degrees), fy: focal(degrees), ..base };
+    let lenses = [
+        ("0.5 degrees", wide(0.5)),
+        ("1 degree", wide(1.0)),
+        ("120 degrees", wide(120.0)),
+        ("160 degrees", wide(160.0)),
+        ("fx = 100 fy", Camera { fx: 400.0, fy: 4.0, ..base }),
+        ("centre outside", Camera { cx: -30.0, cy: 55.0, ..base }),
+    ];
+    for (seed, (what, camera)) in lenses.into_iter().enumerate() {
+        let camera = scenes::rounded(&camera);
+        let model = scenes::cloud(30, 1, &camera, 80 + seed as u64);
+        trial.check(what, &model, &camera, BACKGROUNDS[2], 1)?;
+    }
+    Ok(())
+}
+
+/// Rows that each touch every tile of a full-HD image. In full it is half a million, whose tile
+/// entries do not fit 32 bits. Light ends after a few hundred of them, so that the image must be that
+/// of the rows in front, to the bit, which has no bands.
+pub(super) fn crowd(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+    const TILES: u64 = 120 * 68;
+    let (rows, front) = if trial.long { (530_000, 128) } else { (300, 128) };
+    // In full the backend's own choice, which is 16 entries per row.
+    let tile_cap = (!trial.long).then_some(rows * TILES as usize / 6);
+    let camera = straight(1920, 1080);
+    let model = |rows: usize| {
+        let mut model = Gaussians::default();
+        for row in 0..rows {
+            let z = 1.0 + row as f32 * 1e-6;
+            let shade = |k: usize| ((row * 7 + k * 5) % 11) as f32 * 0.1 - 0.5;
+            scenes::push(&mut model, [0.0, 0.0, z], [100.0 * z; 3], UPRIGHT, -2.0, shade);
+        }
+        model
+    };
+    let what = format!("{rows} rows");
+    let expected = {
+        let front = model(front);
+        let tile_cap = Some(front.len() * TILES as usize);
+        let mut backend = trial.subject.with(&front, Setup { tile_cap, ..Setup::default() })?;
+        backend.render(&camera, GREY, 0)?
+    };
+    let all = model(rows);
+    let target = scenes::target(&camera);
+    let before = resident();
+    let largest_image = (camera.width, camera.height);
+    let room = Setup { largest_image, tile_cap, ..Setup::default() };
+    let mut backend = trial.subject.with(&all, room)?;
+    let output = step(&mut *backend, 1, &camera, &target, GREY, 0)?;
+    if let (Some(before), Some(after), true) = (before, resident(), trial.is_alone()) {
+        let held = after.saturating_sub(before) as f64 / backend.ledger().total() as f64;
+        trial.figure(&what, "memory held, of that promised", held, 1.1);
+    }
+    trial.never(&what, "entries miscounted", output.entries.abs_diff(rows as u64 * TILES) as usize);
+    trial.never(&what, "images in one band only", usize::from(output.bands < 2));
+    let broken = backend.audit()?.len() + usize::from(!output.loss.is_finite());
+    trial.never(&what, "NaN or infinity", broken);
+    drop(backend);
+    let mut backend = trial.subject.with(&all, Setup { tile_cap, ..Setup::default() })?;
+    let image = backend.render(&camera, GREY, 0)?;
+    let pairs = image.rgb.iter().zip(&expected.rgb).chain(image.depth.iter().zip(&expected.depth));
+    let different = pairs.filter(|(a, b)| a.to_bits() != b.to_bits()).count();
+    trial.never(&what, "bits that differ from the rows in front", different);
+    Ok(())
+}

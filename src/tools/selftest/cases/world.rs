@@ -1,0 +1,94 @@
+//! The same scene far from the origin, tiny, huge, and with its axes exchanged.
+
+use glam::{DMat3, DVec3};
+
+use crate::trial::Trial;
+use densify_core::camera::Camera;
+use densify_data::dataset::PointCloud;
+use densify_data::dataset::normalise::Normalisation;
+use densify_render::BackendError;
+use densify_train::init::initialise;
+
+/// A rig of cameras that look at a cloud, in coordinates of the world.
+fn rig() -> (Vec<Camera>, Vec<DVec3>) {
+    let cameras = (0..5_u8).map(|i| {
+        let rotation = DMat3::from_rotation_y(1.2566 * f64::from(i)) * DMat3::from_rotation_x(0.2);
+        Camera {
+            width: 64,
+            height: 48,
+            fx: 60.0,
+            fy: 62.0,
+            cx: 31.0,
+            cy: 25.0,
+            rotation,
+            translation: DVec3::new(0.1, -0.2, 3.0),
+        }
+    });
+    let points = (0..80_u8).map(|i| {
+        let t = f64::from(i);
+        DVec3::new((t * 0.7).sin(), 0.8 * (t * 1.3).sin(), (t * 2.1).cos())
+    });
+    (cameras.collect(), points.collect())
+}
+
+/// The picture of the first camera after `place` has moved the world and `turn` its axes.
+fn picture(
+    trial: &Trial<'_>,
+    turn: DMat3,
+    place: impl Fn(DVec3) -> DVec3,
+) -> Result<Vec<f32>, BackendError> {
+    let (cameras, points) = rig();
+    let cameras: Vec<Camera> = cameras
+        .iter()
+        .map(|camera| {
+            let rotation = camera.rotation * turn.transpose();
+            let centre = place(turn * camera.centre());
+            Camera { rotation, translation: -(rotation * centre), ..*camera }
+        })
+        .collect();
+    let points: Vec<DVec3> = points.iter().map(|p| place(turn * *p)).collect();
+    let centres: Vec<DVec3> = cameras.iter().map(Camera::centre).collect();
+    let normalisation = Normalisation::fit(&centres, &points);
+    let colours = (0..points.len()).map(|i| [i as u8, 3 * i as u8, 255 - i as u8]).collect();
+    let positions = points.iter().map(|p| normalisation.scene_from_world(*p)).collect();
+    let (mut model, _) = initialise(&PointCloud { positions, colours }, 100, 0, 1)
+        .map_err(|error| BackendError::OverLimit(error.to_string()))?;
+    model.opacity_logits.fill(0.5);
+    let camera = normalisation.scene_from_world_camera(&cameras[0]);
+    Ok(trial.subject.backend(&model)?.render(&camera, [0.1; 3], 0)?.rgb)
+}
+
+fn rms(a: &[f32], b: &[f32]) -> f64 {
+    let sum: f64 = a.iter().zip(b).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum();
+    (sum / a.len() as f64).sqrt()
+}
+
+pub(super) fn anywhere(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+    let here = picture(trial, DMat3::IDENTITY, |p| p)?;
+    let away = DVec3::new(1.0, -0.7, 0.3);
+    for offset in [1e3, 1e5, 1e6, 5e6, 1e8] {
+        let there = picture(trial, DMat3::IDENTITY, |p| p + offset * away)?;
+        // 90 dB.
+        trial.figure(&format!("offset {offset:e}"), "rms of colours", rms(&there, &here), 3.2e-5);
+    }
+    for scale in [1e-4, 1e4] {
+        let there = picture(trial, DMat3::IDENTITY, |p| p * scale)?;
+        trial.figure(&format!("scale {scale:e}"), "rms of colours", rms(&there, &here), 3.2e-5);
+    }
+    for power in [-20, -1, 7, 20] {
+        let there = picture(trial, DMat3::IDENTITY, |p| p * 2.0_f64.powi(power))?;
+        let different = there.iter().zip(&here).filter(|(a, b)| a.to_bits() != b.to_bits()).count();
+        trial.never(&format!("scale 2^{power}"), "bits that differ", different);
+    }
+    let turns = [
+        ("yzx", DMat3::from_cols(DVec3::Y, DVec3::Z, DVec3::X)),
+        ("zxy", DMat3::from_cols(DVec3::Z, DVec3::X, DVec3::Y)),
+    ];
+    for (what, turn) in turns {
+        let there = picture(trial, turn, |p| p)?;
+        // 100 dB: sums of three products in another order.
+        let what = format!("axes {what}");
+        trial.figure(&what, "rms of colours, axes exchanged", rms(&there, &here), 1e-5);
+    }
+    Ok(())
+}

@@ -1,0 +1,222 @@
+//! One case on one backend: what is compared, and what was found.
+
+use densify_policies::adc;
+use densify_policies::plan::EditPlan;
+use densify_policies::policy::{Cadence, LossTerms};
+
+use super::compare::{Limits, Table, class, compare_images, relative_error};
+use super::reference::{CLASSES, Image, Model, Rules, ScreenGradient, View, blend, project};
+use super::scenes;
+use super::subject::Subject;
+use super::values::RATES;
+use densify_core::camera::Camera;
+use densify_core::gaussians::Gaussians;
+use densify_core::image::Image8;
+use densify_render::cpu::ModelGradient;
+use densify_render::{BackendError, Differentiable, Rendering, StepInput, StepOutput};
+
+/// Steps after each comparison of a scene, after which nothing may have broken.
+const STEPS: u32 = 5;
+/// What is counted there.
+const NEVER: &str = "NaN or infinity in 5 steps and an edit";
+
+/// A case that is being tried.
+pub(super) struct Trial<'a> {
+    pub(super) subject: &'a Subject,
+    /// Whether there is time for the whole of it.
+    pub(super) long: bool,
+    pub(super) table: Table,
+    /// How far images may be off.
+    pub(super) limits: Limits,
+    /// How far gradients may be off, against the largest of their class.
+    pub(super) gradient: f64,
+}
+
+impl<'a> Trial<'a> {
+    pub(super) fn new(subject: &'a Subject, long: bool) -> Self {
+        let (limits, gradient) = (subject.limits(), subject.gradient());
+        Self { subject, long, table: Table::new("selftest"), limits, gradient }
+    }
+
+    /// Whether what the process holds is the native backend's: other tests may run beside a case, but
+    /// not where it is run in full.
+    pub(super) fn is_alone(&self) -> bool {
+        self.long && matches!(self.subject, Subject::Native { .. })
+    }
+
+    /// Records a figure.
+    pub(super) fn figure(&mut self, what: &str, quantity: &str, error: f64, tolerance: f64) {
+        self.table.check(what, quantity, error, tolerance);
+    }
+
+    /// Records how often something happened that must not.
+    pub(super) fn never(&mut self, what: &str, quantity: &str, count: usize) {
+        self.figure(what, quantity, count as f64, 0.0);
+    }
+
+    /// Compares image, gradients and statistics of one view with the reference's, then trains on it.
+    /// Returns the gradients, and those of the reference.
+    pub(super) fn check(
+        &mut self,
+        what: &str,
+        model: &Gaussians,
+        camera: &Camera,
+        background: [f32; 3],
+        sh_degree: u8,
+    ) -> Result<(ModelGradient, Model), BackendError> {
+        let view = View { camera, background: background.map(f64::from), sh_degree };
+        let (exact, rules) = (Model::of(model), Rules::STANDARD);
+        let splats = project::project(&exact, view, &rules);
+        let order = project::by_depth(&splats);
+        let image = blend::render(&splats, &order, view, &rules);
+        let upstream = scenes::upstream(camera, 99).ignoring(&image.boundary);
+        let screen = blend::backward(&splats, &order, view, &rules, &upstream);
+        let expected = project::backward(&exact, view, &splats, &screen);
+
+        let mut backend = self.subject.backend(model)?;
+        let upstream = scenes::narrowed(&upstream);
+        let (found, measured) = backend.differentiate(camera, background, sh_degree, &upstream)?;
+        self.images(what, &found, &image);
+        for name in CLASSES {
+            let error = relative_error(class(&measured, name), expected.class(name));
+            self.figure(what, name, error, self.gradient);
+        }
+        self.statistics(what, &measured, &screen, &image.boundary);
+        self.train(what, &mut *backend, camera, background, sh_degree)?;
+        Ok((measured, expected))
+    }
+
+    /// Compares the image of one view with the reference's.
+    pub(super) fn check_image(
+        &mut self,
+        what: &str,
+        model: &Gaussians,
+        camera: &Camera,
+        background: [f32; 3],
+        sh_degree: u8,
+    ) -> Result<(), BackendError> {
+        let view = View { camera, background: background.map(f64::from), sh_degree };
+        let image = super::reference::render(&Model::of(model), view, &Rules::STANDARD);
+        let found = self.subject.backend(model)?.render(camera, background, sh_degree)?;
+        self.images(what, &found, &image);
+        Ok(())
+    }
+
+    fn images(&mut self, what: &str, found: &Rendering, image: &Image) {
+        let deepest = image.depth.iter().fold(1.0_f64, |m, d| m.max(*d));
+        let limits = self.limits;
+        let arrays = [
+            ("rgb", &found.rgb, &image.rgb, limits),
+            ("alpha", &found.alpha, &image.alpha, limits),
+            ("depth", &found.depth, &image.depth, limits.scaled(deepest)),
+        ];
+        for (quantity, found, expected, limits) in arrays {
+            let outcome = compare_images(found, expected, &image.boundary, limits);
+            self.table.image(what, quantity, outcome, limits);
+        }
+    }
+
+    fn statistics(
+        &mut self,
+        what: &str,
+        measured: &ModelGradient,
+        rows: &[ScreenGradient],
+        boundary: &[bool],
+    ) {
+        let tolerance = self.gradient;
+        let mut on_screen = |quantity: &str, found: &[f32], expected: Vec<f64>| {
+            self.table.check(what, quantity, relative_error(found, &expected), tolerance);
+        };
+        let flat = |f: fn(&ScreenGradient) -> Vec<f64>| rows.iter().flat_map(f).collect::<Vec<_>>();
+        on_screen("mean2d", measured.mean2d.as_flattened(), flat(|s| s.mean.to_vec()));
+        on_screen("mean2d_abs", measured.mean2d_abs.as_flattened(), flat(|s| s.mean_abs.to_vec()));
+        on_screen("colour", measured.colour.as_flattened(), flat(|s| s.colour.to_vec()));
+        on_screen("max_weight", &measured.max_weight, flat(|s| vec![s.max_weight]));
+        let close = boundary.iter().filter(|b| **b).count() as f64;
+        let mut invisible = 0;
+        for (row, expected) in rows.iter().enumerate() {
+            let off = f64::from(measured.pixel_count[row].abs_diff(expected.pixels));
+            self.figure(what, "pixel_count", off, close);
+            let off = f64::from(measured.sum_weight[row]) - expected.sum_weight;
+            let flips = close * Limits::CPU.step;
+            self.figure(what, "sum_weight", off.abs(), tolerance * expected.sum_weight + flips);
+            invisible += usize::from(expected.pixels > 0 && !measured.visible[row]);
+        }
+        self.never(what, "rows blended but not visible", invisible);
+    }
+
+    /// Some steps and an edit, after which every number of the model, of the optimiser and of an
+    /// image must be one.
+    pub(super) fn train(
+        &mut self,
+        what: &str,
+        backend: &mut dyn Differentiable,
+        camera: &Camera,
+        background: [f32; 3],
+        sh_degree: u8,
+    ) -> Result<(), BackendError> {
+        let target = scenes::target(camera);
+        let mut broken = 0;
+        for number in 1..=STEPS {
+            let output = step(backend, number, camera, &target, background, sh_degree)?;
+            broken += usize::from(!(output.loss.is_finite() && output.ssim.is_finite()));
+        }
+        let rows = backend.rows();
+        let mut plan = EditPlan::new(rows, backend.budget());
+        if rows > 1 {
+            // Refusals do not matter: a budget of two rows has room for a child of one.
+            let _ = plan.prune(0);
+            let _ = plan.grow(rows as u32 - 1, adc::split_by(1.6));
+        }
+        backend.apply(&plan.compile(), 7, STEPS)?;
+        broken += usize::from(backend.rows() != rows);
+        broken += backend.audit()?.len();
+        let image = backend.render(camera, background, sh_degree)?;
+        broken += count_broken(&[&image.rgb, &image.alpha, &image.depth]);
+        self.never(what, NEVER, broken);
+        Ok(())
+    }
+}
+
+/// One training step with the step sizes of the suite.
+pub(super) fn step(
+    backend: &mut dyn Differentiable,
+    number: u32,
+    camera: &Camera,
+    target: &Image8,
+    background: [f32; 3],
+    sh_degree: u8,
+) -> Result<StepOutput, BackendError> {
+    backend.train_step(&StepInput {
+        step: number,
+        view: 0,
+        camera,
+        target,
+        background,
+        exposure: None,
+        sh_degree,
+        rates: RATES,
+        loss_terms: LossTerms::default(),
+        noise: None,
+        cadence: Cadence::default(),
+        seed: 7,
+    })
+}
+
+/// Values that are none.
+pub(super) fn count_broken(arrays: &[&[f32]]) -> usize {
+    arrays.iter().flat_map(|values| values.iter()).filter(|v| !v.is_finite()).count()
+}
+
+/// The bits of an image and of every gradient and statistic.
+pub(super) fn bits((image, gradient): &(Rendering, ModelGradient)) -> Vec<u32> {
+    let classes = CLASSES.map(|name| class(gradient, name));
+    let images: [&[f32]; 3] = [&image.rgb, &image.alpha, &image.depth];
+    let all = images.into_iter().chain(classes).flatten().map(|v| v.to_bits());
+    all.chain(gradient.pixel_count.iter().copied()).collect()
+}
+
+/// Pairs that differ.
+pub(super) fn count_different(a: &[u32], b: &[u32]) -> usize {
+    a.len().abs_diff(b.len()) + a.iter().zip(b).filter(|(a, b)| a != b).count()
+}

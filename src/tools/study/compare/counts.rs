@@ -1,0 +1,137 @@
+//! How many Gaussians every policy had: at the end, beside the true peak.
+//!
+//! Budgets bound the peak, and policies are compared at equal budgets. Some end far below their peak: who
+//! pays for storage or display rather than for training compares them by what they end with.
+
+use super::{Outcome, scenes_and_budgets};
+use crate::columns::Columns;
+use crate::difference::mean;
+use crate::distinct;
+use crate::markdown::MarkdownTable;
+use densify_core::numbers::grouped;
+
+/// Rows at the end, in the mean of some runs; a dash without any.
+fn at_the_end(runs: &[&Outcome]) -> String {
+    let rows = mean(runs.iter().map(|run| run.rows as f64));
+    rows.map_or_else(|| "–".to_owned(), |rows| grouped(rows.round() as usize))
+}
+
+/// Most rows at any instant of any of the runs; a dash without any.
+fn peak(runs: &[&Outcome]) -> String {
+    let peak = runs.iter().map(|run| run.peak_rows).max();
+    let mark = if runs.iter().all(|run| run.kept_its_budget()) { "" } else { " (over)" };
+    peak.map_or_else(|| "–".to_owned(), |rows| format!("{}{mark}", grouped(rows)))
+}
+
+/// All budgets, ascending.
+fn budgets(outcomes: &[Outcome]) -> Vec<usize> {
+    let mut budgets = distinct(outcomes.iter().map(|run| run.budget));
+    budgets.sort_unstable();
+    budgets
+}
+
+/// A table per budget: counts at the end in every scene, beside them the true peaks.
+pub(super) fn tables(outcomes: &[Outcome], policies: &[String]) -> String {
+    let mut text = String::from(
+        "\n## Gaussians at the end and at the true peak\n\nAt the end: means over seeds. True peak: the \
+         most at any instant of any seed. A policy that ends below its budget is compared at equal peak \
+         above, and by what it ends with here.\n",
+    );
+    for budget in budgets(outcomes) {
+        let all = scenes_and_budgets(outcomes);
+        let scenes = all.iter().filter(|(_, other)| *other == budget).map(|(scene, _)| *scene);
+        let scenes: Vec<&str> = scenes.collect();
+        let titled = |what: &str| scenes.iter().map(|s| format!("{s}, {what}")).collect::<Vec<_>>();
+        let titles = [titled("at the end"), titled("peak")].concat();
+        let mut table = MarkdownTable::new(&format!("policy | {}", titles.join(" | ")));
+        for policy in policies {
+            let of = |scene: &&str| -> Vec<&Outcome> {
+                let is_of =
+                    |r: &&Outcome| r.scene == **scene && r.budget == budget && r.factor == *policy;
+                outcomes.iter().filter(is_of).collect()
+            };
+            let runs: Vec<Vec<&Outcome>> = scenes.iter().map(of).collect();
+            let counts = runs.iter().map(|runs| at_the_end(runs));
+            let cells = counts.chain(runs.iter().map(|runs| peak(runs)));
+            table.row(&std::iter::once(policy.clone()).chain(cells).collect::<Vec<_>>());
+        }
+        text += &format!("\n### Budget of {}\n\n{table}", grouped(budget));
+    }
+    text
+}
+
+/// The same for the terminal, over all scenes of a budget.
+pub(super) fn lines(outcomes: &[Outcome], policies: &[String]) -> String {
+    let budgets = budgets(outcomes);
+    let mut titles = vec!["<policy".to_owned()];
+    for &budget in &budgets {
+        titles.extend([format!(">{}: end", grouped(budget)), ">peak".to_owned()]);
+    }
+    let mut columns = Columns::new(&titles.iter().map(String::as_str).collect::<Vec<_>>());
+    for policy in policies {
+        let mut cells = vec![policy.clone()];
+        for &budget in &budgets {
+            let is_of = |r: &&Outcome| r.budget == budget && r.factor == *policy;
+            let runs: Vec<&Outcome> = outcomes.iter().filter(is_of).collect();
+            cells.extend([at_the_end(&runs), peak(&runs)]);
+        }
+        columns.row(cells);
+    }
+    format!(
+        "Gaussians at the end (mean of the runs) and at the true peak (most of any), by budget\n\n{columns}"
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::record::sample;
+
+    fn run(
+        policy: &str,
+        scene: &str,
+        budget: usize,
+        seed: u32,
+        [rows, peak_rows]: [usize; 2],
+    ) -> Outcome {
+        let scene = scene.to_owned();
+        Outcome { scene, budget, rows, peak_rows, ..sample(policy, "", seed, 30.0) }
+    }
+
+    #[test]
+    fn counts_stand_beside_peaks_for_every_budget() {
+        let all = [
+            run("a", "room", 9000, 0, [8000, 9000]),
+            run("a", "room", 9000, 1, [8501, 8999]),
+            run("a", "cup", 9000, 0, [7000, 7000]),
+            run("b", "room", 9000, 0, [2700, 9000]),
+            run("b", "cup", 9000, 0, [2000, 9001]),
+            run("a", "room", 500, 0, [499, 500]),
+        ];
+        let policies = ["a", "b"].map(String::from);
+        let text = tables(&all, &policies);
+        let expected = "
+### Budget of 500
+
+| policy | room, at the end | room, peak |
+|---|---|---|
+| a | 499 | 500 |
+| b | – | – |
+
+### Budget of 9,000
+
+| policy | room, at the end | cup, at the end | room, peak | cup, peak |
+|---|---|---|---|---|
+| a | 8,251 | 7,000 | 9,000 | 7,000 |
+| b | 2,700 | 2,000 | 9,000 | 9,001 (over) |
+";
+        assert!(text.ends_with(expected), "{text}");
+        let said = lines(&all, &policies);
+        // (8000 + 8501 + 7000) / 3 = 7833.67.
+        let expected = "
+policy  500: end  peak  9,000: end          peak
+a            499   500       7,834         9,000
+b              –     –       2,350  9,001 (over)";
+        assert!(said.ends_with(expected), "{said}");
+    }
+}

@@ -1,0 +1,132 @@
+//! Crops at equal budget: the same window of the same view, by every policy.
+//!
+//! The window is chosen by a rule and not by hand: over all views held out, the one whose photograph has the
+//! most edges.
+
+use std::path::Path;
+
+use densify_policies::policy::Needs;
+use image::{RgbImage, imageops};
+
+use super::{Outcome, at, scenes_and_budgets};
+use crate::Picture;
+use crate::window::Window;
+use densify_core::image::Image8;
+use densify_core::numbers::grouped;
+use densify_data::views::{DatasetViews, ViewSource};
+use densify_run::failure::Failure;
+use densify_run::finished::{Machine, open_run};
+use densify_run::{Observer, Silent};
+use densify_train::evaluate::Split;
+use densify_train::output::model_path;
+use densify_train::pictures::{photograph, picture, side_by_side, write_png};
+
+/// Least width of a crop in the picture `[px]`, to which windows are enlarged by whole numbers.
+const SHOWN: u32 = 480;
+/// Space between crops `[px]`.
+const GAP: u32 = 6;
+
+/// Draws a row of crops for every scene and budget: the photograph, then every policy at the first
+/// seed. Runs whose model is gone are left out.
+pub(super) fn draw(
+    output: &Path,
+    outcomes: &[Outcome],
+    observer: &dyn Observer,
+) -> Result<Vec<Picture>, Failure> {
+    let mut pictures = Vec::new();
+    for (scene, budget) in scenes_and_budgets(outcomes) {
+        let (crops, shown) = crops(output, &at(outcomes, scene, budget), observer)?;
+        if crops.is_empty() {
+            continue;
+        }
+        let file = format!("crops-{scene}-{budget}.png");
+        write_png(&output.join(&file), &side_by_side(&crops, GAP).into())?;
+        let order = shown.join(", ");
+        let caption = format!("{scene}, {} rows, from the left: {order}", grouped(budget));
+        pictures.push(Picture { file, caption });
+    }
+    Ok(pictures)
+}
+
+/// The crops of the runs at the first seed after that of the photograph, and what each shows.
+fn crops(
+    output: &Path,
+    runs: &[&Outcome],
+    observer: &dyn Observer,
+) -> Result<(Vec<RgbImage>, Vec<String>), Failure> {
+    let (mut crops, mut shown) = (Vec::new(), vec!["photograph".to_owned()]);
+    let mut place = None;
+    let first = runs.iter().map(|r| r.seed).min();
+    for run in runs.iter().filter(|r| Some(r.seed) == first) {
+        let folder = output.join("runs").join(&run.run);
+        if !model_path(&folder, run.iterations).is_file() {
+            observer.say(format_args!("note: {} is gone; no crop of it", folder.display()));
+            continue;
+        }
+        let machine = Machine::default();
+        let needs = Needs::default();
+        let mut opened = open_run(&folder, run.iterations, None, machine, needs, &Silent)?;
+        let views = opened.views(Split::Test)?;
+        let background = opened.data.background.fixed();
+        let (view, window) = match place {
+            Some(place) => place,
+            None => {
+                let Some((view, window)) = richest_window(&views, background)? else { continue };
+                crops.push(cut(&photograph(&*image(&views, view)?, background), window));
+                *place.insert((view, window))
+            }
+        };
+        let rendering = opened.backend.render(views.camera(view), background, opened.sh_degree)?;
+        crops.push(cut(&picture(&rendering), window));
+        shown.push(run.factor.clone());
+    }
+    Ok((crops, shown))
+}
+
+fn image(
+    views: &DatasetViews,
+    view: usize,
+) -> Result<impl std::ops::Deref<Target = Image8>, Failure> {
+    views.image(view).map_err(|e| Failure::input(format!("{}: {e}", views.name(view))))
+}
+
+/// The window with the most edges of all views.
+fn richest_window(
+    views: &DatasetViews,
+    background: [f32; 3],
+) -> Result<Option<(usize, Window)>, Failure> {
+    let mut best: Option<(u64, usize, Window)> = None;
+    for view in 0..views.count() {
+        let (edges, window) =
+            Window::with_most_edges(&photograph(&*image(views, view)?, background));
+        if best.is_none_or(|(most, ..)| edges > most) {
+            best = Some((edges, view, window));
+        }
+    }
+    Ok(best.map(|(_, view, window)| (view, window)))
+}
+
+/// What the window shows, enlarged.
+fn cut(picture: &RgbImage, window: Window) -> RgbImage {
+    let crop = window.of(picture);
+    let (width, height) = crop.dimensions();
+    let times = SHOWN.div_ceil(width);
+    imageops::resize(&crop, width * times, height * times, imageops::FilterType::Nearest)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn crops_are_enlarged_by_whole_numbers() {
+        for ((width, height), shown) in [((40, 24), (480, 288)), ((2000, 700), (480, 480))] {
+            let picture = RgbImage::new(width, height);
+            let (_, window) = Window::with_most_edges(&picture);
+            let crop = cut(&picture, window);
+            assert_eq!(crop.dimensions(), shown);
+            let pair = side_by_side(&[crop.clone(), crop], GAP);
+            assert_eq!(pair.dimensions(), (2 * shown.0 + GAP, shown.1));
+        }
+    }
+}

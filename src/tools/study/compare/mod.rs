@@ -1,0 +1,309 @@
+//! The study behind `densify compare`: policies under equal conditions, at several budgets.
+
+mod contender;
+mod counts;
+mod crops;
+mod plots;
+mod ranking;
+mod report;
+
+use std::collections::BTreeSet;
+use std::fmt;
+use std::path::PathBuf;
+
+use clap::Args;
+use densify_policies::registry;
+use toml::Value;
+
+use super::cell::Cell;
+use super::child::shared_options;
+use super::difference::{Difference, Pair};
+use super::record::Outcome;
+use super::{EngineArgs, Finished, Study, distinct, labels};
+use contender::Contender;
+use densify_core::numbers;
+use densify_core::numbers::grouped;
+use densify_run::failure::Failure;
+use densify_run::{Observer, Partial};
+
+/// Options of a run that are the comparison's to set.
+const OWN_OPTIONS: [&str; 8] =
+    ["scene", "policy", "budget", "seed", "iterations", "output", "test_iterations", "view"];
+/// What stands for all policies.
+const ALL: &str = "all";
+/// Measurements along each run, for the curves.
+const POINTS: u32 = 8;
+
+const EXAMPLES: &str = "\
+Examples:
+  densify compare data/garden --policies vanilla,diet --budget 200k
+  densify compare data/room data/cup --policies diet,taming,mcmc --budget 15k,30k,60k --seeds 5
+  densify compare data/garden --policies vanilla,diet --budget 1M -- -r 4 --sh-degree 2
+  densify compare data/room data/cup --policies vanilla,diet --budget room=28k,30k
+  densify compare data/garden --policies diet,diet:rho=0,diet:full_depth=0 --budget 200k
+  densify compare data/garden --policies vanilla,all --budget 200k
+  densify compare scene:table scene:thin --policies vanilla,diet --budget 10k --iterations 3000";
+
+/// Trains a scene with several policies, under the same conditions, and says which did best.
+///
+/// Every policy runs with every budget and every seed, one run after another. A run that is
+/// finished is not run again: call the same command to go on after an interruption. The folder then
+/// holds compare.md (tables and pictures), compare.html (the same as one file), compare.jsonl (a record per run),
+/// plots as SVG, and the runs themselves. With --engine a cluster makes the runs.
+///
+/// Quality is measured on views held out. Differences are taken between runs of the same scene,
+/// budget and seed, against the first policy named, with 95 % intervals of their mean from three
+/// seeds on; policies are ranked by that mean. A run whose peak exceeded its budget is marked, and
+/// takes no part in the ranking. The budget bounds the peak, and some policies end far below it: how
+/// many Gaussians each has at the end stands beside the peak. Where the geometry is known (built-in
+/// scenes, and those that `densify scenegen` wrote), the tables also say how well the Gaussians sit
+/// on it.
+#[derive(Debug, Clone, Args)]
+#[command(after_help = EXAMPLES)]
+pub struct Comparison {
+    /// Folders of the scenes, or built-in scenes (scene:NAME)
+    #[arg(required = true)]
+    pub scenes: Vec<PathBuf>,
+    /// Policies, separated by commas; the others are compared with the first. `all` stands for all that
+    /// are not named besides. A policy with parameters of its own is one more: diet:rho=0, or
+    /// diet:rho=0:split=random
+    #[arg(long, value_name = "NAMES", value_delimiter = ',', required = true)]
+    pub policies: Vec<String>,
+    /// Budgets in Gaussians, separated by commas; SCENE=ROWS for one scene alone, by its folder's
+    /// name, which then takes part with these only
+    #[arg(short, long, value_name = "ROWS", value_delimiter = ',', required = true, value_parser = SceneBudget::parse)]
+    pub budget: Vec<SceneBudget>,
+    /// Runs of each kind, with seeds 0, 1, …
+    #[arg(long, value_name = "K", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    pub seeds: u32,
+    /// Length of each run
+    #[arg(short, long, value_name = "N", default_value_t = 7_000, value_parser = clap::value_parser!(u32).range(1..))]
+    pub iterations: u32,
+    /// Folder for the results
+    #[arg(short, long, value_name = "DIR", default_value = "comparison")]
+    pub output: PathBuf,
+    /// Options of `densify train` for every run
+    #[arg(last = true, value_name = "TRAIN OPTIONS")]
+    pub train: Vec<String>,
+    #[command(flatten)]
+    pub engine: EngineArgs,
+}
+
+/// A budget for all scenes, or for one.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) struct SceneBudget {
+    /// The label of the only scene that it is for.
+    pub scene: Option<String>,
+    /// Most Gaussians.
+    pub rows: usize,
+}
+
+impl fmt::Display for SceneBudget {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match &self.scene {
+            Some(scene) => write!(f, "{scene}={}", self.rows),
+            None => write!(f, "{}", self.rows),
+        }
+    }
+}
+
+impl SceneBudget {
+    /// Reads `ROWS`, or `SCENE=ROWS` with the label of a scene.
+    pub(crate) fn parse(text: &str) -> Result<Self, String> {
+        let (scene, rows) = match text.rsplit_once('=') {
+            Some((scene, rows)) => (Some(scene.to_owned()), rows),
+            None => (None, text),
+        };
+        Ok(Self { scene, rows: numbers::rows(rows)? })
+    }
+}
+
+impl Comparison {
+    /// Makes the runs that are not done yet, or hands them in, which is `None`; all with the options `train`, and writes tables and pictures.
+    pub fn run(
+        &self,
+        train: Partial,
+        observer: &dyn Observer,
+    ) -> Result<Option<Finished>, Failure> {
+        let policies = all_policies(&self.policies)?;
+        let cells = self.cells(&policies, train)?;
+        let mut study = Study::open(&self.output, "compare", observer)?;
+        let Some(outcomes) = study.run(&cells, &self.engine)? else { return Ok(None) };
+        let mut text = report::markdown(&outcomes, &policies);
+        text += "\n## Pictures\n";
+        for picture in plots::draw(&self.output, &outcomes, &policies)? {
+            text += &format!("\n![{}]({})\n", picture.caption, picture.file);
+        }
+        for picture in crops::draw(&self.output, &outcomes, observer)? {
+            let caption = picture.caption;
+            text += &format!("\n![{caption}]({})\n\n{caption}.\n", picture.file);
+        }
+        text += &report::options(&outcomes)?;
+        study.finish("compare", &text, report::summary(&outcomes, &policies)).map(Some)
+    }
+
+    /// All runs, in the order in which they run: seed after seed, so that an interrupted comparison is a
+    /// fair one of fewer seeds.
+    fn cells(&self, policies: &[String], train: Partial) -> Result<Vec<Cell>, Failure> {
+        let shared = shared_options(train, &OWN_OPTIONS)?;
+        unique(&self.budget, "--budget")?;
+        let labels = labels(&self.scenes)?;
+        let budgets = budgets(&self.budget, &labels)?;
+        let least = budgets.iter().flatten().copied().min().unwrap_or(1);
+        let contenders: Vec<Contender<'_>> =
+            policies.iter().map(|policy| Contender::new(policy)).collect();
+        for contender in &contenders {
+            contender.check(least, self.iterations)?;
+        }
+        let tests = (1..POINTS).map(|i| i64::from((self.iterations * i / POINTS).max(1)));
+        let shared = Partial::option("test_iterations", tests.map(Value::from).collect::<Vec<_>>())
+            .over(shared);
+        let mut cells = Vec::new();
+        for seed in 0..self.seeds {
+            for ((scene, label), budgets) in self.scenes.iter().zip(&labels).zip(&budgets) {
+                for &budget in budgets {
+                    let base = Cell::new(&shared, (scene, label), budget, seed, self.iterations);
+                    cells.extend(policies.iter().zip(&contenders).map(|(policy, contender)| {
+                        Cell {
+                            factor: policy.clone(),
+                            level: budget.to_string(),
+                            title: format!("{policy}, {} rows", grouped(budget)),
+                            folder: format!("{}-{budget}", contender.folder()),
+                            spec: contender.options().over(base.spec.clone()),
+                            ..base.clone()
+                        }
+                    }));
+                }
+            }
+        }
+        Ok(cells)
+    }
+}
+
+/// The policies that are named, each once. `all` becomes every registered policy that is not named by
+/// itself, in the order of their names.
+fn all_policies(named: &[String]) -> Result<Vec<String>, Failure> {
+    unique(named, "--policies")?;
+    let registered = registry::policies()?;
+    let others = || {
+        let names = registered.iter().map(|entry| entry.name.to_owned());
+        names.filter(|name| !named.contains(name))
+    };
+    let expand = |name: &String| match name.as_str() {
+        ALL => others().collect(),
+        _ => vec![name.clone()],
+    };
+    Ok(named.iter().flat_map(expand).collect())
+}
+
+fn unique<T: Ord + std::fmt::Display>(values: &[T], flag: &str) -> Result<(), Failure> {
+    let mut seen = BTreeSet::new();
+    match values.iter().find(|&value| !seen.insert(value)) {
+        Some(twice) => Err(Failure::input(format!("{flag} names {twice} twice"))),
+        None => Ok(()),
+    }
+}
+
+/// The budgets of each scene: its own, or else those for all.
+fn budgets(asked: &[SceneBudget], labels: &[String]) -> Result<Vec<Vec<usize>>, Failure> {
+    let stranger = asked.iter().find(|b| b.scene.as_ref().is_some_and(|s| !labels.contains(s)));
+    if let Some(stranger) = stranger {
+        return Err(Failure::input(format!(
+            "--budget {stranger} is for none of the scenes; they are called {}",
+            labels.join(", ")
+        )));
+    }
+    let of = |scene: Option<&String>| -> Vec<usize> {
+        asked.iter().filter(|b| b.scene.as_ref() == scene).map(|b| b.rows).collect()
+    };
+    let one = |label: &String| {
+        let own = of(Some(label));
+        let rows = if own.is_empty() { of(None) } else { own };
+        if rows.is_empty() {
+            return Err(Failure::input(format!(
+                "--budget has none for {label}; add {label}=ROWS, or ROWS for all scenes"
+            )));
+        }
+        Ok(rows)
+    };
+    labels.iter().map(one).collect()
+}
+
+/// The outcomes of a scene at a budget.
+fn at<'a>(outcomes: &'a [Outcome], scene: &str, budget: usize) -> Vec<&'a Outcome> {
+    outcomes.iter().filter(|run| run.scene == scene && run.budget == budget).collect()
+}
+
+/// The scenes with their budgets, in the order of their appearance.
+fn scenes_and_budgets(outcomes: &[Outcome]) -> Vec<(&str, usize)> {
+    let runs: Vec<(&str, usize)> = outcomes.iter().map(|run| (&*run.scene, run.budget)).collect();
+    let scenes = distinct(runs.iter().map(|(scene, _)| *scene));
+    let of_scene =
+        |scene: &str| distinct(runs.iter().copied().filter(|(other, _)| *other == scene));
+    scenes.into_iter().flat_map(of_scene).collect()
+}
+
+/// Differences of the policy's outcomes from those of `base` with the same scene, budget and seed. `None`
+/// where there is no pair. Runs that broke their budget make no pair.
+fn difference<'a>(
+    outcomes: impl Iterator<Item = &'a Outcome> + Clone,
+    policy: &str,
+    base: &str,
+    score: impl Fn(&Outcome) -> f64,
+) -> Option<Difference> {
+    let runs = |policy: &str| {
+        let policy = policy.to_owned();
+        outcomes.clone().filter(move |r| r.factor == policy && r.kept_its_budget())
+    };
+    let pairs = runs(policy).filter_map(|run| {
+        let key = |r: &'a Outcome| (&r.scene, r.budget, r.seed);
+        let other = runs(base).find(|other| key(other) == key(run))?;
+        Some(Pair { scene: &run.scene, seed: run.seed, difference: score(run) - score(other) })
+    });
+    Difference::new(&pairs.collect::<Vec<_>>())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn all_are_those_registered_that_are_not_named_besides() {
+        let expanded = |text: &str| {
+            let named: Vec<String> = text.split(',').map(String::from).collect();
+            all_policies(&named).map_err(|failure| failure.message)
+        };
+        let registered = registry::policies().expect("the registry is sound");
+        let names = || registered.iter().map(|entry| entry.name.to_owned());
+        let without = |left_out: &str| names().filter(|name| name != left_out).collect::<Vec<_>>();
+        assert_eq!(expanded("all"), Ok(names().collect()));
+        let vanilla = "vanilla".to_owned();
+        assert_eq!(
+            expanded("vanilla,all"),
+            Ok([vec![vanilla.clone()], without("vanilla")].concat())
+        );
+        assert_eq!(expanded("all,vanilla"), Ok([without("vanilla"), vec![vanilla]].concat()));
+        // With parameters it is one more, and `diet` itself is there too.
+        let with = expanded("diet:rho=0,all").expect("they are known");
+        assert_eq!((with[0].as_str(), with[1..].to_vec()), ("diet:rho=0", names().collect()));
+        assert!(expanded("all,diet,all").is_err_and(|message| message.contains("all twice")));
+    }
+
+    #[test]
+    fn a_scene_with_budgets_of_its_own_takes_no_others() {
+        let labels = ["room".to_owned(), "cup".to_owned()];
+        let of = |text: &str| {
+            let asked: Result<Vec<SceneBudget>, String> =
+                text.split(',').map(SceneBudget::parse).collect();
+            budgets(&asked.expect("they parse"), &labels)
+        };
+        let rows = |text| of(text).map_err(|failure| failure.message);
+        assert_eq!(rows("30k"), Ok(vec![vec![30_000]; 2]));
+        assert_eq!(rows("30k,room=28k,room=1k"), Ok(vec![vec![28_000, 1_000], vec![30_000]]));
+        assert!(rows("room=28k").is_err_and(|m| m.contains("cup=ROWS")));
+        assert!(rows("30k,rom=28k").is_err_and(|m| m.contains("rom=28000") && m.contains("room")));
+        for text in ["room=", "=", "room=x"] {
+            assert!(SceneBudget::parse(text).is_err(), "{text}");
+        }
+    }
+}

@@ -1,0 +1,122 @@
+//! Plots as SVG: quality against budget; rows, PSNR and memory along the runs.
+
+use std::path::Path;
+
+use super::{Outcome, at, scenes_and_budgets};
+use crate::Picture;
+use crate::difference::mean;
+use crate::distinct;
+use crate::panel::{COLOURS, Curve, Panel, svg};
+use crate::plot;
+use densify_core::numbers::grouped;
+use densify_run::failure::Failure;
+
+/// Size of a panel `[px]`.
+const PANEL: (u32, u32) = (720, 300);
+
+/// Draws every plot into the folder `output`.
+pub(super) fn draw(
+    output: &Path,
+    outcomes: &[Outcome],
+    policies: &[String],
+) -> Result<Vec<Picture>, Failure> {
+    let mut pictures = Vec::new();
+    let all = scenes_and_budgets(outcomes);
+    for scene in distinct(all.iter().map(|(scene, _)| *scene)) {
+        let budgets: Vec<usize> =
+            all.iter().filter(|(other, _)| *other == scene).map(|(_, budget)| *budget).collect();
+        if budgets.len() > 1 {
+            let caption = format!("{scene}: quality against budget, means over seeds");
+            let plot = svg(&quality(outcomes, policies, scene, &budgets), PANEL)?;
+            pictures.push(plot::write(output, format!("quality-{scene}.svg"), caption, &plot)?);
+        }
+        for budget in budgets {
+            let caption = format!(
+                "{scene}, {} rows: rows, PSNR and memory over iterations, first seed",
+                grouped(budget)
+            );
+            let plot = svg(&growth(output, &at(outcomes, scene, budget), policies), PANEL)?;
+            let file = format!("growth-{scene}-{budget}.svg");
+            pictures.push(plot::write(output, file, caption, &plot)?);
+        }
+    }
+    Ok(pictures)
+}
+
+/// Scores against budget.
+fn quality(
+    outcomes: &[Outcome],
+    policies: &[String],
+    scene: &str,
+    budgets: &[usize],
+) -> [Panel; 3] {
+    let panel = |y: &'static str, score: fn(&Outcome) -> f64| Panel {
+        title: format!("{scene}: {y} against budget"),
+        x: "budget (rows)",
+        y,
+        log_x: true,
+        has_legend: true,
+        curves: by_policy(policies, |policy| {
+            let point = |&budget: &usize| {
+                let runs = at(outcomes, scene, budget).into_iter();
+                let runs = runs.filter(|r| r.factor == policy && r.kept_its_budget());
+                Some(((budget as f64).ln(), mean(runs.map(score))?))
+            };
+            budgets.iter().filter_map(point).collect()
+        }),
+    };
+    [panel("PSNR (dB)", |r| r.psnr), panel("SSIM", |r| r.ssim), panel("FLIP", |r| r.flip)]
+}
+
+/// Rows, PSNR and memory along the runs at the first seed.
+fn growth(output: &Path, runs: &[&Outcome], policies: &[String]) -> Vec<Panel> {
+    let (scene, budget) = runs.first().map_or(("", 0), |run| (&*run.scene, run.budget));
+    let panel = |y: &'static str, curve: &dyn Fn(&Outcome) -> Vec<(u32, f64)>| Panel {
+        title: format!("{scene}, {} rows: {y} over iterations", grouped(budget)),
+        x: "iteration",
+        y,
+        log_x: false,
+        has_legend: true,
+        curves: by_policy(policies, |policy| {
+            let first = runs.iter().filter(|r| r.factor == policy).min_by_key(|r| r.seed);
+            let points = first.map(|run| curve(run)).unwrap_or_default();
+            points.into_iter().map(|(x, y)| (f64::from(x), y)).collect()
+        }),
+    };
+    let memory = |r: &Outcome| {
+        let bytes = over_time(output, r, "resident_bytes").into_iter();
+        bytes.map(|(step, bytes)| (step, bytes / f64::from(1 << 20))).collect()
+    };
+    let mut panels = vec![
+        panel("rows", &|r| over_time(output, r, "rows")),
+        panel("PSNR (dB)", &|r| r.curve.clone()),
+        panel("resident memory (MiB)", &memory),
+    ];
+    // Not every system says.
+    panels.retain(Panel::shows_something);
+    panels
+}
+
+/// (iteration, value) of a field of the run's log; nothing where it has none.
+fn over_time(output: &Path, run: &Outcome, field: &str) -> Vec<(u32, f64)> {
+    let path = output.join("runs").join(&run.run).join("stats/train.jsonl");
+    let text = std::fs::read_to_string(path).unwrap_or_default();
+    let steps =
+        text.lines().filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok());
+    let point = |step: serde_json::Value| {
+        let iteration = u32::try_from(step["step"].as_u64()?).ok()?;
+        Some((iteration, step[field].as_f64()?))
+    };
+    steps.filter_map(point).collect()
+}
+
+/// A curve per policy. With more of them than colours, those that repeat a colour are dashed.
+fn by_policy(policies: &[String], points: impl Fn(&str) -> Vec<(f64, f64)>) -> Vec<Curve> {
+    let curve = |(at, policy): (usize, &String)| Curve {
+        name: policy.clone(),
+        points: points(policy),
+        colour: at % COLOURS,
+        is_dashed: at >= COLOURS,
+    };
+    policies.iter().enumerate().map(curve).collect()
+}

@@ -1,0 +1,247 @@
+//! The comparison as text: Markdown for the file, a few lines for the terminal.
+
+use std::collections::BTreeSet;
+use std::fmt::Write;
+
+use toml::{Table, Value};
+
+use super::{Outcome, at, counts, difference, ranking, scenes_and_budgets};
+use crate::difference::{INTERVALS, mean};
+use crate::distinct;
+use crate::markdown::{MarkdownTable, number_or_dash};
+use densify_core::numbers::grouped;
+use densify_run::Partial;
+use densify_run::failure::Failure;
+use densify_train::metrics::geometry::Geometry;
+
+/// Mean over runs; `None` where one has no value.
+fn mean_of(runs: &[&Outcome], value: impl Fn(&Outcome) -> Option<f64>) -> Option<f64> {
+    mean(runs.iter().map(|run| value(run)).collect::<Option<Vec<f64>>>()?)
+}
+
+/// The whole comparison.
+pub(super) fn markdown(outcomes: &[Outcome], policies: &[String]) -> String {
+    let mut text = String::from("# Comparison of density-control policies\n");
+    let (Some(first), Some(run)) = (policies.first(), outcomes.first()) else {
+        return text;
+    };
+    let seeds = distinct(outcomes.iter().map(|r| r.seed)).len();
+    let _ = write!(
+        text,
+        "\n{} iterations, {seeds} {}. Means over seeds; differences from `{first}` are paired by \
+         scene, budget and seed. {INTERVALS}. All options are at the end.\n",
+        grouped(run.iterations as usize),
+        if seeds == 1 { "seed" } else { "seeds" },
+    );
+    if policies.len() > 1 {
+        let ranks = ranking::table(outcomes, policies);
+        let _ = write!(text, "\n## Over all scenes and budgets\n\n{ranks}");
+    }
+    text += &counts::tables(outcomes, policies);
+    for (scene, budget) in scenes_and_budgets(outcomes) {
+        let here = at(outcomes, scene, budget);
+        let _ = write!(text, "\n## {scene}, {} rows\n\n", grouped(budget));
+        let mut table = MarkdownTable::new(
+            "policy | PSNR | SSIM | FLIP | rows | true peak | peak memory [MiB] | time [s] | \
+             processor time [s] | extra passes",
+        );
+        for policy in policies {
+            if here.iter().any(|run| run.factor == *policy) {
+                table.row(&row(policy, first, &here, budget));
+            }
+        }
+        text += &table.to_string();
+        text += &geometry(&here, policies);
+    }
+    text
+}
+
+/// Every option that all runs had, those by default too, as a file for `--config` has them.
+pub(super) fn options(outcomes: &[Outcome]) -> Result<String, Failure> {
+    let mut shared: Option<Table> = None;
+    for run in outcomes {
+        let spec = Partial::new(run.spec.clone(), "options")?.describe()?;
+        let mut all = Partial::all(&spec)?.into_table();
+        if let Some(others) = &shared {
+            keep_common(&mut all, others);
+        }
+        shared = Some(all);
+    }
+    let shared = toml::to_string(&shared.unwrap_or_default()).map_err(Failure::input)?;
+    let versions: BTreeSet<&str> = outcomes.iter().map(|run| &*run.densify).collect();
+    let versions = Vec::from_iter(versions).join(", ");
+    Ok(format!(
+        "\n## Options\n\nOf every run, with densify {versions}, defaults included; the tables above name what \
+         differs. What is not here differs between runs or was chosen by each, and stands in its \
+         config.toml.\n\n```toml\n{shared}```\n"
+    ))
+}
+
+/// Keeps what another table has too.
+fn keep_common(table: &mut Table, other: &Table) {
+    table.retain(|name, value| match (value, other.get(name)) {
+        (Value::Table(inner), Some(Value::Table(other))) => {
+            keep_common(inner, other);
+            true
+        }
+        (value, other) => Some(&*value) == other,
+    });
+}
+
+/// A policy's results among those of a scene and budget.
+fn row(policy: &str, first: &str, here: &[&Outcome], budget: usize) -> Vec<String> {
+    let runs: Vec<&Outcome> = here.iter().filter(|r| r.factor == policy).copied().collect();
+    let score = |score: fn(&Outcome) -> f64, digits| {
+        let mean = number_or_dash(mean_of(&runs, |r| Some(score(r))), digits);
+        let difference = difference(here.iter().copied(), policy, first, score);
+        match difference.filter(|_| policy != first) {
+            Some(difference) => format!("{mean} ({})", difference.show(digits)),
+            None => mean,
+        }
+    };
+    let peak = runs.iter().map(|r| r.peak_rows).max().unwrap_or(0);
+    let marked = if peak > budget { " **over the budget: not ranked**" } else { "" };
+    let mib = |r: &Outcome| r.peak_bytes.map(|bytes| bytes as f64 / f64::from(1 << 20));
+    let rows = mean_of(&runs, |r| Some(r.rows as f64)).unwrap_or(0.0);
+    vec![
+        policy.to_owned(),
+        score(|r| r.psnr, 2),
+        score(|r| r.ssim, 4),
+        score(|r| r.flip, 4),
+        grouped(rows.round() as usize),
+        format!("{}{marked}", grouped(peak)),
+        number_or_dash(mean_of(&runs, mib), 0),
+        number_or_dash(mean_of(&runs, |r| Some(r.seconds)), 1),
+        number_or_dash(mean_of(&runs, |r| r.cpu_seconds), 1),
+        number_or_dash(mean_of(&runs, |r| Some(r.extra_forwards as f64)), 0),
+    ]
+}
+
+/// A number of those measured against the known surface.
+type Measure = fn(&Geometry) -> f64;
+
+/// The table of what was measured against the known surface; nothing where none is known.
+fn geometry(here: &[&Outcome], policies: &[String]) -> String {
+    if here.iter().all(|r| r.geometry.is_none()) {
+        return String::new();
+    }
+    let columns: [(Measure, usize); 4] = [
+        (|g| g.depth.rmse, 3),
+        (|g| g.centres.chamfer, 3),
+        (|g| g.centres.f_score_one_percent, 1),
+        (|g| g.floaters.of_rows, 2),
+    ];
+    let mut table = MarkdownTable::new(
+        "policy | depth RMSE [%] | Chamfer [%] | F-score at 1 % [%] | floaters [% of rows]",
+    );
+    for policy in policies {
+        let runs: Vec<&Outcome> = here.iter().filter(|r| r.factor == *policy).copied().collect();
+        if runs.is_empty() {
+            continue;
+        }
+        let cell = |(value, digits): (Measure, usize)| {
+            let percent = |r: &Outcome| {
+                let value = r.geometry.as_ref().map(value);
+                value.filter(|value| value.is_finite()).map(|value| 100.0 * value)
+            };
+            number_or_dash(mean_of(&runs, percent), digits)
+        };
+        let cells = std::iter::once(policy.clone()).chain(columns.map(cell));
+        table.row(&cells.collect::<Vec<_>>());
+    }
+    format!("\nGeometry, lengths as % of the diagonal of the scene:\n\n{table}")
+}
+
+/// For the terminal: who did best over everything, and with how many Gaussians.
+pub(super) fn summary(outcomes: &[Outcome], policies: &[String]) -> String {
+    let (ranks, counts) = (ranking::lines(outcomes, policies), counts::lines(outcomes, policies));
+    format!(
+        "{ranks}\n\nDifferences are paired by scene, budget and seed; brackets are 95 % intervals of \
+         their mean.\n\n{counts}\n"
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::record::sample;
+
+    fn record(policy: &str, seed: u32, psnr: f64, peak_rows: usize) -> Outcome {
+        Outcome { peak_rows, cpu_seconds: Some(2.5), ..sample(policy, "1000", seed, psnr) }
+    }
+
+    #[test]
+    fn differences_are_paired_and_broken_budgets_marked() {
+        let all = [
+            record("a", 0, 30.0, 1000),
+            record("a", 1, 32.0, 1000),
+            record("b", 0, 30.5, 1000),
+            record("b", 1, 32.5, 999),
+            record("c", 0, 40.0, 1001),
+            record("c", 1, 40.0, 1001),
+        ];
+        let policies = ["a", "b", "c"].map(String::from);
+        let text = markdown(&all, &policies);
+        assert!(text.contains("| b | +0.50, two runs | 2 of 2 | 1 |"), "{text}");
+        assert!(text.contains("| b | 31.50 (+0.50, two runs) |"), "{text}");
+        let more = [record("a", 2, 30.0, 1000), record("b", 2, 31.5, 1000)];
+        let text = markdown(&[&all[..], &more].concat(), &policies);
+        // Student's t of two degrees of freedom, 4.303, times √(1/3)/√3.
+        assert!(text.contains("| b | +0.83 [-0.60, +2.27] | 3 of 3 | 1 |"), "{text}");
+        assert!(text.contains("| b | 900 | 1,000 |"), "{text}");
+        assert!(text.contains("| c | not ranked"), "{text}");
+        assert!(text.contains("| a | 30.67 | 0.3067 | 0.6933 | 900 | 1,000 | – |"), "{text}");
+        assert!(text.contains("1,001 **over the budget: not ranked**"), "{text}");
+        assert!(!text.contains("Geometry"), "{text}");
+        let said = summary(&all, &policies);
+        let of_c = "   –  c               –                        –     –       –     –     0  (2 more over";
+        assert!(
+            said.contains(of_c) && said.contains("b          31.500  +0.50, two runs"),
+            "{said}"
+        );
+        assert!(said.contains("policy  1,000: end          peak"), "{said}");
+    }
+
+    #[test]
+    fn options_are_those_of_all_runs_with_their_defaults() {
+        let run = |policy: &str, set: &str| Outcome {
+            spec: format!("iterations = 9\npolicy = '{policy}'\nknob.alpha_min = '1/64'\n{set}")
+                .parse()
+                .expect("TOML"),
+            ..record(policy, 0, 30.0, 1000)
+        };
+        let set = "policy_set.diet = { rho = 0.5 }";
+        let text = options(&[run("diet", set), run("mcmc", set)]).expect("options");
+        for words in ["iterations = 9\n", "near = 0.04", "alpha_min = \"1/64\"", "rho = 0.5"] {
+            assert!(text.contains(words), "{words}: {text}");
+        }
+        assert!(!text.contains("\npolicy = "), "{text}");
+        let text = options(&[run("diet", set), run("diet", "")]).expect("options");
+        assert!(text.contains("policy = \"diet\"") && !text.contains("rho"), "{text}");
+    }
+
+    #[test]
+    fn geometry_is_shown_where_it_is_known() {
+        let measured = |rmse: f64| -> Geometry {
+            let text = format!(
+                r#"{{"depth": {{"rmse": {rmse}, "abs_rel": null, "coverage": 1.0}}, "normal_error": 3.0,
+                "centres": {{"accuracy": 0.01, "accuracy_p95": 0.02, "completeness": 0.005,
+                "chamfer": 0.015, "f_score_half_percent": 0.5, "f_score_one_percent": 0.75}},
+                "floaters": {{"count": 9, "of_rows": 0.01, "of_weight": null}}, "thin": [],
+                "redundancy": {{"blended_per_pixel": 9.0, "below_one_percent": 0.25}}}}"#
+            );
+            serde_json::from_str(&text).expect("geometry")
+        };
+        let with =
+            |policy: &str, seed, geometry| Outcome { geometry, ..record(policy, seed, 30.0, 1000) };
+        let all = [
+            with("a", 0, Some(measured(0.02))),
+            with("a", 1, Some(measured(0.03))),
+            with("b", 0, Some(measured(0.5))),
+            with("b", 1, None),
+        ];
+        let text = markdown(&all, &["a", "b"].map(String::from));
+        assert!(text.contains("| a | 2.500 | 1.500 | 75.0 | 1.00 |"), "{text}");
+        assert!(text.contains("| b | – | – | – | – |"), "{text}");
+    }
+}

@@ -1,0 +1,172 @@
+//! The study behind `densify trade`: what each knob costs and buys.
+
+mod levels;
+mod plots;
+mod report;
+mod table;
+
+use std::path::PathBuf;
+
+use clap::Args;
+
+use super::cell::Cell;
+use super::child::shared_options;
+use super::record::Outcome;
+use super::{EngineArgs, Finished, Study, labels};
+use densify_core::numbers;
+use densify_run::failure::Failure;
+use densify_run::knobs::{EXACT, preset};
+use densify_run::{DEFAULT_BUDGET, Observer, Partial};
+use densify_train::schedule::REFERENCE_ITERATIONS;
+use levels::{Factor, factors};
+use report::Report;
+
+/// Options of a run that are the study's to set.
+const OWN_OPTIONS: [&str; 8] =
+    ["scene", "budget", "seed", "iterations", "output", "knob", "preset", "view"];
+
+/// The factor of a run in which no knob is changed, which is one with the preset `exact`.
+const BASE: &str = "";
+
+const EXAMPLES: &str = "\
+Examples:
+  densify trade scene:room -i 2000 -b 20k
+  densify trade data/garden --knobs alpha_min,sh_degree --seeds 5 -- -r 4
+  densify trade scene:spheres --knobs alpha_min:1/96:1/48 -i 1000 -b 5k -- --policy taming";
+
+/// Measures what each shortcut costs and buys.
+///
+/// For every knob (`densify knobs`) and each of its levels: what training with it arrives at, on views
+/// held out, with time and memory at its peak. One knob at a time from the preset `exact`, with
+/// the same seeds.
+///
+/// A run that is finished is not run again: call the same command to go on after an interruption. The
+/// folder then holds trade.md (tables and plots), trade.html (the same as one file), trade.jsonl (a record per
+/// line), plots as SVG, and the runs themselves. With --engine a cluster makes the runs.
+#[derive(Debug, Clone, Args)]
+#[command(after_help = EXAMPLES)]
+pub struct Trade {
+    /// Folders of the scenes, or built-in scenes (scene:NAME)
+    #[arg(required = true)]
+    pub scenes: Vec<PathBuf>,
+    /// Knobs, separated by commas; a knob with levels of its own as alpha_min:1/64:1/32
+    /// `[default: all that the policy has]`
+    #[arg(long, value_name = "NAMES", value_delimiter = ',')]
+    pub knobs: Vec<String>,
+    /// Runs of each kind, with seeds 0, 1, …
+    #[arg(long, value_name = "K", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    pub seeds: u32,
+    /// Length of each run
+    #[arg(short, long, value_name = "N", default_value_t = 7_000, value_parser = clap::value_parser!(u32).range(1..))]
+    pub iterations: u32,
+    /// Most Gaussians of each run
+    #[arg(short, long, value_name = "ROWS", default_value_t = DEFAULT_BUDGET, value_parser = numbers::rows)]
+    pub budget: usize,
+    /// Folder for the results
+    #[arg(short, long, value_name = "DIR", default_value = "trade")]
+    pub output: PathBuf,
+    /// Options of `densify train` for every run
+    #[arg(last = true, value_name = "TRAIN OPTIONS")]
+    pub train: Vec<String>,
+    #[command(flatten)]
+    pub engine: EngineArgs,
+}
+
+impl Trade {
+    /// Makes what is not done yet, or hands it in, which is `None`; all runs with the options `train`, and writes tables and plots.
+    pub fn run(
+        &self,
+        train: Partial,
+        observer: &dyn Observer,
+    ) -> Result<Option<Finished>, Failure> {
+        let shared = shared_options(train, &OWN_OPTIONS)?;
+        let factors = factors(self, &shared, observer)?;
+        let cells = self.cells(&factors, &shared)?;
+        let mut study = Study::open(&self.output, "trade", observer)?;
+        let Some(outcomes) = study.run(&cells, &self.engine)? else { return Ok(None) };
+        let report = Report::new(self, &factors, outcomes);
+        let mut text = table::markdown(&report);
+        text += "\n## Plots\n";
+        for picture in plots::draw(&self.output, &report)? {
+            text += &format!("\n![{}]({})\n", picture.caption, picture.file);
+        }
+        study.finish("trade", &text, table::summary(&report)).map(Some)
+    }
+
+    /// All runs in which at most one knob is changed, in the order in which they run: seed after seed, so
+    /// that an interrupted study is a fair one of fewer seeds.
+    fn cells(&self, factors: &[Factor], shared: &Partial) -> Result<Vec<Cell>, Failure> {
+        let labels = labels(&self.scenes)?;
+        let mut cells = Vec::new();
+        for seed in 0..self.seeds {
+            for (scene, label) in self.scenes.iter().zip(&labels) {
+                let base = Cell::new(shared, (scene, label), self.budget, seed, self.iterations);
+                let base = Cell {
+                    factor: BASE.to_owned(),
+                    title: "exact".to_owned(),
+                    folder: "exact".to_owned(),
+                    spec: Partial::option("preset", EXACT).over(base.spec.clone()),
+                    scores_without_shortcuts: true,
+                    ..base
+                };
+                cells.push(base.clone());
+                for factor in factors {
+                    let levels = factor.levels.iter();
+                    cells.extend(levels.map(|level| changed(&base, &factor.name, level)));
+                }
+            }
+        }
+        Ok(cells)
+    }
+}
+
+/// The base run with a knob at a level.
+fn changed(base: &Cell, factor: &str, level: &str) -> Cell {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "._".contains(c);
+    let mut spec = base.spec.clone();
+    for (name, value) in changes(factor, level, base.iterations) {
+        spec = Partial::setting(&name, &value).over(spec);
+    }
+    Cell {
+        factor: factor.to_owned(),
+        level: level.to_owned(),
+        title: format!("{factor}={level}"),
+        folder: format!("{factor}-{level}").replace(|c| !plain(c), "-"),
+        spec,
+        ..base.clone()
+    }
+}
+
+/// The options and knobs that a knob at a level stands for, in runs of so many iterations: a preset by its
+/// own levels, where iterations are as much fewer than these as they are fewer than those of a run by
+/// default.
+fn changes(knob: &str, level: &str, iterations: u32) -> Vec<(String, String)> {
+    let change = |&(name, value): &(&str, &str)| {
+        let value = match (name, value.parse::<u64>()) {
+            ("iterations", Ok(own)) => {
+                let scaled = own * u64::from(iterations) / u64::from(REFERENCE_ITERATIONS);
+                scaled.max(1).to_string()
+            }
+            _ => value.to_owned(),
+        };
+        (name.to_owned(), value)
+    };
+    match (knob, preset(level)) {
+        ("preset", Ok(preset)) => preset.levels.iter().map(change).collect(),
+        _ => vec![(knob.to_owned(), level.to_owned())],
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_preset_is_set_by_its_levels_and_shortens_runs_in_proportion() {
+        let pair = |name: &str, value: &str| (name.to_owned(), value.to_owned());
+        assert_eq!(changes("alpha_min", "1/64", 600), [pair("alpha_min", "1/64")]);
+        assert_eq!(changes("preset", "fast", 600), [pair("iterations", "300")]);
+        assert_eq!(changes("preset", "fast", 1), [pair("iterations", "1")]);
+        assert_eq!(changes("preset", "tiny-memory", 600)[0], pair("image_cache", "auto"));
+    }
+}

@@ -1,0 +1,168 @@
+//! Pareto plots as SVG, one per scene: time against PSNR, coloured by peak memory.
+
+use std::path::Path;
+
+use plotters::prelude::*;
+
+use super::report::{PSNR, Report, SECONDS};
+use crate::Picture;
+use crate::plot::{self, Area, range};
+use densify_run::failure::Failure;
+
+/// Size of a plot `[px]`.
+const SIZE: (u32, u32) = (900, 560);
+/// Ends of the colour scale: little memory and much, apart for the colour-blind (viridis).
+const SCALE: [RGBColor; 3] = [RGBColor(68, 1, 84), RGBColor(33, 145, 140), RGBColor(253, 180, 37)];
+
+/// A level in the plot.
+#[derive(Debug, Clone, PartialEq)]
+struct Point {
+    name: String,
+    seconds: f64,
+    /// Against `exact` `[dB]`.
+    psnr: f64,
+    /// Peak memory `[MiB]`.
+    peak: f64,
+    /// Whether no other is faster and better.
+    front: bool,
+}
+
+/// Draws a plot per scene into the folder `output`.
+pub(super) fn draw(output: &Path, report: &Report) -> Result<Vec<Picture>, Failure> {
+    let mut drawn = Vec::new();
+    for scene in &report.scenes {
+        let points = points(report, scene);
+        if points.is_empty() {
+            continue;
+        }
+        let title = format!("{scene}: PSNR against time, coloured by peak memory");
+        let svg = plot::svg(SIZE, |area| draw_points(&title, &points, area))?;
+        drawn.push(plot::write(output, format!("pareto-{scene}.svg"), title, &svg)?);
+    }
+    Ok(drawn)
+}
+
+fn points(report: &Report, scene: &str) -> Vec<Point> {
+    let Some(base) = report.mean(scene, "", "", PSNR) else { return Vec::new() };
+    let levels = report.effects.iter().map(|e| (&*e.factor.name, &*e.level));
+    let point = |(knob, level): (&str, &str)| {
+        let name = if knob.is_empty() { "exact".to_owned() } else { format!("{knob}={level}") };
+        Some(Point {
+            name,
+            seconds: report.mean(scene, knob, level, SECONDS)?.exp(),
+            psnr: report.mean(scene, knob, level, PSNR)? - base,
+            peak: report.peak_mib(scene, knob, level)?,
+            front: false,
+        })
+    };
+    let mut points: Vec<Point> =
+        std::iter::once(("", "")).chain(levels).filter_map(point).collect();
+    let beaten = |p: &Point| points.iter().any(|q| q.seconds < p.seconds && q.psnr > p.psnr);
+    let front: Vec<bool> = points.iter().map(|p| !beaten(p)).collect();
+    for (point, front) in points.iter_mut().zip(front) {
+        point.front = front;
+    }
+    points
+}
+
+/// The colour of a peak within the range of all.
+fn colour(peak: f64, [least, most]: [f64; 2]) -> RGBColor {
+    let share = if most > least { (peak - least) / (most - least) } else { 0.0 };
+    let (from, to, t) = if share < 0.5 {
+        (SCALE[0], SCALE[1], 2.0 * share)
+    } else {
+        (SCALE[1], SCALE[2], 2.0 * share - 1.0)
+    };
+    let mix = |a: u8, b: u8| (f64::from(a) + t * (f64::from(b) - f64::from(a))).round() as u8;
+    RGBColor(mix(from.0, to.0), mix(from.1, to.1), mix(from.2, to.2))
+}
+
+fn draw_points(
+    title: &str,
+    points: &[Point],
+    area: &Area<'_>,
+) -> Result<(), Box<dyn std::error::Error>> {
+    let [fast, slow] = range(points.iter().map(|p| p.seconds)).unwrap_or([1.0; 2]);
+    let [low, high] = range(points.iter().map(|p| p.psnr)).unwrap_or_default();
+    let peaks = range(points.iter().map(|p| p.peak)).unwrap_or_default();
+    let margin = 0.08 * (high - low).max(0.1);
+    let mut chart = ChartBuilder::on(area)
+        .caption(title, ("sans-serif", 17))
+        .margin(8)
+        .margin_right(130)
+        .x_label_area_size(42)
+        .y_label_area_size(60)
+        .build_cartesian_2d((0.93 * fast..1.07 * slow).log_scale(), low - margin..high + margin)?;
+    chart
+        .configure_mesh()
+        .light_line_style(WHITE)
+        .x_desc("time of training [s], logarithmic")
+        .y_desc("PSNR against exact [dB]")
+        .x_label_formatter(&|x| if *x < 10.0 { format!("{x:.2}") } else { format!("{x:.0}") })
+        .y_label_formatter(&|y| format!("{y:+.2}"))
+        .draw()?;
+    for point in points {
+        let at = (point.seconds, point.psnr);
+        let filled = colour(point.peak, peaks).filled();
+        let radius = if point.front { 6 } else { 4 };
+        let ink = if point.front { BLACK.to_rgba() } else { RGBColor(120, 120, 120).to_rgba() };
+        let label =
+            Text::new(point.name.clone(), (9, -5), ("sans-serif", 11).into_font().color(&ink));
+        chart.draw_series(std::iter::once(
+            EmptyElement::at(at) + Circle::new((0, 0), radius, filled) + label,
+        ))?;
+    }
+    scale(area, peaks)
+}
+
+/// The colour scale, right of the plot.
+fn scale(area: &Area<'_>, [least, most]: [f64; 2]) -> Result<(), Box<dyn std::error::Error>> {
+    const STEPS: i32 = 40;
+    let (x, bottom) = (SIZE.0 as i32 - 108, 400);
+    for step in 0..=STEPS {
+        let peak = least + (most - least) * f64::from(step) / f64::from(STEPS);
+        let y = bottom - 6 * step;
+        let box_ = [(x, y), (x + 16, y - 6)];
+        area.draw(&Rectangle::new(box_, colour(peak, [least, most]).filled()))?;
+    }
+    let font = ("sans-serif", 12).into_font();
+    for (peak, y) in [(least, bottom - 4), (most, bottom - 6 * STEPS - 4)] {
+        area.draw(&Text::new(format!("{peak:.1} MiB"), (x + 22, y), font.clone()))?;
+    }
+    area.draw(&Text::new("peak memory", (x, bottom - 6 * STEPS - 26), font))?;
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::report::sample;
+    use super::*;
+
+    #[test]
+    fn a_plot_shows_every_level_and_its_front() {
+        let report = sample();
+        let points = points(&report, "room");
+        let front: Vec<(&str, bool)> = points.iter().map(|p| (&*p.name, p.front)).collect();
+        let expected = [
+            ("exact", false),
+            ("alpha_min=1/64", false),
+            ("alpha_min=1/32", false),
+            ("sh_degree=0", true),
+        ];
+        assert_eq!(front, expected);
+        let text = plot::svg(SIZE, |area| draw_points("title", &points, area)).unwrap();
+        for words in ["title", "alpha_min=1/64", "sh_degree=0", "peak memory", "logarithmic"] {
+            assert!(text.contains(words), "{words} is not in {text}");
+        }
+        assert_eq!(text.matches("<circle").count(), 4);
+        assert!(super::points(&report, "nowhere").is_empty());
+    }
+
+    #[test]
+    fn colours_go_from_end_to_end() {
+        assert_eq!(colour(1.0, [1.0, 3.0]), SCALE[0]);
+        assert_eq!(colour(2.0, [1.0, 3.0]), SCALE[1]);
+        assert_eq!(colour(3.0, [1.0, 3.0]), SCALE[2]);
+        assert_eq!(colour(1.0, [1.0, 1.0]), SCALE[0]);
+    }
+}

@@ -1,0 +1,98 @@
+//! Saves the complete state of a run in one file, and restores it.
+//!
+//! A run that continues from a checkpoint gives the same bits as one that was never interrupted.
+//!
+//! ```text
+//! RUN/checkpoints/iteration_N.safetensors     the two newest are kept
+//! ```
+//!
+//! The file is [safetensors](https://github.com/huggingface/safetensors), which many languages read:
+//! eight bytes of length, a JSON header, and arrays. The arrays of the model are `model.means`,
+//! `model.log_scales`, `model.quats`, `model.opacity_logits`, `model.sh`
+//! ([`Gaussians`](densify_core::gaussians::Gaussians), in the coordinates of training); the others are the
+//! [backend's](densify_render::Backend::state). The rest is JSON in the metadata of the header:
+//! the version of the format, [`Header`], the arrays with a checksum each (CRC-32C), and a checksum
+//! of that JSON. So every byte is checked before it is used.
+//!
+//! A file appears under its name when it is complete and synced to disk. Files are untrusted: sizes
+//! are checked against the length of the file before anything is allocated.
+
+mod fingerprint;
+mod folder;
+mod format;
+mod read;
+mod write;
+
+pub use fingerprint::{Fingerprint, ViewsFingerprint};
+pub use folder::{checkpoint_path, newest, newest_step, remove_older};
+pub use format::VERSION;
+pub use read::Checkpoint;
+pub use write::write;
+
+use std::path::{Path, PathBuf};
+
+use densify_policies::policy::PolicyError;
+use serde::{Deserialize, Serialize};
+
+use crate::trainer::TrainerState;
+use densify_core::files::OutputError;
+use densify_render::{BackendError, StateError};
+
+/// A checkpoint without its arrays.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Header {
+    /// Version of densify that wrote it.
+    pub densify: String,
+    /// The most rows there may ever be.
+    pub budget: usize,
+    /// Spherical-harmonic degree of the model.
+    pub sh_degree: u8,
+    /// The run's configuration, as `config.toml` has it.
+    pub config: toml::Table,
+    /// The dataset.
+    pub dataset: Fingerprint,
+    /// State of the trainer.
+    pub trainer: TrainerState,
+    /// State of the program around the trainer; may be `null`.
+    pub session: serde_json::Value,
+}
+
+/// Why a checkpoint cannot be written or used.
+#[derive(Debug, thiserror::Error)]
+pub enum CheckpointError {
+    /// The file is damaged, or not a checkpoint.
+    #[error("{path}: {problem}")]
+    Invalid {
+        /// The file.
+        path: PathBuf,
+        /// Which part of it, and what is wrong.
+        problem: String,
+    },
+    /// The file cannot be read or written.
+    #[error(transparent)]
+    File(#[from] OutputError),
+    /// The policy cannot save its state.
+    #[error("the policy's state: {source}")]
+    Policy {
+        /// The error of the policy.
+        source: PolicyError,
+    },
+    /// The backend cannot save or restore its state.
+    #[error(transparent)]
+    Backend(#[from] BackendError),
+}
+
+impl CheckpointError {
+    fn invalid(path: &Path, problem: impl ToString) -> Self {
+        Self::Invalid { path: path.to_owned(), problem: problem.to_string() }
+    }
+
+    fn state(path: &Path) -> impl Fn(StateError) -> Self + use<> {
+        let path = path.to_owned();
+        move |error| Self::Invalid { path: path.clone(), problem: error.to_string() }
+    }
+}
+
+#[cfg(test)]
+mod tests;

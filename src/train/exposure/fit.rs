@@ -1,0 +1,114 @@
+//! The rendering of a view exposed as its photograph was: the best factor and offset per channel, by least
+//! squares. Test views have exposures of their own, which nothing in the model can know; measured after this
+//! fit, a model is not blamed for them.
+
+use densify_core::image::Image8;
+
+/// `rendered` with the factor and the offset per channel that bring it nearest to `target` composited on
+/// `background`. Pixels count as far as the target's mask says; a channel without any contrast is moved by
+/// an offset alone. Shape: `[height, width, 3]`.
+///
+/// # Panics
+/// When the sizes differ: callers compare the two first.
+#[must_use]
+pub fn fitted(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Vec<f32> {
+    let width = target.width as usize;
+    assert_eq!(rendered.len(), 3 * width * target.height as usize, "sizes differ");
+    let mut sums = [Sums::default(); 3];
+    for (pixel, colour) in rendered.as_chunks::<3>().0.iter().enumerate() {
+        let weight = target.mask.as_ref().map_or(1.0, |mask| f64::from(mask[pixel]) / 255.0);
+        // An ignored pixel may be NaN.
+        if weight > 0.0 {
+            let truth = target.composited(pixel % width, pixel / width, background);
+            for ((sums, x), y) in sums.iter_mut().zip(colour).zip(truth) {
+                sums.add(weight, f64::from(x.clamp(0.0, 1.0)), f64::from(y));
+            }
+        }
+    }
+    let lines = sums.map(|sums| sums.line());
+    let mut out = rendered.to_owned();
+    for colour in out.as_chunks_mut::<3>().0 {
+        for (x, [factor, offset]) in colour.iter_mut().zip(lines) {
+            *x = (factor * f64::from(x.clamp(0.0, 1.0)) + offset) as f32;
+        }
+    }
+    out
+}
+
+/// Weighted sums of pairs of a rendering's value x and a photograph's y.
+#[derive(Debug, Clone, Copy, Default)]
+struct Sums {
+    weight: f64,
+    x: f64,
+    y: f64,
+    xx: f64,
+    xy: f64,
+}
+
+impl Sums {
+    fn add(&mut self, weight: f64, x: f64, y: f64) {
+        self.weight += weight;
+        self.x += weight * x;
+        self.y += weight * y;
+        self.xx += weight * x * x;
+        self.xy += weight * x * y;
+    }
+
+    /// Factor and offset.
+    fn line(&self) -> [f64; 2] {
+        let Self { weight, x, y, xx, xy } = *self;
+        let variance = xx * weight - x * x;
+        // Below a ten-thousandth of a step of eight bits, squared, it is rounding.
+        let factor = match variance > weight * weight * 1.5e-13 {
+            true => (xy * weight - x * y) / variance,
+            false => 1.0,
+        };
+        match weight > 0.0 {
+            true => [factor, (y - factor * x) / weight],
+            false => [1.0, 0.0],
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Pixels of many colours, rendered as 0.8·y + 0.1 of what the photograph shows.
+    fn pair(mask: Option<Vec<u8>>) -> (Vec<f32>, Image8) {
+        let rgb: Vec<u8> = (0..3 * 48).map(|i| (i * 53 % 251) as u8).collect();
+        let rendered = rgb.iter().map(|&y| 0.8 * f32::from(y) / 255.0 + 0.1).collect();
+        (rendered, Image8 { width: 8, height: 6, rgb, alpha: None, mask })
+    }
+
+    #[test]
+    fn a_factor_and_an_offset_are_undone() {
+        let (rendered, target) = pair(None);
+        let found = fitted(&rendered, &target, [0.0; 3]);
+        for (found, expected) in found.iter().zip(&target.rgb) {
+            assert!((found - f32::from(*expected) / 255.0).abs() < 1e-5, "{found}, {expected}");
+        }
+    }
+
+    #[test]
+    fn masked_pixels_do_not_count() {
+        let mut mask = vec![255; 48];
+        mask[5] = 0;
+        let (mut rendered, target) = pair(Some(mask));
+        rendered[15] = f32::NAN;
+        rendered[16] = 0.9;
+        let found = fitted(&rendered, &target, [0.0; 3]);
+        assert!((found[0] - f32::from(target.rgb[0]) / 255.0).abs() < 1e-5, "{}", found[0]);
+        assert!(found[15].is_nan());
+    }
+
+    #[test]
+    fn one_colour_is_moved_and_no_pixel_leaves_all_as_it_was() {
+        let rgb = vec![51; 3 * 4];
+        let mut target = Image8 { width: 2, height: 2, rgb, alpha: None, mask: None };
+        let found = fitted(&[0.5; 12], &target, [0.0; 3]);
+        assert!(found.iter().all(|x| (x - 0.2).abs() < 1e-6), "{found:?}");
+        target.mask = Some(vec![0; 4]);
+        assert_eq!(fitted(&[0.5; 12], &target, [0.0; 3]), [0.5; 12]);
+    }
+}

@@ -1,0 +1,97 @@
+//! How much each Gaussian shows in the training views, by which a model that is too large is cut.
+
+use densify_policies::policy::{AuxColumn, AuxRequest, Needs, PixelMap};
+
+use crate::evaluate::EvaluateError;
+use densify_core::gaussians::{Gaussians, sigmoid};
+use densify_data::views::ViewSource;
+use densify_render::{AuxInput, Backend, BackendError};
+
+/// What a backend must have been made for.
+#[must_use]
+pub fn needs() -> Needs {
+    Needs { aux: Some(request()), ..Needs::default() }
+}
+
+fn request() -> AuxRequest {
+    AuxRequest { map: PixelMap::default(), columns: vec![AuxColumn::WeightSum], points: 0 }
+}
+
+/// Bytes that [`importance`] takes beside the backend and an image, for a model of so many rows.
+#[must_use]
+pub fn bytes(rows: usize) -> u64 {
+    // A view's column, the sums, and the order of the rows.
+    rows as u64 * (size_of::<f32>() + size_of::<f64>() + size_of::<usize>()) as u64
+}
+
+/// For each row the sum over all views and pixels of its blend weight α·T, >= 0. Shape: `[rows]`.
+///
+/// # Errors
+/// When a view cannot be read or rendered.
+pub fn importance(
+    backend: &mut dyn Backend,
+    views: &impl ViewSource,
+    background: [f32; 3],
+    sh_degree: u8,
+) -> Result<Vec<f64>, EvaluateError> {
+    let request = request();
+    let mut sums = vec![0.0; backend.rows()];
+    for view in 0..views.count() {
+        let name = || views.name(view).to_owned();
+        views.prefetch_after(view);
+        let image =
+            views.image(view).map_err(|source| EvaluateError::View { view: name(), source })?;
+        let input = AuxInput {
+            step: 0,
+            view,
+            seed: 0,
+            camera: views.camera(view),
+            target: &image,
+            background,
+            exposure: None,
+            sh_degree,
+            request: &request,
+        };
+        let seen = backend.observe(&input);
+        let seen =
+            seen.map_err(|source: BackendError| EvaluateError::Backend { view: name(), source })?;
+        for (sum, weight) in sums.iter_mut().zip(&seen.columns[0].1) {
+            *sum += f64::from(*weight);
+        }
+    }
+    Ok(sums)
+}
+
+/// For each row the logarithm of how much of an image it could cover, alone and seen from where it is largest: opacity
+/// times the two longest axes. For where no views are at hand. Shape: `[rows]`.
+#[must_use]
+pub fn footprints(model: &Gaussians) -> Vec<f64> {
+    let of = |row: usize| {
+        let mut log_scales = model.log_scales[row];
+        log_scales.sort_unstable_by(f32::total_cmp);
+        f64::from(sigmoid(model.opacity_logits[row]).ln() + log_scales[1] + log_scales[2])
+    };
+    (0..model.len()).map(of).collect()
+}
+
+/// The `count` rows of the largest importance, in their order; of equals the first.
+#[must_use]
+pub fn largest(importance: &[f64], count: usize) -> Vec<usize> {
+    let mut rows: Vec<usize> = (0..importance.len()).collect();
+    rows.sort_by(|&a, &b| importance[b].total_cmp(&importance[a]));
+    rows.truncate(count);
+    rows.sort_unstable();
+    rows
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_largest_stay_in_their_order() {
+        assert_eq!(largest(&[1.0, 3.0, 0.0, 3.0, 2.0], 3), [1, 3, 4]);
+        assert_eq!(largest(&[1.0, 1.0, 1.0], 2), [0, 1]);
+        assert_eq!(largest(&[1.0], 5), [0]);
+    }
+}

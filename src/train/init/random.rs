@@ -1,0 +1,113 @@
+//! Random points for datasets without points.
+
+use glam::{DMat3, DVec2, DVec3};
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{Rng, SeedableRng};
+
+use densify_core::camera::Camera;
+use densify_data::dataset::PointCloud;
+
+/// Half side of the cube around the focus, as a fraction of the cameras' distance. As in the original:
+/// ±1.3 in NeRF-synthetic scenes, whose cameras are 4.03 away.
+const HALF_CUBE: f64 = 1.0 / 3.0;
+/// Depths of background points, as fractions of the cameras' distance from the focus.
+const BACKGROUND_DEPTHS: (f64, f64) = (2.0 / 3.0, 4.0);
+/// Depths in scenes without a focus `[scene units]`; the cameras are within a radius of 1.
+const FREE_DEPTHS: (f64, f64) = (0.25, 5.0);
+/// Smallest colour and width of the range: the middle half, away from the clamp.
+const COLOURS: (u8, u8) = (64, 128);
+
+/// Random points in view of the cameras, in normalised coordinates, with random colours.
+///
+/// If the cameras look at one object, the points fill a cube around it. With a `background` (images
+/// without alpha) only every other point does; the rest are spread over the views, uniformly in image
+/// and inverse depth. If the cameras have no common focus (a room from inside, a street), all points
+/// are spread over the views. The same arguments give the same points.
+#[must_use]
+pub fn random_points(count: usize, cameras: &[Camera], background: bool, seed: u64) -> PointCloud {
+    let focus = focus(cameras);
+    let mut draw = Draw(ChaCha8Rng::seed_from_u64(seed));
+    let mut points = PointCloud::default();
+    for index in 0..count {
+        let position = match focus {
+            Some((centre, distance)) if !background || index % 2 == 0 || cameras.is_empty() => {
+                centre + (2.0 * draw.unit3() - 1.0) * (HALF_CUBE * distance)
+            }
+            Some((_, distance)) => point_in_view(
+                &mut draw,
+                cameras,
+                (BACKGROUND_DEPTHS.0 * distance, BACKGROUND_DEPTHS.1 * distance),
+            ),
+            None if cameras.is_empty() => 2.0 * draw.unit3() - 1.0,
+            None => point_in_view(&mut draw, cameras, FREE_DEPTHS),
+        };
+        points.positions.push(position);
+        points
+            .colours
+            .push((draw.unit3() * f64::from(COLOURS.1)).to_array().map(|v| COLOURS.0 + v as u8));
+    }
+    points
+}
+
+/// The point closest to all optical axes in least squares, and the median distance of the cameras;
+/// `None` if the axes are parallel or do not meet in front of the cameras.
+fn focus(cameras: &[Camera]) -> Option<(DVec3, f64)> {
+    let (mut normal, mut right) = (DMat3::ZERO, DVec3::ZERO);
+    for camera in cameras {
+        let axis = camera.forward();
+        let across =
+            DMat3::IDENTITY - DMat3::from_cols(axis * axis.x, axis * axis.y, axis * axis.z);
+        normal += across;
+        right += across * camera.centre();
+    }
+    let count = cameras.len() as f64;
+    // The smallest eigenvalue over `count` is the mean square spread of the axes [rad²]; a spread of
+    // a milliradian is noise.
+    if (normal * (1.0 / count)).determinant() < 1e-6 || cameras.is_empty() {
+        return None;
+    }
+    let focus = normal.inverse() * right;
+    let (mut distances, mut misses): (Vec<f64>, Vec<f64>) = cameras
+        .iter()
+        .map(|camera| {
+            let offset = focus - camera.centre();
+            let depth = offset.dot(camera.forward());
+            // A focus behind the camera does not count.
+            let miss = if depth > 0.0 {
+                (offset - depth * camera.forward()).length()
+            } else {
+                f64::INFINITY
+            };
+            (offset.length(), miss)
+        })
+        .unzip();
+    distances.sort_unstable_by(f64::total_cmp);
+    misses.sort_unstable_by(f64::total_cmp);
+    let distance = distances[distances.len() / 2];
+    // Nine of ten cameras see the focus in about the middle third of their image.
+    let miss = misses[misses.len() * 9 / 10];
+    (miss < 0.5 * distance).then_some((focus, distance))
+}
+
+/// A point in view of one of the cameras.
+fn point_in_view(draw: &mut Draw, cameras: &[Camera], (near, far): (f64, f64)) -> DVec3 {
+    let camera = &cameras[((draw.unit() * cameras.len() as f64) as usize).min(cameras.len() - 1)];
+    let pixel =
+        DVec2::new(draw.unit() * f64::from(camera.width), draw.unit() * f64::from(camera.height));
+    let depth = 1.0 / (1.0 / far + draw.unit() * (1.0 / near - 1.0 / far));
+    let ray = DVec3::new((pixel.x - camera.cx) / camera.fx, (pixel.y - camera.cy) / camera.fy, 1.0);
+    camera.rotation.transpose() * (depth * ray - camera.translation)
+}
+
+struct Draw(ChaCha8Rng);
+
+impl Draw {
+    /// Uniform in [0, 1), 53 bits.
+    fn unit(&mut self) -> f64 {
+        (self.0.next_u64() >> 11) as f64 * (1.0 / 9_007_199_254_740_992.0)
+    }
+
+    fn unit3(&mut self) -> DVec3 {
+        DVec3::new(self.unit(), self.unit(), self.unit())
+    }
+}

@@ -1,0 +1,90 @@
+//! The measurements of a model against the surface, from weights and visibility in the training views.
+
+mod centres;
+mod pixels;
+mod rows;
+mod visibility;
+
+use densify_scenegen::GBuffer;
+
+use super::{
+    CentreErrors, DepthErrors, Floaters, Geometry, KnownScene, Redundancy, ThinRecall, needs,
+};
+use crate::evaluate::EvaluateError;
+use densify_core::camera::Camera;
+use densify_data::views::ViewSource;
+use densify_render::Backend;
+use pixels::Pixels;
+use rows::Rows;
+use visibility::Visibility;
+
+/// Measures the model in `backend`, which was made for [`needs`]: weights and visibility in the views
+/// trained on; depth, normals and thin structures in `views`.
+pub fn measure(
+    backend: &mut dyn Backend,
+    ground: &KnownScene<'_>,
+    train: &impl ViewSource,
+    views: &impl ViewSource,
+) -> Result<Geometry, EvaluateError> {
+    let rows = Rows::new(&backend.download()?, ground);
+    let visibility = Visibility::measure(backend, ground, &rows, train)?;
+    let mut pixels = Pixels::new(&rows, ground)?;
+    for view in 0..views.count() {
+        pixels.add(backend, views, view)?;
+    }
+    Ok(Geometry {
+        depth: pixels.depth(),
+        normal_error: pixels.normal_error(),
+        centres: centres::errors(&rows, &visibility, ground)?,
+        floaters: visibility.floaters(&rows, ground.diagonal()),
+        thin: pixels.thin(),
+        redundancy: visibility.redundancy(),
+    })
+}
+
+impl KnownScene<'_> {
+    /// Diagonal of the mesh's bounding box `[world units]`.
+    fn diagonal(&self) -> f64 {
+        self.truth.surface().diagonal()
+    }
+
+    /// A view's camera in world coordinates, for projecting and for casting rays.
+    fn cameras(&self, scene: &Camera) -> (Camera, densify_scenegen::Camera) {
+        let world = self.normalisation.world_from_scene_camera(scene);
+        let caster = densify_scenegen::Camera {
+            width: world.width,
+            height: world.height,
+            fx: world.fx,
+            fy: world.fy,
+            cx: world.cx,
+            cy: world.cy,
+            world_from_camera: world.rotation.transpose(),
+            centre: world.centre(),
+            lens: None,
+        };
+        (world, caster)
+    }
+
+    /// What a view sees, once per view; also where measuring stops if it shall.
+    fn g_buffer(
+        &self,
+        name: &str,
+        caster: &densify_scenegen::Camera,
+    ) -> Result<GBuffer, EvaluateError> {
+        if (self.is_stopped)() {
+            return Err(EvaluateError::Stopped);
+        }
+        let g_buffer = self.truth.g_buffer(name, caster);
+        g_buffer.map_err(|e| EvaluateError::View { view: name.to_owned(), source: e.into() })
+    }
+}
+
+/// `sum / count`; NaN if `count` is 0.
+fn ratio(sum: f64, count: f64) -> f64 {
+    // An empty sum is −0.
+    if count > 0.0 { (sum + 0.0) / count } else { f64::NAN }
+}
+
+#[cfg(test)]
+#[allow(clippy::float_cmp, reason = "exact values")]
+mod tests;

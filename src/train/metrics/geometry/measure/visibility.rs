@@ -1,0 +1,224 @@
+//! Measures rows in the training views: their weight, and whether their place is empty.
+
+use densify_policies::policy::{AuxColumn, AuxRequest};
+use densify_scenegen::{Camera as RayCamera, GBuffer};
+use glam::DVec3;
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{Rng, SeedableRng};
+use rayon::prelude::*;
+
+use super::rows::Rows;
+use super::{Floaters, KnownScene, Redundancy, needs, ratio};
+use crate::evaluate::EvaluateError;
+use densify_core::camera::Camera;
+use densify_core::image::Image8;
+use densify_data::views::ViewSource;
+use densify_render::{AuxInput, Backend};
+
+/// Number of points on the mesh.
+const SAMPLES: usize = 20_000;
+const SEED: u64 = 0x6d65_7368;
+/// Smallest opacity of a floater.
+const MIN_OPACITY: f32 = 0.05;
+/// Smallest distance of a floater from the mesh `[diagonals]`.
+const MIN_DISTANCE: f64 = 0.01;
+/// Largest blend weight of a row with negligible effect.
+const NEGLIGIBLE: f32 = 0.01;
+/// Number of views that must agree.
+const MIN_VIEWS: u32 = 2;
+
+/// Sums over the training views.
+pub(super) struct Visibility {
+    /// Σ α·T of each row.
+    pub(super) weights: Vec<f64>,
+    /// Largest α·T of each row.
+    peaks: Vec<f32>,
+    /// Number of views in which each row's place is empty.
+    empty: Vec<u32>,
+    /// Number of (row, pixel) pairs blended, and of pixels.
+    blended: (f64, f64),
+    /// Points on the mesh that enough views show.
+    pub(super) samples: Vec<DVec3>,
+}
+
+impl Visibility {
+    pub(super) fn measure(
+        backend: &mut dyn Backend,
+        ground: &KnownScene<'_>,
+        rows: &Rows,
+        views: &impl ViewSource,
+    ) -> Result<Self, EvaluateError> {
+        let mut samples: Vec<(DVec3, u32)> =
+            sample(&ground.truth.surface().triangles()).into_iter().map(|p| (p, 0)).collect();
+        let mut visibility = Self {
+            weights: vec![0.0; rows.len()],
+            peaks: vec![0.0; rows.len()],
+            empty: vec![0; rows.len()],
+            blended: (0.0, 0.0),
+            samples: Vec::new(),
+        };
+        let request = needs().aux.unwrap_or_default();
+        for number in 0..views.count() {
+            let name = views.name(number);
+            let failed = |source| EvaluateError::Backend { view: name.to_owned(), source };
+            let camera = views.camera(number);
+            visibility.weigh(backend, ground, camera, &request).map_err(failed)?;
+            let (world, ray_camera) = ground.cameras(camera);
+            let g_buffer = ground.g_buffer(name, &ray_camera)?;
+            let places = visibility.empty.par_iter_mut().zip(&rows.centres);
+            places.for_each(|(empty, &place)| {
+                *empty += u32::from(sees_through(&world, &g_buffer, place));
+            });
+            let surface = ground.truth.surface();
+            samples.par_iter_mut().filter(|(_, views)| *views < MIN_VIEWS).for_each(
+                |(at, views)| {
+                    *views += u32::from(
+                        in_image(&ray_camera, *at) && !surface.blocked(ray_camera.centre, *at),
+                    );
+                },
+            );
+        }
+        let enough = samples.into_iter().filter(|(_, views)| *views >= MIN_VIEWS);
+        visibility.samples = enough.map(|(place, _)| place).collect();
+        Ok(visibility)
+    }
+
+    /// Adds the blend weights of one view.
+    fn weigh(
+        &mut self,
+        backend: &mut dyn Backend,
+        ground: &KnownScene<'_>,
+        camera: &Camera,
+        request: &AuxRequest,
+    ) -> Result<(), densify_render::BackendError> {
+        let pixels = camera.width as usize * camera.height as usize;
+        // The weights, which are all that is requested, do not depend on it.
+        let target = Image8 {
+            width: camera.width,
+            height: camera.height,
+            rgb: vec![0; 3 * pixels],
+            alpha: None,
+            mask: None,
+        };
+        let output = backend.observe(&AuxInput {
+            step: 1,
+            view: 0,
+            seed: 0,
+            camera,
+            target: &target,
+            background: ground.background,
+            exposure: None,
+            sh_degree: ground.sh_degree,
+            request,
+        })?;
+        for (column, values) in output.columns {
+            let numbers = values.iter().map(|&value| f64::from(value));
+            match column {
+                AuxColumn::WeightSum => {
+                    self.weights.iter_mut().zip(numbers).for_each(|(sum, value)| *sum += value);
+                }
+                AuxColumn::WeightMax => {
+                    let peaks = self.peaks.iter_mut().zip(values);
+                    peaks.for_each(|(peak, value)| *peak = peak.max(value));
+                }
+                AuxColumn::PixelCount => self.blended.0 += numbers.sum::<f64>(),
+                _ => {}
+            }
+        }
+        self.blended.1 += pixels as f64;
+        Ok(())
+    }
+
+    /// Whether rows are floaters, by the definition of [`Floaters`].
+    fn is_floater(&self, rows: &Rows, row: usize, diagonal: f64) -> bool {
+        let clear = (MIN_DISTANCE * diagonal).max(2.0 * rows.scales[row].max_element());
+        rows.opacities[row] > MIN_OPACITY
+            && rows.distances[row] > clear
+            && self.empty[row] >= MIN_VIEWS
+    }
+
+    pub(super) fn floaters(&self, rows: &Rows, diagonal: f64) -> Floaters {
+        let all: Vec<usize> =
+            (0..rows.len()).filter(|&row| self.is_floater(rows, row, diagonal)).collect();
+        let weight: f64 = all.iter().map(|&row| self.weights[row]).sum();
+        Floaters {
+            count: all.len(),
+            of_rows: ratio(all.len() as f64, rows.len() as f64),
+            of_weight: ratio(weight, self.weights.iter().sum()),
+        }
+    }
+
+    pub(super) fn redundancy(&self) -> Redundancy {
+        let idle = self.peaks.iter().filter(|&&peak| peak < NEGLIGIBLE).count();
+        Redundancy {
+            blended_per_pixel: ratio(self.blended.0, self.blended.1),
+            below_one_percent: ratio(idle as f64, self.peaks.len() as f64),
+        }
+    }
+}
+
+/// Whether a view shows a surface behind a point, or none.
+fn sees_through(camera: &Camera, g_buffer: &GBuffer, place: DVec3) -> bool {
+    let (pixel, depth) = camera.project(place);
+    let (width, height) = (f64::from(g_buffer.width), f64::from(g_buffer.height));
+    let on_image = (0.0..width).contains(&pixel.x) && (0.0..height).contains(&pixel.y);
+    if !(depth > 0.0 && on_image) {
+        return false;
+    }
+    let shown = g_buffer.depth[pixel.y as usize * g_buffer.width as usize + pixel.x as usize];
+    shown <= 0.0 || depth < f64::from(shown)
+}
+
+fn in_image(camera: &RayCamera, place: DVec3) -> bool {
+    let (pixel, depth) = camera.project(place);
+    depth > 0.0 && camera.contains(pixel)
+}
+
+/// Points of uniform density on the triangles, in their order.
+fn sample(triangles: &[[DVec3; 3]]) -> Vec<DVec3> {
+    let area = |[a, b, c]: &[DVec3; 3]| 0.5 * (*b - *a).cross(*c - *a).length();
+    let total: f64 = triangles.iter().map(area).sum();
+    if !(total > 0.0 && total.is_finite()) {
+        return Vec::new();
+    }
+    let mut rng = ChaCha8Rng::seed_from_u64(SEED);
+    let mut unit = move || (rng.next_u64() >> 11) as f64 / (1_u64 << 53) as f64;
+    let mut points = Vec::with_capacity(SAMPLES);
+    let (mut at, mut end) = (0, area(&triangles[0]));
+    for stratum in 0..SAMPLES {
+        let place = (stratum as f64 + unit()) / SAMPLES as f64 * total;
+        while place >= end && at + 1 < triangles.len() {
+            at += 1;
+            end += area(&triangles[at]);
+        }
+        let [a, b, c] = triangles[at];
+        let (root, v) = (unit().sqrt(), unit());
+        points.push(a + root * ((1.0 - v) * (b - a) + v * (c - a)));
+    }
+    points
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn samples_lie_on_the_triangles_as_densely_everywhere() {
+        // A triangle of area 3 in z = 0, and one of area 1 in z = 1; one without area between.
+        let first = [DVec3::ZERO, 3.0 * DVec3::X, 2.0 * DVec3::Y];
+        let line = [DVec3::ZERO, DVec3::X, 2.0 * DVec3::X];
+        let second = [DVec3::Z, DVec3::Z + DVec3::X, DVec3::Z + 2.0 * DVec3::Y];
+        let points = sample(&[first, line, second]);
+        assert_eq!(points.len(), SAMPLES);
+        let low = points.iter().filter(|p| p.z < 0.5).count();
+        assert!(low.abs_diff(SAMPLES * 3 / 4) <= 1, "{low}");
+        let mut mean = DVec3::ZERO;
+        for p in points.iter().filter(|p| p.z < 0.5) {
+            assert!(p.x >= 0.0 && p.y >= 0.0 && p.x / 3.0 + p.y / 2.0 <= 1.0 + 1e-9, "{p}");
+            mean += *p / low as f64;
+        }
+        assert!(mean.distance(DVec3::new(1.0, 2.0 / 3.0, 0.0)) < 0.03, "{mean}");
+        assert_eq!(points, sample(&[first, line, second]));
+        assert!(sample(&[line]).is_empty());
+    }
+}

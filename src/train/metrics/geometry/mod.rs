@@ -1,0 +1,153 @@
+//! Measures how well Gaussians match the surface that the images were rendered from, where known.
+//!
+//! The model and the cameras are in normalised coordinates; everything is measured in world
+//! coordinates, those of the mesh, in `f64`. Lengths are fractions of the diagonal of the mesh's
+//! bounding box. The weight of a row, w, is the sum of its blend weights α·T over all pixels of all
+//! training views. Samples have a fixed seed, so that results can be repeated.
+
+mod measure;
+
+use densify_policies::policy::{AuxColumn, AuxRequest, Needs};
+use serde::{Deserialize, Deserializer, Serialize};
+
+use densify_data::dataset::GroundTruth;
+use densify_data::dataset::normalise::Normalisation;
+pub use measure::measure;
+
+/// The results. Values without data (no centre, no pixel, no thin structure) are NaN, or `null` in
+/// JSON.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Geometry {
+    /// Depth on the views measured.
+    pub depth: DepthErrors,
+    /// Median angle between the surface's normal and the shortest axis of the Gaussian at a pixel
+    /// `[degrees]`, in 0..=90. The Gaussian is the densest at the surface point among the eight of
+    /// opacity above 0.1 with the nearest centres; it approximates the one with the largest blend
+    /// weight. Over the pixels of [`DepthErrors`], on a regular grid of about 2,000 per view.
+    #[serde(deserialize_with = "or_nan")]
+    pub normal_error: f64,
+    /// Distance from centres to surface and back.
+    pub centres: CentreErrors,
+    /// Rows in empty space.
+    pub floaters: Floaters,
+    /// Recall of thin structures by width, thinnest first; empty if the scene has none.
+    pub thin: Vec<ThinRecall>,
+    /// How much is spent on little.
+    pub redundancy: Redundancy,
+}
+
+/// Rendered depth, Σ α·T·z / Σ α·T, against that of the first surface, over the pixels that show a
+/// surface and have a rendered alpha above 0.5.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct DepthErrors {
+    /// Root mean square error `[diagonals]`.
+    #[serde(deserialize_with = "or_nan")]
+    pub rmse: f64,
+    /// Mean of |error| / depth.
+    #[serde(deserialize_with = "or_nan")]
+    pub abs_rel: f64,
+    /// Fraction of the pixels showing a surface that have a rendered alpha above 0.5.
+    #[serde(deserialize_with = "or_nan")]
+    pub coverage: f64,
+}
+
+/// Distances between centres and surface. Large Gaussians may well have their centres off it.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct CentreErrors {
+    /// Mean distance from centre to mesh, weighted by w `[diagonals]`.
+    #[serde(deserialize_with = "or_nan")]
+    pub accuracy: f64,
+    /// 95th percentile of the distance, weighted by w `[diagonals]`.
+    #[serde(deserialize_with = "or_nan")]
+    pub accuracy_p95: f64,
+    /// Mean distance from the mesh to the nearest centre of opacity above 0.1 `[diagonals]`. Over
+    /// those of 20,000 uniform samples of the mesh that at least two training views see.
+    #[serde(deserialize_with = "or_nan")]
+    pub completeness: f64,
+    /// Accuracy + completeness `[diagonals]`.
+    #[serde(deserialize_with = "or_nan")]
+    pub chamfer: f64,
+    /// Harmonic mean of precision (fraction of the weight w within 0.5 % of the diagonal from the
+    /// mesh) and recall (fraction of the samples within that of a centre), in 0..=1.
+    #[serde(deserialize_with = "or_nan")]
+    pub f_score_half_percent: f64,
+    /// The same at 1 %.
+    #[serde(deserialize_with = "or_nan")]
+    pub f_score_one_percent: f64,
+}
+
+/// Rows of opacity above 0.05 whose distance from the mesh exceeds 1 % of the diagonal and twice their
+/// largest standard deviation, at a place that is empty in at least two training views: their first
+/// surface is farther away, or there is none.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct Floaters {
+    /// Their number.
+    pub count: usize,
+    /// Fraction of the rows.
+    #[serde(deserialize_with = "or_nan")]
+    pub of_rows: f64,
+    /// Fraction of the weight w.
+    #[serde(deserialize_with = "or_nan")]
+    pub of_weight: f64,
+}
+
+/// Pixels that show a thin structure of about this width. They count as found if alpha is above 0.5,
+/// the depth error is below the thickness plus 1 % of the depth, and the colour error, mean over
+/// channels, is below 0.1.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct ThinRecall {
+    /// Width in the image, to the nearest power of two `[px]`.
+    pub width: f64,
+    /// Pixels that show one.
+    pub pixels: usize,
+    /// Fraction of them that are found.
+    pub recall: f64,
+}
+
+/// How much rows contribute to the training views.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct Redundancy {
+    /// Mean number of rows blended per pixel.
+    #[serde(deserialize_with = "or_nan")]
+    pub blended_per_pixel: f64,
+    /// Fraction of the rows whose largest blend weight in any pixel of any view is below 0.01.
+    #[serde(deserialize_with = "or_nan")]
+    pub below_one_percent: f64,
+}
+
+/// The scene that a model is measured in.
+#[derive(Clone, Copy)]
+pub struct KnownScene<'a> {
+    /// The surface.
+    pub truth: &'a GroundTruth,
+    /// From the coordinates of the surface to those of the model and the cameras.
+    pub normalisation: &'a Normalisation,
+    /// Background colour of the renders, sRGB-encoded in `[0, 1]`.
+    pub background: [f32; 3],
+    /// Spherical-harmonic degree evaluated, <= the model's.
+    pub sh_degree: u8,
+    /// Asked before each view; measuring ends with an error once it is true.
+    pub is_stopped: &'a dyn Fn() -> bool,
+}
+
+/// The needs with which the backend for [`measure`] is made.
+#[must_use]
+pub fn needs() -> Needs {
+    let columns = vec![AuxColumn::WeightSum, AuxColumn::WeightMax, AuxColumn::PixelCount];
+    Needs { aux: Some(AuxRequest { columns, ..AuxRequest::default() }), ..Needs::default() }
+}
+
+/// Memory for [`measure`] beside the backend and the surface, at most `[bytes]`: of each row two copies
+/// of the model (as it is read, or on its way from the backend), its place, axes and sums, two search
+/// trees; of each pixel the renders, the surface's depth and normals and their files; samples and angles.
+#[must_use]
+pub fn bytes(rows: usize, sh_degree: u8, image: (u32, u32), views: usize) -> u64 {
+    let row = 2 * 4 * (11 + 3 * densify_core::gaussians::sh_coefficients(sh_degree) as u64) + 512;
+    let pixels = u64::from(image.0) * u64::from(image.1);
+    rows as u64 * row + pixels * 128 + views as u64 * (16 << 10) + (4 << 20)
+}
+
+/// JSON has no NaN, and writes it as null.
+fn or_nan<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
+    Ok(Option::deserialize(from)?.unwrap_or(f64::NAN))
+}

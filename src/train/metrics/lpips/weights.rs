@@ -1,0 +1,108 @@
+//! The file of weights: a safetensors file of what the published package `lpips` loads.
+
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+use safetensors::SafeTensors;
+use safetensors::tensor::Dtype;
+
+use super::Lpips;
+use super::convolution::Convolution;
+use super::network::{Layer, Network, Stage};
+use densify_core::files;
+
+/// Most bytes of a file that are read; VGG-16 takes 59 MB.
+const MOST_BYTES: u64 = 256 << 20;
+/// What to do about a file that does not fit.
+const REMEDY: &str = "write it as docs/metrics.md says";
+
+/// Why weights cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum LpipsError {
+    /// The file cannot be read.
+    #[error("{}: {source}", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        source: std::io::Error,
+    },
+    /// It is not a file of such weights.
+    #[error("{}: {problem}; {REMEDY}", path.display())]
+    Malformed {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        problem: String,
+    },
+}
+
+impl Lpips {
+    /// Reads the weights of VGG-16 or AlexNet, whichever the file has.
+    ///
+    /// # Errors
+    /// When the file cannot be read, is longer than 256 MiB, is no safetensors file, or has not the
+    /// arrays of one of the networks: names and shapes of the package `lpips`, 32-bit floats, finite.
+    pub fn open(path: &Path) -> Result<Self, LpipsError> {
+        let read = |source| LpipsError::Read { path: path.to_owned(), source };
+        let mut bytes = Vec::new();
+        let file = files::open(path).map_err(read)?;
+        file.take(MOST_BYTES + 1).read_to_end(&mut bytes).map_err(read)?;
+        Self::from_bytes(&bytes)
+            .map_err(|problem| LpipsError::Malformed { path: path.to_owned(), problem })
+    }
+
+    pub(super) fn from_bytes(bytes: &[u8]) -> Result<Self, String> {
+        if bytes.len() as u64 > MOST_BYTES {
+            return Err(format!("it is longer than {MOST_BYTES} bytes"));
+        }
+        let file = SafeTensors::deserialize(bytes)
+            .map_err(|e| format!("it is no safetensors file ({e})"))?;
+        let has = |name: &str| file.names().contains(&name);
+        let network = if has("net.slice1.2.weight") {
+            Network::Vgg
+        } else if has("net.slice2.3.weight") {
+            Network::Alex
+        } else {
+            return Err("it holds neither VGG-16 nor AlexNet".to_owned());
+        };
+        let stages = network.stages().into_iter().enumerate().map(|(stage, layers)| {
+            let convolutions = layers.iter().map(|layer| convolution(&file, stage, layer));
+            let convolutions: Vec<_> = convolutions.collect::<Result<_, String>>()?;
+            let channels = convolutions.last().map_or(0, |last| last.channels[1]);
+            let weights =
+                array(&file, &format!("lin{stage}.model.1.weight"), &[1, channels, 1, 1])?;
+            Ok(Stage { convolutions, weights, pooling: network.pooling(stage) })
+        });
+        let stages = stages.collect::<Result<_, String>>()?;
+        Ok(Self { network, stages })
+    }
+}
+
+/// A convolution of the file.
+fn convolution(
+    file: &SafeTensors<'_>,
+    stage: usize,
+    &(number, channels, side, step, padding): &Layer,
+) -> Result<Convolution, String> {
+    let name = format!("net.slice{}.{number}", stage + 1);
+    let shape = [channels[1], channels[0], side, side];
+    let weights = array(file, &format!("{name}.weight"), &shape)?;
+    let bias = array(file, &format!("{name}.bias"), &channels[1..])?;
+    Ok(Convolution::new(channels, (side, step, padding), &weights, bias))
+}
+
+/// An array of the file.
+fn array(file: &SafeTensors<'_>, name: &str, shape: &[usize]) -> Result<Vec<f32>, String> {
+    let found = file.tensor(name).map_err(|_| format!("`{name}` is missing"))?;
+    if found.dtype() != Dtype::F32 || found.shape() != shape {
+        let (kind, found) = (found.dtype(), found.shape());
+        return Err(format!("`{name}` is {kind:?} {found:?}, and should be F32 {shape:?}"));
+    }
+    let values = found.data().as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes));
+    let values: Vec<f32> = values.collect();
+    if values.iter().any(|value| !value.is_finite()) {
+        return Err(format!("`{name}` has values that are not finite"));
+    }
+    Ok(values)
+}

@@ -1,0 +1,303 @@
+//! The folder of a run: two runs are never mixed, and a run is replaced only as a whole.
+
+mod replacement;
+
+use std::ffi::OsStr;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::rc::Rc;
+
+use super::CONFIG_FILE;
+use super::lock::FolderLock;
+use super::tensorboard::PREFIX as EVENTS_PREFIX;
+use densify_core::files::OutputError;
+use densify_core::files::disk::{Operation, attempt};
+use densify_core::files::{RUN_FOLDER_DEPTH, is_temporary, remove_incomplete};
+use replacement::{NEW, OLD, REPLACED, Stuck, hidden, recover, replace, suffix};
+
+/// Files and folders of a run. Everything else in its folder belongs to the user and is left alone.
+const OWNED: [&str; 11] = [
+    CHECKPOINTS,
+    CONFIG_FILE,
+    "cameras.json",
+    MODELS,
+    "stats",
+    "results.json",
+    "per_view.json",
+    "results_train.json",
+    "per_view_train.json",
+    "geometry.json",
+    "geometry_train.json",
+];
+const MODELS: &str = "point_cloud";
+/// Name of the folder of checkpoints in a run's folder.
+pub const CHECKPOINTS: &str = "checkpoints";
+
+/// Path of the model of an iteration.
+#[must_use]
+pub fn model_path(run: &Path, iteration: u32) -> PathBuf {
+    run.join(MODELS).join(format!("iteration_{iteration}")).join("point_cloud.ply")
+}
+
+/// The iterations whose model a run has saved, in order.
+///
+/// # Errors
+/// [`OutputError::Unfit`] when there is none.
+pub fn saved_iterations(run: &Path) -> Result<Vec<u32>, OutputError> {
+    let iteration = |name: &OsStr| name.to_str()?.strip_prefix("iteration_")?.parse().ok();
+    let entries = fs::read_dir(run.join(MODELS)).into_iter().flatten().flatten();
+    let mut saved: Vec<u32> = entries
+        .filter_map(|entry| iteration(&entry.file_name()))
+        .filter(|&iteration| model_path(run, iteration).is_file())
+        .collect();
+    saved.sort_unstable();
+    if saved.is_empty() {
+        return Err(OutputError::no_run(run, "saved model"));
+    }
+    Ok(saved)
+}
+
+/// Whether a process trains in a folder.
+#[must_use]
+pub fn is_in_use(run: &Path) -> bool {
+    FolderLock::check(run).is_err()
+}
+
+/// The folder that a run writes to, locked against other processes for as long as this value lives.
+///
+/// A new run writes in place. A run that replaces another writes to a hidden folder inside and takes
+/// its place in [`finish`](Self::finish); until then the old run is unchanged.
+#[derive(Debug)]
+pub struct RunFolder {
+    target: PathBuf,
+    /// Whether this run created the folder.
+    is_new: bool,
+    /// Suffix of the hidden folder that is written to.
+    staged: Option<String>,
+    lock: Rc<FolderLock>,
+}
+
+/// Tells whether the folder of a run is still its own.
+#[derive(Debug, Clone)]
+pub struct Guard(Rc<FolderLock>);
+
+impl Guard {
+    /// Fails when the folder was moved or removed, or another process has it.
+    ///
+    /// # Errors
+    /// [`OutputError::Lost`].
+    pub fn check(&self) -> Result<(), OutputError> {
+        self.0.confirm()
+    }
+}
+
+impl RunFolder {
+    /// Checks, without writing anything, that a run may go to `target`.
+    ///
+    /// # Errors
+    /// [`OutputError::Unfit`] while a process trains there, when it is no folder, and when it holds
+    /// another run and `overwrite` is not set; [`OutputError::Io`].
+    pub fn check(target: &Path, overwrite: bool) -> Result<(), OutputError> {
+        if !target.is_dir() {
+            // A dangling link is in the way, too.
+            return match target.symlink_metadata() {
+                Ok(_) => {
+                    let target = target.display();
+                    let problem = format!("{target} is not a folder; choose another one with -o");
+                    Err(OutputError::Unfit(problem))
+                }
+                Err(_) => Ok(()),
+            };
+        }
+        FolderLock::check(target)?;
+        if !overwrite && !owned_entries(target)?.is_empty() {
+            return Err(OutputError::occupied(target));
+        }
+        Ok(())
+    }
+
+    /// Creates the folder, or prepares to replace the run that is in it.
+    ///
+    /// # Errors
+    /// As [`check`](Self::check).
+    pub fn create(target: &Path, overwrite: bool) -> Result<Self, OutputError> {
+        Self::check(target, overwrite)?;
+        let mut folder = Self::lock(target)?;
+        // Another process may have trained there since.
+        let occupied = !owned_entries(target)?.is_empty();
+        if occupied && !overwrite {
+            return Err(OutputError::occupied(target));
+        }
+        if occupied {
+            let staging = tempfile::Builder::new().prefix(NEW).tempdir_in(target);
+            let staging = staging.map_err(OutputError::io("create a folder in", target))?.keep();
+            folder.staged = suffix(&staging, NEW);
+        }
+        Ok(folder)
+    }
+
+    /// The folder of a run that continues, or that starts again (`anew`) because it has no checkpoint;
+    /// then its files are removed. Incomplete files of a killed process are removed in any case.
+    ///
+    /// # Errors
+    /// [`OutputError::Io`]; [`OutputError::Unfit`] where there is no run, while a process trains there, and
+    /// when a run that starts again would remove models or checkpoints, or
+    /// files of something that is no run.
+    pub fn resume(target: &Path, anew: bool) -> Result<Self, OutputError> {
+        Self::check(target, true)?;
+        let folder = Self::lock(target)?;
+        if anew {
+            // What the caller has seen may have changed until the folder was locked.
+            let mut checkpoints =
+                fs::read_dir(target.join(CHECKPOINTS)).into_iter().flatten().flatten();
+            let has_checkpoint = checkpoints.any(|entry| !is_temporary(&entry.file_name()));
+            let is_foreign =
+                !target.join(CONFIG_FILE).exists() && !owned_entries(target)?.is_empty();
+            if is_foreign || has_checkpoint || saved_iterations(target).is_ok() {
+                return Err(OutputError::occupied(target));
+            }
+            // Its description stays until it is replaced: a kill must not lose it.
+            remove_owned(target, |name| name != CONFIG_FILE);
+        }
+        remove_incomplete(target, RUN_FOLDER_DEPTH);
+        Ok(folder)
+    }
+
+    /// Creates and locks a folder, and ends a replacement in it that was interrupted.
+    fn lock(target: &Path) -> Result<Self, OutputError> {
+        let is_new = !target.exists();
+        let fail = |e| OutputError::io("create the folder", target)(e);
+        attempt(Operation::Create, target).map_err(fail)?;
+        fs::create_dir_all(target).map_err(fail)?;
+        let lock = Rc::new(FolderLock::take(target)?);
+        recover(target)?;
+        let is_worthless =
+            |path: &PathBuf| !path.join(CHECKPOINTS).exists() && saved_iterations(path).is_err();
+        remove_all(Self::staged(target).into_iter().filter(is_worthless));
+        Ok(Self { target: target.to_owned(), is_new, staged: None, lock })
+    }
+
+    /// Ends a replacement in `target` that a kill has interrupted, if there is one, so that the folder can
+    /// be looked at.
+    ///
+    /// # Errors
+    /// [`OutputError::Unfit`], [`OutputError::Io`].
+    pub fn settle(target: &Path) -> Result<(), OutputError> {
+        if hidden(target, OLD).is_empty() && hidden(target, REPLACED).is_empty() {
+            return Ok(());
+        }
+        let _lock = FolderLock::take(target)?;
+        recover(target)
+    }
+
+    /// Tells during the run whether the folder is still its own.
+    #[must_use]
+    pub fn guard(&self) -> Guard {
+        Guard(Rc::clone(&self.lock))
+    }
+
+    /// Hidden folders in `target` of runs that were to replace the one there and were interrupted.
+    #[must_use]
+    pub fn staged(target: &Path) -> Vec<PathBuf> {
+        let mut staged = hidden(target, NEW);
+        staged.retain(|path| FolderLock::check(path).is_ok());
+        staged
+    }
+
+    /// The folder to write to.
+    #[must_use]
+    pub fn path(&self) -> PathBuf {
+        let staged = |suffix: &String| self.target.join(format!("{NEW}{suffix}"));
+        self.staged.as_ref().map_or_else(|| self.target.clone(), staged)
+    }
+
+    /// Replaces the existing run, if there is one, and removes earlier ones that were to replace it and
+    /// were interrupted; returns the folder.
+    ///
+    /// # Errors
+    /// [`OutputError::NotReplaced`] with the hidden folder of the new run; the old run stays.
+    pub fn finish(self) -> Result<PathBuf, OutputError> {
+        let Some(suffix) = &self.staged else {
+            return Ok(self.target.clone());
+        };
+        let confirmed = self.lock.confirm().map_err(|source| Stuck { source, aside: None });
+        match confirmed.and_then(|()| replace(&self.target, suffix)) {
+            Ok(()) => {
+                remove_all(Self::staged(&self.target));
+                Ok(self.target.clone())
+            }
+            Err(Stuck { source, aside }) => {
+                let source = Box::new(source);
+                Err(OutputError::NotReplaced { staging: self.path(), aside, source })
+            }
+        }
+    }
+
+    /// Ends a failed run: an existing run stays, and the files of the failed one are kept in the
+    /// returned folder.
+    #[must_use]
+    pub fn abandon(self) -> PathBuf {
+        self.path()
+    }
+
+    /// Ends a run without results: removes its files. An existing run and other files stay.
+    pub fn discard(self) {
+        let Self { target, is_new, staged, lock } = self;
+        match staged {
+            Some(suffix) => remove_all([target.join(format!("{NEW}{suffix}"))]),
+            None => remove_owned(&target, |_| true),
+        }
+        drop(lock);
+        if is_new {
+            // It stays if the user has put something there.
+            let _ = fs::remove_dir(&target);
+        }
+    }
+}
+
+/// Removes folders, as far as possible.
+fn remove_all(folders: impl IntoIterator<Item = PathBuf>) {
+    for folder in folders {
+        let _ = fs::remove_dir_all(folder);
+    }
+}
+
+/// Moves the files of a run to another folder.
+fn move_run(from: &Path, to: &Path) -> Result<(), OutputError> {
+    for name in owned_entries(from)? {
+        let path = from.join(&name);
+        attempt(Operation::Rename, &path)
+            .and_then(|()| fs::rename(&path, to.join(&name)))
+            .map_err(OutputError::io("move", &path))?;
+    }
+    Ok(())
+}
+
+/// Removes those files of a run that are meant, as far as possible.
+fn remove_owned(folder: &Path, is_meant: impl Fn(&OsStr) -> bool) {
+    let names = owned_entries(folder).unwrap_or_default();
+    for name in names.into_iter().filter(|name| is_meant(name)) {
+        let path = folder.join(name);
+        let _ = if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
+    }
+}
+
+/// Names of the files of a run in `folder`.
+fn owned_entries(folder: &Path) -> Result<Vec<std::ffi::OsString>, OutputError> {
+    let mut owned = Vec::new();
+    for entry in fs::read_dir(folder).map_err(OutputError::io("read the folder", folder))? {
+        let name = entry.map_err(OutputError::io("read the folder", folder))?.file_name();
+        if is_owned(&name) {
+            owned.push(name);
+        }
+    }
+    Ok(owned)
+}
+
+fn is_owned(name: &OsStr) -> bool {
+    let name = name.to_string_lossy();
+    OWNED.contains(&&*name) || name.starts_with(EVENTS_PREFIX)
+}
+
+#[cfg(test)]
+mod tests;

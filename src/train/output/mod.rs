@@ -1,0 +1,37 @@
+//! Writes the folder of a run, and reads it back; no file in it is ever half written.
+//!
+//! ```text
+//! RUN/
+//!   config.toml                                  everything needed to repeat the run
+//!   cameras.json                                 all cameras, world coordinates
+//!   point_cloud/iteration_N/point_cloud.ply      the model
+//!   point_cloud/iteration_N/exposure.json        how the training views were exposed
+//!   checkpoints/iteration_N.safetensors          to continue the run from
+//!   stats/train.jsonl  events.jsonl  summary.json  requirements.json
+//!   results.json  per_view.json                  test scores, as the original trainer lays them out
+//!   geometry.json                                errors against a known surface
+//!   events.out.tfevents.*                        the same curves for TensorBoard
+//! ```
+//!
+//! A file appears under its name only when it is complete ([`densify_core::files::write_atomically`]). The two logs and
+//! the TensorBoard file grow by whole records.
+
+mod cameras;
+mod folder;
+mod lock;
+mod reading;
+mod records;
+mod tensorboard;
+
+pub use cameras::cameras_json;
+pub use folder::{CHECKPOINTS, Guard, RunFolder, is_in_use, model_path, saved_iterations};
+pub use reading::{
+    all_scores, events_of, geometry_of, psnr_by_view, read_stats, scores_of, steps_of, summary_of,
+};
+pub use records::{RecordLog, StepRecord, Summary, write_geometry, write_json, write_scores};
+pub use tensorboard::TensorBoard;
+
+pub use crate::evaluate::Mean;
+
+/// Name of the file in a run's folder that describes the run.
+pub const CONFIG_FILE: &str = "config.toml";

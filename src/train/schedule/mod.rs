@@ -1,0 +1,369 @@
+//! Schedules of a run: step sizes, spherical-harmonic degree, view order, background.
+//!
+//! All are pure functions of their arguments, so that a run can be repeated, or resumed at any
+//! step, without replaying the steps before. Constants are those of Kerbl et al., *3D
+//! Gaussian Splatting for Real-Time Radiance Field Rendering* (SIGGRAPH 2023), section 5 and its
+//! published code, for a run of 30,000 steps; shorter and longer runs scale them in proportion.
+
+use std::fmt;
+use std::str::FromStr;
+
+use densify_policies::policy::RateOverrides;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
+use densify_core::gaussians::MAX_SH_DEGREE;
+use densify_render::LearningRates;
+
+/// Length of the run for which the published constants were chosen `[steps]`.
+pub const REFERENCE_ITERATIONS: u32 = 30_000;
+
+/// Step sizes of a run. The means' step size is a fraction of the scene's extent and falls
+/// log-linearly over the run; all others are constant unless their value at the end is given.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RateOptions {
+    /// Means, at the start of the run `[fraction of the extent per step]`, > 0.
+    pub mean_start: f64,
+    /// Means, at the end of the run `[fraction of the extent per step]`, > 0.
+    pub mean_end: f64,
+    /// Log-scales, > 0.
+    pub log_scale: f32,
+    /// Quaternions, > 0.
+    pub quat: f32,
+    /// Opacity logits, > 0. The first release used 0.05, those since October 2024 use 0.025.
+    pub opacity: f32,
+    /// Spherical-harmonic coefficients of band 0, > 0.
+    pub sh_dc: f32,
+    /// Spherical-harmonic coefficients of bands 1–3, > 0.
+    pub sh_rest: f32,
+    /// Log-scales at the end of the run, > 0; `None`: as at the start, for this and the next four.
+    pub log_scale_end: Option<f32>,
+    /// Quaternions at the end of the run.
+    pub quat_end: Option<f32>,
+    /// Opacity logits at the end of the run.
+    pub opacity_end: Option<f32>,
+    /// Spherical-harmonic coefficients of band 0 at the end of the run.
+    pub sh_dc_end: Option<f32>,
+    /// Spherical-harmonic coefficients of bands 1–3 at the end of the run.
+    pub sh_rest_end: Option<f32>,
+    /// Factor, at the end of the run, of the step sizes of opacities and of all spherical-harmonic
+    /// coefficients, > 0. It falls log-linearly from 1, which it is up to `fade_from`.
+    pub fade: f64,
+    /// Share of the run after which these step sizes fade, in (0, 1].
+    pub fade_from: f64,
+    /// Factor of all step sizes at the start of the run, > 0; it falls log-linearly to 1 at the end,
+    /// so that the last steps are as fine as in a long run.
+    pub boost: f64,
+}
+
+impl Default for RateOptions {
+    fn default() -> Self {
+        Self {
+            mean_start: 1.6e-4,
+            mean_end: 1.6e-6,
+            log_scale: 5e-3,
+            quat: 1e-3,
+            opacity: 0.025,
+            sh_dc: 2.5e-3,
+            sh_rest: 1.25e-4,
+            log_scale_end: None,
+            quat_end: None,
+            opacity_end: None,
+            sh_dc_end: None,
+            sh_rest_end: None,
+            fade: 1.0,
+            fade_from: 1.0,
+            boost: 1.0,
+        }
+    }
+}
+
+impl RateOptions {
+    /// The default step sizes of a run of so many iterations. Runs of fewer than 30,000 start with
+    /// b = (30,000 / iterations)^0.6 times the published ones, at most 5 times, and the step size of
+    /// colour bands 1–3 keeps an additional factor of min(b, 2) to the end.
+    ///
+    /// A short run has to come as far in fewer steps. Measured on three scenes at 2,000–3,000
+    /// iterations: with the published sizes rows are still far from their optimum at the end, and
+    /// training views are as blurred as test views. View-dependent colour, which has the smallest
+    /// steps and starts last, still lags behind: twice its step size gave +0.39, +0.23 and +0.18 dB
+    /// (cup, three seeds), +0.20 (office), +0.59 (beercan) and −0.04 (room256);
+    /// four times gave less. It costs where colour does not depend on the view: −0.76 dB on the
+    /// built-in `scene:room` (`--lr sh_rest=1.25e-4` is the published size).
+    #[must_use]
+    pub fn for_run(iterations: u32) -> Self {
+        let shortage = f64::from(REFERENCE_ITERATIONS) / f64::from(iterations.max(1));
+        let boost = shortage.powf(0.6).clamp(1.0, 5.0);
+        let published = Self::default();
+        Self { boost, sh_rest: published.sh_rest * boost.min(2.0) as f32, ..published }
+    }
+
+    /// These step sizes as they are at the end, from the start on: a model that is trained already keeps what it has
+    /// learned, of which larger steps take 4 to 6 dB at first.
+    #[must_use]
+    pub fn fine(self) -> Self {
+        Self {
+            mean_start: self.mean_end,
+            log_scale: self.log_scale_end.unwrap_or(self.log_scale),
+            quat: self.quat_end.unwrap_or(self.quat),
+            opacity: self.opacity_end.unwrap_or(self.opacity),
+            sh_dc: self.sh_dc_end.unwrap_or(self.sh_dc),
+            sh_rest: self.sh_rest_end.unwrap_or(self.sh_rest),
+            log_scale_end: None,
+            quat_end: None,
+            opacity_end: None,
+            sh_dc_end: None,
+            sh_rest_end: None,
+            boost: 1.0,
+            ..self
+        }
+    }
+
+    /// These step sizes, overlaid with those of a policy's paper.
+    #[must_use]
+    pub fn with(self, overrides: &RateOverrides) -> Self {
+        let mut rates = self;
+        if let Some(mean) = overrides.mean {
+            (rates.mean_start, rates.mean_end) = (mean.start, mean.end);
+        }
+        for (start, end, rate) in [
+            (&mut rates.log_scale, &mut rates.log_scale_end, overrides.log_scale),
+            (&mut rates.quat, &mut rates.quat_end, overrides.quat),
+            (&mut rates.opacity, &mut rates.opacity_end, overrides.opacity),
+            (&mut rates.sh_dc, &mut rates.sh_dc_end, overrides.sh_dc),
+            (&mut rates.sh_rest, &mut rates.sh_rest_end, overrides.sh_rest),
+        ] {
+            if let Some(rate) = rate {
+                let (first, last) = (rate.start as f32, rate.end as f32);
+                *start = first;
+                *end = (last.to_bits() != first.to_bits()).then_some(last);
+            }
+        }
+        if let Some(fade) = overrides.fade {
+            (rates.fade, rates.fade_from) = (fade.to, fade.from);
+        }
+        rates
+    }
+
+    /// Step sizes of iteration `step` (1-based) of `iterations`, in a scene of this extent
+    /// `[scene units]`.
+    #[must_use]
+    pub fn at(&self, step: u32, iterations: u32, extent: f32) -> LearningRates {
+        let t = f64::from(step.min(iterations)) / f64::from(iterations.max(1));
+        let between = |start: f64, end: f64| ((1.0 - t) * start.ln() + t * end.ln()).exp();
+        let mean = between(self.mean_start, self.mean_end) * f64::from(extent);
+        let factor = self.boost.powf(1.0 - t);
+        let late = (t - self.fade_from).max(0.0) / (1.0 - self.fade_from).max(f64::MIN_POSITIVE);
+        let faded = factor * self.fade.powf(late);
+        let times = |factor: f64, start: f32, end: Option<f32>| {
+            let start = f64::from(start);
+            (end.map_or(start, |end| between(start, f64::from(end))) * factor) as f32
+        };
+        LearningRates {
+            mean: (mean * factor) as f32,
+            noise: mean as f32,
+            log_scale: times(factor, self.log_scale, self.log_scale_end),
+            quat: times(factor, self.quat, self.quat_end),
+            opacity: times(faded, self.opacity, self.opacity_end),
+            sh_dc: times(faded, self.sh_dc, self.sh_dc_end),
+            sh_rest: times(faded, self.sh_rest, self.sh_rest_end),
+        }
+    }
+
+    /// The first step size that is not a positive finite number, by name.
+    #[must_use]
+    pub fn invalid(&self) -> Option<&'static str> {
+        let end = |end: Option<f32>| f64::from(end.unwrap_or(1.0));
+        [
+            ("mean_start", self.mean_start),
+            ("mean_end", self.mean_end),
+            ("boost", self.boost),
+            ("fade", self.fade),
+            ("fade_from", self.fade_from),
+            ("log_scale", f64::from(self.log_scale)),
+            ("quat", f64::from(self.quat)),
+            ("opacity", f64::from(self.opacity)),
+            ("sh_dc", f64::from(self.sh_dc)),
+            ("sh_rest", f64::from(self.sh_rest)),
+            ("log_scale_end", end(self.log_scale_end)),
+            ("quat_end", end(self.quat_end)),
+            ("opacity_end", end(self.opacity_end)),
+            ("sh_dc_end", end(self.sh_dc_end)),
+            ("sh_rest_end", end(self.sh_rest_end)),
+        ]
+        .into_iter()
+        .find_map(|(name, rate)| (!(rate.is_finite() && rate > 0.0)).then_some(name))
+    }
+}
+
+/// Step sizes of a run that starts from a model.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub enum InitRates {
+    /// Those of the end of a run: the model keeps what it has learned
+    #[default]
+    Fine,
+    /// Those of a run from its start: the model may change much
+    Full,
+}
+
+/// A number of steps chosen for a run of [`REFERENCE_ITERATIONS`], scaled to a run of
+/// `iterations`; at least 1.
+#[must_use]
+pub fn scaled(steps: u32, iterations: u32) -> u32 {
+    let exact = u64::from(steps) * u64::from(iterations);
+    let reference = u64::from(REFERENCE_ITERATIONS);
+    let rounded = (exact + reference / 2) / reference;
+    u32::try_from(rounded.max(1)).unwrap_or(u32::MAX)
+}
+
+/// Spherical-harmonic degree of iteration `step`: 0 at first, one more every 1,000 steps of a run
+/// of 30,000, at most `highest`.
+#[must_use]
+pub fn sh_degree(step: u32, iterations: u32, highest: u8) -> u8 {
+    let reached = step / scaled(1_000, iterations);
+    u8::try_from(reached).unwrap_or(u8::MAX).min(highest).min(MAX_SH_DEGREE)
+}
+
+/// What lies behind the Gaussians. As text: `black`, `white`, `random` or `#rrggbb`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Background {
+    /// (0, 0, 0).
+    Black,
+    /// (1, 1, 1).
+    White,
+    /// This colour, sRGB-encoded.
+    Colour([u8; 3]),
+    /// A new colour at each step, uniform in `[0, 1]`³.
+    Random,
+}
+
+impl Background {
+    /// The background of a training step.
+    #[must_use]
+    pub fn at(self, seed: u64, step: u32) -> [f32; 3] {
+        match self {
+            Self::Random => {
+                let mut draws = random_stream(seed, Use::Background, u64::from(step));
+                // The top 24 bits fill an f32's significand exactly.
+                std::array::from_fn(|_| (draws.next_u32() >> 8) as f32 / 16_777_215.0)
+            }
+            fixed => fixed.fixed(),
+        }
+    }
+
+    /// The background for evaluation; black if training draws it at random.
+    #[must_use]
+    pub fn fixed(self) -> [f32; 3] {
+        match self {
+            Self::Black | Self::Random => [0.0; 3],
+            Self::White => [1.0; 3],
+            Self::Colour(rgb) => rgb.map(|channel| f32::from(channel) / 255.0),
+        }
+    }
+}
+
+impl fmt::Display for Background {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Black => f.write_str("black"),
+            Self::White => f.write_str("white"),
+            Self::Random => f.write_str("random"),
+            Self::Colour([r, g, b]) => write!(f, "#{r:02x}{g:02x}{b:02x}"),
+        }
+    }
+}
+
+impl FromStr for Background {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let colour = |hex: &str| {
+            let value = u32::from_str_radix(hex, 16).ok()?;
+            let [_, r, g, b] = value.to_be_bytes();
+            // `from_str_radix` takes a sign as well.
+            (hex.len() == 6 && !hex.starts_with('+')).then_some(Self::Colour([r, g, b]))
+        };
+        match text {
+            "black" => Ok(Self::Black),
+            "white" => Ok(Self::White),
+            "random" => Ok(Self::Random),
+            _ => text.strip_prefix('#').and_then(colour).ok_or_else(|| {
+                format!("`{text}` is not a background; give black, white, random or a colour such as #808080")
+            }),
+        }
+    }
+}
+
+impl<'de> Deserialize<'de> for Background {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        densify_core::numbers::number_or_text(deserializer)
+    }
+}
+
+impl Serialize for Background {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
+/// The order of training views in one epoch (0-based): a permutation of
+/// `0..views`, drawn from (seed, epoch).
+#[must_use]
+pub fn view_order(views: usize, seed: u64, epoch: u32) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..views).collect();
+    let mut draws = random_stream(seed, Use::Views, u64::from(epoch));
+    // Fisher–Yates, written out because the shuffle of a library may change with its version.
+    for last in (1..views).rev() {
+        order.swap(last, below(&mut draws, last as u64 + 1) as usize);
+    }
+    order
+}
+
+/// `count` of the training views, or all of them if there are fewer, drawn at random without
+/// replacement from (seed, step), for policies that look at views of their own.
+#[must_use]
+pub fn fresh_views(views: usize, count: usize, seed: u64, step: u32) -> Vec<usize> {
+    let mut chosen: Vec<usize> = (0..views).collect();
+    let mut draws = random_stream(seed, Use::FreshViews, u64::from(step));
+    draw(&mut chosen, count.min(views), &mut draws);
+    chosen
+}
+
+/// Keeps `count` of the values, all choices equally likely: the first elements of a Fisher–Yates shuffle,
+/// written out because the sampling functions of a library may change with its version.
+pub(crate) fn draw(values: &mut Vec<usize>, count: usize, rng: &mut ChaCha8Rng) {
+    for place in 0..count {
+        let other = place + below(rng, (values.len() - place) as u64) as usize;
+        values.swap(place, other);
+    }
+    values.truncate(count);
+}
+
+/// What random numbers are used for; the streams of different uses are independent.
+#[derive(Debug, Clone, Copy)]
+enum Use {
+    Views = 1,
+    Background = 2,
+    FreshViews = 3,
+}
+
+/// The stream number `counter` of one use: ChaCha is a hash of (key, stream, position).
+fn random_stream(seed: u64, purpose: Use, counter: u64) -> ChaCha8Rng {
+    let mut key = [0_u8; 32];
+    key[..8].copy_from_slice(&seed.to_le_bytes());
+    key[8] = purpose as u8;
+    let mut rng = ChaCha8Rng::from_seed(key);
+    rng.set_stream(counter);
+    rng
+}
+
+/// A number in `0..n`: the high half of a 64 × 64-bit product, with a bias of at most n / 2⁶⁴.
+fn below(rng: &mut ChaCha8Rng, n: u64) -> u64 {
+    ((u128::from(rng.next_u64()) * u128::from(n)) >> 64) as u64
+}
+
+#[cfg(test)]
+mod tests;

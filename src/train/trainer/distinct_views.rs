@@ -1,0 +1,40 @@
+//! Chooses the training views that a policy's scores are measured in, without near-duplicates.
+//!
+//! A view that nearly repeats another, such as the next frame of a film, adds nothing to a score but
+//! costs as much. Such views are left out of scores only: all are trained on, and all test views are
+//! measured.
+
+use densify_core::camera::Camera;
+use densify_data::views::ViewSource;
+
+/// Largest distance of the cameras of near-duplicates `[fraction of the scene extent]`.
+const MAX_DISTANCE: f64 = 0.01;
+/// Smallest cosine of the angle between them: that of one degree.
+const MIN_COSINE: f64 = 0.999_847_7;
+/// Largest difference of focal lengths and principal points `[fraction of the image's width]`.
+const MAX_LENS_DIFFERENCE: f64 = 0.01;
+
+/// The first view of each group of near-duplicates.
+pub(super) fn distinct_views(views: &impl ViewSource, extent: f32) -> Vec<usize> {
+    let near = MAX_DISTANCE * f64::from(extent);
+    let mut chosen: Vec<usize> = Vec::new();
+    for view in 0..views.count() {
+        let camera = views.camera(view);
+        if !chosen.iter().any(|&other| are_near_duplicates(camera, views.camera(other), near)) {
+            chosen.push(view);
+        }
+    }
+    chosen
+}
+
+/// Whether two cameras have the same lens and nearly the same place and orientation.
+fn are_near_duplicates(a: &Camera, b: &Camera, near: f64) -> bool {
+    let lengths = |camera: &Camera| [camera.fx, camera.fy, camera.cx, camera.cy];
+    let apart = lengths(a).into_iter().zip(lengths(b)).map(|(a, b)| (a - b).abs());
+    let is_same_lens = (a.width, a.height) == (b.width, b.height)
+        && apart.fold(0.0, f64::max) <= MAX_LENS_DIFFERENCE * f64::from(a.width);
+    // trace(AᵀB) = 1 + 2 cos of the angle between them.
+    let turn = (a.rotation.transpose() * b.rotation).to_cols_array();
+    let cosine = (turn[0] + turn[4] + turn[8] - 1.0) / 2.0;
+    a.centre().distance(b.centre()) <= near && cosine >= MIN_COSINE && is_same_lens
+}

@@ -1,0 +1,106 @@
+//! The policy's edit: what the policy sees, its plan, and the plan's execution.
+
+use std::time::Instant;
+
+use densify_policies::plan::{EditPlan, RowOps};
+use densify_policies::policy::{PolicyError, SceneInfo, Snapshot};
+use densify_policies::rng::PolicyRng;
+
+use super::policy_views::call_policy;
+use super::{EditEvent, TrainError, Trainer};
+use densify_data::views::ViewSource;
+
+impl<V: ViewSource> Trainer<V> {
+    /// Lets the policy plan and executes the plan. `None` if there was nothing to do.
+    pub(super) fn edit(&mut self, step: u32) -> Result<Option<EditEvent>, TrainError> {
+        let start = Instant::now();
+        self.show_aux_views(step)?;
+        self.views_time = self.views_time.saturating_add(start.elapsed());
+        let signals = self.backend.take_signals(self.needs.signals);
+        let signals = signals.map_err(|e| self.backend_error(step, e))?;
+        let signals = signals.without_first(self.options.frozen);
+        let mut plan = self.new_plan().allowing(&self.needs);
+        let scene = SceneInfo { budget: plan.budget(), ..self.scene.clone() };
+        let candidates = self.backend.candidates();
+        let now = Snapshot { step, scene: &scene, signals: &signals, candidates };
+        let rng = PolicyRng::new(self.options.seed, step);
+        let planned = call_policy(|| self.policy.plan(&now, &rng, &mut plan)).and_then(|done| done);
+        self.backend.give_back(signals);
+        planned.map_err(|source| self.policy_error(step, source))?;
+        self.execute(step, plan)
+    }
+
+    /// An empty plan for the rows that are not frozen.
+    pub(super) fn new_plan(&self) -> EditPlan {
+        let frozen = self.options.frozen;
+        EditPlan::new(self.backend.rows() - frozen, self.row_limit() - frozen)
+    }
+
+    /// Executes a plan. A plan that changes no row and had nothing refused is not an event.
+    pub(super) fn execute(
+        &mut self,
+        step: u32,
+        plan: EditPlan,
+    ) -> Result<Option<EditEvent>, TrainError> {
+        let mut ops = plan.compile();
+        self.check_plan(step, &ops)?;
+        ops = ops.behind(self.options.frozen);
+        // The backend checks the budget, which the trainer's own limit may be below.
+        ops.budget = self.backend.budget();
+        self.backend
+            .apply(&ops, self.options.seed, step)
+            .map_err(|e| self.backend_error(step, e))?;
+        if let Some(history) = &mut self.history {
+            history.follow(&ops, step);
+        }
+        self.peak_rows = self.peak_rows.max(peak_rows(&ops)).max(self.backend.rows());
+        if !ops.edits_rows() && ops.counts.denied == 0 {
+            return Ok(None);
+        }
+        let event = EditEvent::new(step, &ops);
+        let EditEvent { before, removed, added, updated, denied, after, .. } = event;
+        let cause = &event.cause;
+        tracing::info!(step, before, removed, added, updated, denied, after, %cause, "edit");
+        self.events.push(event.clone());
+        Ok(Some(event))
+    }
+
+    /// Checks the budget and all invariants once more, so that a broken plan is an error here and not a
+    /// panic in the backend.
+    fn check_plan(&self, step: u32, ops: &RowOps) -> Result<(), TrainError> {
+        let frozen = self.options.frozen;
+        let (rows, budget) = (self.backend.rows() - frozen, self.row_limit() - frozen);
+        let reason = if ops.rows_before != rows || ops.budget != budget {
+            let RowOps { rows_before, budget: planned, .. } = ops;
+            format!(
+                "made for {rows_before} rows of {planned}, but the model has {rows} of {budget}"
+            )
+        } else if let Err(broken) = ops.check() {
+            broken.to_string()
+        } else {
+            return Ok(());
+        };
+        let problem = format!("its plan is broken: {reason}; this is a bug, please report it");
+        Err(self.policy_error(step, PolicyError::Other(problem)))
+    }
+}
+
+/// Most rows in use at any instant of an edit: children and seeds are written before moves shorten the
+/// model.
+fn peak_rows(ops: &RowOps) -> usize {
+    let new = ops.child_slots.iter().copied().chain(ops.seeds.iter().map(|(slot, _)| *slot));
+    let highest = new.max().map_or(0, |slot| slot as usize + 1);
+    highest.max(ops.rows_before).max(ops.rows_after)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn slots_written_before_the_moves_count_for_the_peak() {
+        let ops =
+            RowOps { rows_before: 4, rows_after: 3, child_slots: vec![1, 5], ..RowOps::default() };
+        assert_eq!(peak_rows(&ops), 6);
+    }
+}

@@ -1,0 +1,71 @@
+//! Errors that end a run.
+
+use densify_policies::policy::PolicyError;
+
+use densify_data::views::ViewError;
+use densify_render::BackendError;
+
+/// Why training cannot continue. The model stays as it was before the step's edit and can still be
+/// [read](super::Trainer::model); only after [`Diverged`](Self::Diverged) it is worthless.
+#[derive(Debug, thiserror::Error)]
+pub enum TrainError {
+    /// An option is out of its range.
+    #[error("{0}")]
+    BadOption(String),
+    /// A view's pixels could not be read.
+    #[error("step {step}: view `{view}`: {source}")]
+    View {
+        /// Iteration.
+        step: u32,
+        /// The view's name.
+        view: String,
+        /// The error of the view source.
+        source: ViewError,
+    },
+    /// The loss is not a finite number.
+    #[error(
+        "step {step}: the loss of view `{view}` is {loss}, so the model is lost; \
+         lower the learning rates, and check the scene's scale and cameras"
+    )]
+    Diverged {
+        /// Iteration.
+        step: u32,
+        /// The view's name.
+        view: String,
+        /// The loss.
+        loss: f32,
+    },
+    /// Rows hold non-finite values: too many of them, or any with [`OnNan::Stop`](super::OnNan::Stop).
+    #[error(
+        "step {step}: {count} of {rows} rows hold numbers that are not finite, first {first}; \
+         lower the learning rates, and check the scene's scale and cameras"
+    )]
+    Unsound {
+        /// Iteration.
+        step: u32,
+        /// How many rows hold them.
+        count: usize,
+        /// Rows of the model.
+        rows: usize,
+        /// Names the first of them and its value.
+        first: String,
+    },
+    /// The policy reported an error, panicked, or returned a plan that breaks an invariant.
+    #[error("step {step}: policy `{policy}`: {source}")]
+    Policy {
+        /// Iteration.
+        step: u32,
+        /// The policy's name.
+        policy: String,
+        /// What it reported.
+        source: PolicyError,
+    },
+    /// The backend failed.
+    #[error("step {step}: {source}")]
+    Backend {
+        /// Iteration.
+        step: u32,
+        /// The backend's error.
+        source: BackendError,
+    },
+}

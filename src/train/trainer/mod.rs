@@ -1,0 +1,272 @@
+//! The training loop, for any policy and any device.
+//!
+//! Views come from a [`ViewSource`], pixels and gradients from a [`Backend`], edits of the rows from a
+//! [`DensityPolicy`]. One step (Kerbl et al. 2023, section 5) takes the next view of the epoch, runs
+//! forward pass, backward pass and optimiser, and then, if the policy is due, one edit. A policy sees
+//! the model after the optimiser's step.
+
+mod auto_budget;
+mod distinct_views;
+mod edit;
+mod error;
+mod history;
+mod nonfinite;
+mod options;
+mod policy_views;
+mod probe;
+mod progress;
+mod report;
+mod resolution;
+mod state;
+mod validate;
+
+use std::time::{Duration, Instant};
+
+use densify_policies::policy::{
+    Cadence, DensityPolicy, LossTerms, Needs, NoiseTerm, PolicyError, SceneInfo,
+};
+
+use crate::exposure::Exposures;
+use crate::schedule;
+pub use auto_budget::{AutoBudget, Interval, MIN_GAIN, Removal, signals as growth_signals};
+use densify_core::image::SharedImage;
+use densify_data::views::ViewSource;
+use densify_render::{Backend, BackendError, StepInput};
+use distinct_views::distinct_views;
+pub use error::TrainError;
+pub use history::RowHistory;
+use nonfinite::AUDIT_EVERY;
+pub use options::{AutoChoices, OnNan, TrainOptions};
+use policy_views::call_policy;
+pub use report::{EditEvent, StepReport};
+pub use state::TrainerState;
+use validate::{check_options, checked_needs};
+
+/// A run in progress.
+pub struct Trainer<V> {
+    views: V,
+    backend: Box<dyn Backend>,
+    policy: Box<dyn DensityPolicy>,
+    policy_name: String,
+    needs: Needs,
+    scene: SceneInfo,
+    options: TrainOptions,
+    step: u32,
+    /// The views of this epoch and of the next one, in order.
+    order: Vec<usize>,
+    next_order: Vec<usize>,
+    peak_rows: usize,
+    extra_forwards: u64,
+    policy_time: Duration,
+    views_time: Duration,
+    images_time: Duration,
+    events: Vec<EditEvent>,
+    /// Training views that the policy's scores are measured in.
+    scored: Vec<usize>,
+    /// Training views that `--budget auto` measures; empty without it.
+    probes: Vec<usize>,
+    auto_budget: Option<AutoBudget>,
+    /// How each training view was exposed, where that is learned.
+    exposures: Option<Exposures>,
+    /// When each row was made and edited, where somebody wants to know.
+    history: Option<RowHistory>,
+}
+
+impl<V: ViewSource> Trainer<V> {
+    /// A new run. `backend` holds the initial model; `policy_name` is for messages only.
+    pub fn new(
+        views: V,
+        backend: Box<dyn Backend>,
+        (policy_name, policy): (&str, Box<dyn DensityPolicy>),
+        scene: SceneInfo,
+        options: TrainOptions,
+    ) -> Result<Self, TrainError> {
+        let count = views.count();
+        check_options(&scene, &options, count, backend.as_ref())?;
+        Ok(Self {
+            needs: checked_needs(policy_name, policy.as_ref(), &scene)?,
+            policy_name: policy_name.to_owned(),
+            order: Vec::new(),
+            next_order: schedule::view_order(count, options.seed, 0),
+            peak_rows: backend.rows(),
+            extra_forwards: 0,
+            policy_time: Duration::ZERO,
+            views_time: Duration::ZERO,
+            images_time: Duration::ZERO,
+            views,
+            backend,
+            policy,
+            scene,
+            options,
+            step: 0,
+            events: Vec::new(),
+            scored: (0..count).collect(),
+            probes: Vec::new(),
+            auto_budget: None,
+            exposures: None,
+            history: None,
+        })
+    }
+
+    /// Lets the run make automatic choices; to be called before the first step. To choose the number of
+    /// rows, the backend must have been made with [`growth_signals`] too.
+    #[must_use]
+    pub fn requiring(mut self, choices: AutoChoices) -> Self {
+        if choices.rows {
+            self.probes = probe::probes(self.views.count(), self.options.seed);
+        }
+        if choices.scored_views {
+            self.scored = distinct_views(&self.views, self.scene.extent);
+        }
+        let (rows, budget) = (self.backend.rows(), self.backend.budget());
+        self.auto_budget = choices.rows.then(|| AutoBudget::new(rows, budget));
+        self
+    }
+
+    /// Lets the run learn how each training view was exposed, beginning with these; to be called before the
+    /// first step. The backend must have been made for it.
+    ///
+    /// # Panics
+    /// When there is not one for each view: a bug in the caller.
+    #[must_use]
+    pub fn exposing(mut self, exposures: Option<Exposures>) -> Self {
+        let count = exposures.as_ref().map_or(self.views.count(), Exposures::count);
+        assert_eq!(count, self.views.count(), "exposures of other views");
+        self.exposures = exposures;
+        self
+    }
+
+    /// One iteration: a view, a gradient step, and the policy's edit if it is due.
+    ///
+    /// May be called beyond [`TrainOptions::iterations`]; learning rates then keep their final values.
+    ///
+    /// # Errors
+    /// [`TrainError`]. After an error the run is over; the model can still be read.
+    pub fn step(&mut self) -> Result<StepReport, TrainError> {
+        let step = self.step + 1;
+        let view = self.next_view();
+        let start = Instant::now();
+        // Until here nothing has changed that a checkpoint holds.
+        let image = self.image(step, view)?;
+        if (self.step as usize).is_multiple_of(self.views.count()) {
+            self.backend.begin_epoch();
+        }
+        self.images_time = self.images_time.saturating_add(start.elapsed());
+        let cadence = self.cadence(step)?;
+        let (loss_terms, noise) = self.terms(step)?;
+        let (camera, image) = self.at_resolution(step, view, image)?;
+        let TrainOptions { iterations, seed, background, rates, .. } = self.options;
+        let exposure = self.exposures.as_ref().map(|exposures| exposures.of(view));
+        let input = StepInput {
+            step,
+            view,
+            camera: &camera,
+            target: &image,
+            background: background.at(seed, step),
+            exposure: exposure.as_ref(),
+            sh_degree: self.sh_degree(step),
+            rates: rates.at(step, iterations, self.scene.extent),
+            loss_terms,
+            noise,
+            cadence,
+            seed,
+        };
+        let output = self.backend.train_step(&input).map_err(|e| self.backend_error(step, e))?;
+        self.step = step;
+        if !output.loss.is_finite() {
+            let view = self.views.name(view).to_owned();
+            return Err(TrainError::Diverged { step, view, loss: output.loss });
+        }
+        if let Some((exposures, gradient)) = self.exposures.as_mut().zip(output.exposure) {
+            exposures.step(view, &gradient, f64::from(step) / f64::from(iterations));
+        }
+        let is_due =
+            call_policy(|| self.policy.is_due(step)).map_err(|e| self.policy_error(step, e))?;
+        let mut events = Vec::new();
+        if is_due || step.is_multiple_of(AUDIT_EVERY) || step == iterations {
+            events.extend(self.remove_nonfinite(step)?);
+        }
+        events.extend(self.update_auto_budget(step)?);
+        let start = Instant::now();
+        if is_due {
+            events.extend(self.edit(step)?);
+        }
+        self.policy_time = self.policy_time.saturating_add(start.elapsed());
+        Ok(StepReport { step, view, output, rows: self.backend.rows(), events })
+    }
+
+    /// `count` of the scored views, or all of them if there are fewer, drawn from (seed, step).
+    fn draw_scored(&self, count: usize, step: u32) -> Vec<usize> {
+        let drawn = schedule::fresh_views(self.scored.len(), count, self.options.seed, step);
+        drawn.into_iter().map(|place| self.scored[place]).collect()
+    }
+
+    fn image(&self, step: u32, view: usize) -> Result<SharedImage, TrainError> {
+        self.views.image(view).map_err(|source| TrainError::View {
+            step,
+            view: self.views.name(view).to_owned(),
+            source,
+        })
+    }
+
+    /// How often the policy lets the optimiser step now.
+    fn cadence(&self, step: u32) -> Result<Cadence, TrainError> {
+        let cadence =
+            call_policy(|| self.policy.cadence(step)).map_err(|e| self.policy_error(step, e))?;
+        let declared = self.needs.cadence;
+        if cadence.is_within(declared) {
+            return Ok(cadence);
+        }
+        let error = format!("it wants {cadence:?}, but declared {declared:?}");
+        Err(self.policy_error(step, PolicyError::Other(error)))
+    }
+
+    /// What the policy adds to the loss and to the means now.
+    fn terms(&self, step: u32) -> Result<(LossTerms, Option<NoiseTerm>), TrainError> {
+        let Needs { loss_terms, noise, .. } = self.needs;
+        let both = || (self.policy.loss_terms(step, loss_terms), self.policy.noise(step, noise));
+        let (terms, noise) = call_policy(both).map_err(|e| self.policy_error(step, e))?;
+        let checked = terms.check().and_then(|()| noise.map_or(Ok(()), |noise| noise.check()));
+        checked.map_err(|error| self.policy_error(step, PolicyError::Other(error)))?;
+        Ok((terms, noise))
+    }
+
+    fn policy_error(&self, step: u32, source: PolicyError) -> TrainError {
+        TrainError::Policy { step, policy: self.policy_name.clone(), source }
+    }
+
+    /// The view of the next step. Prefetches the views after it.
+    fn next_view(&mut self) -> usize {
+        let count = self.views.count();
+        let place = self.step as usize % count;
+        if place == 0 {
+            let epoch = self.step / count as u32;
+            self.order = std::mem::take(&mut self.next_order);
+            self.next_order = schedule::view_order(count, self.options.seed, epoch + 1);
+        }
+        // Beyond the last iteration the end of the run is unknown.
+        let left = self.options.iterations.checked_sub(self.step + 1);
+        let last = left.map_or(usize::MAX, |left| left as usize);
+        let upcoming: Vec<usize> = self.order[place + 1..]
+            .iter()
+            .chain(&self.next_order)
+            .copied()
+            .take(self.options.prefetch.min(last))
+            .collect();
+        self.views.prefetch(&upcoming);
+        self.order[place]
+    }
+
+    /// The spherical-harmonic degree in use at a step.
+    fn sh_degree(&self, step: u32) -> u8 {
+        let TrainOptions { iterations, sh_degree, has_all_bands, .. } = self.options;
+        if has_all_bands { sh_degree } else { schedule::sh_degree(step, iterations, sh_degree) }
+    }
+
+    fn backend_error(&self, step: u32, source: BackendError) -> TrainError {
+        TrainError::Backend { step, source }
+    }
+}
+
+#[cfg(test)]
+mod tests;

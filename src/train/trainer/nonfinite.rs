@@ -1,0 +1,37 @@
+//! Removes rows with non-finite values; many of them end the run.
+
+use super::{EditEvent, OnNan, TrainError, Trainer};
+use densify_data::views::ViewSource;
+
+/// Steps between two audits where the policy is not due.
+pub(super) const AUDIT_EVERY: u32 = 100;
+/// Largest share of the rows that one audit may remove: so few are not missed, but more of them mean that
+/// the run diverges. One row may always be removed.
+const MAX_SHARE: f64 = 1e-3;
+/// Most rows that one audit names in the log.
+const MAX_NAMED: usize = 10;
+
+impl<V: ViewSource> Trainer<V> {
+    /// Removes the rows that have non-finite values after `step`, if there are any.
+    pub(super) fn remove_nonfinite(&mut self, step: u32) -> Result<Option<EditEvent>, TrainError> {
+        let unsound = self.backend.audit().map_err(|e| self.backend_error(step, e))?;
+        let Some(first) = unsound.first() else {
+            return Ok(None);
+        };
+        let (rows, count) = (self.backend.rows(), unsound.len());
+        for row in unsound.iter().take(MAX_NAMED) {
+            tracing::warn!(step, row = row.row, "non-finite value: {row}");
+        }
+        let few = count as f64 <= (MAX_SHARE * rows as f64).max(1.0) && count < rows;
+        // What does not change cannot become unsound.
+        let frozen = self.options.frozen as u32;
+        let is_frozen = unsound.iter().any(|row| row.row < frozen);
+        if self.options.on_nan == OnNan::Stop || !few || is_frozen {
+            return Err(TrainError::Unsound { step, count, rows, first: first.to_string() });
+        }
+        let mut plan = self.new_plan();
+        plan.cause("not finite");
+        plan.prune_all(unsound.into_iter().map(|row| row.row - frozen));
+        self.execute(step, plan)
+    }
+}

@@ -1,0 +1,67 @@
+//! Calls the policy, and renders training views for its decisions.
+
+use std::any::Any;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
+use densify_policies::policy::{AuxView, PolicyError};
+
+use super::{TrainError, Trainer};
+use densify_data::views::ViewSource;
+use densify_render::AuxInput;
+
+impl<V: ViewSource> Trainer<V> {
+    /// Renders the auxiliary views for the policy's event after `step`, one by one.
+    pub(super) fn show_aux_views(&mut self, step: u32) -> Result<(), TrainError> {
+        let frozen = self.options.frozen;
+        let (rows, budget) = (self.backend.rows() - frozen, self.row_limit() - frozen);
+        let count = call_policy(|| self.policy.aux_views(step, rows, budget));
+        let count = count.map_err(|e| self.policy_error(step, e))? as usize;
+        let Some(request) = self.needs.aux.clone().filter(|_| count > 0) else {
+            return Ok(());
+        };
+        let (options, degree) = (self.options, self.sh_degree(step));
+        for view in self.draw_scored(count, step) {
+            let image = self.image(step, view)?;
+            let exposure = self.exposures.as_ref().map(|exposures| exposures.of(view));
+            let measured = self.backend.observe(&AuxInput {
+                step,
+                view,
+                seed: options.seed,
+                camera: self.views.camera(view),
+                target: &image,
+                background: options.background.at(options.seed, step),
+                exposure: exposure.as_ref(),
+                sh_degree: degree,
+                request: &request,
+            });
+            let mut measured = measured.map_err(|e| self.backend_error(step, e))?;
+            for (_, column) in &mut measured.columns {
+                column.drain(..frozen);
+            }
+            self.extra_forwards += 1;
+            let (loss, columns, points) = (measured.loss, &measured.columns, &measured.points);
+            let view = AuxView { step, rows, loss, columns, points };
+            let seen = call_policy(|| self.policy.observe(&view)).and_then(|done| done);
+            seen.map_err(|source| self.policy_error(step, source))?;
+        }
+        Ok(())
+    }
+}
+
+/// The result of `call`. A policy may come from anywhere: if it panics, the run ends with an error that names
+/// it, and the model can still be read. After a panic the policy is not called again, so its state does not
+/// matter; its calls change nothing else but the plan, which is dropped.
+///
+/// # Errors
+/// [`PolicyError::Other`] with the message of the panic.
+pub(super) fn call_policy<T>(call: impl FnOnce() -> T) -> Result<T, PolicyError> {
+    catch_unwind(AssertUnwindSafe(call)).map_err(|panic| {
+        let message = panic_message(&*panic);
+        PolicyError::Other(format!("it panicked: {message}; this is a bug in the policy"))
+    })
+}
+
+fn panic_message(panic: &(dyn Any + Send)) -> &str {
+    let text = panic.downcast_ref::<String>().map(String::as_str);
+    text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("no message")
+}

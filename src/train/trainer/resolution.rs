@@ -1,0 +1,63 @@
+//! Training on smaller images, where the policy asks for it.
+//!
+//! *EAGLES*, Girish et al. 2024, begins with small images and raises their size along the run. A view's
+//! camera shrinks with its image, so that the model stays in the same coordinates.
+
+use std::sync::Arc;
+
+use densify_policies::policy::PolicyError;
+
+use super::policy_views::call_policy;
+use super::{TrainError, Trainer};
+use densify_core::camera::Camera;
+use densify_core::image::SharedImage;
+use densify_data::views::ViewSource;
+
+/// Images are not shrunk below this side: nothing could be learned from them `[px]`.
+const MIN_SIDE: u32 = 16;
+
+impl<V: ViewSource> Trainer<V> {
+    /// The view's camera, and its image, at the size that the policy wants at this step.
+    pub(super) fn at_resolution(
+        &self,
+        step: u32,
+        view: usize,
+        image: SharedImage,
+    ) -> Result<(Camera, SharedImage), TrainError> {
+        let share = call_policy(|| self.policy.resolution(step)).and_then(|share| {
+            self.needs.check_resolution(share).map_err(PolicyError::Other)?;
+            Ok(share)
+        });
+        let share = share.map_err(|e| self.policy_error(step, e))?;
+        let camera = *self.views.camera(view);
+        let (width, height) = shrunk((camera.width, camera.height), share);
+        if (width, height) == (camera.width, camera.height) {
+            return Ok((camera, image));
+        }
+        Ok((camera.resized(width, height), Arc::new(image.shrunk(width, height))))
+    }
+}
+
+/// Both sides times `share`, rounded down, as far as [`MIN_SIDE`] allows.
+fn shrunk((width, height): (u32, u32), share: f64) -> (u32, u32) {
+    let least = f64::from(MIN_SIDE) / f64::from(width.min(height));
+    let share = share.max(least).min(1.0);
+    // A product just below a whole number counts as this number.
+    let side = |side: u32| ((f64::from(side) * share + 1e-6) as u32).max(1);
+    (side(width), side(height))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sides_are_shrunk_alike_and_not_below_the_least() {
+        assert_eq!(shrunk((256, 192), 0.3), (76, 57));
+        assert_eq!(shrunk((100, 50), 0.7), (70, 35));
+        assert_eq!(shrunk((256, 192), 1.0), (256, 192));
+        // 16 / 64 of both.
+        assert_eq!(shrunk((256, 64), 0.1), (64, 16));
+        assert_eq!(shrunk((9, 300), 0.1), (9, 300));
+    }
+}

@@ -1,0 +1,51 @@
+//! Checks before the first step: that scene, options, views, backend and policy agree.
+
+use densify_policies::policy::{DensityPolicy, Needs, SceneInfo};
+
+use super::{TrainError, TrainOptions};
+use densify_render::Backend;
+
+/// Checks that scene, options, views and backend agree.
+pub(super) fn check_options(
+    scene: &SceneInfo,
+    options: &TrainOptions,
+    views: usize,
+    backend: &dyn Backend,
+) -> Result<(), TrainError> {
+    let bad = |reason: String| Err(TrainError::BadOption(reason));
+    if views == 0 {
+        return bad("there is no training view; use a larger --test-every or add images".into());
+    }
+    if u32::try_from(views) != Ok(scene.train_views) {
+        return bad(format!("{views} views, but the scene has {}", scene.train_views));
+    }
+    if options.iterations == 0 || options.iterations != scene.iterations {
+        let (here, there) = (options.iterations, scene.iterations);
+        return bad(format!("--iterations is {here} (scene: {there}); both must be equal, >= 1"));
+    }
+    if !(scene.extent.is_finite() && scene.extent > 0.0) {
+        return bad(format!("the scene's extent is {}; it must be positive", scene.extent));
+    }
+    if let Some(rate) = options.rates.invalid() {
+        return bad(format!("learning rate `{rate}` must be a positive number"));
+    }
+    let (rows, budget) = (backend.rows(), backend.budget());
+    let frozen = options.frozen;
+    if budget != scene.budget + frozen || rows > budget || rows < frozen {
+        let of_scene = scene.budget;
+        return bad(format!("{rows} rows, {frozen} frozen, budget {budget} (scene: {of_scene})"));
+    }
+    Ok(())
+}
+
+/// The needs of a run, if their numbers are valid.
+pub(super) fn checked_needs(
+    name: &str,
+    policy: &dyn DensityPolicy,
+    scene: &SceneInfo,
+) -> Result<Needs, TrainError> {
+    let needs = policy.needs(scene);
+    let bad = |why| TrainError::BadOption(format!("the needs of policy `{name}`: {why}"));
+    needs.check().map_err(bad)?;
+    Ok(needs)
+}
