@@ -2,7 +2,7 @@
 //! extreme is tested.
 //!
 //! A backend is compared with the float64 reference, which `central.rs` checks by central differences;
-//! how near to it is said with each figure (`docs/numerics.md` has them all). Where a decision of the
+//! how near to it is said with each figure (`docs/studies/selftest.tsv` has them all). Where a decision of the
 //! renderer is close, the comparison is of another kind (`compare.rs`, whose tests make it fail).
 //! Properties that hold for any scene are in `properties.rs`.
 //!

@@ -9,7 +9,7 @@
 //! `undeclared` is about what takes no bytes;
 //! `spatial` is a policy that reads and edits where rows are. `cli` runs the program on photographs of a small scene,
 //! and holds policies to surfaces that are known; `fuzz` damages files; `gpu` is what only the GPU backend has;
-//! `invariants` keeps the walls of ARCHITECTURE.md standing.
+//! `invariants` keeps the walls of ARCHITECTURE.md standing, and `documents` keeps the documents true and short.
 
 mod agreement;
 mod aux_views;
@@ -17,6 +17,7 @@ mod candidates;
 mod central;
 mod cli;
 mod declared;
+mod documents;
 mod edits;
 mod exposure;
 mod extremes;

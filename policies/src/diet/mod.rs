@@ -38,7 +38,7 @@
 //! `split` is `long-axis`; `full_depth` suppresses floaters that explain single photographs; `rho` and
 //! `rho_c` limit the whole run, as replacing too many Gaussians overfits; and `max_scale` is 0, as
 //! pruning by size (0.1 after step `max_scale_from` in paper and code) can remove all of a wall, which
-//! nothing replaces. docs/comparison.md has the figures.
+//! nothing replaces. docs/studies has the figures.
 //!
 //! Each event is one plan in which pruning frees slots before new Gaussians take them, so the budget holds
 //! at every instant. The published code exceeds it between insertion and the next pruning; this is not

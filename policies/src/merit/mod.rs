@@ -4,7 +4,7 @@
 //! children of those that photographs pull at from several sides. A scene in which much is badly placed
 //! replaces much, one in which all Gaussians earn their place little.
 //!
-//! Source: our own; docs/merit.md has the figures. The turnover, the gradient with its colour term and the
+//! Source: our own; docs/comparison.md has the figures. The turnover, the gradient with its colour term and the
 //! guard against near views are from *Gaussians on a Diet* (arXiv 2604.20046, our `diet`); the absolute
 //! gradient, splits along the longest axis and the square-root curve from *Improving Densification in 3D
 //! Gaussian Splatting* (Deng et al. 2025, our `igs`).
@@ -89,7 +89,7 @@ crate::register_policy!(
     "merit",
     Merit,
     summary: "replaces what hardly shows, as much as there is of it",
-    source: "our own, docs/merit.md",
+    source: "our own, docs/comparison.md",
     doc: include_str!("mod.rs"),
 );
 

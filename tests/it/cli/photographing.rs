@@ -82,7 +82,7 @@ fn score(root: &Path, name: &str, options: &str, seed: u32) -> f64 {
 }
 
 /// Against the true test views, which are of a pinhole and show nobody. Two runs on the same scene differ by
-/// 0.2 dB of themselves, so three pairs count. Measured: -0.1 dB with a lens (docs/data.md), but -0.5 dB where its
+/// 0.2 dB of themselves, so three pairs count. Measured: -0.1 dB with a lens, but -0.5 dB where its
 /// photographs are resampled bilinearly; 0.0 dB with masks. 0.3 dB are promised; 0.1 dB more is for machines
 /// that round otherwise.
 #[test]
