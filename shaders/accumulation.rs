@@ -18,7 +18,7 @@ pub enum Accumulation {
 }
 
 impl Accumulation {
-    /// All of them, the fastest last, as measured in docs/performance.md.
+    /// All of them, the fastest last, as measured in docs/studies/accumulation.tsv.
     pub const ALL: [Self; 3] = [Self::Slots, Self::SubgroupAtomics, Self::SubgroupCas];
 
     /// Its name, as the knob `accumulation` has it.

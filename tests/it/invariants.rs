@@ -48,16 +48,9 @@ fn found_in(words: &[String], may: impl Fn(&str) -> bool) -> Vec<String> {
 #[test]
 fn only_the_gpu_backend_names_wgpu() {
     let wgpu = ["wgpu::".to_owned()];
-    let found = found_in(&wgpu, |path| path.starts_with("src/backend/gpu"));
+    let found = found_in(&wgpu, |path| path.starts_with("src/render/gpu"));
     assert!(found.is_empty(), "{found:#?}");
     assert!(!found_in(&wgpu, |_| false).is_empty(), "the search finds nothing at all");
-}
-
-#[test]
-fn the_library_does_not_know_the_command_line() {
-    let may = |path: &str| path.starts_with("src/cli/") || path == "src/main.rs";
-    let found = found_in(&["crate::cli".to_owned(), "densify::cli".to_owned()], may);
-    assert!(found.is_empty(), "{found:#?}");
 }
 
 #[test]
@@ -65,7 +58,7 @@ fn the_trainer_names_no_policy() {
     let all = policies().expect("the registry is sound");
     let words = |name: &str| [format!("\"{name}\""), format!("densify_policies::{name}")];
     let words: Vec<String> = all.iter().flat_map(|entry| words(entry.name)).collect();
-    let found = found_in(&words, |path| !path.starts_with("src/trainer"));
+    let found = found_in(&words, |path| !path.starts_with("src/train/trainer"));
     assert!(!words.is_empty() && found.is_empty(), "{found:#?}");
 }
 
@@ -86,30 +79,77 @@ fn every_shader_has_a_native_file_of_the_same_name() {
         assert!(shaders.contains(two) && shaders.remove(&format!("{two}_atomic")), "{two}");
     }
     assert!(shaders.len() >= 9, "{shaders:?}");
-    let native = names("src/backend/cpu", ".rs");
+    let native = names("src/render/cpu", ".rs");
     assert!(shaders.is_subset(&native), "no native twin: {:?}", shaders.difference(&native));
 }
 
-/// The packages that a member names; what others need it cannot name.
-fn dependencies(member: &str) -> Vec<String> {
-    let manifest: toml::Table = read(&root().join(member).join("Cargo.toml")).parse().unwrap();
-    let named = manifest["dependencies"].as_table().expect("it has some");
-    named.keys().cloned().collect()
+/// The packages of the workspace, lowest layer first. A package names only those of lower layers.
+const LAYERS: [&[(&str, &str)]; 9] = [
+    &[
+        ("densify-core", "src/core"),
+        ("densify-policies", "policies"),
+        ("densify-scenegen", "scenegen"),
+        ("densify-shaders", "shaders"),
+    ],
+    &[("densify-data", "src/data"), ("densify-render", "src/render")],
+    &[("densify-train", "src/train")],
+    &[("densify-run", "src/run"), ("densify-selftest", "src/tools/selftest")],
+    &[
+        ("densify-compress", "src/tools/compress"),
+        ("densify-html", "src/tools/html"),
+        ("densify-launch", "src/tools/launch"),
+    ],
+    &[
+        ("densify-blocks", "src/tools/blocks"),
+        ("densify-study", "src/tools/study"),
+        ("densify-view", "src/tools/view"),
+    ],
+    &[("densify-report", "src/tools/report")],
+    &[("densify-cli", "src/cli")],
+    &[("densify", ".")],
+];
+
+/// The packages that a package names; what others need it cannot name.
+fn dependencies(folder: &str) -> Vec<String> {
+    let manifest: toml::Table = read(&root().join(folder).join("Cargo.toml")).parse().unwrap();
+    let named = manifest.get("dependencies").and_then(toml::Value::as_table);
+    named.map_or_else(Vec::new, |named| named.keys().cloned().collect())
 }
 
 #[test]
-fn policies_depend_on_no_device_no_image_and_not_on_the_root() {
-    let found = dependencies("policies");
-    for forbidden in ["wgpu", "image", "rayon", "densify", "densify-scenegen"] {
-        assert!(!found.iter().any(|name| name == forbidden), "densify-policies names {forbidden}");
+fn packages_name_only_those_below_them() {
+    let mut below: BTreeSet<&str> = BTreeSet::new();
+    let mut named = 0;
+    for layer in LAYERS {
+        for (package, folder) in layer {
+            for name in dependencies(folder).iter().filter(|name| name.starts_with("densify")) {
+                assert!(below.contains(&**name), "{package} names {name}, which is not below it");
+                named += 1;
+            }
+        }
+        below.extend(layer.iter().map(|(package, _)| *package));
+    }
+    assert!(named > 50, "only {named} dependencies were found");
+    let workspace: toml::Table = read(&root().join("Cargo.toml")).parse().unwrap();
+    let members = workspace["workspace"]["members"].as_array().unwrap().iter();
+    let listed: BTreeSet<&str> = LAYERS.iter().flat_map(|l| l.iter().map(|(_, f)| *f)).collect();
+    for member in members.filter_map(toml::Value::as_str).filter(|m| !m.starts_with("tests/")) {
+        assert!(listed.contains(member), "{member} has no layer");
     }
 }
 
 #[test]
-fn scenegen_depends_on_neither_of_the_others() {
-    let found = dependencies("scenegen");
-    for forbidden in ["densify", "densify-policies", "wgpu"] {
-        assert!(!found.iter().any(|name| name == forbidden), "densify-scenegen names {forbidden}");
+fn leaves_depend_on_no_device() {
+    for (leaf, forbidden) in [
+        ("policies", &["wgpu", "image", "rayon"][..]),
+        ("scenegen", &["wgpu"]),
+        ("src/core", &["wgpu", "image", "rayon", "clap"]),
+        ("src/data", &["wgpu"]),
+        ("src/render", &["image", "gltf"]),
+    ] {
+        let found = dependencies(leaf);
+        let bad = found.iter().find(|name| forbidden.contains(&name.as_str()));
+        assert!(bad.is_none(), "{leaf} names {bad:?}");
     }
 }
 
