@@ -44,6 +44,7 @@ pub use densify_cli as cli;
 pub use densify_compress as compress;
 pub use densify_core as core;
 pub use densify_data as data;
+pub use densify_inspect as inspect;
 pub use densify_launch as launch;
 pub use densify_render as render;
 pub use densify_run as run;

@@ -7,11 +7,11 @@ use std::path::PathBuf;
 use clap::{ArgMatches, Args};
 
 use super::console::Console;
-use super::limits::{self, Limit};
 use super::render::{Named, RenderingArgs};
 use densify_core::numbers::{grouped, percent};
+use densify_inspect::{Bound, Limit, LimitError, Limits, measured_values};
 use densify_run::RunConfig;
-use densify_run::failure::Failure;
+use densify_run::failure::{Failure, INPUT, LIMIT};
 use densify_run::finished::{is_model, iteration};
 use densify_run::likeness::Likeness;
 use densify_train::evaluate::{Comparison, FittedScore, Mean, Split, evaluate};
@@ -73,6 +73,7 @@ Examples:
 
 pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> Result<(), Failure> {
     let model = &args.model;
+    let limits = Limits { lowest: &args.fail_below, highest: &args.fail_above };
     // A folder without config.toml is no run, whatever else it holds.
     let run = match is_model(model) {
         true => None,
@@ -86,7 +87,7 @@ pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> R
     let mut opened = named.open(&rendering, geometry::needs(), matches, console)?;
     let views = opened.views(args.split)?;
     let knows_geometry = opened.dataset.surface_bytes.is_some();
-    limits::check_keys(knows_geometry, lpips.is_some(), &args.fail_below, &args.fail_above)?;
+    limits.check_keys(knows_geometry, lpips.is_some()).map_err(in_options)?;
     let background = opened.data.background.fixed();
     let width = opened.dataset.train.iter().chain(&opened.dataset.test);
     let width = width.map(|view| view.name.chars().count()).max().unwrap_or(0).max(6);
@@ -120,7 +121,20 @@ pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> R
             write_geometry(model, args.split, iteration, measured)?;
         }
     }
-    limits::check(&limits::values(&mean, geometry.as_ref()), &args.fail_below, &args.fail_above)
+    limits.check(&measured_values(&mean, geometry.as_ref())).map_err(in_options)
+}
+
+/// The error in the words of the options.
+fn in_options(error: LimitError) -> Failure {
+    let code = match error {
+        LimitError::Unknown { .. } => INPUT,
+        LimitError::Exceeded(_) => LIMIT,
+    };
+    let message = error.message(|bound| match bound {
+        Bound::Lowest => "--fail-below",
+        Bound::Highest => "--fail-above",
+    });
+    Failure { code, message }
 }
 
 /// The geometric measurements as lines; lengths as percentages of the diagonal.

@@ -14,7 +14,6 @@
 //! }
 //! ```
 
-mod animation;
 mod blocks;
 mod compress;
 mod console;
@@ -26,7 +25,6 @@ mod film;
 mod flags;
 mod interrupt;
 mod knobs;
-mod limits;
 mod plan;
 mod policies;
 mod progress;

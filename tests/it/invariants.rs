@@ -97,6 +97,7 @@ const LAYERS: [&[(&str, &str)]; 9] = [
     &[
         ("densify-compress", "src/tools/compress"),
         ("densify-html", "src/tools/html"),
+        ("densify-inspect", "src/tools/inspect"),
         ("densify-launch", "src/tools/launch"),
     ],
     &[

@@ -13,9 +13,11 @@ use densify_core::files::{OutputError, write_atomically};
 use densify_core::gaussians::Gaussians;
 use densify_core::numbers::gaussians;
 use densify_data::export::{Format, find, find_by_extension, formats, is_unfit};
+use densify_inspect::Reference;
+use densify_run::RunConfig;
 use densify_run::failure::{Failure, INPUT};
-use densify_run::finished::{model_file, read_model};
-use table::{Line, Truth};
+use densify_run::finished::{Machine, model_file, read_model};
+use table::Line;
 
 /// The name that stands for every format.
 const ALL: &str = "all";
@@ -81,9 +83,9 @@ pub(super) fn run(
         check_output(path, args.overwrite)?;
     }
     let model = read_model(&source, console)?;
-    let mut truth = match &args.scene {
+    let mut reference = match &args.scene {
         None => None,
-        Some(scene) => Some(Truth::open(args, is_run, scene, &model, console)?),
+        Some(scene) => Some(open_reference(args, is_run, scene, &model, console)?),
     };
     let mut lines = Vec::new();
     let mut unfit = None;
@@ -98,9 +100,9 @@ pub(super) fn run(
             }
             Err(failure) => return Err(failure),
         }
-        let psnr = match &mut truth {
+        let psnr = match &mut reference {
             None => None,
-            Some(truth) => Some(truth.compare(read_model(path, console)?)?),
+            Some(reference) => Some(reference.psnr_of(read_model(path, console)?)?),
         };
         console.result(format_args!(
             "{} in {} ({})",
@@ -113,10 +115,28 @@ pub(super) fn run(
     if let Some(failure) = unfit.filter(|_| lines.is_empty()) {
         return Err(failure);
     }
-    if truth.is_some() || lines.len() > 1 {
+    if reference.is_some() || lines.len() > 1 {
         console.result(table::table(&lines, model.len()));
     }
     Ok(())
+}
+
+/// The model itself, to compare what was written with.
+fn open_reference(
+    args: &ExportArgs,
+    is_run: bool,
+    scene: &Path,
+    model: &Gaussians,
+    console: &Console,
+) -> Result<Reference, Failure> {
+    let (data, near) = if is_run {
+        let spec = RunConfig::read(&args.model)?.spec;
+        (spec.data, spec.start.near.0)
+    } else {
+        (args.rendering.data.clone(), args.rendering.near.0)
+    };
+    let machine = Machine::open(&args.rendering.device, console)?;
+    Reference::open(args.model.display(), model, scene, data, (near, machine), console)
 }
 
 /// Formats, each with its file.

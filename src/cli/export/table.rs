@@ -1,22 +1,11 @@
-//! What each format takes, and how near its pictures are to the model's own.
+//! The table of `densify export`: the size of each format, and how closely it reproduces the model.
 
 use std::fmt::Write as _;
 use std::path::Path;
 
-use super::ExportArgs;
-use crate::console::Console;
 use densify_core::files::OutputError;
-use densify_core::gaussians::Gaussians;
 use densify_core::numbers::{grouped, percent};
-use densify_data::dataset::Dataset;
-use densify_data::views::ViewSource;
-use densify_render::Backend;
-use densify_run::RunConfig;
 use densify_run::failure::Failure;
-use densify_run::finished::{Machine, load, views_of};
-use densify_run::likeness::Likeness;
-use densify_train::evaluate::Split;
-use densify_train::metrics::psnr_between;
 
 /// A format that was written.
 pub(super) struct Line {
@@ -29,61 +18,6 @@ impl Line {
     pub(super) fn of(name: &'static str, path: &Path, psnr: Option<f64>) -> Result<Self, Failure> {
         let bytes = path.metadata().map_err(OutputError::io("read", path))?.len();
         Ok(Self { name, bytes, psnr })
-    }
-}
-
-/// The model itself, on the views that were held out.
-pub(super) struct Truth {
-    dataset: Dataset,
-    machine: Machine,
-    /// Distance `[scene units]`.
-    near: f32,
-    background: [f32; 3],
-    sh_degree: u8,
-    backend: Box<dyn Backend>,
-}
-
-impl Truth {
-    pub(super) fn open(
-        args: &ExportArgs,
-        is_run: bool,
-        scene: &Path,
-        model: &Gaussians,
-        console: &Console,
-    ) -> Result<Self, Failure> {
-        let (mut data, near) = match is_run {
-            true => {
-                let spec = RunConfig::read(&args.model)?.spec;
-                (spec.data, spec.start.near.0)
-            }
-            false => (args.rendering.data.clone(), args.rendering.near.0),
-        };
-        data.eval = data.test_every.is_none();
-        let machine = Machine::open(&args.rendering.device, console)?;
-        let dataset = load(scene, &data, console)?;
-        let near = (near * dataset.extent()) as f32;
-        let mut backend = machine.backend(&dataset, model.clone(), near)?;
-        let (background, sh_degree) = (data.background.fixed(), model.sh_degree);
-        let views = views_of(&dataset, Split::Test)?;
-        // Pictures without the model are alike in every format.
-        Likeness::of(backend.as_mut(), &views, (background, sh_degree))?
-            .note(args.model.display(), console);
-        Ok(Self { dataset, machine, near, background, sh_degree, backend })
-    }
-
-    /// PSNR `[dB]` of another model's pictures against this one's, mean over views.
-    pub(super) fn compare(&mut self, other: Gaussians) -> Result<f64, Failure> {
-        let degree = other.sh_degree;
-        let mut backend = self.machine.backend(&self.dataset, other, self.near)?;
-        let views = views_of(&self.dataset, Split::Test)?;
-        let mut sum = 0.0;
-        for view in 0..views.count() {
-            let camera = views.camera(view);
-            let ours = self.backend.render(camera, self.background, self.sh_degree)?;
-            let theirs = backend.render(camera, self.background, degree)?;
-            sum += psnr_between(&ours.rgb, &theirs.rgb);
-        }
-        Ok(sum / views.count() as f64)
     }
 }
 

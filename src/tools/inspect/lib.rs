@@ -1,0 +1,13 @@
+//! Shows what a trained model looks like: pictures and depth, films along camera paths, how closely another format
+//! reproduces it, and whether its scores keep given limits. Prints nothing.
+
+mod animation;
+mod fidelity;
+mod film;
+mod limits;
+mod pictures;
+
+pub use fidelity::Reference;
+pub use film::{CameraRoute, Film, FilmError, FilmOptions, FilmSource};
+pub use limits::{Bound, Limit, LimitError, Limits, measured_values};
+pub use pictures::{Channels, PictureFolder, file_names};

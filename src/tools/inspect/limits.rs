@@ -1,0 +1,237 @@
+//! Limits on scores, as conditions of a script: which values may not be smaller or larger than a bound.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::str::FromStr;
+
+use serde_json::Value;
+
+use densify_train::evaluate::Mean;
+use densify_train::metrics::geometry::{Geometry, ThinRecall};
+
+/// A bound on a measured value. As text: `KEY=NUMBER`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Limit {
+    /// `psnr`, `ssim`, `flip`, `lpips`, or the path of a number in geometry.json.
+    pub key: String,
+    /// The bound, finite.
+    pub bound: f64,
+}
+
+impl FromStr for Limit {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let (key, bound) = text.split_once('=').unwrap_or((text, ""));
+        match bound.trim().parse() {
+            Ok(bound) if f64::is_finite(bound) => Ok(Self { key: key.trim().to_owned(), bound }),
+            _ => Err("give KEY=NUMBER, such as psnr=25".to_owned()),
+        }
+    }
+}
+
+/// The side on which a value may not be.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Bound {
+    /// No smaller value is allowed.
+    Lowest,
+    /// No larger value is allowed.
+    Highest,
+}
+
+/// The limits of an evaluation.
+#[derive(Debug, Clone, Copy)]
+pub struct Limits<'a> {
+    /// Values may not be smaller than these.
+    pub lowest: &'a [Limit],
+    /// Values may not be larger than these.
+    pub highest: &'a [Limit],
+}
+
+/// Why limits are not kept, or cannot be checked.
+#[derive(Debug, Clone, PartialEq)]
+pub enum LimitError {
+    /// No value has this key.
+    Unknown {
+        /// The limit's side.
+        bound: Bound,
+        /// Its key.
+        key: String,
+        /// The keys that exist.
+        known: Vec<String>,
+        /// True if the geometry of the scene is known.
+        has_geometry: bool,
+    },
+    /// Values beyond their limits, each with its side and limit; a value that was not measured is NaN.
+    Exceeded(Vec<(f64, Bound, Limit)>),
+}
+
+/// The values that limits may name: the scores, and every number of geometry.json by its path.
+#[must_use]
+pub fn measured_values(mean: &Mean, geometry: Option<&Geometry>) -> BTreeMap<String, f64> {
+    let mut values = BTreeMap::new();
+    if let Some(geometry) = geometry.and_then(|measured| serde_json::to_value(measured).ok()) {
+        flatten("", &geometry, &mut values);
+    }
+    let lpips = mean.lpips.map(|value| ("lpips", value));
+    let scores = [("psnr", mean.psnr), ("ssim", mean.ssim), ("flip", mean.flip)];
+    for (key, value) in scores.into_iter().chain(lpips) {
+        values.insert(key.to_owned(), value);
+    }
+    values
+}
+
+fn flatten(prefix: &str, value: &Value, values: &mut BTreeMap<String, f64>) {
+    let path = |key: &str| match prefix {
+        "" => key.to_owned(),
+        prefix => format!("{prefix}.{key}"),
+    };
+    match value {
+        Value::Object(map) => map.iter().for_each(|(key, it)| flatten(&path(key), it, values)),
+        Value::Array(list) => {
+            (0..).zip(list).for_each(|(at, it): (u32, _)| {
+                flatten(&path(&at.to_string()), it, values);
+            });
+        }
+        // A value that was not measured keeps no limit.
+        Value::Null => _ = values.insert(prefix.to_owned(), f64::NAN),
+        value => values.extend(value.as_f64().map(|number| (prefix.to_owned(), number))),
+    }
+}
+
+impl Limits<'_> {
+    fn each(&self) -> impl Iterator<Item = (Bound, &Limit)> {
+        let lowest = self.lowest.iter().map(|limit| (Bound::Lowest, limit));
+        lowest.chain(self.highest.iter().map(|limit| (Bound::Highest, limit)))
+    }
+
+    /// Fails, before anything is measured, where a limit names a value that will not be.
+    ///
+    /// # Errors
+    /// [`LimitError::Unknown`].
+    pub fn check_keys(&self, has_geometry: bool, has_lpips: bool) -> Result<(), LimitError> {
+        let example = Geometry { thin: vec![ThinRecall::default()], ..Geometry::default() };
+        let lpips = has_lpips.then_some(0.0);
+        let mean = Mean { psnr: 0.0, ssim: 0.0, flip: 0.0, lpips, fitted: None };
+        let known = measured_values(&mean, has_geometry.then_some(&example));
+        for (bound, Limit { key, .. }) in self.each() {
+            // The number of widths of thin structures is found by measuring.
+            let first = |part| if str::parse::<u32>(part).is_ok() { "0" } else { part };
+            let like = key.split('.').map(first).collect::<Vec<_>>().join(".");
+            if !known.contains_key(&like) {
+                return Err(LimitError::unknown(bound, key, &known));
+            }
+        }
+        Ok(())
+    }
+
+    /// Fails where a value is beyond its limit, or was not measured.
+    ///
+    /// # Errors
+    /// [`LimitError::Exceeded`] with every such value; [`LimitError::Unknown`] for a key that does not exist.
+    pub fn check(&self, values: &BTreeMap<String, f64>) -> Result<(), LimitError> {
+        let mut exceeded = Vec::new();
+        for (bound, limit) in self.each() {
+            let Some(&value) = values.get(&limit.key) else {
+                return Err(LimitError::unknown(bound, &limit.key, values));
+            };
+            let is_kept = match bound {
+                Bound::Lowest => value >= limit.bound,
+                Bound::Highest => value <= limit.bound,
+            };
+            if !is_kept {
+                exceeded.push((value, bound, limit.clone()));
+            }
+        }
+        if exceeded.is_empty() { Ok(()) } else { Err(LimitError::Exceeded(exceeded)) }
+    }
+}
+
+impl LimitError {
+    fn unknown(bound: Bound, key: &str, known: &BTreeMap<String, f64>) -> Self {
+        let has_geometry = known.contains_key("depth.rmse");
+        let known = known.keys().cloned().collect();
+        Self::Unknown { bound, key: key.to_owned(), known, has_geometry }
+    }
+
+    /// The message, with each side's option spelled as `spell` says.
+    pub fn message(&self, spell: impl Fn(Bound) -> &'static str) -> String {
+        match self {
+            Self::Unknown { bound, key, known, has_geometry } => {
+                let geometry = if *has_geometry {
+                    ""
+                } else {
+                    "; geometry is known of built-in scenes, and of those that `densify scenegen` wrote"
+                };
+                let lpips =
+                    if key == "lpips" { "; LPIPS is measured with --lpips FILE" } else { "" };
+                format!(
+                    "{}: nothing called `{key}` is measured; there are {}{geometry}{lpips}",
+                    spell(*bound),
+                    known.join(", ")
+                )
+            }
+            Self::Exceeded(values) => {
+                let line = |(value, bound, Limit { key, bound: number }): &(f64, Bound, Limit)| {
+                    format!("{key} is {value}, beyond {} {key}={number}", spell(*bound))
+                };
+                values.iter().map(line).collect::<Vec<_>>().join("\n")
+            }
+        }
+    }
+}
+
+impl fmt::Display for LimitError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let name = |bound| match bound {
+            Bound::Lowest => "lowest",
+            Bound::Highest => "highest",
+        };
+        f.write_str(&self.message(name))
+    }
+}
+
+impl std::error::Error for LimitError {}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn values_beyond_their_limits_are_named() {
+        let mean = Mean { psnr: 24.5, ssim: 0.9, flip: 0.1, lpips: None, fitted: None };
+        let mut values = measured_values(&mean, None);
+        flatten("", &serde_json::json!({ "depth": { "rmse": 0.02 }, "thin": [null] }), &mut values);
+        let limit = |text: &str| vec![text.parse::<Limit>().unwrap()];
+        let check = |lowest: &str, highest: &str| {
+            Limits { lowest: &limit(lowest), highest: &limit(highest) }.check(&values)
+        };
+        assert_eq!(check("psnr=24.5", "flip=0.1"), Ok(()));
+        let exceeded = check("psnr=25", "depth.rmse=0.01").unwrap_err();
+        assert!(matches!(&exceeded, LimitError::Exceeded(values) if values.len() == 2));
+        for words in ["psnr is 24.5", "lowest psnr=25", "depth.rmse is 0.02"] {
+            assert!(exceeded.to_string().contains(words), "{exceeded}");
+        }
+        assert!(matches!(check("thin.0=0", "flip=1"), Err(LimitError::Exceeded(_))));
+        let unknown = check("PSNR=1", "flip=1").unwrap_err();
+        let is_unknown = matches!(unknown, LimitError::Unknown { .. });
+        assert!(is_unknown && unknown.to_string().contains("psnr, ssim"), "{unknown}");
+        let early = |has_geometry, has_lpips, key: &str| {
+            Limits { lowest: &limit(&format!("{key}=1")), highest: &[] }
+                .check_keys(has_geometry, has_lpips)
+        };
+        for key in ["flip", "centres.f_score_one_percent", "thin.3.recall", "normal_error"] {
+            assert_eq!(early(true, false, key), Ok(()), "{key}");
+            let message = early(false, false, key).err().map(|error| error.to_string());
+            let told = message.is_some_and(|it| it.contains("flip") && it.contains("scenegen"));
+            assert_eq!(told, key != "flip", "{key}");
+        }
+        assert_eq!(early(false, true, "lpips"), Ok(()));
+        assert!(early(true, false, "lpips").unwrap_err().to_string().contains("--lpips"));
+        let typo = early(true, false, "depth.rsme").unwrap_err();
+        assert!(typo.to_string().contains("depth.rmse"), "{typo}");
+        for bad in ["psnr", "psnr=", "psnr=nan", "=x"] {
+            assert!(bad.parse::<Limit>().is_err(), "{bad}");
+        }
+    }
+}
