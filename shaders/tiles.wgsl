@@ -40,7 +40,7 @@ const ARGS_ROW_DIGITS: u32 = 6u;
 const ARGS_ENTRY_BLOCKS: u32 = 9u;
 const ARGS_ENTRY_DIGITS: u32 = 12u;
 
-// What is summed (now.a of scan_blocks and scan_sums).
+// The numbers to sum (now.a of scan_blocks and scan_sums).
 const FLAGS: u32 = 0u;
 const COUNTS_ALL: u32 = 1u;
 const COUNTS_BAND: u32 = 2u;

@@ -146,7 +146,7 @@ pub enum Reset {
     /// All [`Signal`](crate::signals::Signal)s that accumulate; neither `WeightMax` (kept per epoch) nor the
     /// current state of rows (`Opacity`, `ScaleMax`, `ScaleProduct`, `Age`, attributes).
     Signals,
-    /// Those of the given signals that accumulate; for signals that are reset at their own intervals.
+    /// The given signals, except those that do not accumulate; for signals with a reset interval of their own.
     Only(SignalSet),
     /// The list of candidates.
     Candidates,

@@ -10,7 +10,7 @@ pub enum SignalKind {
     /// Summed over the views in which the row was visible since the last
     /// [`Reset::Signals`](crate::plan::Reset::Signals), or since the row was created.
     Sum,
-    /// The same for integers.
+    /// An integer sum over the same views.
     Count,
     /// The largest value of the previous and the current epoch.
     EpochMaximum,
@@ -254,7 +254,7 @@ impl Signals {
         Self::zeros_in(Vec::new(), rows, set)
     }
 
-    /// The same, in the allocation of `values`, whose contents are discarded.
+    /// Like [`zeros`](Self::zeros), in the allocation of `values`, whose contents are discarded.
     #[must_use]
     pub fn zeros_in(mut values: Vec<f32>, rows: usize, set: SignalSet) -> Self {
         values.clear();

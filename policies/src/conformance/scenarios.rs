@@ -17,7 +17,7 @@ pub(super) struct Scenario {
 
 /// Maximum number of events of a run, which bounds the time of policies that are due at every step.
 const MOST_EVENTS: usize = 400;
-/// The same for models of [`MANY`] rows.
+/// Maximum number of events of a run with models of [`MANY`] rows.
 const MOST_EVENTS_OF_MANY: usize = 40;
 /// Rows of a large model, in which a small fraction is still several rows.
 const MANY: usize = 5_000;

@@ -53,7 +53,7 @@ pub enum Hit {
 pub enum Volume {
     /// The product of the standard deviations.
     Plain,
-    /// The same, clipped at its 90th percentile.
+    /// The product of the standard deviations, clipped at its 90th percentile.
     Clipped,
 }
 

@@ -1,4 +1,4 @@
-//! # merit — replaces hardly visible Gaussians, as many as there are
+//! # merit — replaces all hardly visible Gaussians
 //!
 //! Fills the budget slowly and keeps replacing: Gaussians that are hardly visible in any view make room for
 //! children of Gaussians that have large gradients in several views. The number of replacements adapts to
@@ -90,7 +90,7 @@ pub use parameters::{Gradient, MeritParams};
 crate::register_policy!(
     "merit",
     Merit,
-    summary: "replaces hardly visible Gaussians, as many as there are",
+    summary: "replaces all hardly visible Gaussians",
     source: "our own, docs/merit.md",
     doc: include_str!("mod.rs"),
 );

@@ -137,7 +137,7 @@ pub enum DepthMode {
     /// The ray's closest point, in Mahalanobis distance, to the Gaussian with the largest blend
     /// weight (Mini-Splatting).
     MaxWeight,
-    /// The same for the Gaussian at which transmittance first falls below one half.
+    /// The ray's closest point to the Gaussian at which transmittance first falls below one half.
     Median,
 }
 

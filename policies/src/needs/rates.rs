@@ -9,8 +9,8 @@ use super::above_zero;
 pub struct Cadence {
     /// Iterations per optimiser step, for all parameters; >= 1.
     pub all: u32,
-    /// The same for the spherical-harmonic coefficients of bands 1–3, which step at most as often as
-    /// the others; >= 1.
+    /// Iterations per step of the spherical-harmonic coefficients of bands 1–3; the larger of the two
+    /// intervals applies to them; >= 1.
     pub sh_rest: u32,
 }
 
@@ -21,7 +21,7 @@ impl Default for Cadence {
 }
 
 impl Cadence {
-    /// Whether the optimiser steps after iteration `step`, for `[the other parameters, the
+    /// True where the optimiser steps after iteration `step`: for `[all other parameters, the
     /// spherical-harmonic coefficients of bands 1–3]`.
     #[must_use]
     pub fn steps_at(self, step: u32) -> [bool; 2] {
@@ -78,7 +78,7 @@ pub struct Fade {
 }
 
 impl Rate {
-    /// The same from start to end.
+    /// A rate that does not change during the run.
     #[must_use]
     pub const fn constant(rate: f64) -> Self {
         Self { start: rate, end: rate }

@@ -292,8 +292,8 @@ fn packets_find_the_same_as_single_rays() {
                 let hidden = surface.occluded_each(&rays, &mut hint, |slot, _| accept(slot));
                 for (lane, ray) in rays.iter().enumerate() {
                     let alone = surface.closest(ray, None, None, |slot, _| accept(slot));
-                    let told = |hit: Option<LocalHit>| hit.map(|hit| (hit.slot, hit.at));
-                    assert_eq!(told(found[lane]), told(alone), "{count} triangles, {ray:?}");
+                    let summary = |hit: Option<LocalHit>| hit.map(|hit| (hit.slot, hit.at));
+                    assert_eq!(summary(found[lane]), summary(alone), "{count} triangles, {ray:?}");
                     assert_eq!(has(hidden, lane), alone.is_some(), "{count} triangles, {ray:?}");
                     met += usize::from(alone.is_some());
                 }

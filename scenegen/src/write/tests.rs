@@ -389,9 +389,9 @@ fn colmap_tracks_and_reprojection_errors_are_consistent() {
         observed += distances.len();
         let mean = distances.iter().sum::<f64>() / distances.len() as f64;
         let expected = if distances.is_empty() { -1.0 } else { mean };
-        let told = number(&point[7]);
-        assert!((told - expected).abs() <= 1e-6 * (1.0 + expected), "{told}, not {expected}");
-        errors.push(told);
+        let error = number(&point[7]);
+        assert!((error - expected).abs() <= 1e-6 * (1.0 + expected), "{error}, not {expected}");
+        errors.push(error);
     }
     // Each feature belongs to one track.
     let features: usize = views.values().map(|(_, features)| features.len() / 3).sum();
