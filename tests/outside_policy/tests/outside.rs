@@ -67,7 +67,8 @@ fn policy_trains() {
     };
     let frames: Vec<_> = (0..3).map(frame).collect();
     let scene = serde_json::json!({ "w": 32, "h": 24, "fl_x": 40.0, "frames": frames });
-    std::fs::write(root.path().join("transforms.json"), scene.to_string()).expect("the scene is written");
+    std::fs::write(root.path().join("transforms.json"), scene.to_string())
+        .expect("the scene is written");
     let run = root.path().join("run");
     let (code, output) = densify(&format!(
         "train {} -o {} --policy steady --policy-set steady.grow_every=10 --policy-set \
