@@ -1,10 +1,11 @@
-//! How a training step would do on many cores, computed from the times of its tasks on one.
+//! Predicts the speed-up of a training step on many cores from the times of its tasks on one core.
 //!
-//! Regions follow each other. In each, every core takes the next task as soon as it has none; what is in
-//! no region is done by one core. Nothing else is modelled: memory that cores share and the cost of
-//! waking them are not, so that these are upper bounds. `cargo bench --bench cores [-- ROWS@SIZE...]`
+//! A step consists of parallel regions, one after the other, and of serial work between them. In a
+//! region, a core takes the next task as soon as it is free. Contention for memory and the cost of
+//! waking cores are not modelled, so these are upper bounds.
+//! `cargo bench --bench cores [-- ROWS@SIZE...]`
 
-#![expect(clippy::print_stdout, reason = "its output is a table")]
+#![expect(clippy::print_stdout, reason = "the output is a table")]
 
 mod steps;
 
@@ -19,49 +20,49 @@ use densify_policies::policy::{CandidateRequest, DepthMode, ErrorMode, Needs, Si
 
 use steps::{median, ms};
 
-/// Numbers of cores.
+/// Numbers of cores to predict for.
 const CORES: [usize; 2] = [16, 64];
 
-/// A median step.
+/// Median times of a step.
 struct Step {
-    /// What is in no region.
+    /// Time outside of all regions.
     serial: Duration,
     regions: Vec<(&'static str, Vec<Duration>)>,
 }
 
 impl Step {
-    /// Medians over the steps that have as many tasks as the last; steps look for a few pixels more or
-    /// less.
+    /// Medians over the steps with the same number of tasks as the last one; the numbers vary with the
+    /// pixels selected as candidates.
     fn median(mut steps: Vec<StepTasks>) -> Self {
-        let tasks = |step: &StepTasks| -> Vec<usize> {
+        let task_counts = |step: &StepTasks| -> Vec<usize> {
             step.regions.iter().map(|(_, tasks)| tasks.len()).collect()
         };
-        let usual = steps.last().map(tasks);
-        steps.retain(|step| Some(tasks(step)) == usual);
-        let of_regions = |step: &StepTasks| step.regions.iter().flat_map(|(_, tasks)| tasks).sum();
-        let serial = |step: &StepTasks| step.total.saturating_sub(of_regions(step));
+        let last = steps.last().map(task_counts);
+        steps.retain(|step| Some(task_counts(step)) == last);
+        let parallel = |step: &StepTasks| step.regions.iter().flat_map(|(_, tasks)| tasks).sum();
+        let serial = |step: &StepTasks| step.total.saturating_sub(parallel(step));
         let regions = steps[0].regions.iter().enumerate();
         let median_task = |region: usize, task: usize| {
             median(steps.iter().map(|step| step.regions[region].1[task]).collect())
         };
-        let tasks = |region, n| (0..n).map(|task| median_task(region, task)).collect();
+        let medians = |region, count| (0..count).map(|task| median_task(region, task)).collect();
         Self {
             serial: median(steps.iter().map(serial).collect()),
-            regions: regions.map(|(i, (name, of))| (*name, tasks(i, of.len()))).collect(),
+            regions: regions.map(|(i, (name, tasks))| (*name, medians(i, tasks.len()))).collect(),
         }
     }
 
     fn total(&self) -> Duration {
-        self.on(1)
+        self.time_on(1)
     }
 
-    /// What it takes on so many cores.
-    fn on(&self, cores: usize) -> Duration {
+    /// Predicted time on `cores` cores.
+    fn time_on(&self, cores: usize) -> Duration {
         self.serial + self.regions.iter().map(|(_, tasks)| schedule(tasks, cores)).sum::<Duration>()
     }
 }
 
-/// When the last of the tasks is done, if each core takes the next one as soon as it has none.
+/// Time until all tasks are done, if each core takes the next one as soon as it is free.
 fn schedule(tasks: &[Duration], cores: usize) -> Duration {
     let mut free: BinaryHeap<Reverse<Duration>> =
         (0..cores).map(|_| Reverse(Duration::ZERO)).collect();
@@ -78,7 +79,7 @@ fn percent(part: Duration, whole: Duration) -> f64 {
     100.0 * part.as_secs_f64() / whole.as_secs_f64().max(1e-12)
 }
 
-/// The steps of a backend on one thread.
+/// Measures steps on one thread.
 fn record(rows: usize, size: u32, needs: Needs) -> Option<Step> {
     let options = Setup {
         threads: Some(1),
@@ -97,7 +98,7 @@ fn record(rows: usize, size: u32, needs: Needs) -> Option<Step> {
     backend.record_tasks();
     let (camera, target) = (steps::camera(size), steps::target(size));
     let mut steps = Vec::new();
-    // A task that the system interrupted must not be the median one.
+    // With enough steps, a task interrupted by the system is not the median.
     for step in 1..=steps::count(rows).max(17) {
         if let Err(error) = backend.train_step(&steps::input(step, &camera, &target)) {
             println!("{error}");
@@ -110,7 +111,7 @@ fn record(rows: usize, size: u32, needs: Needs) -> Option<Step> {
     Some(Step::median(steps))
 }
 
-/// A line per region; regions of one name together.
+/// Prints a line per name of regions.
 fn print_regions(step: &Step) {
     let total = step.total();
     let mut names: Vec<&str> = Vec::new();
@@ -123,17 +124,17 @@ fn print_regions(step: &Step) {
         "  region               times  tasks       ms  share %  largest task %  of {CORES:?} cores busy %"
     );
     for name in names {
-        let of_name = || step.regions.iter().filter(|region| region.0 == name);
-        let tasks = || of_name().flat_map(|region| &region.1);
+        let regions = || step.regions.iter().filter(|region| region.0 == name);
+        let tasks = || regions().flat_map(|region| &region.1);
         let time: Duration = tasks().sum();
         let largest = tasks().copied().max().unwrap_or_default();
         let busy = CORES.map(|cores| {
-            let spent: Duration = of_name().map(|region| schedule(&region.1, cores)).sum();
+            let spent: Duration = regions().map(|region| schedule(&region.1, cores)).sum();
             format!("{:.0}", percent(time, spent) / cores as f64)
         });
         println!(
             "  {name:20} {:5} {:6} {:8.3} {:8.2} {:15.3}  {}",
-            of_name().count(),
+            regions().count(),
             tasks().count(),
             ms(time),
             percent(time, total),
@@ -143,16 +144,16 @@ fn print_regions(step: &Step) {
     }
 }
 
-fn print_summary(step: &Step, what: &str) {
+fn print_summary(step: &Step, title: &str) {
     let total = step.total();
     let tasks = step.regions.iter().flat_map(|(name, tasks)| tasks.iter().map(move |t| (t, name)));
     let (largest, name) = tasks.max().map_or((Duration::ZERO, "none"), |(t, name)| (*t, name));
     let speed_ups = CORES.map(|cores| {
-        format!("{:.1} on {cores}", total.as_secs_f64() / step.on(cores).as_secs_f64())
+        format!("{:.1} on {cores}", total.as_secs_f64() / step.time_on(cores).as_secs_f64())
     });
     println!(
-        "{what}: {:.2} ms; in no region {:.3} ms, {:.3} %; largest task {:.3} % ({name}); \
-         {} regions; at most {} cores",
+        "{title}: {:.2} ms; serial {:.3} ms, {:.3} %; largest task {:.3} % ({name}); \
+         {} regions; speed-up of at most {} cores",
         ms(total),
         ms(step.serial),
         percent(step.serial, total),
@@ -162,8 +163,8 @@ fn print_summary(step: &Step, what: &str) {
     );
 }
 
-/// A policy that wants errors by pixel and candidates of each step.
-fn demanding(rows: usize) -> Needs {
+/// The needs of a policy that uses errors per pixel and candidates at every step.
+fn largest_needs(rows: usize) -> Needs {
     let candidates = CandidateRequest {
         from: 0,
         until: u32::MAX,
@@ -192,8 +193,8 @@ fn main() {
             print_summary(&step, &format!("{rows}@{size}"));
             print_regions(&step);
         }
-        if let Some(step) = record(rows, size, demanding(rows)) {
-            print_summary(&step, &format!("{rows}@{size}, candidates and errors by pixel"));
+        if let Some(step) = record(rows, size, largest_needs(rows)) {
+            print_summary(&step, &format!("{rows}@{size}, candidates and errors per pixel"));
         }
     }
 }

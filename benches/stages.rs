@@ -1,11 +1,11 @@
 //! Measures the time per training step and per stage on random scenes.
 //!
-//! Runs on one, on two and on all threads, and on every adapter with each of its methods to add up gradients
-//! (software adapters: small scenes only). `cargo bench --bench stages [-- ROWS@SIZE] [avx2]`, such as
-//! `10000@256` for one scene; `avx2` is for machines that have more. Times are medians: processor time,
-//! which a loaded machine distorts little, wall time, and the wall time of each stage.
+//! Runs on one, two and all threads, and on every adapter with each of its methods of accumulating
+//! gradients (software adapters: small scenes only). `cargo bench --bench stages [-- ROWS@SIZE] [avx2]`:
+//! `10000@256` selects one scene; `avx2` limits the CPU backend to AVX2. Times are medians: CPU time,
+//! which depends little on the load of the machine, wall time, and the wall time of each stage.
 
-#![expect(clippy::print_stdout, reason = "its output is a table")]
+#![expect(clippy::print_stdout, reason = "the output is a table")]
 
 mod steps;
 
@@ -19,13 +19,14 @@ use densify::render::{AdapterChoice, AdapterKind, Backend, BackendError, Setup};
 use pulp::{Arch, Simd, WithSimd};
 use steps::{median, ms};
 
-/// Multiply-adds on twelve independent vectors: 1.5 times as many as two units of latency four need.
+/// Multiply-adds on twelve independent vectors; two units with a latency of four cycles need eight.
 struct MultiplyAdds {
     rounds: u32,
 }
 
 impl WithSimd for MultiplyAdds {
-    /// A sum, so that no work is optimised away, and the number of operations, two per multiply-add.
+    /// A sum, which prevents the work from being optimised away, and the number of operations, two per
+    /// multiply-add.
     type Output = (f32, f64);
 
     #[inline(always)]
@@ -62,12 +63,12 @@ fn peak() -> (f64, f64) {
     rates
 }
 
-/// Prints a line with medians over all steps but the first two.
-fn measure(backend: Result<Box<dyn Backend>, BackendError>, rows: usize, size: u32, on: &str) {
+/// Prints a line of medians over all steps but the first two.
+fn measure(backend: Result<Box<dyn Backend>, BackendError>, rows: usize, size: u32, device: &str) {
     let mut backend = match backend {
         Ok(backend) => backend,
         Err(error) => {
-            println!("{rows} rows on {on}: {error}");
+            println!("{rows} rows on {device}: {error}");
             return;
         }
     };
@@ -99,7 +100,7 @@ fn measure(backend: Result<Box<dyn Backend>, BackendError>, rows: usize, size: u
         .map(|(&(name, _), times)| format!("{name} {:.2}", ms(median(times))))
         .collect();
     println!(
-        "{rows:7} {size:5}² {entries:9} {on:>10} {:7.2} {:8.2}  {}",
+        "{rows:7} {size:5}² {entries:9} {device:>10} {:7.2} {:8.2}  {}",
         ms(median(cpu)),
         ms(median(wall)),
         line.join(", ")
@@ -120,19 +121,19 @@ fn main() {
                 AdapterChoice { name: Some(adapter.name.clone()), accumulation: Some(method) };
             devices.extend(GpuDevice::open(&choice).map(|device| (device, "")).ok());
             let timed = GpuDevice::open_with_clock(&choice).ok();
-            devices.extend(timed.map(|device| (device, ", stage by stage, which takes longer")));
+            devices.extend(timed.map(|device| (device, ", timed per stage, which takes longer")));
         }
     }
-    for (i, (device, what)) in devices.iter().enumerate() {
+    for (i, (device, note)) in devices.iter().enumerate() {
         let (adapter, method) = (device.adapter(), device.accumulation());
-        println!("adapter {i}: {}, {}, accumulation={method}{what}", adapter.name, adapter.driver);
+        println!("adapter {i}: {}, {}, accumulation={method}{note}", adapter.name, adapter.driver);
     }
     let all = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
-    let mut numbers_of_threads = vec![1, 2];
+    let mut thread_counts = vec![1, 2];
     if all > 2 {
-        numbers_of_threads.push(all);
+        thread_counts.push(all);
     }
-    println!("   rows  image   entries         on  CPU ms  wall ms  stages [ms]");
+    println!("   rows  image   entries     device  CPU ms  wall ms  stages [ms]");
     for (rows, size) in [
         (10_000, 256),
         (10_000, 512),
@@ -145,7 +146,7 @@ fn main() {
             continue;
         }
         let model = steps::scene(rows, 3);
-        for &threads in &numbers_of_threads {
+        for &threads in &thread_counts {
             let options = Setup {
                 instructions,
                 threads: Some(threads),
@@ -154,8 +155,8 @@ fn main() {
                 ..Setup::new(rows)
             };
             let backend = CpuBackend::new(&model, &options);
-            let on = if threads == 1 { "1 thread".into() } else { format!("{threads} threads") };
-            measure(backend.map(|b| Box::new(b) as Box<dyn Backend>), rows, size, &on);
+            let name = if threads == 1 { "1 thread".into() } else { format!("{threads} threads") };
+            measure(backend.map(|b| Box::new(b) as Box<dyn Backend>), rows, size, &name);
         }
         for (i, (device, _)) in devices.iter().enumerate() {
             if device.adapter().kind == AdapterKind::Software && rows > 50_000 {
@@ -163,8 +164,8 @@ fn main() {
             }
             let options = Setup { largest_image: (size, size), ..Setup::new(rows) };
             let backend = GpuBackend::new(&model, &options, device);
-            let on = format!("adapter {i}");
-            measure(backend.map(|b| Box::new(b) as Box<dyn Backend>), rows, size, &on);
+            let name = format!("adapter {i}");
+            measure(backend.map(|b| Box::new(b) as Box<dyn Backend>), rows, size, &name);
         }
     }
 }

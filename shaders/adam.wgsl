@@ -1,16 +1,18 @@
-// Stage 7: Adam, with the bias correction of each row's own age; src/backend/cpu/adam.rs. Bands of
-// colour come first, each buffer by itself, one parameter per invocation, so that neighbours read
-// neighbours: their gradient is the basis at the direction of view times dL/dcolour, formed here and
-// never stored. The geometry comes last, one row per invocation, and with it what a policy adds: terms of the loss, and noise on the means (regularise.rs); gradients
-// are summed over views where the optimiser steps less often than every iteration (summed.rs).
+// Stage 7: Adam with a bias correction by each row's age; src/backend/cpu/adam.rs.
+// The coefficients of colour come first: one kernel per band, one parameter per invocation, so that
+// reads are coalesced. Their gradient, the basis at the view direction times dL/dcolour, is computed
+// here and never stored. The geometry comes last, one row per invocation, together with the loss
+// terms and the noise on means that policies add (regularise.rs). Where the optimiser does not step
+// at every iteration, gradients are summed until it does (summed.rs).
 
 @group(0) @binding(1) var<storage, read> state: State;
-// Parameters; moments and the gradients summed so far, of rows that are not frozen.
+// Parameters of all rows; moments and waiting gradients of the rows that are not frozen.
 @group(0) @binding(2) var<storage, read_write> params: array<f32>;
 @group(0) @binding(3) var<storage, read_write> first: array<f32>;
 @group(0) @binding(4) var<storage, read_write> second: array<f32>;
 @group(0) @binding(5) var<storage, read_write> waiting: array<f32>;
-// Lower half: steps of all but bands 1-3; upper half: of these, where they step apart.
+// Lower half: steps of all parameters but bands 1-3; upper half: steps of bands 1-3, if they have
+// a schedule of their own.
 @group(0) @binding(6) var<storage, read_write> ages: array<u32>;
 // See project_bwd.wgsl.
 @group(0) @binding(7) var<storage, read> gradient: array<vec4<f32>>;
@@ -34,8 +36,9 @@ fn is_set(bit: u32) -> bool {
     return (frame.draw.z & bit) != 0u;
 }
 
-// The gradient of a parameter together with what waits for it, at `own`; or 0 where it goes on waiting.
-fn exchange(own: u32, g: f32, steps: bool, waited: bool) -> f32 {
+// Adds g to the waiting gradient at `own`: returns the sum if the optimiser steps now, or else keeps
+// it waiting and returns 0.
+fn take_gradient(own: u32, g: f32, steps: bool, waited: bool) -> f32 {
     if !steps {
         waiting[own] += g;
         return 0.0;
@@ -48,7 +51,7 @@ fn exchange(own: u32, g: f32, steps: bool, waited: bool) -> f32 {
     return g;
 }
 
-// Steps the parameter at `at`, whose moments are at `own`.
+// Steps parameter `at`, whose moments are at `own`.
 fn step(at: u32, own: u32, g: f32, rate: f32, correction: vec2<f32>) {
     let m = first[own] * BETA1 + g * (1.0 - BETA1);
     let v = second[own] * BETA2 + g * g * (1.0 - BETA2);
@@ -57,8 +60,8 @@ fn step(at: u32, own: u32, g: f32, rate: f32, correction: vec2<f32>) {
     params[at] -= m * correction.x * rate / (sqrt(v) * correction.y + EPSILON);
 }
 
-// The steps counted so far and the one at hand, of a half of `ages`.
-fn grown(age: u32) -> u32 {
+// An age after one more step; ages fill half a word.
+fn next_age(age: u32) -> u32 {
     return min(age + 1u, 0xffffu);
 }
 
@@ -87,7 +90,7 @@ fn basis_of(k: u32, d: vec3<f32>) -> f32 {
     }
 }
 
-// One band; now.a: its first coefficient, now.b: coefficients.
+// One band; now.a: its first coefficient, now.b: its number of coefficients.
 @compute @workgroup_size(256)
 fn adam_band(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -108,17 +111,17 @@ fn adam_band(
     let waited = is_set(select(MAIN_WAITED, REST_WAITED, is_rest));
     let rate = select(frame.more_rates.x, frame.more_rates.y, is_rest);
     let apart = is_rest && is_set(REST_AGES);
-    let age = grown(select(ages[own] & 0xffffu, ages[own] >> 16u, apart));
+    let age = next_age(select(ages[own] & 0xffffu, ages[own] >> 16u, apart));
     let correction = bias[min(age, MATURE)];
     let d = gradient[5u * own + 4u].xyz;
     let g = basis_of(now.a + k, d) * gradient[5u * own + 3u][channel];
-    let sum = exchange(own_at, g, steps, waited);
+    let sum = take_gradient(own_at, g, steps, waited);
     if steps {
         step(at, own_at, sum, rate, correction);
     }
 }
 
-// Everything but colour; counts the steps.
+// All parameters but colour; updates the ages.
 @compute @workgroup_size(256)
 fn adam_geometry(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -132,7 +135,7 @@ fn adam_geometry(
     let waited = is_set(MAIN_WAITED);
     let own = row - frame.frozen.x;
     let age = ages[own];
-    let correction = bias[min(grown(age & 0xffffu), MATURE)];
+    let correction = bias[min(next_age(age & 0xffffu), MATURE)];
     let base = 12u * row;
     var add = array<f32, 11>();
     if is_set(TERMS) {
@@ -145,7 +148,7 @@ fn adam_geometry(
     }
     for (var k = 0u; k < 11u; k++) {
         let g = gradient[5u * own + k / 4u][k % 4u] + add[k];
-        let sum = exchange(12u * own + k, g, steps, waited);
+        let sum = take_gradient(12u * own + k, g, steps, waited);
         if steps {
             var rate = frame.rates.x;
             if k >= 3u { rate = frame.rates.y; }
@@ -157,24 +160,24 @@ fn adam_geometry(
     var main_age = age & 0xffffu;
     var rest_age = age >> 16u;
     if steps {
-        main_age = grown(main_age);
+        main_age = next_age(main_age);
         confine(base);
         if is_set(NOISE) {
             add_noise(row, base);
         }
     }
     if is_set(REST_STEPS) && is_set(REST_AGES) {
-        rest_age = grown(rest_age);
+        rest_age = next_age(rest_age);
     }
     ages[own] = main_age | rest_age << 16u;
 }
 
-// Brings the parameters of a row back to where they are safe.
+// Normalises the quaternion of a row, and clamps its scales and opacity.
 fn confine(base: u32) {
     let q = vec4(params[base + 6u], params[base + 7u], params[base + 8u], params[base + 9u]);
     let norm2 = dot(q, q);
-    // A quaternion this short has no direction left; it starts again without rotation. Here and
-    // below, NaN stays NaN: an audit shall find it.
+    // A quaternion this short has lost its direction, and is reset to no rotation. Here and below,
+    // NaN stays NaN, for the audit to find.
     var unit = q / sqrt(norm2);
     if below(norm2, 1e-12) {
         unit = vec4(1.0, 0.0, 0.0, 0.0);

@@ -1,13 +1,13 @@
 // Stage 9: executes a compiled plan in place, in chunks of operations; src/backend/cpu/apply.rs.
-// Pass 1 writes families, updates and seeds, no row twice; pass 2 moves tail rows into holes and brings all
-// rows into their order. Each buffer that has rows is edited by itself; in those that have none for frozen rows,
-// rows are counted from the first that is not.
+// Pass 1 writes families, updates and seeds, no row twice; pass 2 moves rows from the end into holes
+// and sorts the rows. Each buffer is edited by itself; buffers without frozen rows start at the first
+// row that is not frozen.
 
-// Numbers per operation.
+// Words per operation.
 const WORDS: u32 = 20u;
 
 @group(0) @binding(1) var<storage, read> ops: array<u32>;
-// Any buffer with rows.
+// Any buffer with one or several numbers per row.
 @group(0) @binding(2) var<storage, read_write> buffer: array<u32>;
 // The geometry: twelve numbers per row.
 @group(0) @binding(3) var<storage, read_write> rows: array<f32>;
@@ -17,8 +17,8 @@ const WORDS: u32 = 20u;
 @group(0) @binding(7) var<storage, read_write> waiting_rows: array<f32>;
 @group(0) @binding(8) var<storage, read> signals: array<f32>;
 
-// The operation of a lane, and the number of the row that it works on. now.a: operations, now.b: numbers per
-// row, now.c: distance between rows, now.d: between the numbers of a row.
+// The operation of an invocation, and which of its row's numbers it works on. now.a: operations,
+// now.b: numbers per row, now.c: stride of rows, now.d: stride of the numbers of a row.
 fn operation_of(id: vec3<u32>, lane: u32) -> vec2<u32> {
     let i = group_of(id) * GROUP + lane;
     return vec2(i / now.b, i % now.b);
@@ -28,7 +28,7 @@ fn place_of(row: u32, number: u32) -> u32 {
     return row * now.c + number * now.d;
 }
 
-// Operations (from, to): copies row `from`, or clears `to` where it is NONE.
+// Operations (from, to): copies row `from` to `to`, or clears `to` if `from` is NONE.
 @compute @workgroup_size(256)
 fn copy_rows(@builtin(workgroup_id) id: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
     let op = operation_of(id, lane);
@@ -44,7 +44,7 @@ fn copy_rows(@builtin(workgroup_id) id: vec3<u32>, @builtin(local_invocation_ind
     }
 }
 
-// Operations (a, b): exchanges two rows; no row twice.
+// Operations (a, b): swaps two rows; no row occurs twice.
 @compute @workgroup_size(256)
 fn swap_rows(@builtin(workgroup_id) id: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
     let op = operation_of(id, lane);
@@ -65,8 +65,9 @@ fn longest(s: vec3<f32>) -> u32 {
     return best;
 }
 
-// The rule at a place of `ops`, and the logarithms of three factors. 0: all by the first; 1: the longest by
-// the first, the others by the second; 2: each by its own; 3: all are the first.
+// Log-scales after the rule at ops[at], which is followed by three terms. 0: the first is added to
+// all; 1: the first to the longest, the second to the others; 2: each to its own axis; 3: all are set
+// to the first.
 fn scales_of(s: vec3<f32>, at: u32) -> vec3<f32> {
     let rule = ops[at];
     let terms = vec3(real(at + 1u), real(at + 2u), real(at + 3u));
@@ -85,24 +86,25 @@ fn scales_of(s: vec3<f32>, at: u32) -> vec3<f32> {
     return changed;
 }
 
-// ln(o / (1 − o)) where 1 − o is known to its last bit.
+// ln(o / (1 − o)), given 1 − o at full precision.
 fn logit_of(opacity: f32, complement: f32) -> f32 {
     return log(opacity) - log(complement);
 }
 
-// Rule 0: the same, 1: this logit, 2: opacity times a factor, 3: conserved by so many siblings.
+// A logit after a rule. 0: unchanged; 1: set to `value`; 2: opacity times `value`; 3: `value` siblings
+// together transmit as much light as the parent.
 fn logit_after(logit: f32, rule: u32, value: f32) -> f32 {
     let opacity = sigmoid(logit);
     let complement = sigmoid(-logit);
     switch rule {
         case 1u: { return value; }
         case 2u: {
-            // 1 − o·f = (1 − o) + o·(1 − f): nothing cancels.
+            // 1 − o·f as (1 − o) + o·(1 − f), without cancellation.
             return logit_of(opacity * value, complement + opacity * (1.0 - value));
         }
         case 3u: {
             let left = pow(complement, 1.0 / value);
-            // 1 − left: for small opacities by its series, where the difference would cancel.
+            // 1 − left; by a series for small opacities, where the difference would cancel.
             let ln_left = -minus_ln_complement(opacity, complement) / value;
             let part = select(1.0 - left, -expm1_small(ln_left), ln_left > -0.1);
             return logit_of(part, left);
@@ -151,10 +153,11 @@ fn put(row: u32, mean: vec3<f32>, log_scale: vec3<f32>, quat: vec4<f32>, logit: 
     rows[base + 10u] = logit;
 }
 
-// Families; now.a: how many, now.b: seed, now.c: step. An operation: parent, place of the first
-// child's slot in `ops`, children, number of the first, whether the parent becomes child 0,
-// placement (0: offset, 1: sampled, 2: along the longest axis, 3: along all axes), three numbers of it, scale
-// rule, three numbers of it, opacity rule, its number, turn ×4, unused.
+// Families; now.a: their number, now.b: seed, now.c: step. Words of an operation: parent; index in
+// `ops` of the first child's row; number of children; index of the first child in its family; 1 if the
+// parent is overwritten by child 0; placement (0: offset, 1: sampled, 2: along the longest axis,
+// 3: along all axes) and three numbers for it; scale rule and three numbers; opacity rule and its
+// number; rotation ×4; unused.
 @compute @workgroup_size(256)
 fn breed(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -211,8 +214,8 @@ fn offset_of(op: u32, child: u32, parent: u32, log_scale: vec3<f32>, quat: vec4<
     }
 }
 
-// Updates; now.a: how many. An operation: row, scale rule, three numbers of it, opacity rule, its
-// number, whether there is a mean, the mean, whether there are coefficients of band 0, these, unused ×5.
+// Updates; now.a: their number. Words of an operation: row; scale rule and three numbers; opacity rule
+// and its number; 1 if the mean is set; the mean; 1 if band 0 is set; its three coefficients; unused ×5.
 @compute @workgroup_size(256)
 fn rewrite(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -238,8 +241,8 @@ fn rewrite(
     rows[base + 10u] = logit_after(rows[base + 10u], ops[op + 5u], real(op + 6u));
 }
 
-// Seeds; now.a: how many. An operation: row, mean, log-scales, quaternion, logit, three coefficients of
-// band 0, unused ×5. Their other coefficients were cleared before.
+// Seeds; now.a: their number. Words of an operation: row; mean; log-scales; quaternion; logit; three
+// coefficients of band 0; unused ×5. The other coefficients have been cleared.
 @compute @workgroup_size(256)
 fn sow(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -259,12 +262,12 @@ fn sow(
     }
 }
 
-// Where opacities stop that decay.
+// Opacities decay down to this.
 const OPACITY_LEAST: f32 = 2e-4;
 
-// Takes something off opacities and scales; now.a: rows, now.b: bits of what opacities lose, now.c: bits of
-// the logarithm of the factor of scales, now.d: where the numbers of views that have shown each row begin in
-// `signals`, or NONE if rows decay that none has shown too. The first number of `ops`: the first row that is not frozen.
+// Decays opacities and scales; now.a: rows, now.b: bits of the amount subtracted from opacities,
+// now.c: bits of the logarithm of the factor of scales, now.d: start of the per-row counts of views in
+// `signals` if only rows seen by a view decay, or else NONE. ops[0]: the first row that is not frozen.
 @compute @workgroup_size(256)
 fn decay(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -280,7 +283,7 @@ fn decay(
     let loss = bitcast<f32>(now.b);
     let base = 12u * row;
     let logit = rows[base + 10u];
-    // What is not finite is left to the audit.
+    // Values that are not finite are left for the audit to find.
     if loss > 0.0 && below(logit, LARGEST) {
         let opacity = sigmoid(logit);
         let left = max(opacity - loss, OPACITY_LEAST);
@@ -291,8 +294,8 @@ fn decay(
     }
 }
 
-// Bounds all opacities and forgets their moments; now.a: rows, now.b: bits of the largest logit,
-// now.c: whether gradients of the opacity wait for a step. The first number of `ops`: the first row that is not frozen.
+// Caps all opacities and clears their moments; now.a: rows, now.b: bits of the largest logit,
+// now.c: 1 if there are waiting gradients to clear. ops[0]: the first row that is not frozen.
 @compute @workgroup_size(256)
 fn clamp_opacity(
     @builtin(workgroup_id) id: vec3<u32>,

@@ -1,13 +1,14 @@
 // Finds rows with a number that is not finite; src/backend/audit.rs. Numbers are read as bits:
 // WGSL may assume that there is no NaN. One row per invocation.
 
-// 0, or 1 + the place of the row's first such number.
+// Per row: 0, or 1 + the index of its first number that is not finite.
 @group(0) @binding(1) var<storage, read_write> marks: array<u32>;
 @group(0) @binding(2) var<storage, read> numbers: array<u32>;
 
 const NOT_FINITE: u32 = 0x7f800000u;
 
-// now.a: rows; now.b: numbers per row; now.c: place of the first; now.d: the first row that has numbers.
+// now.a: rows; now.b: numbers per row; now.c: index of the first number; now.d: the first row that has
+// numbers.
 @compute @workgroup_size(256)
 fn audit(
     @builtin(workgroup_id) id: vec3<u32>,

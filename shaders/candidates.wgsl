@@ -1,4 +1,4 @@
-// The worst pixels of a view, and surface points of chosen pixels, one per invocation;
+// The pixels of a view with the largest errors, and surface points of given pixels, one per invocation;
 // src/backend/cpu/candidates.rs.
 
 @group(0) @binding(1) var<storage, read> state: State;
@@ -7,14 +7,14 @@
 @group(0) @binding(4) var<storage, read> tile_starts: array<u32>;
 @group(0) @binding(5) var<storage, read> splats: array<vec4<f32>>;
 @group(0) @binding(6) var<storage, read> rows: array<f32>;
-// Numbers of the pixels.
+// Indices of the pixels.
 @group(0) @binding(7) var<storage, read> pixels: array<u32>;
-// Where the surface is, and its depth; depth 0 where there is none.
+// Surface points, with their depths; depth 0: no surface.
 @group(0) @binding(8) var<storage, read_write> points: array<vec4<f32>>;
 
 
-// now.a: the band, now.b: how many pixels, now.c: the surface is at the largest blend weight (0) or
-// where half the light is gone (1), now.d: place of the first in `points`.
+// now.a: the band, now.b: number of pixels, now.c: the surface is at the largest blend weight (0) or at
+// transmittance 1/2 (1), now.d: index of the first in `points`.
 @compute @workgroup_size(256)
 fn surface(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -70,10 +70,11 @@ fn surface_row(tile: u32, at: vec2<f32>, is_median: bool) -> u32 {
     return best;
 }
 
-// Where the ray through `at` comes closest to the row, in its Mahalanobis metric; w: the depth there.
+// The point of the ray through `at` that is closest to the row's mean in its Mahalanobis metric;
+// w: its depth.
 fn closest_approach(row: u32, at: vec2<f32>) -> vec4<f32> {
     let ratio = (at - frame.lens.zw) / frame.lens.xy;
-    // Camera z along this vector is 1, so that the parameter of the ray is the depth.
+    // This vector has camera z = 1, so the parameter along the ray is the depth.
     let ray = frame.rotation[0].xyz * ratio.x + frame.rotation[1].xyz * ratio.y + frame.rotation[2].xyz;
     let base = 12u * row;
     let mean = vec3(rows[base], rows[base + 1u], rows[base + 2u]);
@@ -92,26 +93,26 @@ fn closest_approach(row: u32, at: vec2<f32>) -> vec4<f32> {
     return vec4(frame.centre.xyz + ray * depth, depth);
 }
 
-// --- The worst pixels ------------------------------------------------------------------------------
+// --- The pixels with the largest errors: a radix selection -----------------------------------------
 
-// Bits of the final transmittance, and where the pixel stopped.
+// Bits of the final transmittance, and the index at which the pixel stopped.
 @group(0) @binding(9) var<storage, read> finish: array<vec2<u32>>;
 // The error per pixel, or three planes of its gradient.
 @group(0) @binding(10) var<storage, read> map: array<f32>;
-// The first digits of the least error that is wanted; how many are wanted of those that begin so; how
-// many are written down. Then, per digit, how many of those go on so.
+// The leading digits, found so far, of the least selected error; the number of pixels still to select
+// among those with these digits; the number of pixels written. Then a histogram of the next digit.
 @group(0) @binding(11) var<storage, read_write> selection: array<atomic<u32>>;
-// How many there are; then bits of the error, and the pixel, in any order.
+// The number of selected pixels; then, in no particular order, bits of the error and index of each.
 @group(0) @binding(12) var<storage, read_write> worst: array<vec2<u32>>;
 
-// Base of the digits, and where their counts begin.
+// Base of the digits, and start of the histogram.
 const DIGITS: u32 = 256u;
 const COUNTS: u32 = 4u;
 
 var<workgroup> counts: array<atomic<u32>, 256>;
 
-// Bits of the error of a pixel at which a candidate may be, which are in the order of the errors; 0
-// for others. now.c: bits of the least alpha, now.d: 1 where the map is the gradient's.
+// Bits of a pixel's error, which sort like the errors; 0 for a pixel that cannot be a candidate.
+// now.c: bits of the least alpha, now.d: 1 if the map is the gradient.
 fn key_of(pixel: u32) -> u32 {
     let size = frame.image.x * frame.image.y;
     if pixel >= size || !(1.0 - bitcast<f32>(finish[pixel].x) >= bitcast<f32>(now.c)) {
@@ -125,7 +126,7 @@ fn key_of(pixel: u32) -> u32 {
     return select(0u, bitcast<u32>(error), error > 0.0);
 }
 
-// Counts the digits that follow those found; now.a: how far up they stand, now.b: 1 for the first.
+// Counts the digits that follow those found; now.a: their lowest bit, now.b: 1 for the first digit.
 @compute @workgroup_size(256)
 fn count_errors(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -134,7 +135,7 @@ fn count_errors(
     atomicStore(&counts[lane], 0u);
     workgroupBarrier();
     let key = key_of(group_of(id) * GROUP + lane);
-    // A shift by all 32 bits is none.
+    // The first digit is a case of its own: WGSL does not shift by 32 bits.
     if key != 0u && (now.b == 1u || key >> (now.a + 8u) == atomicLoad(&selection[0])) {
         atomicAdd(&counts[(key >> now.a) % DIGITS], 1u);
     }
@@ -145,7 +146,7 @@ fn count_errors(
     }
 }
 
-// now.a: 0 to begin, with now.b wanted; 1 to find the next digit; 2 to say how many were written.
+// now.a: 0: starts a selection of now.b pixels; 1: finds the next digit; 2: stores the number written.
 @compute @workgroup_size(256)
 fn narrow(@builtin(local_invocation_index) lane: u32) {
     if lane == 0u {
@@ -173,8 +174,7 @@ fn narrow(@builtin(local_invocation_index) lane: u32) {
     atomicStore(&selection[COUNTS + lane], 0u);
 }
 
-// Writes down every pixel whose error is not less than the least that is wanted; now.b: how many there
-// is room for.
+// Writes every pixel whose error is at least the least selected one; now.b: capacity.
 @compute @workgroup_size(256)
 fn write_worst(
     @builtin(workgroup_id) id: vec3<u32>,

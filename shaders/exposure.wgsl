@@ -1,20 +1,21 @@
-// The exposure of the photograph at hand, before the loss and after it; src/backend/cpu/exposure.rs. A group
-// has 256 pixels in a row, an invocation of the backward kernel four of them.
+// Applies the exposure of the current photograph before the loss, and backpropagates through it;
+// src/backend/cpu/exposure.rs. A group handles 256 consecutive pixels, and an invocation of the
+// backward kernel four of them.
 
-// Three rows of a matrix, each with the offset of its channel behind it; then the background of the photograph.
+// Three rows of a matrix, each followed by its channel's offset; then the background of the photograph.
 @group(0) @binding(1) var<storage, read> exposure: array<vec4<f32>>;
 @group(0) @binding(2) var<storage, read_write> canvas: array<vec4<f32>>;
 // See rasterize.wgsl.
 @group(0) @binding(3) var<storage, read> finish: array<vec2<u32>>;
 // dL/dpixel: three planes.
 @group(0) @binding(4) var<storage, read_write> gradient: array<f32>;
-// By group, four each: per channel the derivatives times red, green and blue, and their sums; then those times
-// transmittance.
+// Sums of each group, in four vectors: per channel the derivatives times red, green and blue, and the
+// derivatives alone; then, per channel, the derivatives times the transmittance.
 @group(0) @binding(5) var<storage, read_write> exposure_sums: array<vec4<f32>>;
-// The same of the whole image.
+// The same sums over the whole image.
 @group(0) @binding(6) var<storage, read_write> exposure_total: array<vec4<f32>>;
 
-// Invocations of the kernels that add up.
+// Invocations of the kernels that compute sums.
 const ADDERS: u32 = 64u;
 
 var<workgroup> reduced: array<mat4x4<f32>, ADDERS>;
@@ -47,7 +48,7 @@ fn reduced_sum(lane: u32) -> mat4x4<f32> {
     return reduced[0];
 }
 
-// dL/dpixel of the image without the exposure, and the sums of the group.
+// dL/dpixel before the exposure, and the sums of the group.
 @compute @workgroup_size(64)
 fn expose_bwd(
     @builtin(workgroup_id) id: vec3<u32>,

@@ -1,23 +1,23 @@
 // Stage 4: 0.8·L1 + 0.2·(1 − SSIM) and its gradient, one tile per group; src/backend/cpu/loss/.
-// SSIM is written in e = rendering − target, by an exact identity, with the mean of x·y for the variances of
-// both. The 11×11 window is taken apart into columns and rows; beyond the image there are zeros. An
-// invocation sums for eight pixels in a row, whose windows read eighteen values instead of eight times
-// eleven: reading costs more than adding.
+// SSIM is rewritten, exactly, in terms of e = rendering − target and of the mean of x·y, which gives
+// both variances. The 11×11 window is separable; pixels outside the image are zero. An invocation sums
+// eight neighbouring windows at once, which together read 18 values instead of 8 × 11, since reading
+// costs more than adding.
 
 @group(0) @binding(1) var<storage, read_write> state: State;
 @group(0) @binding(2) var<storage, read> canvas: array<vec4<f32>>;
 // Red, green, blue, alpha, a byte each.
 @group(0) @binding(3) var<storage, read> truth: array<u32>;
-// Weights of the pixels, four to a word.
+// Weights of the pixels, one byte each.
 @group(0) @binding(4) var<storage, read> mask: array<u32>;
-// Derivatives of SSIM by the window's mean of e, e² and e·y, per channel: nine planes.
+// Derivatives of SSIM with respect to the window's means of e, e² and e·y, per channel: nine planes.
 @group(0) @binding(5) var<storage, read_write> derivatives: array<f32>;
-// dL/dpixel: three planes; each pixel's part of the loss, where that is asked for, and its weight by edges,
-// where these count.
+// dL/dpixel: three planes; then each pixel's error for the row scores, if requested, and its edge
+// weight, if used.
 @group(0) @binding(6) var<storage, read_write> gradient: array<f32>;
 // Sums of |e| and of SSIM per tile.
 @group(0) @binding(7) var<storage, read_write> tile_sums: array<vec2<f32>>;
-// Error per pixel, where candidates are asked for.
+// Error per pixel, if candidates are requested.
 @group(0) @binding(8) var<storage, read_write> error: array<f32>;
 // See exposure.wgsl.
 @group(0) @binding(9) var<storage, read> exposure: array<vec4<f32>>;
@@ -26,7 +26,7 @@ const C1: f32 = 0.01 * 0.01;
 const C2: f32 = 0.03 * 0.03;
 const SSIM_WEIGHT: f32 = 0.2;
 const REACH: i32 = 5;
-// Side of a tile with its surroundings.
+// Side of a tile with its margin.
 const SIDE: u32 = 26u;
 // Bits of frame.draw.w.
 const HAS_ALPHA: u32 = 1u;
@@ -35,9 +35,9 @@ const WITH_ERROR: u32 = 4u;
 const BY_PIXEL: u32 = 8u;
 const EXPOSED: u32 = 16u;
 
-// Weights of the kth of eighteen values in a row, in the windows around the sixth to the thirteenth, from
-// those of the value before it: what a table of them would be asked for eight times, it is asked once.
-fn moved_on(before: mat2x4<f32>, k: u32) -> mat2x4<f32> {
+// Weights of value k, of 18, in the eight windows centred on values 5 to 12, computed from those of value
+// k − 1: this reads the table once instead of eight times.
+fn next_weights(before: mat2x4<f32>, k: u32) -> mat2x4<f32> {
     var weights = array<f32, 11>(
         0.0010283802, 0.007598758, 0.036000773, 0.10936069, 0.21300553, 0.26601174,
         0.21300553, 0.10936069, 0.036000773, 0.007598758, 0.0010283802,
@@ -57,7 +57,7 @@ fn is_inside(pixel: vec2<i32>) -> bool {
     return all(pixel >= vec2(0)) && all(pixel < vec2<i32>(frame.image.xy));
 }
 
-// e and y of one channel of a pixel; 0 beyond the image.
+// e and y of one channel of a pixel; 0 outside the image.
 fn difference(pixel: vec2<i32>, channel: u32) -> vec2<f32> {
     if !is_inside(pixel) {
         return vec2(0.0);
@@ -76,23 +76,23 @@ fn difference(pixel: vec2<i32>, channel: u32) -> vec2<f32> {
     return vec2((canvas[at][channel] - target_value) * weight_of(at), target_value);
 }
 
-// Values in reach of eight in a row.
+// Values read by eight neighbouring windows.
 const SPAN: u32 = 18u;
-// Eights in a column of the tile, for all columns of its surroundings; eights in the tile's lines.
+// Runs of eight windows in the columns of a tile with its margin, and in the lines of the tile.
 const COLUMNS: u32 = SIDE * TILE / 8u;
 const LINES: u32 = TILE * TILE / 8u;
 
-// A tile with its surroundings: two values per pixel, then up to four per pixel of its columns.
+// A tile with its margin: two values per pixel. Then up to four sums over columns per pixel.
 var<workgroup> around: array<vec2<f32>, 676>;
 var<workgroup> rows: array<vec4<f32>, 416>;
 var<workgroup> reduced: array<vec2<f32>, GROUP>;
 
-// Eight pixels of a line of a tile.
+// Eight neighbouring pixels in a line of a tile.
 struct Eight {
-    // The first one's column, and their line, from the tile's corner [px].
+    // Column of the first, and their line, relative to the tile's corner [px].
     column: u32,
     line: u32,
-    // Place of the first in the image, row after row, and how many are within it.
+    // Index of the first in the image, and how many are inside the image.
     place: u32,
     inside: u32,
 }
@@ -106,18 +106,18 @@ fn eight_of(corner: vec2<u32>, i: u32) -> Eight {
     return Eight(column, line, y * frame.image.x + x, there);
 }
 
-// The pixel at a place of a tile with its surroundings; its coordinates may be outside of the image.
+// Coordinates of pixel i of a tile with its margin; they may be outside the image.
 fn pixel_around(corner: vec2<u32>, i: u32) -> vec2<i32> {
     return vec2<i32>(corner) + vec2(i32(i % SIDE), i32(i / SIDE)) - REACH;
 }
 
-// The first of the ith eight windows below one another, in a tile with its surroundings.
+// The first pixel of the ith run of eight windows in a column, in a tile with its margin.
 fn eighth_of(i: u32) -> u32 {
     return i / SIDE * 8u * SIDE + i % SIDE;
 }
 
-// Sums of four windows below one another, up to four of each, go to their places in `rows`.
-fn keep_four(first: u32, a: vec4<f32>, b: vec4<f32>, c: vec4<f32>, d: vec4<f32>) {
+// Stores the sums of four windows below one another, up to four for each, in `rows`.
+fn store_four(first: u32, a: vec4<f32>, b: vec4<f32>, c: vec4<f32>, d: vec4<f32>) {
     let of_window = transpose(mat4x4(a, b, c, d));
     rows[first] = of_window[0];
     rows[first + SIDE] = of_window[1];
@@ -125,19 +125,19 @@ fn keep_four(first: u32, a: vec4<f32>, b: vec4<f32>, c: vec4<f32>, d: vec4<f32>)
     rows[first + 3u * SIDE] = of_window[3];
 }
 
-// The same of eight windows.
-fn keep_columns(
+// Stores the sums of eight windows below one another.
+fn store_eight(
     first: u32,
     a: mat2x4<f32>,
     b: mat2x4<f32>,
     c: mat2x4<f32>,
     d: mat2x4<f32>,
 ) {
-    keep_four(first, a[0], b[0], c[0], d[0]);
-    keep_four(first + 4u * SIDE, a[1], b[1], c[1], d[1]);
+    store_four(first, a[0], b[0], c[0], d[0]);
+    store_four(first + 4u * SIDE, a[1], b[1], c[1], d[1]);
 }
 
-// SSIM in four pixels, and its derivatives by the window's means.
+// SSIM at four pixels, and its derivatives with respect to the window's means.
 struct Similar {
     ssim: vec4<f32>,
     by_e: vec4<f32>,
@@ -169,8 +169,8 @@ fn similar(
     );
 }
 
-// SSIM, its derivatives, and the sums of the tile. now.a, now.b: bits of the weights of |e| and of
-// 1 − SSIM in the error; now.c, now.d: in what rows are scored by.
+// SSIM, its derivatives, and the sums of the tile. Bits of the weights of |e| and of 1 − SSIM: in the
+// error (now.a, now.b) and in the error for row scores (now.c, now.d).
 @compute @workgroup_size(256)
 fn similarity(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -199,7 +199,7 @@ fn similarity(
             var xy = mat2x4<f32>();
             var w = mat2x4<f32>();
             for (var k = 0u; k < SPAN; k++) {
-                w = moved_on(w, k);
+                w = next_weights(w, k);
                 let here = around[first + k * SIDE];
                 let we = w * here.x;
                 let wy = w * here.y;
@@ -208,7 +208,7 @@ fn similarity(
                 ee += we * here.x;
                 xy += wy * (here.x + here.y);
             }
-            keep_columns(first, e, y, ee, xy);
+            store_eight(first, e, y, ee, xy);
         }
         workgroupBarrier();
         for (var i = lane; i < LINES; i += GROUP) {
@@ -220,7 +220,7 @@ fn similarity(
             var xy = mat2x4<f32>();
             var w = mat2x4<f32>();
             for (var k = 0u; k < SPAN; k++) {
-                w = moved_on(w, k);
+                w = next_weights(w, k);
                 let here = rows[first + k];
                 e += w * here.x;
                 y += w * here.y;
@@ -277,7 +277,7 @@ fn similarity(
     }
 }
 
-// What rows are scored by of a pixel's error, where weights by edges are at this place.
+// A pixel's contribution to row scores, from its error; `place`: index of its edge weight.
 fn weighed(error: f32, place: u32) -> f32 {
     var map = error;
     if frame.score.x != 1.0 {
@@ -289,7 +289,7 @@ fn weighed(error: f32, place: u32) -> f32 {
     return map;
 }
 
-// The sum of `reduced`, for the first invocation.
+// The sum of `reduced`; valid in the first invocation.
 fn reduced_sum(lane: u32) -> vec2<f32> {
     workgroupBarrier();
     for (var half = GROUP / 2u; half > 0u; half /= 2u) {
@@ -324,7 +324,7 @@ fn pixel_gradient(
             var z = mat2x4<f32>();
             var w = mat2x4<f32>();
             for (var k = 0u; k < SPAN; k++) {
-                w = moved_on(w, k);
+                w = next_weights(w, k);
                 let at = top + vec2(0, i32(k));
                 if is_inside(at) {
                     let source = 3u * channel * size + u32(at.y) * frame.image.x + u32(at.x);
@@ -333,7 +333,7 @@ fn pixel_gradient(
                     z += w * derivatives[source + 2u * size];
                 }
             }
-            keep_columns(first, x, y, z, mat2x4<f32>());
+            store_eight(first, x, y, z, mat2x4<f32>());
         }
         workgroupBarrier();
         for (var i = lane; i < LINES; i += GROUP) {
@@ -344,7 +344,7 @@ fn pixel_gradient(
             var z = mat2x4<f32>();
             var w = mat2x4<f32>();
             for (var k = 0u; k < SPAN; k++) {
-                w = moved_on(w, k);
+                w = next_weights(w, k);
                 let here = rows[first + k];
                 x += w * here.x;
                 y += w * here.y;
@@ -358,7 +358,7 @@ fn pixel_gradient(
                     let p = n % 4u;
                     let by_ssim = x[half][p] + 2.0 * ey.x * y[half][p] + ey.y * z[half][p];
                     let g = (1.0 - SSIM_WEIGHT) * scale * sign(ey.x) - SSIM_WEIGHT * scale * by_ssim;
-                    // The loss sees e·mask, so the chain rule has the mask once more.
+                    // The loss is a function of e·mask, so the chain rule multiplies by the mask.
                     let to = eight.place + n;
                     gradient[channel * size + to] = g * weight_of(to);
                 }
@@ -367,7 +367,7 @@ fn pixel_gradient(
     }
 }
 
-// One group: the means over the image.
+// The means over the image; a single group.
 @compute @workgroup_size(256)
 fn total(@builtin(local_invocation_index) lane: u32) {
     var sums = vec2(0.0);

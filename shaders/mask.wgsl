@@ -1,10 +1,10 @@
-// A number per row that learns whether the row is worth its place; src/backend/cpu/mask.rs. One row per
-// invocation, before the geometry steps.
+// Learned masks: one logit per row, trained so that rows that matter little are masked out;
+// src/backend/cpu/mask.rs. One row per invocation, before the geometry steps.
 
 @group(0) @binding(1) var<storage, read> state: State;
 // The geometry: twelve numbers per row.
 @group(0) @binding(2) var<storage, read_write> rows: array<f32>;
-// How far the mask's logit is from where it began; its two moments.
+// Change of each mask's logit since its start; its two moments.
 @group(0) @binding(3) var<storage, read_write> mask_offsets: array<f32>;
 @group(0) @binding(4) var<storage, read_write> mask_moments: array<f32>;
 @group(0) @binding(5) var<storage, read> ages: array<u32>;
@@ -12,8 +12,8 @@
 @group(0) @binding(6) var<storage, read> gradient: array<vec4<f32>>;
 @group(0) @binding(7) var<storage, read> bias: array<vec2<f32>>;
 
-// now.a: bits of the logit at which masks begin, now.b: of the step size, now.c: of the term's derivative by
-// the mask, per row, now.d: of the logit of the threshold.
+// Bits of: the initial logit of masks (now.a), the step size (now.b), the derivative of the loss term
+// with respect to a row's mask (now.c), the logit of the threshold (now.d).
 @compute @workgroup_size(256)
 fn step_masks(
     @builtin(workgroup_id) id: vec3<u32>,

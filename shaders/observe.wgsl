@@ -1,13 +1,13 @@
-// Sums over the pixels that a row is blended into, front to back, for auxiliary views;
+// Sums over the pixels into which a row is blended, front to back, for auxiliary views;
 // src/backend/cpu/observe.rs. One record per entry, as in rasterize_bwd.wgsl.
 
 // The pixel map.
 @group(0) @binding(6) var<storage, read> map: array<f32>;
-// Per slot: the columns of `blended`.
+// Per slot: the columns of `splat_sums`.
 @group(0) @binding(7) var<storage, read_write> records: array<f32>;
 
-// What an invocation finds of splat i at hand; k: of those at a time.
-fn put(
+// An invocation's contribution to the sums of loaded splat i, the kth of a round.
+fn store_splat(
     k: u32,
     i: u32,
     count: u32,
@@ -18,10 +18,10 @@ fn put(
 ) {
     var sums = array<f32, COLUMNS>();
     if i < count {
-        sums = blended(held(i), quad, map_here, pixels);
+        sums = splat_sums(loaded_splat(i), quad, map_here, pixels);
     }
     for (var f = 0u; f < COLUMNS; f++) {
-        put_part(k * COLUMNS + f, lane, sums[f]);
+        store_part(k * COLUMNS + f, lane, sums[f]);
     }
 }
 
@@ -44,22 +44,22 @@ fn replay(
     var first = begin;
     for (; first < end; first += BATCH) {
         let count = min(BATCH, end - first);
-        take_batch(first, count, lane, quad.corner);
-        // Written out, as compilers do not unroll as much as this is.
+        load_batch(first, count, lane, quad.corner);
+        // Unrolled by hand: compilers do not unroll a body of this size.
         var base = 0u;
         for (; base < count; base += SPLATS) {
-            put(0u, base, count, lane, quad, map_here, &pixels);
-            put(1u, base + 1u, count, lane, quad, map_here, &pixels);
-            put(2u, base + 2u, count, lane, quad, map_here, &pixels);
-            put(3u, base + 3u, count, lane, quad, map_here, &pixels);
-            meet();
+            store_splat(0u, base, count, lane, quad, map_here, &pixels);
+            store_splat(1u, base + 1u, count, lane, quad, map_here, &pixels);
+            store_splat(2u, base + 2u, count, lane, quad, map_here, &pixels);
+            store_splat(3u, base + 3u, count, lane, quad, map_here, &pixels);
+            wait_for_all();
             // One invocation per column of each splat.
             let which = base + lane / COLUMNS;
             if lane < SPLATS * COLUMNS && which < count {
                 records[slots[which] * COLUMNS + lane % COLUMNS] =
                     summed(lane, lane % COLUMNS == MAXIMUM);
             }
-            meet();
+            wait_for_all();
         }
         has_ended &= base >= count;
     }
@@ -71,7 +71,7 @@ fn replay(
 @group(0) @binding(10) var<storage, read> all_records: array<f32>;
 @group(0) @binding(11) var<storage, read_write> row_sums: array<f32>;
 
-// Adds a row's records in order; now.a: the band.
+// Sums a row's records in order; now.a: the band.
 @compute @workgroup_size(256)
 fn gather_columns(
     @builtin(workgroup_id) id: vec3<u32>,

@@ -1,11 +1,10 @@
-// Sums over the pixels that a row is blended into, as in observe.wgsl, straight to the sums of rows, as
-// in rasterize_bwd_atomic.wgsl.
+// The sums of observe.wgsl, added directly to those of rows by atomics, as in rasterize_bwd_atomic.wgsl.
 
 // The pixel map.
 @group(0) @binding(6) var<storage, read> map: array<f32>;
 
-// What the subgroup finds of splat i of `count` at hand.
-fn find(
+// The subgroup's contribution to the sums of splat i of the `count` loaded ones.
+fn add_splat(
     i: u32,
     count: u32,
     m: Member,
@@ -16,14 +15,14 @@ fn find(
     if i >= count {
         return;
     }
-    var columns = blended(held(i), quad, map_here, pixels);
+    var columns = splat_sums(loaded_splat(i), quad, map_here, pixels);
     // The second counts pixels.
     if subgroupAny(columns[1] > 0.0) {
         var sums = array<f32, FIELDS>();
         for (var f = 0u; f < COLUMNS; f++) {
             sums[f] = columns[f];
         }
-        deliver(m, i, sums, COLUMNS, MAXIMUM);
+        add_to_row(m, i, sums, COLUMNS, MAXIMUM);
     }
 }
 
@@ -50,15 +49,15 @@ fn replay_atomic(
         }
         let count = min(m.members, end - first);
         if m.place < count {
-            hold(m.place, row_of_slot[list[first + m.place]], quad.corner);
+            load_splat(m.place, row_of_slot[list[first + m.place]], quad.corner);
         }
-        // Four in a round, written out, as in rasterize_bwd_atomic.wgsl.
+        // Four per round, unrolled by hand as in rasterize_bwd_atomic.wgsl.
         var i = 0u;
         for (; i < count; i += 4u) {
-            find(i, count, m, quad, map_here, &pixels);
-            find(i + 1u, count, m, quad, map_here, &pixels);
-            find(i + 2u, count, m, quad, map_here, &pixels);
-            find(i + 3u, count, m, quad, map_here, &pixels);
+            add_splat(i, count, m, quad, map_here, &pixels);
+            add_splat(i + 1u, count, m, quad, map_here, &pixels);
+            add_splat(i + 2u, count, m, quad, map_here, &pixels);
+            add_splat(i + 3u, count, m, quad, map_here, &pixels);
         }
         has_ended &= i >= count;
     }

@@ -2,8 +2,8 @@
 
 // Three per row: mean and l1, shear | l3, log2 of the opacity, depth, unused | colour, unused.
 @group(0) @binding(6) var<storage, read_write> splats: array<vec4<f32>>;
-// Which tiles the row's ellipse touches: columns x0 | x1 << 16, rows y0 | y1 << 16, a bit for each
-// of 8 × 4 blocks of tiles from (x0, y0) on, and the log2 of a block's width | height << 16.
+// The tiles that the row's ellipse touches: columns x0 | x1 << 16, rows y0 | y1 << 16, a bit for each
+// of 8 × 4 blocks of tiles starting at (x0, y0), and the log2 of a block's width | height << 16.
 @group(0) @binding(7) var<storage, read_write> footprints: array<vec4<u32>>;
 // Bits of the depth; NONE for rows that are not on screen.
 @group(0) @binding(8) var<storage, read_write> depths: array<u32>;
@@ -11,7 +11,7 @@
 // Slack for the bounds of an ellipse [px]; see src/backend/cpu/footprint.rs.
 const SLACK: f32 = 0.02;
 
-// Whether a splat reaches any pixel centre, from 1/2 to size - 1/2.
+// True if the splat's extent contains the centre of any pixel; these go from 1/2 to size − 1/2.
 fn reaches(centre: f32, half: f32, size: u32) -> bool {
     return centre + half >= 0.5 && centre - half <= f32(size) - 0.5;
 }
@@ -42,7 +42,7 @@ fn project(
         return;
     }
     let log2_opacity = log2_sigmoid(row.logit);
-    // How far the exponent may fall; <= 0 where even the centre is below 1/255.
+    // Fall of the exponent from the centre to alpha 1/255; <= 0 if the centre is below that.
     let reach = log2_opacity + LOG2_REACH;
     if reach <= 0.0 {
         return;
@@ -57,7 +57,7 @@ fn project(
     let half_height = radius * sqrt(g.cov.z);
     let u = g.ratio.x * frame.lens.x + frame.lens.z;
     let v = g.ratio.y * frame.lens.y + frame.lens.w;
-    // The determinant leaves f32 where a row is some 4e9 px wide; its factors are none then.
+    // The determinant of a row about 4e9 px wide overflows f32, and the factors are then not finite.
     sound = below(g.det, LARGEST) && below(half_width, LARGEST) && below(half_height, LARGEST)
         && below(u, LARGEST) && below(v, LARGEST) && below(factor.x, LARGEST)
         && below(factor.y, LARGEST);
@@ -78,7 +78,7 @@ fn project(
     splats[3u * i + 2u] = vec4(max(raw, vec3(0.0)), 0.0);
     depths[i] = bitcast<u32>(g.p.z);
 
-    // The tiles: per line of blocks, the ellipse's leftmost and rightmost points within it bound them.
+    // Tiles: in each line of blocks, from the ellipse's leftmost to its rightmost point in that line.
     let hw = half_width * 1.0001 + SLACK;
     let hh = half_height * 1.0001 + SLACK;
     let columns = frame.image.z;

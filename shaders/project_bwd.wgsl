@@ -1,11 +1,12 @@
 // Stage 6: splat gradients to parameter gradients, one row per invocation;
-// src/backend/cpu/project_bwd.rs tells where the formulas come from.
+// src/backend/cpu/project_bwd.rs derives the formulas.
 
 // Sums of the records, one record per row.
 @group(0) @binding(6) var<storage, read> row_sums: array<f32>;
 @group(0) @binding(7) var<storage, read> depths: array<u32>;
-// Five per row that is not frozen: by mean and log-scale x | log-scale y, z, quaternion w, x | quaternion y, z, logit,
-// projected mean x | colour (through its clamp), projected mean y | direction of view, unused.
+// Five vectors per row that is not frozen. Derivatives with respect to: mean, log-scale x | log-scale
+// y, z, quaternion w, x | quaternion y, z, logit, projected mean x | colour before its clamp,
+// projected mean y. Then the view direction, unused.
 @group(0) @binding(8) var<storage, read_write> gradient: array<vec4<f32>>;
 
 @compute @workgroup_size(256)
@@ -31,7 +32,7 @@ fn project_bwd(
     let l1 = factor.x;
     let shear = factor.y;
     let l3 = factor.z;
-    // Out of the folded units of the rasteriser.
+    // Undo the folded units of the rasteriser.
     let unfold = 1.0 / FOLD;
     let q = row_sums[at];
     let qu = row_sums[at + 1u] * unfold;
@@ -42,14 +43,14 @@ fn project_bwd(
 
     // Projected mean: L·Σ q·(u, z).
     let dm = vec2(l1 * qu, l3 * qz - l1 * shear * qu);
-    // Columns of W without their scales, M·n, and so on.
+    // Columns of W without their scales (n), and M·n.
     let n0 = l1 * (g.n0 - shear * g.n1);
     let n1 = l3 * g.n1;
     let mn0 = muu * n0 + muz * n1;
     let mn1 = muz * n0 + mzz * n1;
     let scale2 = g.scale * g.scale;
     let by_log_scale = (n0 * mn0 + n1 * mn1) * scale2;
-    // About axis i, with j and k after it.
+    // Rotation about axis i; j and k are the next two axes, cyclically.
     let turn = (n0.yzx * mn0.zxy + n1.yzx * mn1.zxy) * (scale2.yzx - scale2.zxy);
     let v = g.quat.yzw;
     let two = 2.0 * g.quat_inv_norm;
@@ -68,7 +69,7 @@ fn project_bwd(
     let j02 = dot(db0, r2);
     let j11 = dot(db1, r1);
     let j12 = dot(db1, r2);
-    // J = f/z·[1, 0, −x/z; 0, 1, −y/z], its x/z and y/z constant where clamped.
+    // J = f/z·[1, 0, −x/z; 0, 1, −y/z]; where x/z or y/z is clamped, it is constant.
     let by_inv_z = frame.lens.x * (j00 - g.clamped.x * j02) + frame.lens.y * (j11 - g.clamped.y * j12);
     let free = g.clamped == g.ratio;
     let by_ratio = frame.lens.xy * (dm - select(vec2(0.0), g.inv_z * vec2(j02, j12), free));

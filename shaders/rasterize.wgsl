@@ -1,32 +1,32 @@
-// Stage 3: tile lists to pixels; src/backend/cpu/rasterize.rs. quads.wgsl says which invocation has which pixels.
+// Stage 3: tile lists to pixels; src/backend/cpu/rasterize.rs. quads.wgsl assigns pixels to invocations.
 
 // Red, green, blue (background included), depth.
 @group(0) @binding(6) var<storage, read_write> canvas: array<vec4<f32>>;
-// Bits of the final transmittance; place in the tile's list at which the pixel stopped, NONE if it
-// did not.
+// Bits of the final transmittance; index in the tile's list at which the pixel stopped, or NONE.
 @group(0) @binding(7) var<storage, read_write> finish: array<vec2<u32>>;
 
-// Pixels of each row in which none has a larger blend weight; nothing where they are not counted.
+// Number of pixels that each row dominates: no other row has a larger blend weight there. Unused if
+// they are not counted.
 @group(0) @binding(8) var<storage, read_write> dominant: array<atomic<u32>>;
 
 override COUNTS_DOMINANT: bool = false;
 
-// Splats at hand at a time, where all invocations work together.
+// Splats loaded at a time, where all invocations share them (batch.wgsl).
 const BATCH: u32 = 64u;
 
-// What the pixels show.
+// The state of an invocation's pixels.
 struct Shown {
     red: vec4<f32>,
     green: vec4<f32>,
     blue: vec4<f32>,
     depth: vec4<f32>,
     stop: vec4<u32>,
-    // The largest weight, and the place of its splat in the list.
+    // The largest weight, and the index of its splat in the list.
     most: vec4<f32>,
     most_at: vec4<u32>,
 }
 
-// Draws splat k of `count` at hand, the first of which is the nth of the list.
+// Blends splat k of the `count` loaded ones, which start at index n of the list.
 fn draw(
     k: u32,
     count: u32,
@@ -39,8 +39,8 @@ fn draw(
         return;
     }
     let went_on = (*pixels).goes_on;
-    let splat = held(k);
-    let w = taken(falloff(splat, quad).exponent, pixels);
+    let splat = loaded_splat(k);
+    let w = blend(falloff(splat, quad).exponent, pixels);
     (*shown).red += w * splat.colour.x;
     (*shown).green += w * splat.colour.y;
     (*shown).blue += w * splat.colour.z;
@@ -78,11 +78,11 @@ fn rasterize(
         }
         let count = min(m.members, end - first);
         if m.place < count {
-            hold(m.place, row_of_slot[list[first + m.place]], quad.corner);
+            load_splat(m.place, row_of_slot[list[first + m.place]], quad.corner);
         }
-        meet();
-        // Four in a round, written out: compilers do not unroll as much as this is, and rounds are
-        // counted (expect_end).
+        wait_for_all();
+        // Four per round, unrolled by hand: compilers do not unroll a body of this size, and the number
+        // of rounds is limited (see expect_end).
         var k = 0u;
         for (; k < count && is_needed(any(pixels.goes_on)); k += 4u) {
             draw(k, count, first - begin, quad, &pixels, &shown);

@@ -1,11 +1,11 @@
-// Stage 5 in slots: pixel gradients to splat gradients, one record per entry, then one sum per row.
-// rasterize_bwd_atomic.wgsl does the same with atomics; both build on backward.wgsl.
+// Stage 5 without atomics: pixel gradients to splat gradients, one record per entry, then one sum per
+// row. rasterize_bwd_atomic.wgsl does the same with atomics; both use backward.wgsl.
 
 // One record per slot.
 @group(0) @binding(8) var<storage, read_write> records: array<f32>;
 
-// What an invocation finds of splat i at hand; k: of those at a time.
-fn put(
+// An invocation's contribution to the gradients of loaded splat i, the kth of a round.
+fn store_splat(
     k: u32,
     i: i32,
     first: u32,
@@ -14,13 +14,13 @@ fn put(
     own: Upstream,
     pixels: ptr<function, Behind>,
 ) {
-    // Said aloud: naga does not start a variable anew in each round of a loop.
+    // Initialised explicitly: naga does not reset a variable in each round of a loop.
     var sums = array<f32, FIELDS>();
     if i >= 0 {
-        _ = differentiated(held(u32(i)), first + u32(i), quad, own, pixels, &sums);
+        _ = backpropagate(loaded_splat(u32(i)), first + u32(i), quad, own, pixels, &sums);
     }
     for (var f = 0u; f < RECORD; f++) {
-        put_part(k * RECORD + f, lane, sums[f]);
+        store_part(k * RECORD + f, lane, sums[f]);
     }
 }
 
@@ -42,7 +42,7 @@ fn rasterize_bwd(
 
     let m = member(lane);
     let reached = largest_of_all(m, last_of(pixels));
-    // Nobody takes these.
+    // No pixel takes splats behind those.
     var i = reached + lane;
     for (; i < length; i += MEMBERS) {
         let slot = list[begin + i];
@@ -57,23 +57,23 @@ fn rasterize_bwd(
     for (; n < batches; n++) {
         let first = (batches - 1u - n) * BATCH;
         let count = min(BATCH, reached - first);
-        take_batch(begin + first, count, lane, quad.corner);
-        // Groups of four splats, back to front; in each the last comes first. Written out, as compilers
-        // do not unroll as much as this is.
+        load_batch(begin + first, count, lane, quad.corner);
+        // Four splats per round, back to front, the last one first. Unrolled by hand: compilers do not
+        // unroll a body of this size.
         var top = i32(count);
         for (; top > 0; top -= i32(SPLATS)) {
-            put(0u, top - 1, first, lane, quad, own, &pixels);
-            put(1u, top - 2, first, lane, quad, own, &pixels);
-            put(2u, top - 3, first, lane, quad, own, &pixels);
-            put(3u, top - 4, first, lane, quad, own, &pixels);
-            meet();
+            store_splat(0u, top - 1, first, lane, quad, own, &pixels);
+            store_splat(1u, top - 2, first, lane, quad, own, &pixels);
+            store_splat(2u, top - 3, first, lane, quad, own, &pixels);
+            store_splat(3u, top - 4, first, lane, quad, own, &pixels);
+            wait_for_all();
             // One invocation per field of each splat.
             let which = top - 1 - i32(lane / RECORD);
             if lane < SPLATS * RECORD && which >= 0 {
                 let f = lane % RECORD;
                 records[slots[which] * RECORD + f] = summed(lane, f == maximum());
             }
-            meet();
+            wait_for_all();
         }
         has_ended &= top <= 0;
     }
@@ -87,7 +87,7 @@ fn rasterize_bwd(
 @group(0) @binding(11) var<storage, read> all_records: array<f32>;
 @group(0) @binding(12) var<storage, read_write> row_sums: array<f32>;
 
-// Adds a row's records, which lie side by side, in order; now.a: the band.
+// Sums a row's records, which are contiguous, in order; now.a: the band.
 @compute @workgroup_size(256)
 fn gather(
     @builtin(workgroup_id) id: vec3<u32>,

@@ -1,8 +1,8 @@
-// Stage 5 with atomics: pixel gradients straight to the sums of rows, without records. The sums are those
-// of rasterize_bwd.wgsl, added in no fixed order.
+// Stage 5 with atomics: pixel gradients are added directly to the sums of rows, without records. The
+// sums are those of rasterize_bwd.wgsl, in no fixed order.
 
-// What the subgroup finds of splat i at hand, the first of which is the nth of the list.
-fn find(
+// The subgroup's contribution to the gradients of loaded splat i; the first is at index n of the list.
+fn add_splat(
     i: u32,
     n: u32,
     m: Member,
@@ -10,11 +10,11 @@ fn find(
     own: Upstream,
     pixels: ptr<function, Behind>,
 ) {
-    // Said aloud: naga does not start a variable anew in each round of a loop.
+    // Initialised explicitly: naga does not reset a variable in each round of a loop.
     var sums = array<f32, FIELDS>();
-    let is_taken = differentiated(held(i), n + i, quad, own, pixels, &sums);
+    let is_taken = backpropagate(loaded_splat(i), n + i, quad, own, pixels, &sums);
     if subgroupAny(is_taken) {
-        deliver(m, i, sums, RECORD, maximum());
+        add_to_row(m, i, sums, RECORD, maximum());
     }
 }
 
@@ -42,9 +42,9 @@ fn rasterize_bwd_atomic(
         let first = (batches - 1u - n) * m.members;
         let count = min(m.members, reached - first);
         if m.place < count {
-            hold(m.place, row_of_slot[list[begin + first + m.place]], quad.corner);
+            load_splat(m.place, row_of_slot[list[begin + first + m.place]], quad.corner);
         }
-        // A subgroup's pixels are part of the tile's, and many a splat of the tile is not seen in them.
+        // A subgroup covers only a part of the tile, and many of the tile's splats do not reach it.
         let seen = subgroupBallot(m.place < count && may_reach(own_splat, block));
         var word = (count + 31u) / 32u;
         for (; word > 0u; word--) {
@@ -52,7 +52,7 @@ fn rasterize_bwd_atomic(
             while left != 0u {
                 let bit = firstLeadingBit(left);
                 left ^= 1u << bit;
-                find(32u * (word - 1u) + bit, first, m, quad, own, &pixels);
+                add_splat(32u * (word - 1u) + bit, first, m, quad, own, &pixels);
             }
             has_ended &= left == 0u;
         }

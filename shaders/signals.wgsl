@@ -1,5 +1,5 @@
-// Stage 8: the signals that policies ask for, accumulated over views; src/backend/cpu/signals.rs. One row per
-// invocation. Accumulators are planes of a number for each row that is not frozen; only what was asked for has one.
+// Stage 8: accumulates the requested signals over views; src/backend/cpu/signals.rs. One row per
+// invocation. Each requested signal has planes of accumulators, with a number per row that is not frozen.
 
 @group(0) @binding(1) var<storage, read> state: State;
 @group(0) @binding(2) var<storage, read_write> signals: array<f32>;
@@ -10,16 +10,16 @@
 @group(0) @binding(6) var<storage, read> splats: array<vec4<f32>>;
 @group(0) @binding(7) var<storage, read> rows: array<f32>;
 @group(0) @binding(8) var<storage, read> ages: array<u32>;
-// Pixels that the row dominates, where they are counted.
+// Number of pixels that each row dominates, if they are counted.
 @group(0) @binding(9) var<storage, read> dominant: array<u32>;
-// Logits of masks, counted from where they began, where there are masks.
+// Change of each mask's logit since its start, if there are masks.
 @group(0) @binding(10) var<storage, read> mask_offsets: array<f32>;
 
 const FOLD: f32 = 0.8493218;
-// Least largest weight of a view that counts as support.
+// A view supports a row if the row's largest blend weight in it is at least this.
 const SUPPORT_WEIGHT: f32 = 0.02;
 
-// The signals' numbers, which are places in frame.planes; policies/src/signals.rs has the table.
+// Numbers of the signals, which index frame.planes; policies/src/signals.rs has the table.
 override VISIBLE_COUNT: u32;
 override SCREEN_GRADIENT: u32;
 override SCREEN_GRADIENT_ABS: u32;
@@ -92,7 +92,7 @@ fn accumulate(
     add(MEAN_GRADIENT_Z, row, by_mean.z);
     add(MEAN_GRADIENT_NORM, row, norm3(by_mean));
     if ABS_X_AT > 0u {
-        // The sums are in folded units, and l1 is not in the first.
+        // The sums are in folded units, and the first lacks its factor l1.
         let unfold = 1.0 / FOLD;
         let l1 = splats[3u * row].z * unfold;
         let by_x = l1 * unfold * row_sums[at + ABS_X_AT];
@@ -117,7 +117,7 @@ fn accumulate(
         add(WEIGHT_MAX_ROOT, row, sqrt(largest));
         add(SUPPORT, row, select(0.0, 1.0, largest >= SUPPORT_WEIGHT));
     }
-    // Of the smallest values the largest inverse is kept, which starts at 0.
+    // The smallest value is stored as the largest inverse, which can start at 0.
     raise(DEPTH_MIN, row, 1.0 / depth);
     raise(PIXEL_SIZE_MIN, row, 0.5 * (frame.lens.x + frame.lens.y) / depth);
     if plane(DOMINANT_PIXELS) != NONE {
@@ -126,7 +126,7 @@ fn accumulate(
     }
 }
 
-// The score of one view, from the sums of weighed errors and of weights.
+// The score of one view, from the sums of weighted errors and of weights.
 fn score(error: f32, weight: f32) -> f32 {
     if !(error > 0.0 && weight > 0.0) {
         return 0.0;
@@ -141,7 +141,7 @@ fn score(error: f32, weight: f32) -> f32 {
     return score;
 }
 
-// Squares of small gradients would underflow, and some devices flush them to 0 sooner.
+// A norm by scaling: squares of small gradients would underflow, on some devices even sooner.
 fn norm2(v: vec2<f32>) -> f32 {
     let most = max(abs(v.x), abs(v.y));
     if !(most > 0.0) {
@@ -160,9 +160,9 @@ fn norm3(v: vec3<f32>) -> f32 {
     return most * sqrt(dot(scaled, scaled));
 }
 
-// Present values into the first plane of `signals`, which is a scratch buffer then; now.a: the signal,
-// now.b: the number of rows, as no view need have been rendered yet, now.c: bits of the logit at which masks
-// begin, now.d: the number of frozen rows, of which nothing is asked.
+// Writes a signal that is computed from the rows to the first plane of `signals`, here a scratch
+// buffer; now.a: the signal, now.b: rows (`frame` may not be set yet), now.c: bits of the initial logit
+// of masks, now.d: frozen rows, which are skipped.
 @compute @workgroup_size(256)
 fn present(
     @builtin(workgroup_id) id: vec3<u32>,

@@ -1,15 +1,13 @@
 // Stage 2: splats to tile lists; src/backend/cpu/tiles.rs. The rows on screen are sorted by depth,
-// their entries emitted in that order, and these sorted by tile, stably: so each tile's list is
-// sorted by depth, ties by row. The footprint of a row was evaluated once, in project.wgsl; what
-// counts entries and what emits them are whole numbers, and cannot disagree.
+// their entries emitted in that order, and the entries sorted by tile with a stable sort: each tile's
+// list is then sorted by depth, and by row where depths are equal. project.wgsl has stored each row's
+// footprint in integers, so counting entries and emitting them cannot disagree.
 //
-// The file is one piece: lists, sums and sorts share their buffers and the counts that drive them.
-//
-// Sums and sorts are exact and have one order, so that nothing here depends on timing. An entry's
-// place before it is sorted is its slot: a row's slots lie side by side, tile after tile.
+// Sums and sorts are exact and have a fixed order: no result depends on timing. An entry's index
+// before the sort is its slot: the slots of a row are contiguous, in the order of its tiles.
 
 @group(0) @binding(1) var<storage, read_write> state: State;
-// Groups of indirect dispatches, three numbers each; see ARGS_*.
+// Workgroup counts of indirect dispatches, three numbers each; see ARGS_*.
 @group(0) @binding(2) var<storage, read_write> groups: array<u32>;
 @group(0) @binding(3) var<storage, read> depths: array<u32>;
 @group(0) @binding(4) var<storage, read> footprints: array<vec4<u32>>;
@@ -17,9 +15,9 @@
 @group(0) @binding(6) var<storage, read> values_in: array<u32>;
 @group(0) @binding(7) var<storage, read_write> keys_out: array<u32>;
 @group(0) @binding(8) var<storage, read_write> values_out: array<u32>;
-// Numbers to be summed, then the sums within their block of 2,048.
+// Numbers to sum, then their prefix sums within their block of 2,048.
 @group(0) @binding(9) var<storage, read_write> sums: array<u32>;
-// Sums of the blocks before each block.
+// Prefix sums over the blocks.
 @group(0) @binding(10) var<storage, read_write> block_sums: array<u32>;
 // Rows on screen, front to back.
 @group(0) @binding(11) var<storage, read> order: array<u32>;
@@ -32,17 +30,17 @@
 // Items per group in sums and sorts.
 const BLOCK: u32 = 2048u;
 const EACH: u32 = 8u;
-// Where sums saturate: beyond any cap.
+// Sums saturate here, beyond any cap.
 const MOST: u32 = 0x40000000u;
 
-// Places in groups.
+// Indices in `groups`.
 const ARGS_ROWS: u32 = 0u;
 const ARGS_ROW_BLOCKS: u32 = 3u;
 const ARGS_ROW_DIGITS: u32 = 6u;
 const ARGS_ENTRY_BLOCKS: u32 = 9u;
 const ARGS_ENTRY_DIGITS: u32 = 12u;
 
-// What is summed (now.a of scan_blocks and scan_sums).
+// The numbers to sum (now.a of scan_blocks and scan_sums).
 const FLAGS: u32 = 0u;
 const COUNTS_ALL: u32 = 1u;
 const COUNTS_BAND: u32 = 2u;
@@ -68,7 +66,7 @@ fn saturating(a: u32, b: u32) -> u32 {
     return min(a + b, MOST);
 }
 
-// The sum of the values of the invocations before this one; the sum of all is then partial[255].
+// The sum of the values of the preceding invocations; the total is then in partial[255].
 fn sum_before(lane: u32, value: u32) -> u32 {
     partial[lane] = value;
     workgroupBarrier();
@@ -88,7 +86,7 @@ fn sum_before(lane: u32, value: u32) -> u32 {
     return before;
 }
 
-// How many numbers are summed.
+// The number of values to sum.
 fn count_of(what: u32) -> u32 {
     switch what {
         case FLAGS: { return frame.model.x; }
@@ -134,7 +132,7 @@ fn scan_blocks(
     }
 }
 
-// One group: sums over blocks, and what follows from the total.
+// Prefix sums over blocks, and the results that depend on the total; a single group.
 @compute @workgroup_size(256)
 fn scan_sums(@builtin(local_invocation_index) lane: u32) {
     let blocks = ceil_div(count_of(now.a), BLOCK);
@@ -166,7 +164,7 @@ fn scan_sums(@builtin(local_invocation_index) lane: u32) {
     }
 }
 
-// now.b: bands that were encoded.
+// now.b: number of encoded bands.
 fn conclude(total: u32) {
     switch now.a {
         case FLAGS: {
@@ -183,7 +181,8 @@ fn conclude(total: u32) {
         case COUNTS_ALL: {
             state.total = total;
             if now.b == 1u {
-                // One band was encoded. If it does not do, there are no entries, and nobody steps.
+                // Only one band was encoded. If the image needs more, the lists stay empty and no
+                // kernel changes the model.
                 let fits = total <= frame.model.z;
                 state.short = select(1u, 0u, fits);
                 state.cuts[0] = 0u;
@@ -197,7 +196,7 @@ fn conclude(total: u32) {
     }
 }
 
-// Sets the number of entries of the band at hand.
+// Sets the number of entries of the current band.
 fn hold(held: u32, is_news: bool) {
     state.held = held;
     let blocks = ceil_div(held, BLOCK);
@@ -216,7 +215,7 @@ fn summed(i: u32) -> u32 {
 
 // --- Rows ---------------------------------------------------------------------------------------
 
-// Rows on screen, in order of their numbers, with their depths.
+// Lists the rows on screen, in order, with their depths.
 @compute @workgroup_size(256)
 fn compact(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -230,14 +229,14 @@ fn compact(
     }
 }
 
-// A run of tiles of one line of a footprint: columns first..=last.
+// A run of tiles in one line of a footprint: columns first..=last.
 struct Run {
     first: u32,
     last: u32,
 }
 
-// Block `bit` of a line of blocks, as far as it lies in the footprint and in the band's tiles
-// low..high; empty (first > last) if it does not. `before` is the line's first tile.
+// The part of block `bit` in a line of blocks that is in the footprint and in the band's tiles
+// low..high; empty if first > last. `before` is the line's first tile.
 fn run_of(x0: u32, x1: u32, wide: u32, bit: u32, before: u32, low: u32, high: u32) -> Run {
     var first = x0 + (bit << wide);
     var last = min(first + (1u << wide) - 1u, x1);
@@ -253,7 +252,7 @@ fn run_of(x0: u32, x1: u32, wide: u32, bit: u32, before: u32, low: u32, high: u3
     return Run(first, last);
 }
 
-// The band's tiles; now.a: the band, NONE for the whole image.
+// The range of the band's tiles; now.a: the band, or NONE for the whole image.
 fn band() -> vec2<u32> {
     if now.a == NONE {
         return vec2(0u, frame.image.w);
@@ -261,7 +260,7 @@ fn band() -> vec2<u32> {
     return vec2(state.cuts[now.a], state.cuts[now.a + 1u]);
 }
 
-// Entries per row, front to back.
+// Counts the entries of each row, front to back.
 @compute @workgroup_size(256)
 fn count_entries(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -296,7 +295,7 @@ fn emit_entries(
     @builtin(local_invocation_index) lane: u32,
 ) {
     let i = group_of(id) * GROUP + lane;
-    // With more entries than fit, none was held.
+    // The lists stay empty if the entries do not fit.
     if i >= state.visible || state.held == 0u {
         if i < state.visible {
             slots_of_row[order[i]] = vec2(0u, 0u);
@@ -328,7 +327,7 @@ fn emit_entries(
 
 // --- Bands --------------------------------------------------------------------------------------
 
-// Entries per tile of the whole image.
+// Counts the entries of each tile of the whole image.
 @compute @workgroup_size(256)
 fn count_tiles(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -354,8 +353,8 @@ fn count_tiles(
     }
 }
 
-// Cuts the tiles into bands whose lists fit the cap; now.b: bands that were encoded. A single list
-// always fits, since the cap is at least the budget.
+// Divides the tiles into bands whose lists fit the cap; now.b: number of encoded bands. The list of a
+// single tile always fits, since the cap is at least the budget.
 @compute @workgroup_size(1)
 fn cut_bands() {
     let cap = frame.model.z;
@@ -386,7 +385,7 @@ fn cut_bands() {
 }
 
 // --- Stable sort, four bits at a time; now.a: shift, now.b: 1 to sort entries, 0 to sort rows,
-// now.c: 1 where the values are the places -----------------------------------------------------------
+// now.c: 1 if the values are the indices -----------------------------------------------------------
 
 var<workgroup> histogram: array<atomic<u32>, 16>;
 
@@ -422,9 +421,9 @@ fn count_digits(
     }
 }
 
-// Counters of digits d and d + 8 of each invocation, in the halves of one word.
+// Each invocation's counts of digits d and d + 8, in the halves of one word.
 var<workgroup> counters: array<u32, 2048>;
-// Place of each digit within its block.
+// Start of each digit within its block.
 var<workgroup> digit_starts: array<u32, 16>;
 
 @compute @workgroup_size(256)
@@ -447,7 +446,7 @@ fn scatter(
         }
     }
     workgroupBarrier();
-    // Sums over digits first, then invocations; the upper halves go on where the lower ones end.
+    // Prefix sums over digits, then invocations; the upper halves continue from the total of the lower.
     var sum = 0u;
     for (var k = 0u; k < 8u; k++) {
         sum += counters[lane * 8u + k];
@@ -494,7 +493,7 @@ fn scatter(
     }
 }
 
-// The first entry of each tile, by bisection of the sorted keys; one more for the end.
+// The first entry of each tile, by binary search in the sorted keys; one more for the end.
 @compute @workgroup_size(256)
 fn find_tiles(
     @builtin(workgroup_id) id: vec3<u32>,

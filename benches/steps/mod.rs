@@ -1,4 +1,4 @@
-//! The training steps that are measured, and their scenes.
+//! The measured training steps and their scenes.
 
 use std::time::Duration;
 
@@ -11,9 +11,9 @@ use glam::{DMat3, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// A random cloud in front of the camera. Gaussians are smaller the more there are, so that the number of
-/// tile entries per row is that of a trained scene: about 3 at 10,000 rows and 256², 2.7 at 50,000
-/// rows and 512².
+/// A random cloud in front of the camera. The size of the Gaussians depends on their number such that
+/// there are as many tile entries per row as in a trained scene: about 3 at 10,000 rows and 256², 2.7 at
+/// 50,000 rows and 512².
 pub(crate) fn scene(rows: usize, sh_degree: u8) -> Gaussians {
     let mut rng = ChaCha8Rng::seed_from_u64(rows as u64);
     let mut uniform = |from: f32, to: f32| rng.random_range(from..to);
@@ -77,7 +77,7 @@ pub(crate) fn input<'a>(step: u32, camera: &'a Camera, target: &'a Image8) -> St
     }
 }
 
-/// Steps to measure, after two that are not.
+/// Number of steps, of which the first two are not measured.
 pub(crate) fn count(rows: usize) -> u32 {
     (6_000_000 / rows).clamp(7, 60) as u32
 }

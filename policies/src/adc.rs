@@ -7,7 +7,9 @@
 use std::ops::Bound::Excluded;
 
 use crate::parameters::in_range;
-use crate::plan::{EditPlan, Offspring, OpacityRule, ParentFate, Placement, ScaleRule, UNTURNED};
+use crate::plan::{
+    EditPlan, NO_ROTATION, Offspring, OpacityRule, ParentFate, Placement, ScaleRule,
+};
 use crate::policy::{PolicyResult, SceneInfo, Signal, Snapshot};
 use crate::sample::top_k;
 
@@ -23,13 +25,13 @@ pub struct Window {
 }
 
 impl Window {
-    /// Whether `step` (1-based) is one of them.
+    /// True if `step` (1-based) is on the schedule.
     #[must_use]
     pub fn is_due(&self, step: u32) -> bool {
         self.every > 0 && self.from < step && step < self.until && step.is_multiple_of(self.every)
     }
 
-    /// How many of them are at or before `step` (1-based).
+    /// Number of scheduled steps up to and including `step` (1-based).
     #[must_use]
     pub fn count(&self, step: u32) -> u32 {
         let last = step.min(self.until.saturating_sub(1));
@@ -40,11 +42,11 @@ impl Window {
     }
 }
 
-/// The opacity resets of the original: regular ones, and one more for scenes on a white background.
+/// The opacity resets of the original 3DGS: at regular intervals, plus one for scenes on a white background.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OpacityResets {
     regular: Window,
-    /// Step of the one on a white background, if any.
+    /// Step of the reset on a white background, if any.
     white: Option<u32>,
     /// Largest opacity after a reset, in (0, 1).
     max_opacity: f32,
@@ -69,7 +71,7 @@ impl OpacityResets {
         Ok(Self { regular: Window { from: 0, until, every }, white, max_opacity })
     }
 
-    /// Whether there is a reset at `step` (1-based).
+    /// True if opacities are reset at `step` (1-based).
     #[must_use]
     pub fn is_due(&self, step: u32) -> bool {
         step > 0 && (self.regular.is_due(step) || self.white == Some(step))
@@ -79,7 +81,7 @@ impl OpacityResets {
     pub fn plan(&self, step: u32, plan: &mut EditPlan) {
         if self.is_due(step) {
             plan.cause("reset");
-            // In range since `new`.
+            // `new` has checked the range, so this is never refused.
             let _ = plan.clamp_opacity(self.max_opacity);
         }
     }
@@ -101,8 +103,8 @@ pub fn concave_curve(window: Window, step: u32, start: usize, end: usize) -> usi
     (start + (end - start) * (2.0 * x - x * x)).floor() as usize
 }
 
-/// Mean over the views that saw the row, from a sum over views; 0 for a row that no view saw, and where
-/// the mean is not finite. Shape: `[rows]`.
+/// Divides a sum over views by the number of views that saw the row. 0 if no view saw it or the mean is not
+/// finite. Shape: `[rows]`.
 #[must_use]
 pub fn mean_over_views(sum: &[f32], views: &[f32]) -> Vec<f32> {
     let mean = |(&sum, &views): (&f32, &f32)| {
@@ -112,10 +114,10 @@ pub fn mean_over_views(sum: &[f32], views: &[f32]) -> Vec<f32> {
     sum.iter().zip(views).map(mean).collect()
 }
 
-/// Adds `weight` times the mean over views of the colour gradient.
+/// Adds `weight` times the mean of the colour gradient over views.
 ///
 /// # Errors
-/// When the policy has not declared it.
+/// When the policy has not declared [`Signal::ColourGradient`].
 pub(crate) fn add_colour_gradient(
     gradient: &mut [f32],
     now: &Snapshot<'_>,
@@ -129,7 +131,7 @@ pub(crate) fn add_colour_gradient(
     Ok(())
 }
 
-/// A clone: a copy at `offset` from the parent `[scene units]`, which stays as it is.
+/// A clone: the parent is unchanged, and a copy is placed at `offset` from it `[scene units]`.
 #[must_use]
 pub fn clone_at(offset: [f32; 3]) -> Offspring {
     Offspring {
@@ -137,12 +139,12 @@ pub fn clone_at(offset: [f32; 3]) -> Offspring {
         parent: ParentFate::Stays,
         placement: Placement::Offset(offset),
         scale: ScaleRule::Uniform(1.0),
-        turn: UNTURNED,
+        turn: NO_ROTATION,
         opacity: OpacityRule::Same,
     }
 }
 
-/// A split: two samples of the parent replace it, smaller by `factor`.
+/// A split: two children, sampled from the parent and smaller by `factor`, replace it.
 #[must_use]
 pub fn split_by(factor: f32) -> Offspring {
     Offspring {
@@ -150,7 +152,7 @@ pub fn split_by(factor: f32) -> Offspring {
         parent: ParentFate::BecomesChild,
         placement: Placement::Sampled,
         scale: ScaleRule::Uniform(1.0 / factor),
-        turn: UNTURNED,
+        turn: NO_ROTATION,
         opacity: OpacityRule::Same,
     }
 }
@@ -158,7 +160,7 @@ pub fn split_by(factor: f32) -> Offspring {
 /// A long-axis split: two halves of the parent along its longest axis replace it.
 ///
 /// With d = `share`, the children are placed at ±3d standard deviations; their longest axis is 1 − d
-/// times the parent's, the others √(1 − d²) times. As 3d + 3(1 − d) = 3, both ends stay in place
+/// times the parent's, the others √(1 − d²) times. As 3d + 3(1 − d) = 3, the outer ends stay in place
 /// (*Improving Densification in 3D Gaussian Splatting*, 2025). Opacities are multiplied by `opacity`.
 #[must_use]
 pub fn split_long_axis(share: f32, opacity: f32) -> Offspring {
@@ -167,7 +169,7 @@ pub fn split_long_axis(share: f32, opacity: f32) -> Offspring {
         parent: ParentFate::BecomesChild,
         placement: Placement::LongAxis { sigmas: 3.0 * share },
         scale: ScaleRule::LongAxis { long: 1.0 - share, other: (1.0 - share * share).sqrt() },
-        turn: UNTURNED,
+        turn: NO_ROTATION,
         opacity: OpacityRule::Scaled(opacity),
     }
 }
@@ -175,7 +177,7 @@ pub fn split_long_axis(share: f32, opacity: f32) -> Offspring {
 /// Limits of opacity and size beyond which Gaussians are pruned.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PruneLimits {
-    /// Gaussians less opaque than this are pruned.
+    /// Gaussians below this opacity are pruned.
     pub min_opacity: f32,
     /// Gaussians larger than this are pruned `[scene units]`.
     pub max_scale: f32,
@@ -194,8 +196,8 @@ impl PruneLimits {
         }
     }
 
-    /// Whether a Gaussian of this opacity and largest standard deviation `[scene units]` is pruned.
-    /// Values that are not finite are: no gradient will mend them.
+    /// True if a Gaussian of this opacity and largest standard deviation `[scene units]` is to be pruned.
+    /// Non-finite values always are, as training cannot repair them.
     #[must_use]
     pub fn exceeded(&self, opacity: f32, scale: f32) -> bool {
         !(opacity.is_finite() && scale.is_finite())
@@ -215,8 +217,8 @@ impl PruneLimits {
     }
 }
 
-/// Removes the most opaque row (ties by row) from the list `dead` if all rows are on it: a model
-/// without rows could never grow again.
+/// If `dead` lists every row, removes the most opaque one (the first of equals) from the list: an empty
+/// model could never grow again.
 pub fn spare_one(dead: &mut Vec<u32>, opacity: &[f32]) {
     if dead.len() == opacity.len() {
         let spared = top_k(opacity, 1);

@@ -1,32 +1,33 @@
-//! The kinds of edits: children of a parent, rows rewritten in place, rows without a parent, resets. One
-//! piece: they are one vocabulary, and most of it is what each word means.
+//! The kinds of edits: children of a parent, rows rewritten in place, rows without a parent, resets.
+//!
+//! Over 400 lines, as the types belong together and most lines are their documentation.
 
 use serde::{Deserialize, Serialize};
 
 use crate::signals::SignalSet;
 
-/// The children of a clone or a split, and what becomes of the parent.
+/// The children of a clone or a split, and the fate of the parent.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Offspring {
-    /// New rows beside the parent's own slot, >= 1.
+    /// New rows in addition to the parent's own slot, >= 1.
     pub children: u32,
-    /// What happens to the parent's own slot.
+    /// Fate of the parent's own slot.
     pub parent: ParentFate,
-    /// Where the children are placed.
+    /// Positions of the children.
     pub placement: Placement,
-    /// How the scales of children (and of a rewritten parent) follow from the parent's.
+    /// Scales of the children (and of a rewritten parent), relative to the parent's.
     pub scale: ScaleRule,
     /// Rotation of the scaled children (and of a rewritten parent) about the parent's own axes, new =
-    /// old · turn: a quaternion (w, x, y, z) of any length but 0, or [`UNTURNED`].
+    /// old · turn: a quaternion (w, x, y, z) of any length but 0, or [`NO_ROTATION`].
     pub turn: [f32; 4],
-    /// How the opacities of children (and of a rewritten parent) follow from the parent's.
+    /// Opacities of the children (and of a rewritten parent), relative to the parent's.
     pub opacity: OpacityRule,
 }
 
-/// No rotation.
-pub const UNTURNED: [f32; 4] = [1.0, 0.0, 0.0, 0.0];
+/// The identity quaternion.
+pub const NO_ROTATION: [f32; 4] = [1.0, 0.0, 0.0, 0.0];
 
-/// What happens to the row that grows.
+/// The fate of a row that grows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum ParentFate {
     /// Untouched: parameters, moments and age stay (a clone's parent).
@@ -35,10 +36,10 @@ pub enum ParentFate {
     BecomesChild,
 }
 
-/// Where children are placed. New rows are children 1, 2, …; a rewritten parent is child 0.
+/// Positions of children. New rows are children 1, 2, …; a rewritten parent is child 0.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub enum Placement {
-    /// New rows at the parent's mean + this offset `[scene units]`; a rewritten parent does not move.
+    /// New rows at the parent's mean + this offset `[scene units]`; a rewritten parent stays in place.
     Offset([f32; 3]),
     /// Every child at mean + R·diag(s)·ξ, ξ ~ N(0, I), s the parent's scales
     /// (original adaptive density control, Kerbl et al. 2023, section 5.2).
@@ -53,7 +54,7 @@ pub enum Placement {
     Axes([f32; 3]),
 }
 
-/// How scales follow from the parent's.
+/// A change of scales.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub enum ScaleRule {
     /// All three multiplied by this factor, > 0.
@@ -71,10 +72,10 @@ pub enum ScaleRule {
     Set(f32),
 }
 
-/// How opacities follow from the parent's.
+/// A change of opacity.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub enum OpacityRule {
-    /// The same.
+    /// No change.
     Same,
     /// This value, in (0, 1).
     Set(f32),
@@ -92,38 +93,38 @@ pub struct Update {
     pub opacity: OpacityRule,
     /// New scales.
     pub scale: ScaleRule,
-    /// New mean `[scene units]`; `None`: it stays.
+    /// New mean `[scene units]`; `None`: unchanged.
     pub position: Option<[f32; 3]>,
-    /// New base colour, sRGB-encoded, between −[`COLOUR_MAX`] and `COLOUR_MAX`: what a row shows may lie
-    /// beyond `[0, 1]`. What depends on the direction stays. `None`: it stays.
+    /// New base colour, sRGB-encoded, between −[`COLOUR_MAX`] and `COLOUR_MAX` (colours of rows may lie
+    /// outside `[0, 1]`). The view-dependent part is unchanged. `None`: unchanged.
     pub colour: Option<[f32; 3]>,
-    /// Highest spherical-harmonic degree that stays; what depends on the direction beyond it becomes 0, and
-    /// the moments of that too. `None`: all stays.
+    /// Highest spherical-harmonic degree to keep; the coefficients of higher degrees and their moments become
+    /// 0. `None`: all are kept.
     pub sh_degree: Option<u8>,
-    /// Whether the row keeps its moments and its age; otherwise both become zero.
+    /// If true, the row keeps its moments and its age; otherwise both become zero.
     pub keep_moments: bool,
 }
 
-/// What all rows lose at once, however many they are; they keep their moments. See
+/// A reduction of the opacities and scales of all rows, which keep their moments. See
 /// [`EditPlan::decay`](crate::plan::EditPlan::decay).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Decay {
-    /// What opacities lose, >= 0; they do not fall below [`OPACITY_LEAST`] by it.
+    /// Subtracted from opacities, >= 0; it does not reduce them below [`MIN_DECAYED_OPACITY`].
     pub opacity: f32,
-    /// Share of the standard deviations that is lost, in `[0, 1)`.
+    /// Share by which standard deviations are reduced, in `[0, 1)`.
     pub scale: f32,
-    /// Whether only those rows lose anything that a view has shown since the last reset of
-    /// [`Signal::VisibleCount`](crate::signals::Signal::VisibleCount), which must be declared then.
+    /// If true, only rows decay that a view has shown since the last reset of
+    /// [`Signal::VisibleCount`](crate::signals::Signal::VisibleCount), which must then be declared.
     pub seen_only: bool,
 }
 
-/// Where opacities stop that decay: far below what is rendered, 1/255.
-pub const OPACITY_LEAST: f32 = 2e-4;
+/// Opacity at which [`Decay`] stops: far below the smallest alpha that is rendered, 1/255.
+pub const MIN_DECAYED_OPACITY: f32 = 2e-4;
 
-/// Most that a base colour is off 0: more would not fit the narrowest storage.
+/// Largest magnitude of a base colour: larger values would not fit the narrowest storage.
 pub const COLOUR_MAX: f32 = 1e4;
 
-/// A new row without a parent, which looks the same from everywhere; see [`Seed::round`].
+/// A new row without a parent, whose colour does not depend on the view; see [`Seed::round`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Seed {
     /// Mean `[scene units]`.
@@ -133,7 +134,7 @@ pub struct Seed {
     /// Standard deviations along its axes `[scene units]`, > 0.
     pub scales: [f32; 3],
     /// Orientation of its axes, as [`Signal::Orientation`](crate::policy::Signal::Orientation): a
-    /// quaternion (w, x, y, z) of any length but 0, or [`UNTURNED`].
+    /// quaternion (w, x, y, z) of any length but 0, or [`NO_ROTATION`].
     pub orientation: [f32; 4],
     /// Opacity, in (0, 1).
     pub opacity: f32,
@@ -142,35 +143,35 @@ pub struct Seed {
 /// An accumulator that a plan resets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Reset {
-    /// All [`Signal`](crate::signals::Signal)s that accumulate; not `WeightMax` (kept per epoch) nor what
-    /// a row is now (`Opacity`, `ScaleMax`, `ScaleProduct`, `Age`, attributes).
+    /// All [`Signal`](crate::signals::Signal)s that accumulate; neither `WeightMax` (kept per epoch) nor the
+    /// current state of rows (`Opacity`, `ScaleMax`, `ScaleProduct`, `Age`, attributes).
     Signals,
-    /// These signals, as far as they accumulate; for signals with a clock of their own.
+    /// The given signals, except those that do not accumulate; for signals with a reset interval of their own.
     Only(SignalSet),
     /// The list of candidates.
     Candidates,
 }
 
-/// Whether `value` is a number strictly between 0 and 1.
+/// True if `value` is strictly between 0 and 1.
 pub(crate) fn in_open_unit(value: f32) -> bool {
     value > 0.0 && value < 1.0
 }
 
-fn positive(value: f32) -> bool {
+fn is_positive(value: f32) -> bool {
     value.is_finite() && value > 0.0
 }
 
-fn finite(values: &[f32]) -> bool {
+fn all_finite(values: &[f32]) -> bool {
     values.iter().all(|v| v.is_finite())
 }
 
-/// Whether a quaternion has a direction.
-fn turns(quaternion: [f32; 4]) -> bool {
+/// True if the quaternion can be normalised.
+fn is_rotation(quaternion: [f32; 4]) -> bool {
     quaternion.iter().map(|v| v * v).sum::<f32>().is_normal()
 }
 
-/// The name of the first that does not hold.
-fn first_bad(checks: &[(bool, &'static str)]) -> Option<&'static str> {
+/// The name of the first check that fails.
+fn first_failed(checks: &[(bool, &'static str)]) -> Option<&'static str> {
     checks.iter().find(|(holds, _)| !holds).map(|(_, name)| *name)
 }
 
@@ -179,28 +180,28 @@ impl Offspring {
     #[must_use]
     pub fn bad_field(&self) -> Option<&'static str> {
         let placement = match self.placement {
-            Placement::Offset(v) | Placement::Axes(v) => finite(&v),
+            Placement::Offset(v) | Placement::Axes(v) => all_finite(&v),
             Placement::Sampled => true,
             Placement::LongAxis { sigmas } => sigmas.is_finite() && sigmas >= 0.0,
         };
-        first_bad(&[
+        first_failed(&[
             (self.children >= 1, "children"),
             (placement, "placement"),
             (self.scale.is_valid(), "scale"),
-            (turns(self.turn), "turn"),
+            (is_rotation(self.turn), "turn"),
             (self.opacity.is_valid(), "opacity"),
         ])
     }
 
-    /// Whether scales change by axis or are set, or anything is turned: [`Needs::detailed_edits`](crate::policy::Needs)
-    /// declares it.
+    /// True if the children are rotated, or their scales are set or change by axis. Such edits must be
+    /// declared by [`Needs::detailed_edits`](crate::policy::Needs).
     #[must_use]
     pub fn is_detailed(&self) -> bool {
         matches!(self.scale, ScaleRule::Axes(_) | ScaleRule::Set(_))
-            || self.turn.map(f32::to_bits) != UNTURNED.map(f32::to_bits)
+            || self.turn.map(f32::to_bits) != NO_ROTATION.map(f32::to_bits)
     }
 
-    /// How many Gaussians share the parent's opacity: its children, and the parent if it becomes one.
+    /// Number of Gaussians that share the parent's opacity: its children, and the parent if it becomes one.
     #[must_use]
     pub fn siblings(&self) -> u32 {
         self.children.saturating_add(u32::from(self.parent == ParentFate::BecomesChild))
@@ -208,20 +209,20 @@ impl Offspring {
 }
 
 impl ScaleRule {
-    /// Whether every factor is finite and positive.
+    /// True if all values are finite and positive.
     #[must_use]
     pub fn is_valid(&self) -> bool {
         match *self {
-            Self::Uniform(factor) => positive(factor),
-            Self::LongAxis { long, other } => positive(long) && positive(other),
-            Self::Set(scale) => positive(scale),
-            Self::Axes(factors) => factors.into_iter().all(positive),
+            Self::Uniform(factor) => is_positive(factor),
+            Self::LongAxis { long, other } => is_positive(long) && is_positive(other),
+            Self::Set(scale) => is_positive(scale),
+            Self::Axes(factors) => factors.into_iter().all(is_positive),
         }
     }
 }
 
 impl OpacityRule {
-    /// Whether its value is in its range.
+    /// True if the value is in its range.
     #[must_use]
     pub fn is_valid(&self) -> bool {
         match *self {
@@ -233,7 +234,7 @@ impl OpacityRule {
 }
 
 impl Update {
-    /// Changes nothing; other updates are written as `Update { colour: …, ..Update::NONE }`.
+    /// Changes nothing; a base for other updates, such as `Update { colour: …, ..Update::NONE }`.
     pub const NONE: Self = Self {
         opacity: OpacityRule::Same,
         scale: ScaleRule::Uniform(1.0),
@@ -243,8 +244,8 @@ impl Update {
         keep_moments: true,
     };
 
-    /// The row begins anew where it is: round, of this standard deviation `[scene units]` and opacity, of the
-    /// same colour from everywhere, without moments.
+    /// Restarts the row in place: round, with this standard deviation `[scene units]` and opacity, its base
+    /// colour from all directions, and no moments.
     #[must_use]
     pub const fn restart(scale: f32, opacity: f32) -> Self {
         Self {
@@ -257,16 +258,16 @@ impl Update {
         }
     }
 
-    /// The field that is not finite or out of its range, if any. [`OpacityRule::Conserved`] is not in
-    /// range: there are no children to share the opacity with.
+    /// The field that is not finite or out of its range, if any. [`OpacityRule::Conserved`] is out of
+    /// range, as there are no children to share the opacity with.
     #[must_use]
     pub fn bad_field(&self) -> Option<&'static str> {
         let opacity = self.opacity.is_valid() && self.opacity != OpacityRule::Conserved;
         let colour = |colour: [f32; 3]| colour.iter().all(|c| c.abs() <= COLOUR_MAX);
-        first_bad(&[
+        first_failed(&[
             (opacity, "opacity"),
             (self.scale.is_valid(), "scale"),
-            (self.position.is_none_or(|position| finite(&position)), "position"),
+            (self.position.is_none_or(|position| all_finite(&position)), "position"),
             (self.colour.is_none_or(colour), "colour"),
         ])
     }
@@ -277,25 +278,25 @@ impl Decay {
     #[must_use]
     pub fn bad_field(&self) -> Option<&'static str> {
         let opacity = self.opacity.is_finite() && self.opacity >= 0.0;
-        first_bad(&[(opacity, "opacity"), ((0.0..1.0).contains(&self.scale), "scale")])
+        first_failed(&[(opacity, "opacity"), ((0.0..1.0).contains(&self.scale), "scale")])
     }
 }
 
 impl Seed {
-    /// A seed of the same standard deviation `scale` along all axes.
+    /// A seed with standard deviation `scale` along all axes.
     #[must_use]
     pub const fn round(position: [f32; 3], colour: [f32; 3], scale: f32, opacity: f32) -> Self {
-        Self { position, colour, scales: [scale; 3], orientation: UNTURNED, opacity }
+        Self { position, colour, scales: [scale; 3], orientation: NO_ROTATION, opacity }
     }
 
     /// The field that is not finite or out of its range, if any.
     #[must_use]
     pub fn bad_field(&self) -> Option<&'static str> {
-        first_bad(&[
-            (finite(&self.position), "position"),
+        first_failed(&[
+            (all_finite(&self.position), "position"),
             (self.colour.iter().all(|v| (0.0..=1.0).contains(v)), "colour"),
-            (self.scales.into_iter().all(positive), "scales"),
-            (turns(self.orientation), "orientation"),
+            (self.scales.into_iter().all(is_positive), "scales"),
+            (is_rotation(self.orientation), "orientation"),
             (in_open_unit(self.opacity), "opacity"),
         ])
     }
@@ -319,15 +320,15 @@ mod tests {
         assert_eq!(Offspring { children: 0, ..clone }.bad_field(), Some("children"));
         let at = |placement| Offspring { placement, ..clone }.bad_field();
         let scaled = |scale| Offspring { scale, ..clone }.bad_field();
-        let covering = |opacity| Offspring { opacity, ..clone }.bad_field();
+        let opaque = |opacity| Offspring { opacity, ..clone }.bad_field();
         for bad in not_positive() {
             assert_eq!(scaled(ScaleRule::Uniform(bad)), Some("scale"), "{bad}");
             assert_eq!(scaled(ScaleRule::LongAxis { long: bad, other: 1.0 }), Some("scale"));
             assert_eq!(scaled(ScaleRule::LongAxis { long: 1.0, other: bad }), Some("scale"));
             assert_eq!(scaled(ScaleRule::Axes([1.0, bad, 1.0])), Some("scale"), "{bad}");
             assert_eq!(scaled(ScaleRule::Set(bad)), Some("scale"), "{bad}");
-            assert_eq!(covering(OpacityRule::Set(bad)), Some("opacity"), "{bad}");
-            assert_eq!(covering(OpacityRule::Scaled(bad)), Some("opacity"), "{bad}");
+            assert_eq!(opaque(OpacityRule::Set(bad)), Some("opacity"), "{bad}");
+            assert_eq!(opaque(OpacityRule::Scaled(bad)), Some("opacity"), "{bad}");
         }
         for bad in NOT_FINITE {
             assert_eq!(at(Placement::LongAxis { sigmas: bad }), Some("placement"), "{bad}");
@@ -338,8 +339,8 @@ mod tests {
         }
         assert_eq!(Offspring { turn: [0.0; 4], ..clone }.bad_field(), Some("turn"));
         assert_eq!(at(Placement::LongAxis { sigmas: -1.0 }), Some("placement"));
-        assert_eq!(covering(OpacityRule::Set(1.0)), Some("opacity"));
-        assert_eq!(covering(OpacityRule::Scaled(1.0)), None);
+        assert_eq!(opaque(OpacityRule::Set(1.0)), Some("opacity"));
+        assert_eq!(opaque(OpacityRule::Scaled(1.0)), None);
     }
 
     #[test]

@@ -2,24 +2,24 @@
 
 use crate::signals::{AuxColumn, Signal};
 
-/// What a policy returns: nothing or a value, unless it cannot go on.
+/// The result of a policy's methods.
 pub type PolicyResult<T = ()> = Result<T, PolicyError>;
 
-/// Why a policy cannot be built or cannot go on.
+/// The reason why a policy cannot be built or cannot continue.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum PolicyError {
     /// The policy read a signal that its [`needs`](crate::policy::DensityPolicy::needs) do not
     /// list.
     #[error("signal {signal:?} was read but not declared; list it in `needs`")]
     Undeclared {
-        /// The signal in question.
+        /// The undeclared signal.
         signal: Signal,
     },
     /// The policy read a column of an auxiliary view that its
     /// [`Needs::aux`](crate::policy::Needs::aux) do not list.
     #[error("column {column:?} was read but not declared; list it in `needs` under `aux`")]
     UndeclaredColumn {
-        /// The column in question.
+        /// The undeclared column.
         column: AuxColumn,
     },
     /// No policy has this name.
@@ -47,7 +47,7 @@ pub enum PolicyError {
         policy: String,
         /// The parameter.
         parameter: String,
-        /// What is wrong, and what would be right.
+        /// The problem, and the values that are accepted.
         reason: String,
     },
     /// Two policies are registered under one name.
@@ -55,15 +55,15 @@ pub enum PolicyError {
     DuplicateName {
         /// The name.
         name: String,
-        /// Where the first is (file:line).
+        /// Location of the first (file:line).
         first: String,
-        /// Where the second is (file:line).
+        /// Location of the second (file:line).
         second: String,
     },
-    /// A saved state is not this policy's.
+    /// A saved state belongs to another policy.
     #[error("saved state does not fit: {0}")]
     State(String),
-    /// Any other reason to stop.
+    /// Any other reason.
     #[error("{0}")]
     Other(String),
 }

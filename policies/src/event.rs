@@ -1,10 +1,10 @@
-//! Hand-made events for the tests of policies: signals in, pruned and grown rows out.
+//! Hand-made events for tests of policies: signals in, pruned and grown rows out.
 
 use crate::conformance::check_policy_with;
 use crate::plan::{EditPlan, Offspring, ParentFate, RowOps};
 use crate::policy::{
-    AuxColumn, AuxView, Candidate, DensityPolicy, PolicyResult, SceneInfo, Signal, Signals,
-    Snapshot,
+    AuxColumn, AuxView, Candidate, DensityPolicy, PolicyResult, SceneInfo, Signal, SignalSet,
+    Signals, Snapshot,
 };
 use crate::registry::find;
 use crate::rng::PolicyRng;
@@ -29,6 +29,34 @@ pub(crate) fn assert_conforms(name: &str, sets: &[&str]) {
     }
 }
 
+/// Asserts that the policy refuses each of these settings with an error that names the parameter.
+pub(crate) fn assert_refused(name: &str, settings: &[(&str, &str)]) {
+    for (set, parameter) in settings {
+        let built = find(name).unwrap().build(&set.parse().unwrap(), &Event::new(1, 1, 1).scene);
+        let error = built.map(drop).unwrap_err().to_string();
+        assert!(error.contains(parameter), "{set}: {error}");
+    }
+}
+
+/// Asserts that the policy has the parameters of `vanilla`, and plans like `vanilla` with the settings
+/// `defaults` at a growth step of four rows that `event` makes.
+pub(crate) fn assert_grows_like_vanilla(name: &str, event: Event, defaults: &str) {
+    // Over 4 views the means are 2e-4, less, and 1e-3; the last row is faint.
+    let event = Event { budget: 9, ..event }
+        .with(Signal::ScreenGradient, &[8.01e-4, 7.99e-4, 4e-3, 1.0])
+        .with(Signal::ScaleMax, &[0.05, 0.05, 0.2, 0.05])
+        .with(Signal::Opacity, &[0.5, 0.5, 0.5, 0.001]);
+    for set in ["", "tau = 0.0005", "small = 0.03", "governor = true", "min_opacity = 0.6"] {
+        let ours = event.run(name, set).ops;
+        assert_eq!(ours, event.run("vanilla", &format!("{defaults}\n{set}")).ops, "{set}");
+        assert!(ours.edits_rows(), "{set}");
+    }
+    let (ours, theirs) = (find(name).unwrap(), find("vanilla").unwrap());
+    let names = ours.parameter_names();
+    assert!(theirs.parameter_names().iter().all(|parameter| names.contains(parameter)));
+    assert!(ours.step_parameters().starts_with(theirs.step_parameters()));
+}
+
 /// One event of a policy. Signals that are not given are zero.
 #[derive(Debug, Clone)]
 pub(crate) struct Event {
@@ -49,7 +77,7 @@ pub(crate) struct View {
     pub(crate) points: Vec<Candidate>,
 }
 
-/// What a policy did. Rows are those before the edit, ascending, unless stated otherwise.
+/// The edits of a policy. Rows are numbered as before the edit, and ascend unless stated otherwise.
 #[derive(Debug)]
 pub(crate) struct Outcome {
     pub(crate) pruned: Vec<u32>,
@@ -93,12 +121,23 @@ impl Event {
         self.with(signal, &values)
     }
 
-    /// What the policy `name` does with the parameters in `set`.
+    /// Runs the policy `name` with the parameters in `set`.
     pub(crate) fn run(&self, name: &str, set: &str) -> Outcome {
         self.run_policy(&mut *build(name, set, &self.scene)).unwrap()
     }
 
-    /// Lets the policy plan, with exactly the signals and as many of the views as it asks for.
+    /// The given values of the signals in `set`; 0 where none are given.
+    pub(crate) fn signals(&self, set: SignalSet) -> Signals {
+        let mut signals = Signals::zeros(self.rows, set);
+        for (signal, values) in &self.signals {
+            if let Some(column) = signals.get_mut(*signal) {
+                column.copy_from_slice(values);
+            }
+        }
+        signals
+    }
+
+    /// Lets the policy plan, with exactly the signals and the number of views that it requests.
     pub(crate) fn run_policy(&self, policy: &mut dyn DensityPolicy) -> PolicyResult<Outcome> {
         let request = policy.needs(&self.scene).aux.unwrap_or_default();
         let wanted = policy.aux_views(self.step, self.rows, self.budget) as usize;
@@ -114,19 +153,13 @@ impl Event {
                 points: &view.points[..view.points.len().min(request.points as usize)],
             })?;
         }
-        let mut signals = Signals::zeros(self.rows, policy.needs(&self.scene).signals);
-        for (signal, values) in &self.signals {
-            if let Some(column) = signals.get_mut(*signal) {
-                column.copy_from_slice(values);
-            }
-        }
+        let needs = policy.needs(&self.scene);
         let now = Snapshot {
             step: self.step,
             scene: &self.scene,
-            signals: &signals,
+            signals: &self.signals(needs.signals),
             candidates: &self.candidates,
         };
-        let needs = policy.needs(&self.scene);
         let mut plan = EditPlan::new(self.rows, self.budget).allowing(&needs);
         policy.plan(&now, &PolicyRng::new(1, self.step), &mut plan)?;
         Ok(Outcome::new(plan.compile()))
@@ -134,7 +167,7 @@ impl Event {
 }
 
 impl Outcome {
-    /// Of all families, in the order of the plan.
+    /// The offspring of all families, in the order of the plan.
     pub(crate) fn offspring(&self) -> Vec<Offspring> {
         self.ops.families.iter().map(|family| self.ops.offspring(family)).collect()
     }
@@ -144,7 +177,7 @@ impl Outcome {
             let families = ops.families.iter().filter(move |f| f.fate() == fate);
             families.map(|family| family.parent).collect()
         };
-        // Rows were pruned whose slots are overwritten, and rows of the tail that do not move.
+        // Pruned rows are those whose slots are overwritten, and those of the tail that do not move.
         let is_overwritten = |row: &u32| {
             ops.child_slots.contains(row)
                 || ops.seeds.iter().any(|(slot, _)| slot == row)

@@ -4,15 +4,15 @@
 //! suite for any policy ([`conformance`]), and the built-in policies: [`vanilla`], the original
 //! adaptive density control; [`taming`], growth by score along a curve; [`diet`], replacement of the
 //! least important Gaussians; [`mcmc`], relocation and noise; [`igs`], long-axis splits at edges;
-//! [`lightgaussian`] and [`radsplat`], which prune what `vanilla` has grown; [`compact_3dgs`], which
-//! learns what to prune; [`eagles`], which prunes the least influential and begins with small images;
-//! [`mini_splatting`], which samples by importance; [`reduced_3dgs`], which prunes where many Gaussians
-//! share a pixel; [`merit`], our own, which replaces what hardly shows. It knows no renderer, no image and
-//! no device.
+//! [`lightgaussian`] and [`radsplat`], which prune a model grown by `vanilla`; [`compact_3dgs`], which
+//! learns which Gaussians to prune; [`eagles`], coarse-to-fine images with pruning by influence;
+//! [`mini_splatting`], sampling by importance; [`reduced_3dgs`], pruning where many Gaussians share a pixel;
+//! and [`merit`], our own, replacement of hardly visible Gaussians. The crate depends on no renderer, image
+//! type or device.
 //!
 //! # For users of gsplat
 //!
-//! A policy is what gsplat calls a strategy, with one difference: it never touches parameters or
+//! A policy is what gsplat calls a strategy, with one difference: it never modifies parameters or
 //! optimiser state. It reads statistics as plain slices and returns a plan of edits, which a backend
 //! executes within the budget.
 //!
@@ -21,7 +21,7 @@
 //! | a subclass of `Strategy` | a type that implements [`DensityPolicy`](policy::DensityPolicy) |
 //! | `state["grad2d"]`, `state["count"]` | [`Signal::ScreenGradient`](policy::Signal::ScreenGradient), [`Signal::VisibleCount`](policy::Signal::VisibleCount), declared in [`Needs`](policy::Needs) and accumulated by the backend |
 //! | `params["means"]` | [`Signal::Position`](policy::Signal::Position), declared like the others and read with [`positions`](policy::Snapshot::positions) |
-//! | `step_post_backward(step, ...)` | [`plan`](policy::DensityPolicy::plan), called after the optimiser's step of every iteration for which [`is_due`](policy::DensityPolicy::is_due) |
+//! | `step_post_backward(step, ...)` | [`plan`](policy::DensityPolicy::plan), called after the optimiser step of every iteration for which [`is_due`](policy::DensityPolicy::is_due) returns true |
 //! | `duplicate` | [`plan.grow`](plan::EditPlan::grow)`(row, `[`clone_at`](adc::clone_at)`([0.0; 3]))` |
 //! | `split` | `plan.grow(row, `[`split_by`](adc::split_by)`(1.6))` |
 //! | `remove` | [`plan.prune`](plan::EditPlan::prune)`(row)` |
@@ -41,18 +41,18 @@
 //!    prints it, and [`conformance::check_manual`] compares it with the code. The cell `range` holds
 //!    `>= a`, `> a`, `a to b`, `a to b, both excluded` (or `a excluded`), a list of words, or nothing.
 //! 2. **Parameters**: a struct with defaults, which `--policy-set NAME.parameter=value` overrides. Those
-//!    listed in [`STEP_PARAMETERS`](registry::ConfiguredPolicy::STEP_PARAMETERS) scale with the length
-//!    of the run, and say whether they are a step or an interval.
+//!    listed in [`STEP_PARAMETERS`](registry::ConfiguredPolicy::STEP_PARAMETERS), as a step or an interval,
+//!    scale with the length of the run.
 //! 3. **Needs**: the [`Signal`](policy::Signal)s that it reads. Only these are accumulated, and reading
 //!    another is an error. Signals measured in training cost little. Auxiliary views
-//!    ([`Needs::aux`](policy::Needs::aux)) cost extra renders, so the policy says at which events it
-//!    needs them ([`aux_views`](policy::DensityPolicy::aux_views)). Loss terms, noise, learning rates, the interval
-//!    of optimiser steps and changes to the initial model are declared here too.
+//!    ([`Needs::aux`](policy::Needs::aux)) cost extra renders, so the policy requests them only for the
+//!    events that need them ([`aux_views`](policy::DensityPolicy::aux_views)). Loss terms, noise, learning
+//!    rates, the interval of optimiser steps and changes to the initial model are declared here too.
 //! 4. **A plan**: at the steps at which it is due, the policy reads the
 //!    [`Snapshot`](policy::Snapshot) and adds edits to the [`EditPlan`](plan::EditPlan).
 //! 5. **State**, if it has any: [`save`](policy::DensityPolicy::save) and
-//!    [`restore`](policy::DensityPolicy::restore) put into checkpoints whatever future decisions depend
-//!    on, beside parameters and signals. A policy without state writes neither.
+//!    [`restore`](policy::DensityPolicy::restore) store in checkpoints everything that future decisions
+//!    depend on, apart from parameters and signals. A policy without state implements neither.
 //!
 //! Rules:
 //!
@@ -60,9 +60,9 @@
 //!   is not an error. At the budget, prune first, then grow: a pruned row frees its slot within the
 //!   same plan.
 //! - Each row has at most one edit in a plan. Rows are named by their index before the edit.
-//! - Signals may hold anything, such as zero views, or NaN from a broken Gaussian. The functions of
+//! - Signals may hold any value, such as zero views, or NaN from a broken Gaussian. The functions of
 //!   [`sample`] sort NaN last.
-//! - The same run must make the same plans: draw random numbers only from the
+//! - Runs are reproducible: draw random numbers only from the
 //!   [`PolicyRng`](rng::PolicyRng), and use no clock, no threads and no iteration over a `HashMap`.
 //! - Leave at least one row ([`adc::spare_one`]).
 //!
@@ -127,7 +127,7 @@
 //!         plan.cause("fade");
 //!         let count = (self.0.share * now.rows() as f64) as usize;
 //!         let rows: Vec<u32> = (0..now.rows() as u32).collect();
-//!         // One row fewer than all: a model without rows could never grow again.
+//!         // Keep at least one row, as an empty model could never grow again.
 //!         let faintest = count.min(now.rows().saturating_sub(1));
 //!         plan.prune_all(smallest(rows, now.signal(Signal::Opacity)?, faintest));
 //!         // Rows that were just pruned are refused here, and counted as denied.
@@ -141,7 +141,7 @@
 //! densify_policies::register_policy!(
 //!     "fade",
 //!     Fade,
-//!     summary: "replaces the faintest Gaussians by splits of the heaviest",
+//!     summary: "replaces the faintest Gaussians by splits of those with the largest weights",
 //!     source: "an example",
 //!     // In a file of its own: include_str!("fade.rs").
 //!     doc: "| name | default | range | unit | meaning |\n\
@@ -157,10 +157,11 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 //!
-//! # Using it
+//! # Using the policy
 //!
-//! A linker drops crates that are never named. The main file of the program that uses your policy says
-//! `use my_policies as _;` and calls the command line of `densify`; CONTRIBUTING.md shows all of it.
+//! The linker drops crates that are never named. The main file of the program that uses your policy
+//! therefore says `use my_policies as _;` and calls the command line of `densify`; CONTRIBUTING.md has the
+//! complete file.
 
 pub mod adc;
 pub mod compact_3dgs;

@@ -1,17 +1,17 @@
-//! The nearest neighbours of points and the distances to them, by a k-d tree (Bentley 1975).
+//! Nearest neighbours of points, by a k-d tree (Bentley 1975).
 
-/// Points in a leaf of the tree; so few are searched faster one by one.
+/// Maximum number of points in a leaf of the tree, which is searched linearly.
 const LEAF: usize = 8;
 /// Number of neighbours that distances are averaged over.
 const AVERAGED: usize = 3;
 
-/// Points, arranged so that the nearest neighbours of each are found quickly. It takes 5 bytes per point
-/// beside the points.
+/// A search structure for the nearest neighbours of points. Takes 5 bytes per point in addition to the points.
 #[derive(Debug)]
 pub struct Neighbours<'a> {
     points: &'a [[f64; 3]],
-    /// Each range longer than a leaf is split at its middle, along the axis in `axes` there.
+    /// Indices of points. Each range longer than a leaf is split at its middle element.
     order: Vec<u32>,
+    /// Axis of the split at each position of `order`.
     axes: Vec<u8>,
 }
 
@@ -20,26 +20,26 @@ pub struct Neighbours<'a> {
 pub struct Neighbour {
     /// Squared distance, >= 0.
     pub square: f64,
-    /// Its place among the points.
+    /// Index of the neighbour.
     pub index: u32,
 }
 
-/// The nearest neighbours so far of one point.
+/// A search for the nearest neighbours of one point.
 struct Nearest<'a> {
     at: [f64; 3],
-    /// The point, which is no neighbour of itself.
+    /// Index of the point, which is not its own neighbour.
     point: u32,
-    /// Ascending; those not found yet are at an infinite distance. Not empty.
+    /// Neighbours found so far, nearest first, followed by [`NOT_FOUND`]. Not empty.
     found: &'a mut [Neighbour],
-    /// Squared distance that all that is yet to be found is below.
+    /// Only neighbours below this squared distance are of interest.
     bound: f64,
 }
 
-/// The place of a neighbour that is not found yet.
-pub const UNKNOWN: Neighbour = Neighbour { square: f64::INFINITY, index: u32::MAX };
+/// A placeholder for a neighbour that has not been found.
+const NOT_FOUND: Neighbour = Neighbour { square: f64::INFINITY, index: u32::MAX };
 
 impl<'a> Neighbours<'a> {
-    /// Arranges at most 2³² points, whose coordinates must not be NaN.
+    /// Builds the tree of at most 2³² points, whose coordinates must not be NaN.
     #[must_use]
     pub fn new(points: &'a [[f64; 3]]) -> Self {
         let mut order: Vec<u32> = (0..points.len() as u32).collect();
@@ -48,37 +48,35 @@ impl<'a> Neighbours<'a> {
         Self { points, order, axes }
     }
 
-    /// Mean squared distance of a point to its three nearest others, or to all others if there are fewer;
+    /// Mean squared distance of a point to its three nearest neighbours, or to all others if there are fewer;
     /// 0 if there are none.
     ///
     /// # Panics
     /// When there is no such point.
     #[must_use]
     pub fn mean_square_distance(&self, index: usize) -> f64 {
-        let mut found = [UNKNOWN; AVERAGED];
+        let mut found = [NOT_FOUND; AVERAGED];
         let found = self.nearest(index, &mut found).iter();
-        let (count, sum) = found.fold((0.0, 0.0), |(n, sum), other| (n + 1.0, sum + other.square));
+        let (count, sum) = found.fold((0.0, 0.0), |(n, sum), near| (n + 1.0, sum + near.square));
         if count > 0.0 { sum / count } else { 0.0 }
     }
 
-    /// The nearest others of a point, nearest first: as many as `buffer` holds, or all if there are fewer.
-    /// Of points at the same distance, which ones are found depends on nothing but the points.
-    ///
-    /// # Panics
-    /// When there is no such point.
-    pub fn nearest<'b>(&self, index: usize, buffer: &'b mut [Neighbour]) -> &'b [Neighbour] {
+    /// The nearest neighbours of a point, nearest first: as many as `buffer` holds, or all others if there are
+    /// fewer. Ties are broken deterministically.
+    fn nearest<'b>(&self, index: usize, buffer: &'b mut [Neighbour]) -> &'b [Neighbour] {
         self.nearest_below(index, f64::INFINITY, buffer)
     }
 
-    /// Calls `visit` with each point and its `most` [nearest](Self::nearest) others, in an order in which
-    /// points that follow each other are near each other.
-    pub fn each_nearest(&self, most: usize, mut visit: impl FnMut(usize, &[Neighbour])) {
+    /// Calls `visit` with the index of each point and its `most` nearest neighbours, nearest first. Consecutive
+    /// points are near each other.
+    pub fn for_each_nearest(&self, most: usize, mut visit: impl FnMut(usize, &[Neighbour])) {
         let most = most.min(self.points.len().saturating_sub(1));
-        let mut buffer = vec![UNKNOWN; most];
+        let mut buffer = vec![NOT_FOUND; most];
         let mut before: Option<(usize, f64)> = None;
         for &index in &self.order {
             let index = index as usize;
-            // What was near the point before is at most so far from this one; with room for rounding.
+            // By the triangle inequality, the previous point's neighbours are within this bound, with a
+            // margin for rounding.
             let bound = before.map_or(f64::INFINITY, |(before, farthest)| {
                 let step = square(self.points[before], self.points[index]).sqrt();
                 (farthest.sqrt() + step).powi(2) * (1.0 + 1e-9) + f64::MIN_POSITIVE
@@ -95,7 +93,7 @@ impl<'a> Neighbours<'a> {
         bound: f64,
         buffer: &'b mut [Neighbour],
     ) -> &'b [Neighbour] {
-        buffer.fill(UNKNOWN);
+        buffer.fill(NOT_FOUND);
         let (at, point) = (self.points[index], index as u32);
         if !buffer.is_empty() {
             let mut nearest = Nearest { at, point, found: &mut *buffer, bound };
@@ -105,7 +103,7 @@ impl<'a> Neighbours<'a> {
         &buffer[..count]
     }
 
-    /// Visits the points of a range, which is this far from the point along each axis.
+    /// Searches a range of points whose box is at distance `outside` along each axis.
     fn visit(&self, from: usize, to: usize, outside: [f64; 3], nearest: &mut Nearest<'_>) {
         if to - from <= LEAF {
             for &other in &self.order[from..to] {
@@ -122,7 +120,7 @@ impl<'a> Neighbours<'a> {
         nearest.take(self.points, self.order[middle]);
         let mut outside = outside;
         outside[axis] = beyond;
-        // Not where the two are equal: points that coincide would all be visited.
+        // Equality must not count, or coinciding points would all be visited.
         if square(outside, [0.0; 3]) < nearest.bound {
             self.visit(far.0, far.1, outside, nearest);
         }
@@ -160,7 +158,7 @@ fn split(points: &[[f64; 3]], order: &mut [u32], axes: &mut [u8]) {
 impl Nearest<'_> {
     fn take(&mut self, points: &[[f64; 3]], index: u32) {
         let square = square(points[index as usize], self.at);
-        // NaN is not below either.
+        // False for NaN.
         let is_below = square < self.bound;
         if index == self.point || !is_below {
             return;
@@ -198,7 +196,7 @@ mod tests {
         assert!((mean_square_distances(&five)[0] - 5.0 / 3.0).abs() < 1e-12);
     }
 
-    /// Clustered points, with ties and points that coincide.
+    /// Clustered points, with ties and coinciding points.
     fn clustered() -> Vec<[f64; 3]> {
         let rng = PolicyRng::new(1, 1);
         (0..700)
@@ -232,10 +230,10 @@ mod tests {
         let square =
             |a: &[f64; 3], b: &[f64; 3]| (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>();
         for k in [0, 1, 2, 30, 699, 900] {
-            let mut buffer = vec![UNKNOWN; k];
+            let mut buffer = vec![NOT_FOUND; k];
             let mut visits = vec![0; points.len()];
             let mut together = vec![Vec::new(); points.len()];
-            tree.each_nearest(k, |index, found| {
+            tree.for_each_nearest(k, |index, found| {
                 visits[index] += 1;
                 together[index] = found.iter().map(|other| other.square).collect();
             });
@@ -264,15 +262,15 @@ mod tests {
     }
 
     #[test]
-    fn points_that_coincide_are_not_all_visited() {
-        // With all pairs visited this would take minutes.
+    fn coinciding_points_are_not_all_visited() {
+        // Visiting all pairs would take minutes.
         let points = vec![[1.0, 2.0, 3.0]; 200_000];
         let tree = Neighbours::new(&points);
-        let mut buffer = [UNKNOWN; 30];
+        let mut buffer = [NOT_FOUND; 30];
         for index in 0..points.len() {
             let found = tree.nearest(index, &mut buffer);
             assert!(found.len() == 30 && found.iter().all(|other| other.square == 0.0));
         }
-        tree.each_nearest(30, |_, found| assert_eq!(found.len(), 30));
+        tree.for_each_nearest(30, |_, found| assert_eq!(found.len(), 30));
     }
 }

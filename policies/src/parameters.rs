@@ -1,4 +1,4 @@
-//! Parameters of policies: names, ranges, overrides, and scaling with the length of a run.
+//! Parameters of policies: names, ranges, overrides, and scaling with the length of the run.
 
 use std::ops::{Bound, RangeBounds};
 
@@ -7,25 +7,25 @@ use toml::{Table, Value};
 
 use crate::policy::{PolicyError, PolicyResult};
 
-/// Length of the run that defaults in steps are written for `[steps]`.
+/// Length of the run that defaults in steps refer to `[steps]`.
 pub const REFERENCE_ITERATIONS: u32 = 30_000;
 
-/// Largest size of a parameter: its products must be finite as `f32`.
+/// Largest magnitude of a parameter, so that products of parameters are finite as `f32`.
 const LARGEST: f64 = 1e30;
 
-/// Checks that a parameter is in its range, as it is and as `f32`, and at most 1e30 in size, for
-/// [`ConfiguredPolicy::new`]. The registry adds the policy's name to the error.
+/// Checks, for [`ConfiguredPolicy::new`], that a parameter is in its range, also when rounded to `f32`, and at
+/// most 1e30 in size. The registry adds the policy's name to the error.
 ///
 /// [`ConfiguredPolicy::new`]: crate::registry::ConfiguredPolicy::new
 ///
 /// # Errors
 /// [`PolicyError::BadParameter`] with the value and the range.
 pub fn in_range(parameter: &str, value: f64, range: impl RangeBounds<f64>) -> PolicyResult {
-    let [is_in_range, is_so_rounded] =
+    let [is_in_range, is_in_range_rounded] =
         [value, f64::from(value as f32)].map(|value| range.contains(&value));
-    // Also false for what is not a number.
+    // False for NaN.
     let is_moderate = value.abs() <= LARGEST;
-    if is_in_range && is_so_rounded && is_moderate {
+    if is_in_range && is_in_range_rounded && is_moderate {
         return Ok(());
     }
     let mut limits = Vec::new();
@@ -44,7 +44,7 @@ pub fn in_range(parameter: &str, value: f64, range: impl RangeBounds<f64>) -> Po
     }
     let limits = limits.join(" and ");
     let reason = if is_in_range {
-        let rounded = if is_so_rounded { "" } else { " as a 32-bit number" };
+        let rounded = if is_in_range_rounded { "" } else { " as a 32-bit number" };
         format!("{value:e} is out of range; it must be {limits}{rounded}")
     } else {
         format!("{value} is out of range; it must be {limits}")
@@ -64,21 +64,21 @@ pub fn bad_parameter(parameter: &str, reason: impl Into<String>) -> PolicyError 
     }
 }
 
-/// A value as it is written on a command line: TOML where it is some, else text.
+/// Parses a value given on the command line: as TOML if it is valid TOML, otherwise as text.
 #[must_use]
 pub fn parse_value(text: &str) -> Value {
     let parsed = format!("value = {text}").parse::<Table>().ok();
-    // A text with a line break could set further keys; then it is not one value.
+    // A text with a line break could set further keys; it is not a single value then.
     let single = parsed.filter(|table| table.len() == 1);
     single.and_then(|mut table| table.remove("value")).unwrap_or_else(|| text.into())
 }
 
 /// Shortest interval after scaling `[steps]`. Between two events rows must be seen from many views, and
-/// new rows must settle, which takes as many steps in a short run as in a long one.
+/// new rows must converge, which takes as many steps in a short run as in a long one.
 const MIN_INTERVAL: i64 = 100;
 
-/// A parameter that counts steps, by its name. Its default is meant for a run of 30,000 steps and scales
-/// with the length of the run; what is set is taken as it is.
+/// The name of a parameter that counts steps. Its default refers to a run of 30,000 steps and scales with the
+/// length of the run; a value that is set does not.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StepParameter {
     /// A step of the run, or a number of them: scales in proportion.
@@ -87,16 +87,16 @@ pub enum StepParameter {
     Interval(&'static str),
 }
 
-/// The step parameters of a policy that has all those of another, `first`, and `more`; N in all.
+/// Concatenates the step parameters of another policy, `first`, and `more`, N in total.
 ///
 /// # Panics
-/// When they are not N; it does not compile then where the result is a constant.
+/// When the total is not N. In a constant this is a compile error.
 #[must_use]
 pub const fn extended<const N: usize>(
     first: &[StepParameter],
     more: &[StepParameter],
 ) -> [StepParameter; N] {
-    assert!(first.len() + more.len() == N, "another number of step parameters");
+    assert!(first.len() + more.len() == N, "wrong number of step parameters");
     let mut all = [StepParameter::Step(""); N];
     let mut i = 0;
     while i < N {
@@ -115,8 +115,8 @@ impl StepParameter {
     }
 }
 
-/// Multiplies step counts by `iterations` / 30,000: rounded, at least 1, but 0 (which switches something
-/// off) stays 0. Intervals stop shrinking at [`MIN_INTERVAL`].
+/// Multiplies step counts by `iterations` / 30,000 and rounds them to at least 1; 0 stays 0, as it switches
+/// something off. Intervals do not shrink below [`MIN_INTERVAL`].
 pub(crate) fn scale_steps(table: &mut Table, parameters: &[StepParameter], iterations: u32) {
     for parameter in parameters {
         if let Some(Value::Integer(steps)) = table.get_mut(parameter.name())
@@ -132,21 +132,20 @@ pub(crate) fn scale_steps(table: &mut Table, parameters: &[StepParameter], itera
     }
 }
 
-/// The name in `known` most similar to `name`, if any is similar.
+/// The name in `known` most similar to `name`, if any is similar enough.
 #[must_use]
 pub fn nearest<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> Option<String> {
-    // 0.7 accepts a missing or wrong letter in a short name, but not another word.
+    // 0.7 accepts a missing or wrong letter in a short name, but not a different word.
     let scored = known.into_iter().map(|k| (strsim::jaro_winkler(name, k), k));
     let best = scored.filter(|(score, _)| *score >= 0.7).max_by(|a, b| a.0.total_cmp(&b.0));
     best.map(|(_, k)| k.to_owned())
 }
 
-/// The names of the fields of `T`, a struct that derives `Deserialize`, in declaration order. Unlike a
-/// table of defaults, they include fields that are `None` by default. `None` when `T` is not a
-/// plain struct.
+/// The field names of `T`, a struct that derives `Deserialize`, in declaration order. Unlike a table of
+/// defaults, they include fields that are `None` by default. `None` if `T` is not a plain struct.
 pub(crate) fn field_names<T: DeserializeOwned>() -> Option<&'static [&'static str]> {
     let mut names = None;
-    // Always an error: this deserialiser only records the names.
+    // This deserialiser only records the names and always returns an error.
     let _ = T::deserialize(FieldNames(&mut names));
     names
 }
@@ -226,7 +225,7 @@ mod tests {
 
     #[test]
     fn schedules_scale_with_the_run() {
-        // The parameters' names say nothing.
+        // Names do not matter: `until_every` is a step, not an interval.
         let scaled = |steps: i64, iterations| {
             let mut table = Table::new();
             for name in ["until_every", "every", "rows"] {

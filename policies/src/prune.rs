@@ -1,8 +1,8 @@
-//! Pruning by what all training views show of a row, or at random to the same count.
+//! Pruning by a measure over all training views, or of the same number of rows at random.
 //!
-//! Methods that prune a grown model differ in what they measure. What they share is here: the measure
-//! is gathered over the auxiliary views of one event, the rows with the lowest values go, and a control
-//! draws as many rows at random, so that a study can tell what the measure is worth.
+//! Methods that prune a grown model differ in their measure and share this code: the measure is accumulated
+//! over the auxiliary views of one event, and the rows with the lowest values are pruned. A control prunes the
+//! same number of rows at random, so that a study can tell the effect of the measure.
 
 use serde::{Deserialize, Serialize};
 
@@ -11,8 +11,8 @@ use crate::policy::Snapshot;
 use crate::rng::PolicyRng;
 use crate::sample::{smallest, weighted};
 
-/// A number per row, gathered over the auxiliary views of one event. It is no state to be saved: views
-/// and plan of an event belong together, and the next event starts anew.
+/// A number per row, accumulated over the auxiliary views of one event. Not part of a policy's saved state, as
+/// it is used in the same event and the next one starts from zero.
 #[derive(Debug, Default)]
 pub struct OverViews {
     step: u32,
@@ -21,17 +21,17 @@ pub struct OverViews {
 }
 
 impl OverViews {
-    /// Adds the values of a view of `step`, those that are positive. Shape: `[rows]`.
+    /// Adds the positive values of a view of `step`. Shape: `[rows]`.
     pub fn add(&mut self, step: u32, values: &[f32]) {
         self.combine(step, values, |sum, value| sum + value);
     }
 
-    /// Keeps the larger of the values so far and those of a view of `step`, at least 0. Shape: `[rows]`.
+    /// Takes the maximum with the values of a view of `step`, and with 0. Shape: `[rows]`.
     pub fn maximum(&mut self, step: u32, values: &[f32]) {
         self.combine(step, values, f32::max);
     }
 
-    /// The values of this event, which are then forgotten; `None` if no view of it was seen.
+    /// Removes and returns the values of this event; `None` if it had no views.
     pub fn take(&mut self, now: &Snapshot<'_>) -> Option<Vec<f32>> {
         let Self { step, values } = std::mem::take(self);
         (step == now.step && values.len() == now.rows()).then_some(values)
@@ -42,7 +42,7 @@ impl OverViews {
             *self = Self { step, values: vec![0.0; values.len()] };
         }
         for (so_far, &value) in self.values.iter_mut().zip(values) {
-            // Also passes over NaN.
+            // Skips NaN, too.
             if value > 0.0 {
                 *so_far = with(*so_far, value);
             }
@@ -50,22 +50,22 @@ impl OverViews {
     }
 }
 
-/// Which rows a prune removes.
+/// The choice of rows to prune.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Victims {
-    /// Those that the measure ranks lowest.
+    /// Those with the lowest measure.
     Lowest,
-    /// As many, drawn at random with equal chances: a control.
+    /// The same number, drawn uniformly at random, as a control.
     Random,
 }
 
 impl Victims {
-    /// Prunes `count` of the rows that have no edit yet; the control does not read `measure`. At least
-    /// one row of the model is left: without any it could never grow again.
+    /// Prunes `count` of the rows that have no edit yet; the control does not read `measure`. Keeps at least
+    /// one row, as an empty model could never grow again.
     ///
     /// # Panics
-    /// When the lowest are asked for and `measure` has fewer values than the model has rows.
+    /// For `Lowest`, when `measure` has fewer values than the model has rows.
     pub fn prune(self, plan: &mut EditPlan, measure: &[f32], count: usize, rng: &PolicyRng) {
         let left = plan.rows() - plan.pruned();
         let count = count.min(left.saturating_sub(1));
@@ -92,8 +92,8 @@ mod tests {
 
     const NAN: f32 = f32::NAN;
 
-    /// What is taken at an event of `step` with `rows` rows.
-    fn taken(gathered: &mut OverViews, step: u32, rows: usize) -> Option<Vec<f32>> {
+    /// Takes the values at an event of `step` with `rows` rows.
+    fn take(gathered: &mut OverViews, step: u32, rows: usize) -> Option<Vec<f32>> {
         let (scene, signals) =
             (Event::new(1, 1, 1).scene, Signals::zeros(rows, SignalSet::default()));
         gathered.take(&Snapshot { step, scene: &scene, signals: &signals, candidates: &[] })
@@ -104,13 +104,13 @@ mod tests {
         let mut sums = OverViews::default();
         sums.add(5, &[1.0, 2.0, NAN, -3.0]);
         sums.add(5, &[0.5, NAN, 0.0, 4.0]);
-        assert_eq!(taken(&mut sums, 5, 4), Some(vec![1.5, 2.0, 0.0, 4.0]));
-        // What was taken is forgotten.
-        assert_eq!(taken(&mut sums, 5, 4), None);
+        assert_eq!(take(&mut sums, 5, 4), Some(vec![1.5, 2.0, 0.0, 4.0]));
+        // The values are gone after the first call.
+        assert_eq!(take(&mut sums, 5, 4), None);
         let mut largest = OverViews::default();
         largest.maximum(5, &[0.25, NAN, 0.0, -1.0]);
         largest.maximum(5, &[0.125, 0.5, NAN, -2.0]);
-        assert_eq!(taken(&mut largest, 5, 4), Some(vec![0.25, 0.5, 0.0, 0.0]));
+        assert_eq!(take(&mut largest, 5, 4), Some(vec![0.25, 0.5, 0.0, 0.0]));
     }
 
     #[test]
@@ -118,14 +118,14 @@ mod tests {
         let mut sums = OverViews::default();
         sums.add(5, &[1.0, 2.0]);
         sums.add(6, &[0.5, 0.5]);
-        assert_eq!(taken(&mut sums, 6, 2), Some(vec![0.5, 0.5]));
+        assert_eq!(take(&mut sums, 6, 2), Some(vec![0.5, 0.5]));
         sums.add(6, &[1.0, 2.0]);
-        assert_eq!(taken(&mut sums, 7, 2), None);
+        assert_eq!(take(&mut sums, 7, 2), None);
         sums.add(7, &[1.0, 2.0]);
-        assert_eq!(taken(&mut sums, 7, 3), None);
+        assert_eq!(take(&mut sums, 7, 3), None);
     }
 
-    /// The rows that are pruned of those not pruned before.
+    /// The rows that are pruned, excluding those in `before`.
     fn pruned(
         victims: Victims,
         measure: &[f32],
@@ -142,10 +142,10 @@ mod tests {
     }
 
     #[test]
-    fn the_lowest_go_and_one_row_stays() {
+    fn the_lowest_are_pruned_and_one_row_is_kept() {
         let measure = [3.0, 0.0, 5.0, 1.0, 1.0];
         let lowest = |before: &[u32], count| pruned(Victims::Lowest, &measure, before, count, 1);
-        // Of equal rows the first.
+        // The first of equal rows is pruned.
         assert_eq!(lowest(&[], 2), [1, 3]);
         assert_eq!(lowest(&[1], 2), [3, 4]);
         assert_eq!(lowest(&[], 5), [0, 1, 3, 4]);

@@ -4,7 +4,7 @@
 //! count. The hash is pcg4d (Jarzynski and Olano, *Hash Functions for GPU Rendering*, JCGT 9(3),
 //! 2020): 32-bit operations only, so that a shader can compute it too.
 
-/// The purpose of a draw. Draws for different purposes are independent.
+/// The purpose of a draw; draws for different purposes are independent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u32)]
 pub enum Purpose {
@@ -14,9 +14,9 @@ pub enum Purpose {
     Place = 2,
     /// Noise on parameters.
     Noise = 3,
-    /// Drawing with replacement: the row is the number of the draw.
+    /// Drawing with replacement; the index of the draw takes the place of the row.
     Draw = 4,
-    /// Rounding numbers that are stored in fewer bits.
+    /// Stochastic rounding of numbers stored in fewer bits.
     Round = 5,
 }
 
@@ -28,7 +28,7 @@ pub struct PolicyRng {
 }
 
 impl PolicyRng {
-    /// Draws of iteration `step` of a run with this seed.
+    /// The draws of iteration `step` in a run with this seed.
     #[must_use]
     pub fn new(seed: u64, step: u32) -> Self {
         // Folding keeps both halves of a 64-bit seed significant.
@@ -42,14 +42,13 @@ impl PolicyRng {
         pcg4d([row, self.step, self.seed, (purpose as u32) << 16 ^ counter])
     }
 
-    /// A number in (0, 1), never 0 or 1: (k + ½) / 2²³.
+    /// A number in (0, 1): (k + ½) / 2²³.
     #[must_use]
     pub fn uniform(&self, row: u32, purpose: Purpose) -> f32 {
         unit_open(self.bits(row, purpose, 0)[0])
     }
 
-    /// A number in (0, 1), never 0 or 1, of 52 bits: among millions of rows, 23 bits would often
-    /// repeat.
+    /// A number in (0, 1) with 52 bits: among millions of rows, numbers of 23 bits often repeat.
     #[must_use]
     pub fn uniform_f64(&self, row: u32, purpose: Purpose) -> f64 {
         let [high, low, ..] = self.bits(row, purpose, 0);
@@ -73,7 +72,7 @@ impl PolicyRng {
 }
 
 /// The top 23 bits as a number strictly between 0 and 1. With 24 bits, k + ½ would need a 25-bit
-/// mantissa, and the largest would round to 1.
+/// mantissa, and the largest number would round to 1.
 fn unit_open(bits: u32) -> f32 {
     ((bits >> 9) as f32 + 0.5) * (1.0 / 8_388_608.0)
 }
@@ -110,8 +109,8 @@ mod tests {
         (chi2 - freedom) / (2.0 * freedom).sqrt()
     }
 
-    /// How far pairs of numbers in (0, 1) are from filling the unit square evenly.
-    fn joint(pair: impl Fn(u32) -> (f32, f32)) -> f64 {
+    /// The deviation of pairs of numbers in (0, 1) from a uniform distribution over the unit square.
+    fn joint_deviation(pair: impl Fn(u32) -> (f32, f32)) -> f64 {
         let mut counts = [0; 256];
         for draw in 0..DRAWS {
             let (a, b) = pair(draw);
@@ -162,25 +161,36 @@ mod tests {
         let u = |rng: PolicyRng, row: u32, purpose| rng.uniform(row, purpose);
         let select = Purpose::Select;
         let found = [
-            ("rows", joint(|i| (u(rng, 2 * i, select), u(rng, 2 * i + 1, select)))),
-            ("steps", joint(|i| (u(rng, i, select), u(PolicyRng::new(9, 601), i, select)))),
+            ("rows", joint_deviation(|i| (u(rng, 2 * i, select), u(rng, 2 * i + 1, select)))),
+            (
+                "steps",
+                joint_deviation(|i| (u(rng, i, select), u(PolicyRng::new(9, 601), i, select))),
+            ),
             (
                 "step by step",
-                joint(|i| {
+                joint_deviation(|i| {
                     let at = |step| u(PolicyRng::new(9, step), 5, select);
                     (at(2 * i), at(2 * i + 1))
                 }),
             ),
-            ("seeds", joint(|i| (u(rng, i, select), u(PolicyRng::new(10, 600), i, select)))),
+            (
+                "seeds",
+                joint_deviation(|i| (u(rng, i, select), u(PolicyRng::new(10, 600), i, select))),
+            ),
             (
                 "high halves of seeds",
-                joint(|i| (u(rng, i, select), u(PolicyRng::new(9 + (1 << 32), 600), i, select))),
+                joint_deviation(|i| {
+                    (u(rng, i, select), u(PolicyRng::new(9 + (1 << 32), 600), i, select))
+                }),
             ),
-            ("purposes", joint(|i| (u(rng, i, select), u(rng, i, Purpose::Place)))),
-            ("purposes", joint(|i| (u(rng, i, Purpose::Noise), u(rng, i, Purpose::Place)))),
+            ("purposes", joint_deviation(|i| (u(rng, i, select), u(rng, i, Purpose::Place)))),
+            (
+                "purposes",
+                joint_deviation(|i| (u(rng, i, Purpose::Noise), u(rng, i, Purpose::Place))),
+            ),
             (
                 "counters",
-                joint(|i| {
+                joint_deviation(|i| {
                     let at = |counter| unit_open(rng.bits(i, select, counter)[0]);
                     (at(0), at(1))
                 }),

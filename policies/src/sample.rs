@@ -1,6 +1,6 @@
-//! Choosing rows: the largest, the smallest, or at random by weight.
+//! Selecting rows: the largest, the smallest, or at random by weight; and quantiles.
 //!
-//! All choices are deterministic: ties go to the lower row, NaN comes last, and random draws are hashes
+//! Selections are deterministic: ties go to the lower row, NaN comes last, and random draws are hashes
 //! of (seed, step, row, purpose). Selecting takes O(n) and sorting the result O(k log k).
 
 use std::cmp::Ordering;
@@ -37,12 +37,12 @@ pub fn smallest(rows: Vec<u32>, values: &[f32], k: usize) -> Vec<u32> {
     })
 }
 
-/// Draws `k` distinct rows without replacement, each with a probability in proportion to its weight
-/// among those left. In the order drawn; fewer than `k` when fewer weights are positive.
+/// Draws `k` distinct rows without replacement, each with a probability proportional to its weight among the
+/// remaining ones. Returned in the order drawn; fewer than `k` if fewer weights are positive.
 ///
 /// The rows with the smallest −ln(u) / weight are drawn, an exponential variable whose rate is the
-/// weight (Efraimidis and Spirakis, *Weighted random sampling with a reservoir*, 2006). Weights that
-/// are zero, negative or NaN are never drawn; infinite ones always come first.
+/// weight (Efraimidis and Spirakis, *Weighted random sampling with a reservoir*, 2006). Rows with zero,
+/// negative or NaN weights are never drawn; those with infinite weights always come first.
 #[must_use]
 pub fn weighted(weights: &[f32], k: usize, rng: &PolicyRng) -> Vec<u32> {
     let drawn = (0..).zip(weights).filter(|(_, weight)| **weight > 0.0);
@@ -55,10 +55,10 @@ pub fn weighted(weights: &[f32], k: usize, rng: &PolicyRng) -> Vec<u32> {
     keyed.into_iter().map(|(_, row)| row).collect()
 }
 
-/// Draws `k` rows with replacement, each with a probability in proportion to its weight. Returns the
-/// rows drawn, ascending, with their counts; nothing when no weight is positive.
+/// Draws `k` rows with replacement, each with a probability proportional to its weight. Returns the rows
+/// drawn, ascending, with their counts; nothing if no weight is positive.
 ///
-/// Weights that are zero, negative or NaN are never drawn; infinite ones count as `f32::MAX`.
+/// Rows with zero, negative or NaN weights are never drawn; infinite weights count as `f32::MAX`.
 #[must_use]
 pub fn with_replacement(weights: &[f32], k: usize, rng: &PolicyRng) -> Vec<(u32, u32)> {
     let mut total = 0.0_f64;
@@ -77,7 +77,7 @@ pub fn with_replacement(weights: &[f32], k: usize, rng: &PolicyRng) -> Vec<(u32,
         .map(|draw| {
             let at = rng.uniform_f64(draw, Purpose::Draw) * total;
             let row = sums.partition_point(|&sum| sum <= at);
-            // The product may round up to the total; then it is the last row with a weight.
+            // The product may round up to the total, which means the last row with a positive weight.
             row.min(sums.partition_point(|&sum| sum < total)) as u32
         })
         .collect();
@@ -85,7 +85,18 @@ pub fn with_replacement(weights: &[f32], k: usize, rng: &PolicyRng) -> Vec<(u32,
     drawn.chunk_by(|a, b| a == b).map(|same| (same[0], same.len() as u32)).collect()
 }
 
-/// Numbers in the given direction (−0 equals 0), then NaN of either sign.
+/// The linearly interpolated `share` quantile of the finite values; `None` if there are none.
+#[must_use]
+pub fn quantile(values: &[f32], share: f64) -> Option<f64> {
+    let mut finite: Vec<f32> = values.iter().copied().filter(|value| value.is_finite()).collect();
+    let place = share * finite.len().checked_sub(1)? as f64;
+    let (below, between) = (place.floor() as usize, place.fract());
+    let (_, &mut low, above) = finite.select_nth_unstable_by(below, f32::total_cmp);
+    let high = above.iter().copied().min_by(f32::total_cmp).unwrap_or(low);
+    Some(f64::from(low) + between * (f64::from(high) - f64::from(low)))
+}
+
+/// Orders numbers in the given direction (−0 equals 0), followed by NaN of either sign.
 fn nan_last(x: f32, y: f32, direction: impl Fn(Ordering) -> Ordering) -> Ordering {
     x.partial_cmp(&y).map_or_else(|| x.is_nan().cmp(&y.is_nan()), direction)
 }
@@ -141,6 +152,17 @@ mod tests {
             sorted.truncate(k);
             prop_assert_eq!(top_k(&values, k), sorted);
         }
+    }
+
+    #[test]
+    fn quantiles_by_hand() {
+        let values = [5.0, NAN, 1.0, 2.0, f32::INFINITY, 4.0];
+        // Of 1, 2, 4, 5: places 0, 0.75, 1.5 and 3.
+        assert_eq!(
+            [0.0, 0.25, 0.5, 1.0].map(|share| quantile(&values, share)),
+            [Some(1.0), Some(1.75), Some(3.0), Some(5.0)]
+        );
+        assert_eq!((quantile(&[], 0.5), quantile(&[NAN], 0.5)), (None, None));
     }
 
     #[test]

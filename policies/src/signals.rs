@@ -4,28 +4,28 @@ use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
 
-/// How a signal is measured, which decides where a backend keeps it and when it is reset.
+/// The kind of a signal, which determines where a backend stores it and when it is reset.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SignalKind {
     /// Summed over the views in which the row was visible since the last
     /// [`Reset::Signals`](crate::plan::Reset::Signals), or since the row was created.
     Sum,
-    /// The same, for whole numbers.
+    /// An integer sum over the same views.
     Count,
     /// The largest value of the previous and the current epoch.
     EpochMaximum,
     /// The largest value of a view since the last reset, or since the row was created.
     Maximum,
-    /// The smallest value of the views in which the row was visible since then; +∞ where there are none.
+    /// The smallest value over the views in which the row was visible since then; +∞ if there are none.
     Minimum,
     /// Computed from the current parameters or age of the row; needs no memory.
     Present,
-    /// So many numbers of the row as it is now, copied at events only; needs no memory in between.
+    /// Current parameters of the row, this many numbers, copied only at events; needs no memory in between.
     Attribute(usize),
 }
 
-/// What the backward pass must sum over the pixels of each row for a signal, beyond what training needs;
-/// it costs memory and time for every (row, tile) pair.
+/// A quantity that the backward pass must sum over the pixels of each row for a signal. Training does not need
+/// it; it costs memory and time for every (row, tile) pair.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PixelSum {
     /// |dL/d(projected mean)| per axis.
@@ -34,19 +34,19 @@ pub enum PixelSum {
     Weight,
     /// 1 per pixel that the row was blended into.
     Count,
-    /// The blend weight α·T; its maximum, not its sum.
+    /// The maximum of the blend weight α·T, instead of a sum.
     LargestWeight,
     /// The blend weight α·T times the error of the pixel.
     WeightedError,
 }
 
-/// Declares the table of signals, each an entry with name, kind, unit and pixel sums.
+/// Declares the signals, each with name, kind, unit and pixel sums.
 macro_rules! signals {
     ($(
         $(#[$doc:meta])*
         $name:ident: $kind:ident $(($width:literal))? $unit:literal [$($sum:ident),*];
     )*) => {
-        /// What a policy may read of each row: one `f32`, or [a few](Self::width).
+        /// A statistic of each row that a policy may read: one or [several](Self::width) `f32`.
         #[derive(
             Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize,
         )]
@@ -59,7 +59,7 @@ macro_rules! signals {
             /// All signals, in declaration order; `Signal::ALL[s as usize] == s`.
             pub const ALL: [Self; [$(stringify!($name)),*].len()] = [$(Self::$name),*];
 
-            /// How the signal is measured.
+            /// The kind of the signal.
             #[must_use]
             pub const fn kind(self) -> SignalKind {
                 match self {
@@ -75,7 +75,7 @@ macro_rules! signals {
                 }
             }
 
-            /// What it adds to the backward pass.
+            /// Additional sums in the backward pass.
             #[must_use]
             pub const fn pixel_sums(self) -> &'static [PixelSum] {
                 match self {
@@ -95,8 +95,8 @@ signals! {
     ScreenGradient: Sum "1" [];
     /// Sum over views of ‖Σ over pixels |dL/d(mean in NDC)|‖₂ (absolute per axis, AbsGS), >= 0.
     ScreenGradientAbs: Sum "1" [AbsGradient];
-    /// Sum over views of ‖dL/dc‖₂, c the row's view-dependent colour as blended, >= 0. Ignores the
-    /// clamp at 0: a row clamped to black has a gradient too.
+    /// Sum over views of ‖dL/dc‖₂, c the row's view-dependent colour as blended, >= 0. Ignores the clamp at 0,
+    /// so that a row clamped to black also has a gradient.
     ColourGradient: Sum "1" [];
     /// x of the sum over views of dL/d(mean) `[1 / scene units]`.
     MeanGradientX: Sum "1 / scene units" [];
@@ -114,18 +114,16 @@ signals! {
     PixelCount: Count "pixels" [Count];
     /// Sum over all pixels of α·T·e, >= 0, e the pixel's part of the training loss:
     /// 0.8·|I − G| + 0.2·(1 − SSIM), the mean over channels. Divided by
-    /// [`WeightSum`](Self::WeightSum) it is the mean error where the row is seen.
-    /// If [`Needs::error_score`](crate::policy::Needs::error_score) weighs pixels or has another map, so does this
-    /// sum.
+    /// [`WeightSum`](Self::WeightSum) it is the mean error where the row is visible. Map and pixel weights of
+    /// [`Needs::error_score`](crate::policy::Needs::error_score) apply to this sum, too.
     WeightedError: Sum "pixels" [WeightedError];
-    /// Sum over views of an error per row, >= 0, as [`ErrorScore`](crate::policy::ErrorScore) says.
+    /// Sum over views of the row's error, >= 0, as defined by [`ErrorScore`](crate::policy::ErrorScore).
     ErrorScore: Sum "1" [Weight, WeightedError];
     /// Sum over views of √w, w the row's largest blend weight α·T of the view, >= 0. Divided by
-    /// [`VisibleCount`](Self::VisibleCount) it says how much a row matters in all views that see it,
-    /// where [`WeightMax`](Self::WeightMax) is content with one.
+    /// [`VisibleCount`](Self::VisibleCount) it tells how much a row matters in all views that see it,
+    /// whereas a single view determines [`WeightMax`](Self::WeightMax).
     WeightMaxRoot: Sum "1" [LargestWeight];
-    /// Number of views in which the row matters: its largest blend weight α·T is at least
-    /// [`SUPPORT_WEIGHT`].
+    /// Number of views in which the row's largest blend weight α·T is at least [`SUPPORT_WEIGHT`].
     Support: Count "views" [LargestWeight];
     /// Smallest camera depth of the mean `[scene units]`, > 0.
     DepthMin: Minimum "scene units" [];
@@ -133,38 +131,38 @@ signals! {
     PixelSizeMin: Minimum "scene units" [];
     /// Largest share of a view's pixels in which no row has a larger blend weight, in `[0, 1]`.
     DominantPixels: Maximum "image" [];
-    /// Opacity now, in (0, 1).
+    /// Current opacity, in (0, 1).
     Opacity: Present "1" [];
-    /// Largest of the three standard deviations now `[scene units]`, > 0.
+    /// Largest of the three current standard deviations `[scene units]`, > 0.
     ScaleMax: Present "scene units" [];
-    /// Product of the three standard deviations now `[scene units³]`, >= 0.
+    /// Product of the three current standard deviations `[scene units³]`, >= 0.
     ScaleProduct: Present "scene units³" [];
-    /// σ(m) of the row's [mask](crate::policy::MaskTerm) now, in `[0, 1]`; only where one is declared.
+    /// Current σ(m) of the row's [mask](crate::policy::MaskTerm), in `[0, 1]`; only if a mask is declared.
     Mask: Present "1" [];
     /// Optimiser steps since the row was created or rewritten, saturating at 65,535.
     Age: Present "steps" [];
-    /// Mean now `[scene units]`: world coordinates of the scene as it is trained on. Their origin is the
-    /// mean of the training cameras, the farthest of which is 1 away, but for a few that are far from all
-    /// others; if all are at one place, the median distance of the points is 1. They are not turned
-    /// against the dataset's. See [`Snapshot::positions`](crate::policy::Snapshot::positions).
+    /// Current mean `[scene units]`, in the world coordinates used for training. Their origin is the mean of
+    /// the training cameras, and the unit is the distance of the farthest camera, ignoring a few that are far
+    /// from all others; if all cameras coincide, it is the median distance of the points. The axes are parallel
+    /// to the dataset's. See [`Snapshot::positions`](crate::policy::Snapshot::positions).
     Position: Attribute(3) "scene units" [];
-    /// Natural logarithms of the three standard deviations now `[ln scene units]`, along the axes of
+    /// Natural logarithms of the three current standard deviations `[ln scene units]`, along the axes of
     /// [`Orientation`](Self::Orientation).
     LogScale: Attribute(3) "ln scene units" [];
-    /// Orientation now: a quaternion q = (w, x, y, z) of any length but 0. R(q) takes the row's axes to
-    /// the scene's: its columns are the axes.
+    /// Current orientation: a quaternion q = (w, x, y, z) of any length but 0. The columns of R(q) are the row's
+    /// axes in scene coordinates.
     Orientation: Attribute(4) "1" [];
-    /// Base colour now (band 0): red, green and blue, sRGB-encoded; not bounded to `[0, 1]`.
+    /// Current base colour (band 0): red, green and blue, sRGB-encoded; not bounded to `[0, 1]`.
     Colour: Attribute(3) "1" [];
 }
 
-/// Least largest blend weight in a view that counts as [`Signal::Support`].
+/// Smallest blend weight that counts for [`Signal::Support`].
 pub const SUPPORT_WEIGHT: f32 = 0.02;
 
 impl Signal {
-    /// Whether a policy can [reset](crate::plan::Reset) it: whether it accumulates since its last reset.
+    /// True if the signal accumulates until a policy [resets](crate::plan::Reset) it.
     #[must_use]
-    pub const fn is_reset(self) -> bool {
+    pub const fn is_resettable(self) -> bool {
         matches!(
             self.kind(),
             SignalKind::Sum | SignalKind::Count | SignalKind::Maximum | SignalKind::Minimum
@@ -198,13 +196,13 @@ impl SignalSet {
         Self(self.0 | other.0)
     }
 
-    /// Whether no signal is in the set.
+    /// True if the set is empty.
     #[must_use]
     pub fn is_empty(self) -> bool {
         self.0 == 0
     }
 
-    /// Whether `signal` is in the set.
+    /// True if `signal` is in the set.
     #[must_use]
     pub fn contains(self, signal: Signal) -> bool {
         self.0 & (1 << signal as u32) != 0
@@ -250,15 +248,15 @@ pub struct Signals {
 }
 
 impl Signals {
-    /// Columns for `set`, all zero. Each has `rows` values, or rows of [some](Signal::width).
+    /// Columns for `set`, all zero, of shape `[rows, width]` each.
     #[must_use]
     pub fn zeros(rows: usize, set: SignalSet) -> Self {
-        Self::within(Vec::new(), rows, set)
+        Self::zeros_in(Vec::new(), rows, set)
     }
 
-    /// The same, reusing the allocation of `values`; its contents are discarded.
+    /// Like [`zeros`](Self::zeros), in the allocation of `values`, whose contents are discarded.
     #[must_use]
-    pub fn within(mut values: Vec<f32>, rows: usize, set: SignalSet) -> Self {
+    pub fn zeros_in(mut values: Vec<f32>, rows: usize, set: SignalSet) -> Self {
         values.clear();
         values.resize(rows * set.width(), 0.0);
         Self { rows, present: set, values }
@@ -287,7 +285,7 @@ impl Signals {
         self.range(signal).map(|range| &mut self.values[range])
     }
 
-    /// Without the first `rows` rows, in the same memory.
+    /// Removes the first `rows` rows in place.
     ///
     /// # Panics
     /// When there are fewer.

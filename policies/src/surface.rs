@@ -1,20 +1,19 @@
-//! Models made anew: from surface points that the training views show, or from rows that begin again.
+//! Replacing a model by surface points seen in the training views, and sizes for restarted rows.
 //!
-//! *Mini-Splatting*, Fang and Wang 2024, "depth reinitialization" and the restart after sampling, as its
-//! published code and that of diet do it.
+//! *Mini-Splatting*, Fang and Wang 2024, "depth reinitialization" and the restart after sampling, as in its
+//! published code and that of diet.
 
 use crate::neighbours::Neighbours;
 use crate::plan::{EditPlan, Reset, Seed};
 use crate::policy::Candidate;
 
-/// Smallest size of a row, in extents: nearer points sample the surface at the same place (as in the
-/// initialisation).
+/// Smallest size of a row, in extents, as in the initialisation: closer points count as the same surface point.
 const LEAST_DISTANCE: f64 = 2e-4;
 /// Size of a row without neighbours, in extents.
 const LONE_SIZE: f64 = 0.02;
 
-/// For each position the standard deviation of a round row there: the root mean square distance to the
-/// three nearest others `[scene units]`; in a scene of this `extent`. Shape: `[positions]`.
+/// The standard deviations of round rows at these positions: the root mean square distance to the three nearest
+/// neighbours `[scene units]`, in a scene of this `extent`. Shape: `[positions]`.
 #[must_use]
 pub fn sizes(positions: &[[f64; 3]], extent: f32) -> Vec<f32> {
     let extent = f64::from(extent);
@@ -26,8 +25,8 @@ pub fn sizes(positions: &[[f64; 3]], extent: f32) -> Vec<f32> {
     (0..positions.len()).map(|index| size(index) as f32).collect()
 }
 
-/// Prunes all rows and appends at most `most` of the surface points instead, with this opacity. Without any
-/// sound point the model is kept.
+/// Replaces all rows by at most `most` of the surface points, with this opacity. If no point is valid, the
+/// model is kept.
 pub fn replace_model(
     points: &[Candidate],
     most: usize,
@@ -35,10 +34,10 @@ pub fn replace_model(
     extent: f32,
     plan: &mut EditPlan,
 ) {
-    // A valid size until the neighbours are known.
+    // The size is a placeholder until the neighbours are known.
     let seed = |c: &Candidate| Seed::round(c.position, c.colour, 1.0, opacity);
-    let sound = points.iter().map(seed).filter(|seed| seed.bad_field().is_none());
-    let mut seeds: Vec<Seed> = sound.take(most).collect();
+    let valid = points.iter().map(seed).filter(|seed| seed.bad_field().is_none());
+    let mut seeds: Vec<Seed> = valid.take(most).collect();
     if seeds.is_empty() {
         return;
     }
@@ -56,7 +55,7 @@ pub fn replace_model(
     plan.reset(Reset::Candidates);
 }
 
-/// How many surface points of a view to measure for `most` of all `views`, at least one.
+/// Number of surface points per view for a total of `most` over all `views`, at least one.
 #[must_use]
 pub fn points_per_view(most: usize, views: u32) -> u32 {
     let per_view = (most / views.max(1) as usize).max(1);

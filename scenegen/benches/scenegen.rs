@@ -1,8 +1,8 @@
-//! Primary rays per second against the tree library's own traversal of the same rays, and the time to
-//! build, from 10,000 to 2 million triangles.
+//! Compares primary rays per second with the tree library's own traversal of the same rays, and measures build
+//! times, for 10,000 to 2 million triangles.
 //!
-//! The mesh is a sphere with bumps, seen whole in 512 x 512 px. All on one thread. Run with
-//! `cargo bench -p densify-scenegen`; a number limits the triangles: `-- 600000`.
+//! The mesh is a bumpy sphere that fills 512 x 512 px; everything runs on one thread. Run with
+//! `cargo bench -p densify-scenegen`; a number limits the triangles, as in `-- 600000`.
 #![allow(missing_docs, clippy::print_stdout, reason = "a program that prints its measurements")]
 
 use std::hint::black_box;

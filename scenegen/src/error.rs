@@ -3,12 +3,12 @@
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
-/// Why a scene could not be made.
+/// The reason why a scene could not be made.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// A file cannot be read, contradicts its format or needs what is not supported; or there is no
-    /// such scene, option or place for a camera. The message says which.
+    /// An input file cannot be read, is malformed or needs an unsupported feature; or a preset, option or
+    /// camera position is invalid. The message has the details.
     #[error("{0}")]
     Input(String),
     /// A file or folder cannot be written.
@@ -22,7 +22,8 @@ pub enum Error {
 }
 
 impl Error {
-    /// A file contradicts its format or itself; `element` is where in the file: mesh, accessor, line.
+    /// A file violates its format or is inconsistent; `element` is the location in the file, such as a mesh,
+    /// accessor or line.
     pub(crate) fn malformed(
         path: &Path,
         element: impl Display,
@@ -53,7 +54,7 @@ impl Error {
         move |source| Self::Write { path: path.to_owned(), source }
     }
 
-    /// An option's value cannot be used; `option` is its name as on the command line.
+    /// An option has an invalid value; `option` is its name on the command line.
     pub(crate) fn option(option: &str, problem: impl Display) -> Self {
         Self::Input(format!("{option}: {problem}"))
     }

@@ -1,9 +1,9 @@
 //! Intersects rays and triangles without cracks.
 //!
 //! Woop, Benthin and Wald, "Watertight Ray/Triangle Intersection" (JCGT 2013): the triangle is
-//! sheared into the ray's space, where two triangles that share an edge evaluate the very same
-//! products for it with opposite signs, so that a ray cannot pass between them. Where an edge
-//! function is exactly zero it is evaluated again in f64, in which the products are exact.
+//! sheared into the ray's space, where two triangles that share an edge evaluate exactly the same
+//! products for it with opposite signs, so that a ray cannot pass between them. If an edge function is
+//! exactly zero, it is evaluated again in f64, in which the products are exact.
 
 use glam::Vec3;
 
@@ -17,7 +17,7 @@ pub(crate) struct ShearedRay {
     pub(crate) shear: Vec3,
 }
 
-/// Where a ray hits a triangle.
+/// The intersection of a ray and a triangle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Intersection {
     /// Ray parameter.
@@ -26,12 +26,12 @@ pub(crate) struct Intersection {
     pub(crate) v: f32,
     /// Weight of the third vertex.
     pub(crate) w: f32,
-    /// Whether the ray sees the side from which the vertices are counter-clockwise.
+    /// True if the vertices are counter-clockwise as seen along the ray.
     pub(crate) front: bool,
 }
 
 impl ShearedRay {
-    /// `direction` is finite and not zero.
+    /// `direction` must be finite and not zero.
     #[inline]
     pub(crate) fn new(origin: Vec3, direction: Vec3) -> Self {
         let size = direction.abs();
@@ -43,7 +43,7 @@ impl ShearedRay {
             2
         };
         let (mut kx, mut ky) = ((kz + 1) % 3, (kz + 2) % 3);
-        // Winding is kept.
+        // Preserves the winding.
         if direction[kz] < 0.0 {
             std::mem::swap(&mut kx, &mut ky);
         }
@@ -52,13 +52,13 @@ impl ShearedRay {
         Self { origin, kx, ky, kz, shear }
     }
 
-    /// Which coordinates are the first two and the third of the ray's space.
+    /// The coordinate axes that are x, y and z of the ray's space.
     #[inline]
     pub(crate) fn axes(&self) -> [usize; 3] {
         [self.kx, self.ky, self.kz]
     }
 
-    /// The intersection with a triangle, whatever its ray parameter.
+    /// The intersection with a triangle, at any ray parameter.
     #[inline]
     pub(crate) fn intersect(&self, triangle: &[Vec3; 3]) -> Option<Intersection> {
         let corner = |p: Vec3| {
@@ -66,7 +66,7 @@ impl ShearedRay {
             let z = p[self.kz];
             (p[self.kx] - self.shear.x * z, p[self.ky] - self.shear.y * z, self.shear.z * z)
         };
-        // Not by `map`, which is not inlined.
+        // `map` is not inlined here.
         let (a, b, c) = (corner(triangle[0]), corner(triangle[1]), corner(triangle[2]));
         let mut u = c.0 * b.1 - c.1 * b.0;
         let mut v = a.0 * c.1 - a.1 * c.0;
@@ -88,7 +88,7 @@ impl ShearedRay {
         }
         let inverse = 1.0 / determinant;
         let t = (u * a.2 + v * b.2 + w * c.2) * inverse;
-        // A determinant so small that its inverse overflows makes t infinite or NaN: no intersection.
+        // If the inverse of a tiny determinant overflows, t is infinite or NaN.
         t.is_finite().then_some(Intersection {
             t,
             v: v * inverse,

@@ -1,7 +1,7 @@
-//! Geometry, materials, lights and cameras as one type, whatever they were loaded from.
+//! Geometry, materials, lights and cameras, independent of the source's format.
 //!
-//! Coordinates are the source's own (right-handed, +y up unless the source says otherwise) and in
-//! f64: nodes far from the origin lose nothing before the tracer recentres them.
+//! Coordinates are those of the source (right-handed, +y up unless the source says otherwise) in f64, so that
+//! nodes far from the origin keep their precision until the tracer recentres them.
 
 use std::path::Path;
 
@@ -10,31 +10,31 @@ use glam::{DMat3, DVec3, Vec2, Vec3, Vec4};
 use crate::error::Error;
 use crate::texture::{Texture, TextureRef};
 
-/// Everything a source describes.
+/// The contents of a source.
 #[derive(Debug, Clone, Default)]
 pub struct Model {
     /// Name for messages and for `scene.json`.
     pub name: String,
     /// Vertex positions, finite. Shape: `[vertices]`.
     pub positions: Vec<DVec3>,
-    /// Unit vertex normals; empty, or one per vertex, zero where the source has none (then the
-    /// geometric normal stands in). Shape: `[vertices]`.
+    /// Unit vertex normals; empty, or one per vertex, zero if the source has none (the geometric normal is then
+    /// used). Shape: `[vertices]`.
     pub normals: Vec<Vec3>,
-    /// Tangents with handedness in w; empty, or one per vertex, zero where there is none.
+    /// Tangents with handedness in w; empty, or one per vertex, zero if the source has none.
     pub tangents: Vec<Vec4>,
     /// Texture coordinates, two sets; each empty or one per vertex. v points down.
     pub uvs: [Vec<Vec2>; 2],
-    /// Linear RGBA vertex colours, which multiply the base colour; empty or one per vertex.
+    /// Linear RGBA vertex colours that the base colour is multiplied by; empty or one per vertex.
     pub colours: Vec<Vec4>,
     /// Vertex indices, counter-clockwise seen from outside. Shape: `[triangles]`.
     pub triangles: Vec<[u32; 3]>,
     /// Material of each triangle. Shape: `[triangles]`.
     pub triangle_materials: Vec<u32>,
-    /// Materials; never empty once triangles exist.
+    /// Materials; not empty if there are triangles.
     pub materials: Vec<Material>,
     /// Decoded images.
     pub textures: Vec<Texture>,
-    /// The source's lights; without any, the renderer adds its own.
+    /// The source's lights; if empty, the renderer adds its own.
     pub lights: Vec<Light>,
     /// The source's cameras.
     pub cameras: Vec<FileCamera>,
@@ -42,25 +42,25 @@ pub struct Model {
     pub notes: Vec<String>,
 }
 
-/// How a surface reflects.
+/// A reflection model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Reflection {
-    /// The base colour as it is, without light (`KHR_materials_unlit`).
+    /// The base colour, without lighting (`KHR_materials_unlit`).
     Unlit,
-    /// Diffuse only: looks the same from everywhere.
+    /// Diffuse only, independent of the viewing direction.
     Lambert,
     /// glTF's metallic-roughness model: diffuse and GGX.
     MetalRough,
 }
 
-/// How alpha below one is rendered.
+/// The treatment of alpha.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum AlphaMode {
     /// Alpha is ignored.
     Opaque,
     /// There is no surface where alpha is below the cutoff.
     Mask(f32),
-    /// The surface covers by its alpha.
+    /// The surface is blended by its alpha.
     Blend,
 }
 
@@ -69,7 +69,7 @@ pub enum AlphaMode {
 pub struct Material {
     /// Name for messages.
     pub name: String,
-    /// How it reflects.
+    /// Reflection model.
     pub reflection: Reflection,
     /// Linear base colour and alpha.
     pub base: Vec4,
@@ -91,15 +91,15 @@ pub struct Material {
     pub normal_texture: Option<TextureRef>,
     /// Scale of the normal map's x and y.
     pub normal_scale: f32,
-    /// Multiplies what is emitted (sRGB).
+    /// Multiplies the emitted radiance (sRGB).
     pub emissive_texture: Option<TextureRef>,
-    /// How alpha is rendered.
+    /// Treatment of alpha.
     pub alpha: AlphaMode,
-    /// Whether the back is visible too.
+    /// True if the back is also visible.
     pub double_sided: bool,
-    /// Whether this is a thin structure, left out of the initial points on request.
+    /// True for thin structures, which can be excluded from the initial points.
     pub thin: bool,
-    /// Whether what it emits is also a [`Light`]: sampled light does not count it twice.
+    /// True if the emission is also a [`Light`], so that sampled light must not count it twice.
     pub is_light: bool,
 }
 
@@ -135,28 +135,28 @@ impl Material {
     }
 }
 
-/// Where a light's rays come from. Directions and positions are the source's coordinates.
+/// The shape of a light, in the source's coordinates.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum LightKind {
     /// Parallel light travelling along `direction` (unit length); intensity is irradiance.
     Directional {
-        /// Where the light goes.
+        /// Direction of travel.
         direction: DVec3,
     },
     /// Light from a point; intensity is radiant intensity, falling with the square of distance.
     Point {
-        /// Where it is.
+        /// Position.
         position: DVec3,
     },
     /// Light from a point into a cone.
     Spot {
-        /// Where it is.
+        /// Position.
         position: DVec3,
         /// Axis of the cone, unit length.
         direction: DVec3,
-        /// Cosine of the angle within which it is full.
+        /// Cosine of the angle within which intensity is full.
         cos_inner: f32,
-        /// Cosine of the angle beyond which it is dark.
+        /// Cosine of the angle beyond which intensity is zero.
         cos_outer: f32,
     },
     /// A rectangle that emits to the side of `u x v`; intensity is radiance. Sampled.
@@ -173,22 +173,22 @@ pub enum LightKind {
 /// A light.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Light {
-    /// Its shape and place.
+    /// Shape and position.
     pub kind: LightKind,
     /// Linear colour times intensity, in the kind's unit.
     pub intensity: Vec3,
-    /// Distance beyond which there is no light; may be infinite.
+    /// Distance beyond which it has no effect; may be infinite.
     pub range: f64,
 }
 
 /// A camera defined in a file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FileCamera {
-    /// Its name.
+    /// Name, for messages.
     pub name: String,
     /// Columns: right, down, forward; orthonormal.
     pub world_from_camera: DMat3,
-    /// Its place.
+    /// Position.
     pub centre: DVec3,
     /// Vertical field of view `[rad]`.
     pub yfov: f64,
@@ -214,14 +214,14 @@ impl Model {
         self.triangle_materials.resize(self.triangles.len(), material);
     }
 
-    /// Adds a material and returns its number.
+    /// Adds a material and returns its index.
     pub fn material(&mut self, material: Material) -> u32 {
         self.materials.push(material);
         self.materials.len() as u32 - 1
     }
 
-    /// Named after the file that it was read from; an error if there is nothing to render.
-    pub(crate) fn of_file(mut self, path: &Path) -> Result<Self, Error> {
+    /// Names the model after its file, and checks that there is something to render.
+    pub(crate) fn finish(mut self, path: &Path) -> Result<Self, Error> {
         if self.triangles.is_empty() {
             return Err(Error::empty(path.display()));
         }
@@ -243,7 +243,7 @@ impl Model {
         Ok(self)
     }
 
-    /// Whether a triangle belongs to a thin structure.
+    /// True if a triangle belongs to a thin structure.
     #[must_use]
     pub fn is_thin(&self, triangle: u32) -> bool {
         let material = self.triangle_materials.get(triangle as usize);
@@ -259,8 +259,8 @@ impl Model {
     }
 }
 
-/// Appends the values of the `count` vertices after the first `before`, if there are any, to a list
-/// that is empty until vertices have any.
+/// Appends the values of `count` new vertices, after `before` existing ones, to a list that stays empty as long
+/// as no vertex has a value. Vertices without a value get `missing`.
 pub(crate) fn pad<T: Copy>(
     list: &mut Vec<T>,
     values: impl IntoIterator<Item = T>,

@@ -1,12 +1,11 @@
-//! Traces packets of rays: those of a pixel, or from its points to a light, run nearly parallel, so one
-//! traversal of the tree serves them all.
+//! Traces packets of rays. The rays of a pixel, or from its points to a light, are nearly parallel, so they
+//! share one traversal of the tree.
 //!
-//! A node is entered if any of the rays could hit its box. That is decided with intervals
-//! that hold all rays (Boulos, Wald and Shirley, "Geometric and Arithmetic Culling Methods for
-//! Entire Ray Packets", 2006). Rounding is monotonic, so the bounds hold for rounded values too and
-//! no box is missed that a single ray would enter. A leaf's triangles are tested against all rays
-//! in vectors, and only the rays that pass do the whole of [`ShearedRay::intersect`]. So
-//! every ray finds, to the bit, what it would find alone.
+//! A node is entered if any of the rays could hit its box. This is tested with interval bounds of all rays
+//! (Boulos, Wald and Shirley, "Geometric and Arithmetic Culling Methods for Entire Ray Packets", 2006).
+//! Rounding is monotonic, so the bounds hold for rounded values, too, and every box that a single ray would
+//! enter is entered. A leaf's triangles are tested against all rays in vectors, and only the rays that pass
+//! are tested by [`ShearedRay::intersect`]. Each ray therefore finds exactly the same hit as it would alone.
 
 use glam::{BVec3A, DVec3, Vec3, Vec3A};
 use obvhs::aabb::Aabb;
@@ -14,9 +13,9 @@ use obvhs::aabb::Aabb;
 use crate::intersect::{Intersection, ShearedRay};
 use crate::surface::{LocalHit, LocalRay, Surface, padded};
 
-/// Most rays of a packet: the default subsamples of a pixel.
+/// Maximum number of rays of a packet: the default number of subsamples of a pixel.
 pub(crate) const LANES: usize = 16;
-/// Deepest tree that is traversed with packets.
+/// Maximum depth of a tree that is traversed with packets.
 const DEEPEST: usize = 96;
 
 /// Each lane's bit.
@@ -30,13 +29,13 @@ const BITS: [u32; LANES] = {
     bits
 };
 
-/// Whether bit `lane` is set.
+/// True if bit `lane` is set.
 pub(crate) fn has(lanes: u32, lane: usize) -> bool {
     lanes >> lane & 1 == 1
 }
 
 /// The lanes whose bits are set, ascending.
-fn each(mut lanes: u32) -> impl Iterator<Item = usize> {
+fn set_lanes(mut lanes: u32) -> impl Iterator<Item = usize> {
     std::iter::from_fn(move || {
         let lane = lanes.trailing_zeros() as usize;
         lanes &= lanes.wrapping_sub(1);
@@ -44,21 +43,21 @@ fn each(mut lanes: u32) -> impl Iterator<Item = usize> {
     })
 }
 
-/// Bounds of all rays of a packet. An axis along which the rays do not all run forward, or all
-/// backward, is not used: its bounds are infinite.
+/// Bounds of all rays of a packet. The bounds of an axis are infinite unless all rays run forward or all run
+/// backward along it.
 struct PacketBounds {
     /// Axes along which all rays go backward.
     backward: BVec3A,
-    /// The origin that comes first to the near plane of a box, and that which comes last to the far
-    /// one.
+    /// The origin that reaches the near plane of a box first.
     first: Vec3A,
+    /// The origin that reaches the far plane of a box last.
     last: Vec3A,
     /// Bounds of the reciprocal directions.
     inverse: (Vec3A, Vec3A),
 }
 
 impl PacketBounds {
-    /// Around rays with these origins and directions.
+    /// The bounds of rays with these origins and directions.
     fn around(rays: impl Iterator<Item = (Vec3, Vec3)>) -> Self {
         let whole = (Vec3A::INFINITY, Vec3A::NEG_INFINITY);
         let (mut origin, mut direction) = (whole, whole);
@@ -67,24 +66,24 @@ impl PacketBounds {
             origin = (origin.0.min(o), origin.1.max(o));
             direction = (direction.0.min(d), direction.1.max(d));
         }
-        // Below, a reciprocal overflows.
+        // The reciprocal of a smaller number overflows.
         let tiny = Vec3A::splat(f32::MIN_POSITIVE);
         let backward = direction.1.cmple(-tiny);
-        let decides = backward | direction.0.cmpge(tiny);
-        // A reciprocal falls where the direction grows, on either side of zero.
-        let or_one = |v: Vec3A| Vec3A::select(decides, v, Vec3A::ONE);
+        let is_bounded = backward | direction.0.cmpge(tiny);
+        // Reciprocals decrease with the direction, on either side of zero.
+        let or_one = |v: Vec3A| Vec3A::select(is_bounded, v, Vec3A::ONE);
         let inverse = (or_one(1.0 / direction.1), or_one(1.0 / direction.0));
         let first = Vec3A::select(backward, origin.0, origin.1);
         let last = Vec3A::select(backward, origin.1, origin.0);
         Self {
             backward,
-            first: Vec3A::select(decides, first, Vec3A::INFINITY),
-            last: Vec3A::select(decides, last, Vec3A::NEG_INFINITY),
+            first: Vec3A::select(is_bounded, first, Vec3A::INFINITY),
+            last: Vec3A::select(is_bounded, last, Vec3A::NEG_INFINITY),
             inverse,
         }
     }
 
-    /// A bound of where the first ray enters a box; infinite where no ray can meet it.
+    /// A lower bound of the parameter at which a ray enters a box; infinite if no ray can hit it.
     #[inline(always)]
     fn entry(&self, aabb: &Aabb) -> f32 {
         let near = Vec3A::select(self.backward, aabb.max, aabb.min) - self.first;
@@ -99,16 +98,16 @@ impl PacketBounds {
 struct RayPacket<'a> {
     rays: &'a [LocalRay],
     sheared: [ShearedRay; LANES],
-    /// Which coordinates are the first two and the third of the sheared space.
+    /// The coordinate axes that are x, y and z of the sheared space.
     axes: [usize; 3],
-    /// Origins in these axes, and the shear.
+    /// Origins along these axes.
     origin: [[f32; LANES]; 3],
     shear: [[f32; LANES]; 2],
     bounds: PacketBounds,
 }
 
 impl<'a> RayPacket<'a> {
-    /// None for a single ray, and where the rays' largest components differ.
+    /// `None` for a single ray, or if the largest components of the rays differ.
     fn new(rays: &'a [LocalRay]) -> Option<Self> {
         if !(2..=LANES).contains(&rays.len()) {
             return None;
@@ -132,8 +131,8 @@ impl<'a> RayPacket<'a> {
         Some(Self { rays, sheared, axes, origin, shear, bounds })
     }
 
-    /// The rays that may meet a triangle, as bits: all but those for which the edge functions have
-    /// both signs. They are those of [`ShearedRay::intersect`], operation by operation.
+    /// The rays that may hit a triangle, as bits: all except those whose edge functions have both signs. The
+    /// operations are exactly those of [`ShearedRay::intersect`].
     #[expect(clippy::needless_range_loop, reason = "lanes side by side become vectors")]
     #[inline(always)]
     fn may_hit(&self, triangle: &[Vec3; 3]) -> u32 {
@@ -148,7 +147,7 @@ impl<'a> RayPacket<'a> {
             }
             flat
         };
-        // Not by `map`, which is not inlined.
+        // `map` is not inlined here.
         let (a, b, c) = (corner(triangle[0]), corner(triangle[1]), corner(triangle[2]));
         let mut may = 0;
         for lane in 0..LANES {
@@ -157,18 +156,17 @@ impl<'a> RayPacket<'a> {
             let w = b[0][lane] * a[1][lane] - b[1][lane] * a[0][lane];
             let below = (u < 0.0) | (v < 0.0) | (w < 0.0);
             let above = (u > 0.0) | (v > 0.0) | (w > 0.0);
-            // Zeros are evaluated anew in f64.
+            // Zeros are evaluated again in f64.
             let exact = (u == 0.0) | (v == 0.0) | (w == 0.0);
             may |= if (below & above) & !exact { 0 } else { BITS[lane] };
         }
         may & u32::MAX >> (32 - self.rays.len())
     }
 
-    /// Visits the triangles that rays may meet, the nearer boxes first; `look` is given a triangle's
-    /// place in leaf order and the rays, and returns the parameter up to which any ray still looks:
-    /// negative infinity once nothing is left to do.
+    /// Visits the triangles that rays may hit, nearer boxes first. `visit` gets the triangle's slot and the rays
+    /// as bits, and returns the largest ray parameter that is still of interest: negative infinity to stop.
     #[inline]
-    fn walk(&self, surface: &Surface, mut look: impl FnMut(u32, u32) -> f32) {
+    fn traverse(&self, surface: &Surface, mut visit: impl FnMut(u32, u32) -> f32) {
         let nodes = &surface.bvh.nodes;
         let mut reach = self.rays.iter().map(|ray| ray.tmax).fold(0.0, f32::max);
         let mut open = [(0_u32, 0.0_f32); DEEPEST];
@@ -190,7 +188,7 @@ impl<'a> RayPacket<'a> {
                         }
                         let lanes = self.may_hit(triangle);
                         if lanes != 0 {
-                            reach = look(slot, lanes);
+                            reach = visit(slot, lanes);
                         }
                     }
                     break;
@@ -216,9 +214,8 @@ impl<'a> RayPacket<'a> {
 }
 
 impl Surface {
-    /// Whether all rays from `origin` within the pyramid of these directions certainly miss it: no
-    /// leaf's box is near. The pyramid must exceed the rays by more than single precision rounds,
-    /// relative to distance.
+    /// True if no ray from `origin` within the pyramid of these directions can hit the surface, as the pyramid
+    /// hits no leaf's box. The pyramid must contain the rays with a margin for rounding in single precision.
     pub(crate) fn is_missed_by(&self, origin: DVec3, directions: [DVec3; 4]) -> bool {
         let origin = self.local_from_world(origin).as_vec3();
         let bounds = PacketBounds::around(directions.into_iter().map(|d| (origin, d.as_vec3())));
@@ -257,11 +254,13 @@ impl Surface {
             *tmax = ray.tmax;
         }
         let mut reach = tmax.iter().copied().fold(0.0, f32::max);
-        packet.walk(self, |slot, lanes| {
+        packet.traverse(self, |slot, lanes| {
             let mut changed = false;
-            for lane in each(lanes) {
+            for lane in set_lanes(lanes) {
                 let (sheared, ray) = (&packet.sheared[lane], &rays[lane]);
-                let Some(at) = self.meet(slot, sheared, ray.tmin, tmax[lane]) else { continue };
+                let Some(at) = self.intersect(slot, sheared, ray.tmin, tmax[lane]) else {
+                    continue;
+                };
                 let first = best[lane].is_none_or(|best| {
                     at.t < best.at.t || self.triangle_of(slot) < self.triangle_of(best.slot)
                 });
@@ -279,8 +278,8 @@ impl Surface {
         best
     }
 
-    /// Which of at most [`LANES`] rays have an [`Surface::occluder`], as bits. What `hint` names is
-    /// tried first, and becomes what was found last.
+    /// The rays of at most [`LANES`] that have an [`Surface::occluder`], as bits. The triangle `hint` is tested
+    /// first, and is set to the last occluder found.
     pub(crate) fn occluded_each(
         &self,
         rays: &[LocalRay],
@@ -288,12 +287,11 @@ impl Surface {
         accept: impl Fn(u32, &Intersection) -> bool,
     ) -> u32 {
         let mut hidden = 0;
-        // Where the hint hides a ray already, a packet of the others is a smaller one.
+        // The packet consists of the rays that the hint does not occlude.
         let mut left = [0_usize; LANES];
         let mut count = 0;
         for (lane, ray) in rays.iter().enumerate() {
-            let counts = |slot: u32| self.hides(slot, ray, &accept);
-            if hint.is_some_and(counts) {
+            if hint.is_some_and(|slot| self.occludes(slot, ray, &accept)) {
                 hidden |= 1 << lane;
             } else {
                 left[count] = lane;
@@ -320,11 +318,11 @@ impl Surface {
         };
         let mut open = u32::MAX >> (32 - count);
         let reach = others.iter().map(|ray| ray.tmax).fold(0.0, f32::max);
-        packet.walk(self, |slot, lanes| {
-            for lane in each(lanes & open) {
+        packet.traverse(self, |slot, lanes| {
+            for lane in set_lanes(lanes & open) {
                 let ray = &others[lane];
-                let met = self.meet(slot, &packet.sheared[lane], ray.tmin, ray.tmax);
-                if met.is_some_and(|at| accept(slot, &at)) {
+                let hit = self.intersect(slot, &packet.sheared[lane], ray.tmin, ray.tmax);
+                if hit.is_some_and(|at| accept(slot, &at)) {
                     open &= !(1 << lane);
                     hidden |= 1 << left[lane];
                     *hint = Some(slot);

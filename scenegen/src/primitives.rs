@@ -1,4 +1,4 @@
-//! Makes the presets' shapes and painted textures.
+//! Shapes and painted textures of the presets.
 
 use std::f64::consts::{PI, TAU};
 
@@ -15,7 +15,7 @@ impl Model {
         self.ball(level, material, |out| (centre + radius * out, out));
     }
 
-    /// A sphere deformed: `shape` tells the place and the unit normal of each direction's corner.
+    /// A deformed sphere: `shape` returns position and unit normal of the corner in each direction.
     pub(crate) fn ball(
         &mut self,
         level: u32,
@@ -23,7 +23,7 @@ impl Model {
         shape: impl Fn(DVec3) -> (DVec3, DVec3),
     ) {
         let (corners, triangles) = icosphere(level);
-        // Corners are per triangle, so that longitude can go beyond 1 where it wraps.
+        // Triangles do not share corners, so that longitude can exceed 1 where it wraps.
         let (mut positions, mut normals, mut uvs) = (Vec::new(), Vec::new(), Vec::new());
         for triangle in &triangles {
             let corners = triangle.map(|i| corners[i as usize]);
@@ -46,8 +46,8 @@ impl Model {
         self.tiled(corner, u, v, [0.0, 1.0], [1.0, 1.0], material);
     }
 
-    /// [`Model::quad`] with the image repeated: how often along `u` and along `v`, from the place
-    /// `first` in the image, which is at `corner`.
+    /// [`Model::quad`] with the image repeated `times` along `u` and `v`; `first` are the texture coordinates at
+    /// `corner`.
     pub(crate) fn tiled(
         &mut self,
         corner: DVec3,
@@ -63,8 +63,8 @@ impl Model {
         self.add(&positions, &[], &uvs, &[[0, 1, 2], [0, 2, 3]], material);
     }
 
-    /// A box of the given half sides, turned by `turn`; every face shows the whole texture. With
-    /// negative half sides it is seen from inside.
+    /// A box with the given half sides, rotated by `turn`; every face shows the whole texture. With negative
+    /// half sides it is visible from inside.
     pub(crate) fn cuboid(&mut self, centre: DVec3, half: DVec3, turn: DQuat, material: u32) {
         for axis in 0..3 {
             for sign in [-1.0, 1.0] {
@@ -136,8 +136,8 @@ impl Model {
     }
 }
 
-/// Smooth noise in `[0, 1]` that repeats with the unit square: `octaves` lattices, the first of
-/// `cells` cells, each next twice as fine and half as strong.
+/// Smooth noise in `[0, 1]` that repeats with the unit square: `octaves` lattices, the first with `cells` cells,
+/// each following one twice as fine and half as strong.
 pub(crate) fn noise(at: DVec2, cells: u32, octaves: u32, seed: u64) -> f64 {
     let (mut sum, mut weight, mut total) = (0.0, 1.0, 0.0);
     for octave in 0..octaves {
@@ -167,7 +167,7 @@ pub(crate) fn marbled(at: DVec2, cells: u32, seed: u64, from: [f32; 3], to: [f32
     Vec3::from(from).lerp(Vec3::from(to), share as f32)
 }
 
-/// 0 or 1 in a chequered pattern of `count` x `count` fields.
+/// True on the light fields of a chequered pattern of `count` x `count` fields.
 pub(crate) fn chequered(at: DVec2, count: f64) -> bool {
     ((at.x * count).floor() + (at.y * count).floor()).rem_euclid(2.0) < 0.5
 }
@@ -191,7 +191,7 @@ pub(crate) fn icosphere(level: u32) -> (Vec<DVec3>, Vec<[u32; 3]>) {
             corners.push(DVec3::from(corner).normalize());
         }
     }
-    // Of all triples of corners, those whose sides are edges (the shortest distance there is).
+    // Triangles are the triples of corners whose sides are edges, which have the shortest distance.
     let edge = 2.0 / (1.0 + g * g).sqrt() + 1e-9;
     let near = |i: usize, j: usize| corners[i].distance(corners[j]) < edge;
     let mut triangles = Vec::new();

@@ -1,7 +1,7 @@
-//! Reads the files that a mesh file refers to, and decodes images: all untrusted.
+//! Reads the files that a mesh file refers to, and decodes images. All files are untrusted.
 //!
-//! References are plain relative paths that stay in the mesh's folder, symbolic links followed. No
-//! allocation is sized by a header's declaration: readers take the bytes that exist, decoders have limits.
+//! References must be relative paths within the mesh's folder, also after following symbolic links. No
+//! allocation is sized by a header's claim: readers take the bytes that exist, and decoders have limits.
 
 use std::fs::{File, OpenOptions};
 use std::io::{Cursor, Read};
@@ -19,18 +19,19 @@ const MAX_FILE: u64 = 16 << 30;
 const FORMATS: [ImageFormat; 3] = [ImageFormat::Png, ImageFormat::Jpeg, ImageFormat::WebP];
 /// Largest side of an image `[px]`.
 const MAX_SIDE: u32 = 16_384;
-/// Most pixels of an image.
+/// Maximum number of pixels of an image.
 const MAX_PIXELS: u64 = 1 << 28;
-/// Most bytes a decoder may allocate.
+/// Maximum memory of a decoder `[bytes]`.
 pub(crate) const MAX_DECODED: u64 = 1 << 30;
-/// Most bytes that one byte of a compressed file can stand for: zip's limit, 1032, and a margin.
+/// Maximum number of bytes that one byte of a compressed file can expand to: deflate's limit, 1032, and a
+/// margin.
 pub(crate) const EXPANSION: u64 = 1100;
-/// Most texels of all textures of a model.
+/// Maximum number of texels of all textures of a model.
 const MAX_TEXELS: u64 = 1 << 29;
 /// Longest reference `[bytes]`.
 const MAX_NAME: usize = 4096;
 
-/// Opens a file for reading. A pipe, a socket or a device is refused at once, not waited for.
+/// Opens a file for reading. Pipes, sockets and devices are refused at once instead of waiting for them.
 pub(crate) fn open(path: &Path) -> Result<File, Error> {
     let mut options = OpenOptions::new();
     options.read(true);
@@ -40,7 +41,7 @@ pub(crate) fn open(path: &Path) -> Result<File, Error> {
     let known = file.metadata().map_err(Error::io(path))?;
     if !known.is_file() && !known.is_dir() {
         let problem = "it is a pipe, a socket or a device, not a file";
-        return Err(Error::malformed(path, "the file", problem, "put the right file there"));
+        return Err(Error::malformed(path, "the file", problem, "replace it by a regular file"));
     }
     Ok(file)
 }
@@ -55,7 +56,7 @@ pub(crate) fn read(path: &Path) -> Result<Vec<u8>, Error> {
         return Err(too_large());
     }
     let mut bytes = Vec::new();
-    // A buffer that grew would end at twice the size.
+    // A growing buffer could end at twice the size.
     bytes
         .try_reserve_exact(known.len() as usize + 1)
         .map_err(|_| Error::io(path)(std::io::ErrorKind::OutOfMemory.into()))?;
@@ -63,7 +64,7 @@ pub(crate) fn read(path: &Path) -> Result<Vec<u8>, Error> {
     if bytes.len() as u64 > MAX_FILE { Err(too_large()) } else { Ok(bytes) }
 }
 
-/// The folder a mesh file lies in.
+/// The folder of a mesh file.
 pub(crate) struct Folder {
     /// The mesh file, for messages.
     file: PathBuf,
@@ -80,7 +81,7 @@ impl Folder {
         Ok(Self { file: file.to_owned(), folder })
     }
 
-    /// The path of a reference; the file may be missing.
+    /// The path of a reference; the file need not exist.
     pub(crate) fn resolve(&self, element: &str, reference: &str) -> Result<PathBuf, Error> {
         let refuse = |problem| Err(self.refused(element, reference, problem));
         if reference.is_empty() || reference.len() > MAX_NAME {
@@ -106,16 +107,16 @@ impl Folder {
         }
     }
 
-    /// The error for a reference that is no relative path within the folder.
+    /// The error for a reference that is not a relative path within the folder.
     fn refused(&self, element: &str, uri: &str, problem: &str) -> Error {
         let uri: String = uri.chars().take(80).collect();
         let remedy = "keep all files in the mesh's own folder";
         Error::malformed(&self.file, element, format!("the URI {uri:?} {problem}"), remedy)
     }
 
-    /// Reads the file that a percent-encoded relative URI stands for.
+    /// Reads the file of a percent-encoded relative URI.
     pub(crate) fn read_uri(&self, element: &str, uri: &str) -> Result<Vec<u8>, Error> {
-        // A name that is literally there wins: files with a % in their names exist.
+        // A file with the literal name takes precedence, as names may contain a %.
         let literal = self.resolve(element, uri)?;
         if literal.is_file() {
             return read(&literal);
@@ -130,24 +131,24 @@ impl Folder {
         self.read(element, &self.resolve(element, &decoded)?)
     }
 
-    /// Reads a file that was resolved for an element.
+    /// Reads a resolved file of an element.
     pub(crate) fn read(&self, element: &str, path: &Path) -> Result<Vec<u8>, Error> {
         if path.exists() {
             return read(path);
         }
         let name = path.strip_prefix(&self.folder).unwrap_or(path);
         let problem = format!("there is no file {}", name.display());
-        // The mark that has taken the place of what could not be read.
-        let remedy = match name.to_string_lossy().contains(char::REPLACEMENT_CHARACTER) {
-            true => "its name is not UTF-8: rename it, and save the mesh file as UTF-8",
-            false => "put it where the mesh file says, or remove the reference",
+        let remedy = if name.to_string_lossy().contains(char::REPLACEMENT_CHARACTER) {
+            "its name is not UTF-8: rename it, and save the mesh file as UTF-8"
+        } else {
+            "put it where the mesh file says, or remove the reference"
         };
         Err(Error::malformed(&self.file, element, problem, remedy))
     }
 }
 
-/// Adds a texture to a model and returns its number; an error if the model then had too many texels:
-/// many small files can name many large images.
+/// Adds a texture to a model and returns its index. The total number of texels is limited, as many small files
+/// can contain many large images.
 pub(crate) fn add_texture(
     file: &Path,
     element: &str,
@@ -182,7 +183,7 @@ fn percent_decoded(text: &str) -> Option<String> {
     String::from_utf8(bytes).ok()
 }
 
-/// The bytes of a base64 `data:` URI; None for other URIs.
+/// The bytes of a base64 `data:` URI; `None` for other URIs.
 pub(crate) fn data_uri(uri: &str) -> Option<Vec<u8>> {
     let (head, body) = uri.strip_prefix("data:")?.split_once(',')?;
     head.ends_with(";base64").then(|| base64(body)).flatten()
@@ -210,7 +211,7 @@ fn base64(text: &str) -> Option<Vec<u8>> {
     Some(bytes)
 }
 
-/// A decoder with limits for one of these formats; `problem` says that it is another.
+/// A decoder with limits for one of these formats; `problem` is the error for other formats.
 pub(crate) fn image_reader<'a>(
     bytes: &'a [u8],
     formats: &[ImageFormat],

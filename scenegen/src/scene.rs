@@ -1,6 +1,6 @@
 //! Prepares a scene from a source and options, so that its views can be rendered.
 //!
-//! One piece: geometry, cameras, light and exposure are chosen in this order, each from those before.
+//! Over 400 lines, as geometry, cameras, light and exposure each depend on those before.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -12,9 +12,9 @@ use crate::error::Error;
 use crate::lens::Lens;
 use crate::mesh::{FileCamera, Model, Reflection};
 use crate::panorama::Panorama;
-use crate::passers;
+use crate::passers_by;
 use crate::points::{InitPoints, PointCollector, PointOptions};
-use crate::presets::{AskedPreset, Staging, open_sky, sun};
+use crate::presets::{PresetSpec, Staging, open_sky, sun};
 use crate::random::Draws;
 use crate::rig::{Rig, RigKind};
 use crate::shade::{Ambient, Lighting, TriangleFlags};
@@ -23,16 +23,16 @@ use crate::surface::Surface;
 use crate::trace::{Frame, Tracer, luminances};
 use crate::{gltf, obj};
 
-/// What to render.
+/// The source of a scene.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Source {
-    /// A built-in scene, by name; of one that has a size, `NAME:SIZE` too.
+    /// The name of a built-in scene, or `NAME:SIZE` if it has a size.
     Preset(String),
     /// A `.gltf`, `.glb` or `.obj` file.
     File(PathBuf),
 }
 
-/// How to render it. `None` stands for the preset's value, or else the default.
+/// Rendering options. `None`: the preset's value if it has one, otherwise the default.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Options {
     /// Arrangement of the cameras.
@@ -49,27 +49,26 @@ pub struct Options {
     pub radius: Option<f64>,
     /// See [`Rig::jitter`].
     pub jitter: Option<f64>,
-    /// Subsamples per pixel along a side: 4 is 16 samples.
+    /// Subsamples along each side of a pixel; 4 means 16 samples.
     pub grid: u32,
     /// Light from the sky and from other surfaces.
     pub ambient: Option<Ambient>,
     /// An equirectangular `.hdr` or `.exr` image as the sky, in place of the built-in sky and sun.
     pub sky: Option<PathBuf>,
-    /// Whether lights cast shadows.
+    /// If true, lights cast shadows.
     pub shadows: bool,
-    /// Whether all materials are diffuse only.
+    /// If true, all materials are diffuse only.
     pub lambert: bool,
-    /// Factor on all light. `None` chooses one for files with their own lights or sky, and is 1
-    /// otherwise.
+    /// Factor on all light. `None`: chosen automatically for files with their own lights or sky, otherwise 1.
     pub exposure: Option<f32>,
-    /// How far, at most, the exposure of a training view is from the others' `[stops]`, from 0 to 8; more than
-    /// 0 also changes the light of its red and its blue by up to 10 %.
+    /// Largest random change of a training view's exposure `[stops]`, from 0 to 8. Above 0, red and blue also
+    /// change by up to 10 %.
     #[serde(default)]
     pub exposure_jitter: f32,
-    /// What training views are photographed with; `None`: a pinhole, as test views are.
+    /// Lens of training views; test views are always pinhole images.
     #[serde(default)]
     pub lens: Option<Lens>,
-    /// Share of the training views through which people walk, who are masked.
+    /// Share of training views with (masked) people walking through.
     #[serde(default)]
     pub passers_by: f64,
     /// Initial points.
@@ -103,11 +102,11 @@ impl Default for Options {
     }
 }
 
-/// With [`Options::exposure_jitter`]: how far the light of red and of blue is changed at most, as a fraction.
+/// With [`Options::exposure_jitter`], largest relative change of red and blue.
 const WHITE_BALANCE: f32 = 0.1;
 /// Largest [`Options::exposure_jitter`] `[stops]`.
 const MOST_JITTER: f32 = 8.0;
-/// Stream of the random exposures.
+/// Key of the random stream of exposures.
 const EXPOSURES: u64 = 0x0065_7870_6f73_6564;
 
 /// A view's part in training.
@@ -122,17 +121,17 @@ pub enum Split {
 /// A posed view, not yet rendered.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct View {
-    /// Name without ending, as in file names: `train/r_000`.
+    /// File name without extension, such as `train/r_000`.
     pub name: String,
-    /// Its part in training.
+    /// Training or test.
     pub split: Split,
-    /// Its camera.
+    /// Camera.
     pub camera: Camera,
 }
 
-/// Geometry, light and cameras; nothing is rendered yet.
+/// Geometry, light and cameras, not yet rendered.
 pub struct Scene {
-    /// Preset's or file's name.
+    /// Name of the preset or file.
     pub name: String,
     /// Geometry and materials.
     pub model: Model,
@@ -140,24 +139,24 @@ pub struct Scene {
     pub surface: Surface,
     /// All views, training views first.
     pub views: Vec<View>,
-    /// How the cameras were arranged.
+    /// Camera arrangement.
     pub rig: Rig,
     /// Options as given.
     pub options: Options,
     /// [`Options::ambient`], or its default for this scene.
     pub ambient: Ambient,
-    /// Light from all around.
+    /// Environment light.
     pub sky: Sky,
-    /// [`Options::exposure`], or the one chosen.
+    /// [`Options::exposure`], or the automatic one.
     pub exposure: f32,
     train_cameras: Vec<Camera>,
     lighting: Lighting,
     flags: Vec<TriangleFlags>,
-    /// Whether somebody walks through a training view. Shape: `[training views]`.
+    /// True for views with people walking through. Shape: `[training views]`.
     has_passers: Vec<bool>,
 }
 
-/// A scene with all its views, in memory.
+/// A scene with all its rendered views, in memory.
 pub struct Generated {
     /// The scene.
     pub scene: Scene,
@@ -167,7 +166,7 @@ pub struct Generated {
     pub points: InitPoints,
 }
 
-/// Renders a scene with all its views into memory.
+/// Renders all views of a scene into memory.
 ///
 /// # Errors
 /// As [`Scene::prepare`].
@@ -207,24 +206,25 @@ impl Scene {
         let rig = with_options(rig, options);
         let (mut train, test) = rig.cameras(&surface, &cameras)?;
         if let Some(lens) = options.lens {
-            train = train.into_iter().map(|camera| lens.on(camera)).collect::<Result<_, _>>()?;
+            train =
+                train.into_iter().map(|camera| camera.with_lens(lens)).collect::<Result<_, _>>()?;
         }
         let ambient = options.ambient.unwrap_or(ambient);
         let flags = TriangleFlags::all(&surface, &model);
         let is_file = matches!(source, Source::File(_));
-        let brought_lights = is_file && !model.lights.is_empty();
+        let has_own_lights = is_file && !model.lights.is_empty();
         if let Some(path) = &options.sky {
             sky = Sky::Image(Arc::new(Panorama::load(path)?));
             model.lights.retain(|light| *light != sun());
-        } else if is_file && !brought_lights {
+        } else if is_file && !has_own_lights {
             model.lights.push(sun());
         }
         let light = |sky, grid| {
             Lighting::new(&model.lights, &surface, sky, (ambient, options.shadows, grid))
         };
         let mut exposure = options.exposure.unwrap_or(1.0);
-        // Light in units of its own.
-        if brought_lights || options.sky.is_some() {
+        // The unit of the file's lights or sky is unknown.
+        if has_own_lights || options.sky.is_some() {
             let is_fill = options.sky.is_none();
             if options.exposure.is_none() {
                 let only = light(if is_fill { Sky::uniform(0.0) } else { sky.clone() }, 1);
@@ -233,7 +233,7 @@ impl Scene {
                     Tracer { surface, model, flags, lighting: &only, exposure: 1.0, seed: 0 };
                 exposure = exposure_for(&tracer, &train);
             }
-            // Fill light in the units the exposure takes to the image's.
+            // Fill light in the unit of the file's lights.
             if is_fill {
                 sky = sky.dimmed(0.4 / exposure);
             }
@@ -256,7 +256,7 @@ impl Scene {
             ambient,
             sky,
             exposure,
-            has_passers: passers::chosen(options.seed, train.len(), options.passers_by),
+            has_passers: passers_by::select_views(options.seed, train.len(), options.passers_by),
             train_cameras: train,
             lighting,
             flags,
@@ -264,19 +264,18 @@ impl Scene {
         })
     }
 
-    /// Renders a view. The same at any number of threads.
+    /// Renders a view. The result does not depend on the number of threads.
     #[must_use]
     pub fn render(&self, view: usize) -> Frame {
         let (camera, gains) = (&self.views[view].camera, self.gains(view));
         let mut frame = self.tracer().render(camera, view as u64, gains);
         if self.has_passers.get(view) == Some(&true) {
-            passers::walk_into(&mut frame, camera, self.options.seed, view, gains);
+            passers_by::draw(&mut frame, camera, self.options.seed, view, gains);
         }
         frame
     }
 
-    /// The factors on the light of each channel in a training view, where [exposures
-    /// differ](Options::exposure_jitter).
+    /// The factors on the channels of a training view, if [exposures vary](Options::exposure_jitter).
     #[must_use]
     pub fn gains(&self, view: usize) -> Option<[f32; 3]> {
         let stops = self.options.exposure_jitter;
@@ -290,7 +289,7 @@ impl Scene {
         Some([gain * red, gain, gain * blue])
     }
 
-    /// Gathers initial points from training views as they are rendered.
+    /// A collector of initial points, which is given training views as they are rendered.
     #[must_use]
     pub fn point_collector(&self) -> PointCollector<'_> {
         PointCollector::new(self.tracer(), &self.train_cameras, self.options.points)
@@ -311,7 +310,7 @@ impl Scene {
 fn check(options: &Options) -> Result<(), Error> {
     let share = |option, value: f64| match value {
         0.0..=1.0 => Ok(()),
-        _ => Err(Error::option(option, format!("{value} is not in 0..=1"))),
+        _ => Err(Error::option(option, format!("{value} is not in 0 to 1"))),
     };
     share("--point-noise", options.points.noise)?;
     share("--outliers", options.points.outliers)?;
@@ -320,7 +319,7 @@ fn check(options: &Options) -> Result<(), Error> {
     if !(1..=64).contains(&options.grid) {
         return Err(Error::option(
             "--samples",
-            format!("{} per side is not in 1..=64", options.grid),
+            format!("{} per side is not in 1 to 64", options.grid),
         ));
     }
     if options.points.count > 1 << 28 {
@@ -328,7 +327,7 @@ fn check(options: &Options) -> Result<(), Error> {
     }
     if !(0.0..=MOST_JITTER).contains(&options.exposure_jitter) {
         let stops = options.exposure_jitter;
-        let problem = format!("{stops} stops are not in 0..={MOST_JITTER}");
+        let problem = format!("{stops} stops are not in 0 to {MOST_JITTER}");
         return Err(Error::option("--exposure-jitter", problem));
     }
     if options.exposure.is_some_and(|e| !(e > 0.0 && e.is_finite())) {
@@ -340,14 +339,14 @@ fn check(options: &Options) -> Result<(), Error> {
 fn stage(source: &Source, seed: u64) -> Result<(String, Staging, Vec<FileCamera>), Error> {
     match source {
         Source::Preset(name) => {
-            let asked: AskedPreset = name.parse()?;
-            let mut staging = asked.build(seed);
-            staging.model.name = asked.to_string();
-            Ok((asked.to_string(), staging, Vec::new()))
+            let spec: PresetSpec = name.parse()?;
+            let mut staging = spec.build(seed);
+            staging.model.name = spec.to_string();
+            Ok((spec.to_string(), staging, Vec::new()))
         }
         Source::File(path) => {
-            let ending = path.extension().map(|e| e.to_string_lossy().to_lowercase());
-            let model = match ending.as_deref() {
+            let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
+            let model = match extension.as_deref() {
                 Some("gltf" | "glb") => gltf::load(path)?,
                 Some("obj") => obj::load(path)?,
                 _ => {
@@ -375,7 +374,7 @@ fn stage(source: &Source, seed: u64) -> Result<(String, Staging, Vec<FileCamera>
 fn with_options(rig: Rig, options: &Options) -> Rig {
     let kind = options.rig.unwrap_or(rig.kind);
     let default = Rig::default();
-    // Another arrangement than the preset's does not inherit what was chosen for that.
+    // A different kind of arrangement does not inherit parameters tuned for the preset's kind.
     let rig = match kind {
         same if same == rig.kind => rig,
         RigKind::Inside => Rig {

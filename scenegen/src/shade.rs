@@ -1,7 +1,7 @@
-//! How much light a surface sends towards the viewer: Lambert and glTF's metallic-roughness model
-//! (glTF 2.0 specification, appendix B), lit by the scene's lights and the sky.
+//! Shading of surfaces by Lambert's law and glTF's metallic-roughness model (glTF 2.0 specification, appendix
+//! B), lit by the scene's lights and the sky.
 //!
-//! One piece: lights, surfaces and what they reflect share the point being shaded.
+//! Over 400 lines, as lights, materials and reflection all work on the point being shaded.
 
 use std::f32::consts::PI;
 use std::sync::OnceLock;
@@ -18,10 +18,10 @@ use crate::sky::Sky;
 use crate::surface::{LocalHit, LocalRay, Surface};
 use crate::texture::TextureRef;
 
-/// Smallest alpha of GGX: below, the peak of a highlight is too narrow for single precision.
+/// Smallest alpha of GGX: the peak of a highlight would otherwise be too narrow for single precision.
 const MIN_ALPHA: f32 = 1e-3;
-/// Secondary rays start this far above the surface and end this far before a light: 20 ulps of
-/// local coordinates, as the hit point is rounded in each coordinate and along the ray.
+/// Distance above the surface at which secondary rays start, and in front of a light at which they end: 20 ulps
+/// of local coordinates, as the hit point is rounded in each coordinate and along the ray.
 const LIFT: f32 = 2.5e-3;
 /// Normal reflectance of a dielectric.
 const DIELECTRIC: f32 = 0.04;
@@ -30,11 +30,11 @@ const DIELECTRIC: f32 = 0.04;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Ambient {
-    /// The whole sky reaches everything; in closed form, no secondary ray.
+    /// The sky is never occluded; computed in closed form without secondary rays.
     Open,
-    /// Occlusion of the sky is sampled by this many rays per pixel.
+    /// Occlusion of the sky is sampled with this number of rays per pixel.
     Occlusion(u32),
-    /// One bounce: as occlusion, and the occluding surfaces send their own direct light.
+    /// As `Occlusion`, and the occluding surfaces reflect their direct light (one bounce).
     Bounce(u32),
 }
 
@@ -45,15 +45,16 @@ pub(crate) struct Lighting {
     pub(crate) sky: Sky,
     pub(crate) ambient: Ambient,
     pub(crate) shadows: bool,
-    /// Subsamples per pixel along a side.
+    /// Subsamples along each side of a pixel.
     pub(crate) grid: u32,
 }
 
-/// A point of a surface with its material's textures read.
+/// A surface point with its material evaluated.
 pub(crate) struct Point<'a> {
-    place: Vec3,
-    /// Towards the viewer.
+    position: Vec3,
+    /// Geometric normal, towards the viewer.
     geometric: Vec3,
+    /// Shading normal.
     shading: Vec3,
     material: &'a Material,
     base: Vec3,
@@ -63,19 +64,18 @@ pub(crate) struct Point<'a> {
     emitted: Vec3,
 }
 
-/// A pixel's random numbers, and triangles to try first.
+/// A pixel's random numbers, and triangles to test first, which speeds up rays but does not change results.
 pub(crate) struct Sampling {
     pub(crate) draws: Draws,
-    /// A triangle that a camera ray hit, by place in leaf order.
-    pub(crate) met: Option<u32>,
-    /// The last triangle that hid a light, by place in leaf order. It is tried first; no result
-    /// depends on it.
-    pub(crate) hid: Option<u32>,
+    /// Slot of a triangle hit by a camera ray.
+    pub(crate) hit_hint: Option<u32>,
+    /// Slot of the last triangle that occluded a light.
+    pub(crate) occluder_hint: Option<u32>,
 }
 
-/// A point as one of a pixel's subsamples sees it.
+/// A point seen by one of a pixel's subsamples.
 pub(crate) struct VisiblePoint<'a> {
-    /// Number of the subsample.
+    /// Index of the subsample.
     pub(crate) index: u32,
     pub(crate) point: Point<'a>,
     /// Towards the viewer.
@@ -92,7 +92,7 @@ impl Lighting {
         let place = |p: DVec3| surface.local_from_world(p);
         let scale = surface.scale();
         let lights = lights.iter().map(|light| {
-            // Falls with the square of distance: in local units distances are larger.
+            // Intensity falls with the square of distance, and distances are in local units.
             let spread = (scale * scale) as f32;
             let (kind, gain) = match light.kind {
                 LightKind::Directional { .. } => (light.kind, 1.0),
@@ -112,8 +112,8 @@ impl Lighting {
         Self { lights: lights.collect(), sky, ambient, shadows, grid: grid.max(1) }
     }
 
-    /// Radiance of points towards their viewers. At most [`LANES`]: those of a pixel, whose way to a
-    /// light is shared.
+    /// Radiance of at most [`LANES`] points of a pixel towards their viewers. They share a packet of shadow rays
+    /// to each light.
     pub(crate) fn radiance(
         &self,
         shaded: &ShadedSurface<'_>,
@@ -126,7 +126,7 @@ impl Lighting {
         }
         for light in &self.lights {
             let mut rays = [LocalRay::NONE; LANES];
-            // For each ray: its point's number and its light if it is not blocked.
+            // For each ray, the index of its point and the light it adds if it is not occluded.
             let mut contributions = [(0, Vec3::ZERO); LANES];
             let mut count = 0;
             for (number, VisiblePoint { index, point, view }) in points.iter().enumerate() {
@@ -135,24 +135,24 @@ impl Lighting {
                 }
                 let u = || stratum(*index, self.grid, sampling.draws.square());
                 let Some((to_light, distance, irradiance)) =
-                    light_arriving_at(light, point.place, u)
+                    incident_light(light, point.position, u)
                 else {
                     continue;
                 };
                 if point.geometric.dot(to_light) <= 0.0 {
                     continue;
                 }
-                let sent = point.reflected(*view, to_light) * irradiance;
-                if sent.max_element() > 0.0 {
+                let reflected = point.reflected(*view, to_light) * irradiance;
+                if reflected.max_element() > 0.0 {
                     rays[count] = shadow_ray(point, to_light, distance);
-                    contributions[count] = (number, sent);
+                    contributions[count] = (number, reflected);
                     count += 1;
                 }
             }
-            let hidden = self.shadowed(shaded, &rays[..count], sampling);
-            for (lane, &(number, sent)) in contributions.iter().enumerate().take(count) {
-                if !has(hidden, lane) {
-                    total[number] += sent;
+            let occluded = self.occluded(shaded, &rays[..count], sampling);
+            for (lane, &(number, reflected)) in contributions.iter().enumerate().take(count) {
+                if !has(occluded, lane) {
+                    total[number] += reflected;
                 }
             }
         }
@@ -165,7 +165,7 @@ impl Lighting {
     }
 
     /// The rays that do not reach their light, as bits.
-    fn shadowed(
+    fn occluded(
         &self,
         shaded: &ShadedSurface<'_>,
         rays: &[LocalRay],
@@ -175,7 +175,7 @@ impl Lighting {
             return 0;
         }
         let solid = |slot, at: &Intersection| shaded.is_solid(slot, at);
-        shaded.surface.occluded_each(rays, &mut sampling.hid, solid)
+        shaded.surface.occluded_each(rays, &mut sampling.occluder_hint, solid)
     }
 
     fn ambient(
@@ -216,7 +216,7 @@ impl Lighting {
         diffuse + self.specular_bounce(shaded, seen, sampling)
     }
 
-    /// Radiance from a direction: the sky's, or that of the directly lit surface before it.
+    /// Radiance from a direction: that of the sky, or of the directly lit surface in front of it.
     fn incoming(
         &self,
         shaded: &ShadedSurface<'_>,
@@ -228,8 +228,8 @@ impl Lighting {
         let ray = secondary_ray(point, direction, f32::MAX);
         if !bounce {
             let solid = |slot, at: &Intersection| shaded.is_solid(slot, at);
-            let hidden = shaded.surface.occluder(&ray, solid).is_some();
-            return if hidden { Vec3::ZERO } else { self.sky.radiance(direction) };
+            let occluded = shaded.surface.occluder(&ray, solid).is_some();
+            return if occluded { Vec3::ZERO } else { self.sky.radiance(direction) };
         }
         let solid = |slot, at: &Intersection| shaded.is_solid(slot, at);
         let Some(hit) = shaded.surface.closest(&ray, None, None, solid) else {
@@ -243,14 +243,14 @@ impl Lighting {
         let mut total = emitted + there.diffuse_colour() * self.sky.irradiance(there.shading) / PI;
         for light in &self.lights {
             let u = || sampling.draws.square();
-            let Some((to_light, distance, irradiance)) = light_arriving_at(light, there.place, u)
+            let Some((to_light, distance, irradiance)) = incident_light(light, there.position, u)
             else {
                 continue;
             };
             let cos = there.shading.dot(to_light);
             if cos > 0.0
                 && there.geometric.dot(to_light) > 0.0
-                && self.shadowed(shaded, &[shadow_ray(&there, to_light, distance)], sampling) == 0
+                && self.occluded(shaded, &[shadow_ray(&there, to_light, distance)], sampling) == 0
             {
                 total += there.diffuse_colour() / PI * cos * irradiance;
             }
@@ -258,8 +258,7 @@ impl Lighting {
         total
     }
 
-    /// The sky's specular reflection without rays: a blurred sky's radiance times the reflected
-    /// share.
+    /// The sky's specular reflection without rays: the radiance of the blurred sky times the albedo.
     fn specular_sky(&self, point: &Point<'_>, view: Vec3) -> Vec3 {
         let cos = point.shading.dot(view).max(0.0);
         let (scale, bias) = directional_albedo(cos, point.roughness);
@@ -268,7 +267,7 @@ impl Lighting {
         albedo * self.sky.blurred(direction, point.roughness)
     }
 
-    /// The specular reflection of sky and surfaces, by one sampled direction.
+    /// The specular reflection of sky and surfaces, from one sampled direction.
     fn specular_bounce(
         &self,
         shaded: &ShadedSurface<'_>,
@@ -293,8 +292,8 @@ impl Lighting {
 }
 
 impl<'a> Point<'a> {
-    /// Reads the material at a hit; also its alpha, 0 where a mask says there is no surface.
-    /// `width` is the width of the ray's cone there, local units.
+    /// Evaluates the material at a hit, and its alpha, which is 0 where it is masked out. `width` is the width of
+    /// the ray's cone there, in local units.
     pub(crate) fn read(
         shaded: &ShadedSurface<'a>,
         ray: &LocalRay,
@@ -307,7 +306,7 @@ impl<'a> Point<'a> {
         let Intersection { v, w, front, .. } = hit.at;
         let face = (b - a).cross(c - a);
         let side = if front { 1.0 } else { -1.0 };
-        // A triangle hit edge-on or without area has no normal of its own.
+        // A triangle without area has no normal.
         let geometric = face.normalize_or(-ray.direction * side) * side;
         let base = at.base(material);
         let alpha = at.alpha(material, base.w);
@@ -320,7 +319,7 @@ impl<'a> Point<'a> {
         if let Some(texture) = &material.normal_texture {
             let texel = at.texel(Some(texture)).xyz();
             shading = at.normal_mapped(shading, side, texel, texture, material.normal_scale);
-            // A normal that turns away from the viewer's side would be lit from behind.
+            // A normal on the other side of the surface would be lit from behind.
             if shading.dot(geometric) <= 0.0 {
                 shading = geometric;
             }
@@ -331,7 +330,7 @@ impl<'a> Point<'a> {
         let roughness = (material.roughness * rough_texel.y).clamp(0.0, 1.0);
         let emitted = material.emissive * at.texel(material.emissive_texture.as_ref()).xyz();
         let point = Self {
-            place: a + v * (b - a) + w * (c - a),
+            position: a + v * (b - a) + w * (c - a),
             geometric,
             shading,
             material,
@@ -359,7 +358,7 @@ impl<'a> Point<'a> {
         Vec3::splat(DIELECTRIC).lerp(self.base, self.metallic)
     }
 
-    /// Reflected radiance per irradiance from a direction, cosine included.
+    /// Reflected radiance per irradiance from a direction, including the cosine.
     fn reflected(&self, view: Vec3, to_light: Vec3) -> Vec3 {
         let cos_light = self.shading.dot(to_light);
         if cos_light <= 0.0 {
@@ -378,25 +377,25 @@ impl<'a> Point<'a> {
     }
 }
 
-/// Geometry with its materials, as rays hit it.
+/// Geometry with its materials.
 pub(crate) struct ShadedSurface<'a> {
     pub(crate) surface: &'a Surface,
     pub(crate) model: &'a Model,
-    /// By place in leaf order; empty where every triangle is opaque from both sides.
+    /// By slot; empty if all triangles are opaque and double-sided.
     pub(crate) flags: &'a [TriangleFlags],
 }
 
 /// Properties of a triangle that decide whether a ray hits it.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(crate) struct TriangleFlags {
-    /// Its back is invisible.
+    /// The back is invisible.
     pub(crate) one_sided: bool,
-    /// Its alpha may be below one.
+    /// Alpha may be below one.
     pub(crate) see_through: bool,
 }
 
 impl TriangleFlags {
-    /// The flags of all triangles by place in leaf order; empty where none is set.
+    /// The flags of all triangles by slot; empty if none is set.
     pub(crate) fn all(surface: &Surface, model: &Model) -> Vec<Self> {
         let flags = |slot: usize| {
             let triangle = surface.triangle_of(slot as u32) as usize;
@@ -412,14 +411,14 @@ impl TriangleFlags {
 }
 
 impl<'a> ShadedSurface<'a> {
-    /// Whether a triangle is there at all for a ray from a camera.
+    /// True if camera rays can hit this side of the triangle.
     #[inline]
     pub(crate) fn is_visible(&self, slot: u32, at: &Intersection) -> bool {
         at.front || !self.flags.get(slot as usize).is_some_and(|t| t.one_sided)
     }
 
-    /// Whether a triangle is opaque here, for shadows and sampled light: from both sides, where its
-    /// alpha is at least one half.
+    /// True if a triangle is opaque here for shadows and sampled light, from either side: its alpha is at least
+    /// one half.
     pub(crate) fn is_solid(&self, slot: u32, at: &Intersection) -> bool {
         if !self.flags.get(slot as usize).is_some_and(|t| t.see_through) {
             return true;
@@ -444,7 +443,7 @@ impl<'a> ShadedSurface<'a> {
     }
 }
 
-/// A point of a triangle, for interpolating its corners and sampling its textures.
+/// A point of a triangle, for interpolating vertex attributes and sampling textures.
 struct TrianglePoint<'a> {
     model: &'a Model,
     indices: [usize; 3],
@@ -459,7 +458,7 @@ impl TrianglePoint<'_> {
         material.base * self.texel(material.base_texture.as_ref()) * tint
     }
 
-    /// The surface's alpha, by the base colour's.
+    /// The surface's alpha, from that of the base colour.
     fn alpha(&self, material: &Material, base: f32) -> f32 {
         if material.alpha == AlphaMode::Opaque {
             return 1.0;
@@ -498,7 +497,7 @@ impl TrianglePoint<'_> {
         image.sample(uv, &texture.sampler, footprint)
     }
 
-    /// The shading normal as a normal map turns it.
+    /// The shading normal after normal mapping.
     fn normal_mapped(
         &self,
         normal: Vec3,
@@ -517,12 +516,12 @@ impl TrianglePoint<'_> {
             },
         };
         let tangent = (tangent - normal * normal.dot(tangent)).normalize_or_zero();
-        // VisiblePoint from behind, the normal is turned but the image on the surface is not.
+        // Seen from behind, the normal is flipped but the texture is not.
         let bitangent = normal.cross(tangent) * handedness * side;
         (bump.x * tangent + bump.y * bitangent + bump.z * normal).normalize_or(normal)
     }
 
-    /// Direction of growing u, and 1 or −1 as growing v (which points down) is to its other side.
+    /// The direction of increasing u, and the handedness, 1 or −1.
     fn tangent_of_uvs(&self, texture: &TextureRef) -> Option<(Vec3, f32)> {
         let uvs = &self.model.uvs[texture.uv_set.min(1)];
         let [ta, tb, tc] = self.indices.map(|i| uvs.get(i).map(|&uv| texture.transformed(uv)));
@@ -534,24 +533,23 @@ impl TrianglePoint<'_> {
             return None;
         }
         let tangent = (e1 * d2.y - e2 * d1.y) / determinant;
-        // glTF's bitangent is along growing v of an image whose origin is its upper left corner
-        // turned around: green points up in the image.
+        // In glTF v points down but the bitangent points up in the image, hence the sign.
         Some((tangent, -determinant.signum()))
     }
 }
 
-/// Direction to a light, distance, and irradiance of a surface that faces it; `u` draws the point
-/// of an area light. None where it does not shine.
-fn light_arriving_at(
+/// Direction to a light, distance, and irradiance of a surface that faces it; `u` draws the point of an area
+/// light. `None` if the light does not reach this position.
+fn incident_light(
     light: &Light,
-    place: Vec3,
+    target: Vec3,
     u: impl FnOnce() -> Vec2,
 ) -> Option<(Vec3, f32, Vec3)> {
     let from_point = |position: DVec3| {
-        let way = position.as_vec3() - place;
-        let distance = way.length();
-        let near = distance > 0.0 && f64::from(distance) <= light.range;
-        near.then(|| (way / distance, distance))
+        let offset = position.as_vec3() - target;
+        let distance = offset.length();
+        let in_range = distance > 0.0 && f64::from(distance) <= light.range;
+        in_range.then(|| (offset / distance, distance))
     };
     match light.kind {
         LightKind::Directional { direction } => {
@@ -590,13 +588,13 @@ fn attenuation(distance: f32, range: f64) -> f32 {
     inverse_square * (1.0 - share.powi(4)).clamp(0.0, 1.0) as f32
 }
 
-/// The ray from a point that ends just before a light.
+/// The ray from a point to just in front of a light.
 fn shadow_ray(point: &Point<'_>, to_light: Vec3, distance: f32) -> LocalRay {
     secondary_ray(point, to_light, (distance - 2.0 * LIFT).max(0.0))
 }
 
 fn secondary_ray(point: &Point<'_>, direction: Vec3, tmax: f32) -> LocalRay {
-    LocalRay { origin: point.place + point.geometric * LIFT, direction, tmin: 0.0, tmax }
+    LocalRay { origin: point.position + point.geometric * LIFT, direction, tmin: 0.0, tmax }
 }
 
 /// Schlick's approximation.
@@ -605,12 +603,12 @@ fn fresnel(f0: Vec3, cos: f32) -> Vec3 {
     f0 + (Vec3::ONE - f0) * (grazing * grazing) * (grazing * grazing) * grazing
 }
 
-/// Steps of the table of directional albedo along each axis.
+/// Number of steps of the table of directional albedo along each axis.
 const STEPS: usize = 16;
 
-/// The share of light from all around that GGX reflects towards a viewer, as a factor of the normal
-/// reflectance and a rest (Karis, "Real Shading in Unreal Engine 4", 2013): interpolated in a table that
-/// is integrated once by sampling visible normals.
+/// The directional albedo of GGX as a factor (scale) on the normal reflectance and an offset (bias) (Karis,
+/// "Real Shading in Unreal Engine 4", 2013). Interpolated in a table that is computed once by sampling visible
+/// normals.
 fn directional_albedo(cos: f32, roughness: f32) -> (f32, f32) {
     static TABLE: OnceLock<Vec<(f32, f32)>> = OnceLock::new();
     let table = TABLE.get_or_init(|| {

@@ -1,7 +1,7 @@
-//! Light from all around: a gradient between ground and zenith, or an image.
+//! Environment light: a gradient between ground and zenith, or an image.
 //!
-//! A gradient's radiance is linear in the sine of elevation. Irradiance then has a closed form, so a
-//! scene that asks for no occlusion of the sky needs no secondary ray for it.
+//! A gradient's radiance is linear in the sine of the elevation. Its irradiance then has a closed form, so that
+//! scenes without occlusion of the sky need no secondary rays.
 
 use std::f32::consts::PI;
 use std::sync::Arc;
@@ -11,11 +11,11 @@ use serde::{Serialize, Serializer};
 
 use crate::panorama::Panorama;
 
-/// The sky. It only lights: where a ray hits no surface, the image stays transparent.
+/// The sky. It lights the scene but is not visible: pixels without a surface are transparent.
 #[derive(Debug, Clone, Serialize)]
 #[serde(untagged)]
 pub enum Sky {
-    /// Between two colours.
+    /// A gradient between two colours.
     Gradient {
         /// Linear radiance straight up.
         zenith: [f32; 3],
@@ -24,7 +24,7 @@ pub enum Sky {
         /// Upward direction, unit length.
         up: [f32; 3],
     },
-    /// From an image.
+    /// An image.
     Image(#[serde(serialize_with = "shared")] Arc<Panorama>),
 }
 
@@ -34,13 +34,13 @@ fn shared<S: Serializer>(image: &Panorama, to: S) -> Result<S::Ok, S::Error> {
 }
 
 impl Sky {
-    /// The same radiance from everywhere.
+    /// A sky with equal radiance in all directions.
     #[must_use]
     pub fn uniform(radiance: f32) -> Self {
         Self::Gradient { zenith: [radiance; 3], ground: [radiance; 3], up: [0.0, 1.0, 0.0] }
     }
 
-    /// A gradient's light times a factor; an image is as it is.
+    /// Multiplies a gradient's light by a factor; an image is unchanged.
     pub(crate) fn dimmed(self, factor: f32) -> Self {
         match self {
             Self::Gradient { zenith, ground, up } => Self::Gradient {
@@ -63,8 +63,8 @@ impl Sky {
         }
     }
 
-    /// Irradiance of a surface with this normal: the integral of radiance times cosine over its
-    /// hemisphere. Of a gradient, pi · (mean + 2/3 · half · n·up).
+    /// Irradiance of a surface with this normal: the integral of radiance times cosine over its hemisphere. For
+    /// a gradient it is pi · (mean + 2/3 · half · n·up).
     pub(crate) fn irradiance(&self, normal: Vec3) -> Vec3 {
         match self {
             Self::Gradient { zenith, ground, up } => {
@@ -75,8 +75,7 @@ impl Sky {
         }
     }
 
-    /// Mean radiance of a lobe about a direction that is sharp at roughness 0 and a cosine lobe
-    /// at 1.
+    /// Mean radiance of a lobe around a direction: sharp at roughness 0, a cosine lobe at 1.
     pub(crate) fn blurred(&self, direction: Vec3, roughness: f32) -> Vec3 {
         match self {
             Self::Gradient { zenith, ground, up } => {

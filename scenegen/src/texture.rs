@@ -1,34 +1,33 @@
-//! Images on surfaces: colour spaces, wrap modes, filters and texture transforms.
+//! Textures: colour spaces, wrap modes, filters and texture transforms.
 //!
-//! Texels are filtered in linear light. Minification uses a pyramid of halved images, so that a
-//! fine texture has the same colour from every distance; a ground truth that shimmers would teach
-//! a trainer noise.
+//! Texels are filtered in linear light. Minification uses mipmaps, so that a fine texture has the same colour
+//! from every distance; a trainer would learn the noise of a shimmering ground truth.
 
 use std::sync::OnceLock;
 
 use glam::{Vec2, Vec4};
 
-/// What lies beyond the unit square of texture coordinates.
+/// The continuation of a texture beyond the unit square of its coordinates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Wrap {
-    /// The edge's texels.
+    /// The texels of the edge.
     Clamp,
     /// The image repeated.
     Repeat,
-    /// The image repeated, every second copy mirrored.
+    /// The image repeated, every other copy mirrored.
     Mirror,
 }
 
-/// How texels are read.
+/// Wrap modes and filters of a texture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Sampler {
-    /// Horizontally.
+    /// Horizontal wrap mode.
     pub wrap_u: Wrap,
-    /// Vertically.
+    /// Vertical wrap mode.
     pub wrap_v: Wrap,
-    /// Whether a texel is a square of one colour when it is larger than a pixel's sample.
+    /// If true, magnified texels are not interpolated.
     pub nearest: bool,
-    /// Whether smaller images stand in for many texels.
+    /// If true, mipmaps are used for minification.
     pub mipmaps: bool,
 }
 
@@ -38,22 +37,21 @@ impl Default for Sampler {
     }
 }
 
-/// A texture as a material uses it.
+/// A material's use of a texture.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TextureRef {
-    /// Number of the texture in the model.
+    /// Index of the texture in the model.
     pub texture: u32,
-    /// Which set of texture coordinates: 0 or 1.
+    /// Set of texture coordinates: 0 or 1.
     pub uv_set: usize,
-    /// How to read it.
+    /// Wrap modes and filters.
     pub sampler: Sampler,
-    /// Rows of the matrix that texture coordinates (u, v, 1) are multiplied with first
-    /// (`KHR_texture_transform`).
+    /// Rows of the matrix that transforms texture coordinates (u, v, 1) (`KHR_texture_transform`).
     pub transform: [[f32; 3]; 2],
 }
 
 impl TextureRef {
-    /// A texture read through its first coordinates, repeated and filtered.
+    /// A texture with the first set of coordinates, repeated and filtered.
     #[must_use]
     pub fn new(texture: u32) -> Self {
         let transform = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
@@ -65,17 +63,17 @@ impl TextureRef {
         Vec2::new(row(self.transform[0]), row(self.transform[1]))
     }
 
-    /// How much larger areas become by the transform.
+    /// The factor of the transform on areas.
     pub(crate) fn area_scale(&self) -> f32 {
         let [[a, b, _], [c, d, _]] = self.transform;
         (a * d - b * c).abs()
     }
 }
 
-/// A decoded image with its smaller copies.
+/// A decoded image with its mipmaps.
 #[derive(Debug, Clone)]
 pub struct Texture {
-    /// Whether colours are sRGB-encoded; alpha never is.
+    /// True if colours are sRGB-encoded; alpha never is.
     pub srgb: bool,
     levels: Vec<Level>,
 }
@@ -89,8 +87,8 @@ struct Level {
 }
 
 impl Texture {
-    /// A texture of `width` x `height` RGBA texels, the upper row first. `texels` has four bytes
-    /// for each; missing ones are white.
+    /// A texture of `width` x `height` RGBA texels, top row first. `texels` has four bytes per texel; missing
+    /// ones are white.
     #[must_use]
     pub fn new(width: u32, height: u32, mut texels: Vec<u8>, srgb: bool) -> Self {
         let (width, height) = (width.max(1), height.max(1));
@@ -111,8 +109,8 @@ impl Texture {
         (self.levels[0].width, self.levels[0].height)
     }
 
-    /// The linear RGBA value at `uv`, (0, 0) being the upper left corner, averaged over about
-    /// `footprint` of the texture's width.
+    /// The linear RGBA value at `uv`, averaged over about `footprint` of the texture's width. (0, 0) is the top
+    /// left corner.
     #[must_use]
     pub fn sample(&self, uv: Vec2, sampler: &Sampler, footprint: f32) -> Vec4 {
         let uv = Vec2::new(wrapped(uv.x, sampler.wrap_u), wrapped(uv.y, sampler.wrap_v));
@@ -120,7 +118,7 @@ impl Texture {
         let first = &self.levels[0];
         let texels = footprint * ((first.width * first.height) as f32).sqrt();
         let level = if sampler.mipmaps { texels.log2() } else { 0.0 };
-        // NaN takes the first level.
+        // NaN selects the first level.
         if level.is_nan() || level <= 0.0 {
             let nearest = sampler.nearest;
             return if nearest {
@@ -171,7 +169,7 @@ impl Level {
         let mut texels = Vec::with_capacity(4 * width as usize * height as usize);
         for y in 0..height {
             for x in 0..width {
-                // The range of source texels; three where the size is odd.
+                // The range of source texels: two, or three if the size is odd.
                 let (x0, x1) = range(x, width, self.width);
                 let (y0, y1) = range(y, height, self.height);
                 let mut sum = Vec4::ZERO;
@@ -194,7 +192,7 @@ fn range(i: u32, count: u32, of: u32) -> (u32, u32) {
     ((i * of / count) as u32, ((i + 1) * of / count) as u32)
 }
 
-/// Into `[0, 1]`, by the wrap mode. NaN becomes 0.
+/// Maps a coordinate into `[0, 1]` by the wrap mode. NaN becomes 0.
 fn wrapped(x: f32, wrap: Wrap) -> f32 {
     let x = if x.is_finite() { x } else { 0.0 };
     match wrap {
@@ -207,12 +205,12 @@ fn wrapped(x: f32, wrap: Wrap) -> f32 {
     }
 }
 
-/// The two texels about a coordinate in `[0, 1]` and the second one's weight.
+/// The two texels on either side of a coordinate in `[0, 1]`, and the weight of the second.
 fn neighbours(u: f32, size: u32, wrap: Wrap) -> (u32, u32, f32) {
     let x = u * size as f32 - 0.5;
     let first = if x < 0.0 { -1 } else { x as i64 };
     let last = i64::from(size) - 1;
-    // Of two neighbours at most one is beyond an edge, by one. Mirrored, it is the edge itself.
+    // At most one of the two is beyond an edge, by one texel. Mirrored, it is the texel at the edge.
     let at = |i: i64, repeated: i64| match wrap {
         _ if (0..=last).contains(&i) => i as u32,
         Wrap::Repeat => repeated as u32,
@@ -225,19 +223,19 @@ fn to_u8(v: f32) -> u8 {
     (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8
 }
 
-/// Linear light of a sRGB value in `[0, 1]` (IEC 61966-2-1).
+/// The linear value of an sRGB value in `[0, 1]` (IEC 61966-2-1).
 #[must_use]
 pub fn linear_from_srgb(v: f64) -> f64 {
     if v <= 0.04045 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) }
 }
 
-/// The sRGB value of linear light in `[0, 1]` (IEC 61966-2-1).
+/// The sRGB value of a linear value in `[0, 1]` (IEC 61966-2-1).
 #[must_use]
 pub fn srgb_from_linear(v: f64) -> f64 {
     if v <= 0.003_130_8 { 12.92 * v } else { 1.055 * v.powf(1.0 / 2.4) - 0.055 }
 }
 
-/// Tables from a texel's bytes to linear light and to coverage.
+/// Tables from a texel's bytes to linear colour and alpha.
 #[derive(Debug, Clone, Copy)]
 struct Values {
     colour: &'static [f32; 256],
@@ -255,8 +253,8 @@ impl Values {
     }
 }
 
-/// The sRGB byte nearest to linear light: rounded half up in the encoded space, values outside
-/// `[0, 1]` clamped, NaN to 0.
+/// The sRGB byte nearest to a linear value, which is clamped to `[0, 1]`. Rounds half up in the encoded space;
+/// NaN gives 0.
 #[must_use]
 pub fn encode(v: f32) -> u8 {
     (srgb_from_linear(f64::from(v.clamp(0.0, 1.0))) * 255.0 + 0.5) as u8

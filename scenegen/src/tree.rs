@@ -1,8 +1,8 @@
-//! Builds the tree over a mesh's triangles in parts: the library's builder needs three times the memory
-//! of its result.
+//! Builds the tree over a mesh's triangles in parts, as the library's builder needs three times the memory of
+//! its result.
 //!
-//! Parts are halves of halves, cut at the median triangle across the widest axis. They hang from the
-//! nodes of those cuts, and the library's optimiser then improves the whole tree.
+//! Triangles are repeatedly halved at the median along the widest axis. The parts are attached to the nodes of
+//! these splits, and the library's optimiser then improves the whole tree.
 
 use obvhs::aabb::Aabb;
 use obvhs::bvh2::Bvh2;
@@ -11,13 +11,13 @@ use obvhs::bvh2::node::Bvh2Node;
 use obvhs::bvh2::reinsertion::ReinsertionOptimizer;
 use obvhs::ploc::{PlocBuilder, PlocSearchDistance, SortPrecision};
 
-/// Most triangles of a part. The builder takes some 200 bytes for each.
+/// Maximum number of triangles of a part. The builder takes about 200 bytes for each.
 const PART: usize = 1 << 16;
-/// Share of all nodes, those with the largest boxes, that the last optimisation tries to move.
+/// Share of the nodes, those with the largest boxes, that the last optimisation tries to move.
 const IMPROVED: f32 = 0.1;
 
-/// The tree over `count` triangles, whose boxes `box_of` tells. Leaves hold up to eight triangles,
-/// `primitive_indices` their numbers.
+/// Builds the tree over `count` triangles with boxes `box_of`. Leaves hold up to eight triangles, and
+/// `primitive_indices` their indices.
 pub(crate) fn build(count: usize, box_of: impl Fn(u32) -> Aabb) -> Bvh2 {
     build_in_parts(count, PART, &box_of)
 }
@@ -29,15 +29,15 @@ fn build_in_parts(count: usize, part: usize, box_of: &impl Fn(u32) -> Aabb) -> B
     tree.primitive_indices.reserve_exact(count);
     build_below(&mut tree, 0, &mut ids, part, box_of);
     drop(ids);
-    // The optimiser's stacks are sized by it.
+    // The optimiser sizes its stacks by the depth.
     tree.max_depth = tree.max_depth.max(depth(&tree));
     improve(&mut tree);
-    // The optimiser needs parents, tracing does not.
+    // Only the optimiser needs parents.
     tree.parents = Vec::new();
     tree
 }
 
-/// Puts the tree over `ids` at a node that is there already.
+/// Builds the tree over `ids` below an existing node.
 fn build_below(
     tree: &mut Bvh2,
     place: usize,
@@ -67,9 +67,9 @@ fn build_below(
     tree.nodes[place] = Bvh2Node::new(around, 0, pair as u32);
 }
 
-/// Moves the tree of a part into the whole, its root to `place`.
+/// Adds the tree of a part to the whole tree, with its root at `place`.
 fn graft(tree: &mut Bvh2, place: usize, part: &Bvh2, ids: &[u32]) {
-    // The root's slot is there already, so the part's node i comes to i + nodes.
+    // The root's node exists already, so node i of the part moves to i + nodes.
     let (nodes, primitives) = (tree.nodes.len() - 1, tree.primitive_indices.len());
     let mut moved = part.nodes.iter().map(|node| {
         let shift = if node.is_leaf() { primitives } else { nodes };
@@ -84,9 +84,9 @@ fn graft(tree: &mut Bvh2, place: usize, part: &Bvh2, ids: &[u32]) {
     tree.max_depth = tree.max_depth.max(part.max_depth);
 }
 
-/// The library's medium preset up to its last improvement, step by step: its own function validates
-/// in debug builds and panics for the degenerate trees that hostile meshes have. Its triangles are
-/// numbered by their places in `ids`.
+/// The library's medium preset without its last optimisation. Its steps are called one by one, as the library's
+/// own function validates in debug builds and panics for degenerate trees of hostile meshes. Triangles are
+/// numbered by their indices in `ids`.
 fn build_part(ids: &[u32], box_of: &impl Fn(u32) -> Aabb) -> Bvh2 {
     let boxes: Vec<Aabb> = ids.iter().map(|&id| box_of(id)).collect();
     let mut part = PlocBuilder::with_capacity(boxes.len()).build(
@@ -102,7 +102,7 @@ fn build_part(ids: &[u32], box_of: &impl Fn(u32) -> Aabb) -> Bvh2 {
     part
 }
 
-/// The optimiser's own schedule, for nodes in any order: the optimiser looks for the largest boxes
+/// Runs the optimiser's own schedule on nodes in any order, as the optimiser itself looks for the largest boxes
 /// among the first nodes only.
 fn improve(tree: &mut Bvh2) {
     let mut optimiser = ReinsertionOptimizer::default();
@@ -125,8 +125,8 @@ fn improve(tree: &mut Bvh2) {
     }
 }
 
-/// Number of levels below the root, plus one: the library's own bound is that of the tree before it
-/// was improved, and its stacks panic when full.
+/// Number of levels of the tree. The library's own bound is that of the tree before optimisation, and its stacks
+/// panic when full.
 pub(crate) fn depth(bvh: &Bvh2) -> usize {
     let mut deepest = 1;
     let mut open = vec![(0_u32, 1_usize)];
@@ -147,14 +147,14 @@ mod tests {
 
     use super::*;
 
-    /// Boxes on a bent line, some at one place.
+    /// Boxes on a curve, some of which coincide.
     fn box_of(id: u32) -> Aabb {
         let along = (id / 3) as f32;
         let at = Vec3A::new(along, (0.1 * along).sin(), 0.01 * along * along);
         Aabb::new(at - 0.4, at + 0.4)
     }
 
-    /// Every triangle is in one leaf, and every box holds those below it.
+    /// Checks that every triangle is in one leaf, and that every box contains those below it.
     fn check(tree: &Bvh2, count: u32) {
         let mut seen = vec![false; count as usize];
         let mut open = vec![0_u32];
@@ -193,7 +193,7 @@ mod tests {
 
     #[test]
     fn a_tree_in_parts_is_as_good() {
-        // What a ray that meets the outermost box meets of the others on average, by their areas.
+        // The expected number of boxes hit by a ray that hits the root's box, by their areas.
         let cost = |tree: &Bvh2| {
             let areas: f32 = tree.nodes.iter().map(|node| node.aabb().half_area()).sum();
             areas / tree.nodes[0].aabb().half_area()

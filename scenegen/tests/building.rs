@@ -1,5 +1,5 @@
-//! Tests that building the tree needs little more memory than the tree. A program of its own, because
-//! the peak is the process's.
+//! Tests that building the tree needs little more memory than the tree. A separate program, as it measures the
+//! peak memory of the process.
 #![allow(clippy::print_stderr, reason = "tests say why they skip")]
 
 mod process;
@@ -9,9 +9,9 @@ use densify_scenegen::mesh::Model;
 use glam::DVec3;
 use process::status;
 
-/// What the library's builder may hold for the part at work: 65,536 triangles of 300 bytes.
+/// Allowed memory of the library's builder for one part: 65,536 triangles of 300 bytes.
 const PART_BYTES: u64 = 20 << 20;
-/// Of each triangle: its number while parts are cut, and candidates of the last improvement.
+/// Allowed memory per triangle: its index while parts are split, and candidates of the last optimisation.
 const TRIANGLE_BYTES: u64 = 4 + 8;
 
 /// A wavy sheet of `2 side²` triangles.
@@ -36,11 +36,11 @@ fn sheet(side: u32) -> Model {
 fn building_takes_little_more_than_the_tree() {
     let model = sheet(600);
     let Some(before) = status("VmRSS:") else {
-        eprintln!("skipped: this system does not tell a process's memory");
+        eprintln!("skipped: this system does not report the memory of a process");
         return;
     };
     let surface = Surface::new(&model).expect("triangles");
-    let peak = status("VmHWM:").expect("it was told before");
+    let peak = status("VmHWM:").expect("a peak");
     let allowed =
         surface.bytes() as u64 + model.triangles.len() as u64 * TRIANGLE_BYTES + PART_BYTES;
     let taken = peak - before;

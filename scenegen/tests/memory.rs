@@ -1,5 +1,5 @@
-//! Tests that views stream to disk: their number does not change the memory. A program of its own,
-//! because the peak is the process's.
+//! Tests that memory does not depend on the number of views, as they stream to disk. A separate program, as it
+//! measures the peak memory of the process.
 #![allow(clippy::print_stderr, reason = "tests say why they skip")]
 
 mod process;
@@ -30,13 +30,13 @@ fn write_views(train: u32) {
 fn the_number_of_views_makes_no_difference() {
     write_views(3);
     let Some(few) = status("VmHWM:") else {
-        eprintln!("skipped: this system does not tell a process's peak");
+        eprintln!("skipped: this system does not report the peak memory of a process");
         return;
     };
     write_views(60);
-    let many = status("VmHWM:").expect("it was told before");
+    let many = status("VmHWM:").expect("a peak");
     let image = u64::from(SIDE * SIDE) * PIXEL_BYTES;
-    // Held, they would be sixty; four are left to the allocator's moods.
+    // Holding the views would take sixty images; four allow for variations of the allocator.
     assert!(
         many - few < 4 * image,
         "{} more images at the peak",

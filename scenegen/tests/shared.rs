@@ -1,9 +1,9 @@
-//! Tests the meshes of the shared data: sound files render, files that need unsupported extensions are
-//! refused by name, and each malformed file has the outcome in the table here.
+//! Tests with the meshes of the shared data: valid files render, files that need unsupported extensions are
+//! refused by name, and each malformed file has the outcome listed here.
 //!
-//! Most files with a validator's report have no scene. So each is read twice: as it is, and with a
+//! Most files with a validator's report have no scene, so each is read twice: unchanged, and with a
 //! scene of all its meshes (or, without any, of its accessors or buffer views as positions and
-//! indices) and a buffer of zeros. Some files that the validator rejects load all the same: their
+//! indices) and a buffer of zeros. Some files that the validator rejects load nevertheless: their
 //! errors are in metadata that is not read, in alignments that this reader does not need, or in morph
 //! targets, which are not rendered. Files that it accepts load, or have no triangle to render.
 
@@ -83,12 +83,12 @@ fn shared_meshes_that_need_other_software_are_refused_by_name() {
     }
 }
 
-// What a file does: load, or an error that has this in it.
+// The outcome of a file: it loads, or gives an error that contains this text.
 const LOADS: &str = "it loads";
 const EMPTY: &str = "no triangle to render";
 
-/// Files as they are that do not do as others: those of the validator have no scene, the rest load.
-const AS_THEY_ARE: &[(&str, &str)] = &[
+/// Unchanged files with an unusual outcome; others of the validator have no scene, and all others load.
+const UNCHANGED: &[(&str, &str)] = &[
     (
         "assimp/BoxWithInfinites-glTF-Binary/BoxWithInfinites.glb",
         "mesh 0 primitive 0: vertex 0 is not finite",
@@ -128,18 +128,18 @@ const AS_THEY_ARE: &[(&str, &str)] = &[
         "GLB header: it says 49 bytes, the file has 48",
     ),
     ("gltf-validator/base/glb/no_header.glb", "JSON: expected value"),
-    ("gltf-validator/base/glb/only_bin_chunk.glb", "GLB chunk 0: it is no JSON"),
+    ("gltf-validator/base/glb/only_bin_chunk.glb", "GLB chunk 0: it is not JSON"),
     ("gltf-validator/base/glb/only_header.glb", "GLB: there is no JSON chunk"),
     (
         "gltf-validator/base/glb/truncated_chunk_data.glb",
         "GLB header: it says 48 bytes, the file has 47",
     ),
     ("gltf-validator/base/glb/truncated_chunk_header.glb", "GLB header: the file ends within it"),
-    ("gltf-validator/base/glb/two_bin_chunks.glb", "GLB chunk 0: it is no JSON"),
-    ("gltf-validator/base/glb/two_empty_bin_chunks.glb", "GLB chunk 0: it is no JSON"),
+    ("gltf-validator/base/glb/two_bin_chunks.glb", "GLB chunk 0: it is not JSON"),
+    ("gltf-validator/base/glb/two_empty_bin_chunks.glb", "GLB chunk 0: it is not JSON"),
     ("gltf-validator/base/glb/two_empty_json_chunks.glb", "JSON: EOF while parsing a value"),
-    ("gltf-validator/base/glb/unknown_chunk.glb", "GLB chunk 0: it is no JSON"),
-    ("gltf-validator/base/glb/zero_chunk_header.glb", "GLB chunk 0: it is no JSON"),
+    ("gltf-validator/base/glb/unknown_chunk.glb", "GLB chunk 0: it is not JSON"),
+    ("gltf-validator/base/glb/zero_chunk_header.glb", "GLB chunk 0: it is not JSON"),
     ("gltf-validator/base/glb/zero_length.glb", "GLB header: it says 0 bytes, the file has 12"),
     ("gltf-validator/base/json/bom.gltf", "JSON: expected value"),
     ("gltf-validator/base/json/empty_file.gltf", "JSON: EOF while parsing a value"),
@@ -190,7 +190,7 @@ const AS_THEY_ARE: &[(&str, &str)] = &[
     ),
 ];
 
-/// Files with a report, with a scene made of what is in them, that do not load.
+/// Files of the validator that do not load with a scene made of their contents.
 const WITH_A_SCENE: &[(&str, &str)] = &[
     (
         "gltf-validator/base/accessor/alignment.gltf",
@@ -209,7 +209,7 @@ const WITH_A_SCENE: &[(&str, &str)] = &[
     ),
     (
         "gltf-validator/base/accessor/matrix_alignment.gltf",
-        "mesh 0 primitive 0, accessor 0: matrices are no vertex attributes",
+        "mesh 0 primitive 0, accessor 0: matrices are not vertex attributes",
     ),
     (
         "gltf-validator/base/accessor/small_stride.gltf",
@@ -269,8 +269,8 @@ const WITH_A_SCENE: &[(&str, &str)] = &[
     ),
 ];
 
-/// A `.glb` of a file's JSON with a scene of everything, and zeros as its buffer. None where the JSON
-/// is none, or too short of what a file needs.
+/// A `.glb` of a file's JSON with a scene of all its contents and a buffer of zeros. `None` if the JSON is
+/// malformed or incomplete.
 fn with_a_scene(path: &Path) -> Option<Vec<u8>> {
     let mut root: Value = serde_json::from_slice(&fs::read(path).ok()?).ok()?;
     let count = |root: &Value, what| root.get(what).and_then(Value::as_array).map_or(0, Vec::len);
@@ -284,7 +284,7 @@ fn with_a_scene(path: &Path) -> Option<Vec<u8>> {
     }
     let accessors = count(&root, "accessors");
     if root.get("meshes").and_then(Value::as_array).is_none_or(Vec::is_empty) {
-        // What is no position may be an index.
+        // Scalars cannot be positions, so they are used as indices.
         let used = |i: usize| match root["accessors"][i]["type"].as_str() {
             Some("SCALAR") => json!({ "attributes": { "POSITION": accessors }, "indices": i }),
             _ => json!({ "attributes": { "POSITION": i } }),
@@ -314,9 +314,9 @@ fn with_a_scene(path: &Path) -> Option<Vec<u8>> {
     Some(bytes)
 }
 
-/// Complaints about a file that does neither what its row says nor, without one, as others; each row
-/// is used once.
-fn judge(
+/// Adds a complaint if the outcome is not that of the file's row, or `others` if it has none. Each row is used
+/// once.
+fn check_outcome(
     rows: &mut Vec<(&str, &str)>,
     others: &str,
     name: &str,
@@ -326,7 +326,7 @@ fn judge(
     let row = rows.iter().position(|(row, _)| *row == name);
     let expected = row.map_or(others, |row| rows.swap_remove(row).1);
     let found = found.map_or_else(|error| error.to_string(), |_| LOADS.to_owned());
-    // What loads from a buffer of zeros has all its corners in one place.
+    // With a buffer of zeros all corners coincide, so such an error counts as loading.
     let found = if found.contains("no triangle has an area") { LOADS } else { &found };
     if !found.contains(expected) {
         complaints.push(format!("{name}: {found}, expected: {expected}"));
@@ -335,15 +335,15 @@ fn judge(
 
 #[test]
 #[ignore = "needs the shared meshes: set DENSIFY_SHARED"]
-fn every_malformed_shared_file_does_what_the_table_says() {
+fn every_malformed_shared_file_has_the_listed_outcome() {
     let root = shared("malformed");
     let folder = tempfile::tempdir().expect("folder");
     let mut complaints = Vec::new();
-    let (mut plain, mut wired) = (AS_THEY_ARE.to_vec(), WITH_A_SCENE.to_vec());
+    let (mut unchanged, mut with_scene) = (UNCHANGED.to_vec(), WITH_A_SCENE.to_vec());
     for path in files(&root) {
         let name = path.strip_prefix(&root).expect("inside").to_string_lossy().replace('\\', "/");
         let others = if name.starts_with("gltf-validator") { EMPTY } else { LOADS };
-        judge(&mut plain, others, &name, prepare(&path), &mut complaints);
+        check_outcome(&mut unchanged, others, &name, prepare(&path), &mut complaints);
         let report = PathBuf::from(format!("{}.report.json", path.display()));
         if report.is_file()
             && !name.contains("/glb/")
@@ -351,11 +351,13 @@ fn every_malformed_shared_file_does_what_the_table_says() {
         {
             let file = folder.path().join("with_a_scene.glb");
             fs::write(&file, bytes).expect("write");
-            judge(&mut wired, LOADS, &name, prepare(&file), &mut complaints);
+            check_outcome(&mut with_scene, LOADS, &name, prepare(&file), &mut complaints);
         }
     }
-    let unused =
-        plain.iter().chain(&wired).map(|(name, _)| format!("{name}: there is no such file"));
+    let unused = unchanged
+        .iter()
+        .chain(&with_scene)
+        .map(|(name, _)| format!("{name}: there is no such file"));
     complaints.extend(unused);
     assert!(complaints.is_empty(), "{}", complaints.join("\n"));
 }

@@ -1,11 +1,10 @@
-// Sums over a tile's pixels that are added to those of rows at once, by atomics: a subgroup (subgroups.wgsl)
-// adds up what it finds in its pixels, and adds that to the sums of the splat's row, one invocation per
-// field. slots.wgsl replaces this file where sums must have a
-// fixed order.
+// Sums over a tile's pixels, added to those of rows by atomics: a subgroup (subgroups.wgsl) sums over
+// its pixels, then adds the result to the sums of the splat's row, one invocation per field.
+// slots.wgsl replaces this file if sums must have a fixed order.
 
-// Adds to the sums of the row of splat i at hand what the subgroup has found; `maximum`: the field that is
-// the largest of its values, which are >= 0; none: NONE.
-fn deliver(m: Member, i: u32, found: array<f32, FIELDS>, stride: u32, maximum: u32) {
+// Adds the subgroup's contribution to the sums of loaded splat i's row; `maximum`: the field that holds
+// the largest of its values, all >= 0, instead of their sum, or NONE.
+fn add_to_row(m: Member, i: u32, found: array<f32, FIELDS>, stride: u32, maximum: u32) {
     var sums = found;
     for (var f = 0u; f < stride; f++) {
         if f == maximum {
@@ -21,7 +20,7 @@ fn deliver(m: Member, i: u32, found: array<f32, FIELDS>, stride: u32, maximum: u
         for (var f = 0u; f < stride; f++) {
             sum = select(sum, sums[f], f == mine);
         }
-        // NaN is none of 0.
+        // NaN differs from 0, and is added.
         if mine < stride && sum != 0.0 {
             if mine == maximum {
                 raise(first + mine, sum);

@@ -2,25 +2,25 @@
 // src/backend/cpu/rasterize_bwd.rs derives the sums.
 
 @group(0) @binding(6) var<storage, read> finish: array<vec2<u32>>;
-// dL/dpixel, plane after plane: red, green, blue, and alpha and depth where MORE is set; or else the error
-// of the pixels where records have a sum of it.
+// Planes of dL/dpixel: red, green, blue, and, if MORE is set, alpha and depth. If it is not, a plane of
+// the pixels' errors follows if records have a sum of errors.
 @group(0) @binding(7) var<storage, read> pixel_gradient: array<f32>;
 
-// Whether alpha and depth have gradients.
+// True if alpha and depth have gradients.
 override MORE: bool = false;
 
-// dL/dpixel of an invocation's pixels; 0 outside of the image.
+// dL/dpixel of an invocation's pixels; 0 outside the image.
 struct Upstream {
     red: vec4<f32>,
     green: vec4<f32>,
     blue: vec4<f32>,
     alpha: vec4<f32>,
-    // By depth, or the error.
+    // dL/ddepth, or the error.
     map: vec4<f32>,
 }
 
-// Pixels as they are behind the splat at hand: the light that is left there, and dL/d(what is seen);
-// and the place in the list at which they stopped.
+// The state of the pixels behind the current splat: the transmittance there, dL/d(transmitted colour),
+// and the index in the list at which the pixels stopped.
 struct Behind {
     light: vec4<f32>,
     seen: vec4<f32>,
@@ -49,7 +49,7 @@ fn upstream(quad: Quad) -> Upstream {
     return g;
 }
 
-// Pixels behind all splats of a list.
+// The state behind all splats of a list.
 fn behind_all(quad: Quad, own: Upstream, length: u32) -> Behind {
     let b = frame.background;
     let seen = own.red * b.x + own.green * b.y + own.blue * b.z;
@@ -64,20 +64,20 @@ fn behind_all(quad: Quad, own: Upstream, length: u32) -> Behind {
     return pixels;
 }
 
-// The number that is the largest of its values rather than their sum; none: NONE.
+// The field of a record that is the largest of its values instead of their sum, or NONE.
 fn maximum() -> u32 {
     return select(NONE, WEIGHT_MAX_AT, WEIGHT_MAX_AT > 0u);
 }
 
-// How many splats, from the front, pixels go through before all have stopped.
+// The number of splats, from the front, that are needed until all pixels have stopped.
 fn last_of(pixels: Behind) -> u32 {
     return max(max(pixels.stop.x, pixels.stop.y), max(pixels.stop.z, pixels.stop.w));
 }
 
-// What the parameters need of a splat, the nth of the list, summed over the pixels, which are left as
-// they are behind the next splat in front; with q = α·dL/dα and w = α·T. False, and nothing, where none of
-// the pixels takes it.
-fn differentiated(
+// Sums of splat n of the list over the pixels, from which its gradients follow, with q = α·dL/dα and
+// w = α·T; updates the state for the next splat in front. Returns false if none of the pixels takes
+// the splat.
+fn backpropagate(
     splat: Splat,
     n: u32,
     quad: Quad,

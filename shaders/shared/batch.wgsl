@@ -3,7 +3,7 @@
 
 struct Member {
     place: u32,
-    // As many as there are splats at hand at a time, at most.
+    // At most as many as splats are loaded at a time.
     members: u32,
 }
 
@@ -15,17 +15,17 @@ fn member(lane: u32) -> Member {
     return Member(lane, BATCH);
 }
 
-// Waits until all have come here.
-fn meet() {
+// Waits for all invocations of the group.
+fn wait_for_all() {
     workgroupBarrier();
 }
 
-// Whether an invocation must go on with the splats at hand, when it wants to or not.
+// True if an invocation must continue with the loaded splats; `wants`: if it has use for them itself.
 fn is_needed(wants: bool) -> bool {
     return wants;
 }
 
-// The largest value of any of them; the splats at hand are no longer needed.
+// The largest value in the group; overwrites the loaded splats.
 fn largest_of_all(m: Member, x: u32) -> u32 {
     if m.place == 0u {
         atomicStore(&largest_found, 0u);
@@ -39,15 +39,15 @@ fn largest_of_all(m: Member, x: u32) -> u32 {
     return workgroupUniformLoad(&largest_known);
 }
 
-// Makes a row's splat the one at hand of a place; `corner`: of the tile.
-fn hold(place: u32, row: u32, corner: vec2<u32>) {
+// Loads a row's splat to index `place`; `corner`: of the tile.
+fn load_splat(place: u32, row: u32, corner: vec2<u32>) {
     let splat = splat_of(row, corner);
     batch[3u * place] = splat.a;
     batch[3u * place + 1u] = splat.b;
     batch[3u * place + 2u] = splat.colour;
 }
 
-// Splat i at hand.
-fn held(i: u32) -> Splat {
+// Loaded splat i.
+fn loaded_splat(i: u32) -> Splat {
     return Splat(batch[3u * i], batch[3u * i + 1u], batch[3u * i + 2u]);
 }

@@ -2,10 +2,10 @@
 
 // Sums of the map, of pixels, of weights, of distances; the largest weight.
 const COLUMNS: u32 = 5u;
-// The one that is no sum.
+// The field that is a maximum; the others are sums.
 const MAXIMUM: u32 = 4u;
 
-// The pixel map at an invocation's pixels; 0 outside of the image.
+// The pixel map at an invocation's pixels; 0 outside the image.
 fn map_at(quad: Quad) -> vec4<f32> {
     var here = vec4(0.0);
     for (var p = 0u; p < 4u; p++) {
@@ -16,14 +16,14 @@ fn map_at(quad: Quad) -> vec4<f32> {
     return here;
 }
 
-// The columns of a splat, over the pixels.
-fn blended(
+// A splat's sums over an invocation's pixels.
+fn splat_sums(
     splat: Splat,
     quad: Quad,
     map_here: vec4<f32>,
     pixels: ptr<function, Open>,
 ) -> array<f32, COLUMNS> {
-    let w = taken(falloff(splat, quad).exponent, pixels);
+    let w = blend(falloff(splat, quad).exponent, pixels);
     let x = quad.x - splat.a.x;
     let y = quad.y - splat.a.y;
     let one = select(vec4(0.0), vec4(1.0), w > vec4(0.0));

@@ -43,7 +43,7 @@ fn log2_sigmoid(x: f32) -> f32 {
     return min(x, 0.0) * LOG2_E - log2_of_1_to_2(1.0 + exp_exact(-abs(x)));
 }
 
-// Everything of the forward projection that the backward pass needs again.
+// The results of the forward projection that the backward pass uses too.
 struct Geometry {
     scale: vec3<f32>,
     quat: vec4<f32>,
@@ -63,7 +63,7 @@ struct Geometry {
     det: f32,
 }
 
-// a·b − c·d with the rounding error of the second product given back (Kahan).
+// a·b − c·d, with a correction for the rounding error of the second product (Kahan).
 fn difference_of_products(a: f32, b: f32, c: f32, d: f32) -> f32 {
     let cd = c * d;
     let error = fma(-c, d, cd);
@@ -120,7 +120,7 @@ fn conic(g: Geometry) -> vec3<f32> {
 fn direction(mean: vec3<f32>) -> vec4<f32> {
     let v = mean - frame.centre.xyz;
     let norm2 = dot(v, v);
-    // Below this the square has lost its bits; the direction is then undefined and its gradient 0.
+    // Below this the square loses precision; the direction is then undefined and its gradient 0.
     if norm2 > 1e-30 {
         let inv = 1.0 / sqrt(norm2);
         return vec4(v * inv, inv);
@@ -170,7 +170,7 @@ fn basis(degree: u32, d: vec3<f32>) -> array<f32, 16> {
     return y;
 }
 
-// Coefficient k of the three channels.
+// Coefficient k of all three channels.
 fn coefficient(row: u32, k: u32) -> vec3<f32> {
     if k == 0u {
         let at = 3u * row;

@@ -1,11 +1,11 @@
 // Shared by the kernels that work tile by tile (rasterize, rasterize_bwd, observe and the atomic ones):
 // their inputs, the pixels of an invocation, and a splat's blending there.
 //
-// One tile per group of 64 invocations. Each has four pixels that make a square, the four numbers of a
-// vec4: a splat is read once for all of them, and what they add to its sums meets in registers.
+// One tile per group of 64 invocations. Each has a square of four pixels, the components of a vec4: a
+// splat is read once for all four, and their contributions to its sums are added in registers.
 
 @group(0) @binding(1) var<storage, read_write> state: State;
-// Slots, tile after tile, front to back.
+// Slots sorted by tile, then front to back.
 @group(0) @binding(2) var<storage, read> list: array<u32>;
 @group(0) @binding(3) var<storage, read> row_of_slot: array<u32>;
 @group(0) @binding(4) var<storage, read> tile_starts: array<u32>;
@@ -14,7 +14,7 @@
 // Invocations of a tile.
 const MEMBERS: u32 = 64u;
 
-// Numbers of the longest record.
+// Length of the longest record.
 const FIELDS: u32 = 15u;
 
 struct Splat {
@@ -27,30 +27,30 @@ struct Splat {
 
 // The pixels of an invocation.
 struct Quad {
-    // Of the tile, in the image [px].
+    // Corner of the tile in the image [px].
     corner: vec2<u32>,
-    // Centres, from that corner [px].
+    // Centres, relative to that corner [px].
     x: vec4<f32>,
     y: vec4<f32>,
-    // Places in the image, row after row, where they are inside of it.
+    // Indices in the image, for pixels inside the image.
     place: vec4<u32>,
     inside: vec4<bool>,
 }
 
-// Whether a tile is there, and in the band at hand, `now.a`.
+// True for a tile of the image that is in the current band, `now.a`.
 fn is_in_band(tile: u32) -> bool {
     return tile < frame.image.w && tile >= state.cuts[now.a] && tile < state.cuts[now.a + 1u];
 }
 
-// Says whether loops have come to their end: llvmpipe ends all of an invocation after 65,535 rounds
-// together, without a word. What is computed then is worth nothing, and the host must know.
+// Records in `state` if a loop ended early: llvmpipe silently ends the loops of an invocation after
+// 65,535 rounds in total. The results are then invalid, and the host reports it.
 fn expect_end(has_ended: bool) {
     if !has_ended {
         state.broken_off = 1u;
     }
 }
 
-// Neighbours in number are neighbours in the image, so that those that run together mostly agree.
+// Invocations with close indices have close pixels, so that those that run together rarely diverge.
 fn quad_of(tile: u32, lane: u32) -> Quad {
     let corner = corner_of(tile);
     let x = ((lane & 1u) << 1u) | (lane & 4u) | ((lane >> 1u) & 8u);
@@ -75,7 +75,7 @@ fn splat_of(row: u32, corner: vec2<u32>) -> Splat {
     return Splat(within, splats[3u * row + 1u], splats[3u * row + 2u]);
 }
 
-// A splat in the pixels: distances from its mean along its own axes, and log2 of its opacity there.
+// A splat at the pixels: distances from its mean along its own axes, and log2 of its opacity there.
 struct Falloff {
     u: vec4<f32>,
     z: vec4<f32>,
@@ -89,14 +89,14 @@ fn falloff(splat: Splat, quad: Quad) -> Falloff {
     return Falloff(u, z, splat.b.y - u * u - z * z);
 }
 
-// Pixels on their way from front to back: the light that is left, and whether they go on.
+// The state of pixels from front to back: the transmittance, and true while they have not stopped.
 struct Open {
     light: vec4<f32>,
     goes_on: vec4<bool>,
 }
 
-// The weights of a splat in pixels, of which it takes the light, or which stop before it.
-fn taken(exponent: vec4<f32>, pixels: ptr<function, Open>) -> vec4<f32> {
+// Blends a splat into the pixels and returns its weights; pixels that stop before it get 0.
+fn blend(exponent: vec4<f32>, pixels: ptr<function, Open>) -> vec4<f32> {
     let reached = (*pixels).goes_on & (exponent >= vec4(-LOG2_REACH));
     if !any(reached) {
         return vec4(0.0);
@@ -111,7 +111,7 @@ fn taken(exponent: vec4<f32>, pixels: ptr<function, Open>) -> vec4<f32> {
     return select(vec4(0.0), weight, takes);
 }
 
-// A function of the four pixels, added up; always in the same order.
+// The sum of a value over the four pixels, always in the same order.
 fn total(x: vec4<f32>) -> f32 {
     return (x.x + x.y) + (x.z + x.w);
 }

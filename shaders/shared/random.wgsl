@@ -1,6 +1,6 @@
-// Draws as hashes of (seed, step, row, purpose): the twin of policies/src/rng.rs, bit by bit up to
-// the uniform numbers. And the elementary functions that normal numbers need, since a device's own
-// logarithm, sine and cosine may be as coarse as 2^-11.
+// Random numbers as hashes of (seed, step, row, purpose), the counterpart of policies/src/rng.rs;
+// uniform numbers agree bit by bit. Normal numbers use the logarithm, sine and cosine defined here,
+// since a device's own may have errors of 2^-11.
 
 const PURPOSE_PLACE: u32 = 2u;
 const PURPOSE_NOISE: u32 = 3u;
@@ -43,7 +43,7 @@ fn ln_exact(x: f32) -> f32 {
     return f32(n) * 0.6931471806 + 2.0 * t * p;
 }
 
-// Cosine and sine of a whole turn's fraction in [0, 1).
+// Cosine and sine of an angle in turns, in [0, 1).
 fn cos_sin_of_turn(turn: f32) -> vec2<f32> {
     let quarter = round(4.0 * turn);
     let x = (turn - 0.25 * quarter) * 6.2831853072;

@@ -1,40 +1,41 @@
-// Sums over a tile's pixels, written to one record per entry in its slot. What each invocation finds in
-// its four pixels is stored in shared memory and added in a fixed order, the same on every device; four
-// splats share two barriers. atomics.wgsl replaces this file where gradients are added by atomics.
+// Sums over a tile's pixels, written to one record per entry, in its slot. Each invocation stores the
+// sums over its four pixels in shared memory; these are added in a fixed order, the same on every
+// device. Four splats share two barriers. atomics.wgsl replaces this file if gradients are added by
+// atomics.
 
-// Splats at a time, and loaded at a time, at most.
+// Splats summed per round, and splats loaded at a time, at most.
 const SPLATS: u32 = 4u;
 const BATCH: u32 = 8u;
 
-// Half of the invocations. So many rounds of a loop compilers unroll, and it matters: rounds are counted
-// (expect_end), and a tile of 3,000 splats would have too many otherwise.
+// Half of the invocations. Compilers unroll a loop of this many rounds, as is necessary: rounds are
+// limited (see expect_end), and a tile of 3,000 splats would exceed the limit.
 const ROUND: u32 = 32u;
-// Numbers from one sum's parts to the next one's: one more than there are, so that those that add up
-// different sums read different banks.
+// Distance from one sum's parts to the next one's: one more than there are parts, so that invocations
+// that add different sums read different banks.
 const PITCH: u32 = 65u;
 
-// Part n·PITCH + lane: of sum n, found by an invocation.
+// Part n·PITCH + lane: the invocation's part of sum n.
 var<workgroup> parts: array<f32, 3900>;
-// Of the splats at hand.
+// Slots of the loaded splats.
 var<workgroup> slots: array<u32, BATCH>;
 
-// Makes the next `count` splats, from one in the list on, those at hand; to be called by all.
-fn take_batch(from_entry: u32, count: u32, lane: u32, corner: vec2<u32>) {
-    meet();
+// Loads the `count` splats that start at `from_entry` in the list; to be called by all invocations.
+fn load_batch(from_entry: u32, count: u32, lane: u32, corner: vec2<u32>) {
+    wait_for_all();
     if lane < count {
         let slot = list[from_entry + lane];
         slots[lane] = slot;
-        hold(lane, row_of_slot[slot], corner);
+        load_splat(lane, row_of_slot[slot], corner);
     }
-    meet();
+    wait_for_all();
 }
 
-// What an invocation has found for sum n.
-fn put_part(n: u32, lane: u32, x: f32) {
+// Stores an invocation's part of sum n.
+fn store_part(n: u32, lane: u32, x: f32) {
     parts[n * PITCH + lane] = x;
 }
 
-// ROUND parts in order, added to what is given, or the largest of all.
+// ROUND parts, added in order to the given value, or the largest of all of them.
 fn reduced(given: f32, first: u32, is_maximum: bool) -> f32 {
     var sum = given;
     for (var i = 0u; i < ROUND; i++) {

@@ -3,8 +3,8 @@
 const BETA1: f32 = 0.9;
 const BETA2: f32 = 0.999;
 const EPSILON: f32 = 1e-15;
-// Logits of opacities stay within this.
+// Largest absolute value of opacity logits.
 const LOGIT_MAX: f32 = 9.2;
-// The age from which there is no bias left to correct.
+// The bias correction is 1 from this age on.
 const MATURE: u32 = 17400u;
 

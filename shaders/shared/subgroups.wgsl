@@ -1,20 +1,20 @@
 // The invocations of a subgroup share splats, without shared memory or barriers: each holds one splat
-// and passes it to the others. batch.wgsl replaces this file on devices without subgroups.
+// and broadcasts it to the others. batch.wgsl replaces this file on devices without subgroups.
 
-// An invocation among those of its subgroup, which may be of any size. They are counted, as sizes that
-// drivers tell may be more than there are.
+// The index of an invocation in its subgroup, and the size of the subgroup. Invocations are counted,
+// since the size that drivers report may be too large.
 struct Member {
     place: u32,
     members: u32,
 }
 
-// A rectangle of pixels: its first and last centres, from the corner of the tile [px].
+// A rectangle of pixels: its first and last centres, relative to the tile's corner [px].
 struct Block {
     low: vec2<f32>,
     high: vec2<f32>,
 }
 
-// The pixels of the subgroup. To be called while all of them are there.
+// The bounding rectangle of the subgroup's pixels. To be called while all invocations are active.
 fn block_of(quad: Quad) -> Block {
     return Block(
         vec2(subgroupMin(quad.x.x), subgroupMin(quad.y.x)),
@@ -22,8 +22,8 @@ fn block_of(quad: Quad) -> Block {
     );
 }
 
-// Whether a splat may reach into a block, by the box around its ellipse, which is widened so that none is
-// lost to rounding. Nor is one whose box has no numbers: nothing compares with them.
+// True if a splat may reach a pixel of the block, judged by its ellipse's bounding box. The box is
+// widened, so that rounding loses no splat, and a box with NaN counts as reaching.
 fn may_reach(splat: Splat, block: Block) -> bool {
     let radius = sqrt(max(splat.b.y + LOG2_REACH, 0.0));
     let down = radius / splat.b.x;
@@ -32,37 +32,37 @@ fn may_reach(splat: Splat, block: Block) -> bool {
     return !(any(splat.a.xy + half < block.low) || any(splat.a.xy - half > block.high));
 }
 
-// The splat of this invocation, and its row.
+// The splat that this invocation holds, and its row.
 var<private> own_splat: Splat;
 var<private> own_row: u32;
 
-// To be called before any of them has ended.
+// To be called before any invocation has ended.
 fn member(lane: u32) -> Member {
     return Member(subgroupExclusiveAdd(1u), subgroupAdd(1u));
 }
 
-// They go in step.
-fn meet() {
+// A subgroup runs in step and need not wait.
+fn wait_for_all() {
 }
 
-// Whether an invocation must go on with the splats at hand, when it wants to or not: others need its own.
+// True if an invocation must continue with the loaded splats: others may need the one that it holds.
 fn is_needed(wants: bool) -> bool {
     return subgroupAny(wants);
 }
 
-// The largest that any of them has.
+// The largest value in the subgroup.
 fn largest_of_all(m: Member, x: u32) -> u32 {
     return subgroupMax(x);
 }
 
-// Makes a row's splat the one at hand of a place, which is this invocation's; `corner`: of the tile.
-fn hold(place: u32, row: u32, corner: vec2<u32>) {
+// Loads a row's splat to index `place`, which is this invocation's; `corner`: of the tile.
+fn load_splat(place: u32, row: u32, corner: vec2<u32>) {
     own_row = row;
     own_splat = splat_of(row, corner);
 }
 
-// Splat i at hand.
-fn held(i: u32) -> Splat {
+// Loaded splat i.
+fn loaded_splat(i: u32) -> Splat {
     return Splat(
         subgroupShuffle(own_splat.a, i),
         subgroupShuffle(own_splat.b, i),

@@ -1,5 +1,5 @@
-// The sums of rows, on devices whose atomics are whole numbers only: additions compare and exchange the
-// bits of f32. The order of additions varies, and so do the last bits of a sum.
+// The sums of rows, on devices with atomics for integers only: additions compare and exchange the bits
+// of f32. The order of additions varies, and with it the last bits of a sum.
 
 @group(0) @binding(8) var<storage, read_write> row_sums: array<atomic<u32>>;
 
@@ -19,7 +19,7 @@ fn add(at: u32, x: f32) {
     }
 }
 
-// Makes a sum the larger of itself and x, which is >= 0: such numbers are in the order of their bits.
+// Replaces a sum by the larger of itself and x >= 0; the bits of such numbers sort like the numbers.
 fn raise(at: u32, x: f32) {
     atomicMax(&row_sums[at], bitcast<u32>(x));
 }

@@ -1,4 +1,4 @@
-// The sums of rows, on devices with atomic addition of f32. The order of additions varies, and so do
+// The sums of rows, on devices with atomic addition of f32. The order of additions varies, and with it
 // the last bits of a sum.
 
 @group(0) @binding(8) var<storage, read_write> row_sums: array<atomic<f32>>;
@@ -11,8 +11,8 @@ fn add(at: u32, x: f32) {
     atomicAdd(&row_sums[at], x);
 }
 
-// Makes a sum the larger of itself and x. f32 has no atomic maximum: values are exchanged, and an
-// invocation that gets back a larger value than it stored stores that one again.
+// Replaces a sum by the larger of itself and x. WGSL has no atomic maximum of f32: values are exchanged,
+// and an invocation that gets back a larger value than it stored stores that value again.
 fn raise(at: u32, x: f32) {
     var mine = x;
     loop {

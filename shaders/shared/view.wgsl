@@ -1,5 +1,5 @@
-// Shared by all stages: the view and the settings of a step (one uniform buffer), the scalars that stay
-// on the device (one storage buffer), the numbering of work, and e^x.
+// Shared by all stages: the view and the settings of a step (a uniform buffer), scalars that stay on
+// the device (a storage buffer), the parameters of a dispatch, and e^x.
 
 struct Frame {
     // Rows of camera_from_world's rotation; w: its translation.
@@ -22,14 +22,15 @@ struct Frame {
     more_rates: vec4<f32>,
     // Strength times step size, sharpness, opacity.
     noise: vec4<f32>,
-    // How errors add up to a score: power of a pixel's error, weight of edges, powers of the weights' sum and
-    // of a view.
+    // How errors are combined into a score: exponent of a pixel's error, weight of edges, exponents of
+    // the sum of weights and of a view's score.
     score: vec4<f32>,
-    // Seed, step, bits of what is due (see adam.wgsl), kind of target (see loss.wgsl).
+    // Seed, step, flags of the optimiser (see adam.wgsl), flags of the loss (see loss.wgsl).
     draw: vec4<u32>,
-    // Rows at the front that never change, and have no place in arrays that only training needs; unused ×3.
+    // Number of frozen rows: they come first, never change, and have no entries in the arrays used only
+    // for training; unused ×3.
     frozen: vec4<u32>,
-    // Planes of the signals' accumulators, by their numbers; NONE where not asked for.
+    // Plane of each signal's accumulators; NONE if it is not requested.
     planes: array<vec4<u32>, 8>,
 }
 
@@ -38,16 +39,16 @@ struct State {
     visible: u32,
     // Entries of the whole image, saturated at 2^30.
     total: u32,
-    // Bands that the image needs.
+    // Number of bands that the image needs.
     bands: u32,
     // 1: more bands are needed than were encoded; the step must change nothing.
     short: u32,
     // Entries of all bands, as one number of 64 bits.
     entries_low: u32,
     entries_high: u32,
-    // Entries of the band at hand.
+    // Entries of the current band.
     held: u32,
-    // 1: a loop over a tile's splats has ended before its time, now or ever.
+    // 1: a loop over a tile's splats has ended too early, in this step or an earlier one.
     broken_off: u32,
     // Means over pixels and channels.
     l1: f32,
@@ -57,7 +58,7 @@ struct State {
     cuts: array<u32>,
 }
 
-// What differs between dispatches of one kernel.
+// Parameters that differ between dispatches of one kernel.
 struct Now {
     a: u32,
     b: u32,
@@ -73,14 +74,14 @@ const TILE: u32 = 16u;
 const GROUP: u32 = 256u;
 
 // Blending: the largest alpha; the transmittance at which a pixel stops; the smallest alpha, and −log2
-// of it. All but the first are knobs.
+// of it. All but the first are settings.
 const ALPHA_MAX: f32 = 0.99;
 override TRANSMITTANCE_MIN: f32 = 1e-4;
 override ALPHA_MIN: f32 = 1.0 / 255.0;
 override LOG2_REACH: f32 = 7.9943534;
 
-// Workgroups in the first of two dimensions, each of which has at most 65,535 of them. It is a
-// constant because DX12 does not tell an indirect dispatch how many there are.
+// Workgroups in the first of two dimensions, each of which has at most 65,535 of them. This is a
+// constant because an indirect dispatch on DX12 does not provide the number.
 const ACROSS: u32 = 32768u;
 
 fn group_of(id: vec3<u32>) -> u32 {
@@ -92,7 +93,7 @@ fn corner_of(tile: u32) -> vec2<u32> {
     return vec2(tile % frame.image.z, tile / frame.image.z) * TILE;
 }
 
-// |x| <= most; false for NaN and infinity. By bits: WGSL may assume that there is no NaN.
+// |x| <= most; false for NaN and infinity. Compares bits, since WGSL may assume that there is no NaN.
 fn below(x: f32, most: f32) -> bool {
     return (bitcast<u32>(x) & 0x7fffffffu) <= bitcast<u32>(most);
 }
@@ -101,11 +102,11 @@ const LARGEST: f32 = 3.4028234e38;
 
 const LOG2_E: f32 = 1.44269504;
 
-// e^x, x clamped to [-87, 88]; relative error below 2e-7, where a device's own may lose more.
+// e^x, x clamped to [-87, 88]; relative error below 2e-7; a device's own function may be less accurate.
 fn exp_exact(wide: f32) -> f32 {
     let x = clamp(wide, -87.0, 88.0);
     let n = round(x * LOG2_E);
-    // ln 2 in two parts (Cody and Waite): the first has few bits, so n times it is exact.
+    // ln 2 in two parts (Cody and Waite): the first has few bits, so its product with n is exact.
     let f = fma(-n, 1.4286068e-6, fma(-n, 0.69314575, x));
     var p = fma(1.984127e-4, f, 1.3888889e-3);
     p = fma(p, f, 8.333334e-3);
@@ -117,7 +118,7 @@ fn exp_exact(wide: f32) -> f32 {
     return bitcast<f32>(bitcast<u32>(p) + (bitcast<u32>(i32(n)) << 23u));
 }
 
-// The logistic function; 1 − sigmoid(x) is sigmoid(−x), where nothing cancels.
+// The logistic function; use sigmoid(−x) for 1 − sigmoid(x), without cancellation.
 fn sigmoid(x: f32) -> f32 {
     let e = exp_exact(-abs(x));
     return select(e, 1.0, x >= 0.0) / (1.0 + e);

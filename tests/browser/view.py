@@ -1,9 +1,9 @@
-"""Drives the page of `densify view` in a real browser: Chromium without a window, through chromedriver.
+"""Tests the page of `densify view` in a real browser: headless Chromium, driven through chromedriver.
 
     python view.py DENSIFY RUN OTHER [FOLDER FOR SCREENSHOTS]          needs chromium and chromium-driver
 
-RUN and OTHER are of one scene, and RUN must hold views out. WebDriver is JSON over HTTP, for which Python's own
-library is enough.
+RUN and OTHER are of one scene, and RUN must have test views. WebDriver is JSON over HTTP, for which Python's
+standard library suffices.
 """
 
 import base64
@@ -21,7 +21,7 @@ from pathlib import Path
 
 STEPS = 50
 PATIENCE = 60.0
-# A small picture of what the stage shows: enough to tell pictures apart, and from empty ones.
+# Statistics of a thumbnail of the stage, which distinguish pictures from each other and from empty ones.
 PROBE = """
 const small = document.createElement("canvas");
 small.width = small.height = 48;
@@ -36,14 +36,14 @@ for (let i = 0; i < data.length; i += 4) {
 const mean = light.reduce((a, b) => a + b) / light.length;
 return { spread: Math.sqrt(light.reduce((a, b) => a + (b - mean) ** 2, 0) / light.length), light: light.join(), colours: colours.size };
 """
-# Between the bytes of two pictures of one size.
+# The PSNR [dB] between the bytes of two pictures of one size.
 DECIBELS = """
 const decibels = (a, b) => {
   const sum = a.reduce((sum, x, i) => sum + (x - b[i]) ** 2, 0);
   return 10 * Math.log10(255 ** 2 / Math.max(sum / (a.length * 3 / 4), 1e-9));
 };
 """
-# Decibels between the right one of two pictures and a PNG, of one size.
+# The PSNR [dB] between the picture on the right and a PNG of the same size.
 PSNR = DECIBELS + """
 const done = arguments[arguments.length - 1], image = new Image();
 image.onload = () => {
@@ -58,8 +58,8 @@ image.onload = () => {
 };
 image.src = arguments[0];
 """
-# Decibels between the middle of the stage now and at the last call.
-MIDDLE = DECIBELS + """
+# The PSNR [dB] between the middle of the stage now and at the last call.
+MIDDLE_PSNR = DECIBELS + """
 const { width, height } = picture, side = Math.round(height / 3);
 const copy = document.createElement("canvas"), out = copy.getContext("2d", { willReadFrequently: true });
 [copy.width, copy.height] = [side, side];
@@ -68,68 +68,68 @@ const { data } = out.getImageData(0, 0, side, side), before = window.middle ?? d
 window.middle = data;
 return decibels(data, before);
 """
-# Pixels of the marks over the picture.
-MARKED = """
+# The number of pixels of the marks over the picture.
+MARK_PIXELS = """
 const copy = document.createElement("canvas"), out = copy.getContext("2d", { willReadFrequently: true });
 [copy.width, copy.height] = [marks.width, marks.height];
 out.drawImage(marks, 0, 0);
 const { data } = out.getImageData(0, 0, copy.width, copy.height);
 return data.filter((value, i) => i % 4 === 3 && value).length;
 """
-# A camera that is drawn: where, and which one a click there goes to.
-DRAWN = """
+# The position of a camera's mark, and the camera that a click there goes to.
+CAMERA_MARK = """
 const places = allViews().map(({ split, number }) => projector()(frustum(scene.views[split][number])[0]));
 const [width, height] = area();
 const [x, y] = places.find(([x, y, z]) => z > 0 && x > 20 && y > 60 && x < width - 120 && y < height - 60).map(Math.round);
 return [x, y, cameraAt(x, y)];
 """
-# What the keyboard cannot reach, or has no name, of what is seen.
-UNREACHED = """
+# Visible controls that the keyboard does not reach, or that have no name.
+UNREACHABLE = """
 const seen = [...document.querySelectorAll("button, select, input, summary, [tabindex]")]
   .filter((it) => it.offsetParent !== null && !it.disabled && (it.type !== "radio" || it.checked));
 const name = (it) => it.ariaLabel || it.labels?.[0]?.textContent || it.textContent;
 return seen.filter((it) => !it.dataset.reached || !name(it).trim()).map((it) => it.id || it.outerHTML);
 """
-# Which of these parts of the page lie over each other.
+# Pairs of the given elements that overlap.
 OVERLAPS = """
 const boxes = arguments[0].map((id) => [id, document.getElementById(id).getBoundingClientRect()]);
 const crosses = (a, b) => a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom;
 return boxes.flatMap(([id, box], i) => boxes.slice(i + 1).filter(([, other]) => crosses(box, other)).map(([other]) => `${id} and ${other}`));
 """
-# Turns the scene with every frame of the screen, for some seconds; then says how many pictures were shown in a second,
-# and their widths.
+# Turns the scene with every frame of the screen for some seconds; returns the pictures shown per second, the rate that
+# the page reports, and the pictures' widths.
 TURN = """
 const done = arguments[arguments.length - 1], stage = document.getElementById("stage"), begun = performance.now();
-const pictures = () => Number(stage.dataset.pictures), sides = [], before = pictures();
+const pictures = () => Number(stage.dataset.pictures), widths = [], before = pictures();
 let last = before;
 const turn = (now) => {
   if (now - begun > 1000 * arguments[0]) {
     const rate = (pictures() - before) / (performance.now() - begun) * 1000;
-    return done({ rate, said: Number(stage.dataset.rate), sides });
+    return done({ rate, reported: Number(stage.dataset.rate), widths });
   }
   orbit(0.012, 0.002 * Math.sin(now / 700));
   if (pictures() !== last) {
     last = pictures();
-    sides.push(Number(stage.dataset.size.split("x")[0]));
+    widths.push(Number(stage.dataset.size.split("x")[0]));
   }
   requestAnimationFrame(turn);
 };
 requestAnimationFrame(turn);
 """
-# How large a coarse picture is, of 1, after one that was half as large: by what it took to make and to come here, of
-# 1000 bytes that take a microsecond each, and what a reply takes alone.
-PACED = """
+# The size that the page chooses for coarse pictures, relative to full size, after one of size 0.5 and 1000 bytes, each
+# of which takes a microsecond. Arguments: the time to render it, the time until it arrived, and the network's latency.
+COARSE_SIZE = """
 const [milliseconds, took, alone] = arguments;
 [latency, perByte] = [alone, 1e-3];
 pace([{ bitmap: { width: 1, height: 1 }, bytes: 1000, milliseconds, held: milliseconds, took }], performance.now() - took, true, 0.5);
 return coarse;
 """
-# Every reply comes later by so many milliseconds, as over a network; also counts the wishes that are under way at once.
-FAR = """
-const near = window.fetch;
-window.fetch = async (...wish) => {
+# Delays every reply by the given milliseconds, like a slow network; also finds the largest number of pending requests.
+DELAY = """
+const fetchAtOnce = window.fetch;
+window.fetch = async (...request) => {
   window.atOnce = Math.max(window.atOnce ?? 0, underway);
-  const answer = await near(...wish);
+  const answer = await fetchAtOnce(...request);
   await new Promise((resolve) => setTimeout(resolve, arguments[0]));
   return answer;
 };
@@ -165,40 +165,40 @@ class Browser:
     def run(self, script: str, *arguments: object) -> object:
         return self.call("POST", f"{self.session}/execute/sync", {"script": script, "args": list(arguments)})
 
-    def wait(self, script: str, *arguments: object) -> object:
-        """Runs a script that calls its last argument when it is done."""
+    def run_async(self, script: str, *arguments: object) -> object:
+        """Runs a script that calls its last argument when it has finished."""
         return self.call("POST", f"{self.session}/execute/async", {"script": script, "args": list(arguments)})
 
     def command(self, name: str, **parameters: object) -> None:
-        """A command of the DevTools."""
+        """Runs a command of the DevTools."""
         self.call("POST", f"{self.session}/goog/cdp/execute", {"cmd": name, "params": parameters})
 
-    def until(self, condition: str, what: str) -> None:
+    def wait_for(self, condition: str, message: str) -> None:
         end = time.monotonic() + PATIENCE
         while not self.run(f"return Boolean({condition})"):
-            assert time.monotonic() < end, f"{what}: {self.run('return document.body.innerText')}"
+            assert time.monotonic() < end, f"{message}: {self.run('return document.body.innerText')}"
             time.sleep(0.02)
 
-    def is_sharp(self) -> None:
-        self.until("document.getElementById('stage').dataset.state === 'sharp'", "no sharp picture")
+    def wait_until_sharp(self) -> None:
+        self.wait_for("document.getElementById('stage').dataset.state === 'sharp'", "no sharp picture")
 
     def choose(self, name: str, value: str) -> None:
-        """Chooses from a list, as a hand does."""
+        """Selects an option of a list, like a user."""
         script = "const list = document.getElementById(arguments[0]); list.value = arguments[1];"
         script += "list.dispatchEvent(new Event('change', { bubbles: true })); return list.value;"
         assert self.run(script, name, value) == value, f"{name} has no {value}"
-        self.is_sharp()
+        self.wait_until_sharp()
 
     def press(self, *names: str) -> None:
         actions = [{"type": kind, "value": name} for name in names for kind in ("keyDown", "keyUp")]
         self.call("POST", f"{self.session}/actions", {"actions": [{"type": "key", "id": "keys", "actions": actions}]})
 
-    def hand(self, *actions: dict) -> None:
+    def mouse(self, *actions: dict) -> None:
         pointer = {"type": "pointer", "id": "hand", "parameters": {"pointerType": "mouse"}, "actions": list(actions)}
         self.call("POST", f"{self.session}/actions", {"actions": [pointer]})
 
     def pinch(self, *places: tuple[int, int]) -> None:
-        """Two fingers: their places, one of each in turn, and where each goes."""
+        """Moves two fingers: places 0 and 1 are where they start, places 2 and 3 where they end."""
         sources = []
         for finger, (at, to) in enumerate([(places[0], places[2]), (places[1], places[3])]):
             move = lambda place, duration: {"type": "pointerMove", "duration": duration, "x": place[0], "y": place[1]}
@@ -207,21 +207,22 @@ class Browser:
             sources.append({"type": "pointer", "id": f"finger{finger}", "parameters": parameters, "actions": actions})
         self.call("POST", f"{self.session}/actions", {"actions": sources})
 
-    def is_reached_by_key(self) -> None:
-        """Everything that is seen is reached by key, and has a name."""
+    def check_keyboard_access(self) -> None:
+        """All visible controls are reached by Tab and have a name."""
         for _ in range(70):
             self.press("\ue004")  # Tab
             self.run("document.activeElement.dataset.reached = true")
-        unreached = self.run(UNREACHED)
-        assert not unreached, f"not reached by key, or without a name: {unreached}"
+        unreachable = self.run(UNREACHABLE)
+        assert not unreachable, f"not reached by keyboard, or without a name: {unreachable}"
 
     def log(self, kind: str) -> list[dict]:
         return self.call("POST", f"{self.session}/se/log", {"type": kind})
 
-    def keep(self, folder: Path | None, name: str) -> None:
-        """Writes a screenshot, where there is a folder for them."""
+    def screenshot(self, folder: Path | None, name: str) -> None:
+        """Writes a screenshot if there is a folder for them."""
         if folder:
-            self.picture(folder / f"{name}.png")
+            png = self.call("GET", f"{self.session}/screenshot")
+            (folder / f"{name}.png").write_bytes(base64.b64decode(png))
 
     def size(self, width: int, height: int) -> None:
         self.command("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
@@ -229,95 +230,91 @@ class Browser:
     def theme(self, name: str) -> None:
         self.command("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": name}])
 
-    def picture(self, path: Path) -> None:
-        path.write_bytes(base64.b64decode(self.call("GET", f"{self.session}/screenshot")))
-
     def close(self) -> None:
         self.call("DELETE", self.session)
         self.driver.terminate()
         self.driver.wait()
 
 
-def moves(browser: Browser) -> None:
-    """Every other way to move, each in the right direction and no other."""
+def check_moves(browser: Browser) -> None:
+    """All other ways to move go in the right direction only."""
     browser.run("document.getElementById('marks').focus()")
     state = "return [camera.at, camera.right, camera.up, camera.back, camera.away, camera.fov]"
     dot = lambda a, b: sum(x * y for x, y in zip(a, b))
 
-    def went(act) -> tuple[list[float], list, list]:
-        """How far the camera went to the right, up and back."""
-        browser.is_sharp()
+    def step_of(act) -> tuple[list[float], list, list]:
+        """How far an action moves the camera to the right, up and back; the camera's state before and after."""
+        browser.wait_until_sharp()
         before = browser.run(state)
         act()
-        browser.is_sharp()
+        browser.wait_until_sharp()
         after = browser.run(state)
         step = [a - b for a, b in zip(after[0], before[0])]
         return [dot(step, axis) for axis in before[1:4]], before, after
 
-    def held(key: str) -> None:
+    def hold(key: str) -> None:
         for kind in ("keyDown", "keyUp"):
             actions = [{"type": "key", "id": "keys", "actions": [{"type": kind, "value": key}]}]
             browser.call("POST", f"{browser.session}/actions", {"actions": actions})
             time.sleep(0.3)
 
     for key, axis, sign in [("w", 2, -1), ("a", 0, -1), ("d", 0, 1), ("e", 1, 1), ("q", 1, -1)]:
-        step, before, after = went(lambda: held(key))
+        step, before, after = step_of(lambda: hold(key))
         others = [abs(step[i]) for i in range(3) if i != axis]
-        assert step[axis] * sign > 0 and max(others) < 1e-6, f"{key} goes {step}"
+        assert step[axis] * sign > 0 and max(others) < 1e-6, f"{key} moves by {step}"
         assert before[3] == after[3], f"{key} turns"
-    drag = lambda button: browser.hand(
+    drag = lambda button: browser.mouse(
         {"type": "pointerMove", "duration": 0, "origin": "viewport", "x": 440, "y": 380},
         {"type": "pointerDown", "button": button},
         {"type": "pointerMove", "duration": 0, "origin": "pointer", "x": 60, "y": 0},
         {"type": "pointerUp", "button": button},
     )
-    # What is shifted to the right is seen from farther left.
-    step, before, after = went(lambda: drag(2))
-    assert step[0] < 0 and abs(step[1]) < 1e-6 and before[3] == after[3], f"the right button goes {step}"
-    step, before, after = went(lambda: drag(0))
-    assert before[3] != after[3] and step[0] < 0, f"the left button goes {step}"
-    step, before, after = went(lambda: browser.press("+"))
-    assert step[2] < 0 and after[4] < before[4], f"+ goes {step}"
-    step, before, after = went(lambda: browser.press("-"))
-    assert step[2] > 0 and after[4] > before[4], f"- goes {step}"
-    # Arrow keys do what dragging does, and with Shift they shift.
+    # Dragging the scene to the right moves the camera to the left.
+    step, before, after = step_of(lambda: drag(2))
+    assert step[0] < 0 and abs(step[1]) < 1e-6 and before[3] == after[3], f"the right button moves by {step}"
+    step, before, after = step_of(lambda: drag(0))
+    assert before[3] != after[3] and step[0] < 0, f"the left button moves by {step}"
+    step, before, after = step_of(lambda: browser.press("+"))
+    assert step[2] < 0 and after[4] < before[4], f"+ moves by {step}"
+    step, before, after = step_of(lambda: browser.press("-"))
+    assert step[2] > 0 and after[4] > before[4], f"- moves by {step}"
+    # Arrow keys act like dragging; with Shift they pan.
     click = "document.querySelector(arguments[0]).click()"
     right = "\ue014"
     for mode in ("look", "pan", "orbit"):
         browser.run(click, f"input[value={mode}]")
         browser.run("document.getElementById('marks').focus()")
-        step, before, after = went(lambda: browser.press(right))
-        turns, shifts = before[3] != after[3], max(map(abs, step)) > 1e-6
-        assert (turns, shifts) == (mode != "pan", mode != "look"), f"an arrow key, to {mode}: {turns}, {shifts}"
-        # To the right is to the right.
-        assert mode != "look" or dot(after[3], before[1]) < 0, "an arrow to the right turns the head to the left"
-        assert mode != "pan" or step[0] > 0, f"an arrow to the right shifts by {step}"
+        step, before, after = step_of(lambda: browser.press(right))
+        turns, moves = before[3] != after[3], max(map(abs, step)) > 1e-6
+        assert (turns, moves) == (mode != "pan", mode != "look"), f"an arrow key in mode {mode}: {turns}, {moves}"
+        assert mode != "look" or dot(after[3], before[1]) < 0, "the right arrow looks to the left"
+        assert mode != "pan" or step[0] > 0, f"the right arrow pans by {step}"
     keys = [{"type": kind, "value": key} for kind, key in [("keyDown", "\ue008"), ("keyDown", right), ("keyUp", right), ("keyUp", "\ue008")]]
     shift = {"actions": [{"type": "key", "id": "keys", "actions": keys}]}
-    step, before, after = went(lambda: browser.call("POST", f"{browser.session}/actions", shift))
-    assert step[0] > 0 and before[3] == after[3], f"Shift with an arrow goes {step}"
-    # Keys are the scene's wherever the focus is, but for those that the control there needs.
+    step, before, after = step_of(lambda: browser.call("POST", f"{browser.session}/actions", shift))
+    assert step[0] > 0 and before[3] == after[3], f"Shift with an arrow moves by {step}"
+    # Keys move the camera wherever the focus is, except for keys that the focused control uses.
     for there, keys, is_used in [("#loop", "+", True), ("#loop", right, True), ("#fov", "+", True), ("#fov", right, False),
                                  ("input[value=orbit]", "+", True), ("#left", "+", False)]:
         browser.run("document.querySelector(arguments[0]).focus()", there)
         at = browser.run("return camera.at")
         browser.press(keys)
-        browser.is_sharp()
+        browser.wait_until_sharp()
         assert (browser.run("return camera.at") != at) == is_used, f"{keys!r} at {there}"
     slide = "const slider = document.getElementById(arguments[0]); slider.value = arguments[1];"
     slide += "for (const kind of ['input', 'change']) slider.dispatchEvent(new Event(kind, { bubbles: true }));"
     browser.run(slide, "fov", 30)
-    assert browser.run(state)[5] == 30, "the field of view stays"
-    browser.is_sharp()
+    assert browser.run(state)[5] == 30, "the field of view does not change"
+    browser.wait_until_sharp()
     size = "return Number(document.getElementById('stage').dataset.size.split('x')[0])"
-    whole = browser.run(size)
+    full = browser.run(size)
     options = browser.run("return Array.from(document.getElementById('sharpness').options, (it) => it.value)")
     browser.choose("sharpness", min(options, key=float))
-    assert browser.run(size) == int(whole * float(min(options, key=float))), f"{browser.run(size)} px of {whole}"
+    assert browser.run(size) == int(full * float(min(options, key=float))), f"{browser.run(size)} px of {full}"
     browser.choose("sharpness", "1")
     browser.run("document.getElementById('marks').focus()")
     browser.press("[")
-    browser.is_sharp()
+    browser.wait_until_sharp()
     assert browser.run("return view"), "[ goes to no camera"
 
 
@@ -325,33 +322,33 @@ def check(browser: Browser, url: str, densify: str, run: str, rendered: Path, fo
     browser.size(1280, 800)
     browser.theme("dark")
     browser.open(url)
-    browser.is_sharp()
-    # The first time it says what is seen; the key that everything begins with closes that.
-    assert browser.run("return document.getElementById('guide').open"), "no help at first"
-    browser.keep(folder, "first")
+    browser.wait_until_sharp()
+    # The first time, the page opens with its help; Enter closes it.
+    assert browser.run("return document.getElementById('guide').open"), "the help is not open at first"
+    browser.screenshot(folder, "first")
     browser.press("\ue007")
     assert not browser.run("return document.getElementById('guide').open"), "Enter does not close the help"
 
     browser.choose("view", "test:0")
-    browser.keep(folder, "test-camera")
-    # Whoever leaves a photograph's camera sees the same, with more around it.
-    browser.run(MIDDLE)
+    browser.screenshot(folder, "test-camera")
+    # Leaving a photograph's camera keeps the picture, with more around it.
+    browser.run(MIDDLE_PSNR)
     browser.run("orbit(0, 0)")
-    browser.is_sharp()
-    near = browser.run(MIDDLE)
-    assert near >= 38, f"the picture is {near:.1f} dB from that of the camera that was left"
+    browser.wait_until_sharp()
+    near = browser.run(MIDDLE_PSNR)
+    assert near >= 38, f"the picture has a PSNR of {near:.1f} dB to that before leaving the camera"
     browser.choose("view", "test:0")
     browser.choose("left", "photograph:0")
     browser.choose("right", "render:0")
-    # What the photograph's camera saw, and what is drawn there, at the photograph's own size.
+    # Photograph and render are shown at the photograph's size.
     own = browser.run("const { width, height } = scene.views.test[0]; return `${width}x${height}`")
     found = browser.run("return document.getElementById('stage').dataset.size")
     assert found == own, f"{found} instead of {own}"
-    # Pixel by pixel it is what `densify render` writes.
+    # The picture is that of `densify render`.
     name = Path(browser.run("return scene.views.test[0].name")).with_suffix(".png")
     png = base64.b64encode((rendered / "pictures" / name).read_bytes()).decode()
-    near = browser.wait(PSNR, f"data:image/png;base64,{png}")
-    assert near >= 38, f"the picture is {near:.1f} dB from that of densify render"
+    near = browser.run_async(PSNR, f"data:image/png;base64,{png}")
+    assert near >= 38, f"the picture has a PSNR of {near:.1f} dB to that of densify render"
     before = browser.run(PROBE)
     browser.run("document.getElementById('divider').focus()")
     browser.press("\ue011")  # Home
@@ -359,171 +356,171 @@ def check(browser: Browser, url: str, densify: str, run: str, rendered: Path, fo
     assert before["light"] != after["light"], "the border does not move"
     assert browser.run("return document.getElementById('divider').getAttribute('aria-valuenow')") == "0"
     browser.press(*["\ue014"] * 20)  # Right
-    browser.keep(folder, "compare")
+    browser.screenshot(folder, "compare")
     browser.choose("left", "difference:0")
     assert browser.run("return document.getElementById('mean').textContent").startswith("Difference (FLIP): 0.")
-    browser.keep(folder, "difference")
+    browser.screenshot(folder, "difference")
     browser.choose("right", "")
     browser.theme("light")
-    bare = browser.run(MARKED)
+    bare = browser.run(MARK_PIXELS)
     browser.run("document.getElementById('frusta').click()")
-    cameras = browser.run(MARKED)
+    cameras = browser.run(MARK_PIXELS)
     browser.run("document.getElementById('points').click()")
-    assert bare == 0 < cameras < browser.run(MARKED), "cameras or points are not drawn"
-    browser.keep(folder, "marks")
+    assert bare == 0 < cameras < browser.run(MARK_PIXELS), "cameras or points are not drawn"
+    browser.screenshot(folder, "marks")
     browser.run("document.getElementById('points').click()")
     for kind in browser.run("return scene.kinds.map(({ kind }) => kind)"):
         browser.choose("left", f"{kind}:0")
         assert browser.run(PROBE)["spread"] > 4, f"{kind} is empty"
-    browser.keep(folder, "rows")
+    browser.screenshot(folder, "rows")
     browser.choose("left", "render:0")
 
-    # Turning: every picture differs, and none is empty.
+    # Turning: all pictures differ, and none is empty.
     seen: set[str] = set()
     middle = {"type": "pointerMove", "duration": 0, "origin": "viewport", "x": 440, "y": 380}
-    browser.hand(middle, {"type": "pointerDown", "button": 0})
+    browser.mouse(middle, {"type": "pointerDown", "button": 0})
     for step in range(STEPS):
         count = browser.run("return Number(document.getElementById('stage').dataset.pictures)")
-        browser.hand({"type": "pointerMove", "duration": 0, "origin": "pointer", "x": 11, "y": 3 if step % 2 else -2})
-        browser.until(f"Number(document.getElementById('stage').dataset.pictures) > {count}", f"no picture at step {step}")
+        browser.mouse({"type": "pointerMove", "duration": 0, "origin": "pointer", "x": 11, "y": 3 if step % 2 else -2})
+        browser.wait_for(f"Number(document.getElementById('stage').dataset.pictures) > {count}", f"no picture at step {step}")
         found = browser.run(PROBE)
         assert found["spread"] > 4, f"picture {step} is empty"
         seen.add(found["light"])
     assert len(seen) == STEPS, f"{STEPS} steps gave {len(seen)} pictures"
-    # Lifted over the panel, the hand turns no more.
-    browser.hand({"type": "pointerUp", "button": 0})
-    browser.is_sharp()
-    browser.keep(folder, "anywhere")
+    # The scene stops turning when the button is released, here over the panel.
+    browser.mouse({"type": "pointerUp", "button": 0})
+    browser.wait_until_sharp()
+    browser.screenshot(folder, "anywhere")
     before = browser.run("return version")
-    browser.hand(middle)
-    assert browser.run("return version") == before, "who has let go still turns"
-    # A click on a camera that is drawn goes there.
-    x, y, found = browser.run(DRAWN)
+    browser.mouse(middle)
+    assert browser.run("return version") == before, "the scene still turns after the button is released"
+    # A click on a camera's mark goes to that camera.
+    x, y, found = browser.run(CAMERA_MARK)
     place = {"type": "pointerMove", "duration": 0, "origin": "viewport", "x": x, "y": y}
-    browser.hand(place, {"type": "pointerDown", "button": 0}, {"type": "pointerUp", "button": 0})
-    assert found and browser.run("return view") == found, f"no click goes to {found}"
-    browser.is_sharp()
-    # The wheel goes nearer; on the way pictures are smaller than at rest.
+    browser.mouse(place, {"type": "pointerDown", "button": 0}, {"type": "pointerUp", "button": 0})
+    assert found and browser.run("return view") == found, f"a click does not go to {found}"
+    browser.wait_until_sharp()
+    # The wheel moves closer; while moving, pictures are smaller than at rest.
     watch = "window.sizes = []; const note = () => sizes.push(Number(stage.dataset.size.split('x')[0]));"
     browser.run(watch + "coarse = 0.4; new MutationObserver(note).observe(stage, { attributeFilter: ['data-size'] });")
     before = browser.run("return camera.away")
     wheel = {"type": "scroll", "x": 440, "y": 380, "deltaX": 0, "deltaY": -300, "duration": 0}
     browser.call("POST", f"{browser.session}/actions", {"actions": [{"type": "wheel", "id": "wheel", "actions": [wheel]}]})
-    assert browser.run("return camera.away") < 0.9 * before, "the wheel does not go nearer"
-    browser.is_sharp()
+    assert browser.run("return camera.away") < 0.9 * before, "the wheel does not move closer"
+    browser.wait_until_sharp()
     sizes = browser.run("return sizes")
-    assert sizes[0] < 0.6 * sizes[-1], f"pictures of {sizes} px on the way"
+    assert sizes[0] < 0.6 * sizes[-1], f"widths of pictures while moving: {sizes} px"
     pace = "const { rate, rested } = document.getElementById('stage').dataset; return [rate, rested]"
-    # Flying by key, as fast as pictures come.
+    # Flying by keyboard.
     keys = lambda kind: [{"type": "key", "id": "keys", "actions": [{"type": kind, "value": "s"}]}]
     browser.run("document.getElementById('marks').focus()")
     before = browser.run("return [...camera.at]")
     browser.call("POST", f"{browser.session}/actions", {"actions": keys("keyDown")})
     time.sleep(1.5)
     browser.call("POST", f"{browser.session}/actions", {"actions": keys("keyUp")})
-    browser.is_sharp()
+    browser.wait_until_sharp()
     assert browser.run("return dot(add(camera.at, arguments[0], -1), camera.back)", before) > 0, "S does not fly back"
     rate, rested = browser.run(pace)
     print(f"{rate} pictures per second moving; sharp {rested} ms after the last change")
-    # Two fingers that part go nearer.
+    # Spreading two fingers moves closer.
     before = browser.run("return camera.away")
     browser.pinch((400, 300), (480, 300), (300, 300), (580, 300))
     after = browser.run("return camera.away")
-    assert after < 0.9 * before, f"fingers that part: from {before} to {after} away"
-    browser.is_sharp()
-    moves(browser)
-    browser.is_reached_by_key()
+    assert after < 0.9 * before, f"spreading two fingers changes the distance from {before} to {after}"
+    browser.wait_until_sharp()
+    check_moves(browser)
+    browser.check_keyboard_access()
     browser.run("document.getElementById('marks').focus()")
     browser.press("k", "r", "]", "k")
-    assert not browser.run("return document.getElementById('save').disabled"), "no camera path to save"
+    assert not browser.run("return document.getElementById('save').disabled"), "there is no camera path to save"
     assert browser.run("return keys.length") == 2
-    # What the page saves, densify flies along.
+    # densify renders the camera path that the page saves.
     keep = "URL.createObjectURL = (blob) => { window.made = blob; return 'data:,'; };"
     keep += "HTMLAnchorElement.prototype.click = function () { if (this.download) made.text().then((it) => { window.saved = it; }); };"
     browser.run(keep + "document.getElementById('save').click()")
-    browser.until("window.saved", "no camera path is saved")
+    browser.wait_for("window.saved", "no camera path is saved")
     path = rendered / "camera_path.json"
     path.write_text(browser.run("return saved"))
     fly = lambda to, *more: subprocess.run(
         [densify, "render", run, "--path", path, *more, "-o", rendered / to, "--backend", "cpu"], check=True, capture_output=True
     )
-    # Two seconds from camera to camera, 30 pictures each.
+    # Two seconds between the two cameras, at 30 pictures per second.
     fly("flight", "--size", "16x12")
     frames = {it.read_bytes() for it in (rendered / "flight").rglob("*.png")}
     assert len(frames) == 60, f"{len(frames)} pictures of the flight"
-    # Half-way the page is where the film is.
+    # The page's picture half-way along the path is that of densify.
     fly("thirds", "--frames", "3")
     browser.run("setOnPath(0.5); view = null; changed()")
-    browser.is_sharp()
+    browser.wait_until_sharp()
     png = base64.b64encode((rendered / "thirds" / "frame_00001.png").read_bytes()).decode()
-    near = browser.wait(PSNR.replace("shown[1]", "shown[0]"), f"data:image/png;base64,{png}")
-    assert near >= 36, f"half-way along the path the page is {near:.1f} dB from the film"
+    near = browser.run_async(PSNR.replace("shown[1]", "shown[0]"), f"data:image/png;base64,{png}")
+    assert near >= 36, f"half-way along the path, the page has a PSNR of {near:.1f} dB to densify"
     browser.run("document.getElementById('remove').click()")
     assert browser.run("return keys.length") == 1, "the last camera is not removed"
 
-    # Where there is little room.
+    # A narrow screen.
     browser.size(360, 740)
-    browser.is_sharp()
+    browser.wait_until_sharp()
     for element in ["html", "#panel"]:
         width = browser.run("return document.querySelector(arguments[0]).scrollWidth", element)
         assert width <= 360, f"{element} is {width} px wide"
-    assert browser.run("return area()[0]") > 340, "the panel leaves the picture no room"
-    browser.keep(folder, "phone")
+    assert browser.run("return area()[0]") > 340, "the panel leaves no room for the picture"
+    browser.screenshot(folder, "phone")
     browser.run("document.getElementById('help').click()")
     width = browser.run("return document.getElementById('guide').scrollWidth")
     assert width <= 360, f"the help is {width} px wide"
     below = browser.run("const it = document.getElementById('guide'); return [it.scrollHeight - it.clientHeight, it.scrollTop]")
-    assert below[0] > 0 and below[1] == 0, f"of the help {below[0]} px do not fit, and it opens {below[1]} px below its title"
-    browser.keep(folder, "phone-help")
+    assert below[0] > 0 and below[1] == 0, f"{below[0]} px of the help are out of view, and it opens {below[1]} px below its title"
+    browser.screenshot(folder, "phone-help")
     browser.theme("dark")
     browser.run("document.getElementById('guide').close()")
     browser.run("document.getElementById('fold').click()")
-    browser.is_sharp()
-    browser.keep(folder, "phone-dark")
-    # A phone on its side has its panel beside the picture.
+    browser.wait_until_sharp()
+    browser.screenshot(folder, "phone-dark")
+    # A phone in landscape has the panel beside the picture.
     browser.run("document.getElementById('fold').click()")
     browser.size(740, 360)
-    browser.is_sharp()
+    browser.wait_until_sharp()
     width, height = browser.run("return area()")
     assert width >= 400 and height >= 350, f"the picture is {width}x{height}"
     assert browser.run("return document.getElementById('panel').clientWidth") > 200, "there is no panel"
-    browser.keep(folder, "phone-on-its-side")
+    browser.screenshot(folder, "phone-landscape")
 
-    is_clean(browser, url)
+    check_logs(browser, url)
 
 
-def check_from_afar(browser: Browser, url: str) -> None:
-    """Over a slow network it moves as fluently, in pictures that are not much smaller."""
+def check_slow_network(browser: Browser, url: str) -> None:
+    """Over a slow network, the page shows as many pictures per second, and not much smaller ones."""
 
     def turned() -> tuple[float, float]:
-        found = browser.wait(TURN, 3)
-        browser.is_sharp()
-        half = found["sides"][len(found["sides"]) // 2:]
-        return found["rate"], sum(half) / len(half)
+        found = browser.run_async(TURN, 3)
+        browser.wait_until_sharp()
+        later = found["widths"][len(found["widths"]) // 2:]
+        return found["rate"], sum(later) / len(later)
 
     browser.size(1280, 800)
     browser.open(url)
-    browser.is_sharp()
-    # What does not get shorter with fewer pixels does not make pictures smaller.
-    for making, took, alone, is_larger in [(15, 20, 2, True), (80, 90, 2, False), (15, 115, 99, True), (15, 500, 99, True),
+    browser.wait_until_sharp()
+    # Latency, which does not depend on the number of pixels, does not make pictures smaller.
+    for rendering, total, latency, is_larger in [(15, 20, 2, True), (80, 90, 2, False), (15, 115, 99, True), (15, 500, 99, True),
                                            (80, 180, 99, False)]:
-        found = browser.run(PACED, making, took, alone)
-        assert (found > 0.5) == is_larger, f"{making} ms to make, {took} ms until it is here, {alone} ms of them on its way: {found}"
+        found = browser.run(COARSE_SIZE, rendering, total, latency)
+        assert (found > 0.5) == is_larger, f"{rendering} ms to render, {total} ms in total, latency {latency} ms: {found}"
     browser.open(url)
-    browser.is_sharp()
-    near, side = turned()
-    browser.run(FAR, 80)
+    browser.wait_until_sharp()
+    rate, width = turned()
+    browser.run(DELAY, 80)
     browser.run("changed()")
-    browser.until("latency >= 80", "it does not see how far away it is")
-    far, smaller = turned()
-    print(f"{near:.1f} pictures/s, {side:.0f} px wide; 80 ms away {far:.1f}, {smaller:.0f} px wide")
-    assert smaller >= side / 2, f"pictures of {smaller:.0f} px from afar, {side:.0f} px from near"
-    assert far >= 0.4 * near, f"{far:.1f} pictures/s from afar, {near:.1f} from near"
-    assert browser.run("return atOnce") > 1, "from afar it waits for each picture before it asks for the next"
+    browser.wait_for("latency >= 80", "the page does not notice the latency")
+    slow_rate, slow_width = turned()
+    print(f"{rate:.1f} pictures/s, {width:.0f} px wide; with a latency of 80 ms {slow_rate:.1f}, {slow_width:.0f} px wide")
+    assert slow_width >= width / 2, "over a slow network, pictures are too small"
+    assert slow_rate >= 0.4 * rate, "over a slow network, pictures are too rare"
+    assert browser.run("return atOnce") > 1, "over a slow network, the page waits for each picture before it requests the next"
 
 
-def check_two(browser: Browser, url: str, folder: Path | None) -> None:
-    """Two runs, seen from one camera, with a border between them."""
+def check_two_runs(browser: Browser, url: str, folder: Path | None) -> None:
+    """Two runs, shown from one camera, with a border between them."""
 
     def halves() -> list[str]:
         lights = []
@@ -535,54 +532,54 @@ def check_two(browser: Browser, url: str, folder: Path | None) -> None:
     browser.size(1280, 800)
     browser.theme("light")
     browser.open(url)
-    browser.is_sharp()
+    browser.wait_until_sharp()
     if browser.run("return document.getElementById('guide').open"):
         browser.press("\ue007")
     names = browser.run("return scene.models.map(({ name }) => name)")
     tags = browser.run("return ['left-name', 'right-name'].map((id) => document.getElementById(id).textContent)")
     assert len(names) == 2 and all(name in tag for name, tag in zip(names, tags)), f"{names}: {tags}"
     before = halves()
-    assert before[0] != before[1], "both sides show one model"
-    # Whoever turns one turns the other.
+    assert before[0] != before[1], "both sides show the same model"
+    # Both sides turn together.
     browser.run("document.getElementById('marks').focus()")
     browser.press("\ue012", "\ue012")  # Left
-    browser.is_sharp()
+    browser.wait_until_sharp()
     after = halves()
-    assert before[0] != after[0] and before[1] != after[1], "one side stands still"
-    # By hand, in steps of their own, and lifted beyond the edge.
+    assert before[0] != after[0] and before[1] != after[1], "one side does not turn"
+    # The border follows the mouse until the button is released, here beyond the picture's edge.
     x = browser.run("setBorder(0.5); return Math.round(area()[0] / 2)")
     move = lambda x: {"type": "pointerMove", "duration": 0, "origin": "viewport", "x": x, "y": 400}
-    browser.hand(move(x), {"type": "pointerDown", "button": 0})
-    browser.hand(move(x - 100))
-    browser.hand(move(x + 700))
-    browser.hand({"type": "pointerUp", "button": 0})
-    assert browser.run("return border") == 1, "the border does not follow the hand"
-    browser.hand(move(x))
-    assert browser.run("return border") == 1, "the border follows a hand that has let go"
+    browser.mouse(move(x), {"type": "pointerDown", "button": 0})
+    browser.mouse(move(x - 100))
+    browser.mouse(move(x + 700))
+    browser.mouse({"type": "pointerUp", "button": 0})
+    assert browser.run("return border") == 1, "the border does not follow the mouse"
+    browser.mouse(move(x))
+    assert browser.run("return border") == 1, "the border follows the mouse after the button is released"
     browser.run("setBorder(0.5)")
-    browser.keep(folder, "two")
+    browser.screenshot(folder, "two")
     browser.size(360, 740)
-    browser.is_sharp()
-    over = browser.run(OVERLAPS, ["left-name", "right-name", "fold", "status"])
-    assert not over, f"{over} lie over each other"
-    browser.keep(folder, "two-phone")
-    is_clean(browser, url)
+    browser.wait_until_sharp()
+    overlaps = browser.run(OVERLAPS, ["left-name", "right-name", "fold", "status"])
+    assert not overlaps, f"these overlap: {overlaps}"
+    browser.screenshot(folder, "two-phone")
+    check_logs(browser, url)
 
 
-def is_clean(browser: Browser, url: str) -> None:
-    """Nothing was complained about, and nothing asked of others."""
+def check_logs(browser: Browser, url: str) -> None:
+    """The log has no errors or warnings, and all requests went to the page's server."""
     severe = [entry["message"] for entry in browser.log("browser") if entry["level"] in ("SEVERE", "WARNING")]
     assert not severe, "\n".join(severe)
     events = [json.loads(entry["message"])["message"] for entry in browser.log("performance")]
     urls = {event["params"]["request"]["url"] for event in events if event["method"] == "Network.requestWillBeSent"}
-    assert f"{url}frame" in urls, "no request is known"
-    strange = [it for it in urls if not it.startswith((url, "data:", "blob:" + url.rstrip("/")))]
-    assert not strange, f"requests beyond the page: {strange}"
+    assert f"{url}frame" in urls, "the log has no request for a picture"
+    foreign = [it for it in urls if not it.startswith((url, "data:", "blob:" + url.rstrip("/")))]
+    assert not foreign, f"requests to other servers: {foreign}"
 
 
 @contextmanager
 def served(densify: str, *shown: str) -> Iterator[tuple[Browser, str]]:
-    """A browser, and the address of a page that is served meanwhile."""
+    """Serves a page; yields a browser and the page's address."""
     command = [densify, "view", *shown, "--port", "0", "--backend", "cpu"]
     program = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
@@ -594,25 +591,25 @@ def served(densify: str, *shown: str) -> Iterator[tuple[Browser, str]]:
         finally:
             browser.close()
         program.send_signal(signal.SIGINT)
-        assert program.wait(PATIENCE) == 0, "Ctrl-C does not end it well"
+        assert program.wait(PATIENCE) == 0, "densify view does not end cleanly on Ctrl-C"
     finally:
         program.kill()
 
 
 def main(densify: str, run: str, other: str, folder: str | None = None) -> None:
-    kept = Path(folder) if folder else None
-    if kept:
-        kept.mkdir(parents=True, exist_ok=True)
+    screenshots = Path(folder) if folder else None
+    if screenshots:
+        screenshots.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as rendered:
         command = [densify, "render", run, "-o", f"{rendered}/pictures", "--backend", "cpu"]
         subprocess.run(command, check=True, capture_output=True)
         with served(densify, run) as (browser, url):
-            check(browser, url, densify, run, Path(rendered), kept)
-            check_from_afar(browser, url)
+            check(browser, url, densify, run, Path(rendered), screenshots)
+            check_slow_network(browser, url)
     with served(densify, run, other) as (browser, url):
-        check_two(browser, url, kept)
-    print("the page shows a test camera as densify render does, compares, turns, flies, fits 360 px, is fluent from afar, and "
-          "asks nobody else")
+        check_two_runs(browser, url, screenshots)
+    print("the page shows a test camera like densify render, compares, turns, flies, fits 360 px, copes with a slow network, and "
+          "sends no requests elsewhere")
 
 
 if __name__ == "__main__":

@@ -1,10 +1,9 @@
-"""Trains a scene in blocks with HyperQueue, and compares the merged model with that of this machine alone, byte for
-byte.
+"""Trains a scene in blocks with HyperQueue and without it; the merged models must be identical.
 
     python3 tests/engines/hq_blocks.py PROGRAM
 
-Needs the package hyperqueue, which has no command `hq`: the tasks of the job file, with their dependencies and
-resources, are handed to a server and two workers that it starts.
+Needs the package hyperqueue. It has no command `hq`, so the tasks of the job file, with their dependencies and
+resources, are submitted through its API, to a server and two workers started here.
 """
 
 import subprocess
@@ -38,11 +37,10 @@ def main(program: str) -> None:
             densify("blocks", *blocks.split())
         densify("blocks", "submit", str(scratch / "local"))
         folder = scratch / "hq"
-        shown = densify("blocks", "submit", str(folder), "--engine", "hq", "--dry-run")
+        job_file = tomllib.loads(densify("blocks", "submit", str(folder), "--engine", "hq", "--dry-run"))
         (folder / "logs").mkdir()
-        described = tomllib.loads(shown)
-        job, tasks = Job(name=described["name"]), {}
-        for task in described["task"]:
+        job, tasks = Job(name=job_file["name"]), {}
+        for task in job_file["task"]:
             (request,) = task["request"]
             tasks[task["id"]] = job.program(
                 task["command"],
@@ -61,8 +59,8 @@ def main(program: str) -> None:
             sys.exit(densify("blocks", "status", str(folder)))
         local, hq = [(scratch / engine / "merged.ply").read_bytes() for engine in ["local", "hq"]]
         if local != hq:
-            sys.exit("HyperQueue made another model")
-        print(f"the same model of {len(hq)} bytes")
+            sys.exit("the model trained with HyperQueue differs")
+        print(f"the models are identical: {len(hq)} bytes")
 
 
 main(sys.argv[1])

@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# Starts a Slurm of two nodes on this machine, runs a command with it, and stops it.
+# Starts a Slurm cluster of two nodes on this machine, runs a command with it, and stops it.
 #
 #   tests/engines/slurm.sh COMMAND ARGUMENT...
 #
-# Needs root, and Debian's slurmctld, slurmd, slurm-client and munge. Everything is in a temporary folder; nothing of a
-# Slurm that is installed is touched.
+# Needs root, and Debian's slurmctld, slurmd, slurm-client and munge. All files are in a temporary folder; an installed
+# Slurm is not affected.
 set -euo pipefail
 
 folder="$(mktemp -d)"
@@ -19,7 +19,7 @@ stop() {
 }
 trap stop EXIT
 
-# Who may submit: root alone, by a key of its own.
+# Only root may submit jobs, with a new key.
 dd if=/dev/urandom of="$folder/key" bs=1024 count=1 status=none
 chmod 400 "$folder/key"
 munged --force --key-file="$folder/key" --socket="$folder/munge" --pid-file="$folder/munge.pid" \

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Trains a scene in four blocks with Slurm, kills one task on the way, and compares the merged model with that of this
-# machine alone, byte for byte. Then a comparison of policies is handed in and collected. Called by slurm.sh:
+# Trains a scene in four blocks with Slurm, killing one of the tasks, and without Slurm; the merged models must be
+# identical. Then the same for a comparison of policies. Called by slurm.sh:
 #
 #   tests/engines/slurm.sh tests/engines/slurm_blocks.sh PROGRAM
 set -euo pipefail
@@ -22,7 +22,7 @@ killed=''
 for _ in $(seq 600); do
     state="$("$program" blocks status "$scratch/slurm")"
     if [ -z "$killed" ] && grep -q '^block-.*running, saved [1-9]' <<<"$state"; then
-        # SIGKILL, as for a process that has taken too much memory.
+        # SIGKILL, like the system when memory runs out.
         killed="$(pgrep -f "^$program blocks run $scratch/slurm block-" | head -n 1)"
         [ -n "$killed" ] && kill -9 "$killed"
     fi
@@ -32,21 +32,21 @@ done
 squeue --noheader
 "$program" blocks status "$scratch/slurm"
 [ -n "$killed" ] || fail 'no task was killed'
-grep -q 'resume   from step' "$scratch"/slurm/logs/densify-blocks-*.log || fail 'no task has gone on from a checkpoint'
-cmp "$scratch/local/merged.ply" "$scratch/slurm/merged.ply" || fail 'Slurm made another model'
+grep -q 'resume   from step' "$scratch"/slurm/logs/densify-blocks-*.log || fail 'no task has resumed from a checkpoint'
+cmp "$scratch/local/merged.ply" "$scratch/slurm/merged.ply" || fail 'the model trained with Slurm differs'
 
-study() {
+study() { # FOLDER OPTION...
     "$program" compare "$scratch/scene" -o "$scratch/$1" --policies vanilla,diet --budget 1k --seeds 1 --iterations 200 \
         "${@:2}" -- --backend cpu --threads 1 --sh-degree 0
 }
-study alone >/dev/null
-study handed --engine slurm
+study local-study >/dev/null
+study slurm-study --engine slurm
 for _ in $(seq 240); do
-    [ -f "$scratch/handed/compare.md" ] && break
+    [ -f "$scratch/slurm-study/compare.md" ] && break
     sleep 0.5
-    study handed --engine slurm >/dev/null
+    study slurm-study --engine slurm >/dev/null
 done
 models() { grep -o '"run":"[^"]*"\|"model":[0-9]*' "$scratch/$1/compare.jsonl" | sort; }
-[ "$(models alone)" = "$(models handed)" ] || fail 'Slurm made other runs'
-echo "the same $(wc -l <"$scratch/handed/compare.jsonl") runs of a study"
-echo "the same model of $(stat -c %s "$scratch/slurm/merged.ply") bytes, with one task killed and requeued"
+[ "$(models local-study)" = "$(models slurm-study)" ] || fail 'the runs of the comparison with Slurm differ'
+echo "$(wc -l <"$scratch/slurm-study/compare.jsonl") runs of the comparison are identical"
+echo "the models are identical: $(stat -c %s "$scratch/slurm/merged.ply") bytes, with one task killed and requeued"

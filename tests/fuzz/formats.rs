@@ -1,9 +1,8 @@
-//! One function per format that strangers' files come in. Whatever the bytes are, it must return
-//! whether they were accepted: no panic, no hang, no allocation that the file's size does not account
-//! for.
+//! One fuzz target per format of untrusted files: a function that reads arbitrary bytes and returns true
+//! if they are accepted. It must not panic, hang, or allocate more memory than the file's size justifies.
 //!
-//! `cargo fuzz` drives them without end (see CONTRIBUTING.md), and `tests/it/fuzz.rs` for a moment
-//! in every test run, from the same corpora.
+//! `cargo fuzz` runs the targets for as long as wanted (see CONTRIBUTING.md), and `tests/it/fuzz.rs`
+//! briefly in every test run, with the same corpora.
 
 use std::path::Path;
 
@@ -16,10 +15,10 @@ use densify::run::RunConfig;
 use densify::train::checkpoint::Checkpoint;
 use densify_scenegen::{Options, PointOptions, Scene, Source};
 
-/// A format and what reads it.
+/// The name of a format, and the function that reads it.
 pub type Format = (&'static str, fn(&[u8]) -> bool);
 
-/// All of them. The names are those of the fuzz targets in `Cargo.toml` and of the corpora's folders.
+/// All formats. Their names are those of the fuzz targets in `Cargo.toml` and of the corpora's folders.
 pub const FORMATS: [Format; 17] = [
     ("colmap_bin", colmap_bin),
     ("colmap_txt", colmap_txt),
@@ -40,19 +39,19 @@ pub const FORMATS: [Format; 17] = [
     ("splat_glb", splat_glb),
 ];
 
-/// Reads bytes as a file of a format.
+/// Reads bytes as a file of a format; true if they are accepted.
 ///
 /// # Panics
-/// When there is no such format, or the bytes do to it what they must not.
+/// If there is no such format, or the bytes reveal a bug in its reader.
 pub fn read(format: &str, bytes: &[u8]) -> bool {
     let known = FORMATS.iter().find(|(name, _)| *name == format);
-    known.expect("a format").1(bytes)
+    known.expect("a known format").1(bytes)
 }
 
-/// What stands between the files of a format that has several.
-const BETWEEN: &[u8] = b"\n=====\n";
+/// Separates the files of an input that consists of several.
+const SEPARATOR: &[u8] = b"\n=====\n";
 
-/// The photographs of datasets whose other files are looked at.
+/// The photograph used wherever another file is tested.
 const PHOTOGRAPH: &[u8] = include_bytes!("corpus/image/photograph.png");
 
 /// `cameras.bin`, `images.bin` and `points3D.bin`.
@@ -83,20 +82,20 @@ fn realitycapture(bytes: &[u8]) -> bool {
 
 /// A dataset in a ZIP archive.
 fn archive(bytes: &[u8]) -> bool {
-    within(&[("scan.zip", bytes)], |folder| loads(&folder.join("scan.zip")))
+    in_folder(&[("scan.zip", bytes)], |folder| loads(&folder.join("scan.zip")))
 }
 
-/// A photograph: its header when the dataset is loaded, its pixels after that.
+/// A photograph: loading the dataset reads its header, loading the view its pixels.
 fn image(bytes: &[u8]) -> bool {
-    let listing = br#"{"camera_angle_x": 0.8, "frames": [
+    let frames = br#"{"camera_angle_x": 0.8, "frames": [
         {"file_path": "images/0.png", "transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,4],[0,0,0,1]]},
         {"file_path": "images/1.png", "transform_matrix": [[1,0,0,1],[0,1,0,0],[0,0,1,4],[0,0,0,1]]}]}"#;
-    dataset(&[("transforms.json", listing), ("images/0.png", bytes), ("images/1.png", bytes)])
+    dataset(&[("transforms.json", frames), ("images/0.png", bytes), ("images/1.png", bytes)])
 }
 
-/// A PLY file, as a model, compressed or not, and as a cloud of points.
+/// A PLY file, read as a model, compressed or not, and as a point cloud.
 fn ply(bytes: &[u8]) -> bool {
-    within(&[("model.ply", bytes)], |folder| {
+    in_folder(&[("model.ply", bytes)], |folder| {
         let path = folder.join("model.ply");
         let model = model(&path);
         let points = read_points(&path);
@@ -107,33 +106,33 @@ fn ply(bytes: &[u8]) -> bool {
     })
 }
 
-/// SPZ of any version.
+/// An SPZ file of any version.
 fn spz(bytes: &[u8]) -> bool {
-    within(&[("model.spz", bytes)], |folder| model(&folder.join("model.spz")))
+    in_folder(&[("model.spz", bytes)], |folder| model(&folder.join("model.spz")))
 }
 
-/// SOG as an archive.
+/// An SOG archive.
 fn sog(bytes: &[u8]) -> bool {
-    within(&[("model.sog", bytes)], |folder| model(&folder.join("model.sog")))
+    in_folder(&[("model.sog", bytes)], |folder| model(&folder.join("model.sog")))
 }
 
-/// SOG as `meta.json` and its pictures.
+/// An SOG folder: `meta.json` and its pictures.
 fn sog_folder(bytes: &[u8]) -> bool {
     let names =
         ["meta.json", "means_l.webp", "means_u.webp", "quats.webp", "scales.webp", "sh0.webp"];
     let names = names.into_iter().chain(["shN_centroids.webp", "shN_labels.webp"]);
     let files: Vec<_> = names.zip(split(bytes)).collect();
-    within(&files, model)
+    in_folder(&files, model)
 }
 
-/// `.splat`.
+/// A `.splat` file.
 fn splat(bytes: &[u8]) -> bool {
-    within(&[("model.splat", bytes)], |folder| model(&folder.join("model.splat")))
+    in_folder(&[("model.splat", bytes)], |folder| model(&folder.join("model.splat")))
 }
 
 /// A glTF file of splats, binary or text.
 fn splat_glb(bytes: &[u8]) -> bool {
-    within(&[("model.glb", bytes)], |folder| model(&folder.join("model.glb")))
+    in_folder(&[("model.glb", bytes)], |folder| model(&folder.join("model.glb")))
 }
 
 fn model(path: &Path) -> bool {
@@ -147,7 +146,7 @@ fn model(path: &Path) -> bool {
     })
 }
 
-/// A glTF file with everything inside.
+/// A glTF text file with embedded buffers.
 fn gltf(bytes: &[u8]) -> bool {
     mesh(&[("mesh.gltf", bytes)])
 }
@@ -164,9 +163,9 @@ fn obj(bytes: &[u8]) -> bool {
     mesh(&[("mesh.obj", mesh_file), ("mesh.mtl", library), ("texture.png", PHOTOGRAPH)])
 }
 
-/// A checkpoint: its header, its model, and what a backend keeps beside it.
+/// A checkpoint: its header, its model, and the state of the backend.
 fn checkpoint(bytes: &[u8]) -> bool {
-    within(&[("step.safetensors", bytes)], |folder| {
+    in_folder(&[("step.safetensors", bytes)], |folder| {
         let Ok(mut found) = Checkpoint::open(&folder.join("step.safetensors")) else {
             return false;
         };
@@ -176,8 +175,8 @@ fn checkpoint(bytes: &[u8]) -> bool {
         };
         assert!(model.len() <= budget);
         let options = Setup { threads: Some(1), ..Setup::new(model.len()) };
-        let mut backend = CpuBackend::new(&model, &options).expect("it is as small as its file");
-        // Whether this backend keeps what the file's kept is another question.
+        let mut backend = CpuBackend::new(&model, &options).expect("a model as small as its file");
+        // The file may be refused here: it may come from a backend with other state.
         let _ = found.restore(&mut backend);
         true
     })
@@ -185,7 +184,7 @@ fn checkpoint(bytes: &[u8]) -> bool {
 
 /// `config.toml` of a run.
 fn config(bytes: &[u8]) -> bool {
-    within(&[("config.toml", bytes)], |folder| {
+    in_folder(&[("config.toml", bytes)], |folder| {
         let config = RunConfig::read(folder);
         config.is_ok_and(|config| !config.scene_path().as_os_str().is_empty())
     })
@@ -194,7 +193,7 @@ fn config(bytes: &[u8]) -> bool {
 fn dataset(files: &[(&str, &[u8])]) -> bool {
     let images = ["images/0.png", "images/1.png"].map(|name| (name, PHOTOGRAPH));
     let all: Vec<_> = images.into_iter().chain(files.iter().copied()).collect();
-    within(&all, loads)
+    in_folder(&all, loads)
 }
 
 fn loads(path: &Path) -> bool {
@@ -211,7 +210,7 @@ fn loads(path: &Path) -> bool {
 }
 
 fn mesh(files: &[(&str, &[u8])]) -> bool {
-    within(files, |folder| {
+    in_folder(files, |folder| {
         let options = Options {
             size: Some((8, 8)),
             train: Some(2),
@@ -227,19 +226,19 @@ fn mesh(files: &[(&str, &[u8])]) -> bool {
     })
 }
 
-/// The files of an input that stands for several.
+/// Splits an input into its files.
 fn split(bytes: &[u8]) -> impl Iterator<Item = &[u8]> {
     let mut rest = Some(bytes);
     std::iter::from_fn(move || {
         let all = rest?;
-        let at = all.windows(BETWEEN.len()).position(|window| window == BETWEEN);
-        rest = at.map(|at| &all[at + BETWEEN.len()..]);
+        let at = all.windows(SEPARATOR.len()).position(|window| window == SEPARATOR);
+        rest = at.map(|at| &all[at + SEPARATOR.len()..]);
         Some(&all[..at.unwrap_or(all.len())])
     })
 }
 
-/// Writes files into a folder of their own, and looks at it.
-fn within(files: &[(&str, &[u8])], look: impl FnOnce(&Path) -> bool) -> bool {
+/// Writes files to a temporary folder and reads them there.
+fn in_folder(files: &[(&str, &[u8])], read: impl FnOnce(&Path) -> bool) -> bool {
     let folder = tempfile::tempdir().expect("a folder");
     for (name, bytes) in files {
         let path = folder.path().join(name);
@@ -248,5 +247,5 @@ fn within(files: &[(&str, &[u8])], look: impl FnOnce(&Path) -> bool) -> bool {
         }
         std::fs::write(path, bytes).expect("a file");
     }
-    look(folder.path())
+    read(folder.path())
 }

@@ -1,4 +1,5 @@
-//! Every fuzz target: the binary's name is that of the format it reads. See `formats.rs`.
+//! The main file of all fuzz targets: the name of the binary is the format that it reads. See
+//! `formats.rs`.
 #![no_main]
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {

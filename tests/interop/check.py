@@ -1,4 +1,4 @@
-"""Reads a folder that `densify scenegen` wrote with COLMAP's library, and as nerfstudio's parser does.
+"""Reads a dataset of `densify scenegen` with COLMAP's library, and by the steps of nerfstudio's parser.
 
     python check.py FOLDER          needs the packages of requirements.txt
 """
@@ -13,7 +13,7 @@ import pycolmap
 
 
 def colmap(root: Path) -> None:
-    """COLMAP opens the model, finds nothing wrong, and computes the errors that are stored."""
+    """COLMAP reads the model without complaint, and computes the stored errors."""
     model = pycolmap.Reconstruction(root / "sparse/0")
     print(model.summary())
     names = {image.name for image in model.images.values()}
@@ -25,22 +25,22 @@ def colmap(root: Path) -> None:
         for element in point.track.elements:
             image = model.images[element.image_id]
             feature = image.points2D[element.point2D_idx]
-            assert feature.point3D_id == i, f"point {i}: its feature is another point's"
-            assert image.project_point(point.xyz) is not None, f"point {i} lies behind {image.name}"
+            assert feature.point3D_id == i, f"point {i}: its feature belongs to another point"
+            assert image.project_point(point.xyz) is not None, f"point {i} is behind {image.name}"
     model.update_point_3d_errors()
     for i, point in model.points3D.items():
         if point.track.length():
             assert np.isclose(point.error, stored[i], rtol=1e-6, atol=1e-6), f"point {i}"
     tracked = [point.error for point in model.points3D.values() if point.track.length()]
-    assert len(tracked) > 100 and 0 < np.median(tracked) < 2, "the errors are not those of noise"
-    # It writes what it has read.
+    assert len(tracked) > 100 and 0 < np.median(tracked) < 2, "the errors are not plausible for noise"
+    # COLMAP can write the model, too.
     with tempfile.TemporaryDirectory() as written:
         model.write_binary(written)
         assert pycolmap.Reconstruction(written).num_points3D() == len(stored)
 
 
 def nerfstudio(root: Path) -> None:
-    """The steps of nerfstudio 1.1's nerfstudio_dataparser.py and depth_dataset.py."""
+    """Follows nerfstudio_dataparser.py and depth_dataset.py of nerfstudio 1.1."""
     meta = json.loads((root / "transforms.json").read_text())
     names = [root / frame["file_path"] for frame in meta["frames"]]
     for split in ("train", "val", "test"):
@@ -50,13 +50,13 @@ def nerfstudio(root: Path) -> None:
         assert name.is_file() and np.array(frame["transform_matrix"]).shape == (4, 4), name
         depth = np.load(root / frame["depth_file_path"]).astype(np.float32) * 1e-3
         assert depth.shape == (meta["h"], meta["w"]) and depth.max() > 0, name
-    # These are COLMAP's cameras with their y and z axes turned.
+    # The cameras are those of COLMAP with the y and z axes flipped.
     model = pycolmap.Reconstruction(root / "sparse/0")
     poses = {image.name: image.cam_from_world() for image in model.images.values()}
     for frame in meta["frames"]:
         pose = np.linalg.inv(np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1]))
-        there = poses[frame["file_path"].removeprefix("images/")].matrix()
-        assert np.allclose(pose[:3], there, atol=1e-9), frame["file_path"]
+        expected = poses[frame["file_path"].removeprefix("images/")].matrix()
+        assert np.allclose(pose[:3], expected, atol=1e-9), frame["file_path"]
 
 
 if __name__ == "__main__":

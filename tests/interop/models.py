@@ -1,10 +1,10 @@
-"""Opens every format that densify writes in other programs, and what they write in densify.
+"""Reads every format that densify writes with other programs, and their files with densify.
 
     python models.py DENSIFY NODE_MODULES MODEL.ply...
 
-splat-transform (node) reads each export: as many rows, the same values up to the steps of the format, the same
-bounds, and a picture that is near the one it renders of the PLY, which in turn is near densify's own of the same
-camera. It reads no glTF: Khronos' validator checks the GLB, and its accessors are read here. The pictures need
+splat-transform (node) reads each export. The number of rows, the values up to the format's precision, and the bounds
+must be those of the PLY. Its rendering of the export must be close to its rendering of the PLY, which must be close to
+densify's. It does not read glTF: Khronos' validator checks the GLB, and its accessors are read here. The pictures need
 Pillow, and a Vulkan driver for Dawn.
 """
 
@@ -20,9 +20,9 @@ from PIL import Image, ImageChops, ImageStat
 
 SIZE = (320, 240)
 FOV = 50.0
-# Exports, each with the least PSNR [dB] of its picture to that of the PLY.
+# Least PSNR [dB] of each export's picture to that of the PLY.
 EXPORTS = {"m.ply": 99, "m.compressed.ply": 45, "m.spz": 45, "m.v4.spz": 45, "m.sog": 42}
-# Two rasterisers of one model: tile sizes, thresholds, and the rounding to bytes differ.
+# Least PSNR [dB] between the two rasterisers, which differ in tile sizes, thresholds, and rounding to bytes.
 LEAST_BETWEEN_RASTERISERS = 38
 
 Row = dict[str, float]
@@ -46,31 +46,31 @@ def bounds(found: list[Row]) -> list[float]:
 
 
 def compare(truth: list[Row], found: list[Row], what: str) -> None:
-    """Positions and logarithms of scales to the steps of the coarsest format; coefficients to its palette."""
+    """Allows for the precision of the coarsest format, and for its palette of coefficients."""
     assert len(truth) == len(found), f"{what}: {len(found)} rows"
-    moved = max(abs(a - b) for a, b in zip(bounds(truth), bounds(found)))
-    assert moved < 0.003, f"{what}: the bounds are {moved} apart"
-    # Of many rows some hundred, as each is looked for among all; not those whose opacity is 0 in a byte, of which
-    # writers keep nothing else.
+    distance = max(abs(a - b) for a, b in zip(bounds(truth), bounds(found)))
+    assert distance < 0.003, f"{what}: the bounds differ by {distance}"
+    # A sample of about a hundred rows, since each is searched for in all rows. Rows with an opacity of 0 in a byte are
+    # excluded, since writers drop their other values.
     visible = [row for row in truth if opacity(row) > 0.004]
     for row in visible[:: max(1, len(visible) // 100)]:
-        apart = lambda other: math.dist([row[k] for k in "xyz"], [other[k] for k in "xyz"])
-        # Of several at one place, as density control makes them, the most alike.
-        near = sorted(found, key=apart)[:32]
-        alike = ["opacity", *(f"{name}_{k}" for name in ("f_dc", "scale") for k in range(3))]
-        other = min(near, key=lambda other: 100 * apart(other) + sum(abs(row[k] - other[k]) for k in alike))
-        assert apart(other) < 0.003, f"{what}: {apart(other)} apart"
+        distance = lambda other: math.dist([row[k] for k in "xyz"], [other[k] for k in "xyz"])
+        # Density control creates several rows at one position: the most similar one is compared.
+        nearest = sorted(found, key=distance)[:32]
+        compared = ["opacity", *(f"{name}_{k}" for name in ("f_dc", "scale") for k in range(3))]
+        other = min(nearest, key=lambda other: 100 * distance(other) + sum(abs(row[k] - other[k]) for k in compared))
+        assert distance(other) < 0.003, f"{what}: positions differ by {distance(other)}"
         assert abs(opacity(row) - opacity(other)) < 0.004, f"{what}: opacity"
         for name, limit in [("scale_", 0.1), ("f_dc_", 0.06), ("f_rest_", 0.7)]:
             for key in (key for key in row if key.startswith(name)):
                 assert abs(row[key] - other[key]) < limit, f"{what}: {key} {row[key]} {other[key]}"
         q, p = ([r[f"rot_{i}"] for i in range(4)] for r in (row, other))
         cosine = abs(sum(a * b for a, b in zip(q, p))) / math.hypot(*q) / math.hypot(*p)
-        assert cosine > 0.9998, f"{what}: turned"
+        assert cosine > 0.9998, f"{what}: rotations differ"
 
 
 def psnr(a: Path, b: Path) -> float:
-    """Of two pictures of bytes [dB]; at most 99."""
+    """The PSNR of two pictures [dB]; at most 99."""
     one, other = (Image.open(path).convert("RGB") for path in (a, b))
     assert one.size == other.size == SIZE, f"{a}, {b}: {one.size}, {other.size}"
     squares = sum(ImageStat.Stat(ImageChops.difference(one, other)).sum2)
@@ -79,16 +79,16 @@ def psnr(a: Path, b: Path) -> float:
 
 
 def glb_rows(path: Path) -> list[Row]:
-    """The rows of a binary glTF of Gaussian splats, in the names of the PLY and the node's frame undone."""
+    """The rows of a binary glTF of Gaussian splats in its mesh's own frame, with the names of the PLY."""
     data = path.read_bytes()
     magic, version, length, json_length = struct.unpack_from("<4sIII", data)
-    assert (magic, version, length) == (b"glTF", 2, len(data)), "the head of a GLB"
+    assert (magic, version, length) == (b"glTF", 2, len(data)), "this is not the header of a GLB"
     tree = json.loads(data[20 : 20 + json_length])
     binary = 20 + json_length + 8
     primitive = tree["meshes"][0]["primitives"][0]
     splatting = primitive["extensions"]["KHR_gaussian_splatting"]
     assert splatting["kernel"] == "ellipse" and "KHR_gaussian_splatting" in tree["extensionsUsed"], splatting
-    # Half a turn about x or z: each axis keeps its sign or turns it round.
+    # A half turn about x or z: each axis keeps or flips its sign.
     rotation = tree["nodes"][0].get("rotation", [0, 0, 0, 1])
     assert sorted(map(abs, rotation)) == [0, 0, 0, 1], f"a half turn is expected: {rotation}"
 
@@ -96,28 +96,28 @@ def glb_rows(path: Path) -> list[Row]:
         accessor = tree["accessors"][primitive["attributes"][name]]
         view = tree["bufferViews"][accessor["bufferView"]]
         width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
-        assert accessor["componentType"] == 5126, "floats"
+        assert accessor["componentType"] == 5126, f"{name} is not in floats"
         start = binary + view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
         return [struct.unpack_from(f"<{width}f", data, start + 4 * width * i) for i in range(accessor["count"])]
 
     names = ("POSITION", *(f"KHR_gaussian_splatting:{name}" for name in ("ROTATION", "SCALE", "OPACITY")))
-    position, turn, scale, alpha = map(column, names)
-    shades = [column(f"KHR_gaussian_splatting:SH_DEGREE_{l}_COEF_{k}") for l in range(4) for k in range(2 * l + 1)
-              if f"KHR_gaussian_splatting:SH_DEGREE_{l}_COEF_{k}" in primitive["attributes"]]
+    position, rotation, scale, alpha = map(column, names)
+    coefficients = [column(f"KHR_gaussian_splatting:SH_DEGREE_{l}_COEF_{k}") for l in range(4) for k in range(2 * l + 1)
+                    if f"KHR_gaussian_splatting:SH_DEGREE_{l}_COEF_{k}" in primitive["attributes"]]
     found = []
     for i in range(len(position)):
         row = dict(zip("xyz", position[i])) | {f"scale_{k}": math.log(scale[i][k]) for k in range(3)}
-        row |= {f"rot_{(k + 1) % 4}": turn[i][k] for k in range(4)}
+        row |= {f"rot_{(k + 1) % 4}": rotation[i][k] for k in range(4)}
         row["opacity"] = math.log(alpha[i][0] / (1 - alpha[i][0]))
-        row |= {f"f_dc_{c}": shades[0][i][c] for c in range(3)}
-        rest = len(shades) - 1
-        row |= {f"f_rest_{c * rest + k}": shades[k + 1][i][c] for c in range(3) for k in range(rest)}
+        row |= {f"f_dc_{c}": coefficients[0][i][c] for c in range(3)}
+        rest = len(coefficients) - 1
+        row |= {f"f_rest_{c * rest + k}": coefficients[k + 1][i][c] for c in range(3) for k in range(rest)}
         found.append(row)
     return found
 
 
 def camera(truth: list[Row]) -> tuple[list[float], list[float], list[float], list[float]]:
-    """A view of the middle of a model: position, and the axes to the right, up and backward."""
+    """A camera that looks at the middle of a model: its position, and its right, up and backward axes."""
     middle, reach = [], 0.0
     for axis in "xyz":
         values = sorted(row[axis] for row in truth)
@@ -143,42 +143,42 @@ def check(densify: str, modules: Path, model: Path, folder: Path) -> None:
     path = [component for axis in zip(right, up, back, at) for component in axis] + [0, 0, 0, 1]
     frames, size = folder / "path.json", "x".join(map(str, SIZE))
     frames.write_text(json.dumps({"seconds": 1, "fps": 1, "camera_path": [{"camera_to_world": path, "fov": FOV}]}))
-    # It turns a PLY's frame by half a turn about z into its own.
+    # splat-transform rotates the PLY's frame by a half turn about z.
     turned = lambda v: ",".join(map(repr, [-v[0], -v[1], v[2]]))
     view = ["--camera-pos", turned(at), "--camera-target", turned([a - b for a, b in zip(at, back)])]
     view += ["--camera-up", turned(up), "--camera-fov", FOV, "--resolution", size]
 
     def picture(file: Path) -> Path:
-        shown = folder / f"{file.name}.webp"
-        run(other, "-q", "-w", "-g", 0, file, *view, shown)
-        return shown
+        rendered = folder / f"{file.name}.webp"
+        run(other, "-q", "-w", "-g", 0, file, *view, rendered)
+        return rendered
 
     run(densify, "render", model, "--path", frames, "--size", size, "-o", folder / "own")
     of_ply = picture(model)
     between = psnr(next((folder / "own").glob("*.png")), of_ply)
     print(f"{model}, rendered by both: {between:.2f} dB")
     assert between >= LEAST_BETWEEN_RASTERISERS
-    there, here = folder / "there.ply", folder / "here.ply"
+    read_by_other, read_by_densify = folder / "read_by_other.ply", folder / "read_by_densify.ply"
     for name, least in EXPORTS.items():
         ours, theirs = folder / f"ours.{name}", folder / f"theirs.{name}"
         run(densify, "export", model, "-o", ours)
-        run(other, "-q", "-w", ours, there)
-        compare(truth, rows(there), f"{ours.name} read by splat-transform")
+        run(other, "-q", "-w", ours, read_by_other)
+        compare(truth, rows(read_by_other), f"{ours.name} read by splat-transform")
         run(other, "-q", "-w", "-g", "cpu", model, theirs)
-        shown, shown_of_theirs = (psnr(picture(file), of_ply) for file in (ours, theirs))
-        print(f"{name}, rendered by splat-transform: {shown:.2f} dB from the PLY, its own {shown_of_theirs:.2f} dB")
-        # A model that has hardly begun loses more to a format's own steps.
-        assert shown >= min(least, shown_of_theirs)
-        run(densify, "export", theirs, "-o", here, "--overwrite")
-        compare(truth, rows(here), f"{theirs.name} read by densify")
+        quality, their_quality = (psnr(picture(file), of_ply) for file in (ours, theirs))
+        print(f"{name}, rendered by splat-transform: {quality:.2f} dB to the PLY; its own export {their_quality:.2f} dB")
+        # A model early in training loses more to the format's precision.
+        assert quality >= min(least, their_quality)
+        run(densify, "export", theirs, "-o", read_by_densify, "--overwrite")
+        compare(truth, rows(read_by_densify), f"{theirs.name} read by densify")
     ours, theirs = folder / "ours.glb", folder / "theirs.glb"
     run(densify, "export", model, "-o", ours)
     run("node", Path(__file__).with_name("validate.js"), validator, ours)
-    compare(truth, glb_rows(ours), "ours.glb by its accessors")
+    compare(truth, glb_rows(ours), "ours.glb")
     run(other, "-q", "-w", model, theirs)
-    run(densify, "export", theirs, "-o", here, "--overwrite")
-    compare(truth, rows(here), "theirs.glb read by densify")
-    print(f"{model}: the same in every format, both ways")
+    run(densify, "export", theirs, "-o", read_by_densify, "--overwrite")
+    compare(truth, rows(read_by_densify), "theirs.glb read by densify")
+    print(f"{model}: the same in every format, in both directions")
 
 
 if __name__ == "__main__":

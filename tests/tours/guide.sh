@@ -1,30 +1,30 @@
-# What the tours share: the commands of a document's section, run as they stand there.
+# Functions shared by the tours, which run the commands of a document's section as they are written.
 
 fail() { printf 'error: %s\n' "$*" >&2; exit 1; }
 
-# Prints the commands of a section: its indented lines, without comments. Lines whose comment begins
-# with "in full" take hours, and are left out.
+# Prints the commands of a section: its indented lines, without comments. Lines with a comment that
+# begins with "in full" take hours and are skipped.
 commands() { # DOCUMENT HEADING
     awk -v heading="$2" '
         /^#+ / { inside = $0 ~ "^#+ " heading "$" }
         inside && /^    / && !/# in full/' "$1" | sed 's/^ *//; s/ *#.*//'
 }
 
-# Runs them in the current folder, each printed first. PROGRAM stands in for `densify`.
+# Prints and runs the commands of a section in the current folder, with PROGRAM as `densify`.
 walk() { # DOCUMENT HEADING PROGRAM
-    local shown
-    shown="$(commands "$1" "$2")"
-    [ -n "$shown" ] || fail "$1 shows no command under \"$2\""
+    local lines
+    lines="$(commands "$1" "$2")"
+    [ -n "$lines" ] || fail "$1 has no commands under \"$2\""
     densify() { "$program" "$@"; }
     local program="$3" line
     while IFS= read -r line; do
         printf '\n$ %s\n' "$line"
         eval "$line"
-    done <<<"$shown"
+    done <<<"$lines"
 }
 
-# Prints the blocks that are fenced below a heading as one script: ```sh is run, and ```LANGUAGE PATH is
-# written to PATH. Other blocks are only to be read.
+# Turns the fenced blocks below a heading into one script: a block ```sh is run, and a block
+# ```LANGUAGE PATH is written to PATH. Other blocks are skipped.
 recipe() { # DOCUMENT HEADING
     awk -v heading="$2" '
         /^#+ / && !fenced { inside = $0 ~ "^#+ " heading "$"; next }
@@ -34,10 +34,10 @@ recipe() { # DOCUMENT HEADING
                 match($0, /^ */)
                 path = $2
                 if (path) printf "mkdir -p \"$(dirname %s)\"\ncat >%s <<\"END OF FILE\"\n", path, path
-                shown = path || $1 == "```sh"
+                is_used = path || $1 == "```sh"
             }
             fenced = !fenced
             next
         }
-        inside && fenced && shown { print /^ *$/ ? "" : substr($0, RLENGTH + 1) }' "$1"
+        inside && fenced && is_used { print /^ *$/ ? "" : substr($0, RLENGTH + 1) }' "$1"
 }

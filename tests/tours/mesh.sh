@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# An engineer with a mesh: the README's way from the mesh to a test that a CI can hold.
+# Starting from a mesh: runs the README's commands from the mesh to a test for continuous integration.
 #
 # tests/tours/mesh.sh PROGRAM MESH
 set -euo pipefail
@@ -14,7 +14,7 @@ cp "$mesh" "$folder/chair.glb"
 cd "$folder"
 walk "$here/../../README.md" 'Test against known geometry' "$program" | tee said.txt
 
-# The same test fails where more is asked for than the model has.
+# With a limit above the model's PSNR, the same test fails.
 test="$(commands "$here/../../README.md" 'Test against known geometry' | grep -- --fail-below)"
 code=0
 (densify() { "$program" "$@"; }; eval "$test --fail-below psnr=99") || code=$?

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# A newcomer with photographs: the README's way from a dataset to a model that is looked at.
+# Starting from photographs: runs the README's commands from a dataset to pictures of a model.
 #
-# tests/tours/photographs.sh PROGRAM DATASET [FOLDER]: FOLDER, new, keeps the pictures.
+# tests/tours/photographs.sh PROGRAM DATASET [FOLDER]: the pictures are kept in FOLDER, which must be new.
 set -euo pipefail
 here="$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)"
 . "$here/guide.sh"
@@ -15,7 +15,7 @@ cp -r "$dataset" "$folder/data/garden"
 cd "$folder"
 walk "$here/../../README.md" 'Train on your photographs' "$program" | tee said.txt
 
-# The model shows the scene, and its pictures are there to be looked at.
+# The model shows the scene, and its pictures have been written.
 psnr="$(sed -n 's/^test *PSNR \([0-9.]*\) dB.*/\1/p' said.txt)"
 awk -v psnr="$psnr" 'BEGIN { exit !(psnr > 20) }' || fail "the model has a PSNR of ${psnr:-none} dB"
 mapfile -t pictures < <(find pictures -name "*.pair.png" -size +0)

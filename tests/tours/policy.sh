@@ -1,18 +1,19 @@
 #!/usr/bin/env bash
-# An author of a policy: CONTRIBUTING.md's way from `cargo new` to a comparison, in a crate of its own.
+# Writing a policy: runs the commands of CONTRIBUTING.md from `cargo new` to a comparison, in a new crate.
 set -euo pipefail
 here="$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)"
 . "$here/guide.sh"
 root="$(realpath "$here/../..")"
 folder="$(mktemp -d)"
 trap 'rm -rf "$folder"' EXIT
-# What is built stays for the next time.
+# Builds are kept for later runs.
 CARGO_TARGET_DIR="$(realpath -m "${CARGO_TARGET_DIR:-$root/target}")/tours"
 export CARGO_TARGET_DIR
 
 cd "$folder"
-# The checkout lies elsewhere, and dependencies have its versions: without a network there are no others. `cargo test`
-# removes from the copy what the policy does not need, so the trainer, added later, needs a copy of its own.
+# The recipe is changed in two ways: paths lead to this checkout, and its Cargo.lock is copied, since other versions are
+# not available without a network. The lock is copied again for the trainer, which is added later: `cargo test` removes
+# unused dependencies from it.
 lock="cp '$root/Cargo.lock' ."
 recipe "$root/CONTRIBUTING.md" 'A policy' |
     sed "s|\.\./densify|$root|g; s|^cd my_policy\$|&; $lock|; s|^cargo add |$lock; &|" >recipe.sh
@@ -23,10 +24,10 @@ has 'test steady_conforms \.\.\. ok' said.txt
 has '^test +PSNR [0-9.]+ dB' said.txt
 has '\| steady +\|' my_policy/comparison/compare.md
 has '\| vanilla +\|' my_policy/comparison/compare.md
-# What a policy's tests are built from serves for its program too.
+# The tests and the program of the policy share one build of densify-policies.
 built="$(grep -c 'Compiling densify-policies ' said.txt || true)"
 [ "$built" -le 1 ] || fail "densify-policies was built $built times: its dependencies have other features in densify"
-# What was left out is refused by name.
+# Commands that need the missing feature are refused, and the error names it.
 for words in 'train scene:spheres --backend gpu' 'devices'; do
     code=0
     # shellcheck disable=SC2086 # words

@@ -1,7 +1,7 @@
-//! # compact-3dgs — growth as in `vanilla`, with a learned mask that says which Gaussians to prune
+//! # compact-3dgs — growth as in `vanilla`, with a learned mask that decides which Gaussians to prune
 //!
-//! Grows a model as `vanilla` does, while every Gaussian learns a mask; those whose mask falls to almost
-//! nothing are pruned, during growth and to the end of the run.
+//! Grows a model as `vanilla` does. Every Gaussian also learns a mask, and Gaussians whose mask falls close
+//! to zero are pruned, during growth and until the end of the run.
 //!
 //! Source: *Compact 3D Gaussian Representation for Radiance Field*, Lee, Rho, Sun, Ko, Park, CVPR 2024,
 //! arXiv 2311.13681, section 3.1, with the constants of its public code.
@@ -11,30 +11,30 @@
 //! **Growth** is that of `vanilla`, with its parameters: clones and splits by screen gradient, pruning by
 //! opacity and size, opacity resets, and a hard stop at the budget (or `governor`).
 //!
-//! **Mask.** Each Gaussian has a number m, at first `mask_start`, and renders with its opacity and its
-//! scales times 1\[σ(m) > `min_mask`\]. The derivative of this step is taken to be that of σ(m)
-//! (straight-through). `mask_weight` · mean σ(m) is added to the loss, so that masks fall unless the
-//! images hold them up. m has the learning rate `mask_rate`. A clone or a child of a split begins with
-//! its parent's mask.
+//! **Mask.** Each Gaussian has a parameter m, initially `mask_start`. It is rendered with its opacity and
+//! scales multiplied by 1\[σ(m) > `min_mask`\], whose derivative is taken to be that of σ(m)
+//! (straight-through). `mask_weight` · mean σ(m) is added to the loss, so a mask falls unless the images
+//! need its Gaussian. m has the learning rate `mask_rate`. Clones and children of splits inherit the
+//! parent's mask.
 //!
-//! **Pruning.** Gaussians with σ(m) ≤ `min_mask` are pruned at every growth, every `mask_every` steps to
-//! the end of the run, and after its last step. Until then they are transparent.
+//! **Pruning.** Gaussians with σ(m) ≤ `min_mask` are pruned at every growth step, every `mask_every` steps
+//! until the end of the run, and after its last step. Until then they are transparent.
 //!
-//! `random_keep` is a control that shows what the masks are worth: there are none, and at `grow_until`
-//! Gaussians are drawn at random and pruned until this number is left.
+//! `random_keep` is a control that measures the effect of the masks: it disables them, and at `grow_until`
+//! prunes Gaussians at random until this number is left.
 //!
 //! ## Under a budget
 //!
-//! The budget bounds growth and is never exceeded. What the masks free is grown anew until `grow_until`.
-//! Nothing grows after that, so a run ends below the budget, by as much as the masks find needless: at 96 to
-//! 100 % of a budget of 8,000 after 7,000 steps at half size (six scenes).
+//! The budget bounds growth and is never exceeded. Until `grow_until`, new Gaussians take the place of those
+//! pruned by their masks. Nothing grows after that, so a run ends below the budget: at 96 to 100 % of a
+//! budget of 8,000 after 7,000 steps at half size (six scenes).
 //!
 //! ## Differences from the published code
 //!
 //! - A Gaussian whose mask has fallen to `min_mask` stays transparent until it is pruned. In the published
-//!   code its mask could in principle rise again, although it has no gradient but that of the term.
-//! - The paper also replaces colours by a grid with a small network and quantises shapes. Neither is
-//!   density control.
+//!   code its mask could rise again in principle, although only the loss term acts on it.
+//! - The paper also replaces colours by a grid with a small network and quantises shapes. Neither is part
+//!   of density control.
 //! - The last Gaussian is never pruned.
 //!
 //! ## Parameters
@@ -56,12 +56,12 @@
 //! | reset_opacity | 0.01 | 0 to 1, both excluded | | largest opacity after a reset |
 //! | white_reset_at | 500 | >= 0 | step | one more reset, on a white background only; 0: never |
 //! | governor | false | | | grow along a curve instead of by `tau` |
-//! | mask_start | 1.0 | -20 to 20 | | m of a fresh Gaussian |
+//! | mask_start | 1.0 | -20 to 20 | | initial m |
 //! | mask_rate | 0.01 | > 0 | | learning rate of m |
 //! | mask_weight | 0.0005 | >= 0 | loss | coefficient of the mean of σ(m) |
-//! | min_mask | 0.01 | 0 to 1, both excluded | | Gaussians whose σ(m) is no larger are pruned |
-//! | mask_every | 1000 | >= 0 | steps | interval of pruning by masks beside growth; 0: only then and at the end |
-//! | random_keep | 0 | >= 0 | Gaussians | a control: no masks, and this many left at random; 0: masks |
+//! | min_mask | 0.01 | 0 to 1, both excluded | | Gaussians with σ(m) up to this are pruned |
+//! | mask_every | 1000 | >= 0 | steps | interval of further prunes by mask; 0: only at growth steps and at the end |
+//! | random_keep | 0 | >= 0 | Gaussians | control: no masks, random pruning down to this number; 0: masks |
 //!
 //! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
 //! (`…_every`) do not shrink below 100 steps.
@@ -83,7 +83,7 @@ use crate::vanilla::{Vanilla, VanillaParams};
 crate::register_policy!(
     "compact-3dgs",
     Compact,
-    summary: "growth as in vanilla, with a learned mask per Gaussian that says what to prune",
+    summary: "growth as in vanilla, with a learned mask per Gaussian that decides what to prune",
     source: "Compact-3DGS, Lee et al. 2024, arXiv 2311.13681",
     doc: include_str!("mod.rs"),
 );
@@ -122,7 +122,7 @@ impl Default for CompactParams {
 pub struct Compact {
     params: CompactParams,
     growth: Vanilla,
-    /// When masks prune beside growth.
+    /// Prunes by mask in addition to those at growth steps.
     prune: Window,
     iterations: u32,
 }
@@ -165,14 +165,14 @@ impl DensityPolicy for Compact {
     }
 
     fn is_due(&self, step: u32) -> bool {
-        self.growth.is_due(step) || self.is_prune(step)
+        self.growth.is_due(step) || self.prunes_at(step)
     }
 
     fn plan(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
         if self.growth.is_due(now.step) {
             self.growth.plan(now, rng, plan)?;
         }
-        if !self.is_prune(now.step) {
+        if !self.prunes_at(now.step) {
             return Ok(());
         }
         if self.is_control() {
@@ -195,7 +195,7 @@ impl Compact {
         self.params.random_keep > 0
     }
 
-    fn is_prune(&self, step: u32) -> bool {
+    fn prunes_at(&self, step: u32) -> bool {
         if self.is_control() {
             return step > 0 && step == self.params.growth.grow_until;
         }

@@ -1,14 +1,14 @@
 //! Tests of the rules of `compact-3dgs`, each worked out by hand.
 
 use super::*;
-use crate::event::{Event, Outcome, assert_conforms, build, due_steps};
+use crate::event::{Event, Outcome, assert_conforms, assert_refused, build, due_steps};
 use crate::registry::find;
 
 fn run(event: &Event, set: &str) -> Outcome {
     event.run("compact-3dgs", set)
 }
 
-/// Rows of opacity 0.5 that neither grow nor die by themselves, with these masks.
+/// Rows of opacity 0.5 with these masks; the growth rules neither densify nor prune them.
 fn event(step: u32, masks: &[f32]) -> Event {
     Event::new(step, masks.len(), masks.len())
         .with_all(Signal::VisibleCount, 4.0)
@@ -20,7 +20,7 @@ fn event(step: u32, masks: &[f32]) -> Event {
 #[test]
 fn rows_whose_mask_has_fallen_are_pruned() {
     let masks = [0.01, 0.0101, 0.5, 0.0, f32::NAN];
-    // At a growth, at a multiple of 1,000 after growth, and at the end.
+    // At a growth step, at a multiple of 1,000 after growth, and at the end.
     for step in [600, 17_000, 30_000] {
         let done = run(&event(step, &masks), "");
         assert_eq!(done.pruned, [0, 3], "step {step}");
@@ -38,7 +38,7 @@ fn masks_prune_at_every_growth_and_every_thousand_steps_to_the_end() {
         due_steps("compact-3dgs", &format!("reset_every = 0\n{set}"), &scene)
     };
     let steps = due("", 30_000);
-    // 144 growths, 600 to 14,900; from 15,000 on every thousand; the last is the end of the run.
+    // 144 growth steps, 600 to 14,900; from 15,000 on every thousand; the last is the end of the run.
     let late: Vec<u32> = (15..=30).map(|thousand| 1000 * thousand).collect();
     assert_eq!((steps[0], &steps[144..]), (600, &late[..]));
     // A run of 7,000: 1,000 · 7/30 = 233.3 steps, and the last step, which is no multiple.
@@ -76,30 +76,28 @@ fn growth_is_that_of_vanilla() {
 }
 
 #[test]
-fn the_control_leaves_so_many_at_random() {
+fn the_control_prunes_at_random_to_the_given_number() {
     assert_eq!(run(&event(15_000, &[1.0; 100]), "random_keep = 1").ops.rows_after, 1);
     let event = event(15_000, &[0.0; 100]);
     let done = run(&event, "random_keep = 40");
     assert_eq!(done.ops.rows_after, 40);
-    // Not the first sixty: rows on both sides of the middle go.
+    // Pruned rows lie on both sides of the middle, so they are not simply the first sixty.
     assert!(done.pruned.iter().any(|&row| row >= 50) && done.pruned.iter().any(|&row| row < 50));
     assert_eq!(run(&event, "random_keep = 200").ops.rows_after, 100);
 }
 
 #[test]
 fn numbers_out_of_range_are_refused_by_name() {
-    let scene = Event::new(1, 1, 1).scene;
-    for (set, name) in [
-        ("mask_start = 21.0", "mask_start"),
-        ("mask_rate = 0.0", "mask_rate"),
-        ("mask_weight = -1.0", "mask_weight"),
-        ("min_mask = 0.99999999", "min_mask"),
-        ("min_mask = 0.0", "min_mask"),
-    ] {
-        let refused = find("compact-3dgs").unwrap().build(&set.parse().unwrap(), &scene);
-        let message = refused.map(|_| ()).unwrap_err().to_string();
-        assert!(message.contains(name), "{set}: {message}");
-    }
+    assert_refused(
+        "compact-3dgs",
+        &[
+            ("mask_start = 21.0", "mask_start"),
+            ("mask_rate = 0.0", "mask_rate"),
+            ("mask_weight = -1.0", "mask_weight"),
+            ("min_mask = 0.99999999", "min_mask"),
+            ("min_mask = 0.0", "min_mask"),
+        ],
+    );
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! Checks a manual page: all parameters are in its table, with the defaults and ranges of the code.
+//! Checks that a manual page lists all parameters with the defaults and ranges of the code.
 
 use toml::{Table, Value};
 
@@ -25,7 +25,7 @@ pub fn check_manual(entry: &PolicyEntry) -> Result<(), Report> {
             None => wrong.push(format!("`{name}` is missing")),
             Some(row) if row.len() != 5 => wrong.push(format!("`{name}` has {} cells", row.len())),
             Some(row) => {
-                if !is_same(&parse_value(row[1]), default) {
+                if !equals(&parse_value(row[1]), default) {
                     wrong.push(format!("`{name}` has the default {default}, not {}", row[1]));
                 }
                 wrong.extend(check_range(entry, name, default, row[2]));
@@ -42,7 +42,7 @@ pub fn check_manual(entry: &PolicyEntry) -> Result<(), Report> {
     report.result()
 }
 
-fn is_same(documented: &Value, default: &Value) -> bool {
+fn equals(documented: &Value, default: &Value) -> bool {
     let number = |value: &Value| value.as_float().or_else(|| value.as_integer().map(|v| v as f64));
     match (number(documented), number(default)) {
         (Some(documented), Some(default)) => documented.total_cmp(&default).is_eq(),
@@ -50,11 +50,11 @@ fn is_same(documented: &Value, default: &Value) -> bool {
     }
 }
 
-/// Builds the policy with values at the ends of the documented range and beyond them. Returns the first
-/// that is not accepted or refused as documented.
+/// Builds the policy with values at the ends of the documented range and beyond them. Reports the first
+/// value that is not accepted or refused as documented.
 fn check_range(entry: &PolicyEntry, name: &str, default: &Value, range: &str) -> Option<String> {
-    let Some((inside, outside)) = values(range, default) else {
-        return Some(format!("`{name}` has the range `{range}`, which is of no known form"));
+    let Some((inside, outside)) = boundary_values(range, default) else {
+        return Some(format!("`{name}` has the range `{range}`, which is not in a known form"));
     };
     let build = |value: &Value| {
         let set = Table::from_iter([(name.to_owned(), value.clone())]);
@@ -73,9 +73,9 @@ fn check_range(entry: &PolicyEntry, name: &str, default: &Value, range: &str) ->
     })
 }
 
-/// Values inside and outside of a range: `>= a`, `> a`, `a to b`, this followed by `, a excluded`,
-/// `, b excluded` or `, both excluded`, or a list of words. `None` for other forms.
-fn values(range: &str, default: &Value) -> Option<(Vec<Value>, Vec<Value>)> {
+/// Values inside and outside of a range: `>= a`, `> a`, `a to b` (optionally followed by `, a excluded`,
+/// `, b excluded` or `, both excluded`), or a list of words. `None` for other forms.
+fn boundary_values(range: &str, default: &Value) -> Option<(Vec<Value>, Vec<Value>)> {
     if range.is_empty() {
         return Some((Vec::new(), Vec::new()));
     }

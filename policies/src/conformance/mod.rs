@@ -10,20 +10,21 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 //!
-//! The suite builds the policy with its defaults and leads it through scripted runs: models that are
-//! empty, have one row, are full or have room, and plans that refuse all growth; statistics that are
-//! plausible, zero, all equal, negative, infinite, NaN or a mixture of these; auxiliary views with the
-//! same. [`Check`] lists what is checked of every plan:
+//! The suite builds the policy with its defaults and takes it through scripted runs. Models are empty, have
+//! one row, are full or have room, and some plans refuse all growth. Statistics, also those of auxiliary
+//! views, are plausible, zero, all equal, negative, infinite, NaN or a mixture. [`Check`] lists the
+//! properties that are checked:
 //!
 //! - the budget holds, and one row is left;
-//! - the policy edits at least one of these models, which have up to 5,000 rows, so that small shares count;
-//! - the same input gives the same plan, and a policy saved and restored in mid-run continues the same;
-//! - nothing is read that was not declared, and declarations are valid;
-//! - no statistics and no refusals cause an error or a panic;
+//! - the policy edits at least one of the models (some have thousands of rows, so that a small fraction is
+//!   still several rows);
+//! - the same input gives the same plan, and a policy saved and restored in mid-run continues identically;
+//! - only declared inputs are read, and declarations are valid;
+//! - neither statistics nor refusals cause an error or a panic;
 //! - the manual page lists all parameters with their defaults and ranges.
 //!
-//! The suite cannot know whether a rule is the published one. Test the identities of your policy
-//! yourself: children that conserve opacity, splits that keep their ends, curves that end at the budget.
+//! The suite cannot tell whether your rules match the paper. Test the identities of your policy yourself:
+//! children that conserve opacity, splits that keep their ends, curves that end at the budget.
 
 use std::fmt;
 
@@ -56,17 +57,17 @@ pub enum Check {
     /// Every number in its needs is in its range, and at no step is its cadence longer or its resolution
     /// lower than declared.
     DeclaresValidNumbers,
-    /// It plans without error or panic, whatever the statistics hold and whatever the plan refuses.
+    /// It plans without error or panic for any statistics and any refusals.
     NeverFails,
-    /// It returns the plan that it was given, for these rows and this budget.
+    /// It does not replace the plan it was given, so rows and budget stay the same.
     KeepsPlan,
-    /// It leaves at least one row of a model that had any.
+    /// It leaves at least one row, unless the model was empty.
     LeavesARow,
-    /// It edits a model in at least one of the scripted runs; else the other checks have seen nothing.
+    /// It edits a model in at least one of the scripted runs; otherwise the other checks prove nothing.
     Edits,
     /// From the same inputs it makes the same plan, has the same needs and is due at the same steps.
     IsDeterministic,
-    /// Saved as JSON in mid-run and restored, it continues the same.
+    /// Saved as JSON in mid-run and restored, it continues identically.
     RestoresState,
     /// It refuses a saved state that is not its own.
     RejectsForeignState,
@@ -83,12 +84,12 @@ impl fmt::Display for Check {
             Self::RequestsConsistently => "requests views together with what is measured in them",
             Self::DeclaresEdits => "declares detailed edits",
             Self::DeclaresValidNumbers => "declares valid numbers",
-            Self::NeverFails => "plans without error, whatever it is given",
+            Self::NeverFails => "plans without error for any input",
             Self::KeepsPlan => "keeps the plan that it is given",
             Self::LeavesARow => "leaves at least one row",
             Self::Edits => "edits a model",
             Self::IsDeterministic => "makes the same plan from the same inputs",
-            Self::RestoresState => "continues the same after save and restore",
+            Self::RestoresState => "continues identically after save and restore",
             Self::RejectsForeignState => "refuses a state that is not its own",
             Self::IsDocumented => "documents its parameters",
         })
@@ -100,7 +101,7 @@ impl fmt::Display for Check {
 pub struct Report {
     /// The policy's name and where it is registered.
     pub policy: String,
-    /// The failed checks, and how they failed.
+    /// The failed checks, each with an explanation.
     pub failures: Vec<(Check, String)>,
 }
 
@@ -176,7 +177,7 @@ fn check_building(entry: &PolicyEntry, set: &Table, report: &mut Report) {
     let parameters = entry.parameters();
     for step in entry.step_parameters().iter().map(|step| step.name()) {
         if !parameters.iter().any(|(name, value)| name == step && value.is_integer()) {
-            report.add(Check::Builds, format!("`{step}` counts steps but is no integer parameter"));
+            report.add(Check::Builds, format!("`{step}` counts steps but is not an integer"));
         }
     }
     let unknown = Table::from_iter([("no_such_parameter".to_owned(), Value::Integer(1))]);

@@ -1,4 +1,4 @@
-//! Leads copies of a policy through a scripted run and compares what they do.
+//! Takes several copies of a policy through a scripted run and compares their plans.
 
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -15,14 +15,14 @@ use crate::policy::{
 use crate::registry::PolicyEntry;
 use crate::rng::PolicyRng;
 
-/// Most auxiliary views of an event.
+/// Maximum number of auxiliary views per event.
 const MAX_VIEWS: u32 = 3;
 
 type Failure = (Check, String);
 
-/// Runs a scenario with several copies of the policy: one as in training; a second one; one that is
-/// shown more than it declares; and, from a third and from two thirds of the run on, one that was saved
-/// and restored. All must make the same plans. Returns whether any plan edited the model.
+/// Runs a scenario with several copies of the policy: two as in training, one that is shown more than it
+/// declares, and two that were saved and restored, after one third and two thirds of the run. All must make
+/// the same plans. Returns true if any plan edited the model.
 pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Result<bool, Failure> {
     let scene = &scenario.scene;
     let build = || {
@@ -57,8 +57,7 @@ pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Resu
     Ok(edits)
 }
 
-/// Checks that the needs are consistent and in range, at every step too, and that no cadence exceeds the
-/// declared one.
+/// Checks that the needs, and the values that may vary by step, are consistent and in range.
 fn check_needs(
     policy: &dyn DensityPolicy,
     needs: &Needs,
@@ -96,7 +95,7 @@ fn run_event(
     let event = model.event(pattern, scene, step, needs);
     let aux = policy.aux_views(step, rows, budget);
     if aux > 0 && needs.aux.is_none() {
-        let why = "it wants auxiliary views, but its needs do not say what to measure there";
+        let why = "it requests auxiliary views, but its needs do not say what to measure there";
         return Err((Check::RequestsConsistently, why.to_owned()));
     }
     let request = needs.aux.clone().unwrap_or_default();
@@ -108,7 +107,7 @@ fn run_event(
         let resolution = policy.resolution(step);
         (policy.cadence(step), terms, policy.noise(step, needs.noise), resolution)
     };
-    // Before the plan, which may change what follows.
+    // Read before planning, which may change the policy's state.
     let wanted = schedule(policy);
     observe(policy, step, rows, &views, &request, false)?;
     let ops = plan(policy, scenario, &event, needs, false)?;
@@ -118,9 +117,7 @@ fn run_event(
             return Err(differs("is not due at this step"));
         }
         if copy.aux_views(step, rows, budget) != aux || schedule(&**copy) != wanted {
-            return Err(differs(
-                "wants other views, or another cadence, resolution, terms or noise",
-            ));
+            return Err(differs("requests other views, cadence, resolution, loss terms or noise"));
         }
         let sees_all = *check == Check::ReadsOnlyDeclared;
         observe(&mut **copy, step, rows, &views, &request, sees_all)?;
@@ -135,7 +132,7 @@ fn run_event(
     Ok(ops)
 }
 
-/// Shows the views to a copy: what it declared, or everything.
+/// Shows the views to a copy: only declared columns and points, or everything.
 fn observe(
     policy: &mut dyn DensityPolicy,
     step: u32,
@@ -148,7 +145,7 @@ fn observe(
         let columns = view.columns.iter();
         let columns = columns.filter(|(column, _)| sees_all || request.columns.contains(column));
         let columns: Vec<_> = columns.cloned().collect();
-        // As many as were requested, or all if none were.
+        // `sees_all` shows points only to a policy that requested none.
         let most =
             if sees_all && request.points == 0 { usize::MAX } else { request.points as usize };
         let points = &view.points[..most.min(view.points.len())];
@@ -164,7 +161,7 @@ fn observe(
     Ok(())
 }
 
-/// Lets a copy plan, with what it declared or with everything.
+/// Lets a copy plan, given only declared inputs or everything.
 fn plan(
     policy: &mut dyn DensityPolicy,
     scenario: &Scenario,
@@ -208,7 +205,7 @@ fn never_fails(why: String) -> Failure {
     (Check::NeverFails, why)
 }
 
-/// A new copy with the policy's state, which passes through text as in a checkpoint.
+/// Gives `copy` the policy's state, through JSON text as in a checkpoint.
 fn restored(
     policy: &dyn DensityPolicy,
     mut copy: Box<dyn DensityPolicy>,

@@ -1,29 +1,31 @@
-//! The scripted runs of the suite: which model, which budget, which statistics.
+//! The scripted runs of the suite: models, budgets and statistics.
 
 use std::fmt;
 
 use super::synthetic::{PATTERNS, Pattern};
 use crate::policy::SceneInfo;
 
-/// One run.
+/// One scripted run.
 #[derive(Debug, Clone)]
 pub(super) struct Scenario {
     name: &'static str,
     pub(super) scene: SceneInfo,
-    /// Whether plans refuse all growth, whatever the scene's budget.
+    /// True if plans refuse all growth, regardless of the scene's budget.
     refuses_growth: bool,
     pattern: Pattern,
 }
 
-/// Most events of one run, for policies that are due at every step; and of one with many rows.
-const MOST_EVENTS: [usize; 2] = [400, 40];
-/// Rows of a model in which even small shares are rows.
+/// Maximum number of events of a run, which bounds the time of policies that are due at every step.
+const MOST_EVENTS: usize = 400;
+/// Maximum number of events of a run with models of [`MANY`] rows.
+const MOST_EVENTS_OF_MANY: usize = 40;
+/// Rows of a large model, in which a small fraction is still several rows.
 const MANY: usize = 5_000;
 
 impl Scenario {
-    /// Most events that are looked at.
+    /// Maximum number of events that are run.
     pub(super) fn most_events(&self) -> usize {
-        MOST_EVENTS[usize::from(self.scene.initial_rows >= MANY)]
+        if self.scene.initial_rows >= MANY { MOST_EVENTS_OF_MANY } else { MOST_EVENTS }
     }
 
     /// The budget of the plan for a model of `rows` rows.

@@ -1,4 +1,4 @@
-//! Synthetic statistics: a model that is only a number of rows, with plausible and with broken values.
+//! Synthetic statistics, plausible or broken, for a model of which only the number of rows is tracked.
 
 use crate::plan::RowOps;
 use crate::policy::{
@@ -6,7 +6,7 @@ use crate::policy::{
 };
 use crate::rng::{PolicyRng, Purpose};
 
-/// What the statistics of a run hold.
+/// The kind of values that the statistics of a run hold.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Pattern {
     Plausible,
@@ -18,9 +18,9 @@ pub(super) enum Pattern {
     Infinite,
     MinusInfinite,
     Nan,
-    /// Each value by one of the patterns above.
+    /// Each value follows one of the patterns above.
     Mixture,
-    /// Each event by one of the patterns above.
+    /// Each event follows one of the patterns above.
     Changing,
 }
 
@@ -51,7 +51,7 @@ fn value(pattern: Pattern, bits: [u32; 4], plausible: impl Fn(f32) -> f32) -> f3
         Pattern::Infinite => f32::INFINITY,
         Pattern::MinusInfinite => f32::NEG_INFINITY,
         Pattern::Nan => f32::NAN,
-        // Half of them plausible, so that policies act at all.
+        // Half of the values are plausible, so that policies act at all.
         Pattern::Mixture => {
             let pattern =
                 if bits[1].is_multiple_of(2) { 0 } else { bits[2] as usize % (PATTERNS.len() - 2) };
@@ -60,7 +60,7 @@ fn value(pattern: Pattern, bits: [u32; 4], plausible: impl Fn(f32) -> f32) -> f3
     }
 }
 
-/// A value such as training may produce, for u in [0, 1).
+/// A value that training may produce, for u in [0, 1).
 fn plausible(signal: Signal, u: f32, scene: &SceneInfo) -> f32 {
     match signal {
         Signal::VisibleCount => (20.0 * u).floor(),
@@ -73,7 +73,7 @@ fn plausible(signal: Signal, u: f32, scene: &SceneInfo) -> f32 {
         Signal::Position => 2.0 * scene.extent * (u - 0.5),
         Signal::LogScale => (0.15 * scene.extent * u.powi(3) + 1e-6).ln(),
         Signal::Orientation => u - 0.5,
-        // What a row shows may lie beyond 0 and 1.
+        // Colours of rows may lie outside 0 to 1.
         Signal::Colour => 1.4 * u - 0.2,
         other => match other.kind() {
             SignalKind::Count => (1000.0 * u).floor(),
@@ -105,7 +105,7 @@ pub(super) struct View {
 }
 
 impl Model {
-    /// The statistics of an event; new candidates are collected.
+    /// Makes the statistics of an event and collects new candidates.
     pub(super) fn event(
         &mut self,
         pattern: Pattern,
@@ -137,7 +137,7 @@ impl Model {
         Event { step, declared, all, candidates: self.candidates.clone() }
     }
 
-    /// The statistics of one auxiliary view.
+    /// Makes the statistics of one auxiliary view.
     pub(super) fn view(
         &self,
         pattern: Pattern,
@@ -174,7 +174,7 @@ impl Model {
     }
 }
 
-/// A candidate from numbered values, each with a scale.
+/// A candidate whose fields are `number(index, scale)`.
 fn candidate(number: impl Fn(u32, f32) -> f32) -> Candidate {
     Candidate {
         position: [0, 1, 2].map(|part| number(part, 1.0)),

@@ -1,6 +1,6 @@
-//! Tests that the registered policies conform, and that policies with one fault each are caught.
+//! Tests that the registered policies conform, and that a policy with any one fault is caught.
 //!
-//! One piece, as all faults are those of one policy.
+//! One file, as one policy has all the faults.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{SystemTime, UNIX_EPOCH};
@@ -28,7 +28,7 @@ fn every_registered_policy_conforms() {
     }
 }
 
-/// What is wrong with a [`Faulty`].
+/// The fault of a [`Faulty`] policy.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 enum Fault {
     #[default]
@@ -53,15 +53,15 @@ enum Fault {
     HasUndeclaredCadence,
     HasNanTermsLate,
     ShrinksImagesTooFar,
-    /// Follows what it does not save.
+    /// Depends on state that it does not save.
     ShrinksImagesUnsaved,
     NeverEdits,
-    /// Takes one row in a thousand, by the system's clock.
+    /// Prunes one row in a thousand, chosen by the system's clock.
     ReadsTheClock,
     PanicsOnManyRows,
-    /// Remembers rows beyond the thousandth, and does not save them.
+    /// Counts events of models above 1,000 rows, and does not save the count.
     ForgetsManyRows,
-    /// Is sure that a row can be put where it is.
+    /// Panics if its update with the row's own position is refused.
     TrustsPositions,
     UpdatesUndeclared,
 }
@@ -111,15 +111,14 @@ struct Params {
     fault: Fault,
 }
 
-/// A policy with a state: at every third event of its life it prunes the faintest row, at the
-/// others it clones two rows, one by gradient and one at random, and rewrites the first row. It conforms
-/// but for its fault.
+/// A policy with state: every third event prunes the faintest row; the others clone two rows, one by
+/// gradient and one at random, and rewrite the first row. It conforms except for its fault.
 struct Faulty {
     fault: Fault,
     events: u64,
-    /// Bits of the numbers seen in the auxiliary views of its life.
+    /// Hash of the numbers seen in auxiliary views.
     seen: u64,
-    /// What the policy forgets to save.
+    /// State that the policy does not save.
     unsaved: u32,
 }
 
@@ -398,7 +397,7 @@ fn manuals_are_checked() {
         ("> 0", "0.0 is accepted"),
         ("0 to 1, 1 excluded", "1.0 is accepted"),
         ("0 to 1, both excluded", "0.0 is accepted"),
-        ("about 1", "of no known form"),
+        ("about 1", "not in a known form"),
     ] {
         let message = range(wrong).unwrap_err();
         assert!(message.contains(value), "{wrong}: {message}");

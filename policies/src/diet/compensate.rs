@@ -1,20 +1,20 @@
-//! Compensation: pixels with a large error become new rows.
+//! Compensation: new rows at pixels with large errors.
 
 use super::{Diet, NewbornSize};
 use crate::adc::Window;
 use crate::plan::{EditPlan, Seed};
 use crate::policy::{CandidateRequest, PolicyResult, SceneInfo, Signal, Snapshot};
-use crate::quota::rows_of_event;
+use crate::quota::event_quota;
 use crate::sample::top_k;
 
 impl Diet {
-    /// The pixels to collect, if compensation is on.
+    /// The pixels to collect; `None` if compensation is off.
     pub(super) fn candidate_request(&self, scene: &SceneInfo) -> Option<CandidateRequest> {
         let Window { from, until, every } = self.insert;
         if every == 0 || from >= until {
             return None;
         }
-        // What one interval can collect at the budget, but at most the budget.
+        // The most that one interval can collect at the budget, but at most the budget.
         let steps = every.min(until - from) as usize;
         let per_step = (scene.budget / self.params.rows_per_candidate as usize).max(1);
         let capacity = steps.saturating_mul(per_step).min(scene.budget).max(1);
@@ -30,7 +30,7 @@ impl Diet {
         })
     }
 
-    /// Appends the worst candidates, and evicts rows for those that have no room.
+    /// Appends the worst candidates, evicting rows to make room for them.
     pub(super) fn insert(
         &self,
         now: &Snapshot<'_>,
@@ -55,7 +55,7 @@ impl Diet {
             let _ = plan.append(seed);
         }
         let errors: Vec<f32> = valid.iter().map(|(error, _)| *error).collect();
-        let most = rows_of_event(self.params.rho_c, self.insert, now.step, plan.budget());
+        let most = event_quota(self.params.rho_c, self.insert, now.step, plan.budget());
         let worst = top_k(&errors, most);
         let missing = worst.len().saturating_sub(plan.room());
         self.evict(now, plan, importance, (missing, exempt))?;

@@ -1,11 +1,11 @@
 //! # diet — growth by replacing the least important Gaussians, at a fixed budget
 //!
-//! Densifies Gaussians with large gradients, replaces the least important ones at the budget, and later
-//! places new ones at the pixels with the largest errors.
+//! Densifies Gaussians with large gradients. At the budget it replaces the least important Gaussians, and
+//! later it places new ones at the pixels with the largest errors.
 //!
 //! Source: *Gaussians on a Diet: High-Quality Memory-Bounded 3D Gaussian Splatting Training*, arXiv
 //! 2604.20046. Where the paper and its public code differ, or either is in doubt, the default is the
-//! rule that we consider right, and the others can be chosen by name.
+//! rule that we consider right, and a parameter selects the others.
 //!
 //! ## Method
 //!
@@ -13,42 +13,42 @@
 //! Gaussians with g >= `tau`, where g = g_p + `colour_weight` · g_c. g_p and g_c are the norms of the
 //! loss gradient with respect to the projected mean (NDC) and to the colour, averaged over the views
 //! that saw the Gaussian; views nearer than `full_depth` are weighted by the square of the ratio (as in
-//! *Pixel-GS*, Zhang et al. 2024). Dead Gaussians (less opaque than `min_opacity`) are pruned and are
-//! no candidates. If there are more candidates than room, the least important Gaussians are evicted:
-//! up to `rho` · budget over all growths together, an equal part in each. Then the candidates with the
-//! largest g are densified: small ones (up to `small` · scene extent) are cloned, the others split in
-//! two (`split`). The rest is counted as denied, and the gradient statistics are reset.
+//! *Pixel-GS*, Zhang et al. 2024). Gaussians below `min_opacity` are pruned and are never candidates. If
+//! there are more candidates than room, the least important Gaussians are evicted: at most `rho` · budget
+//! over the whole run, an equal part at each growth step. Then the candidates with the largest g are
+//! densified: small ones (up to `small` · scene extent) are cloned, the others split in two (`split`).
+//! The remaining candidates are counted as denied, and the gradient statistics are reset.
 //!
-//! **Eviction** prunes the Gaussians with the lowest importance, candidates excepted. Importance is the
+//! **Eviction** prunes the Gaussians with the lowest importance, but no candidates. Importance is the
 //! largest blend weight α·T over all pixels of the views chosen by `importance`. New Gaussians are
 //! protected for an epoch, but at most `protect` steps; if there are not enough others, they are
 //! evicted too, the oldest first.
 //!
 //! **Compensation**, every `insert_every` steps between `compensate_from` and `compensate_until`.
-//! Within this window each step collects the pixels of its view with the largest error, one per
-//! `rows_per_candidate` Gaussians, with the surface points they show. At each insertion the worst
-//! pixels collected since the last one become new Gaussians with the ground-truth colour: up to
-//! `rho_c` · budget over all insertions together, an equal part in each. Where there is no room, the
+//! Within this window each step collects the pixels of its view with the largest errors, one per
+//! `rows_per_candidate` Gaussians, together with the surface points seen there. At each insertion the worst
+//! pixels collected since the last one become new Gaussians with the ground-truth colour: at most
+//! `rho_c` · budget over the whole run, an equal part at each insertion. Where there is no room, the
 //! least important Gaussians are evicted. The list is then cleared.
 //!
-//! **Pruning**, every `prune_every` steps until both have ended, evicts Gaussians above the budget. (There
-//! are none, unless a model was loaded that is too large.)
+//! **Pruning**, every `prune_every` steps until growth and compensation have ended, evicts Gaussians above
+//! the budget. (This happens only if the loaded model was too large.)
 //!
-//! Some defaults differ from paper and code, after measurements in runs of 2,000 to 7,000 steps:
-//! `split` is `long-axis`; `full_depth` suppresses floaters that explain single photographs; `rho` and
+//! Some defaults differ from paper and code, based on runs of 2,000 to 7,000 steps:
+//! `split` is `long-axis`; `full_depth` suppresses floaters that fit a single photograph; `rho` and
 //! `rho_c` limit the whole run, as replacing too many Gaussians overfits; and `max_scale` is 0, as
-//! pruning by size (0.1 after step `max_scale_from` in paper and code) can remove all of a wall, which
-//! nothing replaces. docs/studies has the figures.
+//! pruning by size (0.1 after step `max_scale_from` in paper and code) can remove an entire wall, which
+//! is then never replaced. docs/studies has the figures.
 //!
 //! Each event is one plan in which pruning frees slots before new Gaussians take them, so the budget holds
-//! at every instant. The published code exceeds it between insertion and the next pruning; this is not
+//! at all times. The published code exceeds it between insertion and the next pruning; this is not
 //! offered. Opacities are never reset. The published settings also use a learning rate of 0.025 for
 //! opacities, which is an option of the trainer.
 //!
 //! ## Choices
 //!
 //! - `mixed_gradient = false`: g = 2 g_p, as the published code does (its mixed form is switched off).
-//! - `growth = "all"`: every candidate grows for which there is room or a Gaussian to evict, without the
+//! - `growth = "all"`: every candidate grows as long as there is room or a Gaussian to evict, without the
 //!   limit `rho`, as in the paper and the code.
 //! - `split`: how a candidate larger than `small` is split.
 //!   - `random`: two samples of the parent, with scales divided by `split_factor`, as in the original.
@@ -58,11 +58,11 @@
 //! - `shift`: the offset of a clone from its parent. Σ sums over the views since the last growth, dL/dμ is
 //!   the loss gradient with respect to the mean, s the parent's largest standard deviation. Splits
 //!   are not shifted.
-//!   - `descent`: −`kappa` · s · Σ dL/dμ / Σ |dL/dμ|: downhill, by at most `kappa` · s, and by less
-//!     where the views disagree.
-//!   - `paper`: + Σ dL/dμ, the sum over the views. Uphill, and about 10⁻⁶ of the scene.
+//!   - `descent`: −`kappa` · s · Σ dL/dμ / Σ |dL/dμ|: against the gradient, by at most `kappa` · s, and by
+//!     less where the views disagree.
+//!   - `paper`: + Σ dL/dμ, the sum over the views. Along the gradient, by about 10⁻⁶ of the scene.
 //!   - `code`: + Σ dL/dμ / n², n the number of views. The code divides the gradient of the last view
-//!     by n; the mean over all views stands for it here.
+//!     by n; here the mean over all views takes the place of that gradient.
 //!   - `none`: no shift.
 //! - `clone_opacity = "conserve"`: parent and clone both get the opacity o′ = 1 − √(1 − o), and scales
 //!   multiplied by o / (2o′ − o′²/√2), so that together they are as opaque as the parent was (*3D
@@ -71,25 +71,25 @@
 //! - `importance`: the views in which importance is measured.
 //!   - `epochs`: the training renders of the previous and the current epoch, at no extra cost.
 //!   - `fresh`: `fresh_views` random training views, rendered for each event that may evict, as in the
-//!     code. This costs up to a hundred renders per growth, and a Gaussian that only other views show
+//!     code. This costs up to a hundred renders per growth step, and a Gaussian visible only in other views
 //!     counts as unimportant.
 //! - `reinit_at`: at this step the whole model is replaced, as the code does at step 5000 of outdoor
 //!   scenes (after Mini-Splatting). All training views are rendered; in each,
 //!   ⌊`reinit_share` · budget / views⌋ pixels (at least 1) are drawn without replacement in proportion
 //!   to their accumulated alpha. Each becomes a Gaussian with the ground-truth colour at the point where
 //!   its ray is closest to the Gaussian with the largest blend weight. Its size is the root mean
-//!   square distance to its three nearest neighbours, its opacity `newborn_opacity`; moments and age are
-//!   zero. Learning rates and SH degree continue. Nothing else happens at that step.
+//!   square distance to its three nearest neighbours, its opacity is `newborn_opacity`, and its moments and
+//!   age are zero. Learning rates and SH degree are unaffected. Nothing else happens at that step.
 //! - `error`: `l1-dssim` (0.8 · L1 + 0.2 · (1 − SSIM)), `l1`, or `grad`, the norm of the loss gradient
 //!   with respect to the pixel's colour, as in the code; `grad` finds blurred structure but not a constant
 //!   colour offset.
-//! - `depth`: the Gaussian whose closest point on the ray is the surface: `max-weight`, the one with the
-//!   largest blend weight, or `median`, the one at which transmittance falls below one half.
-//! - `nms`: non-maximum suppression; only pixels with the largest error of their 3 × 3 neighbours count.
+//! - `depth`: the surface is the point of the ray closest to one Gaussian: that with the largest blend
+//!   weight (`max-weight`), or that at which transmittance falls below one half (`median`).
+//! - `nms`: non-maximum suppression; only pixels with the largest error of their 3 × 3 neighbourhood count.
 //! - `newborn_size`: the standard deviation of an inserted Gaussian.
 //!   - `pixel`: `size_pixels` times the width of the pixel at that depth.
-//!   - `code`: (geometric mean of the largest standard deviation of all Gaussians)². The code squares the
-//!     mean of each axis; only the largest one is available here. Depends on the unit of length.
+//!   - `code`: (geometric mean of the largest standard deviations of all Gaussians)². The code squares the
+//!     mean of each axis; only the largest is available here. Depends on the unit of length.
 //!
 //! ## Parameters
 //!
@@ -103,7 +103,7 @@
 //! | colour_weight | 30.0 | >= 0 | | weight of the colour gradient |
 //! | full_depth | 0.8 | >= 0 | scene extent | nearer views count less in g; 0: all count equally |
 //! | growth | "turnover" | turnover, all | | how many candidates grow |
-//! | rho | 0.25 | >= 0 | budget | most Gaussians that all growths replace |
+//! | rho | 0.25 | >= 0 | budget | most Gaussians that growth replaces in the whole run |
 //! | small | 0.01 | >= 0 | scene extent | largest size that is cloned; larger ones are split |
 //! | split | "long-axis" | random, long-axis | | how a large Gaussian is split |
 //! | split_factor | 1.6 | 1 to 100 | | a `random` split divides the scales by this |
@@ -116,36 +116,36 @@
 //! | max_scale | 0.0 | >= 0 | scene extent | Gaussians above this size are dead; 0: no limit |
 //! | max_scale_from | 3000 | >= 0 | step | start of pruning by size (exclusive) |
 //! | importance | "epochs" | epochs, fresh | | views in which importance is measured |
-//! | fresh_views | 100 | >= 1 | views | random views per event, for `fresh`; all if there are fewer |
+//! | fresh_views | 100 | >= 1 | views | random views per event for `fresh`; all if there are fewer |
 //! | protect | 100 | 0 to 65535 | steps | longest protection of new Gaussians; 0: none |
 //! | prune_every | 50 | >= 0 | steps | interval of pruning; 0: never |
 //! | compensate_from | 10000 | >= 0 | step | start of compensation (exclusive) |
 //! | compensate_until | 15000 | >= 0 | step | end of compensation (exclusive) |
 //! | insert_every | 500 | >= 0 | steps | interval of insertions; 0: no compensation |
-//! | rho_c | 0.1 | >= 0 | budget | most Gaussians that all insertions add; 0: no compensation |
+//! | rho_c | 0.1 | >= 0 | budget | most Gaussians that insertions add in the whole run; 0: no compensation |
 //! | rows_per_candidate | 3000 | >= 1 | Gaussians | each step collects one pixel per this many |
 //! | error | "l1-dssim" | l1-dssim, l1, grad | | error that ranks pixels |
 //! | depth | "max-weight" | max-weight, median | | surface point on a pixel's ray |
 //! | nms | true | | | non-maximum suppression of pixels |
-//! | min_alpha | 0.5 | 0 to 1 | | least accumulated alpha of a pixel |
+//! | min_alpha | 0.5 | 0 to 1 | | smallest accumulated alpha of a pixel |
 //! | newborn_size | "pixel" | pixel, code | | size of inserted Gaussians |
-//! | size_pixels | 2.0 | > 0 | pixels | size of inserted Gaussians, for `pixel` |
+//! | size_pixels | 2.0 | > 0 | pixels | size of inserted Gaussians for `pixel` |
 //! | newborn_opacity | 0.1 | 0 to 1, both excluded | | opacity of inserted Gaussians |
-//! | reinit_at | 0 | >= 0 | step | when the whole model is replaced; 0: never |
-//! | reinit_share | 0.8 | 0 to 1, 0 excluded | budget | most Gaussians after that |
+//! | reinit_at | 0 | >= 0 | step | step at which the whole model is replaced; 0: never |
+//! | reinit_share | 0.8 | 0 to 1, 0 excluded | budget | most Gaussians after the replacement |
 //!
 //! ## Ablations
 //!
-//! Each ingredient can be switched off: the colour gradient with `mixed_gradient = false`, the weight of
+//! Each ingredient can be switched off: the colour gradient with `mixed_gradient = false`, the weighting of
 //! near views with `full_depth = 0`, the shift with `shift = "none"`, the error map with
-//! `error = "grad"`, the depth guard with `min_alpha = 0`, the size rule with `newborn_size = "code"`,
+//! `error = "grad"`, the alpha limit with `min_alpha = 0`, the size rule with `newborn_size = "code"`,
 //! protection with `protect = 0`, turnover with `rho = 0`, compensation with `rho_c = 0`, spacing with
 //! `nms = false`. Re-initialisation is off by default.
 //!
 //! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
 //! (`…_every`) do not shrink below 100 steps. `protect` does not scale.
 
-// One piece: a third is the manual page, and growth, compensation and pruning meet in `plan`.
+// Over 400 lines, of which a third is the manual page; growth, compensation and pruning meet in `plan`.
 
 use crate::adc::{PruneLimits, Window, add_colour_gradient, mean_over_views, spare_one};
 use crate::parameters::StepParameter::{self, Interval, Step};
@@ -154,7 +154,7 @@ use crate::policy::{
     AuxColumn, AuxRequest, AuxView, Candidate, DensityPolicy, Needs, PolicyResult, SceneInfo,
     Signal, SignalSet, Snapshot,
 };
-use crate::quota::rows_of_event;
+use crate::quota::event_quota;
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
 use crate::sample::largest;
@@ -184,9 +184,10 @@ pub struct Diet {
     insert: Window,
     /// Rows younger than this are protected `[steps]`.
     protected_age: f32,
-    /// Surface points of the current re-initialisation. They are not saved: the event uses them up.
+    /// Surface points for the current re-initialisation. Not saved, as the event consumes them.
     surface: Vec<Candidate>,
-    /// Largest blend weights in the auxiliary views of the current event, which uses them up.
+    /// Largest blend weights in the auxiliary views of the current event. Not saved, as the event consumes
+    /// them.
     fresh: Vec<f32>,
 }
 
@@ -278,7 +279,7 @@ impl DensityPolicy for Diet {
         // Rows are evicted only if there could be more of them than the budget after growth and
         // insertion.
         let grown = if self.grow.is_due(step) { rows } else { 0 };
-        let inserted = rows_of_event(self.params.rho_c, self.insert, step, budget);
+        let inserted = event_quota(self.params.rho_c, self.insert, step, budget);
         let evicts = rows + grown + inserted > budget;
         if evicts && self.params.importance == Importance::Fresh {
             self.params.fresh_views
@@ -333,7 +334,7 @@ impl DensityPolicy for Diet {
             let without_room = candidates.len().saturating_sub(plan.room());
             let most = match self.params.growth {
                 Growth::Turnover => {
-                    rows_of_event(self.params.rho, self.grow, now.step, plan.budget())
+                    event_quota(self.params.rho, self.grow, now.step, plan.budget())
                 }
                 Growth::All => usize::MAX,
             };
@@ -357,15 +358,15 @@ const MEAN_GRADIENT: [Signal; 3] =
     [Signal::MeanGradientX, Signal::MeanGradientY, Signal::MeanGradientZ];
 
 impl Diet {
-    /// What to measure in auxiliary views: surface points, weights, both or none.
+    /// The measurements in auxiliary views: surface points, weights, both or none.
     fn aux_request(&self, scene: &SceneInfo) -> Option<AuxRequest> {
         let points = self.surface_points(scene);
         let columns = match self.params.importance {
             Importance::Epochs => Vec::new(),
             Importance::Fresh => vec![AuxColumn::WeightMax],
         };
-        let asks = points > 0 || !columns.is_empty();
-        asks.then(|| AuxRequest { points, columns, ..AuxRequest::default() })
+        let needs_views = points > 0 || !columns.is_empty();
+        needs_views.then(|| AuxRequest { points, columns, ..AuxRequest::default() })
     }
 
     /// The gradient g of every row. Shape: `[rows]`.

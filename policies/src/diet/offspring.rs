@@ -1,4 +1,4 @@
-//! The children of a candidate: a clone, shifted or not, or a split.
+//! The children of a candidate: an optionally shifted clone, or a split.
 
 use super::{CloneOpacity, Diet, DietParams, MEAN_GRADIENT, Shift, Split};
 use crate::adc::{clone_at, split_by, split_long_axis};
@@ -43,7 +43,7 @@ impl Diet {
             Shift::Paper => 1.0,
             Shift::Code => read(Signal::VisibleCount)?.powi(-2),
             Shift::Descent => {
-                // The length of a sum is at most the sum of lengths, but for rounding.
+                // Rounding must not make the sum of lengths less than the length of the sum.
                 let length = sum.iter().map(|v| v * v).sum::<f32>().sqrt();
                 let lengths = read(Signal::MeanGradientNorm)?.max(length);
                 -(self.params.kappa as f32) * read(Signal::ScaleMax)? / lengths

@@ -1,4 +1,4 @@
-//! Tests of the rules of `diet`, each worked out by hand. One piece, as all share one kind of event.
+//! Tests of the rules of `diet`, each worked out by hand. One file, as all tests share one kind of event.
 
 use super::offspring::conserving_scale;
 use super::*;
@@ -6,14 +6,14 @@ use crate::adc::{clone_at, split_by, split_long_axis};
 use crate::event::{Event, Outcome, View, assert_conforms, build, due_steps};
 use crate::plan::{EditCounts, Offspring, OpacityRule, ParentFate, Placement, ScaleRule, Seed};
 use crate::policy::{Candidate, DepthMode, ErrorMode};
-use crate::quota::rows_of_share;
+use crate::quota::share_of_budget;
 
 fn run(event: &Event, set: &str) -> Outcome {
     event.run("diet", set)
 }
 
-/// Old rows of opacity 0.5, seen by four views, of size 0.05: small, as the extent is 10.
-/// Row i has importance i/100.
+/// Old rows of opacity 0.5 and size 0.05 (small, as the extent is 10), seen by four views. Row i has
+/// importance i/100.
 fn event(step: u32, rows: usize, budget: usize) -> Event {
     let importance: Vec<f32> = (0..rows).map(|row| row as f32 / 100.0).collect();
     Event::new(step, rows, budget)
@@ -24,8 +24,8 @@ fn event(step: u32, rows: usize, budget: usize) -> Event {
         .with(Signal::WeightMax, &importance)
 }
 
-/// Screen gradient sums of `rows` rows: those listed get 1, 2, 3, … in this order, others 0.
-fn wanting(rows: usize, listed: &[usize]) -> Vec<f32> {
+/// Screen gradient sums of `rows` rows: 1, 2, 3, … for those listed, in this order, and 0 for the others.
+fn gradient_sums(rows: usize, listed: &[usize]) -> Vec<f32> {
     let mut sums = vec![0.0; rows];
     for (sum, &row) in (1..).zip(listed) {
         sums[row] = sum as f32;
@@ -33,8 +33,8 @@ fn wanting(rows: usize, listed: &[usize]) -> Vec<f32> {
     sums
 }
 
-// `rho` and `rho_c` are for the whole run: a growth at step 600 is the first of 94, an insertion at
-// step 10,500 the first of 9.
+// `rho` and `rho_c` apply to the whole run: growth at step 600 is the first of 94 growth steps, and the
+// insertion at step 10,500 the first of 9.
 
 fn candidate(error: f32, pixel_size: f32) -> Candidate {
     Candidate { position: [error, 0.0, 0.0], colour: [error, 0.5, 1.0], pixel_size, error }
@@ -56,8 +56,9 @@ fn the_gradient_mixes_screen_and_colour() {
 
 #[test]
 fn at_the_budget_the_least_important_are_replaced() {
-    // A tenth of 20: two rows, the least important of rows 0, 1, 2, … that are no candidates.
-    let event = event(600, 20, 20).with(Signal::ScreenGradient, &wanting(20, &[0, 2, 9, 12, 19]));
+    // A tenth of 20: two rows, the least important of the rows that are not candidates.
+    let event =
+        event(600, 20, 20).with(Signal::ScreenGradient, &gradient_sums(20, &[0, 2, 9, 12, 19]));
     let done = run(&event, "rho = 9.4");
     assert_eq!(done.pruned, [1, 3]);
     assert_eq!(done.cloned, [19, 12]);
@@ -75,18 +76,18 @@ fn all_events_together_replace_the_share() {
     let window = Window { from: 500, until: 10_000, every: 100 };
     let parts = |share: f64, window: Window, budget: usize| -> Vec<usize> {
         let steps = (1..=30_000).filter(|&step| window.is_due(step));
-        steps.map(|step| rows_of_event(share, window, step, budget)).collect()
+        steps.map(|step| event_quota(share, window, step, budget)).collect()
     };
     let quarter = parts(0.25, window, 200_000);
     assert_eq!((quarter.len(), quarter.iter().sum()), (94, 50_000));
     assert!(quarter.iter().all(|part| (531..=532).contains(part)));
-    // Less than one per event.
+    // Fewer than one per event.
     assert_eq!(parts(0.25, window, 100).iter().sum::<usize>(), 25);
-    // Products just below the integer that is meant.
-    assert_eq!((rows_of_share(0.29, 100), rows_of_share(0.1, 29)), (29, 2));
+    // Products that rounding puts just below an integer.
+    assert_eq!((share_of_budget(0.29, 100), share_of_budget(0.1, 29)), (29, 2));
     let once = Window { from: 500, until: 601, every: 100 };
     assert_eq!((parts(0.29, once, 100), parts(0.1, once, 29)), (vec![29], vec![2]));
-    assert_eq!(rows_of_event(1.0, window, 650, 100), 0);
+    assert_eq!(event_quota(1.0, window, 650, 100), 0);
 }
 
 #[test]
@@ -95,7 +96,7 @@ fn the_dead_and_the_room_come_first() {
     let mut opacity = [0.5; 19];
     opacity[7] = 0.0049;
     let event = event(600, 19, 20)
-        .with(Signal::ScreenGradient, &wanting(19, &[7, 10, 11, 12, 13, 14]))
+        .with(Signal::ScreenGradient, &gradient_sums(19, &[7, 10, 11, 12, 13, 14]))
         .with(Signal::Opacity, &opacity);
     let done = run(&event, "rho = 9.4");
     assert_eq!(done.pruned, [0, 1, 7]);
@@ -125,16 +126,16 @@ fn huge_rows_are_kept_unless_a_size_limit_is_set() {
 }
 
 #[test]
-fn importance_may_be_that_of_fresh_views() {
-    // By epochs rows 0 and 1 matter least; in the fresh views row 4, a candidate, then 6 and 2.
+fn importance_may_be_measured_in_fresh_views() {
+    // By epochs rows 0 and 1 are least important; in the fresh views row 4, a candidate, then 6 and 2.
     let fresh = [0.3, 0.4, 0.02, 0.5, 0.0, 0.6, 0.01, 0.7];
-    let mut event = event(600, 8, 8).with(Signal::ScreenGradient, &wanting(8, &[4, 7]));
+    let mut event = event(600, 8, 8).with(Signal::ScreenGradient, &gradient_sums(8, &[4, 7]));
     // Each row is in one of two views.
-    let of = |parity: usize| -> Vec<f32> {
+    let weights = |parity: usize| -> Vec<f32> {
         (0..8).map(|row| if row % 2 == parity { fresh[row] } else { 0.0 }).collect()
     };
     let view =
-        |parity| View { columns: vec![(AuxColumn::WeightMax, of(parity))], ..View::default() };
+        |parity| View { columns: vec![(AuxColumn::WeightMax, weights(parity))], ..View::default() };
     event.views = vec![view(0), view(1)];
     assert_eq!(run(&event, "rho = 23.5").pruned, [0, 1]);
     assert_eq!(run(&event, "rho = 23.5\nimportance = \"fresh\"").pruned, [2, 6]);
@@ -154,11 +155,11 @@ fn fresh_views_are_rendered_where_rows_may_be_evicted() {
     assert_eq!([50, 51, 100].map(|rows| wants(600, rows)), [false, true, true]);
     // An insertion adds up to 5.
     assert_eq!([95, 96, 100].map(|rows| wants(10_500, rows)), [false, true, true]);
-    // Pruning is for models that are too large.
+    // Pruning acts only on models above the budget.
     assert_eq!([100, 101].map(|rows| wants(650, rows)), [false, true]);
     let both = build("diet", "importance = \"fresh\"\nrho_c = 1.4\ncompensate_from = 500", &scene);
     assert_eq!([47, 48].map(|rows| both.aux_views(1000, rows, 100)), [0, 100]);
-    // Where all rows are replaced, all views are looked at.
+    // Replacing the model renders all views.
     let replaces = build("diet", "importance = \"fresh\"\nreinit_at = 600", &scene);
     assert_eq!([600, 700].map(|step| replaces.aux_views(step, 100, 100)), [u32::MAX, 100]);
 }
@@ -168,7 +169,7 @@ fn new_rows_are_protected_for_an_epoch() {
     let mut age = [1000.0; 20];
     age[..5].copy_from_slice(&[0.0, 99.0, 100.0, 29.0, 30.0]);
     let mut event = event(600, 20, 20)
-        .with(Signal::ScreenGradient, &wanting(20, &[18, 19]))
+        .with(Signal::ScreenGradient, &gradient_sums(20, &[18, 19]))
         .with(Signal::Age, &age);
     event.scene.train_views = 300;
     assert_eq!(run(&event, "rho = 9.4").pruned, [2, 5]);
@@ -179,10 +180,10 @@ fn new_rows_are_protected_for_an_epoch() {
 }
 
 #[test]
-fn where_all_are_new_the_oldest_are_evicted() {
-    // One is old, three are needed: the old one first, then ages 60, 60 by importance.
+fn if_all_rows_are_new_the_oldest_are_evicted() {
+    // One row is old and three must go: the old one first, then the two of age 60 by importance.
     let event = event(600, 6, 6)
-        .with(Signal::ScreenGradient, &wanting(6, &[5]))
+        .with(Signal::ScreenGradient, &gradient_sums(6, &[5]))
         .with(Signal::Age, &[10.0, 60.0, 60.0, 59.0, 200.0, 0.0]);
     assert_eq!(run(&event, "rho = 47").pruned, [4]);
     let event = Event { budget: 3, ..event };
@@ -282,7 +283,7 @@ fn a_model_too_large_is_cut_to_the_budget() {
 #[test]
 fn rows_pruned_for_the_budget_do_not_grow() {
     // Two of six rows are too many; candidate 0 is one of them, so one eviction is enough.
-    let event = event(600, 6, 4).with(Signal::ScreenGradient, &wanting(6, &[0, 5]));
+    let event = event(600, 6, 4).with(Signal::ScreenGradient, &gradient_sums(6, &[0, 5]));
     let done = run(&event, "rho = 47");
     assert_eq!(done.pruned, [0, 1, 2]);
     assert_eq!((done.cloned, done.ops.counts.denied), (vec![5], 0));
@@ -330,7 +331,8 @@ fn the_size_of_the_code_is_the_squared_geometric_mean() {
 #[test]
 fn growth_pruning_and_insertion_can_fall_on_one_step() {
     // 44 rows, budget 40: four go; three candidates want room, two rows are to be inserted.
-    let mut event = event(1000, 44, 40).with(Signal::ScreenGradient, &wanting(44, &[5, 40, 41]));
+    let mut event =
+        event(1000, 44, 40).with(Signal::ScreenGradient, &gradient_sums(44, &[5, 40, 41]));
     event.candidates = (1..9).map(|i| candidate(i as f32 / 10.0, 0.01)).collect();
     let done = run(&event, "rho = 9.4\nrho_c = 1.4\ncompensate_from = 500");
     assert_eq!(done.ops.cause, "grow+prune+insert");
@@ -357,7 +359,7 @@ fn windows_are_those_of_the_paper() {
 }
 
 #[test]
-fn only_what_is_used_is_asked_for() {
+fn needs_list_only_used_signals() {
     let mut scene = Event::new(1, 1, 1).scene;
     scene.budget = 30_000;
     let needs = |set: &str| build("diet", set, &scene).needs(&scene);
@@ -383,7 +385,7 @@ fn only_what_is_used_is_asked_for() {
     let renders = needs("importance = \"fresh\"");
     assert_eq!(renders.aux.unwrap().columns, [AuxColumn::WeightMax]);
     assert!(full.aux.is_none() && !renders.signals.contains(WeightMax));
-    // Views are no steps: a shorter run renders as many.
+    // The number of views does not scale with the run.
     let short = SceneInfo { iterations: 3000, ..scene.clone() };
     let rendered = |set| build("diet", set, &short).aux_views(100, 1, 0);
     assert_eq!(rendered("importance = \"fresh\""), 100);
@@ -400,7 +402,7 @@ fn only_what_is_used_is_asked_for() {
     assert_eq!(needs("compensate_until = 10000").candidates, None);
 }
 
-/// A view that shows surface points in a row, one unit apart from `from` on.
+/// A view that shows surface points on a line, one unit apart, starting at `from`.
 fn surface(from: f32, count: u32) -> View {
     let point =
         |i: u32| Candidate { position: [from + i as f32, 0.0, 0.0], ..candidate(0.5, 0.01) };
@@ -441,19 +443,19 @@ fn the_model_is_replaced_by_surface_points() {
 }
 
 #[test]
-fn points_that_coincide_and_points_alone_have_a_size() {
+fn coinciding_and_isolated_points_have_a_size() {
     let mut event = event(5000, 3, 10);
     event.scene.train_views = 1;
-    let twice = Candidate { position: [1.0, 2.0, 3.0], ..candidate(0.5, 0.01) };
-    let nowhere = Candidate { position: [f32::NAN; 3], ..twice };
+    let point = Candidate { position: [1.0, 2.0, 3.0], ..candidate(0.5, 0.01) };
+    let nowhere = Candidate { position: [f32::NAN; 3], ..point };
     let scales = |points: Vec<Candidate>| -> Vec<f32> {
         let views = vec![View { points, ..View::default() }];
         let done = run(&Event { views, ..event.clone() }, "reinit_at = 5000");
         done.ops.seeds.iter().map(|(_, seed)| seed.scales[1]).collect()
     };
     // The extent is 10.
-    assert_eq!(scales(vec![twice, twice]), [2e-3, 2e-3]);
-    assert_eq!(scales(vec![twice, nowhere]), [0.2]);
+    assert_eq!(scales(vec![point, point]), [2e-3, 2e-3]);
+    assert_eq!(scales(vec![point, nowhere]), [0.2]);
 }
 
 #[test]

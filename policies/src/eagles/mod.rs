@@ -1,7 +1,7 @@
-//! # eagles — growth on images that grow too, and pruning of the least influential
+//! # eagles — coarse-to-fine images, with pruning of the least influential Gaussians
 //!
-//! Trains on small images first and on larger ones later. Meanwhile the model grows as in `vanilla`, and
-//! every now and then the Gaussians that have contributed least to the images since the last prune go.
+//! Trains on small images first and on larger ones later. The model grows as in `vanilla`, and at long
+//! intervals the Gaussians that have contributed least to the images since the last prune are pruned.
 //!
 //! Source: *EAGLES: Efficient Accelerated 3D Gaussians with Lightweight EncodingS*, Girish, Gupta,
 //! Shrivastava, ECCV 2024, arXiv 2312.04564: its coarse-to-fine training and its pruning by influence, with
@@ -13,34 +13,34 @@
 //!
 //! 1 − (1 − `first_resolution`) · (1 + cos(π · t / `whole_from`)) / 2
 //!
-//! so that the share rises from `first_resolution` to 1, which it is from `whole_from` on. Small images are
-//! quick, and what is grown on them is fewer and smoother Gaussians.
+//! so that the factor rises from `first_resolution` to 1 at step `whole_from`. Small images train faster
+//! and yield fewer and smoother Gaussians.
 //!
-//! **Growth** is that of `vanilla`, with its parameters, later and at longer intervals: clones and splits by
-//! screen gradient, pruning by opacity and size, opacity resets, and a hard stop at the budget (or
+//! **Growth** is that of `vanilla`, with its parameters, but ends later and has longer intervals: clones and
+//! splits by screen gradient, pruning by opacity and size, opacity resets, and a hard stop at the budget (or
 //! `governor`).
 //!
 //! **Pruning.** A Gaussian's influence is the sum of its blend weights α·T over all pixels of the views
-//! trained on since the last prune, or since it was made. Every `prune_every` steps before `prune_until`
-//! those go whose influence is no larger than the quantile `prune_share` of all: interpolated linearly
-//! between the two nearest, as numpy and PyTorch do. Gaussians that the same step has just grown stay.
+//! trained on since the last prune, or since it was created. Every `prune_every` steps before `prune_until`
+//! Gaussians are pruned whose influence is at most the `prune_share` quantile, interpolated linearly as numpy
+//! and PyTorch do. Gaussians that grow in the same step are kept.
 //!
-//! `victims = "random"` draws as many Gaussians at random instead: a control that shows what the
-//! influence is worth.
+//! `victims = "random"` is a control that measures the effect of the criterion: it prunes the same number
+//! at random.
 //!
 //! ## Under a budget
 //!
-//! The budget bounds growth and is never exceeded. What is pruned before `grow_until` is grown anew; the
-//! prunes after it, two with the defaults, leave 1 − `prune_share` of the model each, together 72 %.
+//! The budget bounds growth and is never exceeded. Until `grow_until`, new Gaussians take the place of pruned
+//! ones. Later prunes, two with the defaults, keep 1 − `prune_share` of the model each, together 72 %.
 //!
 //! ## Differences from the published code
 //!
-//! - The paper also encodes colours, rotations and opacities as quantised vectors with small decoders. They
-//!   shrink the file and are no density control; the learning rates that belong to them are left out.
-//! - Images are shrunk by the mean over the area of a pixel, where the published code interpolates between
-//!   four pixels and so skips others. They are not shrunk below 16 pixels a side.
-//! - The code's own defaults are another configuration: `prune_every` = 3000, `prune_share` = 0.05,
-//!   `prune_until` = 24000, growth as in `vanilla`, and whole images (`whole_from` = 0).
+//! - The paper also encodes colours, rotations and opacities as quantised vectors with small decoders. This
+//!   reduces file size and is not part of density control; it is left out, with its learning rates.
+//! - Images are downscaled by averaging over each pixel's area, whereas the published code interpolates
+//!   between four pixels and skips others. They are never downscaled below 16 pixels a side.
+//! - The code's own defaults are a different configuration: `prune_every` = 3000, `prune_share` = 0.05,
+//!   `prune_until` = 24000, growth as in `vanilla`, and full-size images (`whole_from` = 0).
 //! - The last Gaussian is never pruned.
 //!
 //! ## Parameters
@@ -62,11 +62,11 @@
 //! | reset_opacity | 0.01 | 0 to 1, both excluded | | largest opacity after a reset |
 //! | white_reset_at | 500 | >= 0 | step | one more reset, on a white background only; 0: never |
 //! | governor | false | | | grow along a curve instead of by `tau` |
-//! | first_resolution | 0.3 | 0 to 1, 0 excluded | sides | share of the images' sides at the start |
-//! | whole_from | 21000 | >= 0 | step | from here on images are whole; 0: always |
+//! | first_resolution | 0.3 | 0 to 1, 0 excluded | sides | factor on the images' sides at the start |
+//! | whole_from | 21000 | >= 0 | step | start of training on full-size images; 0: always |
 //! | prune_every | 5100 | >= 0 | steps | interval of prunes; 0: never |
 //! | prune_until | 27000 | >= 0 | step | end of prunes (exclusive) |
-//! | prune_share | 0.15 | 0 to 1 | Gaussians | quantile of influence up to which a prune removes |
+//! | prune_share | 0.15 | 0 to 1 | Gaussians | quantile of influence up to which Gaussians are pruned |
 //! | victims | "lowest" | lowest, random | | which Gaussians are pruned |
 //!
 //! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
@@ -85,12 +85,13 @@ use crate::policy::{DensityPolicy, Needs, PolicyResult, SceneInfo, Signal, Snaps
 use crate::prune::Victims;
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
+use crate::sample::quantile;
 use crate::vanilla::{Vanilla, VanillaParams};
 
 crate::register_policy!(
     "eagles",
     Eagles,
-    summary: "growth as in vanilla on images that grow too, and pruning of the least influential",
+    summary: "growth as in vanilla on coarse-to-fine images, and pruning of the least influential",
     source: "EAGLES, Girish et al. 2024, arXiv 2312.04564",
     doc: include_str!("mod.rs"),
 );
@@ -130,7 +131,7 @@ impl Default for EaglesParams {
     }
 }
 
-/// Growth as in `vanilla` on images that grow too, and pruning by influence.
+/// Growth as in `vanilla` on coarse-to-fine images, and pruning by influence.
 #[derive(Debug)]
 pub struct Eagles {
     params: EaglesParams,
@@ -189,24 +190,13 @@ impl DensityPolicy for Eagles {
         }
         let influence: Vec<f32> =
             now.signal(Signal::WeightSum)?.iter().map(|&sum| sum.max(0.0)).collect();
-        let limit = quantile(&influence, self.params.prune_share);
+        let limit = quantile(&influence, self.params.prune_share).unwrap_or(0.0);
         let is_low = |&row: &u32| plan.is_free(row) && f64::from(influence[row as usize]) <= limit;
         let count = (0..plan.rows() as u32).filter(is_low).count();
         self.params.victims.prune(plan, &influence, count, rng);
         plan.reset(Reset::Only([Signal::WeightSum].into()));
         Ok(())
     }
-}
-
-/// The value below which this share of them lies, interpolated linearly between the two nearest; 0 of none.
-fn quantile(values: &[f32], share: f64) -> f64 {
-    let mut sorted = values.to_vec();
-    sorted.sort_unstable_by(f32::total_cmp);
-    let Some(last) = sorted.len().checked_sub(1) else { return 0.0 };
-    let place = share * last as f64;
-    let below = (place.floor() as usize).min(last);
-    let [low, high] = [below, (below + 1).min(last)].map(|at| f64::from(sorted[at]));
-    low + (place - below as f64) * (high - low)
 }
 
 #[cfg(test)]

@@ -3,16 +3,16 @@
 #![expect(clippy::float_cmp, reason = "values are exact, or rounded before they are compared")]
 
 use super::*;
-use crate::event::{Event, Outcome, assert_conforms, build, due_steps};
+use crate::event::{
+    Event, Outcome, assert_conforms, assert_grows_like_vanilla, assert_refused, build, due_steps,
+};
 use crate::parameters::REFERENCE_ITERATIONS;
 use crate::policy::SignalSet;
-use crate::registry::find;
-
 fn run(event: &Event, set: &str) -> Outcome {
     event.run("eagles", set)
 }
 
-/// Rows that neither grow nor die, with this influence.
+/// Rows with this influence; the growth rules neither densify nor prune them.
 fn event(step: u32, influence: &[f32]) -> Event {
     Event::new(step, influence.len(), influence.len())
         .with_all(Signal::VisibleCount, 4.0)
@@ -22,8 +22,8 @@ fn event(step: u32, influence: &[f32]) -> Event {
 }
 
 #[test]
-fn the_lowest_share_of_influence_goes_and_sums_begin_anew() {
-    // The quantile 0.15 of 0..=20 is 3: four rows are no larger.
+fn the_least_influential_are_pruned_and_sums_are_reset() {
+    // The 0.15 quantile of 0..=20 is 3: four rows are at or below it.
     let influence: Vec<f32> = (0..21_u8).rev().map(f32::from).collect();
     let done = run(&event(5100, &influence), "");
     assert_eq!(done.pruned, [17, 18, 19, 20]);
@@ -33,20 +33,13 @@ fn the_lowest_share_of_influence_goes_and_sums_begin_anew() {
     assert!(run(&event(5100, &influence), "prune_share = 0").pruned == [20]);
     // One row is left.
     assert_eq!(run(&event(5100, &influence), "prune_share = 1.0").pruned.len(), 20);
-    // All that no view has shown are equal, and go together.
+    // Rows that no view has shown are equal and are pruned together.
     let unseen = [0.0, 5.0, 0.0, f32::NAN, 0.0, 7.0, 8.0, 9.0];
     assert_eq!(run(&event(5100, &unseen), "").pruned, [0, 2, 3, 4]);
 }
 
 #[test]
-fn quantiles_are_interpolated() {
-    let found = |share| quantile(&[4.0, 1.0, 2.0], share);
-    assert_eq!([0.0, 0.25, 0.5, 0.75, 1.0].map(found), [1.0, 1.5, 2.0, 3.0, 4.0]);
-    assert_eq!((quantile(&[], 0.5), quantile(&[3.0], 0.7)), (0.0, 3.0));
-}
-
-#[test]
-fn images_rise_to_their_size_along_half_a_cosine() {
+fn the_resolution_rises_along_half_a_cosine() {
     let at = |set: &str, step| {
         let policy = build("eagles", set, &Event::new(1, 1, 1).scene);
         (policy.resolution(step) * 1e6).round() / 1e6
@@ -81,22 +74,14 @@ fn the_schedule_is_the_published_one() {
 
 #[test]
 fn growth_is_that_of_vanilla() {
-    // Over 4 views the means are 2e-4, less, and 1e-3; the last row is faint.
-    let event = Event { budget: 9, ..event(625, &[1.0; 4]) }
-        .with(Signal::ScreenGradient, &[8.01e-4, 7.99e-4, 4e-3, 1.0])
-        .with(Signal::ScaleMax, &[0.05, 0.05, 0.2, 0.05])
-        .with(Signal::Opacity, &[0.5, 0.5, 0.5, 0.001]);
-    let theirs = "grow_every = 125\ngrow_until = 18000\nreset_every = 2500\nmax_scale_from = 2500";
-    for set in ["", "tau = 0.0005", "small = 0.03", "governor = true", "min_opacity = 0.6"] {
-        let (ours, theirs) = (run(&event, set), event.run("vanilla", &format!("{theirs}\n{set}")));
-        assert_eq!(ours.ops, theirs.ops, "{set}");
-        assert!(ours.ops.edits_rows(), "{set}");
-    }
+    let defaults =
+        "grow_every = 125\ngrow_until = 18000\nreset_every = 2500\nmax_scale_from = 2500";
+    assert_grows_like_vanilla("eagles", event(625, &[1.0; 4]), defaults);
 }
 
 #[test]
 fn a_prune_passes_over_rows_that_the_same_event_grew() {
-    // The quantile ⅓ of four is 1; rows 0 and 1 are no larger, and row 0 is cloned.
+    // The ⅓ quantile is 1; rows 0 and 1 are at or below it, and row 0 is cloned.
     let event = Event { budget: 9, ..event(625, &[0.5, 1.0, 3.0, 4.0]) }
         .with(Signal::ScreenGradient, &[1.0, 0.0, 0.0, 0.0]);
     let done = run(&event, "prune_every = 625\nprune_share = 0.3333334");
@@ -105,28 +90,27 @@ fn a_prune_passes_over_rows_that_the_same_event_grew() {
 }
 
 #[test]
-fn the_control_prunes_as_many_at_random() {
+fn the_control_prunes_the_same_number_at_random() {
     let influence: Vec<f32> = (0..1000_u16).map(f32::from).collect();
     let done = run(&event(5100, &influence), "victims = \"random\"\nprune_share = 0.5");
     assert_eq!(done.pruned.len(), 500);
-    // Not the lowest: of 1,000 in halves, 250 ± 5·√62.5.
+    // Half of those pruned are in the lower half: 250 ± 5·√62.5.
     let low = done.pruned.iter().filter(|row| **row < 500).count();
     assert!(low.abs_diff(250) < 40, "{low}");
 }
 
 #[test]
 fn bad_parameters_are_named() {
-    for (set, name) in [
-        ("tau = -1.0", "eagles.tau"),
-        ("first_resolution = 0.0", "eagles.first_resolution"),
-        ("first_resolution = nan", "eagles.first_resolution"),
-        ("prune_share = 1.5", "eagles.prune_share"),
-        ("whole_from = -1", "eagles.whole_from"),
-    ] {
-        let built = find("eagles").unwrap().build(&set.parse().unwrap(), &event(1, &[1.0]).scene);
-        let error = built.map(drop).unwrap_err().to_string();
-        assert!(error.contains(name), "{set}: {error}");
-    }
+    assert_refused(
+        "eagles",
+        &[
+            ("tau = -1.0", "eagles.tau"),
+            ("first_resolution = 0.0", "eagles.first_resolution"),
+            ("first_resolution = nan", "eagles.first_resolution"),
+            ("prune_share = 1.5", "eagles.prune_share"),
+            ("whole_from = -1", "eagles.whole_from"),
+        ],
+    );
 }
 
 #[test]

@@ -12,26 +12,27 @@
 //! budget · √((step − `grow_from`) / (`curve_until` − `grow_from`)) Gaussians, at most the budget.
 //! Candidates have an absolute screen gradient of at least `tau`: the norm of the loss gradient with
 //! respect to the projected mean (NDC), with absolute values summed over pixels, averaged over the
-//! views that saw the Gaussian. As many candidates as the curve allows are drawn without replacement,
-//! in proportion to their edge scores. For these, `views` random training views are rendered; in each,
-//! a Gaussian's score is the sum of the edge map over the pixels that it is blended into, divided by
-//! the mean of all Gaussians with a positive sum; the scores of all views are added. At the first
-//! growth after a recovery prune all views are used. After `final_from` the gradient itself is the
-//! score, no view is rendered, and `tau` is divided by `final_divisor`.
+//! views that saw the Gaussian. Candidates are drawn without replacement, in proportion to their edge
+//! scores, until the curve is reached. To compute the scores, `views` random training views are rendered;
+//! in each, a Gaussian's score is the sum of the edge map over the pixels that it is blended into, divided
+//! by the mean of all Gaussians with a positive sum; the scores of all views are added. The first growth
+//! step after a recovery prune uses all views. After `final_from` the gradient itself is the score, no view
+//! is rendered, and `tau` is divided by `final_divisor`.
 //!
 //! A candidate is **split along its longest axis**. With d = `split_share`, two children are placed at
 //! ±3d standard deviations; their longest axis is 1 − d times the parent's, the others √(1 − d²)
 //! times, so that both ends stay in place. Their opacity is the parent's times `child_opacity`.
 //!
-//! **Pruning** follows the splits of the same event. What it frees is used by the next growth, and
-//! Gaussians below the limit may be drawn before. It removes those less opaque than `min_opacity` at each
-//! growth, but none at the last, where nothing would take their place, unless `prune_last` is set. `recover` steps
-//! after each of the first `recoveries` opacity resets it also removes the share `recovery_share` of what
-//! is left, those with the lowest opacity: what has not recovered is not needed. Before all growth, at
-//! step `first_prune_at`, it removes those less opaque than `first_prune_opacity`.
+//! **Pruning** follows the splits of the same step; the next growth step uses the room it makes, and
+//! Gaussians below the opacity limit may be drawn before they are pruned. Each growth step but the last
+//! prunes Gaussians below `min_opacity`; at the last nothing would take their place, so it prunes only with
+//! `prune_last`. `recover` steps after each of the first `recoveries` opacity resets, a recovery prune also
+//! removes the share `recovery_share` of the remaining Gaussians, those with the lowest opacity: a Gaussian
+//! that has not recovered is not needed. Before all growth, at step `first_prune_at`, Gaussians below
+//! `first_prune_opacity` are pruned.
 //!
 //! **Opacity resets** limit opacities to `reset_opacity` every `reset_every` steps, `resets` times in
-//! all, and never from `grow_until` on. Only the recovery prunes end after two resets; the resets do not.
+//! total, and never from `grow_until` on. By default only the first two are followed by a recovery prune.
 //!
 //! **The optimiser** steps at every iteration up to `sum_from`, then once per `sum` iterations, after
 //! `sum_more_from` once per `sum_more`, on the summed gradients. The learning rate of the means falls
@@ -39,18 +40,18 @@
 //!
 //! ## Differences from the published code
 //!
-//! - **`sums`.** The published 5 and 20 give 1,500 + 375 optimiser steps after half of 30,000 iterations,
-//!   but 350 + 88 in a run of 7,000. By default (`"scaled"`) both are multiplied by iterations / 30,000
-//!   and rounded, at least 1, so that a short run has about as many optimiser steps, as far as it has
-//!   iterations; 7,000 gives 1 and 5. `"fixed"` takes them as they are in a run of any length.
-//! - The published code splits, then prunes. A plan has one edit per Gaussian: one that is drawn, and
-//!   whose children would be pruned in the same event, is pruned itself. What is left is the same.
+//! - **`sums`.** The published 5 and 20 give 1,500 + 375 optimiser steps in the second half of 30,000
+//!   iterations, but 350 + 88 in a run of 7,000. By default (`"scaled"`) both are multiplied by
+//!   iterations / 30,000 and rounded, at least 1, so that a short run has about as many optimiser steps if
+//!   it has enough iterations; 7,000 gives 1 and 5. `"fixed"` uses the same values in a run of any length.
+//! - The published code splits, then prunes. A plan has one edit per Gaussian: if a Gaussian is drawn and
+//!   its children would be pruned in the same event, it is pruned itself. The result is the same.
 //! - `recover` counts optimiser steps and does not scale with the length of the run, but is at most half
 //!   the interval of resets, so that the prune comes before the next reset.
 //! - The published code averages gradients from step 500 on; here the first growth averages over all
 //!   steps before it.
-//! - The published code divides edge scores by their mean over all Gaussians; here it is the mean over
-//!   those that the view shows.
+//! - The published code divides edge scores by their mean over all Gaussians; here the mean is over those
+//!   that the view shows.
 //! - The last Gaussian is never pruned.
 //!
 //! ## Parameters
@@ -66,17 +67,17 @@
 //! | split_share | 0.45 | 0 to 1, both excluded | | d of the split |
 //! | child_opacity | 0.6 | 0 to 1, 0 excluded | | factor on the children's opacity |
 //! | final_from | 14500 | >= 0 | step | start of growth by gradient (exclusive) |
-//! | final_divisor | 1.5 | >= 1 | | divides `tau` from then on |
+//! | final_divisor | 1.5 | >= 1 | | divisor of `tau` from then on |
 //! | min_opacity | 0.005 | 0 to 1 | | Gaussians below this opacity are pruned |
-//! | prune_last | false | | | prune at the last growth, too |
-//! | first_prune_at | 300 | >= 0 | step | the first pruning; 0: none |
-//! | first_prune_opacity | 0.02 | 0 to 1 | | opacity limit of the first pruning |
+//! | prune_last | false | | | also prune at the last growth step |
+//! | first_prune_at | 300 | >= 0 | step | step of the first prune; 0: none |
+//! | first_prune_opacity | 0.02 | 0 to 1 | | opacity limit of the first prune |
 //! | reset_every | 3000 | >= 0 | steps | interval of opacity resets; 0: never |
 //! | resets | 4 | >= 0 | | number of opacity resets |
 //! | reset_opacity | 0.05 | 0 to 1, both excluded | | largest opacity after a reset |
-//! | recover | 300 | >= 1 | steps | from a reset to the recovery prune |
-//! | recoveries | 2 | >= 0 | | number of resets that a recovery prune follows |
-//! | recovery_share | 0.2 | 0 to 1 | Gaussians | share that the recovery prune removes; 0: none |
+//! | recover | 300 | >= 1 | steps | steps from a reset to its recovery prune |
+//! | recoveries | 2 | >= 0 | | number of recovery prunes, after the first resets |
+//! | recovery_share | 0.2 | 0 to 1 | Gaussians | share that a recovery prune removes; 0: none |
 //! | sum_from | 15000 | >= 0 | step | start of summed gradients (exclusive) |
 //! | sum | 5 | 1 to 1000 | steps | iterations per optimiser step from then on |
 //! | sum_more_from | 22500 | >= 0 | step | start of longer sums (exclusive) |
@@ -87,8 +88,8 @@
 //! | sh_rest | 0.00025 | > 0 | | learning rate of SH bands 1–3 |
 //!
 //! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
-//! (`…_every`) do not shrink below 100 steps. `recover` does not scale; `sum` and `sum_more` are for a run
-//! of 30,000 even where they are set, unless `sums` is `"fixed"`.
+//! (`…_every`) do not shrink below 100 steps. `recover` does not scale; `sum` and `sum_more` scale even if
+//! they are set, unless `sums` is `"fixed"`.
 
 use crate::adc::{OpacityResets, PruneLimits, Window, mean_over_views, spare_one, split_long_axis};
 use crate::parameters::StepParameter::{self, Interval, Step};
@@ -126,7 +127,7 @@ pub struct Igs {
     score: EdgeScore,
 }
 
-/// Edge scores of the current event. They are not saved: each event starts anew.
+/// Edge scores of the current event. Not saved, as each event starts from zero.
 #[derive(Debug, Default)]
 struct EdgeScore {
     step: u32,
@@ -158,7 +159,7 @@ impl ConfiguredPolicy for Igs {
             grow: Window { from, until, every },
             resets: OpacityResets::new(params.reset_every, resets_until, 0, opacity, scene)?,
             recover: params.recover.min((params.reset_every / 2).max(1)),
-            sums: params.sums_of(scene.iterations),
+            sums: params.scaled_sums(scene.iterations),
             score: EdgeScore::default(),
             params,
         })
@@ -276,12 +277,12 @@ impl Igs {
                 .is_some_and(|reset| reset <= last && self.resets.is_due(reset))
     }
 
-    /// Whether the gradient is the score.
+    /// True if the gradient is the score.
     fn is_final(&self, step: u32) -> bool {
         step > self.params.final_from
     }
 
-    /// What is pruned at `step` before anything is drawn.
+    /// Limits below which rows are pruned at `step` before candidates are drawn.
     fn first_limits(&self, step: u32) -> PruneLimits {
         let first = self.params.first_prune_opacity as f32;
         let min_opacity = if self.is_first_prune(step) { first } else { 0.0 };
@@ -296,7 +297,7 @@ impl Igs {
         (budget as f64 * passed.min(1.0).sqrt()).floor() as usize
     }
 
-    /// The candidates to split, drawn by their scores, as many as the curve allows.
+    /// Draws candidates to split by their scores, as many as the curve allows.
     fn draw(
         &self,
         now: &Snapshot<'_>,
@@ -325,17 +326,17 @@ impl Igs {
         Ok(weighted(&weights, count, rng))
     }
 
-    /// Prunes rows, as if those in `drawn` were already split.
+    /// Prunes rows as if those in `drawn` were already split.
     fn prune(&self, now: &Snapshot<'_>, drawn: &[u32], plan: &mut EditPlan) -> PolicyResult {
         let opacity = now.signal(Signal::Opacity)?;
         let limits = self.first_limits(now.step);
         if self.is_first_prune(now.step) {
             plan.cause("first-prune");
         }
-        // The opacity after the splits, of both children where there are any; NaN: out before them.
-        let is_out = |&opacity: &f32| limits.exceeded(opacity, 0.0);
+        // The opacity after the splits, that of each child for split rows; NaN if pruned before them.
+        let is_pruned = |&opacity: &f32| limits.exceeded(opacity, 0.0);
         let mut after: Vec<f32> =
-            opacity.iter().map(|o| if is_out(o) { f32::NAN } else { *o }).collect();
+            opacity.iter().map(|o| if is_pruned(o) { f32::NAN } else { *o }).collect();
         for &row in drawn {
             after[row as usize] *= self.params.child_opacity as f32;
         }
@@ -358,14 +359,14 @@ impl Igs {
     }
 }
 
-/// The value below which a `share` of the values is: the first, in ascending order, that is not below the
-/// interpolated quantile. Of equal values all or none are below it.
+/// The smallest value that is not below the interpolated `share` quantile. Equal values are either all below
+/// it or all not.
 fn limit_of_share(mut values: Vec<f32>, share: f64) -> f32 {
     if values.is_empty() {
         return 0.0;
     }
     let place = share * (values.len() - 1) as f64;
-    // A product just above an integer counts as this integer: its error is at most 2⁻⁵³ of itself.
+    // A product just above an integer counts as that integer: its relative error is at most 2⁻⁵³.
     let place = (place * (1.0 - f64::EPSILON)).ceil() as usize;
     *values.select_nth_unstable_by(place, f32::total_cmp).1
 }

@@ -7,8 +7,8 @@ use serde::{Deserialize, Serialize};
 use crate::parameters::{REFERENCE_ITERATIONS, in_range};
 use crate::policy::PolicyResult;
 
-/// Most iterations per optimiser step.
-const MOST_SUMMED: u32 = 1000;
+/// Maximum number of iterations per optimiser step.
+const MAX_SUM: u32 = 1000;
 
 /// Parameters of [`Igs`](super::Igs).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -45,13 +45,13 @@ pub struct IgsParams {
     pub sh_rest: f64,
 }
 
-/// What `sum` and `sum_more` are in a run that is not 30,000 iterations long.
+/// The effect of the run's length on `sum` and `sum_more`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Sums {
-    /// In proportion to the run's length, so that the number of optimiser steps stays.
+    /// They are proportional to the run's length, so that the number of optimiser steps stays the same.
     Scaled,
-    /// As they are.
+    /// None.
     Fixed,
 }
 
@@ -91,14 +91,14 @@ impl Default for IgsParams {
 }
 
 impl IgsParams {
-    /// `sum` and `sum_more` in a run of so many iterations.
-    pub(super) fn sums_of(&self, iterations: u32) -> [u32; 2] {
+    /// `sum` and `sum_more` for a run of `iterations`.
+    pub(super) fn scaled_sums(&self, iterations: u32) -> [u32; 2] {
         [self.sum, self.sum_more].map(|sum| match self.sums {
             Sums::Fixed => sum,
             Sums::Scaled => {
                 let exact =
                     f64::from(sum) * f64::from(iterations) / f64::from(REFERENCE_ITERATIONS);
-                exact.round().clamp(1.0, f64::from(MOST_SUMMED)) as u32
+                exact.round().clamp(1.0, f64::from(MAX_SUM)) as u32
             }
         })
     }
@@ -116,8 +116,8 @@ impl IgsParams {
         in_range("first_prune_opacity", self.first_prune_opacity, 0.0..=1.0)?;
         in_range("recover", self.recover.into(), 1.0..)?;
         in_range("recovery_share", self.recovery_share, 0.0..=1.0)?;
-        in_range("sum", self.sum.into(), 1.0..=MOST_SUMMED.into())?;
-        in_range("sum_more", self.sum_more.into(), 1.0..=MOST_SUMMED.into())?;
+        in_range("sum", self.sum.into(), 1.0..=MAX_SUM.into())?;
+        in_range("sum_more", self.sum_more.into(), 1.0..=MAX_SUM.into())?;
         in_range("mean_start", self.mean_start, positive)?;
         in_range("mean_end", self.mean_end, positive)?;
         in_range("sh_rest", self.sh_rest, positive)?;

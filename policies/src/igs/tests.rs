@@ -7,8 +7,8 @@ fn run(event: &Event, set: &str) -> Outcome {
     event.run("igs", set)
 }
 
-/// Rows of opacity 0.5, seen by four views with a mean absolute gradient of 1, with these edge sums
-/// in one auxiliary view.
+/// Rows of opacity 0.5, seen by four views with a mean absolute gradient of 1. One auxiliary view has these
+/// edge sums.
 fn event(step: u32, edges: &[f32], budget: usize) -> Event {
     let mut event = Event::new(step, edges.len(), budget)
         .with_all(Signal::VisibleCount, 4.0)
@@ -31,7 +31,7 @@ fn growth_follows_the_square_root() {
     assert_eq!(done.ops.cause, "grow");
     assert!(!done.ops.reset_signals.is_empty());
     let after = |step| run(&Event { step, ..event.clone() }, "").ops.rows_after;
-    // Not below what there is; the budget at 14,500, and not beyond it. (At the end the gradient decides.)
+    // Never below the current number; at 14,500 the budget, and never beyond it. (Then each row has a child.)
     assert_eq!([after(600), after(2000), after(14_500), after(14_900)], [60, 60, 120, 120]);
     let low = Event { budget: 100, ..event.clone() };
     assert_eq!(run(&Event { step: 14_500, ..low }, "").ops.rows_after, 100);
@@ -72,7 +72,7 @@ fn each_view_has_the_same_weight() {
     score.add(7, &[0.0; 3]);
     score.add(7, &[f32::NAN, -1.0, 0.0]);
     assert_eq!(score.rows, [0.5, 2.0, 1.5]);
-    // What another event has seen is forgotten.
+    // Another event starts from zero.
     score.add(8, &[0.0, 2.0, 0.0]);
     assert_eq!(score.rows, [0.0, 1.0, 0.0]);
 }
@@ -80,10 +80,10 @@ fn each_view_has_the_same_weight() {
 #[test]
 fn draws_follow_the_edges() {
     let edges: Vec<f32> = (0..4000).map(|row| if row % 2 == 0 { 1.0 } else { 9.0 }).collect();
-    // Room for 100 of them: 10 faint ones, within five standard deviations (3 each).
+    // Room for 100 splits, 10 of them of rows with weak edges, within five standard deviations (3 each).
     let split = run(&event(14_400, &edges, 4114), "").split;
-    let faint = split.iter().filter(|row| *row % 2 == 0).count();
-    assert!((90..=110).contains(&split.len()) && faint <= 25, "{faint} of {}", split.len());
+    let weak = split.iter().filter(|row| *row % 2 == 0).count();
+    assert!((90..=110).contains(&split.len()) && weak <= 25, "{weak} of {}", split.len());
 }
 
 #[test]
@@ -94,12 +94,12 @@ fn the_faint_are_pruned_at_each_growth_and_first_at_step_300() {
     assert!(first.split.is_empty() && !first.ops.reset_signals.is_empty());
     let growing = run(&Event { step: 600, ..event.clone() }, "");
     assert_eq!(growing.pruned, [2, 3]);
-    // ⌊100 · √(100/14000)⌋ = 8 may be: all are drawn but what is not a number, and 0.6 · 0.004 goes.
+    // The curve allows ⌊100 · √(100/14000)⌋ = 8: all are drawn except NaN, and 0.6 · 0.004 is pruned.
     assert_eq!((growing.split.len(), growing.ops.counts.denied), (2, 0));
     let all = event.clone().with(Signal::Opacity, &[0.001, 0.002, 0.001, 0.0]);
     assert_eq!(run(&all, "").pruned, [0, 2, 3]);
-    // Where both fall on one step, the first prune comes before the draw.
-    // Two of 24 may be, and it is the one left that is split, not those with edges.
+    // If both fall on one step, the first prune comes before the draw. The curve allows two of 24 rows, and
+    // the one that is left is split, not those with edges.
     let budget = 24;
     let edges = vec![view(&[1e9, 1.0, 1e9, 1e9])];
     let both = Event { step: 600, budget, views: edges, ..event };
@@ -109,16 +109,16 @@ fn the_faint_are_pruned_at_each_growth_and_first_at_step_300() {
 
 #[test]
 fn rows_are_split_before_they_are_pruned() {
-    // ⌊7 · √(3500/14000)⌋ = 3 Gaussians may be at step 4000, as there are: nothing is split, though one
-    // is pruned; its slot is for the next growth.
+    // At step 4000 the curve allows ⌊7 · √(3500/14000)⌋ = 3 Gaussians, as many as there are: nothing is split
+    // although one is pruned; the next growth step uses its slot.
     let faint = event(4000, &[1.0; 3], 7).with(Signal::Opacity, &[0.5, 0.004, 0.5]);
     let done = run(&faint, "");
     assert_eq!((&done.pruned[..], done.split.len(), done.ops.rows_after), (&[1][..], 0, 2));
     assert!(done.ops.reset_signals.is_empty(), "nothing was split");
     let next = event(4000, &[1.0; 2], 7);
     assert_eq!(run(&next, "").split.len(), 1);
-    // ⌊9 · 0.5⌋ = 4: one is drawn, the only one with edges. Its children would have opacities of
-    // 0.6 · 0.0083 < 0.005: it goes, and none of the others takes its place.
+    // ⌊9 · 0.5⌋ = 4: the only row with edges is drawn. Its children would have opacities of
+    // 0.6 · 0.0083 < 0.005, so it is pruned, and no other row is split instead.
     let last = event(4000, &[0.0, 1.0, 0.0], 9);
     let drawn = |opacity: f32| {
         let done = run(&last.clone().with(Signal::Opacity, &[0.5, opacity, 0.5]), "");
@@ -127,22 +127,22 @@ fn rows_are_split_before_they_are_pruned() {
     };
     assert_eq!(drawn(0.0083), (vec![1], vec![], 0));
     assert_eq!(drawn(0.0084), (vec![], vec![1], 0));
-    // One that is below the limit itself is drawn like any other, here in place of nobody.
+    // A row that is below the limit itself is drawn like any other.
     assert_eq!(drawn(0.004), (vec![1], vec![], 0));
 }
 
 #[test]
-fn nothing_is_pruned_at_the_end() {
+fn the_last_growth_step_prunes_nothing() {
     let at = |step, set: &str| {
         let faint = event(step, &[0.0; 2], 9).with(Signal::Opacity, &[0.5, 0.004]);
         run(&faint.with_all(Signal::ScreenGradientAbs, 0.0), set).pruned
     };
     assert_eq!([at(14_800, ""), at(14_900, "")], [vec![1], vec![]]);
     assert_eq!(at(14_900, "prune_last = true"), [1]);
-    // Whatever the length of the run: of 7,000 iterations growth ends before step 3,500.
+    // In a shorter run, of 7,000 iterations, growth ends before step 3,500.
     let short = "grow_until = 3500\ngrow_from = 117";
     assert_eq!([at(3_300, short), at(3_400, short)], [vec![1], vec![]]);
-    // Nor is what is split: 0.6 · 0.004 is kept. A value that is not a number is not.
+    // A split row with children of 0.6 · 0.004 is kept, too. NaN is still pruned.
     let split = event(14_900, &[1.0; 2], 9).with(Signal::Opacity, &[0.004, f32::NAN]);
     let done = run(&split, "");
     assert_eq!((done.pruned, done.split), (vec![1], vec![0]));
@@ -150,11 +150,11 @@ fn nothing_is_pruned_at_the_end() {
 
 #[test]
 fn the_budget_holds_while_rows_are_split_and_pruned() {
-    // All at the budget of 4; the curve is at its end. Nothing is split, one is pruned.
+    // The model is at the budget of 4 and the curve at its end: nothing is split, one row is pruned.
     let full = event(14_600, &[1.0; 4], 4).with(Signal::Opacity, &[0.5, 0.004, 0.5, 0.5]);
     let done = run(&full, "");
     assert_eq!((&done.pruned[..], done.split.len(), done.ops.rows_after), (&[1][..], 0, 3));
-    // Room for one: one of four is split, as pruning comes later, or goes with its children.
+    // Room for one: one of four is split, or pruned if its children would be.
     let room = run(&Event { budget: 5, ..full.clone() }, "");
     assert_eq!((room.pruned, room.ops.counts.denied), (vec![1], 0));
     assert!(room.split.len() <= 1);
@@ -176,7 +176,7 @@ fn a_fifth_is_pruned_after_each_of_two_resets() {
     let one_dead = opacity.map(|o| if o < 0.015 { 0.001 } else { o });
     let one_dead = event.clone().with(Signal::Opacity, &one_dead);
     assert_eq!(run(&one_dead, "").pruned, [1, 4, 7]);
-    // Of equal ones all or none.
+    // Equal opacities are pruned together or not at all.
     let equal = event.clone().with(Signal::Opacity, &opacity.map(|o| o.max(0.03)));
     assert!(run(&equal, "").pruned.is_empty());
     assert!(run(&event, "recovery_share = 0").pruned.is_empty());
@@ -189,15 +189,15 @@ fn a_fifth_is_pruned_after_each_of_two_resets() {
 
 #[test]
 fn the_fifth_is_that_of_the_model_after_the_splits() {
-    // Step 3300: √(2800/14000) = 0.447; ⌊20 · 0.447⌋ = 8: two of six are drawn, those with edges.
+    // Step 3300: √(2800/14000) = 0.447; ⌊20 · 0.447⌋ = 8: the two of six rows with edges are drawn.
     let opacity = [0.9, 0.1, 0.05, 0.3, 0.4, 0.2];
     let event = event(3300, &[0.0, 1.0, 0.0, 0.0, 1.0, 0.0], 20).with(Signal::Opacity, &opacity);
-    // Then there are 0.05, 0.06, 0.06, 0.2, 0.24, 0.24, 0.3, 0.9; place 0.2 · 7 = 1.4, so that all below
-    // the next, 0.06, go: only row 2.
+    // The opacities are then 0.05, 0.06, 0.06, 0.2, 0.24, 0.24, 0.3, 0.9. The quantile is at place
+    // 0.2 · 7 = 1.4; only row 2 is below the next value, 0.06.
     let done = run(&event, "");
     assert_eq!((done.pruned, done.ops.rows_after), (vec![2], 7));
-    // Place 0.3 · 7 = 2.1: below 0.2. Both children of row 1 go, and row 1 in their place.
-    // (Place 0.28 · 7 = 1.96 is below it; were children counted once, 0.28 · 5 = 1.4 would be 0.2 too.)
+    // Place 0.3 · 7 = 2.1: values below 0.2 are pruned, both children of row 1 among them, so row 1 is.
+    // (Place 0.28 · 7 = 1.96 gives 0.06. If children counted once, 0.28 · 5 = 1.4 would give 0.2.)
     assert_eq!(run(&event, "recovery_share = 0.28").pruned, [2]);
     let more = run(&event, "recovery_share = 0.3");
     assert_eq!((more.pruned, more.split), (vec![1, 2], vec![4]));
@@ -206,7 +206,7 @@ fn the_fifth_is_that_of_the_model_after_the_splits() {
 #[test]
 fn the_share_is_cut_at_the_quantile() {
     let eleven: Vec<f32> = (0..11_u8).map(f32::from).collect();
-    // At 2.5 the quantile is between 2 and 3: whatever is below 3 is below it.
+    // At place 2.5 the quantile is between 2 and 3, so the limit is 3.
     let limits: Vec<f32> =
         [0.0, 0.2, 0.25, 1.0].iter().map(|&share| limit_of_share(eleven.clone(), share)).collect();
     assert_eq!(limits, [0.0, 2.0, 3.0, 10.0]);
@@ -280,34 +280,34 @@ fn optimiser_steps(set: &str, iterations: u32) -> [usize; 2] {
     let policy = build("igs", set, &scene);
     let longest = policy.needs(&scene).cadence;
     let count = |from: u32, to: u32| {
-        let of = |step| {
+        let is_due = |step| {
             assert!(policy.cadence(step).is_within(longest), "{step}");
             policy.cadence(step).steps_at(step)[0]
         };
-        (from + 1..=to).filter(|&step| of(step)).count()
+        (from + 1..=to).filter(|&step| is_due(step)).count()
     };
     let quarter = iterations / 4;
     [count(2 * quarter, 3 * quarter), count(3 * quarter, iterations)]
 }
 
 #[test]
-fn a_short_run_has_as_many_optimiser_steps_as_it_can() {
-    // 7500/5 and 7500/20; twice as long, sums of 10 and 40.
+fn the_number_of_optimiser_steps_is_kept_in_short_runs() {
+    // 7500/5 and 7500/20; a run twice as long has sums of 10 and 40.
     assert_eq!(optimiser_steps("", 30_000), [1500, 375]);
     assert_eq!(optimiser_steps("", 60_000), [1500, 375]);
     // 7,000: 5 · 7/30 = 1.17, 20 · 7/30 = 4.67, so 1 and 5: 1750 and 350.
     assert_eq!(optimiser_steps("", 7000), [1750, 350]);
-    // 1.33 becomes 1: as many as there are iterations.
+    // 1.33 becomes 1: a step at every iteration.
     assert_eq!(optimiser_steps("", 2000), [500, 500]);
     assert_eq!(optimiser_steps("", 4), [1, 1]);
     // As published: 1,750/5, and the multiples of 20 from 5,260 to 7,000.
     let fixed = "sums = \"fixed\"";
     assert_eq!(optimiser_steps(fixed, 30_000), [1500, 375]);
     assert_eq!(optimiser_steps(fixed, 7000), [350, 88]);
-    // What is set is for 30,000 too.
+    // Values that are set scale too.
     assert_eq!(optimiser_steps("sum = 30", 7000), [250, 350]);
     assert_eq!(optimiser_steps(&format!("sum = 30\n{fixed}"), 7000), [59, 88]);
-    // Not beyond what a sum may be: 20 · 400 / 3.
+    // 20 · 400 / 3 is clamped to the maximum.
     let scene = SceneInfo { iterations: 4_000_000, ..Event::new(1, 1, 1).scene };
     let long = build("igs", "", &scene);
     assert_eq!(long.needs(&scene).cadence, Cadence { all: 1000, sh_rest: 1 });

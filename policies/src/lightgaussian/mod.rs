@@ -1,7 +1,7 @@
 //! # lightgaussian — growth as in `vanilla`, then pruning by global significance
 //!
 //! Grows a model as `vanilla` does, and at two later steps prunes the Gaussians that contribute least
-//! to all training views together. The rest of the run trains what is left.
+//! to all training views together. The rest of the run trains the remaining Gaussians.
 //!
 //! Source: *LightGaussian: Unbounded 3D Gaussian Compression with 15x Reduction and 200+ FPS*, Fan, Wang,
 //! Wen, Zhu, Xu, Wang, NeurIPS 2024, arXiv 2311.17245, section 3.2, with the constants of its public
@@ -20,35 +20,34 @@
 //! S = V^β · Σ over all training views, Σ over the pixels that the Gaussian is blended into, of o
 //!
 //! with o its opacity, V the product of its three standard deviations and β = `volume_power`. The
-//! published second share is the first, 0.5, times 0.8. With `schedule = "once"`, the share `once_share`
-//! is pruned at `once_at`, the other published form. A share of 0, or a step of 0, switches a prune off;
-//! if both fall on one step, only the first is made.
+//! published second share is the first, 0.5, times 0.8. With `schedule = "once"`, the other published
+//! form, the share `once_share` is pruned at `once_at`. A share of 0, or a step of 0, switches a prune off;
+//! if both prunes fall on one step, only the first takes place.
 //!
-//! - `hit` is what a pixel adds: `opacity`, the opacity o, as in the published code; or `blend-weight`,
-//!   the weight α·T that the Gaussian has there, so that what is hidden behind others counts less. The
-//!   paper has the opacity times the transmittance T; the blend weight also falls off towards the
-//!   Gaussian's rim. The default is what the published figures were made with.
+//! - `hit` is the contribution of a pixel: `opacity`, the opacity o, as in the published code; or
+//!   `blend-weight`, the Gaussian's weight α·T there, so that a Gaussian hidden behind others counts less.
+//!   The paper uses the opacity times the transmittance T; the blend weight also falls off towards the
+//!   Gaussian's edge. The default is that of the published figures.
 //! - `volume` is V: `plain`, as in the published code; or `clipped`, as in the paper, min(V / V90, 1),
-//!   where a tenth of all Gaussians is larger than V90.
-//! - `victims = "random"` draws as many Gaussians at random instead: a control that shows what the
-//!   significance is worth. It renders no view, and up to the first prune it is the same run.
+//!   where V90 is the 90th percentile.
+//! - `victims = "random"` is a control that measures the effect of the criterion: it prunes the same number
+//!   at random. It renders no view, and is identical up to the first prune.
 //!
 //! ## Under a budget
 //!
-//! The budget bounds growth and is never exceeded. Nothing grows after the prunes, so a run ends far
-//! below it: with the defaults at 0.5 · 0.6 = 30 % of what has grown, with `once` at 34 %. At equal
-//! budgets this is compared with models of three times as many Gaussians at the end; compare it by their
-//! final number too.
+//! The budget bounds growth and is never exceeded. Nothing grows after the prunes, so a run ends far below
+//! it: with the defaults at 0.5 · 0.6 = 30 % of the grown model, with `once` at 34 %. Other policies end
+//! with three times as many Gaussians at the same budget, so compare by final number, too.
 //!
 //! ## Differences from the published code
 //!
-//! - The published code divides V by a volume V_ref, that which nine tenths of all Gaussians exceed. As it
-//!   is one number for all, it changes no order, and is left out.
+//! - The published code divides V by a volume V_ref that 90 % of the Gaussians exceed. It is the same for
+//!   all Gaussians and does not change their order, so it is left out.
 //! - ⌊share · N⌋ of N Gaussians are pruned; the published code also prunes those of equal significance.
 //!   The last Gaussian is never pruned.
 //! - Training views that nearly repeat another are not rendered (`--full` renders all).
-//! - The published pipeline goes on with distilled spherical harmonics and quantised vectors. They shrink
-//!   the file of a finished model and are no density control.
+//! - The published pipeline continues with distilled spherical harmonics and quantised vectors. They reduce
+//!   the file size of a finished model and are not part of density control.
 //!
 //! ## Parameters
 //!
@@ -69,7 +68,7 @@
 //! | reset_opacity | 0.01 | 0 to 1, both excluded | | largest opacity after a reset |
 //! | white_reset_at | 500 | >= 0 | step | one more reset, on a white background only; 0: never |
 //! | governor | false | | | grow along a curve instead of by `tau` |
-//! | schedule | "twice" | twice, once | | which of the two published schedules |
+//! | schedule | "twice" | twice, once | | the published schedule |
 //! | first_at | 16000 | >= 0 | step | first prune of `twice`; 0: none |
 //! | first_share | 0.5 | 0 to 1 | Gaussians | share that it removes |
 //! | second_at | 24000 | >= 0 | step | second prune of `twice`; 0: none |
@@ -77,9 +76,9 @@
 //! | once_at | 20000 | >= 0 | step | the prune of `once`; 0: none |
 //! | once_share | 0.66 | 0 to 1 | Gaussians | share that it removes |
 //! | victims | "lowest" | lowest, random | | which Gaussians are pruned |
-//! | hit | "opacity" | opacity, blend-weight | | what a pixel adds to the significance |
-//! | volume | "plain" | plain, clipped | | the volume that the significance has as a factor |
-//! | volume_power | 0.1 | 0 to 1 | | power β of the volume; 0: it does not count |
+//! | hit | "opacity" | opacity, blend-weight | | contribution of a pixel to the significance |
+//! | volume | "plain" | plain, clipped | | volume V in the significance |
+//! | volume_power | 0.1 | 0 to 1 | | power β of the volume; 0: the volume is ignored |
 //!
 //! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
 //! (`…_every`) do not shrink below 100 steps.
@@ -113,7 +112,7 @@ crate::register_policy!(
 pub struct LightGaussian {
     params: LightGaussianParams,
     growth: Vanilla,
-    /// Σ over the views of the event: pixels, or blend weights. Shape: `[rows]`.
+    /// Number of pixels or blend weights, summed over the views of the event. Shape: `[rows]`.
     hits: OverViews,
 }
 
@@ -173,7 +172,7 @@ impl DensityPolicy for LightGaussian {
             let significance = match (self.params.victims, self.hits.take(now)) {
                 (Victims::Random, _) => Vec::new(),
                 (Victims::Lowest, Some(hits)) => self.significance(now, &hits)?,
-                // Without a view nothing is known of any row, and none is pruned.
+                // No view was measured, so nothing is pruned.
                 (Victims::Lowest, None) => return Ok(()),
             };
             self.params.victims.prune(plan, &significance, count, rng);
@@ -183,7 +182,7 @@ impl DensityPolicy for LightGaussian {
 }
 
 impl LightGaussian {
-    /// What is summed over the views.
+    /// The column that is summed over the views.
     fn column(&self) -> AuxColumn {
         match self.params.hit {
             Hit::Opacity => AuxColumn::PixelCount,
@@ -203,20 +202,20 @@ impl LightGaussian {
         }
     }
 
-    /// S of every row, >= 0; 0 where it is not a number. Shape: `[rows]`.
+    /// The significance S of every row, >= 0; 0 in place of NaN. Shape: `[rows]`.
     fn significance(&self, now: &Snapshot<'_>, hits: &[f32]) -> PolicyResult<Vec<f32>> {
         let (opacity, volume) = (now.signal(Signal::Opacity)?, now.signal(Signal::ScaleProduct)?);
         let per_hit = |row: usize| match self.params.hit {
             Hit::Opacity => opacity[row],
-            // Its opacity is in the blend weight.
+            // The blend weight includes the opacity.
             Hit::BlendWeight => 1.0,
         };
         let largest = match self.params.volume {
             Volume::Plain => f32::INFINITY,
-            Volume::Clipped => ninety_percent(volume),
+            Volume::Clipped => percentile_90(volume),
         };
         let significance = |(row, (&hits, &volume)): (usize, (&f32, &f32))| {
-            // `min` would turn NaN into the limit.
+            // `min` would replace NaN by the limit.
             let volume = if volume > largest { largest } else { volume };
             let volume = f64::from(volume).powf(self.params.volume_power);
             let significance = f64::from(hits) * f64::from(per_hit(row)) * volume;
@@ -226,9 +225,9 @@ impl LightGaussian {
     }
 }
 
-/// The volume that a tenth of all rows exceeds: of n in descending order, the one after ⌊n / 10⌋.
-/// Infinite without rows, which then clips nothing.
-fn ninety_percent(volume: &[f32]) -> f32 {
+/// The 90th percentile: of n values in descending order, the one after the first ⌊n / 10⌋. Infinite if there
+/// are no values.
+fn percentile_90(volume: &[f32]) -> f32 {
     let mut sorted = volume.to_vec();
     let larger = sorted.len() / 10;
     if larger >= sorted.len() {

@@ -27,7 +27,7 @@ pub struct LightGaussianParams {
     pub volume_power: f64,
 }
 
-/// When rows are pruned.
+/// The number of prunes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Schedule {
@@ -37,7 +37,7 @@ pub enum Schedule {
     Once,
 }
 
-/// What a pixel adds to the significance of the rows that are blended into it.
+/// The contribution of a pixel to the significance of the rows blended into it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Hit {
@@ -47,13 +47,13 @@ pub enum Hit {
     BlendWeight,
 }
 
-/// The volume that the significance has as a factor.
+/// The volume in the significance.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Volume {
     /// The product of the standard deviations.
     Plain,
-    /// The same, at most the volume that a tenth of all rows exceeds.
+    /// The product of the standard deviations, clipped at its 90th percentile.
     Clipped,
 }
 
@@ -77,7 +77,7 @@ impl Default for LightGaussianParams {
 }
 
 impl LightGaussianParams {
-    /// Checks the ranges of those that are not `vanilla`'s.
+    /// Checks the ranges of the parameters that are not `vanilla`'s.
     pub(super) fn check(&self) -> PolicyResult {
         in_range("first_share", self.first_share, 0.0..=1.0)?;
         in_range("second_share", self.second_share, 0.0..=1.0)?;

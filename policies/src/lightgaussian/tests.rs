@@ -1,18 +1,20 @@
 //! Tests of the rules of `lightgaussian`, each worked out by hand.
 
-#![expect(clippy::float_cmp, reason = "values are carried to the last bit")]
+#![expect(clippy::float_cmp, reason = "values are exact, or rounded before they are compared")]
 
 use super::*;
-use crate::event::{Event, Outcome, View, assert_conforms, build, due_steps};
+use crate::event::{
+    Event, Outcome, View, assert_conforms, assert_grows_like_vanilla, assert_refused, build,
+    due_steps,
+};
 use crate::parameters::REFERENCE_ITERATIONS;
 use crate::policy::SignalSet;
-use crate::registry::find;
 
 fn run(event: &Event, set: &str) -> Outcome {
     event.run("lightgaussian", set)
 }
 
-/// Rows of opacity 0.5 and volume 1 that neither grow nor die, and no view.
+/// Rows of opacity 0.5 and volume 1 and no view; the growth rules neither densify nor prune them.
 fn event(step: u32, rows: usize) -> Event {
     Event::new(step, rows, rows)
         .with_all(Signal::VisibleCount, 4.0)
@@ -21,7 +23,7 @@ fn event(step: u32, rows: usize) -> Event {
         .with_all(Signal::ScaleProduct, 1.0)
 }
 
-/// A view in which the rows are blended into so many pixels, with such sums of blend weights.
+/// A view in which rows are blended into these numbers of pixels, with these sums of blend weights.
 fn view(pixels: &[f32], weights: &[f32]) -> View {
     let columns =
         vec![(AuxColumn::PixelCount, pixels.to_vec()), (AuxColumn::WeightSum, weights.to_vec())];
@@ -44,8 +46,8 @@ fn significance_is_summed_over_all_views() {
 }
 
 #[test]
-fn the_blend_weight_has_the_opacity_in_it() {
-    // Weights 3, 2, 4 of both views; times the opacity row 2 would be lowest with 0.4.
+fn the_blend_weight_is_not_multiplied_by_the_opacity() {
+    // The weights of both views are 3, 2, 4; multiplied by the opacity, row 2 would be lowest with 0.4.
     let mut event = event(16_000, 3).with(Signal::Opacity, &[0.5, 0.9, 0.1]);
     event.views = vec![view(&[9.0; 3], &[1.0, 2.0, 4.0]), view(&[9.0; 3], &[2.0, 0.0, 0.0])];
     assert_eq!(run(&event, "hit = \"blend-weight\"\nfirst_share = 0.34").pruned, [1]);
@@ -70,18 +72,12 @@ fn volume_counts_by_its_tenth_root() {
     assert_eq!(pruned("first_share = 0.5\nvolume_power = 1"), [0, 2]);
 }
 
-/// The significance of the rows of an event with these pixels in its one view.
+/// The significance of the rows of an event with these numbers of pixels in its one view.
 fn significance(event: &Event, set: &str, pixels: &[f32]) -> Vec<f32> {
     let growth = Vanilla::new(Default::default(), &event.scene).unwrap();
     let params: LightGaussianParams = toml::from_str(set).unwrap();
     let policy = LightGaussian { params, growth, hits: OverViews::default() };
-    let set = SignalSet::from([Signal::Opacity, Signal::ScaleProduct]);
-    let mut signals = crate::policy::Signals::zeros(event.rows, set);
-    for (signal, values) in &event.signals {
-        if let Some(column) = signals.get_mut(*signal) {
-            column.copy_from_slice(values);
-        }
-    }
+    let signals = event.signals(SignalSet::from([Signal::Opacity, Signal::ScaleProduct]));
     let (step, scene) = (event.step, &event.scene);
     let now = Snapshot { step, scene, signals: &signals, candidates: &[] };
     policy.significance(&now, pixels).unwrap()
@@ -89,7 +85,7 @@ fn significance(event: &Event, set: &str, pixels: &[f32]) -> Vec<f32> {
 
 #[test]
 fn the_largest_tenth_of_volumes_is_clipped() {
-    // Of twenty volumes two are larger than V90 = 32^10, and count as it: factors 1, 32, 32 and 32
+    // Two of twenty volumes are larger than V90 = 32^10 and are clipped: factors 1, 32, 32 and 32
     // instead of 1, 32, 64 and 128. Pixels 2 · ½ = 1.
     let mut volume = [1.0; 20];
     volume[7] = 32_f32.powi(10);
@@ -102,13 +98,13 @@ fn the_largest_tenth_of_volumes_is_clipped() {
     };
     assert_eq!(at(""), [1.0, 32.0, 64.0, 128.0]);
     assert_eq!(at("volume = \"clipped\""), [1.0, 32.0, 32.0, 32.0]);
-    assert_eq!(ninety_percent(&[1.0, 3.0, 2.0]), 3.0);
-    assert_eq!(ninety_percent(&[1.0, 9.0, 3.0, 2.0, 0.0, 0.0, 0.0, 0.0, 8.0, 0.0]), 8.0);
-    assert!(ninety_percent(&[]).is_infinite());
+    assert_eq!(percentile_90(&[1.0, 3.0, 2.0]), 3.0);
+    assert_eq!(percentile_90(&[1.0, 9.0, 3.0, 2.0, 0.0, 0.0, 0.0, 0.0, 8.0, 0.0]), 8.0);
+    assert!(percentile_90(&[]).is_infinite());
 }
 
 #[test]
-fn what_is_not_a_number_is_pruned_first() {
+fn nan_has_no_significance() {
     let event = event(16_000, 3).with(Signal::ScaleProduct, &[1.0, f32::NAN, 1.0]);
     assert_eq!(significance(&event, "", &[f32::NAN, 4.0, 4.0]), [0.0, 0.0, 2.0]);
 }
@@ -149,19 +145,7 @@ fn prunes_come_after_growth_and_scale_with_the_run() {
 
 #[test]
 fn growth_is_that_of_vanilla() {
-    // Over 4 views the means are 2e-4, less, and 1e-3; the last row is faint.
-    let event = Event { budget: 9, ..event(600, 4) }
-        .with(Signal::ScreenGradient, &[8.01e-4, 7.99e-4, 4e-3, 1.0])
-        .with(Signal::ScaleMax, &[0.05, 0.05, 0.2, 0.05])
-        .with(Signal::Opacity, &[0.5, 0.5, 0.5, 0.001]);
-    for set in ["", "tau = 0.0005", "small = 0.03", "governor = true", "min_opacity = 0.6"] {
-        let (ours, theirs) = (run(&event, set), event.run("vanilla", set));
-        assert_eq!(ours.ops, theirs.ops, "{set}");
-        assert!(ours.ops.edits_rows(), "{set}");
-    }
-    let (ours, theirs) = (find("lightgaussian").unwrap(), find("vanilla").unwrap());
-    assert!(theirs.parameters().iter().all(|p| ours.parameters().contains(p)));
-    assert!(ours.step_parameters().starts_with(theirs.step_parameters()));
+    assert_grows_like_vanilla("lightgaussian", event(600, 4), "");
 }
 
 #[test]
@@ -176,12 +160,12 @@ fn a_prune_passes_over_rows_that_the_same_event_grew() {
 }
 
 #[test]
-fn the_control_prunes_as_many_at_random_and_renders_nothing() {
+fn the_control_prunes_the_same_number_at_random_and_renders_nothing() {
     let event = event(16_000, 1000);
     let random = "victims = \"random\"";
     let done = run(&event, random);
     assert_eq!(done.ops.rows_after, 500);
-    // Not the first or last 500, which would be an order: of 1,000 in halves, 250 ± 5·√62.5.
+    // Half of those pruned are in the first half: 250 ± 5·√62.5.
     let early = done.pruned.iter().filter(|row| **row < 500).count();
     assert!(early.abs_diff(250) < 40, "{early}");
     assert!(run(&Event { step: 24_000, ..event.clone() }, random).pruned != done.pruned);
@@ -201,18 +185,17 @@ fn without_a_view_nothing_is_pruned() {
 
 #[test]
 fn bad_parameters_are_named() {
-    for (set, name) in [
-        ("tau = -1.0", "lightgaussian.tau"),
-        ("first_share = 1.5", "lightgaussian.first_share"),
-        ("reset_opacity = 1.0", "lightgaussian.reset_opacity"),
-        ("grow_every = -1", "lightgaussian.grow_every"),
-        ("victims = \"lowst\"", "lightgaussian.victims"),
-        ("tua = 1.0", "tua"),
-    ] {
-        let built = find("lightgaussian").unwrap().build(&set.parse().unwrap(), &event(1, 1).scene);
-        let error = built.map(drop).unwrap_err().to_string();
-        assert!(error.contains(name), "{set}: {error}");
-    }
+    assert_refused(
+        "lightgaussian",
+        &[
+            ("tau = -1.0", "lightgaussian.tau"),
+            ("first_share = 1.5", "lightgaussian.first_share"),
+            ("reset_opacity = 1.0", "lightgaussian.reset_opacity"),
+            ("grow_every = -1", "lightgaussian.grow_every"),
+            ("victims = \"lowst\"", "lightgaussian.victims"),
+            ("tua = 1.0", "tua"),
+        ],
+    );
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! # mcmc — relocation of dead Gaussians, noise on faint ones
 //!
-//! Moves dead Gaussians to places where others do the work, adds 5 % in a three-hundredth of the run up
+//! Moves dead Gaussians to the positions of living ones, grows the model by 5 % per 1/300 of the run up
 //! to the budget, and lets faint Gaussians explore by adding noise to their means.
 //!
 //! Source: *3D Gaussian Splatting as Markov Chain Monte Carlo*, Kheradmand, Rebain, Sharma, Sun, Tseng,
@@ -13,43 +13,43 @@
 //!
 //! 1. Gaussians with an opacity of at most `min_opacity` are dead. Each is replaced by a copy of a
 //!    living Gaussian, drawn with replacement in proportion to opacity.
-//! 2. The model grows by the factor 1 + `growth`, up to the budget: that many more copies are drawn in
-//!    the same way. An event that stands for n published ones grows by (1 + `growth`)ⁿ; n is 1 in a run
-//!    of 30,000 with the default `grow_every`.
+//! 2. The model grows by the factor 1 + `growth`, up to the budget, by further copies drawn in the same
+//!    way. An event that stands for n published ones grows by (1 + `growth`)ⁿ; n is 1 in a run of 30,000
+//!    with the default `grow_every`.
 //!
 //! A Gaussian drawn n times becomes N = n + 1 equal ones that together render like the original. Each
 //! has the opacity o′ = 1 − (1 − o)^(1/N), at least `min_opacity`, and standard deviations multiplied
 //! by o / Σₖ C(N, k)·(−1)^(k−1)·o′^k/√k, k from 1 to N (equation 9 of the paper with its double sum
 //! evaluated). N is capped at `most_shares` in these formulas. Mean, rotation and colour are copied.
 //!
-//! **In every step** two terms are added to the loss, `opacity_term` · mean opacity and
+//! **At every step** two terms are added to the loss, `opacity_term` · mean opacity and
 //! `scale_term` · mean standard deviation, so that Gaussians which are not needed fade and shrink.
-//! After the optimiser's step every mean moves by Σ·ξ · σ(−`noise_sharpness`·(o − `noise_opacity`)) ·
+//! After the optimiser step every mean moves by Σ·ξ · σ(−`noise_sharpness`·(o − `noise_opacity`)) ·
 //! `noise` · λ, with Σ the Gaussian's covariance, ξ ~ N(0, I) and λ the learning rate of the means at
-//! that step. The factor by which the trainer lengthens the steps of short runs is not part of this λ:
-//! steps are lengthened to follow their gradients further, and noise follows none.
+//! that step. In short runs the trainer increases learning rates; λ is the rate before this increase, which
+//! serves to follow gradients further and does not apply to noise.
 //!
-//! **Learning rates** are the published ones, whatever the trainer's are: means 1.6e-4 falling to
-//! 1.6e-6, log-scales 5e-3, quaternions 1e-3, opacities 0.05, SH band 0 2.5e-3 and bands 1–3 a twentieth
-//! of it. The trainer lengthens all of them in short runs, and `--lr` overrides each.
+//! **Learning rates** are the published ones, independent of the trainer's: means 1.6e-4 falling to
+//! 1.6e-6, log-scales 5e-3, quaternions 1e-3, opacities 0.05, SH band 0 2.5e-3, and bands 1–3 a twentieth
+//! of that. The trainer increases all of them in short runs, and `--lr` overrides each.
 //!
-//! **At the start** all opacities are `start_opacity`, and standard deviations are multiplied by
+//! **At the start** all opacities are set to `start_opacity`, and standard deviations are multiplied by
 //! `start_scale`. Opacities are never reset.
 //!
 //! ## Differences from the published code
 //!
-//! - Relocation and growth are one edit. Both draw by the opacities before the event, and a Gaussian
-//!   drawn by both is shared equally among all its copies. The published code draws for growth by the
-//!   opacities after relocation.
+//! - Relocation and growth are one edit. Both draw by the opacities before the event, and if both draw the
+//!   same Gaussian, all its copies are equal. The published code draws for growth by the opacities after
+//!   relocation.
 //! - All copies start with zero moments and age 0. The published code keeps stale moments in the slots
 //!   of dead Gaussians.
 //! - The published `noise` and `scale_term` depend on the unit of length. Here the unit is the camera
 //!   radius (scene extent / 1.1), as in gsplat's normalised scenes.
-//! - The published code grows by 5 % every 100 steps: 244 events, ×150,000. A run of 2,000 has 16 events,
-//!   which at 5 % each end at twice the initial number, whatever the budget. So `growth` is meant per 100
-//!   steps of a run of 30,000, and an event stands for n = `grow_every` · 300 / iterations of them: 15 in
-//!   that run, where it doubles the model.
-//! - If no Gaussian is alive, nothing is done.
+//! - The published code grows by 5 % every 100 steps: 244 events, ×150,000. A run of 2,000 has 16 events;
+//!   at 5 % each they would only double the model, whatever the budget. `growth` is therefore per 100 steps
+//!   of a run of 30,000, and an event stands for n = `grow_every` · 300 / iterations of them: 15 in a run of
+//!   2,000, where each event doubles the model.
+//! - If no Gaussian is alive, nothing happens.
 //!
 //! ## Parameters
 //!
@@ -79,7 +79,9 @@ use serde::{Deserialize, Serialize};
 use crate::adc::Window;
 use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::parameters::{REFERENCE_ITERATIONS, in_range};
-use crate::plan::{EditPlan, Offspring, OpacityRule, ParentFate, Placement, ScaleRule, UNTURNED};
+use crate::plan::{
+    EditPlan, NO_ROTATION, Offspring, OpacityRule, ParentFate, Placement, ScaleRule,
+};
 use crate::policy::{
     DensityPolicy, LossTerms, Needs, NoiseTerm, PolicyResult, Rate, RateOverrides, SceneInfo,
     Signal, SignalSet, Snapshot, StartRule,
@@ -225,7 +227,7 @@ impl DensityPolicy for Mcmc {
         if dead.len() == now.rows() {
             return Ok(());
         }
-        let target = grown(now.rows(), self.growth).min(plan.budget());
+        let target = grown_rows(now.rows(), self.growth).min(plan.budget());
         let copies = dead.len() + target.saturating_sub(now.rows());
         if !dead.is_empty() {
             plan.cause("relocate");
@@ -241,21 +243,21 @@ impl DensityPolicy for Mcmc {
     }
 }
 
-/// The factor on the number of rows at an event every `every` steps, where `growth` is that of an event
-/// every 100 steps of 30,000; infinite where an event stands for very many.
+/// The factor on the number of rows at events that are `every` steps apart. `growth` is per 100 steps of a
+/// run of 30,000. The factor may overflow to infinity.
 fn growth_of_event(growth: f64, every: u32, iterations: u32) -> f64 {
     let published = f64::from(REFERENCE_ITERATIONS / PUBLISHED_INTERVAL);
     (1.0 + growth).powf(f64::from(every) * published / f64::from(iterations.max(1)))
 }
 
 /// ⌊`growth`·`rows`⌋, at most `usize::MAX`.
-fn grown(rows: usize, growth: f64) -> usize {
-    // A product just below an integer counts as this integer: its error is at most 2⁻⁵³ of itself.
+fn grown_rows(rows: usize, growth: f64) -> usize {
+    // A product just below an integer counts as that integer: its relative error is at most 2⁻⁵³.
     (growth * rows as f64 * (1.0 + f64::EPSILON)).floor() as usize
 }
 
 impl Mcmc {
-    /// Copies of a row that together with it render like the row did.
+    /// Copies of a row that, together with it, render like the original row.
     fn copies(&self, opacity: f32, copies: u32) -> Offspring {
         let members = copies.saturating_add(1);
         let counted = members.min(self.params.most_shares);
@@ -267,7 +269,7 @@ impl Mcmc {
             parent: ParentFate::BecomesChild,
             placement: Placement::Offset([0.0; 3]),
             scale: ScaleRule::Uniform(scale as f32),
-            turn: UNTURNED,
+            turn: NO_ROTATION,
             opacity: if is_exact { OpacityRule::Conserved } else { OpacityRule::Set(share as f32) },
         }
     }
@@ -276,7 +278,7 @@ impl Mcmc {
 /// The opacity, at least `least`, of each of `members` equal rows that replace one of opacity
 /// `opacity`, and the factor on their standard deviations.
 fn share(opacity: f64, members: u32, least: f64) -> (f64, f64) {
-    // Less than 1 also as an f32.
+    // The largest number below 1 as an f32.
     let most = 1.0 - f64::from(f32::EPSILON);
     let opacity = opacity.clamp(0.0, most);
     let share = (1.0 - (1.0 - opacity).powf(1.0 / f64::from(members))).clamp(least, most);

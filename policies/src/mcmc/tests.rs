@@ -12,7 +12,7 @@ fn event(opacity: &[f32], budget: usize) -> Event {
     Event::new(600, opacity.len(), budget).with(Signal::Opacity, opacity)
 }
 
-/// The double sum of the paper, as printed.
+/// The double sum as printed in the paper.
 fn denominator(share: f64, members: u32) -> f64 {
     let binomial =
         |n: u32, k: u32| (0..k).fold(1.0, |c, i| c * f64::from(n - i) / f64::from(i + 1));
@@ -43,7 +43,7 @@ fn two_shares_by_hand() {
     // o = 0.75: o′ = 0.5, 0.75/(1 − 0.25/√2) = 0.911053.
     let (half, scale) = share(0.75, 2, 0.005);
     assert!((half - 0.5).abs() < 1e-12 && (scale - 0.911_053).abs() < 1e-6, "{half} {scale}");
-    // The limits given with the formula: 0.996 at 0.05, 0.81 at 0.99.
+    // Values stated with the formula: 0.996 at 0.05, 0.81 at 0.99.
     assert!((share(0.05, 2, 0.005).1 - 0.996).abs() < 1e-3);
     assert!((share(0.99, 2, 0.005).1 - 0.81).abs() < 5e-3);
     // Clamped from below: 1 − 0.994^½ = 0.003 becomes 0.005.
@@ -85,10 +85,10 @@ fn growth_is_five_percent_up_to_the_budget() {
     assert_eq!(both.ops.cause, "relocate+grow");
     assert_eq!((both.ops.rows_after, both.offspring()[0].children), (3, 2));
     assert!(!run(&event(&opacity, 200), "growth = 0.0").ops.edits_rows());
-    // A model that is too large loses its dead, and gets nothing for them.
+    // If the model is above the budget, dead rows are pruned without replacement.
     let over = run(&event(&[0.001, 0.5, 0.5, 0.001], 2), "");
     assert_eq!((over.pruned, over.ops.rows_after), (vec![0, 3], 2));
-    // No copy is drawn that has no room.
+    // Copies are drawn only if there is room.
     assert_eq!(over.ops.counts.denied, 0);
 }
 
@@ -98,7 +98,7 @@ fn an_event_of_a_short_run_stands_for_several_published_ones() {
     let after = |iterations: u32, set: &str| {
         let mut event = event(&opacity, 100_000);
         event.scene.iterations = iterations;
-        // Within the window of any of these runs.
+        // Step 200 is within the window of all these runs.
         run(&Event { step: 200, ..event }, &format!("grow_from = 0\ngrow_until = 999\n{set}"))
             .ops
             .rows_after
@@ -107,7 +107,7 @@ fn an_event_of_a_short_run_stands_for_several_published_ones() {
     assert_eq!([after(30_000, ""), after(15_000, ""), after(2000, "")], [105, 110, 207]);
     // Intervals grow with longer runs (100 becomes 200), and the growth stays.
     assert_eq!(after(60_000, ""), 105);
-    // Half an interval is half the exponent: √1.21 = 1.1. Twice is its square.
+    // Half the interval halves the exponent: √1.21 = 1.1. Twice the interval squares the factor.
     assert_eq!(after(30_000, "growth = 0.21\ngrow_every = 50"), 110);
     assert_eq!(after(30_000, "growth = 0.21\ngrow_every = 200"), 146);
 }
@@ -117,12 +117,12 @@ fn extreme_growth_fills_the_budget_and_no_more() {
     for (growth, every, iterations) in [(0.05, u32::MAX, 30_000), (1.0, u32::MAX, 1), (1.0, 100, 0)]
     {
         let factor = growth_of_event(growth, every, iterations);
-        assert_eq!(grown(3, factor).min(1000), 1000, "{growth} {every} {iterations}");
+        assert_eq!(grown_rows(3, factor).min(1000), 1000, "{growth} {every} {iterations}");
     }
     for (growth, every) in [(0.0, u32::MAX), (0.5, 0)] {
-        assert_eq!(grown(3, growth_of_event(growth, every, 1)), 3);
+        assert_eq!(grown_rows(3, growth_of_event(growth, every, 1)), 3);
     }
-    // As published, to the bit.
+    // Exactly as published.
     for growth in [0.0, 0.05, 0.1, 1.0] {
         assert_eq!(growth_of_event(growth, 100, 30_000).to_bits(), (1.0 + growth).to_bits());
     }
@@ -132,7 +132,7 @@ fn extreme_growth_fills_the_budget_and_no_more() {
 fn runs_of_2_000_steps_fill_their_budget() {
     let scene = SceneInfo { iterations: 2000, ..Event::new(1, 1, 1).scene };
     let mut policy = build("mcmc", "", &scene);
-    // From 100 rows, 2.0789-fold at each event: 207, 430, 893, 1856, 3858, 8020, and then all.
+    // From 100 rows, 2.0789-fold at each event: 207, 430, 893, 1856, 3858, 8020, then the budget.
     let (mut rows, mut seen) = (100, Vec::new());
     for step in (1..=2000).filter(|&step| build("mcmc", "", &scene).is_due(step)) {
         let event = Event { step, ..event(&vec![0.5; rows], 10_000) };
@@ -158,7 +158,7 @@ fn every_group_has_its_published_rate() {
 }
 
 #[test]
-fn the_opaque_are_drawn_more_often() {
+fn opaque_rows_are_drawn_more_often() {
     let opacity: Vec<f32> = (0..2000).map(|row| if row % 2 == 0 { 0.1 } else { 0.4 }).collect();
     let done = run(&event(&opacity, 4000), "growth = 1.0");
     let (mut faint, mut strong) = (0, 0);
@@ -183,7 +183,7 @@ fn many_copies_count_as_most_shares() {
 }
 
 #[test]
-fn without_the_living_nothing_is_done() {
+fn nothing_happens_if_no_row_is_alive() {
     for opacity in [&[0.001, 0.002][..], &[f32::NAN], &[]] {
         assert!(run(&event(opacity, 9), "").ops.is_empty());
     }

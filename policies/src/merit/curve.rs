@@ -1,12 +1,12 @@
-//! How many rows are born: what the curve still allows, and what is replaced.
+//! The number of new rows per event: those that the curve allows and those that replace others.
 
 use super::{Merit, MeritParams};
 use crate::plan::EditPlan;
 use crate::policy::{PolicyResult, Signal, Snapshot};
-use crate::quota::rows_of_event;
+use crate::quota::event_quota;
 
 impl Merit {
-    /// How many rows the curve allows beyond those that are left.
+    /// Number of rows that the curve allows in addition to those not pruned.
     pub(super) fn missing(&self, step: u32, start: usize, plan: &EditPlan) -> usize {
         let MeritParams { grow_from: from, curve_until: until, .. } = self.params;
         let length = f64::from(until.saturating_sub(from).max(1));
@@ -16,22 +16,22 @@ impl Merit {
         allowed.saturating_sub(plan.rows() - plan.pruned())
     }
 
-    /// How many rows this event replaces.
+    /// Number of rows that this event replaces.
     pub(super) fn turnover(&self, now: &Snapshot<'_>, plan: &EditPlan) -> PolicyResult<usize> {
         let MeritParams { rho, most_rho, replaceable, .. } = self.params;
-        let part = |share| rows_of_event(share, self.events, now.step, plan.budget());
+        let part = |share| event_quota(share, self.events, now.step, plan.budget());
         let importance = now.signal(Signal::WeightMax)?;
         let limit = replaceable as f32 * median(importance);
         let age = self.ages(now)?;
-        let is_needless = |&row: &u32| {
+        let is_unimportant = |&row: &u32| {
             plan.is_free(row) && self.is_old(age, row) && importance[row as usize] < limit
         };
-        let needless = (0..now.rows() as u32).filter(is_needless).count();
-        Ok(needless.min(part(most_rho)).max(part(rho)))
+        let unimportant = (0..now.rows() as u32).filter(is_unimportant).count();
+        Ok(unimportant.min(part(most_rho)).max(part(rho)))
     }
 }
 
-/// The middle of the numbers among these values, the upper one of two; 0 if there is none.
+/// The upper median of the finite values; 0 if there are none.
 fn median(values: &[f32]) -> f32 {
     let mut numbers: Vec<f32> = values.iter().copied().filter(|value| value.is_finite()).collect();
     let middle = numbers.len() / 2;

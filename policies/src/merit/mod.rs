@@ -1,44 +1,45 @@
-//! # merit — replaces what hardly shows, as much as there is of it
+//! # merit — replaces all hardly visible Gaussians
 //!
-//! Fills the budget slowly and then keeps replacing: Gaussians that hardly show anywhere make room for
-//! children of those that photographs pull at from several sides. A scene in which much is badly placed
-//! replaces much, one in which all Gaussians earn their place little.
+//! Fills the budget slowly and keeps replacing: Gaussians that are hardly visible in any view make room for
+//! children of Gaussians that have large gradients in several views. The number of replacements adapts to
+//! the scene: the more Gaussians are badly placed, the more are replaced.
 //!
 //! Source: our own; docs/comparison.md has the figures. The turnover, the gradient with its colour term and the
-//! guard against near views are from *Gaussians on a Diet* (arXiv 2604.20046, our `diet`); the absolute
-//! gradient, splits along the longest axis and the square-root curve from *Improving Densification in 3D
-//! Gaussian Splatting* (Deng et al. 2025, our `igs`).
+//! weighting of near views are from *Gaussians on a Diet* (arXiv 2604.20046, our `diet`); the absolute
+//! gradient, splits along the longest axis and the square-root curve are from *Improving Densification in
+//! 3D Gaussian Splatting* (Deng et al. 2025, our `igs`).
 //!
 //! ## Method
 //!
-//! **Events** come every `grow_every` steps between `grow_from` and `grow_until`.
+//! **Events** take place every `grow_every` steps between `grow_from` and `grow_until`.
 //!
-//! **How many.** The model may have S + (F − S) · √x Gaussians, S those at the start, F the budget and x the
-//! part of the way from `grow_from` to `curve_until`, at most 1. Births fill what is missing; no threshold
-//! holds them back. By default the curve goes on beyond the last event.
+//! **Growth.** The model may have S + (F − S) · √x Gaussians, with S the initial number, F the budget and x
+//! the fraction of the way from `grow_from` to `curve_until`, at most 1. Each event adds Gaussians up to this
+//! number, without a gradient threshold. By default the curve extends beyond the last event.
 //!
-//! Beyond that, Gaussians are replaced: as many as are less important than `replaceable` times the median
-//! importance, and are no newborns. In all events together these are at least `rho` · F, whether there are
-//! so many or not, and at most `most_rho` · F, an equal part in each event. While there is room below the
-//! budget, these births take it and nothing dies for them: so the rest of the budget fills. Importance is the largest
-//! blend weight α·T over all pixels of the training views of the previous and the current epoch.
+//! **Turnover.** Each event also replaces the Gaussians whose importance is below `replaceable` times the
+//! median, except newborns. Over the whole run it replaces at least `rho` · F Gaussians, even if fewer are
+//! below this limit, and at most `most_rho` · F, an equal part at each event. While the model is below the
+//! budget, the new Gaussians use the free room and nothing is pruned for them, so the budget fills faster.
+//! Importance is the largest blend weight α·T over all pixels of the training views of the previous and the
+//! current epoch.
 //!
-//! **Births** go to the Gaussians with the largest g = g_p + `colour_weight` · g_c. g_c is the norm of the loss
+//! **Parents** are the Gaussians with the largest g = g_p + `colour_weight` · g_c. g_c is the norm of the loss
 //! gradient with respect to the colour, g_p that with respect to the projected mean (NDC), with absolute
-//! values summed over pixels where `gradient` is `abs`. Both are averaged over the views since the last event;
-//! views nearer than `full_depth` are weighted by the square of the ratio. Gaussians that fewer than
-//! `least_views` of these views have seen get no children.
+//! values summed over pixels if `gradient` is `abs`. Both are averaged over the views since the last event;
+//! views nearer than `full_depth` are weighted by the square of the ratio. Gaussians seen in fewer than
+//! `least_views` of these views get no children.
 //!
-//! **Deaths.** Gaussians less opaque than `min_opacity` are pruned. Where there is no room for the births, the
-//! least important Gaussians go, parents excepted. Newborns (younger than an epoch, at most `protect` steps)
-//! go only if there are no others, the oldest first.
+//! **Pruning.** Gaussians below `min_opacity` are pruned. If there is no room for new Gaussians, the least
+//! important ones are pruned, but no parents. Newborns (younger than an epoch, at most `protect` steps)
+//! are pruned only if there are no others, the oldest first.
 //!
 //! **Children.** A Gaussian larger than `small` is split along its longest axis: with d = `split_share`, two
 //! halves at ±3d standard deviations, their longest axis 1 − d times the parent's, the others √(1 − d²) times,
-//! their opacity `child_opacity` times the parent's. A smaller one is cloned where it is.
+//! their opacity `child_opacity` times the parent's. A smaller one is cloned in place.
 //!
-//! Each event is one plan that prunes before it grows, so the budget holds at every instant. Opacities are
-//! never reset, the loss has no further terms, and learning rates are the trainer's.
+//! Each event is one plan that prunes before it grows, so the budget holds at all times. Opacities are
+//! never reset, the loss has no additional terms, and learning rates are the trainer's.
 //!
 //! ## Parameters
 //!
@@ -47,14 +48,14 @@
 //! | grow_from | 500 | >= 0 | step | start of events (exclusive) |
 //! | grow_until | 15000 | >= 0 | step | end of events (exclusive) |
 //! | grow_every | 100 | >= 0 | steps | interval of events; 0: never |
-//! | curve_until | 30000 | >= 0 | step | when the curve reaches the budget |
-//! | rho | 0.25 | >= 0 | budget | fewest Gaussians that are replaced in all |
-//! | replaceable | 0.15 | >= 0 | median importance | less important ones are replaced; 0: only `rho` |
-//! | most_rho | 2.0 | >= 0 | budget | most Gaussians that are replaced in all |
-//! | gradient | "abs" | abs, screen | | screen gradient, of absolute values or as it is |
+//! | curve_until | 30000 | >= 0 | step | step at which the curve reaches the budget |
+//! | rho | 0.25 | >= 0 | budget | fewest Gaussians replaced in the whole run |
+//! | replaceable | 0.15 | >= 0 | median importance | less important Gaussians are replaced; 0: only `rho` |
+//! | most_rho | 2.0 | >= 0 | budget | most Gaussians replaced in the whole run |
+//! | gradient | "abs" | abs, screen | | screen gradient, with absolute values or without |
 //! | colour_weight | 30.0 | >= 0 | | weight of the colour gradient; 0: none |
 //! | full_depth | 0.8 | >= 0 | scene extent | nearer views count less in g; 0: all count equally |
-//! | least_views | 3 | >= 0 | views | fewest views of a parent |
+//! | least_views | 3 | >= 0 | views | fewest views that a parent is seen in |
 //! | protect | 100 | 0 to 65535 | steps | longest protection of newborns; 0: none |
 //! | small | 0.01 | >= 0 | scene extent | largest size that is cloned; 0: all are split |
 //! | split_share | 0.45 | 0 to 1, both excluded | | d of the split |
@@ -63,15 +64,17 @@
 //!
 //! ## Ablations
 //!
-//! Slow filling is switched off by `curve_until = 0`, turnover by `rho = 0` and `replaceable = 0`, its measure by
-//! `replaceable = 0` alone, absolute gradients by `gradient = "screen"`, the colour gradient by
-//! `colour_weight = 0`, the guard against near views by `full_depth = 0`, the demand for several views by
-//! `least_views = 0`, clones by `small = 0`, protection by `protect = 0`.
+//! Slow filling is switched off by `curve_until = 0`, turnover by `rho = 0` and `replaceable = 0`, its
+//! adaptation to the scene by `replaceable = 0` alone, absolute gradients by `gradient = "screen"`, the colour
+//! gradient by `colour_weight = 0`, the weighting of near views by `full_depth = 0`, the minimum number of
+//! views by `least_views = 0`, clones by `small = 0`, protection by `protect = 0`.
 //!
 //! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
 //! (`…_every`) do not shrink below 100 steps. `protect` does not scale.
 
-use crate::adc::{Window, clone_at, spare_one, split_long_axis};
+use crate::adc::{
+    Window, add_colour_gradient, clone_at, mean_over_views, spare_one, split_long_axis,
+};
 use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::plan::{EditPlan, Offspring, Reset};
 use crate::policy::{DensityPolicy, Needs, PolicyResult, SceneInfo, Signal, SignalSet, Snapshot};
@@ -81,19 +84,18 @@ use crate::sample::{largest, smallest};
 
 mod curve;
 mod parameters;
-mod score;
 
 pub use parameters::{Gradient, MeritParams};
 
 crate::register_policy!(
     "merit",
     Merit,
-    summary: "replaces what hardly shows, as much as there is of it",
+    summary: "replaces all hardly visible Gaussians",
     source: "our own, docs/comparison.md",
     doc: include_str!("mod.rs"),
 );
 
-/// Births where gradients are large, deaths of what hardly shows.
+/// Growth by gradient, replacing hardly visible rows.
 #[derive(Debug)]
 pub struct Merit {
     params: MeritParams,
@@ -148,7 +150,7 @@ impl DensityPolicy for Merit {
         plan.cause("grow");
         let opacity = now.signal(Signal::Opacity)?;
         let least = self.params.min_opacity as f32;
-        // Also what is not a number.
+        // False for NaN.
         let is_alive = |row: u32| opacity[row as usize] >= least;
         let mut dead: Vec<u32> = (0..now.rows() as u32).filter(|&row| !is_alive(row)).collect();
         spare_one(&mut dead, opacity);
@@ -160,7 +162,7 @@ impl DensityPolicy for Merit {
         let without_room = parents.len().saturating_sub(plan.room());
         self.prune_least(now, plan, &parents, without_room)?;
         for row in parents {
-            // Where there is still no room, the plan counts it as denied.
+            // A refusal is counted by the plan.
             let _ = plan.grow(row, self.offspring(now, row as usize)?);
         }
         plan.reset(Reset::Signals);
@@ -169,14 +171,25 @@ impl DensityPolicy for Merit {
 }
 
 impl Merit {
-    /// Whether a row is old enough to be replaced. `age` is empty where nothing is protected.
+    /// True if a row is old enough to be replaced. `age` is empty if no rows are protected.
     fn is_old(&self, age: &[f32], row: u32) -> bool {
         age.get(row as usize).is_none_or(|age| *age >= self.protected_age)
     }
 
-    /// Ages, if newborns are protected.
+    /// Ages of all rows; empty if no rows are protected.
     fn ages<'a>(&self, now: &Snapshot<'a>) -> PolicyResult<&'a [f32]> {
         if self.protected_age > 0.0 { now.signal(Signal::Age) } else { Ok(&[]) }
+    }
+
+    /// The gradient g of every row, >= 0. Shape: `[rows]`.
+    fn gradient(&self, now: &Snapshot<'_>) -> PolicyResult<Vec<f32>> {
+        let views = now.signal(Signal::VisibleCount)?;
+        let screen = now.signal(self.params.gradient.signal())?;
+        let mut gradient = mean_over_views(screen, views);
+        if self.params.colour_weight > 0.0 {
+            add_colour_gradient(&mut gradient, now, self.params.colour_weight as f32)?;
+        }
+        Ok(gradient)
     }
 
     /// The rows that get children, the largest gradient first.
@@ -189,16 +202,16 @@ impl Merit {
         let gradient = self.gradient(now)?;
         let views = now.signal(Signal::VisibleCount)?;
         let least = self.params.least_views as f32;
-        let may = |row: &u32| {
+        let is_eligible = |row: &u32| {
             let index = *row as usize;
             plan.is_free(*row) && gradient[index] > 0.0 && views[index] >= least
         };
-        let rows: Vec<u32> = (0..now.rows() as u32).filter(may).collect();
+        let rows: Vec<u32> = (0..now.rows() as u32).filter(is_eligible).collect();
         Ok(largest(rows, &gradient, births))
     }
 
-    /// Prunes the `count` least important rows that are no parents; newborns only where there are no
-    /// others, the oldest first.
+    /// Prunes the `count` least important rows that are not parents; newborns only if there are no others,
+    /// the oldest first.
     fn prune_least(
         &self,
         now: &Snapshot<'_>,

@@ -30,13 +30,13 @@ pub struct MeritParams {
     pub min_opacity: f64,
 }
 
-/// Which gradient with respect to the projected mean.
+/// The gradient with respect to the projected mean.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Gradient {
-    /// With absolute values summed over pixels.
+    /// [`Signal::ScreenGradientAbs`].
     Abs,
-    /// Its norm.
+    /// [`Signal::ScreenGradient`].
     Screen,
 }
 
@@ -80,7 +80,7 @@ impl MeritParams {
         in_range("most_rho", self.most_rho, 0.0..)?;
         in_range("colour_weight", self.colour_weight, 0.0..)?;
         in_range("full_depth", self.full_depth, 0.0..)?;
-        // `Signal::Age` saturates there.
+        // `Signal::Age` saturates at 65,535.
         in_range("protect", f64::from(self.protect), 0.0..=65_535.0)?;
         in_range("small", self.small, 0.0..)?;
         in_range("split_share", self.split_share, (Excluded(0.0), Excluded(1.0)))?;

@@ -3,7 +3,7 @@
 use super::*;
 use crate::event::{Event, Outcome, assert_conforms, due_steps};
 
-/// Nothing but the rule in question.
+/// Settings that switch off turnover and the colour gradient.
 const BARE: &str = "rho = 0.0\nreplaceable = 0.0\ncolour_weight = 0.0\n";
 
 fn run(event: &Event, set: &str) -> Outcome {
@@ -12,8 +12,8 @@ fn run(event: &Event, set: &str) -> Outcome {
     event.run("merit", &all.to_string())
 }
 
-/// Old rows of opacity 0.5 and size 0.05 (small, as the extent is 10) that four views saw; each has a larger
-/// gradient and is more important than the one before.
+/// Old rows of opacity 0.5 and size 0.05 (small, as the extent is 10), seen by four views; gradient and
+/// importance rise from row to row.
 fn event(step: u32, rows: usize, budget: usize) -> Event {
     let rising: Vec<f32> = (1..=rows).map(|row| row as f32 / 100.0).collect();
     Event::new(step, rows, budget)
@@ -38,7 +38,7 @@ fn the_curve_fills_the_budget_without_a_threshold() {
     assert_eq!(run(&late, "curve_until = 8500").ops.rows_after, 120);
     let low = Event { budget: 99, ..late };
     assert_eq!(run(&low, "curve_until = 8500").ops.rows_after, 99);
-    // What was pruned is missing too.
+    // Pruned rows are replaced too.
     let mut opacity = vec![0.5; 60];
     opacity[7] = 0.004;
     opacity[9] = f32::NAN;
@@ -46,7 +46,7 @@ fn the_curve_fills_the_budget_without_a_threshold() {
     // Their slots are reused.
     assert_eq!((faint.pruned, faint.ops.rows_after), (vec![7, 9], 100));
     assert_eq!((faint.ops.counts.removed, faint.cloned.len()), (2, 42));
-    // They have no children.
+    // Pruned rows have no children.
     let late = Event { step: 8600, ..event.with(Signal::Opacity, &opacity) };
     let done = run(&late, "curve_until = 8500");
     assert_eq!((done.cloned.len(), done.ops.counts.denied), (58, 0));
@@ -61,8 +61,8 @@ fn events_come_at_their_steps() {
 }
 
 #[test]
-fn what_hardly_shows_is_replaced_as_much_as_there_is_of_it() {
-    // The median of 20 (the upper of two) is 1.0: below 0.3 are rows 0 to 2.
+fn all_unimportant_rows_are_replaced() {
+    // The upper median is 1.0: rows 0 to 2 are below 0.3.
     let mut importance = vec![1.0; 20];
     importance[..4].copy_from_slice(&[0.1, 0.2, 0.29, 0.31]);
     let event = event(600, 20, 20).with(Signal::WeightMax, &importance);
@@ -70,29 +70,29 @@ fn what_hardly_shows_is_replaced_as_much_as_there_is_of_it() {
     let done = run(&event, set);
     assert_eq!((done.pruned, done.cloned), (vec![0, 1, 2], vec![19, 18, 17]));
     assert_eq!((done.ops.rows_after, done.ops.counts.denied), (20, 0));
-    // Of 144 events (600 to 14,900) each has at most 14.4 · 20 / 144 = 2.
+    // Each of the 144 events (600 to 14,900) has at most 14.4 · 20 / 144 = 2.
     let most = run(&event, "replaceable = 0.3\nmost_rho = 14.4");
     assert_eq!(most.pruned, [0, 1]);
-    // At least rho, whether there are so many or not: 36 · 20 / 144 = 5.
+    // At least `rho`, even if fewer are below the limit: 36 · 20 / 144 = 5.
     assert_eq!(run(&event, "replaceable = 0.3\nrho = 36.0").pruned, [0, 1, 2, 3, 4]);
-    // A newborn is no reason to replace more.
+    // Newborns do not count.
     let mut age = vec![1000.0; 20];
     age[1] = 99.0;
     let young = event.clone().with(Signal::Age, &age);
     assert_eq!(run(&young, set).pruned, [0, 2]);
     assert_eq!(run(&young, &format!("{set}\nprotect = 99")).pruned, [0, 1, 2]);
-    // Nor is one that is pruned anyway: it is born anew, beside the two.
+    // Nor do rows that are pruned anyway; these are replaced in addition.
     let mut opacity = vec![0.5; 20];
     opacity[0] = 0.004;
     let faint = run(&event.clone().with(Signal::Opacity, &opacity), set);
     assert_eq!((faint.pruned, faint.ops.rows_after), (vec![0, 1, 2], 20));
-    // NaN is neither below nor counted: the fifth of nine is 1.0.
+    // NaN is not below the limit and not part of the median: the fifth of nine is 1.0.
     importance[9..].fill(f32::NAN);
     assert_eq!(run(&event.with(Signal::WeightMax, &importance), set).pruned, [0, 1, 2]);
 }
 
 #[test]
-fn the_least_important_go_but_no_parents() {
+fn the_least_important_rows_are_pruned_but_no_parents() {
     // The two with the largest gradients are the least important too.
     let mut gradient = vec![0.1; 6];
     gradient[..2].copy_from_slice(&[5.0, 6.0]);
@@ -103,7 +103,7 @@ fn the_least_important_go_but_no_parents() {
     // Newborns only if there are no others, the oldest first.
     let young = event.with(Signal::Age, &[500.0, 500.0, 10.0, 30.0, 20.0, 200.0]);
     assert_eq!(run(&young, "rho = 48.0").pruned, [3, 5]);
-    // An epoch of ten steps is over.
+    // With an epoch of ten steps all rows are old.
     let scene = SceneInfo { train_views: 10, ..young.scene.clone() };
     assert_eq!(run(&Event { scene, ..young }, "rho = 48.0").pruned, [2, 3]);
 }
@@ -122,7 +122,7 @@ fn the_gradient_is_a_mean_with_its_colour_over_enough_views() {
     assert_eq!(one("least_views = 0"), [2]);
     assert_eq!(one("gradient = \"screen\""), [3]);
     let more = Event { budget: 9, ..event.clone() };
-    // What nothing pulls at has no children.
+    // A row without a gradient has no children.
     let all = run(&more, "curve_until = 8500\nleast_views = 0").cloned;
     assert_eq!(all, [2, 0, 1]);
 }
@@ -138,7 +138,7 @@ fn the_small_are_cloned_and_the_large_are_split() {
 }
 
 #[test]
-fn only_what_is_used_is_asked_for() {
+fn needs_list_only_used_signals() {
     let scene = Event::new(1, 10, 10).scene;
     let needs = |set| crate::event::build("merit", set, &scene).needs(&scene);
     assert!((needs("").full_depth - 8.0).abs() < 1e-6);

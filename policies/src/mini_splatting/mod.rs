@@ -1,7 +1,7 @@
-//! # mini-splatting — growth by what views dominate, then sampling by importance
+//! # mini-splatting — splits of dominant Gaussians, then sampling by importance
 //!
-//! Grows a model as `vanilla` does and wherever a Gaussian dominates too many pixels, rebuilds it from
-//! surface points on the way, and then keeps half of it, drawn by importance.
+//! Grows a model as `vanilla` does and also splits Gaussians that dominate too many pixels. Twice it rebuilds
+//! the model from surface points, and later it keeps half of the Gaussians, drawn by importance.
 //!
 //! Source: *Mini-Splatting: Representing Scenes with a Constrained Number of Gaussians*, Fang, Wang, ECCV
 //! 2024, arXiv 2403.14166, with the constants of its public code.
@@ -9,46 +9,46 @@
 //! ## Method
 //!
 //! **Growth** is that of `vanilla`, with its parameters, but without opacity resets (`reset_every` = 0).
-//! Besides, a Gaussian that dominates more than `dominant_share` of a view's pixels, in any view since the
-//! last growth, is split: in these pixels no other Gaussian has a larger blend weight, so that one
-//! Gaussian stands for a whole area, mostly blurred. (Published as more than H·W/5000 pixels.) These splits
-//! follow those of `vanilla`, the largest share first while there is room.
+//! A Gaussian dominates a pixel if no other has a larger blend weight there. One that dominates more than
+//! `dominant_share` of a view's pixels, in any view since the last growth step, covers a whole area and mostly
+//! blurs it, so it is split. (Published as more than H·W/5000 pixels.) These splits follow those of `vanilla`,
+//! the largest share first while there is room.
 //!
 //! **Re-initialisation** at the steps `first_reinit_at` and `second_reinit_at`: the whole model is replaced by
-//! at most `reinit_share` of the budget in surface points, drawn in all training views in proportion to
-//! their opacity. A new Gaussian is as large as the distance to its three nearest neighbours, with opacity
-//! `restart_opacity`. Nothing else grows at these steps.
+//! surface points, at most `reinit_share` of the budget, drawn in all training views in proportion to their
+//! opacity. The size of a new Gaussian is the root mean square distance to its three nearest neighbours, its
+//! opacity `restart_opacity`. Nothing else grows at these steps.
 //!
 //! **Sampling** at step `sample_at`. A Gaussian's importance is the sum of its blend weights α·T over all
-//! pixels of all training views, and 0 if it dominates no pixel of any. (`importance` = "density" divides
-//! the sum of each view by the number of pixels, as published for outdoor scenes.) Of the Gaussians with an
-//! importance above 0 the share `sample_share` is drawn without replacement, in proportion to it, and the
-//! others are pruned. Those that are left restart: round, as large as the distance to their three
-//! nearest neighbours, with opacity `restart_opacity`, the same colour from everywhere, and without
-//! moments of the optimiser. (Published shares: 0.5, and 0.3 for Tanks & Temples and Deep Blending.)
+//! pixels of all training views, or 0 if it dominates no pixel. (`importance` = "density" divides the sum of
+//! each view by the number of pixels, as published for outdoor scenes.) Of the Gaussians with an importance
+//! above 0, the share `sample_share` is drawn without replacement, in proportion to it, and all others are
+//! pruned. The remaining ones restart: round, sized by the distance to their three nearest neighbours, with
+//! opacity `restart_opacity`, without view-dependent colour and without optimiser moments. (Published shares:
+//! 0.5, and 0.3 for Tanks & Temples and Deep Blending.)
 //!
-//! **The cut** at step `cut_at` keeps the most important Gaussians that together have the share `cut_mass` of
-//! the importance, and prunes the others.
+//! **Cut** at step `cut_at`: the most important Gaussians, which together have the share `cut_mass` of the
+//! total importance, are kept and the others pruned.
 //!
 //! The learning rate of opacities is `opacity_rate`.
 //!
-//! `victims = "random"` draws as many at random at both steps: a control that shows what the importance is
-//! worth.
+//! `victims = "random"` is a control that measures the effect of the importance: sampling and cut keep the
+//! same numbers at random.
 //!
 //! ## Under a budget
 //!
-//! The budget bounds growth and is never exceeded. The published code grows to several million and then
-//! prunes; here the budget is the peak. The sampling leaves `sample_share` of the Gaussians that dominate a
-//! pixel, which many do not, and the cut what carries `cut_mass` of the importance. With a budget of 8,000,
-//! runs of 7,000 steps at half size ended at 9 to 22 % of it, 15 % in the mean of six scenes. Compare it by
-//! its final number too.
+//! The budget bounds growth and is never exceeded. The published code grows to several million Gaussians and
+//! then prunes; here the budget is the peak. Sampling keeps `sample_share` of the Gaussians that dominate a
+//! pixel, which many do not, and the cut keeps `cut_mass` of the importance. With a budget of 8,000, runs of
+//! 7,000 steps at half size ended at 9 to 22 % of it, on average 15 % over six scenes. Compare by final
+//! number, too.
 //!
 //! ## Differences from the published code
 //!
-//! - There, learning rates restart their schedule at the first re-initialisation, and view-dependent
-//!   colour is trained from the sampling on only. Here both follow the trainer's schedule.
-//! - A Gaussian has one edit per event: what is cloned is not split as well.
-//! - A restarted Gaussian keeps its orientation, which does not show, as it is round.
+//! - The published code restarts the learning-rate schedule at the first re-initialisation, and trains
+//!   view-dependent colour only after sampling. Here both follow the trainer's schedule.
+//! - A Gaussian has one edit per event: a cloned Gaussian is not split as well.
+//! - A restarted Gaussian keeps its orientation, which has no effect as it is round.
 //! - Training views that nearly repeat another are not rendered (`--full` renders all).
 //! - The last Gaussian is never pruned.
 //!
@@ -71,18 +71,18 @@
 //! | reset_opacity | 0.01 | 0 to 1, both excluded | | largest opacity after a reset |
 //! | white_reset_at | 0 | >= 0 | step | one more reset, on a white background only; 0: never |
 //! | governor | false | | | grow along a curve instead of by `tau` |
-//! | dominant_share | 0.0002 | 0 to 1 | pixels of a view | what a Gaussian may dominate without being split |
+//! | dominant_share | 0.0002 | 0 to 1 | pixels of a view | Gaussians that dominate more than this are split |
 //! | first_reinit_at | 5000 | >= 0 | step | first re-initialisation; 0: none |
 //! | second_reinit_at | 10000 | >= 0 | step | second re-initialisation; 0: none |
 //! | reinit_share | 0.8 | 0 to 1, 0 excluded | budget | most Gaussians after a re-initialisation |
 //! | sample_at | 15000 | >= 0 | step | sampling; 0: none |
-//! | sample_share | 0.5 | 0 to 1 | Gaussians | share that is kept of those with an importance |
-//! | importance | "sum" | sum, density | | sum of blend weights, or that per pixel of a view |
-//! | restart_opacity | 0.1 | 0 to 1, both excluded | | opacity of Gaussians that are new or restart |
+//! | sample_share | 0.5 | 0 to 1 | Gaussians | share kept of the Gaussians with an importance above 0 |
+//! | importance | "sum" | sum, density | | sum of blend weights, or the sum per pixel of each view |
+//! | restart_opacity | 0.1 | 0 to 1, both excluded | | opacity of new and restarted Gaussians |
 //! | cut_at | 20000 | >= 0 | step | the cut; 0: none |
 //! | cut_mass | 0.99 | 0 to 1 | importance | share of the importance that is kept |
 //! | opacity_rate | 0.05 | > 0 | | learning rate of opacities |
-//! | victims | "lowest" | lowest, random | | whether importance decides, or chance |
+//! | victims | "lowest" | lowest, random | | which Gaussians are pruned: the least important or random ones |
 //!
 //! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
 //! (`…_every`) do not shrink below 100 steps.
@@ -96,7 +96,7 @@ use crate::policy::{
     RateOverrides, SceneInfo, Signal, SignalSet, Snapshot,
 };
 use crate::prune::{OverViews, Victims};
-use crate::quota::rows_of_share;
+use crate::quota::share_of_budget;
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
 use crate::sample::{largest, weighted};
@@ -110,7 +110,7 @@ pub use parameters::{Importance, MiniSplattingParams};
 crate::register_policy!(
     "mini-splatting",
     MiniSplatting,
-    summary: "splits what dominates too many pixels, rebuilds from surface points, samples by importance",
+    summary: "splits dominant Gaussians, rebuilds from surface points, samples by importance",
     source: "Mini-Splatting, Fang and Wang 2024, arXiv 2403.14166",
     doc: include_str!("mod.rs"),
 );
@@ -120,10 +120,11 @@ crate::register_policy!(
 pub struct MiniSplatting {
     params: MiniSplattingParams,
     growth: Vanilla,
-    /// Of the event at hand: surface points, importance, pixels dominated. Events start anew, so they are
-    /// not saved.
+    /// Surface points of the current event. This and the next two are not saved, as each event starts from
+    /// zero.
     surface: Vec<Candidate>,
     importance: OverViews,
+    /// Number of pixels that each row dominates.
     dominated: OverViews,
 }
 
@@ -220,7 +221,7 @@ impl DensityPolicy for MiniSplatting {
     }
 }
 
-/// Whether something is to be done at `step`; never where it is to be done at 0.
+/// True if `step` is `at`; a step of 0 means never.
 fn is_at(at: u32, step: u32) -> bool {
     step > 0 && step == at
 }
@@ -230,12 +231,12 @@ impl MiniSplatting {
         is_at(self.params.first_reinit_at, step) || is_at(self.params.second_reinit_at, step)
     }
 
-    /// Most rows after a re-initialisation.
+    /// Maximum number of rows after a re-initialisation.
     fn reinit_rows(&self, budget: usize) -> usize {
-        rows_of_share(self.params.reinit_share, budget)
+        share_of_budget(self.params.reinit_share, budget)
     }
 
-    /// As in `vanilla`, and splits of what dominates too much.
+    /// Grows as `vanilla` does, then splits rows that dominate too many pixels.
     fn grow(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
         self.growth.plan(now, rng, plan)?;
         let share = now.signal(Signal::DominantPixels)?;
@@ -250,16 +251,16 @@ impl MiniSplatting {
         Ok(())
     }
 
-    /// The importance of each row over the views of this event; `None` if none was seen.
+    /// The importance of each row over the views of this event; `None` if no view was measured.
     fn importance(&mut self, now: &Snapshot<'_>) -> Option<Vec<f32>> {
         let dominated = self.dominated.take(now)?;
         let importance = self.importance.take(now)?.into_iter().zip(dominated);
         Some(importance.map(|(sum, pixels)| if pixels > 0.0 { sum } else { 0.0 }).collect())
     }
 
-    /// Draws the rows that stay, and lets them restart.
+    /// Draws the rows to keep and restarts them.
     fn sample(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
-        // Without a view nothing is known of any row.
+        // No view was measured, so nothing is pruned.
         let Some(importance) = self.importance(now) else { return Ok(()) };
         let positions = now.positions()?;
         let is_sound = |row: usize| positions[row].iter().all(|x| x.is_finite());
@@ -280,28 +281,28 @@ impl MiniSplatting {
         kept.sort_unstable();
         plan.cause("sample");
         plan.prune_all((0..now.rows() as u32).filter(|row| kept.binary_search(row).is_err()));
-        let of_kept: Vec<_> =
+        let kept_positions: Vec<_> =
             kept.iter().map(|&row| positions[row as usize].map(f64::from)).collect();
         let opacity = self.params.restart_opacity as f32;
-        for (row, size) in kept.into_iter().zip(sizes(&of_kept, now.scene.extent)) {
+        for (row, size) in kept.into_iter().zip(sizes(&kept_positions, now.scene.extent)) {
             let _ = plan.update(row, Update::restart(size, opacity));
         }
         plan.reset(Reset::Signals);
         Ok(())
     }
 
-    /// Prunes the least important rows that together have no more than what `cut_mass` leaves.
+    /// Prunes the least important rows, which together have at most 1 − `cut_mass` of the importance.
     fn cut(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) {
         let Some(importance) = self.importance(now) else { return };
         let total: f64 = importance.iter().map(|&value| f64::from(value)).sum();
         let mut ascending: Vec<f64> = importance.iter().map(|&value| f64::from(value)).collect();
         ascending.sort_unstable_by(f64::total_cmp);
         let mut left = (1.0 - self.params.cut_mass) * total;
-        let count = ascending.iter().take_while(|&&value| {
+        let pruned = ascending.iter().take_while(|&&value| {
             left -= value;
             left >= 0.0
         });
-        let count = count.count();
+        let count = pruned.count();
         self.params.victims.prune(plan, &importance, count, rng);
     }
 }

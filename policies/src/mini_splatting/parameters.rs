@@ -30,13 +30,13 @@ pub struct MiniSplattingParams {
     pub victims: Victims,
 }
 
-/// How the importance of a view is measured.
+/// The importance of a row in one view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Importance {
     /// Sum of the blend weights.
     Sum,
-    /// That divided by the number of pixels.
+    /// Sum of the blend weights, divided by the number of pixels.
     Density,
 }
 
@@ -61,7 +61,7 @@ impl Default for MiniSplattingParams {
 }
 
 impl MiniSplattingParams {
-    /// Checks ranges; those of growth are checked where it is made.
+    /// Checks the ranges of the parameters that are not `vanilla`'s.
     pub(super) fn check(&self) -> PolicyResult {
         let inside = (Excluded(0.0), Excluded(1.0));
         in_range("dominant_share", self.dominant_share, 0.0..=1.0)?;

@@ -1,17 +1,16 @@
 //! Tests of the rules of `mini-splatting`, each worked out by hand.
 
-#![expect(clippy::float_cmp, reason = "values are carried to the last bit")]
+#![expect(clippy::float_cmp, reason = "values are copied without rounding")]
 
 use super::*;
-use crate::event::{Event, Outcome, View, assert_conforms, build, due_steps};
+use crate::event::{Event, Outcome, View, assert_conforms, assert_refused, build, due_steps};
 use crate::plan::{OpacityRule, ScaleRule};
-use crate::registry::find;
 
 fn run(event: &Event, set: &str) -> Outcome {
     event.run("mini-splatting", set)
 }
 
-/// Rows of opacity 0.5 along a line, one unit apart, that neither grow nor die by themselves.
+/// Rows of opacity 0.5 along a line, one unit apart; the growth rules neither densify nor prune them.
 fn event(step: u32, rows: usize) -> Event {
     let line: Vec<f32> = (0..rows).flat_map(|row| [row as f32, 0.0, 0.0]).collect();
     Event::new(step, rows, rows)
@@ -21,7 +20,7 @@ fn event(step: u32, rows: usize) -> Event {
         .with(Signal::Position, &line)
 }
 
-/// A view with these sums of weights, pixels blended into, and pixels dominated.
+/// A view with these sums of weights, numbers of pixels blended into, and numbers of pixels dominated.
 fn view(weights: &[f32], pixels: &[f32], dominated: &[f32]) -> View {
     let columns = [
         (AuxColumn::WeightSum, weights),
@@ -35,7 +34,7 @@ fn view(weights: &[f32], pixels: &[f32], dominated: &[f32]) -> View {
 }
 
 #[test]
-fn what_dominates_too_many_pixels_is_split() {
+fn dominant_rows_are_split() {
     let event = Event { budget: 9, ..event(600, 4) }
         // H·W/5000 is 2e-4 of the pixels; row 3 grows by its gradient and is not split as well.
         .with(Signal::DominantPixels, &[1.99e-4, 2.01e-4, 0.5, 0.6])
@@ -94,14 +93,14 @@ fn the_model_is_replaced_by_surface_points() {
     assert!(done.ops.families.is_empty() && done.ops.cause == "reinit");
     assert!(done.ops.seeds.iter().all(|(_, seed)| seed.opacity == 0.1));
     assert_eq!(run(&event, "reinit_share = 0.4").ops.rows_after, 4);
-    // Without points, and at another step, it is kept.
+    // Without points, and at other steps, the model is kept.
     assert!(run(&Event { views: Vec::new(), ..event.clone() }, "").ops.is_empty());
     assert!(!run(&Event { step: 5100, ..event }, "").cloned.is_empty());
 }
 
 #[test]
-fn half_of_what_has_an_importance_stays_and_restarts() {
-    // Row 1 dominates nothing, row 4 is nowhere: three have an importance, of which ⌊1.5⌋ = 1 stays.
+fn half_of_the_rows_with_an_importance_are_kept_and_restarted() {
+    // Row 1 dominates nothing and row 4 has no weight: three have an importance, of which ⌊1.5⌋ = 1 is kept.
     let mut event = event(15_000, 5);
     event.views = vec![
         view(&[5.0, 9.0, 0.0, 0.0, 0.0], &[5.0; 5], &[1.0, 0.0, 0.0, 0.0, 0.0]),
@@ -119,7 +118,7 @@ fn half_of_what_has_an_importance_stays_and_restarts() {
     let ScaleRule::Set(size) = all.ops.updates[0].1.scale else { panic!("{:?}", all.ops.updates) };
     assert!((size - 6.5_f32.sqrt()).abs() < 1e-6, "{size}");
     assert!(!all.ops.reset_signals.is_empty());
-    // Without a view nothing is known.
+    // Without a view nothing is pruned.
     assert!(run(&Event { views: Vec::new(), ..event }, "").ops.is_empty());
 }
 
@@ -145,7 +144,7 @@ fn the_cut_leaves_ninety_nine_percent_of_the_importance() {
 }
 
 #[test]
-fn the_control_keeps_as_many_at_random() {
+fn the_control_keeps_the_same_number_at_random() {
     // 300 of 1,000 have an importance.
     let weights: Vec<f32> = (0..1000).map(|row| if row < 300 { 1.0 } else { 0.0 }).collect();
     let mut event = event(15_000, 1000);
@@ -162,20 +161,17 @@ fn the_control_keeps_as_many_at_random() {
 
 #[test]
 fn numbers_out_of_range_are_refused_by_name() {
-    let scene = Event::new(1, 1, 1).scene;
-    for (name, value) in [
-        ("dominant_share", 1.1),
-        ("reinit_share", 0.0),
-        ("sample_share", -0.1),
-        ("restart_opacity", 0.999_999_99),
-        ("cut_mass", 1.5),
-        ("opacity_rate", 0.0),
-    ] {
-        let set = format!("{name} = {value:?}").parse().unwrap();
-        let refused = find("mini-splatting").unwrap().build(&set, &scene);
-        let message = refused.map(|_| ()).unwrap_err().to_string();
-        assert!(message.contains(name), "{name}: {message}");
-    }
+    assert_refused(
+        "mini-splatting",
+        &[
+            ("dominant_share = 1.1", "dominant_share"),
+            ("reinit_share = 0.0", "reinit_share"),
+            ("sample_share = -0.1", "sample_share"),
+            ("restart_opacity = 0.99999999", "restart_opacity"),
+            ("cut_mass = 1.5", "cut_mass"),
+            ("opacity_rate = 0.0", "opacity_rate"),
+        ],
+    );
 }
 
 #[test]

@@ -1,7 +1,7 @@
-//! What a policy declares: the statistics it reads, and changes to initialisation, loss and optimiser.
+//! The declarations of a policy: the statistics it reads, and changes to initialisation, loss and optimiser.
 //!
-//! The trainer and the backend act on these declarations without knowing the policy. What is not
-//! declared is neither computed nor allocated.
+//! The trainer and the backend act on these declarations without knowing the policy. Nothing else is
+//! computed or allocated.
 
 mod pixels;
 mod rates;
@@ -16,7 +16,7 @@ pub use pixels::{
 pub use rates::{Cadence, Fade, Rate, RateOverrides};
 pub use terms::{LossTerms, MaskTerm, NoiseTerm};
 
-/// What a policy reads, and how it wants the model initialised and trained.
+/// The inputs of a policy, and its changes to initialisation and training.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Needs {
     /// Per-row statistics.
@@ -26,45 +26,43 @@ pub struct Needs {
     /// views count equally.
     ///
     /// Gaussians near a camera have large screen gradients but appear in few other views; growing them
-    /// mostly produces floaters that explain one photograph (*Pixel-GS*, Zhang et al. 2024,
-    /// section 3.3).
+    /// mostly produces floaters that fit a single photograph (*Pixel-GS*, Zhang et al. 2024, section 3.3).
     pub full_depth: f32,
-    /// How the errors of pixels add up to [`Signal::ErrorScore`].
+    /// The sum of pixel errors that is [`Signal::ErrorScore`].
     pub error_score: ErrorScore,
     /// Pixels to collect as candidates for new rows, if any.
     pub candidates: Option<CandidateRequest>,
-    /// What is measured in [auxiliary views](crate::policy::DensityPolicy::observe), if any.
+    /// Measurements in [auxiliary views](crate::policy::DensityPolicy::observe), if any.
     pub aux: Option<AuxRequest>,
-    /// Terms added to the training loss, unless the policy has
-    /// [others](crate::policy::DensityPolicy::loss_terms) for a step.
+    /// Terms added to the training loss; the policy may [vary](crate::policy::DensityPolicy::loss_terms) them
+    /// by step.
     pub loss_terms: LossTerms,
-    /// Noise on the means after each optimiser step, unless the policy has
-    /// [another](crate::policy::DensityPolicy::noise) for a step.
+    /// Noise on the means after each optimiser step; the policy may
+    /// [vary](crate::policy::DensityPolicy::noise) it by step.
     pub noise: Option<NoiseTerm>,
-    /// A number per row that learns whether the row is worth its place, if any.
+    /// A learned mask per row, if any.
     pub mask: Option<MaskTerm>,
     /// Longest [cadence](crate::policy::DensityPolicy::cadence) of the run. Above 1, gradients are
     /// summed between optimiser steps, and the sums need memory.
     pub cadence: Cadence,
-    /// Smallest [share of their sides](crate::policy::DensityPolicy::resolution) that training images are
-    /// ever shrunk to, in (0, 1]; `None`: they are always whole, and no memory is set aside for smaller
-    /// ones.
+    /// Smallest [factor](crate::policy::DensityPolicy::resolution) on the sides of training images in the run,
+    /// in (0, 1]. `None`: images are always full-size, and no memory is reserved for smaller ones.
     pub least_resolution: Option<f64>,
-    /// Learning rates that replace the trainer's defaults, but not what the user sets.
+    /// Learning rates that replace the trainer's defaults, but not the user's settings.
     pub rates: RateOverrides,
     /// Changes to the initial rows.
     pub start: StartRule,
-    /// Whether plans hold edits that take more memory: rows rewritten in place
-    /// ([`EditPlan::update`](crate::plan::EditPlan::update)), children that are turned, or whose scales
-    /// change by axis ([`ScaleRule::Axes`](crate::plan::ScaleRule::Axes)).
+    /// True if plans hold edits that take more memory: rows rewritten in place
+    /// ([`EditPlan::update`](crate::plan::EditPlan::update)), and children that are rotated or whose scales
+    /// are set or change by axis ([`ScaleRule::Axes`](crate::plan::ScaleRule::Axes)).
     pub detailed_edits: bool,
 }
 
 impl Needs {
-    /// Checks that images may be shrunk to this share of their sides at a step.
+    /// Checks that this factor on the sides of images is within the declared range.
     ///
     /// # Errors
-    /// When it is not a number, above 1 or below what was declared, with both.
+    /// When it is NaN, above 1 or below the declared one; the message has both.
     pub fn check_resolution(&self, share: f64) -> Result<(), String> {
         let least = self.least_resolution.unwrap_or(1.0);
         if (least..=1.0).contains(&share) {
@@ -78,7 +76,7 @@ impl Needs {
     /// # Errors
     /// The first that is not, with its value.
     pub fn check(&self) -> Result<(), String> {
-        finite("full_depth", self.full_depth.into(), 0.0)?;
+        at_least("full_depth", self.full_depth.into(), 0.0)?;
         self.error_score.check()?;
         self.loss_terms.check()?;
         self.noise.map_or(Ok(()), |noise| noise.check())?;
@@ -86,7 +84,7 @@ impl Needs {
             Some(mask) => {
                 mask.check()?;
                 if self.cadence.all > 1 {
-                    return Err("masks step with every view: cadence.all must be 1".to_owned());
+                    return Err("masks are updated at every view: cadence.all must be 1".to_owned());
                 }
             }
             None if self.signals.contains(Signal::Mask) => {
@@ -95,15 +93,15 @@ impl Needs {
             None => {}
         }
         if let Some(aux) = &self.aux {
-            finite("aux.map.error", aux.map.error.into(), 0.0)?;
-            finite("aux.map.edge", aux.map.edge.into(), 0.0)?;
+            at_least("aux.map.error", aux.map.error.into(), 0.0)?;
+            at_least("aux.map.edge", aux.map.edge.into(), 0.0)?;
         }
         if let Some(least) = self.least_resolution.filter(|least| !(*least > 0.0 && *least <= 1.0))
         {
             return Err(format!("least_resolution is {least}; it must be above 0 and at most 1"));
         }
-        finite("cadence.all", self.cadence.all.into(), 1.0)?;
-        finite("cadence.sh_rest", self.cadence.sh_rest.into(), 1.0)?;
+        at_least("cadence.all", self.cadence.all.into(), 1.0)?;
+        at_least("cadence.sh_rest", self.cadence.sh_rest.into(), 1.0)?;
         self.rates.check()?;
         above_zero("start.scale", self.start.scale.into())?;
         match self.start.opacity {
@@ -115,7 +113,7 @@ impl Needs {
     }
 }
 
-fn finite(name: &str, value: f64, least: f64) -> Result<(), String> {
+fn at_least(name: &str, value: f64, least: f64) -> Result<(), String> {
     if value.is_finite() && value >= least {
         return Ok(());
     }
@@ -132,7 +130,7 @@ fn above_zero(name: &str, value: f64) -> Result<(), String> {
 /// Changes to the initial rows.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct StartRule {
-    /// Opacity of all rows, in (0, 1); `None` leaves the trainer's.
+    /// Opacity of all rows, in (0, 1); `None`: the trainer's.
     pub opacity: Option<f32>,
     /// Factor on all standard deviations, > 0.
     pub scale: f32,

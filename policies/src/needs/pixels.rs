@@ -1,44 +1,44 @@
-//! What policies want to know of pixels: candidates for new rows, error scores, auxiliary views.
+//! Statistics of pixels that policies can request: candidates for new rows, error scores, auxiliary views.
 
 use serde::{Deserialize, Serialize};
 
-use super::finite;
+use super::at_least;
 use crate::signals::AuxColumn;
 
-/// How the errors of pixels add up to [`Signal::ErrorScore`](crate::policy::Signal::ErrorScore). A view adds
+/// The sum of pixel errors that is [`Signal::ErrorScore`](crate::policy::Signal::ErrorScore). A view adds
 ///
 /// (Σ w·M(p) / (Σ w)^`footprint`)^`view_power`, with M(p) = e(p)^`power` · (1 + `edge` · g(p) / ḡ),
 ///
-/// both sums over the pixels p that the row is blended into, w its blend weight α·T there and e the error of
-/// the pixel that `map` names. g is the 8-neighbour Laplacian of the photograph's 8-bit luma, clipped to
-/// 0..255, and ḡ its mean over the view (in a view without edges all weigh the same).
+/// both sums over the pixels p that the row is blended into, with w its blend weight α·T there and e the
+/// pixel's error according to `map`. g is the 8-neighbour Laplacian of the photograph's 8-bit luma, clipped
+/// to 0..255, and ḡ its mean over the view (in a view without edges all pixels weigh the same).
 ///
-/// The default is Σ w·e. A power above 1 looks at the worst pixels, a footprint of 1 at the mean error
-/// whatever the row's size, and a view power below 1 at rows that many views complain of.
+/// The default is Σ w·e. A power above 1 emphasises the worst pixels, a footprint of 1 gives the mean error
+/// independent of the row's size, and a view power below 1 favours rows with errors in many views.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ErrorScore {
     /// The error e of a pixel.
     pub map: ErrorMap,
     /// Power of a pixel's error, in (0, 16].
     pub power: f32,
-    /// Weight of edges, >= 0; 0: none, at no cost.
+    /// Weight of edges, >= 0; 0 ignores them at no cost.
     pub edge: f32,
-    /// Power of the sum of blend weights that divides, in `[0, 1]`.
+    /// Power of the sum of blend weights in the denominator, in `[0, 1]`.
     pub footprint: f32,
     /// Power of a view's score, in (0, 1].
     pub view_power: f32,
 }
 
-/// The error of a pixel that an [`ErrorScore`] sums, >= 0; means over channels of the rendering I and the
-/// photograph G.
+/// The error of a pixel in an [`ErrorScore`], >= 0: the mean over channels, with I the rendering and G the
+/// photograph.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum ErrorMap {
-    /// Its part of the training loss: 0.8 · |I − G| + 0.2 · (1 − SSIM).
+    /// The pixel's part of the training loss: 0.8 · |I − G| + 0.2 · (1 − SSIM).
     #[default]
     Loss,
-    /// |I − G|: colour, whatever is around.
+    /// |I − G|, the error of the pixel's own colour.
     L1,
-    /// 1 − SSIM: structure.
+    /// 1 − SSIM, the error of the structure around the pixel.
     Dssim,
 }
 
@@ -61,7 +61,7 @@ impl Default for ErrorScore {
 }
 
 impl ErrorScore {
-    /// Whether M is the error itself, but for edges.
+    /// True if M is the error itself, apart from edges.
     #[must_use]
     pub fn is_plain_map(&self) -> bool {
         self.power.total_cmp(&1.0).is_eq()
@@ -73,13 +73,12 @@ impl ErrorScore {
         if !(error > 0.0 && weight > 0.0) {
             return 0.0;
         }
-        let by_size =
-            if self.footprint > 0.0 { error / weight.powf(self.footprint) } else { error };
-        if self.view_power < 1.0 { by_size.powf(self.view_power) } else { by_size }
+        let score = if self.footprint > 0.0 { error / weight.powf(self.footprint) } else { error };
+        if self.view_power < 1.0 { score.powf(self.view_power) } else { score }
     }
 
     pub(super) fn check(&self) -> Result<(), String> {
-        finite("error_score.edge", self.edge.into(), 0.0)?;
+        at_least("error_score.edge", self.edge.into(), 0.0)?;
         for (name, value, lowest, most) in [
             ("power", self.power, f32::MIN_POSITIVE, 16.0),
             ("footprint", self.footprint, 0.0, 1.0),
@@ -96,7 +95,7 @@ impl ErrorScore {
     }
 }
 
-/// Which pixels of the training views to collect as candidates for new rows.
+/// Selects pixels of the training views as candidates for new rows.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CandidateRequest {
     /// Start of the window (exclusive) `[step]`.
@@ -105,15 +104,15 @@ pub struct CandidateRequest {
     pub until: u32,
     /// Each step collects one candidate per this many rows, >= 1.
     pub rows_per_candidate: u32,
-    /// Most candidates held at a time; later ones are dropped.
+    /// Maximum number of candidates held at a time; later ones are dropped.
     pub capacity: usize,
     /// The error that ranks pixels.
     pub error: ErrorMode,
-    /// How the surface point on the pixel's ray is chosen.
+    /// The surface point on the pixel's ray.
     pub depth: DepthMode,
-    /// Least accumulated alpha of a pixel, in `[0, 1]`: a transparent pixel has no depth.
+    /// Smallest accumulated alpha of a pixel, in `[0, 1]`: a transparent pixel has no depth.
     pub min_alpha: f32,
-    /// Non-maximum suppression: only pixels with the largest error of their 3×3 neighbours count.
+    /// Non-maximum suppression: only pixels with the largest error of their 3×3 neighbourhood count.
     pub spaced: bool,
 }
 
@@ -131,26 +130,26 @@ pub enum ErrorMode {
     L1Dssim,
 }
 
-/// How the surface point of a pixel is chosen.
+/// The surface point on a pixel's ray.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum DepthMode {
     /// The ray's closest point, in Mahalanobis distance, to the Gaussian with the largest blend
     /// weight (Mini-Splatting).
     MaxWeight,
-    /// The same for the Gaussian at which transmittance first falls below one half.
+    /// The ray's closest point to the Gaussian at which transmittance first falls below one half.
     Median,
 }
 
-/// What is measured in an auxiliary view: a training view rendered for one event of the policy.
+/// Measurements in an auxiliary view: a training view rendered for one event of the policy.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct AuxRequest {
     /// The pixel map M that [`AuxColumn::MapSum`] sums.
     pub map: PixelMap,
     /// Per-row statistics.
     pub columns: Vec<AuxColumn>,
-    /// Most surface points per view: pixels drawn without replacement in proportion to their
-    /// accumulated alpha, with the point that [`DepthMode::MaxWeight`] chooses.
+    /// Maximum number of surface points per view: pixels drawn without replacement in proportion to their
+    /// accumulated alpha, with the surface point of [`DepthMode::MaxWeight`].
     pub points: u32,
 }
 
@@ -158,7 +157,7 @@ pub struct AuxRequest {
 ///
 /// n scales a map to 0..1 by its minimum and maximum in the view (0 where they are equal), e(p) is the
 /// mean over channels of |I − G|, and g(p) the 8-neighbour Laplacian of the 8-bit luma of the ground
-/// truth, clipped to 0..255, with repeated borders. The image's mask multiplies e and g.
+/// truth, clipped to 0..255, with repeated borders. e and g are multiplied by the image's mask.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct PixelMap {
     /// Weight of the error, >= 0.

@@ -1,16 +1,16 @@
-//! How the optimiser steps for a policy: its learning rates, and how often.
+//! A policy's learning rates and intervals of optimiser steps.
 
 use serde::{Deserialize, Serialize};
 
 use super::above_zero;
 
-/// How often the optimiser steps; in between, gradients are summed over the views.
+/// The interval of optimiser steps; in between, gradients are summed over the views.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Cadence {
     /// Iterations per optimiser step, for all parameters; >= 1.
     pub all: u32,
-    /// The same for the spherical-harmonic coefficients of bands 1–3, which step at most as often as
-    /// the others; >= 1.
+    /// Iterations per step of the spherical-harmonic coefficients of bands 1–3; the larger of the two
+    /// intervals applies to them; >= 1.
     pub sh_rest: u32,
 }
 
@@ -21,16 +21,15 @@ impl Default for Cadence {
 }
 
 impl Cadence {
-    /// Whether the optimiser steps after iteration `step`: first for all parameters but the
-    /// spherical-harmonic coefficients of bands 1–3, then for these.
+    /// True where the optimiser steps after iteration `step`: for `[all other parameters, the
+    /// spherical-harmonic coefficients of bands 1–3]`.
     #[must_use]
     pub fn steps_at(self, step: u32) -> [bool; 2] {
         let all = self.all.max(1);
         [step.is_multiple_of(all), step.is_multiple_of(self.sh_rest.max(all))]
     }
 
-    /// Whether a backend made for `longest` has the gradient sums and step counts that this cadence
-    /// needs.
+    /// True if a backend made for `longest` has the gradient sums and step counts that this cadence needs.
     #[must_use]
     pub fn is_within(self, longest: Self) -> bool {
         let is_sound = self.all > 0 && self.sh_rest > 0;
@@ -40,7 +39,7 @@ impl Cadence {
     }
 }
 
-/// Learning rates that a policy is published with; `None` leaves the trainer's.
+/// Learning rates published with a policy; `None`: the trainer's.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct RateOverrides {
     /// Means `[fraction of the extent per step]`.
@@ -72,14 +71,14 @@ pub struct Rate {
 /// the model does not memorise single photographs.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Fade {
-    /// The share of the run after which it begins, in `[0, 1)`.
+    /// Share of the run after which the fade begins, in `[0, 1)`.
     pub from: f64,
     /// The factor at the end of the run, in (0, 1].
     pub to: f64,
 }
 
 impl Rate {
-    /// The same from start to end.
+    /// A rate that does not change during the run.
     #[must_use]
     pub const fn constant(rate: f64) -> Self {
         Self { start: rate, end: rate }

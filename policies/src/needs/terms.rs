@@ -1,8 +1,8 @@
-//! What policies add to a training step: terms of the loss, noise on the means, masks.
+//! Additions to a training step: terms of the loss, noise on the means, masks.
 
 use serde::{Deserialize, Serialize};
 
-use super::{above_zero, finite};
+use super::{above_zero, at_least};
 
 /// Coefficients of terms added to the image loss; 0 switches a term off, at no cost.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
@@ -14,7 +14,7 @@ pub struct LossTerms {
 }
 
 impl LossTerms {
-    /// Whether no term is added.
+    /// True if no term is added.
     #[must_use]
     pub fn is_none(&self) -> bool {
         !(self.opacity > 0.0 || self.scale > 0.0)
@@ -25,28 +25,28 @@ impl LossTerms {
     /// # Errors
     /// The first that is not, with its value.
     pub fn check(&self) -> Result<(), String> {
-        finite("loss_terms.opacity", self.opacity.into(), 0.0)?;
-        finite("loss_terms.scale", self.scale.into(), 0.0)
+        at_least("loss_terms.opacity", self.opacity.into(), 0.0)?;
+        at_least("loss_terms.scale", self.scale.into(), 0.0)
     }
 }
 
 /// Noise on the means after each optimiser step (*3D Gaussian Splatting as Markov Chain Monte Carlo*,
 /// Kheradmand et al. 2024, section 3.2): Δμ = Σ·ξ · σ(−`sharpness`·(o − `opacity`)) · `strength` · λ,
-/// with Σ the row's covariance, ξ ~ N(0, I), o its opacity, σ the logistic function and λ the step
-/// size of the means at that step `[scene units]`, without the factor by which short runs lengthen steps:
-/// that is for what has a gradient to follow.
+/// with Σ the row's covariance, ξ ~ N(0, I), o its opacity, σ the logistic function and λ the learning rate
+/// of the means at that step `[scene units]`, without its increase in short runs (which serves to follow
+/// gradients further).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct NoiseTerm {
     /// Strength of the noise `[1 / scene units²]`, >= 0.
     pub strength: f32,
-    /// How steeply noise falls with opacity, >= 0.
+    /// Steepness of the fall of the noise with opacity, >= 0.
     pub sharpness: f32,
     /// Opacity at which the noise is halved.
     pub opacity: f32,
 }
 
 impl NoiseTerm {
-    /// The factor of the noise at this opacity, in (0, 1).
+    /// The factor on the noise at this opacity, in (0, 1).
     #[must_use]
     pub fn share(&self, opacity: f32) -> f32 {
         1.0 / (1.0 + (self.sharpness * (opacity - self.opacity)).exp())
@@ -57,39 +57,39 @@ impl NoiseTerm {
     /// # Errors
     /// The first that is not, with its value.
     pub fn check(&self) -> Result<(), String> {
-        finite("noise.strength", self.strength.into(), 0.0)?;
-        finite("noise.sharpness", self.sharpness.into(), 0.0)?;
-        finite("noise.opacity", self.opacity.into(), 0.0)
+        at_least("noise.strength", self.strength.into(), 0.0)?;
+        at_least("noise.sharpness", self.sharpness.into(), 0.0)?;
+        at_least("noise.opacity", self.opacity.into(), 0.0)
     }
 }
 
-/// A trained mask per row (*Compact 3D Gaussian Representation*, Lee et al. 2024, section 3.1). A row
-/// renders with its opacity and its scales times 1\[σ(m) > `threshold`\], whose derivative by m is taken to
-/// be that of σ(m), and `weight` · mean σ(m) is added to the loss. A row whose mask falls to the threshold
-/// becomes transparent for good, also in what is saved; that the policy prunes it is for the policy to do.
+/// A learned mask per row (*Compact 3D Gaussian Representation*, Lee et al. 2024, section 3.1). A row is
+/// rendered with its opacity and scales multiplied by 1\[σ(m) > `threshold`\], whose derivative by m is taken
+/// to be that of σ(m), and `weight` · mean σ(m) is added to the loss. A row whose mask falls to the threshold
+/// stays transparent, also in saved models, until the policy prunes it.
 ///
-/// m steps by Adam with every view. A newborn row has its parent's mask.
+/// m is updated by Adam at every view. A new row inherits its parent's mask.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct MaskTerm {
-    /// m at first.
+    /// Initial m.
     pub start: f32,
     /// Step size of m, > 0.
     pub rate: f32,
     /// Coefficient of the mean of σ(m) over rows, >= 0.
     pub weight: f32,
-    /// In (0, 1).
+    /// σ(m) up to which a row is transparent, in (0, 1).
     pub threshold: f32,
 }
 
 impl MaskTerm {
     pub(super) fn check(&self) -> Result<(), String> {
         above_zero("mask.rate", self.rate.into())?;
-        finite("mask.weight", self.weight.into(), 0.0)?;
+        at_least("mask.weight", self.weight.into(), 0.0)?;
         if !(self.threshold > 0.0 && self.threshold < 1.0) {
             let threshold = self.threshold;
             return Err(format!("mask.threshold is {threshold}; it must be between 0 and 1"));
         }
-        // Beyond it σ(m) is 0 or 1 and has no derivative.
+        // Beyond this range σ(m) rounds to 0 or 1 and has no derivative.
         if !(-20.0..=20.0).contains(&self.start) {
             return Err(format!("mask.start is {}; it must be from -20 to 20", self.start));
         }

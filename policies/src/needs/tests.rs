@@ -1,4 +1,4 @@
-//! Tests of declarations: their ranges, and what follows from them.
+//! Tests of declarations: their ranges and derived values.
 
 use super::*;
 
@@ -57,7 +57,7 @@ fn numbers_out_of_range_are_refused() {
 #[test]
 fn a_view_scores_by_error_size_and_power() {
     let score = ErrorScore { footprint: 0.5, view_power: 0.5, ..ErrorScore::default() };
-    // 8 / √4 = 4, and its root.
+    // 8 / √4 = 4, whose root is 2.
     assert!((score.of_view(8.0, 4.0) - 2.0).abs() < 1e-6);
     assert!((ErrorScore::default().of_view(8.0, 4.0) - 8.0).abs() < 1e-6);
     let none = [(0.0, 4.0), (8.0, 0.0), (f32::NAN, 4.0)];
@@ -65,7 +65,7 @@ fn a_view_scores_by_error_size_and_power() {
 }
 
 #[test]
-fn images_are_shrunk_as_far_as_declared() {
+fn resolutions_must_be_within_the_declared_range() {
     let needs = Needs { least_resolution: Some(0.3), ..Needs::default() };
     assert!([0.3, 0.5, 1.0].iter().all(|&share| needs.check_resolution(share).is_ok()));
     let wrong = [0.29, 1.01, f64::NAN, -0.5];

@@ -3,21 +3,21 @@
 use serde::{Deserialize, Serialize};
 
 use crate::edit::{
-    Decay, Offspring, OpacityRule, ParentFate, Placement, ScaleRule, Seed, UNTURNED, Update,
+    Decay, NO_ROTATION, Offspring, OpacityRule, ParentFate, Placement, ScaleRule, Seed, Update,
     in_open_unit,
 };
 use crate::signals::SignalSet;
 
-/// A compiled plan. Rows `0..rows_before` are live before it, rows `0..rows_after` after it; no slot
-/// at or beyond the budget is ever written, and none before `first_row`.
+/// A compiled plan. Rows `0..rows_before` are live before it, rows `0..rows_after` after it. No slot at or
+/// beyond the budget is written, nor any before `first_row`.
 ///
-/// A backend executes in pass 1 `families` (the parent is read once, then its children and the
-/// parent itself are written), `updates` and `seeds`: no slot is written twice, and no written slot is
-/// read by another entry. In pass 2 it executes `moves`, then brings the rows into [`order`](Self::order),
-/// then it executes `decay` and `clamp_opacity` over all rows from `first_row` on and the resets.
+/// In pass 1 a backend executes `families` (it reads the parent once, then writes its children and the parent
+/// itself), `updates` and `seeds`: no slot is written twice, and no written slot is read by another entry. In
+/// pass 2 it executes `moves`, sorts the rows into [`order`](Self::order), and executes `decay` and
+/// `clamp_opacity` on all rows from `first_row` on, and the resets.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct RowOps {
-    /// The first row that the plan concerns: those before it are [frozen](Self::behind).
+    /// The first row that may change; those before it are [frozen](Self::after_frozen).
     pub first_row: usize,
     /// Rows before the edit.
     pub rows_before: usize,
@@ -25,9 +25,9 @@ pub struct RowOps {
     pub rows_after: usize,
     /// The budget the plan was made for.
     pub budget: usize,
-    /// Parents; [`offspring`](Self::offspring) has how their children follow.
+    /// Parents; see [`offspring`](Self::offspring) for their children.
     pub families: Vec<Family>,
-    /// Scales and turns that are too large for a [`Family`].
+    /// Scales and rotations that are too large for a [`Family`].
     pub shapes: Vec<(ScaleRule, [f32; 4])>,
     /// Slots of all children, family after family.
     pub child_slots: Vec<u32>,
@@ -38,13 +38,13 @@ pub struct RowOps {
     /// (from, to): live tail rows that fill the holes left by pruned rows; every `from` >=
     /// `rows_after` > every `to`.
     pub moves: Vec<(u32, u32)>,
-    /// What all rows lose.
+    /// Reduction of all opacities and scales.
     pub decay: Option<Decay>,
     /// Upper bound for all opacities, in (0, 1); both opacity moments of all rows become zero.
     pub clamp_opacity: Option<f32>,
-    /// The signals that start anew in all rows; rows that move keep the others.
+    /// The signals that are reset in all rows; moved rows keep the others.
     pub reset_signals: SignalSet,
-    /// Whether the candidate list is cleared.
+    /// If true, the candidate list is cleared.
     pub reset_candidates: bool,
     /// Numbers of rows changed, for the event log.
     pub counts: EditCounts,
@@ -52,12 +52,12 @@ pub struct RowOps {
     pub cause: String,
 }
 
-/// One parent and its children. An [`Offspring`] in less memory: there may be millions.
+/// One parent and its children, more compact than an [`Offspring`], as there may be millions.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Family {
     /// The parent's row.
     pub parent: u32,
-    /// Its first child's place in [`RowOps::child_slots`].
+    /// Index of its first child in [`RowOps::child_slots`].
     pub first_child: u32,
     children: u32,
     fate: ParentFate,
@@ -66,7 +66,7 @@ pub struct Family {
     opacity: OpacityRule,
 }
 
-/// Scales and turn of a family.
+/// Scales and rotation of a family.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Shape {
     Uniform(f32),
@@ -74,7 +74,7 @@ enum Shape {
         long: f32,
         other: f32,
     },
-    /// A place in [`RowOps::shapes`].
+    /// An index into [`RowOps::shapes`].
     Listed(u32),
 }
 
@@ -98,14 +98,14 @@ impl Family {
         Self { parent, first_child, children, fate, placement, shape, opacity }
     }
 
-    /// What happens to the parent's own slot.
+    /// Fate of the parent's own slot.
     #[must_use]
     pub fn fate(&self) -> ParentFate {
         self.fate
     }
 }
 
-/// How many rows an edit changed.
+/// Numbers of rows changed by an edit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct EditCounts {
     /// Rows pruned.
@@ -124,14 +124,14 @@ pub struct EditCounts {
 pub struct BrokenOps(String);
 
 impl RowOps {
-    /// Whether nothing changes, neither rows nor accumulators. A plan whose edits were all refused is
-    /// empty too; see [`EditCounts::denied`].
+    /// True if neither rows nor accumulators change. This includes plans whose edits were all refused; see
+    /// [`EditCounts::denied`].
     #[must_use]
     pub fn is_empty(&self) -> bool {
         !self.edits_rows() && self.reset_signals.is_empty() && !self.reset_candidates
     }
 
-    /// Whether any row is added, removed, rewritten, clamped or decays.
+    /// True if any row is added, removed or changed.
     #[must_use]
     pub fn edits_rows(&self) -> bool {
         !(self.families.is_empty()
@@ -143,10 +143,10 @@ impl RowOps {
             && self.clamp_opacity.is_none())
     }
 
-    /// The same plan for a model in which so many frozen rows, of which the plan knows nothing, stand before those
-    /// that it was made for.
+    /// Shifts all rows by `frozen`, for a model with this number of frozen rows before those that the plan was
+    /// made for.
     #[must_use]
-    pub fn behind(mut self, frozen: usize) -> Self {
+    pub fn after_frozen(mut self, frozen: usize) -> Self {
         let by = frozen as u32;
         self.first_row += frozen;
         self.rows_before += frozen;
@@ -165,14 +165,14 @@ impl RowOps {
         self
     }
 
-    /// The order in which rows stand in the end: row i of the model is what pass 2 left in slot `order[i]`. A
-    /// permutation of `0..rows_after`; empty where nothing changes place.
+    /// The final order of rows: row i of the model is the one in slot `order[i]` after the moves. A permutation
+    /// of `0..rows_after`, or empty if the rows are already in order.
     ///
-    /// Rows keep their order, each followed by its children; seeds come last. Rows near each other in space,
-    /// as they begin, thus stay near each other in memory, which makes steps faster.
+    /// Rows keep their order, each followed by its children; seeds come last. Initially, neighbours in memory
+    /// are neighbours in space; this order preserves that, which makes steps faster.
     #[must_use]
     pub fn order(&self) -> Vec<u32> {
-        // By slot: the row that was there before the edit, or the parent, and whether it is a child.
+        // Sort key of each slot: the row's index before the edit, or its parent's, and a bit for children.
         let mut origin: Vec<u64> = (0..self.rows_after as u64).map(|row| row << 1).collect();
         for &(from, to) in &self.moves {
             origin[to as usize] = u64::from(from) << 1;
@@ -203,7 +203,7 @@ impl RowOps {
         &self.child_slots[family.first_child as usize..][..family.children as usize]
     }
 
-    /// How `family`'s children follow from the parent.
+    /// The offspring of `family`.
     ///
     /// # Panics
     /// When `family` does not belong to this plan.
@@ -215,9 +215,9 @@ impl RowOps {
     fn find_offspring(&self, family: &Family) -> Option<Offspring> {
         let Family { children, fate: parent, placement, opacity, .. } = *family;
         let (scale, turn) = match family.shape {
-            Shape::Uniform(factor) => (ScaleRule::Uniform(factor), UNTURNED),
-            Shape::LongAxis { long, other } => (ScaleRule::LongAxis { long, other }, UNTURNED),
-            Shape::Listed(place) => *self.shapes.get(place as usize)?,
+            Shape::Uniform(factor) => (ScaleRule::Uniform(factor), NO_ROTATION),
+            Shape::LongAxis { long, other } => (ScaleRule::LongAxis { long, other }, NO_ROTATION),
+            Shape::Listed(index) => *self.shapes.get(index as usize)?,
         };
         Some(Offspring { children, parent, placement, scale, turn, opacity })
     }
@@ -234,7 +234,7 @@ impl RowOps {
     }
 
     /// Checks all invariants: rows within the budget, no slot written twice, no written slot read by
-    /// another entry, rows `0..rows_after` dense, values in range, counts right. Takes linear time and
+    /// another entry, rows `0..rows_after` dense, values in range, counts correct. Takes linear time and
     /// one bit per row.
     ///
     /// # Errors
@@ -245,12 +245,12 @@ impl RowOps {
         let mut claimed = Slots::new(slots);
         self.check_families(&mut claimed)?;
         for (row, update) in &self.updates {
-            sound(update.bad_field(), || format!("update of row {row}"))?;
+            valid(update.bad_field(), || format!("update of row {row}"))?;
             self.check_live("updated row", *row)?;
             claimed.claim("updated row", *row)?;
         }
         for (slot, seed) in &self.seeds {
-            sound(seed.bad_field(), || format!("seed in slot {slot}"))?;
+            valid(seed.bad_field(), || format!("seed in slot {slot}"))?;
             self.check_new_slot("seed", *slot)?;
             claimed.claim("seed", *slot)?;
         }
@@ -274,7 +274,7 @@ impl RowOps {
         let is_child = |family: &&Family| family.fate == ParentFate::BecomesChild;
         let updated = self.updates.len() + self.families.iter().filter(is_child).count();
         require(counts.updated == updated, || format!("{updated} updated, but {counts:?}"))?;
-        sound(self.decay.and_then(|decay| decay.bad_field()), || "the decay".to_owned())?;
+        valid(self.decay.and_then(|decay| decay.bad_field()), || "the decay".to_owned())?;
         require(self.clamp_opacity.is_none_or(in_open_unit), || {
             format!("opacity bound {:?}", self.clamp_opacity)
         })
@@ -285,7 +285,7 @@ impl RowOps {
         for family in &self.families {
             let parent = family.parent;
             let bad_field = self.find_offspring(family).map_or(Some("shape"), |o| o.bad_field());
-            sound(bad_field, || format!("family of row {parent}"))?;
+            valid(bad_field, || format!("family of row {parent}"))?;
             require(family.first_child as usize == first_child, || {
                 format!("family of row {parent} starts at {}", family.first_child)
             })?;
@@ -303,8 +303,8 @@ impl RowOps {
         Ok(())
     }
 
-    /// Every move ends in a hole; every parent and updated row of the tail is moved; all rows from
-    /// `rows_before` upward are new.
+    /// Checks that every move ends in a hole, every parent and updated row of the tail is moved, and all rows
+    /// from `rows_before` upward are new.
     fn check_moves(&self, claimed: &mut Slots) -> Result<(), BrokenOps> {
         let Self { rows_before, rows_after, .. } = self;
         let mut moved = Slots::new(*rows_before);
@@ -347,7 +347,7 @@ impl RowOps {
     }
 }
 
-fn sound(bad_field: Option<&'static str>, what: impl Fn() -> String) -> Result<(), BrokenOps> {
+fn valid(bad_field: Option<&'static str>, what: impl Fn() -> String) -> Result<(), BrokenOps> {
     require(bad_field.is_none(), || {
         format!("{} has a bad {}", what(), bad_field.unwrap_or_default())
     })
@@ -369,6 +369,7 @@ impl Slots {
         self.0.get(slot as usize / 64).is_some_and(|word| word >> (slot % 64) & 1 == 1)
     }
 
+    /// Adds `slot`, unless another entry has claimed it.
     fn claim(&mut self, role: &str, slot: u32) -> Result<(), BrokenOps> {
         let is_new = !self.contains(slot);
         require(is_new, || format!("{role} {slot} is used by another entry"))?;

@@ -1,4 +1,4 @@
-//! Compiled edits that hold, and every way in which one may be corrupt.
+//! Tests of compiled plans, valid and corrupt.
 
 use super::*;
 use crate::needs::Needs;
@@ -9,7 +9,7 @@ const SPLIT: Offspring = Offspring {
     parent: ParentFate::BecomesChild,
     placement: Placement::Sampled,
     scale: ScaleRule::Uniform(0.5),
-    turn: UNTURNED,
+    turn: NO_ROTATION,
     opacity: OpacityRule::Same,
 };
 const SEED: Seed = Seed::round([0.0; 3], [0.5; 3], 1.0, 0.1);
@@ -62,7 +62,7 @@ fn every_corruption_is_found() {
         }),
         ("bad listed shape", |ops| {
             ops.families[0].shape = Shape::Listed(0);
-            ops.shapes = vec![(ScaleRule::Axes([1.0, 0.0, 1.0]), UNTURNED)];
+            ops.shapes = vec![(ScaleRule::Axes([1.0, 0.0, 1.0]), NO_ROTATION)];
         }),
         ("a shape that is not listed", |ops| {
             ops.families[0].shape = Shape::Listed(0);
@@ -103,8 +103,8 @@ fn every_corruption_is_found() {
 
 #[test]
 fn frozen_rows_are_out_of_reach() {
-    let behind = || shrinking().behind(4);
-    let ops = behind();
+    let shifted = || shrinking().after_frozen(4);
+    let ops = shifted();
     assert_eq!(ops.check(), Ok(()));
     assert_eq!((ops.first_row, ops.rows_before, ops.rows_after, ops.budget), (4, 14, 11, 14));
     assert_eq!((ops.families[0].parent, ops.updates[0].0, ops.seeds[0].0), (13, 11, 6));
@@ -123,7 +123,7 @@ fn frozen_rows_are_out_of_reach() {
         }),
     ];
     for (name, corrupt) in corruptions {
-        let mut ops = behind();
+        let mut ops = shifted();
         corrupt(&mut ops);
         assert!(ops.check().is_err(), "{name} is not found");
     }

@@ -1,20 +1,20 @@
 //! The edits of a policy as data: the only way to change the number of rows.
 //!
 //! A policy writes into an [`EditPlan`]; the plan compiles to [`RowOps`]; a backend applies them.
-//! Every call keeps the invariants, so a plan over budget cannot be expressed: each row has at most
-//! one edit, and the number of rows never exceeds the budget, not even during the edit. A refused
+//! Every call preserves the invariants, so a plan that exceeds the budget cannot be expressed: each row has
+//! at most one edit, and the number of rows never exceeds the budget, not even during the edit. A refused
 //! call changes nothing, returns the reason, and is counted.
 
 use crate::edit::in_open_unit;
 pub use crate::edit::{
-    COLOUR_MAX, Decay, OPACITY_LEAST, Offspring, OpacityRule, ParentFate, Placement, Reset,
-    ScaleRule, Seed, UNTURNED, Update,
+    COLOUR_MAX, Decay, MIN_DECAYED_OPACITY, NO_ROTATION, Offspring, OpacityRule, ParentFate,
+    Placement, Reset, ScaleRule, Seed, Update,
 };
 use crate::needs::Needs;
 pub use crate::ops::{BrokenOps, EditCounts, Family, RowOps};
 use crate::signals::{Signal, SignalSet};
 
-/// Why a plan refused an edit. Each refusal is counted.
+/// The reason why a plan refused an edit. Each refusal is counted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum Refused {
     /// The edit would need more rows than the budget leaves.
@@ -29,16 +29,16 @@ pub enum Refused {
     /// A number in this field of the edit is not finite or out of its range.
     #[error("`{0}` is not finite or out of range")]
     BadValue(&'static str),
-    /// The edit is one that only [`Needs::detailed_edits`] allows, or a decay of rows that were seen without
-    /// the signal that says which.
+    /// The edit needs [`Needs::detailed_edits`], or it is a decay of seen rows only and needs
+    /// [`Signal::VisibleCount`].
     #[error(
-        "not declared: updates, scales by axis and turns need `detailed_edits` in the policy's needs, \
-         and a decay of what was seen needs the signal `visible_count`"
+        "not declared: updates, scales by axis and rotations need `detailed_edits` in the policy's needs, \
+         and a decay of seen rows needs the signal `visible_count`"
     )]
     Undeclared,
 }
 
-/// The edit of a row; one byte, which is all that a plan stores for untouched rows.
+/// The edit of a row. An untouched row takes only this byte in a plan.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum RowEdit {
     None,
@@ -47,8 +47,8 @@ enum RowEdit {
     Updated,
 }
 
-/// Most memory a plan takes per row, without seeds `[bytes]`: the edit's byte, and, as each family has a
-/// child, a family with its child's slot for every second row, or an update of each row.
+/// Maximum memory of a plan per row, without seeds `[bytes]`: the edit's byte, and either a family and its
+/// child's slot for every second row (as each family has a child), or an update of each row.
 #[must_use]
 pub fn bytes_per_row(needs: &Needs) -> usize {
     let family = size_of::<Family>() + size_of::<u32>();
@@ -73,8 +73,8 @@ pub struct EditPlan {
     pruned: usize,
     added: usize,
     denied: usize,
-    detailed: bool,
-    knows_seen: bool,
+    detailed_edits: bool,
+    has_visible_count: bool,
     was_undeclared: bool,
     families: Vec<Family>,
     shapes: Vec<(ScaleRule, [f32; 4])>,
@@ -97,8 +97,8 @@ impl EditPlan {
             pruned: 0,
             added: 0,
             denied: 0,
-            detailed: false,
-            knows_seen: false,
+            detailed_edits: false,
+            has_visible_count: false,
             was_undeclared: false,
             families: Vec::new(),
             shapes: Vec::new(),
@@ -112,11 +112,11 @@ impl EditPlan {
         }
     }
 
-    /// The plan, with the edits that `needs` declares.
+    /// Allows the edits that `needs` declares.
     #[must_use]
     pub fn allowing(self, needs: &Needs) -> Self {
-        let knows_seen = needs.signals.contains(Signal::VisibleCount);
-        Self { detailed: needs.detailed_edits, knows_seen, ..self }
+        let has_visible_count = needs.signals.contains(Signal::VisibleCount);
+        Self { detailed_edits: needs.detailed_edits, has_visible_count, ..self }
     }
 
     /// Rows before the edit.
@@ -125,16 +125,16 @@ impl EditPlan {
         self.edits.len()
     }
 
-    /// Most rows the model may have.
+    /// Maximum number of rows of the model.
     #[must_use]
     pub fn budget(&self) -> usize {
         self.budget
     }
 
-    /// How many more rows may be added: budget − (rows − pruned + added).
+    /// Number of rows that may still be added: budget − (rows − pruned + added).
     #[must_use]
     pub fn room(&self) -> usize {
-        // Slots are u32 on every backend, whatever the budget says.
+        // Slots are u32 on every backend, whatever the budget.
         self.budget.min(u32::MAX as usize).saturating_sub(self.rows() - self.pruned + self.added)
     }
 
@@ -144,7 +144,7 @@ impl EditPlan {
         self.pruned
     }
 
-    /// Whether `row` exists and has no edit yet.
+    /// True if `row` exists and has no edit yet.
     #[must_use]
     pub fn is_free(&self, row: u32) -> bool {
         self.edits.get(row as usize) == Some(&RowEdit::None)
@@ -176,11 +176,10 @@ impl EditPlan {
         let children = offspring.children as usize;
         let is_detailed = offspring.is_detailed();
         if is_detailed {
-            self.check_declared(self.detailed)?;
+            self.check_declared(self.detailed_edits)?;
         }
         self.claim(parent, offspring.bad_field(), children, RowEdit::Grown)?;
-        // The most there can be, if no more rows are pruned: growing an array in steps would hold it
-        // twice while it is moved.
+        // Reserve the maximum at once: reallocating would briefly need twice the memory.
         let most = (self.rows() - self.pruned).min(self.room());
         if self.families.is_empty() {
             self.families.reserve_exact(most);
@@ -199,7 +198,7 @@ impl EditPlan {
     /// # Errors
     /// [`Refused::Undeclared`], [`Refused::NoSuchRow`], [`Refused::Taken`], [`Refused::BadValue`].
     pub fn update(&mut self, row: u32, update: Update) -> Result<(), Refused> {
-        self.check_declared(self.detailed)?;
+        self.check_declared(self.detailed_edits)?;
         self.claim(row, update.bad_field(), 0, RowEdit::Updated)?;
         if self.updates.is_empty() {
             self.updates.reserve_exact(self.rows() - self.pruned - self.families.len());
@@ -219,21 +218,21 @@ impl EditPlan {
         Ok(())
     }
 
-    /// Takes something off the opacities and scales of all rows, new ones too unless only
-    /// [seen](Decay::seen_only) rows decay, after all other edits but
-    /// [`clamp_opacity`](Self::clamp_opacity). A later call replaces an earlier one.
+    /// Reduces the opacities and scales of all rows, or only of [seen](Decay::seen_only) ones. It applies after
+    /// all other edits except [`clamp_opacity`](Self::clamp_opacity), and new rows count as not seen. A later
+    /// call replaces an earlier one.
     ///
     /// # Errors
     /// [`Refused::BadValue`], [`Refused::Undeclared`].
     pub fn decay(&mut self, decay: Decay) -> Result<(), Refused> {
-        self.check_declared(self.knows_seen || !decay.seen_only)?;
+        self.check_declared(self.has_visible_count || !decay.seen_only)?;
         self.check(decay.bad_field(), 0)?;
         self.decay = Some(decay);
         Ok(())
     }
 
-    /// Limits the opacity of all rows, after all other edits; of several limits the lowest holds. Both
-    /// opacity moments become zero.
+    /// Limits the opacity of all rows, after all other edits. If called several times, the lowest limit
+    /// applies. Both opacity moments become zero.
     ///
     /// # Errors
     /// [`Refused::BadValue`] when `max` is not in (0, 1).
@@ -248,14 +247,14 @@ impl EditPlan {
         match accumulator {
             Reset::Signals => self.reset(Reset::Only(Signal::ALL.into())),
             Reset::Only(signals) => {
-                let some = signals.iter().filter(|signal| signal.is_reset()).collect();
-                self.reset_signals = self.reset_signals.union(some);
+                let resettable = signals.iter().filter(|signal| signal.is_resettable()).collect();
+                self.reset_signals = self.reset_signals.union(resettable);
             }
             Reset::Candidates => self.reset_candidates = true,
         }
     }
 
-    /// Names the reason, for the event log. Different tags are joined by `+`.
+    /// Adds a reason for the event log. Different tags are joined by `+`.
     pub fn cause(&mut self, tag: &str) {
         if tag.is_empty() || self.cause.split('+').any(|known| known == tag) {
             return;
@@ -276,12 +275,12 @@ impl EditPlan {
         let rows_before = self.rows();
         let rows_after = rows_before - self.pruned + self.added;
         let is_pruned = |&slot: &usize| self.edits[slot] == RowEdit::Pruned;
-        // Slots in `0..rows_after` without a live row: the first ones take the new rows, the rest
-        // (only where the model shrinks) take rows from the tail.
+        // Slots in `0..rows_after` without a live row: the first ones take the new rows, the others
+        // (only if the model shrinks) take rows from the tail.
         let mut holes = (0..rows_before).filter(is_pruned).chain(rows_before..).map(|s| s as u32);
 
         let child_slots: Vec<u32> = holes.by_ref().take(self.children()).collect();
-        // Seeds lead the zip: it must not draw a hole when there is no seed left to fill it.
+        // Seeds come first in the zip, so that no hole is consumed without a seed to fill it.
         let seeds = self.seeds.iter().zip(holes.by_ref()).map(|(&seed, slot)| (slot, seed));
         let seeds: Vec<(u32, Seed)> = seeds.collect();
         let live_tail = (rows_after..rows_before).filter(|slot| !is_pruned(slot));
@@ -316,7 +315,7 @@ impl EditPlan {
         ops
     }
 
-    /// Whether an edit was refused that the policy had to declare.
+    /// True if an edit was refused because the policy did not declare it.
     pub(crate) fn was_undeclared(&self) -> bool {
         self.was_undeclared
     }
@@ -329,7 +328,7 @@ impl EditPlan {
         self.refuse(Refused::Undeclared)
     }
 
-    /// Rows added by families, without seeds.
+    /// Number of rows added by families, without seeds.
     fn children(&self) -> usize {
         self.added - self.seeds.len()
     }

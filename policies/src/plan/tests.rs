@@ -1,4 +1,4 @@
-//! Tests of edits, room and refusals, and of any plan against a plain vector.
+//! Tests of edits, room and refusals, and of random plans against a plain vector.
 
 use super::*;
 use proptest::prelude::*;
@@ -13,7 +13,7 @@ fn family(children: u32, parent: ParentFate) -> Offspring {
         parent,
         placement: Placement::Sampled,
         scale: ScaleRule::Uniform(0.625),
-        turn: UNTURNED,
+        turn: NO_ROTATION,
         opacity: OpacityRule::Same,
     }
 }
@@ -56,9 +56,9 @@ fn a_refused_value_changes_nothing() {
     assert_eq!(ops.counts.denied, 4);
 }
 
-/// A row takes little memory where little is declared; what is declared is held once.
+/// Undeclared edits take no memory, and declared ones are allocated once.
 #[test]
-fn detailed_edits_are_declared_and_have_their_room() {
+fn detailed_edits_must_be_declared_and_are_preallocated() {
     assert_eq!([Needs::default(), detailed()].map(|needs| bytes_per_row(&needs)), [29, 65]);
     let plain = family(1, ParentFate::BecomesChild);
     let by_axis = Offspring { scale: ScaleRule::Axes([1.0, 0.5, 2.0]), ..plain };
@@ -126,7 +126,7 @@ fn calls() -> impl Strategy<Value = (usize, usize, Vec<Call>)> {
     })
 }
 
-/// What a slot of the naive model holds.
+/// The content of a slot in the naive model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Occupant {
     Row(u32),
@@ -134,7 +134,7 @@ enum Occupant {
     Seed(usize),
 }
 
-/// Executes `ops` on a plain vector, checking every sub-step, and returns the occupants left.
+/// Executes `ops` on a plain vector, checking every sub-step, and returns the resulting slots.
 fn execute(ops: &RowOps, pruned: &[u32], budget: usize) -> Vec<Occupant> {
     let slots = ops.rows_before.max(budget);
     let mut model: Vec<Option<Occupant>> = (0..slots)
@@ -235,17 +235,17 @@ fn signals_are_reset_alone_or_all_together() {
     let only = |signals: &[Signal]| Reset::Only(signals.iter().copied().collect());
     let some = reset(&[only(&[Signal::WeightSum]), only(&[Signal::VisibleCount])]);
     assert_eq!(some, SignalSet::from([Signal::VisibleCount, Signal::WeightSum]));
-    // What a row is now, and what is kept by epoch, has no reset.
+    // Signals of the current state and signals kept per epoch are not reset.
     assert!(reset(&[only(&[Signal::Opacity, Signal::WeightMax])]).is_empty());
     let all = reset(&[only(&[Signal::WeightSum]), Reset::Signals]);
     let resettable: SignalSet =
-        Signal::ALL.into_iter().filter(|signal| signal.is_reset()).collect();
+        Signal::ALL.into_iter().filter(|signal| signal.is_resettable()).collect();
     assert_eq!(all, resettable);
     assert!(all.contains(Signal::ScreenGradient) && !all.contains(Signal::Age));
 }
 
 #[test]
-fn a_decay_of_what_was_seen_needs_to_know_what_was_seen() {
+fn a_decay_of_seen_rows_needs_the_visible_count() {
     let decay = Decay { opacity: 0.1, scale: 0.2, seen_only: true };
     let mut plan = EditPlan::new(1, 1).allowing(&detailed());
     assert_eq!(plan.decay(decay), Err(Refused::Undeclared));

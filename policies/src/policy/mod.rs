@@ -1,9 +1,9 @@
-//! The policy interface: what a policy declares, what it sees, and what it returns.
+//! The policy interface: a policy's declarations, inputs and outputs.
 //!
 //! A policy decides which Gaussians are cloned, split, pruned or added. It declares the statistics
 //! it needs ([`Needs`]), and the backend accumulates only these. At the steps at which it
 //! [`is_due`](DensityPolicy::is_due) it reads a [`Snapshot`] and writes its edits into an
-//! [`EditPlan`]. It touches no parameter and no device, so every policy runs unchanged on every
+//! [`EditPlan`]. It accesses neither parameters nor devices, so every policy runs unchanged on every
 //! backend and can be tested without a renderer.
 
 use serde::{Deserialize, Serialize};
@@ -21,15 +21,15 @@ pub use crate::signals::{
 
 /// A density-control policy.
 pub trait DensityPolicy: Send {
-    /// What this policy reads, and how it wants the model initialised and trained. Only this is
-    /// computed and allocated; reading anything else is a [`PolicyError::Undeclared`].
+    /// The inputs of this policy, and its changes to initialisation and training. Only these inputs are
+    /// computed and allocated; reading any other returns [`PolicyError::Undeclared`].
     fn needs(&self, scene: &SceneInfo) -> Needs;
 
-    /// Whether this policy edits after the optimiser step of iteration `step` (1-based).
+    /// True if this policy edits after the optimiser step of iteration `step` (1-based).
     fn is_due(&self, step: u32) -> bool;
 
-    /// How often the optimiser steps at iteration `step`; at most as rarely as
-    /// [declared](Needs::cadence). Gradients still summed when it changes are used at the next step.
+    /// The interval of optimiser steps at iteration `step`, at most the [declared](Needs::cadence) one. If it
+    /// changes, the gradients summed so far are used at the next optimiser step.
     fn cadence(&self, step: u32) -> Cadence {
         let _ = step;
         Cadence::default()
@@ -47,15 +47,14 @@ pub trait DensityPolicy: Send {
         declared
     }
 
-    /// What both sides of the training image are multiplied by at iteration `step`, from the
-    /// [declared least](Needs::least_resolution) to 1. Views rendered for policies and measurements are
-    /// always whole.
+    /// Factor on both sides of the training image at iteration `step`, from the
+    /// [declared minimum](Needs::least_resolution) to 1. Auxiliary and test views are always full-size.
     fn resolution(&self, step: u32) -> f64 {
         let _ = step;
         1.0
     }
 
-    /// How many training views, drawn at random without replacement, are rendered and
+    /// Number of training views, drawn at random without replacement, that are rendered and
     /// [observed](Self::observe) before the plan of `step`, at which the policy is due; all of them
     /// if there are fewer. 0 for a policy that declares no [`Needs::aux`].
     fn aux_views(&self, step: u32, rows: usize, budget: usize) -> u32 {
@@ -73,15 +72,15 @@ pub trait DensityPolicy: Send {
         Ok(())
     }
 
-    /// Writes the edits of this event into `plan`. A pure function of its arguments and the
-    /// policy's own state: no device, no I/O, no randomness but `rng`.
+    /// Writes the edits of this event into `plan`. A pure function of its arguments and the policy's own
+    /// state: no device, no I/O, and no randomness other than `rng`.
     ///
     /// # Errors
     /// [`PolicyError`] stops the run with the policy's name and the step; the plan is dropped.
     fn plan(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult;
 
-    /// The state that future decisions depend on, beside the parameters. The default is for
-    /// policies that have none.
+    /// The state that future decisions depend on, apart from the parameters. The default is for policies
+    /// without state.
     fn save(&self) -> PolicyState {
         PolicyState::Null
     }
@@ -89,7 +88,7 @@ pub trait DensityPolicy: Send {
     /// Restores what [`save`](Self::save) returned.
     ///
     /// # Errors
-    /// [`PolicyError::State`] when `state` is not this policy's.
+    /// [`PolicyError::State`] when `state` belongs to another policy.
     fn restore(&mut self, state: PolicyState) -> PolicyResult {
         if state.is_null() {
             return Ok(());
@@ -100,29 +99,28 @@ pub trait DensityPolicy: Send {
     }
 }
 
-/// A policy's state as JSON; `null` for a policy that has none.
+/// A policy's state as JSON; `null` for a policy without state.
 pub type PolicyState = serde_json::Value;
 
 /// The scene and the run, as known before the first step.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SceneInfo {
-    /// Size of the scene: 1.1 times the largest distance of a training camera from their mean
-    /// `[scene units]`, > 0, or what [`Signal::Position`] has as 1 in its place. Size thresholds are
-    /// fractions of it.
+    /// Size of the scene `[scene units]`, > 0: 1.1 times the largest distance of a training camera from their
+    /// mean, or of its substitute described at [`Signal::Position`]. Size thresholds are fractions of it.
     pub extent: f32,
     /// Number of training views, >= 1; also the length of an epoch in steps.
     pub train_views: u32,
-    /// Most rows the model may ever have.
+    /// Maximum number of rows of the model.
     pub budget: usize,
     /// Rows after initialisation, <= `budget`.
     pub initial_rows: usize,
     /// Length of the run in steps.
     pub iterations: u32,
-    /// Whether images are composited on white (the original then resets opacity at step 500).
+    /// True if images are composited on white (the original then resets opacity at step 500).
     pub white_background: bool,
 }
 
-/// What a policy sees at an event. Row `i` of every signal is row `i` of the model now.
+/// The inputs of a policy at an event. Row `i` of every signal is the current row `i` of the model.
 #[derive(Debug, Clone, Copy)]
 pub struct Snapshot<'a> {
     /// Iteration just finished, 1-based.
@@ -137,13 +135,13 @@ pub struct Snapshot<'a> {
 }
 
 impl<'a> Snapshot<'a> {
-    /// Number of rows now.
+    /// Current number of rows.
     #[must_use]
     pub fn rows(&self) -> usize {
         self.signals.rows()
     }
 
-    /// The values of `signal`. Shape: `[rows, width]`, where the [width](Signal::width) is mostly 1.
+    /// The values of `signal`. Shape: `[rows, width]`, where the [width](Signal::width) is usually 1.
     ///
     /// # Errors
     /// [`PolicyError::Undeclared`] when the policy's needs do not list it.
@@ -184,7 +182,7 @@ impl<'a> Snapshot<'a> {
     }
 }
 
-/// A pixel with a large error, and the surface point that it shows.
+/// A pixel with a large error, and the surface point seen there.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Candidate {
     /// Surface point `[scene units]`.

@@ -1,4 +1,4 @@
-//! Tests of what a policy may read.
+//! Tests of the inputs of policies.
 
 use super::*;
 use crate::event::Event;

@@ -1,7 +1,7 @@
-//! # radsplat — growth as in `vanilla`, then pruning of what no pixel shows
+//! # radsplat — growth as in `vanilla`, then pruning of Gaussians that are visible in no pixel
 //!
-//! Grows a model as `vanilla` does, and at two later steps prunes the Gaussians that have no weight worth
-//! mentioning in any pixel of any training view. The rest of the run trains what is left.
+//! Grows a model as `vanilla` does, and at two later steps prunes the Gaussians whose weight is negligible in
+//! every pixel of every training view. The rest of the run trains the remaining Gaussians.
 //!
 //! Source: *RadSplat: Radiance Field-Informed Gaussian Splatting for Robust Real-Time Rendering with 900+
 //! FPS*, Niemeyer, Manhardt, Rakotosaona, Oechsle, Duckworth, Gosula, Tateno, Bates, Kaeser, Tombari, 3DV
@@ -15,29 +15,29 @@
 //!
 //! **Pruning.** At the steps `first_at` and `second_at` all training views are rendered. A Gaussian's
 //! importance is its largest blend weight α·T in any pixel of any view, and those below `min_weight` are
-//! pruned. A sum would spare large faint Gaussians; the largest weight asks whether a Gaussian matters
-//! anywhere. The paper's light variant, with fewer Gaussians, is `min_weight` = 0.25.
+//! pruned. A sum of weights would spare large faint Gaussians; the largest weight tells whether a Gaussian
+//! matters anywhere. The paper's light variant, with fewer Gaussians, is `min_weight` = 0.25.
 //!
-//! `victims = "random"` draws as many Gaussians at random instead: a control that shows what the
-//! importance is worth. Up to the first prune it is the same run, and that prune removes as many. What
-//! it leaves still holds most of the unimportant, so that by itself the second prune would remove more
-//! than that of the real run: give the number that the real run had left as `random_keep`.
+//! `victims = "random"` is a control that measures the effect of the importance: it prunes at random. It is
+//! identical up to the first prune, which removes the same number. As most unimportant Gaussians remain after
+//! it, the second prune would remove more than in the real run: set `random_keep` to the number that the real
+//! run had after its second prune.
 //!
 //! ## Under a budget
 //!
 //! The budget bounds growth and is never exceeded. Nothing grows after the prunes, so a run ends below
-//! the budget, by as much as the scene has Gaussians that no pixel shows; compare it by its final
-//! number too. Of what had grown within a budget of 8,000 in 2,000 steps at half size, the defaults
-//! left 97 % on room256 and 87 % on cup, the light variant 34 % and 11 %.
+//! the budget, by an amount that depends on the scene; compare by final number, too. With a budget of 8,000
+//! and 2,000 steps at half size, the defaults kept 97 % of the grown model on room256 and 87 % on cup, the
+//! light variant 34 % and 11 %.
 //!
 //! ## Differences from the paper
 //!
-//! - The paper starts from a radiance field and trains on its pictures. Here the start and the
-//!   photographs are those of every other policy.
+//! - The paper starts from a radiance field and trains on its renderings. Here initial model and
+//!   photographs are the same as for every other policy.
 //! - The last Gaussian is never pruned.
 //! - Training views that nearly repeat another are not rendered (`--full` renders all).
 //! - The paper then groups cameras and stores which Gaussians each group sees. That speeds up viewing and
-//!   is no density control.
+//!   is not part of density control.
 //!
 //! ## Parameters
 //!
@@ -62,7 +62,7 @@
 //! | second_at | 24000 | >= 0 | step | second prune; 0: none |
 //! | min_weight | 0.01 | 0 to 1 | | Gaussians whose largest blend weight is below this are pruned |
 //! | victims | "lowest" | lowest, random | | which Gaussians are pruned |
-//! | random_keep | 0 | >= 0 | Gaussians | left by the second prune of `random`; 0: as many as `min_weight` leaves |
+//! | random_keep | 0 | >= 0 | Gaussians | number after the second prune of `random`; 0: as by `min_weight` |
 //!
 //! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
 //! (`…_every`) do not shrink below 100 steps.
@@ -84,7 +84,7 @@ use crate::vanilla::{Vanilla, VanillaParams};
 crate::register_policy!(
     "radsplat",
     RadSplat,
-    summary: "growth as in vanilla, then two prunes of what has little weight in every pixel",
+    summary: "growth as in vanilla, then two prunes of Gaussians with little weight in every pixel",
     source: "RadSplat, Niemeyer et al. 2024, arXiv 2403.13806",
     doc: include_str!("mod.rs"),
 );
@@ -146,11 +146,11 @@ impl DensityPolicy for RadSplat {
     }
 
     fn is_due(&self, step: u32) -> bool {
-        self.growth.is_due(step) || self.is_prune(step)
+        self.growth.is_due(step) || self.prunes_at(step)
     }
 
     fn aux_views(&self, step: u32, _rows: usize, _budget: usize) -> u32 {
-        if self.is_prune(step) && self.kept_at_random(step).is_none() { u32::MAX } else { 0 }
+        if self.prunes_at(step) && self.kept_at_random(step).is_none() { u32::MAX } else { 0 }
     }
 
     fn observe(&mut self, view: &AuxView<'_>) -> PolicyResult {
@@ -162,7 +162,7 @@ impl DensityPolicy for RadSplat {
         if self.growth.is_due(now.step) {
             self.growth.plan(now, rng, plan)?;
         }
-        if !self.is_prune(now.step) {
+        if !self.prunes_at(now.step) {
             return Ok(());
         }
         let weight = self.weight.take(now);
@@ -180,11 +180,11 @@ impl DensityPolicy for RadSplat {
 }
 
 impl RadSplat {
-    fn is_prune(&self, step: u32) -> bool {
+    fn prunes_at(&self, step: u32) -> bool {
         step > 0 && (step == self.params.first_at || step == self.params.second_at)
     }
 
-    /// How many rows the control leaves at `step`, where that is given.
+    /// Number of rows that the control keeps at `step`, if `random_keep` sets it.
     fn kept_at_random(&self, step: u32) -> Option<usize> {
         let RadSplatParams { second_at, victims, random_keep, .. } = self.params;
         let is_given = victims == Victims::Random && random_keep > 0 && step == second_at;

@@ -1,7 +1,7 @@
 //! # reduced-3dgs — growth as in `vanilla`, with regular pruning of redundant Gaussians
 //!
-//! Grows a model as `vanilla` does, and throughout the run prunes Gaussians that crowd a place where
-//! several others already are, together with the faintest.
+//! Grows a model as `vanilla` does, and throughout the run prunes Gaussians in crowded regions as well as the
+//! faintest ones.
 //!
 //! Source: *Reducing the Memory Footprint of 3D Gaussian Splatting*, Papantonakis, Kopanas, Kerbl, Lanvin,
 //! Drettakis, I3D 2024, arXiv 2406.17074, section 3.1, with the constants of its public code.
@@ -11,45 +11,45 @@
 //! **Growth** is that of `vanilla`, with its parameters: clones and splits by screen gradient, pruning by
 //! opacity and size, opacity resets, and a hard stop at the budget (or `governor`).
 //!
-//! **Redundancy.** No view can tell apart what lies within one pixel. Around each Gaussian's mean there is
-//! therefore a sphere of radius r = √3/2 · p, p the smallest width that a pixel had at its depth in the
-//! views since the last prune: half the diagonal of a cube with edge p. Of the Gaussian's `neighbours`
-//! nearest neighbours, those are counted whose ellipsoid (`sigmas` standard deviations) meets the sphere, and
-//! itself. The redundancy R of a Gaussian is the smallest of the counts of all spheres that it meets in
-//! this way, so that it is not redundant where it fills a place that has few others.
+//! **Redundancy.** No view can separate Gaussians within one pixel. Each Gaussian therefore has a sphere
+//! around its mean with radius r = √3/2 · p, half the diagonal of a cube with edge p, where p is the smallest
+//! width of a pixel at its depth in the views since the last prune. The count of a sphere is 1 plus the number
+//! of the Gaussian's `neighbours` nearest neighbours whose ellipsoid (`sigmas` standard deviations) intersects
+//! it. The redundancy R of a Gaussian is the smallest count of all spheres that it intersects in this way, so
+//! a Gaussian is not redundant if it is needed in one sparse region.
 //!
 //! **Pruning** every `prune_every` steps until `prune_until` (inclusive), but not at opacity resets:
 //!
-//! 1. Of the Gaussians with R > max(mean + `deviations` · standard deviation, `min_redundancy`), mean and
-//!    standard deviation over all Gaussians, those are pruned whose opacity is below the median of these.
-//! 2. Gaussians less opaque than both the `faint_share` quantile of all opacities and `faint_opacity` are
+//! 1. A Gaussian is redundant if R > max(mean + `deviations` · standard deviation, `min_redundancy`), with
+//!    mean and standard deviation over all Gaussians. Redundant Gaussians below their median opacity are
 //!    pruned.
-//! 3. After growth (`grow_until`), Gaussians less opaque than 1/255 are pruned: no pixel shows them.
+//! 2. Gaussians below both `faint_opacity` and the `faint_share` quantile of all opacities are pruned.
+//! 3. After growth (`grow_until`), Gaussians below opacity 1/255 are pruned, as they are never rendered.
 //!
-//! **Loss.** `opacity_term` · mean opacity is added, so that what the images do not need fades.
+//! **Loss.** `opacity_term` · mean opacity is added, so that unneeded Gaussians fade.
 //!
-//! `victims = "random"` draws as many at random instead: a control that shows what the choice is worth. As
-//! it leaves redundant Gaussians behind, it finds more to prune than the real run. To end at the same
-//! number, give that of the real run as `random_keep`: from `grow_until` on, each prune then removes
-//! the same share, and the last one leaves this number.
+//! `victims = "random"` is a control that measures the effect of the criterion: it prunes the same number at
+//! random. As it leaves redundant Gaussians, it then finds more to prune than the real run. To end at the same
+//! number, set `random_keep` to that of the real run: from `grow_until` on, each prune then removes the same
+//! share, and the last one ends at this number.
 //!
 //! ## Under a budget
 //!
-//! The budget bounds growth and is never exceeded. What pruning frees is grown anew until `grow_until`.
-//! Nothing grows after that, so a run ends below the budget: with the defaults by at least the faintest
-//! 3 % at each prune, as long as these are below `faint_opacity`. Of a budget of 8,000, runs of 7,000 steps
-//! at half size left 24 to 34 % (six scenes). Compare it by its final number too.
+//! The budget bounds growth and is never exceeded. Until `grow_until`, new Gaussians take the place of pruned
+//! ones. Nothing grows after that, so a run ends below the budget: with the defaults each prune removes at
+//! least the faintest 3 %, as long as these are below `faint_opacity`. With a budget of 8,000, runs of 7,000
+//! steps at half size ended at 24 to 34 % of it (six scenes). Compare by final number, too.
 //!
 //! ## Differences from the published code
 //!
-//! - Spherical harmonics of Gaussians whose colour hardly varies are not dropped: this needs the colour
-//!   that each view saw. Without it, the published schedule prunes to the end of the run, as here. The
-//!   published codebook of the finished model is no density control.
-//! - The text does not say where an ellipsoid ends. Three standard deviations is where a rasteriser stops
-//!   drawing it.
+//! - Spherical harmonics of Gaussians whose colour hardly varies are not dropped, as this needs the colour
+//!   seen by each view. Without it, the published schedule prunes to the end of the run, as here. The
+//!   published codebook for the finished model is not part of density control.
+//! - The paper does not define the extent of an ellipsoid. Three standard deviations is where a rasteriser
+//!   stops drawing it.
 //! - The smallest pixel is that of the views since the last prune, a few epochs, not of all views. A
-//!   Gaussian that none of them showed has no sphere of its own.
-//! - Redundancy is measured before the growth of the same step, and what grows at it is not pruned.
+//!   Gaussian that was visible in none of them has no sphere.
+//! - Redundancy is measured before the growth of the same step, and Gaussians that grow are not pruned.
 //! - The last Gaussian is never pruned.
 //!
 //! ## Parameters
@@ -73,15 +73,15 @@
 //! | governor | false | | | grow along a curve instead of by `tau` |
 //! | prune_every | 1000 | >= 0 | steps | interval of pruning; 0: never |
 //! | prune_until | 30000 | >= 0 | step | end of pruning (inclusive) |
-//! | neighbours | 30 | 1 to 1000 | Gaussians | nearest neighbours that are looked at |
+//! | neighbours | 30 | 1 to 1000 | Gaussians | nearest neighbours that are tested |
 //! | sigmas | 3.0 | > 0 | standard deviations | half-axes of an ellipsoid |
-//! | deviations | 1.0 | >= 0 | standard deviations | what R exceeds its mean by if it is redundant |
-//! | min_redundancy | 3.0 | >= 0 | Gaussians | what R exceeds at least if it is redundant |
-//! | faint_share | 0.03 | 0 to 1 | Gaussians | quantile of opacity below which Gaussians are faint |
-//! | faint_opacity | 0.05 | 0 to 1 | | opacity below which they are, too; 0: none are |
+//! | deviations | 1.0 | >= 0 | standard deviations | how far above the mean R is for a redundant Gaussian |
+//! | min_redundancy | 3.0 | >= 0 | Gaussians | R of a redundant Gaussian is above this |
+//! | faint_share | 0.03 | 0 to 1 | Gaussians | Gaussians below this quantile of opacity … |
+//! | faint_opacity | 0.05 | 0 to 1 | | … and below this opacity are pruned; 0: none |
 //! | opacity_term | 0.001 | >= 0 | loss | coefficient of the mean opacity |
 //! | victims | "lowest" | lowest, random | | which Gaussians are pruned |
-//! | random_keep | 0 | >= 0 | Gaussians | left by the prunes of `random`; 0: each prunes as many as `lowest` |
+//! | random_keep | 0 | >= 0 | Gaussians | final number of `random`; 0: each prune removes as many as `lowest` |
 //!
 //! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
 //! (`…_every`) do not shrink below 100 steps.
@@ -95,8 +95,9 @@ use crate::policy::{
 use crate::prune::Victims;
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
+use crate::sample::quantile;
 use crate::vanilla::Vanilla;
-use redundancy::Shapes;
+use redundancy::Ellipsoids;
 
 mod parameters;
 mod redundancy;
@@ -111,10 +112,10 @@ crate::register_policy!(
     doc: include_str!("mod.rs"),
 );
 
-/// Opacity below which nothing is drawn: a pixel stops at this alpha.
+/// Smallest alpha that is rendered.
 const INVISIBLE: f32 = 1.0 / 255.0;
 
-/// Growth as in `vanilla`, with pruning of what is redundant or faint.
+/// Growth as in `vanilla`, with pruning of redundant and faint rows.
 #[derive(Debug)]
 pub struct Reduced {
     params: ReducedParams,
@@ -136,7 +137,7 @@ impl ConfiguredPolicy for Reduced {
 impl DensityPolicy for Reduced {
     fn needs(&self, scene: &SceneInfo) -> Needs {
         let growth = self.growth.needs(scene);
-        let shapes = SignalSet::from([
+        let shape = SignalSet::from([
             Signal::Position,
             Signal::LogScale,
             Signal::Orientation,
@@ -144,21 +145,21 @@ impl DensityPolicy for Reduced {
         ]);
         let opacity = self.params.opacity_term as f32;
         Needs {
-            signals: growth.signals.union(shapes),
+            signals: growth.signals.union(shape),
             loss_terms: LossTerms { opacity, ..LossTerms::default() },
             ..growth
         }
     }
 
     fn is_due(&self, step: u32) -> bool {
-        self.growth.is_due(step) || self.is_prune(step)
+        self.growth.is_due(step) || self.prunes_at(step)
     }
 
     fn plan(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
         if self.growth.is_due(now.step) {
             self.growth.plan(now, rng, plan)?;
         }
-        if self.is_prune(now.step) {
+        if self.prunes_at(now.step) {
             self.prune(now, rng, plan)?;
             plan.reset(Reset::Only(SignalSet::default().with(Signal::PixelSizeMin)));
         }
@@ -167,14 +168,14 @@ impl DensityPolicy for Reduced {
 }
 
 impl Reduced {
-    fn is_prune(&self, step: u32) -> bool {
+    fn prunes_at(&self, step: u32) -> bool {
         let ReducedParams { prune_every, prune_until, .. } = self.params;
-        let is_listed = prune_every > 0 && step <= prune_until && step.is_multiple_of(prune_every);
-        // Right after a reset all opacities are alike.
-        is_listed && step > 0 && !self.growth.is_reset(step)
+        let is_due = prune_every > 0 && step <= prune_until && step.is_multiple_of(prune_every);
+        // Right after a reset all opacities are similar.
+        is_due && step > 0 && !self.growth.resets_at(step)
     }
 
-    /// Prunes the redundant and the faint, or as many at random, of those without an edit.
+    /// Prunes redundant and faint rows, or the same number at random, among those without an edit.
     fn prune(&self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
         if let Some(count) = self.random_count(now, plan) {
             Victims::Random.prune(plan, &[], count, rng);
@@ -185,7 +186,7 @@ impl Reduced {
         let mut count = 0;
         for row in self.victims(now)? {
             if plan.is_free(row) && order[row as usize].is_infinite() {
-                // Should all rows be on the list, the most opaque is the one that is left.
+                // If all rows are to be pruned, the most opaque one is kept.
                 order[row as usize] = opacity[row as usize];
                 count += 1;
             }
@@ -194,7 +195,7 @@ impl Reduced {
         Ok(())
     }
 
-    /// The rows that are redundant or faint; some of them twice.
+    /// The rows that are redundant or faint; some may be listed twice.
     fn victims(&self, now: &Snapshot<'_>) -> PolicyResult<Vec<u32>> {
         let opacity = now.signal(Signal::Opacity)?;
         let mut victims = self.redundant(&self.redundancy(now)?, opacity);
@@ -209,17 +210,17 @@ impl Reduced {
 
     /// R of every row, >= 1. Shape: `[rows]`.
     fn redundancy(&self, now: &Snapshot<'_>) -> PolicyResult<Vec<f32>> {
-        let shapes = Shapes {
+        let ellipsoids = Ellipsoids {
             means: now.positions()?,
             log_scales: now.log_scales()?,
             orientations: now.orientations()?,
             pixel_sizes: now.signal(Signal::PixelSizeMin)?,
             sigmas: self.params.sigmas,
         };
-        Ok(shapes.redundancy(self.params.neighbours as usize))
+        Ok(ellipsoids.redundancy(self.params.neighbours as usize))
     }
 
-    /// Of the rows whose redundancy is far above the mean, those that are less opaque than their median.
+    /// The redundant rows below their median opacity.
     fn redundant(&self, redundancy: &[f32], opacity: &[f32]) -> Vec<u32> {
         let (mean, deviation) = mean_and_deviation(redundancy);
         let least = (mean + self.params.deviations * deviation).max(self.params.min_redundancy);
@@ -233,8 +234,8 @@ impl Reduced {
         rows
     }
 
-    /// How many rows the control prunes at `step`, where the number that it leaves is given: the same share
-    /// at all prunes from the end of growth on, and before that none.
+    /// Number of rows that the control prunes at `step` to end at `random_keep`: the same share at each prune
+    /// after growth. `None` during growth or without `random_keep`.
     fn random_count(&self, now: &Snapshot<'_>, plan: &EditPlan) -> Option<usize> {
         let ReducedParams { victims, random_keep, prune_until, prune_every, .. } = self.params;
         let (step, until) = (now.step, prune_until.min(now.scene.iterations));
@@ -243,30 +244,19 @@ impl Reduced {
         }
         let left = plan.rows() - plan.pruned();
         let later = (step / prune_every + 1..=until / prune_every)
-            .filter(|event| self.is_prune(event * prune_every));
+            .filter(|event| self.prunes_at(event * prune_every));
         let prunes = later.count() + 1;
         let kept = left as f64 * (f64::from(random_keep) / left as f64).powf(1.0 / prunes as f64);
         Some(left.saturating_sub(kept.round() as usize))
     }
 }
 
-/// Mean and standard deviation (of a sample); 0 where there are too few values.
+/// Mean and sample standard deviation; 0 if there are too few values.
 fn mean_and_deviation(values: &[f32]) -> (f64, f64) {
     let count = values.len() as f64;
     let mean = values.iter().map(|&v| f64::from(v)).sum::<f64>() / count.max(1.0);
     let squares: f64 = values.iter().map(|&v| (f64::from(v) - mean).powi(2)).sum();
     (mean, (squares / (count - 1.0).max(1.0)).sqrt())
-}
-
-/// The value that the share `share` of all finite values does not exceed, interpolated between two of
-/// them; `None` if none is finite.
-fn quantile(values: &[f32], share: f64) -> Option<f64> {
-    let mut finite: Vec<f32> = values.iter().copied().filter(|value| value.is_finite()).collect();
-    let place = share * finite.len().checked_sub(1)? as f64;
-    let (below, between) = (place.floor() as usize, place.fract());
-    let (_, &mut low, above) = finite.select_nth_unstable_by(below, f32::total_cmp);
-    let high = above.iter().copied().min_by(f32::total_cmp).unwrap_or(low);
-    Some(f64::from(low) + between * (f64::from(high) - f64::from(low)))
 }
 
 #[cfg(test)]

@@ -49,16 +49,14 @@ impl Default for ReducedParams {
 }
 
 impl ReducedParams {
-    /// Checks ranges; those of growth are checked where it is made.
+    /// Checks the ranges of the parameters that are not `vanilla`'s.
     pub(super) fn check(&self) -> PolicyResult {
-        // The term is declared as an f32, which must be finite too.
-        let opacity_term = f64::from(self.opacity_term as f32);
         in_range("neighbours", f64::from(self.neighbours), 1.0..=1000.0)?;
         in_range("sigmas", self.sigmas, (Excluded(0.0), Unbounded))?;
         in_range("deviations", self.deviations, 0.0..)?;
         in_range("min_redundancy", self.min_redundancy, 0.0..)?;
         in_range("faint_share", self.faint_share, 0.0..=1.0)?;
         in_range("faint_opacity", self.faint_opacity, 0.0..=1.0)?;
-        in_range("opacity_term", opacity_term, 0.0..)
+        in_range("opacity_term", self.opacity_term, 0.0..)
     }
 }

@@ -1,21 +1,22 @@
-//! How many Gaussians share the space of a pixel: spheres around means, and the ellipsoids that meet them.
+//! Redundancy: the number of Gaussians that share the space of a pixel, by intersecting spheres around their
+//! means with ellipsoids.
 
 use crate::neighbours::Neighbours;
 
 /// Half the diagonal of a cube with edge 1.
 const HALF_DIAGONAL: f64 = 0.866_025_403_784_438_6;
-/// Most steps of Newton's method. Of a million random cases with axes that differ by up to 10¹², none took
-/// more than 16.
+/// Maximum number of steps of Newton's method. In a million random cases with axes that differ by up to 10¹²,
+/// none took more than 16.
 const MOST_STEPS: u32 = 50;
-/// Relative change at which Newton's method ends: some roundings of an f64.
-const SETTLED: f64 = 1e-14;
-/// Shortest half-axis: its square is far from the smallest f64, and no scene is so small.
+/// Relative change at which Newton's method stops: some multiples of the rounding error of an f64.
+const TOLERANCE: f64 = 1e-14;
+/// Shortest half-axis: its square is well within the range of f64, and no scene is so small.
 const SHORTEST: f64 = 1e-38;
 /// Longest half-axis and distance, likewise.
 const LONGEST: f64 = 1e38;
 
-/// Means, ellipsoids and pixel sizes of all rows.
-pub(super) struct Shapes<'a> {
+/// Ellipsoids and pixel sizes of all rows.
+pub(super) struct Ellipsoids<'a> {
     /// `[scene units]`.
     pub(super) means: &'a [[f32; 3]],
     /// `[ln scene units]`.
@@ -29,27 +30,27 @@ pub(super) struct Shapes<'a> {
     pub(super) sigmas: f64,
 }
 
-impl Shapes<'_> {
-    /// For each row the smallest count of the spheres that it meets, its own included: the row of the
-    /// sphere, and those of the row's `most` nearest neighbours whose ellipsoids meet the sphere. 1 for
-    /// a row that meets none, or is not finite. Shape: `[rows]`.
+impl Ellipsoids<'_> {
+    /// The redundancy of each row: the smallest count of the spheres that it intersects, its own included. The
+    /// count of a row's sphere is 1 plus the number of its `most` nearest neighbours whose ellipsoids
+    /// intersect it. 1 for a row that intersects none or is not finite. Shape: `[rows]`.
     pub(super) fn redundancy(&self, most: usize) -> Vec<f32> {
         let half_axes: Vec<[f64; 3]> = self.log_scales.iter().map(|s| self.half_axes(*s)).collect();
-        let is_sound = |&row: &u32| {
+        let is_valid = |&row: &u32| {
             let row = row as usize;
-            let turns = self.orientations[row].iter().map(|q| q * q).sum::<f32>().is_normal();
+            let is_rotation = self.orientations[row].iter().map(|q| q * q).sum::<f32>().is_normal();
             let fits = |value: f64| value.abs() <= LONGEST;
-            turns
+            is_rotation
                 && half_axes[row].iter().all(|&axis| fits(axis))
                 && self.means[row].iter().all(|&x| fits(x.into()))
         };
-        let rows: Vec<u32> = (0..self.means.len() as u32).filter(is_sound).collect();
+        let rows: Vec<u32> = (0..self.means.len() as u32).filter(is_valid).collect();
         let points: Vec<[f64; 3]> =
             rows.iter().map(|&row| self.means[row as usize].map(f64::from)).collect();
         let tree = Neighbours::new(&points);
         let mut redundancy = vec![f32::INFINITY; self.means.len()];
         let mut met = Vec::new();
-        tree.each_nearest(most, |index, nearest| {
+        tree.for_each_nearest(most, |index, nearest| {
             let (row, mean) = (rows[index], points[index]);
             let radius = HALF_DIAGONAL * f64::from(self.pixel_sizes[row as usize]);
             let has_sphere = radius > 0.0 && radius <= LONGEST;
@@ -66,10 +67,10 @@ impl Shapes<'_> {
                 let is_farther = |reach: f64| other.square > reach * reach;
                 let meets = || {
                     let from = [0, 1, 2].map(|k: usize| mean[k] - at[k]);
-                    let from = turned_back(self.orientations[row as usize], from);
+                    let from = rotate_back(self.orientations[row as usize], from);
                     sphere_meets(from, radius, axes)
                 };
-                // What meets the ball within the ellipsoid, and what misses the ball around it.
+                // Fast tests with the inscribed and the circumscribed ball of the ellipsoid.
                 if !is_farther(short + radius) || (!is_farther(long + radius) && meets()) {
                     met.push(row);
                 }
@@ -85,14 +86,14 @@ impl Shapes<'_> {
     fn half_axes(&self, log_scales: [f32; 3]) -> [f64; 3] {
         log_scales.map(|log| {
             let axis = self.sigmas * f64::from(log).exp();
-            // `max` would turn NaN into the limit.
+            // `max` would replace NaN by the limit.
             if axis < SHORTEST { SHORTEST } else { axis }
         })
     }
 }
 
-/// A vector of the scene along the axes of the quaternion (w, x, y, z) of any length but 0: R(q)ᵀ · v.
-fn turned_back(q: [f32; 4], v: [f64; 3]) -> [f64; 3] {
+/// Rotates a vector into the frame of the quaternion (w, x, y, z) of any length but 0: R(q)ᵀ · v.
+fn rotate_back(q: [f32; 4], v: [f64; 3]) -> [f64; 3] {
     let [w, x, y, z] = q.map(f64::from);
     let norm = w * w + x * x + y * y + z * z;
     // v + 2 u × (u × v − w v), u = (x, y, z): the rotation by the conjugate.
@@ -105,26 +106,27 @@ fn turned_back(q: [f32; 4], v: [f64; 3]) -> [f64; 3] {
     [0, 1, 2].map(|k: usize| v[k] + 2.0 * outer[k] / norm)
 }
 
-/// Whether the sphere around `centre` meets the ellipsoid with these `half_axes` at the origin.
+/// True if the sphere around `centre` intersects the ellipsoid with these `half_axes` at the origin.
 ///
 /// With half-axes e and the centre p outside, the ellipsoid's nearest point is eᵢ² pᵢ / (eᵢ² + t) with the
 /// t >= 0 at which F(t) = Σ (eᵢ pᵢ / (eᵢ² + t))² − 1 is 0; its squared distance D(t) = t² Σ (pᵢ / (eᵢ² + t))²
-/// grows with t. F falls and is convex, so that Newton's method from below never passes the root: as soon
-/// as D there is too large, the sphere misses.
+/// grows with t. F is decreasing and convex, so Newton's method from below never passes the root. If D exceeds
+/// the squared radius at any iterate, the sphere does not intersect.
 fn sphere_meets(centre: [f64; 3], radius: f64, half_axes: [f64; 3]) -> bool {
     let axes = [0, 1, 2].map(|k: usize| (half_axes[k], centre[k].abs()));
     if axes.iter().any(|(e, p)| *p > e + radius) {
         return false;
     }
-    // The ellipsoid with half-axes e + r lies within what spheres around points of this one cover: the
-    // root of Σ (e + r)² u² is at most that of Σ e² u² plus r (Minkowski), for every direction u.
+    // The Minkowski sum of the ellipsoid and a ball of radius r contains the ellipsoid with half-axes e + r, as
+    // √(Σ (e + r)² u²) <= √(Σ e² u²) + r for every direction u.
     if axes.iter().map(|(e, p)| (p / (e + radius)).powi(2)).sum::<f64>() <= 1.0 {
         return true;
     }
     let is_within = |t: f64| {
         axes.iter().map(|(e, p)| (t * p / (e * e + t)).powi(2)).sum::<f64>() <= radius * radius
     };
-    // Each term of F + 1 is at most 1 at the root; and none has a smaller denominator than the shortest axis.
+    // Bounds of the root: each term of F + 1 is at most 1 there, and no denominator is smaller than that of the
+    // shortest axis.
     let mut t = axes.iter().map(|(e, p)| e * (p - e)).fold(0.0, f64::max);
     let shortest = half_axes[0].min(half_axes[1]).min(half_axes[2]);
     let most = axes.iter().map(|(e, p)| (e * p).powi(2)).sum::<f64>().sqrt() - shortest * shortest;
@@ -143,7 +145,7 @@ fn sphere_meets(centre: [f64; 3], radius: f64, half_axes: [f64; 3]) -> bool {
         }
         let step = -value / slope;
         t += step;
-        if step <= SETTLED * t {
+        if step <= TOLERANCE * t {
             break;
         }
     }
@@ -157,7 +159,7 @@ mod tests {
 
     const UPRIGHT: [f32; 4] = [1.0, 0.0, 0.0, 0.0];
 
-    /// Asserts that a sphere at `centre` just misses, and just meets, where its distance is `distance`.
+    /// Asserts that the distance of `centre` from the ellipsoid is `distance`.
     fn assert_distance(centre: [f64; 3], half_axes: [f64; 3], distance: f64) {
         let meets = |radius| sphere_meets(centre, radius, half_axes);
         assert!(!meets(distance * (1.0 - 1e-9)), "{centre:?} {half_axes:?} {distance}");
@@ -173,17 +175,17 @@ mod tests {
         assert_distance([0.0, 0.0, 1.5], [3.0, 2.0, 1.0], 0.5);
         assert!(sphere_meets([1.0, 1.0, 0.5], 1e-30, [3.0, 2.0, 1.0]));
         assert!(sphere_meets([0.0; 3], 1e-30, [1e-38; 3]));
-        // From (1.8, 1.6, 0) of the ellipse with axes 3 and 2, (1.8/9, 1.6/4) = (0.2, 0.4) points outward:
-        // twice that is √0.8 away.
+        // At (1.8, 1.6, 0) the normal of the ellipse with axes 3 and 2 is along (1.8/9, 1.6/4) = (0.2, 0.4);
+        // twice this vector is √0.8 long.
         assert_distance([2.2, 2.4, 0.0], [3.0, 2.0, 1.0], 0.8_f64.sqrt());
-        // A needle and a disk, thin as a hair.
+        // A needle and a very thin disk.
         assert_distance([5.0, 1.0, 0.0], [10.0, 1e-12, 1e-12], 1.0);
         assert_distance([3.0, 0.0, 4.0], [3.0, 3.0, 1e-9], 4.0);
     }
 
     #[test]
-    fn distances_agree_with_points_off_the_surface() {
-        // From a point of the surface along its normal, the distance is how far one went.
+    fn distances_agree_with_points_along_normals() {
+        // A point along the normal of a surface point is at a known distance.
         let rng = PolicyRng::new(3, 1);
         for case in 0..2000 {
             let unit = rng.normal3(case, Purpose::Place, 0).map(f64::from);
@@ -196,21 +198,21 @@ mod tests {
             let distance = (3.0 * logs[0]).exp();
             let centre = [0, 1, 2].map(|k: usize| surface[k] + distance * normal[k] / steep);
             let meets = |radius| sphere_meets(centre, radius, half_axes);
-            // What is lost where the surface is far and the distance small.
-            let lost = 1e-6 * distance + 1e-12 * half_axes.iter().fold(0.0, |a: f64, b| a.max(*b));
-            assert!(!meets(distance - lost) && meets(distance + lost), "{case}: {centre:?}");
+            // Rounding matters if the surface is far from the origin and the distance small.
+            let error = 1e-6 * distance + 1e-12 * half_axes.iter().fold(0.0, |a: f64, b| a.max(*b));
+            assert!(!meets(distance - error) && meets(distance + error), "{case}: {centre:?}");
         }
     }
 
     #[test]
-    fn vectors_are_turned_back_onto_the_axes() {
+    fn vectors_are_rotated_back_onto_the_axes() {
         // A quarter turn about z takes the row's x axis to the scene's y axis; a quaternion of length 2.
         let half = 2.0_f32.sqrt();
-        let turned = turned_back([half, 0.0, 0.0, half], [0.0, 3.0, 5.0]);
+        let turned = rotate_back([half, 0.0, 0.0, half], [0.0, 3.0, 5.0]);
         let expected = [3.0, 0.0, 5.0];
         assert!((0..3).all(|k| (turned[k] - expected[k]).abs() < 1e-6), "{turned:?}");
         assert!(
-            turned_back(UPRIGHT, [1.0, 2.0, 3.0])
+            rotate_back(UPRIGHT, [1.0, 2.0, 3.0])
                 .iter()
                 .zip(1..)
                 .all(|(x, k)| (x - f64::from(k)).abs() < 1e-12)
@@ -221,43 +223,43 @@ mod tests {
         let means: Vec<_> = xs.iter().map(|&x| [x, 0.0, 0.0]).collect();
         let log_scales: Vec<_> =
             half_axes.iter().map(|axes| axes.map(|a| (a / 3.0).ln())).collect();
-        let shapes = Shapes {
+        let ellipsoids = Ellipsoids {
             means: &means,
             log_scales: &log_scales,
             orientations: &vec![UPRIGHT; xs.len()],
             pixel_sizes: pixels,
             sigmas: 3.0,
         };
-        shapes.redundancy(most)
+        ellipsoids.redundancy(most)
     }
 
     #[test]
-    fn the_smallest_count_of_the_spheres_that_a_row_meets() {
-        // Balls of radius 1 at 0, 2, 4 and 20, with spheres of radius 1.1: each of the first two meets the
-        // next ball's rim, 1 away. Counts: 2, 3, 2, 1. The middle one is in the sphere of the first.
+    fn the_smallest_count_of_all_intersected_spheres() {
+        // Balls of radius 1 at 0, 2, 4 and 20, with spheres of radius 1.1: the surface of the next ball is 1 away
+        // from each mean. Counts: 2, 3, 2, 1. The second row is in the sphere of the first.
         let pixel = 1.1 / 0.866_025_4;
         let xs = [0.0, 2.0, 4.0, 20.0];
         assert_eq!(redundancy(&xs, &[[1.0; 3]; 4], &[pixel; 4], 30), [2.0, 2.0, 2.0, 1.0]);
-        // Radius √3/2 does not reach: 1 is farther.
+        // A radius of √3/2 is too small.
         assert_eq!(redundancy(&xs, &[[1.0; 3]; 4], &[1.0; 4], 30), [1.0; 4]);
-        // The sphere of the middle one alone: it counts three, and so do those that it meets.
+        // Only the second row has a sphere, which counts three rows.
         let own = [0.0, pixel, f32::INFINITY, 0.0];
         assert_eq!(redundancy(&xs, &[[1.0; 3]; 4], &own, 30), [3.0, 3.0, 3.0, 1.0]);
-        // A needle that reaches everywhere, and one across. Counts: 2, 3, 3, 2.
+        // One needle along the line and one across. Counts: 2, 3, 3, 2.
         let along = [[30.0, 0.01, 0.01], [1.0; 3], [1.0; 3], [0.01, 0.01, 30.0]];
         assert_eq!(redundancy(&xs, &along, &[pixel; 4], 30), [2.0, 2.0, 3.0, 2.0]);
     }
 
     #[test]
-    fn only_the_nearest_neighbours_are_looked_at() {
-        // Five at one place: with two neighbours each sphere counts three, with thirty it counts five.
+    fn only_the_nearest_neighbours_are_tested() {
+        // Five rows at one place: with two neighbours each sphere counts three, with thirty it counts five.
         let at = |most| redundancy(&[1.0; 5], &[[1.0; 3]; 5], &[1.0; 5], most);
         assert_eq!((at(2), at(30)), (vec![3.0; 5], vec![5.0; 5]));
         assert!(redundancy(&[], &[], &[], 30).is_empty());
     }
 
     #[test]
-    fn what_is_not_finite_meets_nothing() {
+    fn non_finite_rows_intersect_nothing() {
         let axes = [[1.0; 3], [1.0; 3], [f32::INFINITY; 3], [f32::NAN; 3]];
         let xs = [0.0, f32::NAN, 0.0, 0.0];
         assert_eq!(redundancy(&xs, &axes, &[1.0; 4], 30), [1.0; 4]);

@@ -1,7 +1,9 @@
 //! Tests of the rules of `reduced-3dgs`, each worked out by hand.
 
 use super::*;
-use crate::event::{Event, Outcome, assert_conforms, build, due_steps};
+use crate::event::{
+    Event, Outcome, assert_conforms, assert_grows_like_vanilla, assert_refused, build, due_steps,
+};
 use crate::parameters::REFERENCE_ITERATIONS;
 use crate::registry::find;
 
@@ -9,8 +11,8 @@ fn run(event: &Event, set: &str) -> Outcome {
     event.run("reduced-3dgs", set)
 }
 
-/// Rows of opacity 0.5 that neither grow nor die by themselves: balls with half-axes of 1 at these x, in
-/// views whose pixels there have spheres of radius 0.5.
+/// Rows of opacity 0.5: balls with half-axes of 1 at these x, with spheres of radius 0.5. The growth rules
+/// neither densify nor prune them.
 fn event(step: u32, xs: &[f32]) -> Event {
     let means: Vec<f32> = xs.iter().flat_map(|&x| [x, 0.0, 0.0]).collect();
     let upright = [1.0, 0.0, 0.0, 0.0].repeat(xs.len());
@@ -24,28 +26,28 @@ fn event(step: u32, xs: &[f32]) -> Event {
         .with_all(Signal::PixelSizeMin, 0.577_35)
 }
 
-/// Twenty rows that are alone, then six at one place.
+/// Twenty isolated rows, then six at one place.
 fn crowd(step: u32) -> Event {
     let alone = (0..20).map(|row| 10.0 * row as f32);
     event(step, &alone.chain([-50.0; 6]).collect::<Vec<f32>>())
 }
 
-/// The opacities of the crowd; the others have 0.5.
+/// Opacities of the six rows at one place, and 0.5 for the others.
 fn opacities(crowd: [f32; 6]) -> Vec<f32> {
     [0.5; 20].into_iter().chain(crowd).collect()
 }
 
 #[test]
 fn the_fainter_half_of_the_redundant_is_pruned() {
-    // R is 1 twenty times and 6 six times: mean 56/26 = 2.154, standard deviation √(25·20·6/26/25) = 2.148:
-    // above 4.302 are the six. Their median is (0.3 + 0.4)/2 = 0.35.
+    // R is 1 for twenty rows and 6 for six: mean 56/26 = 2.154, standard deviation √(25·20·6/26/25) = 2.148.
+    // The six are above 4.302. Their median opacity is (0.3 + 0.4)/2 = 0.35.
     let event = crowd(1000).with(Signal::Opacity, &opacities([0.1, 0.2, 0.3, 0.4, 0.6, 0.9]));
     let pruned = |set: &str| run(&event, &format!("faint_opacity = 0.0\n{set}")).pruned;
     assert_eq!(pruned(""), [20, 21, 22]);
-    // 2.154 + 1.79·2.148 = 5.999, and with 1.80 it is 6.02.
+    // 2.154 + 1.79·2.148 = 5.999; with 1.80 the sum is 6.02.
     assert_eq!(pruned("deviations = 1.79"), [20, 21, 22]);
     assert!(pruned("deviations = 1.8").is_empty());
-    // At least so many: R must exceed it.
+    // R must exceed `min_redundancy`.
     assert_eq!(pruned("min_redundancy = 5.9"), [20, 21, 22]);
     assert!(pruned("min_redundancy = 6.0").is_empty());
     // With two neighbours R is 3, which is not more than 3.
@@ -54,8 +56,7 @@ fn the_fainter_half_of_the_redundant_is_pruned() {
     let done = run(&event, "");
     assert_eq!(done.ops.cause, "densify+prune");
     assert!(done.ops.reset_signals.contains(Signal::PixelSizeMin));
-    // The default of `min_redundancy`: pairs, where mean + deviation is less. R of 2 is not enough, 3 is not
-    // more than 3.
+    // By the default of `min_redundancy`, an R of 3 is not enough and 4 is.
     let at = |xs: &[f32]| {
         let fades: Vec<f32> = (0..xs.len()).map(|row| 0.1 + 0.1 * row as f32).collect();
         let event = self::event(1000, xs).with(Signal::Opacity, &fades);
@@ -67,17 +68,13 @@ fn the_fainter_half_of_the_redundant_is_pruned() {
 
 #[test]
 fn spheres_are_as_large_as_the_smallest_pixel() {
-    // Balls 1.45 apart: a rim is 0.45 away from a mean. √3/2 · 0.577 = 0.5 reaches it, √3/2 · 0.51 = 0.44 does
-    // not; nor do half-axes of 2.6/3.
+    // Balls 1.45 apart: the next surface is 0.45 away from each mean. √3/2 · 0.577 = 0.5 reaches it;
+    // √3/2 · 0.51 = 0.44 does not, nor do half-axes of 2.6/3.
     let shifted = event(1000, &[0.0, 1.45, 2.9, -1.45, -2.9, 40.0]);
     let redundancy = |event: &Event, set: &str| {
         let growth = Vanilla::new(Default::default(), &event.scene).unwrap();
         let policy = Reduced { params: toml::from_str(set).unwrap(), growth };
-        let mut signals =
-            crate::policy::Signals::zeros(event.rows, policy.needs(&event.scene).signals);
-        for (signal, values) in &event.signals {
-            signals.get_mut(*signal).unwrap().copy_from_slice(values);
-        }
+        let signals = event.signals(policy.needs(&event.scene).signals);
         let (step, scene) = (event.step, &event.scene);
         policy.redundancy(&Snapshot { step, scene, signals: &signals, candidates: &[] }).unwrap()
     };
@@ -101,14 +98,14 @@ fn the_faintest_are_pruned() {
     assert_eq!(pruned(&faint, ""), [98, 99, 100]);
     assert_eq!(pruned(&faint, "faint_share = 0.05"), [96, 97, 98, 99, 100]);
     assert!(pruned(&faint, "faint_opacity = 0.0").is_empty());
-    // Where the quantile is above 0.05, that is the limit: 0.048 and 0.049 are below.
+    // If the quantile is above 0.05, the limit is 0.05: 0.048 and 0.049 are below it.
     assert_eq!(pruned(&all(0.048, 0.001), ""), [99, 100]);
     assert_eq!(pruned(&all(0.048, 0.001), "faint_opacity = 0.0485"), [100]);
     assert!(pruned(&all(0.5, 0.001), "").is_empty());
 }
 
 #[test]
-fn after_growth_what_is_invisible_is_pruned() {
+fn invisible_rows_are_pruned_after_growth() {
     // 1/255 = 0.003922.
     let event = event(15_000, &[0.0, 10.0, 20.0]).with(Signal::Opacity, &[0.0039, 0.00393, 0.5]);
     let at = |step| run(&Event { step, ..event.clone() }, "faint_opacity = 0.0").pruned;
@@ -122,7 +119,7 @@ fn after_growth_what_is_invisible_is_pruned() {
 }
 
 #[test]
-fn prunes_are_every_thousand_steps_but_at_resets() {
+fn prunes_are_every_thousand_steps_except_at_resets() {
     let policy = |set: &str, iterations| {
         let scene = SceneInfo { iterations, ..Event::new(1, 1, 1).scene };
         let growth = Vanilla::new(Default::default(), &scene).unwrap();
@@ -130,7 +127,7 @@ fn prunes_are_every_thousand_steps_but_at_resets() {
         (Reduced { params: set.try_into().unwrap(), growth }, iterations)
     };
     let prunes = |(policy, last): (Reduced, u32)| -> Vec<u32> {
-        (0..=last).filter(|&step| policy.is_prune(step)).collect()
+        (0..=last).filter(|&step| policy.prunes_at(step)).collect()
     };
     let thousands = |at: &dyn Fn(u32) -> bool| -> Vec<u32> {
         (1..=30).filter(|&k| at(k)).map(|k| 1000 * k).collect()
@@ -160,25 +157,15 @@ fn the_mean_opacity_is_a_term_of_the_loss() {
 
 #[test]
 fn growth_is_that_of_vanilla() {
-    let event = Event { budget: 9, ..event(600, &[0.0, 10.0, 20.0, 30.0]) }
-        .with(Signal::ScreenGradient, &[8.01e-4, 7.99e-4, 4e-3, 1.0])
-        .with(Signal::ScaleMax, &[0.05, 0.05, 0.2, 0.05])
-        .with(Signal::Opacity, &[0.5, 0.5, 0.5, 0.001]);
-    for set in ["", "tau = 0.0005", "small = 0.03", "governor = true", "min_opacity = 0.6"] {
-        let (ours, theirs) = (run(&event, set), event.run("vanilla", set));
-        assert_eq!(ours.ops, theirs.ops, "{set}");
-        assert!(ours.ops.edits_rows(), "{set}");
-    }
-    // The smallest pixel has a clock of its own.
+    let event = event(600, &[0.0, 10.0, 20.0, 30.0]);
+    // The smallest pixel is reset by prunes only.
     assert!(!run(&event, "").ops.reset_signals.contains(Signal::PixelSizeMin));
-    let (ours, theirs) = (find("reduced-3dgs").unwrap(), find("vanilla").unwrap());
-    assert!(theirs.parameters().iter().all(|p| ours.parameters().contains(p)));
-    assert!(ours.step_parameters().starts_with(theirs.step_parameters()));
+    assert_grows_like_vanilla("reduced-3dgs", event, "");
 }
 
 #[test]
-fn what_grows_is_not_pruned_and_one_row_is_left() {
-    // Row 20 is the faintest of the crowd, and cloned.
+fn rows_that_grow_are_not_pruned_and_one_row_is_kept() {
+    // Row 20 is the faintest of the six at one place, and is cloned.
     let mut gradient = [0.0; 26];
     gradient[20] = 1.0;
     let event = Event { budget: 27, ..crowd(1000) }
@@ -187,13 +174,13 @@ fn what_grows_is_not_pruned_and_one_row_is_left() {
     let done = run(&event, "faint_opacity = 0.0");
     assert_eq!((done.cloned.as_slice(), done.pruned.as_slice()), (&[20][..], &[21, 22][..]));
     assert_eq!(done.ops.counts.denied, 0);
-    // All invisible: the most opaque is left.
+    // All rows are invisible: the most opaque is kept.
     let last = self::event(20_000, &[0.0, 10.0, 20.0]).with(Signal::Opacity, &[1e-3, 3e-3, 2e-3]);
     assert_eq!(run(&last, "").pruned, [0, 2]);
 }
 
 #[test]
-fn the_control_prunes_as_many_at_random() {
+fn the_control_prunes_the_same_number_at_random() {
     let event = crowd(1000).with(Signal::Opacity, &opacities([0.1, 0.2, 0.3, 0.4, 0.6, 0.9]));
     let random = "victims = \"random\"\nfaint_opacity = 0.0";
     // Three of 26 in each of 300 events: each row 34.6 ± 5·√30.6 times.
@@ -220,46 +207,35 @@ fn the_control_may_end_at_a_given_number() {
     assert_eq!(left(27_000, 810, "prune_until = 27500"), 10);
     // Prunes after the run's last step do not count.
     assert_eq!(left(29_000, 90, "prune_until = 90000"), 30);
-    // Of the sixteen from the end of growth on, the first leaves 810·(1/81)^(1/16) = 615.5.
+    // The first of the sixteen prunes after growth leaves 810·(1/81)^(1/16) = 615.5.
     assert_eq!(left(15_000, 810, ""), 615);
     let one = "victims = \"random\"\nrandom_keep = 1";
     assert_eq!(run(&event(30_000, &xs[..30]), one).ops.rows_after, 1);
-    // During growth as many as the rule would prune, which is none here.
+    // During growth it prunes as many as the rule would, here none.
     assert_eq!(left(14_000, 810, "grow_every = 0"), 810);
 }
 
 #[test]
-fn quantiles_and_deviations_by_hand() {
-    let values = [5.0, f32::NAN, 1.0, 2.0, f32::INFINITY, 4.0];
-    // Of 1, 2, 4, 5: places 0, 1.5 and 3.
-    assert_eq!(
-        [0.0, 0.5, 1.0].map(|share| quantile(&values, share)),
-        [Some(1.0), Some(3.0), Some(5.0)]
-    );
-    // Place 0.75.
-    assert_eq!(quantile(&values, 0.25), Some(1.75));
-    assert_eq!((quantile(&[], 0.5), quantile(&[f32::NAN], 0.5)), (None, None));
+fn deviations_by_hand() {
     assert_eq!(mean_and_deviation(&[1.0, 3.0, 5.0]), (3.0, 2.0));
     assert_eq!((mean_and_deviation(&[4.0]), mean_and_deviation(&[])), ((4.0, 0.0), (0.0, 0.0)));
 }
 
 #[test]
 fn bad_parameters_are_named() {
-    for (set, name) in [
-        ("tau = -1.0", "reduced-3dgs.tau"),
-        ("neighbours = 0", "reduced-3dgs.neighbours"),
-        ("sigmas = 0.0", "reduced-3dgs.sigmas"),
-        ("deviations = -1.0", "reduced-3dgs.deviations"),
-        ("faint_share = 1.5", "reduced-3dgs.faint_share"),
-        ("opacity_term = 1e39", "reduced-3dgs.opacity_term"),
-        ("victims = \"lowst\"", "reduced-3dgs.victims"),
-        ("neighbors = 3", "neighbors"),
-    ] {
-        let built =
-            find("reduced-3dgs").unwrap().build(&set.parse().unwrap(), &Event::new(1, 1, 1).scene);
-        let error = built.map(drop).unwrap_err().to_string();
-        assert!(error.contains(name), "{set}: {error}");
-    }
+    assert_refused(
+        "reduced-3dgs",
+        &[
+            ("tau = -1.0", "reduced-3dgs.tau"),
+            ("neighbours = 0", "reduced-3dgs.neighbours"),
+            ("sigmas = 0.0", "reduced-3dgs.sigmas"),
+            ("deviations = -1.0", "reduced-3dgs.deviations"),
+            ("faint_share = 1.5", "reduced-3dgs.faint_share"),
+            ("opacity_term = 1e39", "reduced-3dgs.opacity_term"),
+            ("victims = \"lowst\"", "reduced-3dgs.victims"),
+            ("neighbors = 3", "neighbors"),
+        ],
+    );
 }
 
 #[test]

@@ -1,8 +1,8 @@
 //! The registry: policies by name, from this crate and from any other that is linked.
 //!
-//! [`register_policy!`](crate::register_policy) registers a policy where it is defined; no central list
-//! names it. A linker drops crates that are never named, so the main file of a program that uses an
-//! outside crate of policies says `use my_policies as _;`.
+//! [`register_policy!`](crate::register_policy) registers a policy where it is defined; there is no central
+//! list. The linker drops crates that are never named, so the main file of a program that uses an outside
+//! crate of policies says `use my_policies as _;`.
 
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -17,13 +17,13 @@ pub use inventory;
 /// A policy that can be built from a table of parameters.
 pub trait ConfiguredPolicy: DensityPolicy + Sized + 'static {
     /// The parameters: a struct with `#[serde(deny_unknown_fields, default)]`. Use `f64`, `u32`, `bool`
-    /// and enums without data, so that defaults print as written. Those of another policy can be a
-    /// field with `#[serde(flatten)]`; then leave out `deny_unknown_fields`, which serde does not
-    /// support with it. Unknown names are refused all the same.
+    /// and enums without data, so that defaults print as written. The parameters of another policy can be a
+    /// field with `#[serde(flatten)]`; then leave out `deny_unknown_fields`, which serde does not support
+    /// together with it. Unknown names are refused in any case.
     type Params: Serialize + DeserializeOwned + Default;
 
-    /// Integer parameters that count steps. Their defaults are for a run of 30,000 steps and scale with
-    /// its length; values set by the user do not. An [`Interval`](StepParameter::Interval) does not
+    /// Integer parameters that count steps. Their defaults are for a run of 30,000 steps and scale with the
+    /// length of the run; values set by the user do not. An [`Interval`](StepParameter::Interval) does not
     /// shrink below 100 steps (or below its default, if that is less).
     const STEP_PARAMETERS: &'static [StepParameter] = &[];
 
@@ -37,7 +37,7 @@ pub trait ConfiguredPolicy: DensityPolicy + Sized + 'static {
 /// Registers a policy under a name.
 ///
 /// `doc` is the text of the defining file, `include_str!("this_file.rs")`; its leading `//!` block is the
-/// manual page. (A text without such a block is the manual page itself.) The [crate's guide](crate)
+/// manual page. (A text without such a block is itself the manual page.) The [crate documentation](crate)
 /// has an example.
 #[macro_export]
 macro_rules! register_policy {
@@ -61,18 +61,18 @@ type BuildResult = PolicyResult<Box<dyn DensityPolicy>>;
 /// A registered policy.
 #[derive(Debug, Clone, Copy)]
 pub struct PolicyEntry {
-    /// Its name, as given on the command line.
+    /// Name, as given on the command line.
     pub name: &'static str,
-    /// What it does, in one line.
+    /// One-line description.
     pub summary: &'static str,
-    /// Where it is published.
+    /// Publication.
     pub source: &'static str,
     doc: &'static str,
     place: (&'static str, u32),
     step_parameters: &'static [StepParameter],
     field_names: fn() -> Option<&'static [&'static str]>,
     defaults: fn() -> Result<Table, String>,
-    /// The table after a round trip through the parameters' types.
+    /// Converts the table to the parameters' types and back.
     typed: fn(Table) -> Result<Table, String>,
     build: fn(Table, &SceneInfo) -> BuildResult,
 }
@@ -107,7 +107,7 @@ impl PolicyEntry {
         }
     }
 
-    /// Where the policy is registered (file:line).
+    /// The place where the policy is registered (file:line).
     #[must_use]
     pub fn location(&self) -> String {
         format!("{}:{}", self.place.0, self.place.1)
@@ -143,8 +143,8 @@ impl PolicyEntry {
     }
 
     /// Names and defaults for a run of 30,000 steps, in declaration order. Parameters that are `None` by
-    /// default are not listed, as TOML has no such value. Empty when the defaults cannot be written in
-    /// TOML, which [`build`](Self::build) reports.
+    /// default are not listed, as TOML has no such value. Empty if the defaults cannot be written as TOML;
+    /// [`build`](Self::build) then returns the error.
     #[must_use]
     pub fn parameters(&self) -> Vec<(String, Value)> {
         let mut defaults = self.defaults().unwrap_or_default();
@@ -155,7 +155,7 @@ impl PolicyEntry {
         listed
     }
 
-    /// The parameters of a run: the defaults, scaled to its length, overlaid with `set`. Ranges are
+    /// The parameters of a run: the defaults, scaled to its length, overridden by `set`. Ranges are
     /// checked by [`build`](Self::build).
     ///
     /// # Errors
@@ -217,10 +217,10 @@ impl PolicyEntry {
     }
 }
 
-/// All policies, sorted by name. (The linker finds them in any order.)
+/// All policies, sorted by name, as the order of the linker is arbitrary.
 ///
 /// # Errors
-/// [`PolicyError::DuplicateName`] when two have one name.
+/// [`PolicyError::DuplicateName`] when two have the same name.
 pub fn policies() -> PolicyResult<Vec<&'static PolicyEntry>> {
     sorted(inventory::iter::<PolicyEntry>.into_iter().collect())
 }

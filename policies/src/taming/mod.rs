@@ -1,7 +1,7 @@
 //! # taming — growth along a curve, by a score measured in rendered views
 //!
-//! Densifies Gaussians with large screen gradients, drawn by a score that measures how much each one
-//! matters in badly rendered views, so that their number follows a concave curve up to the budget.
+//! Densifies Gaussians with large screen gradients, drawn by a score that measures their importance in badly
+//! rendered views. Their number follows a concave curve up to the budget.
 //!
 //! Source: *Taming 3DGS: High-Quality Radiance Fields with Limited Resources*, Mallick, Goel, Kerbl,
 //! Vicente Carrasco, Steinberger, De la Torre, SIGGRAPH Asia 2024, arXiv 2406.15643, with the constants
@@ -30,21 +30,19 @@
 //! Opacities are reset as in `vanilla`. SH bands 1–3 have the learning rate `sh_rest` and step once per
 //! `sh_every` iterations, on the summed gradients (`--lr` overrides these).
 //!
-//! With `multiplier` m > 0, the curve ends at ⌊m · S⌋ instead, but never above the budget.
+//! With `multiplier` m > 0 the curve ends at ⌊m · S⌋ instead, but never above the budget.
 //!
 //! ## Differences from the published code
 //!
-//! - The published code draws the Gaussians to prune from all and removes those drawn that are dead; it
-//!   also uses scores from before splits removed parents, so that they belong to other Gaussians.
-//!   `prune = "published"` does both; the default, `candidates`, draws from the dead by their own
-//!   scores.
+//! - The published code draws from all Gaussians and prunes those drawn that are dead (too faint or too
+//!   large). It also uses scores from before splits removed parents, so that they belong to other Gaussians.
+//!   `prune = "published"` does both; the default, `candidates`, draws from the dead by their own scores.
 //! - Dead Gaussians do not grow.
-//! - One render per view gives colour, map and sums; the published code renders twice.
-//! - The edge filter repeats the outermost pixels of an image; the published code leaves the luma itself
-//!   there.
+//! - Colour, map and sums come from one render per view; the published code renders twice.
+//! - The edge filter repeats the outermost pixels of an image; the published code keeps their luma instead.
 //! - Opacities are trained to the end. The published code stops at step 15,000, apparently by mistake.
-//! - All Gaussians step at every iteration; the published code has a mode in which those off screen do
-//!   not.
+//! - All Gaussians are updated at every iteration; the published code has a mode that skips those off
+//!   screen.
 //!
 //! ## Parameters
 //!
@@ -71,9 +69,9 @@
 //! | blend_weight | 50.0 | >= 0 | | coefficient of the sum of blend weights |
 //! | min_opacity | 0.005 | 0 to 1 | | Gaussians below this opacity are dead |
 //! | max_scale | 0.1 | > 0 | scene extent | Gaussians above this size are dead |
-//! | max_scale_from | 3000 | >= 0 | step | from when on size counts (exclusive) |
-//! | prune | "candidates" | candidates, published | | which Gaussians the prune draws from |
-//! | prune_share | 0.5 | 0 to 1 | the dead | share of the dead that is drawn |
+//! | max_scale_from | 3000 | >= 0 | step | start of pruning by size (exclusive) |
+//! | prune | "candidates" | candidates, published | | Gaussians that the prune draws from |
+//! | prune_share | 0.5 | 0 to 1 | dead Gaussians | share that is drawn |
 //! | prune_until | 14500 | >= 0 | step | end of pruning (exclusive) |
 //! | reset_every | 3000 | >= 0 | steps | interval of opacity resets; 0: never |
 //! | reset_opacity | 0.01 | 0 to 1, both excluded | | largest opacity after a reset |
@@ -287,7 +285,7 @@ impl Taming {
         let mut pruned = match self.params.prune {
             PruneDraw::Candidates => weighted(&masked(&weights, &dead), count, rng),
             PruneDraw::Published => {
-                // Rows are renumbered without the parents of splits, but the scores are not.
+                // As published: rows are renumbered without the parents of splits, but scores are not.
                 let kept: Vec<u32> =
                     (0..now.rows() as u32).filter(|&row| !is_split[row as usize]).collect();
                 let drawn = weighted(&weights, count, rng).into_iter();

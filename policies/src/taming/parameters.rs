@@ -39,13 +39,13 @@ pub struct TamingParams {
     pub sh_rest: f64,
 }
 
-/// Which rows the prune draws from.
+/// The rows that the prune draws from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum PruneDraw {
-    /// The dead, by their own scores.
+    /// Dead rows, by their own scores.
     Candidates,
-    /// All rows, by scores that belong to other rows; of those drawn, the dead are pruned.
+    /// All rows, by scores that belong to other rows; dead rows among those drawn are pruned.
     Published,
 }
 

@@ -1,12 +1,12 @@
-//! The score of `taming`: how much a row matters in badly rendered views.
+//! The score of `taming`: the importance of a row in badly rendered views.
 //!
 //! The terms of the row itself (gradient, opacity, size) are the same in all views, so only their
-//! common factor is summed over views: Σ 50·L over those that show the row.
+//! common factor is summed over views: Σ 50·L over those in which the row is visible.
 
 use super::TamingParams;
 use crate::policy::{AuxColumn, AuxView, PolicyResult, Signal, Snapshot};
 
-/// Factor on a view's loss in the published code. It matters only beside the 10⁻⁶ of pruning.
+/// Factor on a view's loss in the published code. It matters only relative to the 10⁻⁶ in pruning.
 const VIEW_WEIGHT: f32 = 50.0;
 
 /// Sums over the views of the current event. Shape: `[rows]` each.
@@ -69,7 +69,7 @@ impl Score {
     }
 }
 
-/// Adds `weight` · x / median of the positive x; nothing where x is not positive.
+/// Adds `weight` · x / median of the positive x, for positive x.
 fn add_term(sums: &mut [f32], weight: f32, values: &[f32]) {
     let Some(median) = median_of_positive(values) else { return };
     for (sum, &x) in sums.iter_mut().zip(values) {

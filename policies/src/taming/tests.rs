@@ -8,8 +8,8 @@ fn run(event: &Event, set: &str) -> Outcome {
     event.run("taming", set)
 }
 
-/// Small rows of opacity 0.5 with a screen gradient of 1 in four views, all alike in the one
-/// auxiliary view, of loss 0.02.
+/// Small rows of opacity 0.5 with a screen gradient of 1 in four views; all statistics are the same in the only
+/// auxiliary view, which has a loss of 0.02.
 fn event(step: u32, rows: usize, budget: usize) -> Event {
     let mut event = Event::new(step, rows, budget)
         .with_all(Signal::VisibleCount, 4.0)
@@ -17,12 +17,9 @@ fn event(step: u32, rows: usize, budget: usize) -> Event {
         .with_all(Signal::Opacity, 0.5)
         .with_all(Signal::ScaleMax, 0.05)
         .with_all(Signal::ScaleProduct, 1e-4);
-    event.views = vec![View { loss: 0.02, columns: alike(rows), points: Vec::new() }];
+    let columns = AuxColumn::ALL.map(|column| (column, vec![2.0; rows])).to_vec();
+    event.views = vec![View { loss: 0.02, columns, points: Vec::new() }];
     event
-}
-
-fn alike(rows: usize) -> Vec<(AuxColumn, Vec<f32>)> {
-    AuxColumn::ALL.map(|column| (column, vec![2.0; rows])).to_vec()
 }
 
 fn set(view: &mut View, column: AuxColumn, values: &[f32]) {
@@ -42,10 +39,7 @@ fn score(event: &Event, set: &str) -> Vec<f32> {
         let (step, rows, loss) = (event.step, event.rows, view.loss);
         score.add(&AuxView { step, rows, loss, columns, points: &[] }, &params).unwrap();
     }
-    let mut signals = crate::policy::Signals::zeros(event.rows, SignalSet::from(Signal::ALL));
-    for (signal, values) in &event.signals {
-        signals.get_mut(*signal).unwrap().copy_from_slice(values);
-    }
+    let signals = event.signals(Signal::ALL.into());
     let now =
         Snapshot { step: event.step, scene: &event.scene, signals: &signals, candidates: &[] };
     let gradient: Vec<f32> =
@@ -82,7 +76,7 @@ fn the_score_by_hand() {
         let found = score(&doubled, "");
         assert!((found[1] - 275.1 - coefficient).abs() < 1e-3, "{signal:?}: {}", found[1]);
     }
-    // A second view of half the loss, which does not show row 0.
+    // A second view with half the loss, in which row 0 is not visible.
     let mut second = event.views[0].clone();
     second.loss = 0.01;
     set(&mut second, AuxColumn::Radius, &[0.0, 2.0, 2.0]);
@@ -103,18 +97,18 @@ fn scores_of_another_event_are_forgotten() {
 }
 
 #[test]
-fn the_curve_and_the_qualified_bound_growth() {
+fn growth_is_bounded_by_the_curve_and_the_number_of_candidates() {
     // S = 100, B = 942: at the first event ⌊842·57/841⌋ = 57 more.
     let event = event(1000, 100, 942);
     let done = run(&event, "");
     assert_eq!((done.ops.rows_after, done.cloned.len()), (157, 57));
     assert!(!done.ops.reset_signals.is_empty());
     assert_eq!(done.ops.cause, "densify");
-    // 30 qualify.
+    // 30 candidates.
     let gradient: Vec<f32> = (0..100).map(|row| if row < 30 { 8.01e-4 } else { 7.9e-4 }).collect();
     let few = event.clone().with(Signal::ScreenGradient, &gradient);
     assert_eq!(run(&few, "").ops.rows_after, 130);
-    // The budget is the plan's, whatever the curve says; the multiplier is below it.
+    // `multiplier` ends the curve below the budget, and the plan's budget bounds it.
     assert_eq!(run(&event, "multiplier = 3.0").ops.rows_after, 113);
     assert_eq!(run(&Event { budget: 120, ..event.clone() }, "multiplier = 9").ops.rows_after, 101);
     assert!(!run(&event, "multiplier = 0.5").ops.edits_rows());
@@ -137,12 +131,12 @@ fn small_and_large_rows_share_the_growth() {
 
 #[test]
 fn draws_follow_the_score() {
-    // Blend weights 2 and 202: scores 275.1 − … ; the rows with none of the terms are never drawn.
+    // Rows that no view shows have no score and are never drawn.
     let mut event = event(1000, 100, 942);
     let shown: Vec<f32> = (0..100).map(|row| if row % 2 == 0 { 2.0 } else { 0.0 }).collect();
     set(&mut event.views[0], AuxColumn::Radius, &shown);
     let done = run(&event, "");
-    // 50 rows have a score, and all of them grow, though 57 might.
+    // All 50 rows with a score grow, although the curve allows 57.
     assert_eq!(done.cloned.len(), 50);
     assert!(done.cloned.iter().all(|row| row % 2 == 0));
 }
@@ -160,7 +154,7 @@ fn half_of_the_dead_are_pruned() {
     // Not at the last event.
     assert!(run(&Event { step: 14_500, ..event.clone() }, "").pruned.is_empty());
     assert_eq!(run(&Event { step: 14_000, ..event.clone() }, "").pruned.len(), 2);
-    // Rows with a high score are rarely drawn: row 0 has nearly none, so it is drawn.
+    // Rows with a low score are drawn more often; row 0 has none, so it is drawn.
     let mut scored = event.clone();
     let mut shown = vec![2.0; 20];
     shown[0] = 0.0;
@@ -183,15 +177,15 @@ fn the_dead_do_not_grow() {
 }
 
 #[test]
-fn the_published_draw_hits_few_and_others() {
-    // 4 dead of 400: of ⌊4/2⌋ = 2 rows drawn among all, hardly one is dead.
+fn the_published_draw_prunes_fewer_and_other_rows() {
+    // 4 of 400 rows are dead: the ⌊4/2⌋ = 2 rows drawn among all are unlikely to be.
     let mut opacity = [0.5; 400];
     opacity[..4].fill(0.004);
     let mut event = event(1000, 400, 400).with(Signal::Opacity, &opacity);
     assert_eq!(run(&event, "").pruned.len(), 2);
     assert!(run(&event, "prune = \"published\"").pruned.is_empty());
-    // Rows 0 and 1 are split; only place 2 has nearly no score, so that it is drawn for sure. Of the
-    // survivors 2, 3, 4, … place 2 is row 4: it is pruned, though the score is that of row 2.
+    // Rows 0 and 1 are split. Only index 2 has nearly no score, so it is drawn. Among the remaining rows 2, 3,
+    // 4, … index 2 is row 4, which is pruned although the score is that of row 2.
     let mut scale = [0.05; 400];
     scale[..2].fill(0.5);
     let mut gradient = [0.0; 400];
@@ -224,7 +218,7 @@ fn opacities_are_reset_as_in_the_original() {
 }
 
 #[test]
-fn views_are_rendered_and_bands_are_summed_as_the_parameters_say() {
+fn views_and_cadence_follow_the_parameters() {
     let scene = Event::new(1, 1, 1).scene;
     let policy = build("taming", "sh_every = 5\nsh_rest = 0.5\nerror_weight = 3", &scene);
     assert_eq!([policy.aux_views(1000, 1, 9), policy.aux_views(3001, 1, 9)], [10, 0]);

@@ -1,7 +1,7 @@
 //! # vanilla — the original adaptive density control
 //!
 //! Clones or splits Gaussians with large screen gradients, prunes transparent and oversized ones, and
-//! resets opacities now and then.
+//! resets opacities at intervals.
 //!
 //! Source: Kerbl, Kopanas, Leimkühler, Drettakis, *3D Gaussian Splatting for Real-Time Radiance Field
 //! Rendering*, SIGGRAPH 2023, section 5.2, with the constants and the order of its public code.
@@ -26,12 +26,12 @@
 //! ## Under a budget
 //!
 //! By default growth stops hard at the budget. As in the original, growth comes before pruning; the
-//! largest g grow first while there is room, and at the budget nothing grows until pruning has made
-//! room. What is refused is counted as denied. A hard stop spends the budget on whatever grows first,
-//! which some consider an unfair baseline.
+//! Gaussians with the largest g grow first while there is room, and at the budget nothing grows until
+//! pruning has made room. Refused growth is counted as denied. A hard stop spends the budget on whatever
+//! grows first, which some consider an unfair baseline.
 //!
-//! With `governor`, `tau` is not used. Each event grows the Gaussians with the largest g, as many as
-//! bring the model up to a curve that rises from the S initial Gaussians to the budget B:
+//! With `governor`, `tau` is not used. Each event grows the Gaussians with the largest g until the model
+//! reaches a curve that rises from the S initial Gaussians to the budget B:
 //! N(x) = S + (B − S)(2x/M − (x/M)²) at event x of M (*Taming 3DGS*, Mallick et al. 2024, equation 2).
 //!
 //! ## Parameters
@@ -176,7 +176,7 @@ impl DensityPolicy for Vanilla {
         if self.grow.is_due(now.step) {
             plan.cause("densify");
             self.densify(now, plan)?;
-            // No others: a policy that grows as this one does may have signals with a clock of their own.
+            // Only these, as a policy that reuses this growth may reset others at its own intervals.
             plan.reset(Reset::Only([Signal::VisibleCount, Signal::ScreenGradient].into()));
         }
         self.resets.plan(now.step, plan);
@@ -185,18 +185,18 @@ impl DensityPolicy for Vanilla {
 }
 
 impl Vanilla {
-    /// Whether rows grow at `step` (1-based).
+    /// True if rows grow at `step` (1-based).
     pub(crate) fn grows_at(&self, step: u32) -> bool {
         self.grow.is_due(step)
     }
 
-    /// Whether opacities are reset at `step` (1-based).
-    pub(crate) fn is_reset(&self, step: u32) -> bool {
+    /// True if opacities are reset at `step` (1-based).
+    pub(crate) fn resets_at(&self, step: u32) -> bool {
         self.resets.is_due(step)
     }
 
-    /// Grows, then prunes. As in the original, rows are pruned as they are after growth: a huge row
-    /// that is split is judged by the size of its children.
+    /// Grows, then prunes. As in the original, pruning applies to the state after growth: a huge row that is
+    /// split is judged by the size of its children.
     fn densify(&self, now: &Snapshot<'_>, plan: &mut EditPlan) -> PolicyResult {
         let opacity = now.signal(Signal::Opacity)?;
         let scale = now.signal(Signal::ScaleMax)?;
@@ -212,15 +212,18 @@ impl Vanilla {
             let grown_scale = if is_small(row) { scale[row] } else { scale[row] / factor };
             limits.exceeded(opacity[row], grown_scale)
         };
-        let needs_detail = |row: usize| match self.params.governor {
-            true => gradient[row] > 0.0,
-            false => gradient[row] >= self.params.tau as f32,
+        let governor = self.params.governor;
+        let is_candidate = |row: usize| {
+            if governor { gradient[row] > 0.0 } else { gradient[row] >= self.params.tau as f32 }
         };
-        let parents = (0..now.rows()).filter(|&row| needs_detail(row) && !would_die(row));
+        let parents = (0..now.rows()).filter(|&row| is_candidate(row) && !would_die(row));
         let parents: Vec<u32> = parents.map(|row| row as u32).collect();
-        let count = match self.params.governor {
-            true => self.governed_rows(now.scene, now.step).saturating_sub(now.rows()),
-            false => parents.len(),
+        let count = if governor {
+            let SceneInfo { initial_rows, budget, .. } = *now.scene;
+            let allowed = concave_curve(self.grow, now.step, initial_rows, budget);
+            allowed.saturating_sub(now.rows())
+        } else {
+            parents.len()
         };
         for row in largest(parents, &gradient, count) {
             let offspring =
@@ -234,11 +237,6 @@ impl Vanilla {
         spare_one(&mut dead, opacity);
         plan.prune_all(dead);
         Ok(())
-    }
-
-    /// Number of rows that the growth curve allows at this step.
-    fn governed_rows(&self, scene: &SceneInfo, step: u32) -> usize {
-        concave_curve(self.grow, step, scene.initial_rows, scene.budget)
     }
 }
 

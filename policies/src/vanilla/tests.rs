@@ -1,4 +1,4 @@
-//! Tests of the rules of the original, one event at a time.
+//! Tests of the rules of `vanilla`, one event at a time.
 
 use super::*;
 use crate::event::{Event, Outcome, assert_conforms, due_steps};
@@ -8,7 +8,7 @@ fn run(event: &Event, set: &str) -> Outcome {
     event.run("vanilla", set)
 }
 
-/// Rows of opacity 0.5, seen by four views, of size 0.05: small, as the extent is 10.
+/// Rows of opacity 0.5 and size 0.05 (small, as the extent is 10), seen by four views.
 fn event(step: u32, gradient_sums: &[f32], budget: usize) -> Event {
     Event::new(step, gradient_sums.len(), budget)
         .with(Signal::ScreenGradient, gradient_sums)
@@ -69,14 +69,14 @@ fn huge_rows_are_pruned_after_step_3000_unless_a_split_makes_them_small() {
     let late = run(&Event { step: 3100, ..event.clone() }, "");
     assert_eq!(late.pruned, [1, 3]);
     assert_eq!(late.split, [2]);
-    // Without room for its split, a huge row is too large to be kept.
+    // A huge row is pruned if there is no room for its split.
     let full = run(&Event { step: 3100, budget: 4, ..event }, "");
     assert_eq!(full.pruned, [1, 2, 3]);
     assert_eq!(full.ops.counts.denied, 1);
 }
 
 #[test]
-fn at_the_budget_growth_stops_and_pruning_goes_on() {
+fn at_the_budget_growth_stops_and_pruning_continues() {
     let event = event(600, &[9.0, 8.0, 0.0], 3).with(Signal::Opacity, &[0.5, 0.5, 0.001]);
     let done = run(&event, "");
     assert!(done.cloned.is_empty());
@@ -93,7 +93,7 @@ fn the_largest_gradients_grow_first() {
 }
 
 #[test]
-fn events_happen_when_the_original_has_them() {
+fn the_schedule_is_that_of_the_original() {
     let due = |set: &str, white_background, iterations| {
         let scene = SceneInfo { white_background, iterations, ..Event::new(1, 1, 1).scene };
         due_steps("vanilla", set, &scene)

@@ -11,11 +11,11 @@ use super::fault;
 use crate::error::Error;
 use crate::resource::{Folder, data_uri};
 
-/// Most elements of an accessor that has no data of its own (sparse ones begin as zeros): nothing
-/// in the file bounds their number.
+/// Maximum number of elements of an accessor without data of its own (sparse accessors start as zeros), as
+/// nothing in the file bounds it.
 const MAX_ZEROS: usize = 1 << 24;
 
-/// The contents of a file's buffers, read when first asked for.
+/// The contents of a file's buffers, each read at its first use.
 pub(super) struct Buffers<'a> {
     path: &'a Path,
     root: &'a json::Root,
@@ -35,14 +35,14 @@ impl Floats {
         self.values.len() / self.size
     }
 
-    /// Element `i`; components beyond the accessor's own are 1.
+    /// Element `i`; components that the accessor lacks are 1.
     pub(super) fn get<const N: usize>(&self, i: usize) -> [f32; N] {
         let element = &self.values[i * self.size..(i + 1) * self.size];
         std::array::from_fn(|c| element.get(c).copied().unwrap_or(1.0))
     }
 }
 
-/// Where an accessor's elements lie.
+/// Type and number of an accessor's elements.
 struct Layout {
     component: ComponentType,
     size: usize,
@@ -60,12 +60,12 @@ impl<'a> Buffers<'a> {
         Ok(Self { path, root, folder, blob, read: vec![None; root.buffers.len()] })
     }
 
-    /// The bytes that a URI stands for: a file's, or its own.
+    /// The bytes of a URI: those of a file, or embedded data.
     pub(super) fn uri(&self, element: &str, uri: &str) -> Result<Vec<u8>, Error> {
         if !uri.starts_with("data:") {
             return self.folder.read_uri(element, uri);
         }
-        data_uri(uri).ok_or_else(|| fault(self.path, element, "its data URI is no base64"))
+        data_uri(uri).ok_or_else(|| fault(self.path, element, "its data URI is not base64"))
     }
 
     /// The bytes of a buffer view.
@@ -117,7 +117,7 @@ impl<'a> Buffers<'a> {
         Ok(&whole[..usize::try_from(buffer.byte_length.0).unwrap_or(whole.len()).min(whole.len())])
     }
 
-    /// An accessor's elements, which must have one of `sizes` components. Normalised integers become
+    /// An accessor's elements, whose number of components must be in `sizes`. Normalised integers become
     /// fractions.
     pub(super) fn floats(
         &mut self,
@@ -145,7 +145,7 @@ impl<'a> Buffers<'a> {
         if layout.size != 1 || !unsigned {
             return Err(fault(self.path, name, "indices must be unsigned scalars"));
         }
-        self.elements(index, &layout, &name, whole)
+        self.elements(index, &layout, &name, unsigned_integer)
     }
 
     fn layout(&self, index: usize, name: &str) -> Result<Layout, Error> {
@@ -163,7 +163,7 @@ impl<'a> Buffers<'a> {
             Type::Vec3 => 3,
             Type::Vec4 => 4,
             Type::Mat2 | Type::Mat3 | Type::Mat4 => {
-                return Err(fault(self.path, name, "matrices are no vertex attributes"));
+                return Err(fault(self.path, name, "matrices are not vertex attributes"));
             }
         };
         let count = usize::try_from(accessor.count.0).unwrap_or(usize::MAX);
@@ -173,7 +173,7 @@ impl<'a> Buffers<'a> {
         Ok(Layout { component: component.0, size, count, normalised: accessor.normalized })
     }
 
-    /// All components of an accessor, sparse replacements made.
+    /// All components of an accessor, with sparse replacements applied.
     fn elements<T: Copy + Default>(
         &mut self,
         index: usize,
@@ -188,8 +188,8 @@ impl<'a> Buffers<'a> {
                 let offset = accessor.byte_offset.map_or(0, |o| o.0);
                 let stride = self.root.buffer_views.get(view.value()).and_then(|v| v.byte_stride);
                 let bytes = self.view(view.value(), name)?;
-                let place = Place { offset, stride: stride.map(|s| s.0), width };
-                gather(bytes, &place, layout, &convert).ok_or_else(|| beyond(path, name))?
+                let packing = Packing { offset, stride: stride.map(|s| s.0), width };
+                unpack(bytes, &packing, layout, &convert).ok_or_else(|| beyond(path, name))?
             }
             None if layout.count > MAX_ZEROS => {
                 return Err(fault(path, name, "it has more than 2^24 elements and no buffer view"));
@@ -203,16 +203,19 @@ impl<'a> Buffers<'a> {
             return Err(fault(path, name, "its sparse indices have an unknown componentType"));
         };
         let count = usize::try_from(sparse.count.0).unwrap_or(usize::MAX);
-        let one = Layout { component: component.0, size: 1, count, normalised: false };
+        let of_indices = Layout { component: component.0, size: 1, count, normalised: false };
         let view = self.view(sparse.indices.buffer_view.value(), name)?;
-        let place =
-            Place { offset: sparse.indices.byte_offset.0, stride: None, width: component.0.size() };
-        let places = gather(view, &place, &one, whole).ok_or_else(|| beyond(path, name))?;
-        let many = Layout { count, ..*layout };
+        let width_of_index = component.0.size();
+        let packing =
+            Packing { offset: sparse.indices.byte_offset.0, stride: None, width: width_of_index };
+        let targets = unpack(view, &packing, &of_indices, unsigned_integer)
+            .ok_or_else(|| beyond(path, name))?;
+        let of_values = Layout { count, ..*layout };
         let view = self.view(sparse.values.buffer_view.value(), name)?;
-        let place = Place { offset: sparse.values.byte_offset.0, stride: None, width };
-        let news = gather(view, &place, &many, &convert).ok_or_else(|| beyond(path, name))?;
-        for (&target, new) in places.iter().zip(news.chunks_exact(layout.size)) {
+        let packing = Packing { offset: sparse.values.byte_offset.0, stride: None, width };
+        let replacements =
+            unpack(view, &packing, &of_values, &convert).ok_or_else(|| beyond(path, name))?;
+        for (&target, new) in targets.iter().zip(replacements.chunks_exact(layout.size)) {
             let at = target as usize * layout.size;
             let Some(old) = values.get_mut(at..at + layout.size) else {
                 return Err(fault(path, name, format!("its sparse index {target} lies beyond it")));
@@ -227,22 +230,25 @@ fn beyond(path: &Path, name: &str) -> Error {
     fault(path, name, "its elements lie beyond its buffer view")
 }
 
-struct Place {
+/// The arrangement of elements in a buffer view `[bytes]`.
+struct Packing {
     offset: u64,
+    /// Distance between elements; `None` if they are contiguous.
     stride: Option<usize>,
+    /// Size of a component.
     width: usize,
 }
 
-/// The components of `layout.count` elements; None where they lie beyond the bytes.
-fn gather<T>(
+/// The components of `layout.count` elements; `None` if they lie beyond the bytes.
+fn unpack<T>(
     bytes: &[u8],
-    place: &Place,
+    packing: &Packing,
     layout: &Layout,
     convert: impl Fn(&[u8]) -> T,
 ) -> Option<Vec<T>> {
-    let element = layout.size * place.width;
-    let stride = place.stride.filter(|&stride| stride > 0).unwrap_or(element);
-    let bytes = bytes.get(usize::try_from(place.offset).ok()?..)?;
+    let element = layout.size * packing.width;
+    let stride = packing.stride.filter(|&stride| stride > 0).unwrap_or(element);
+    let bytes = bytes.get(usize::try_from(packing.offset).ok()?..)?;
     // The last element need not fill its stride.
     let needed = (layout.count.checked_sub(1)?).checked_mul(stride)?.checked_add(element)?;
     if stride < element || needed > bytes.len() {
@@ -251,7 +257,7 @@ fn gather<T>(
     let mut values = Vec::with_capacity(layout.count * layout.size);
     for i in 0..layout.count {
         let element = &bytes[i * stride..i * stride + element];
-        values.extend(element.chunks_exact(place.width).map(&convert));
+        values.extend(element.chunks_exact(packing.width).map(&convert));
     }
     Some(values)
 }
@@ -273,6 +279,6 @@ fn number(component: ComponentType, normalised: bool, bytes: &[u8]) -> f32 {
     if normalised { (value / full).max(-1.0) } else { value }
 }
 
-fn whole(bytes: &[u8]) -> u32 {
+fn unsigned_integer(bytes: &[u8]) -> u32 {
     bytes.iter().rev().fold(0, |value, &byte| value << 8 | u32::from(byte))
 }

@@ -14,15 +14,15 @@ use crate::mesh::{AlphaMode, Material, Reflection};
 use crate::resource::{self, decode};
 use crate::texture::{Sampler, Texture, TextureRef, Wrap};
 
-/// A reference to a texture, from wherever in the JSON.
-struct Use<'j> {
+/// A reference to a texture; glTF has several JSON types for it.
+struct TextureUse<'j> {
     texture: usize,
     uv_set: u32,
     transform: Option<&'j json::extensions::texture::TextureTransform>,
 }
 
 impl Reader<'_> {
-    /// The model's number of a material, which is read at its first use.
+    /// The model's index of a material, which is read at its first use.
     pub(super) fn material(&mut self, index: Option<usize>) -> Result<u32, Error> {
         if let Some(&number) = self.materials.get(&index) {
             return Ok(number);
@@ -36,22 +36,22 @@ impl Reader<'_> {
             })?,
         };
         let name = index.map_or_else(|| "default material".to_owned(), |i| format!("material {i}"));
-        let mut texture = |used: Option<Use<'_>>, srgb| match used {
+        let mut texture = |used: Option<TextureUse<'_>>, srgb| match used {
             Some(used) => self.texture(&name, &used, srgb),
             None => Ok(None),
         };
         let pbr = &source.pbr_metallic_roughness;
-        let base_texture = texture(pbr.base_color_texture.as_ref().map(of_info), true)?;
+        let base_texture = texture(pbr.base_color_texture.as_ref().map(texture_use), true)?;
         let metal_rough_texture =
-            texture(pbr.metallic_roughness_texture.as_ref().map(of_info), false)?;
-        let emissive_texture = texture(source.emissive_texture.as_ref().map(of_info), true)?;
+            texture(pbr.metallic_roughness_texture.as_ref().map(texture_use), false)?;
+        let emissive_texture = texture(source.emissive_texture.as_ref().map(texture_use), true)?;
         let normal = source.normal_texture.as_ref();
-        // The crate has no type for this extension of normal textures.
+        // The gltf crate has no type for this extension of normal textures.
         let normal_transform: Option<json::extensions::texture::TextureTransform> = normal
             .and_then(|t| t.extensions.as_ref()?.others.get("KHR_texture_transform"))
             .and_then(|value| serde_json::from_value(value.clone()).ok());
         let normal_texture = texture(
-            normal.map(|t| Use {
+            normal.map(|t| TextureUse {
                 texture: t.index.value(),
                 uv_set: t.tex_coord,
                 transform: normal_transform.as_ref(),
@@ -64,11 +64,11 @@ impl Reader<'_> {
             .map_or(1.0, |e| e.emissive_strength.0);
         let (metallic, roughness) = (pbr.metallic_factor.0, pbr.roughness_factor.0);
         let unlit = extensions.is_some_and(|e| e.unlit.is_some());
-        // A fully rough dielectric has 4 % of nearly even reflectance: counted as diffuse.
+        // The specular reflection of a fully rough dielectric is 4 % and nearly uniform, so it is ignored.
         let diffuse = metallic == 0.0 && roughness >= 1.0 && metal_rough_texture.is_none();
         let emissive = Vec3::from(source.emissive_factor.0) * strength;
         let base = Vec4::from(pbr.base_color_factor.0);
-        let sane = |v: f32| if v.is_finite() { v.clamp(0.0, 1e6) } else { 0.0 };
+        let valid = |v: f32| if v.is_finite() { v.clamp(0.0, 1e6) } else { 0.0 };
         let material = Material {
             name: source.name.clone().unwrap_or_else(|| name.clone()),
             reflection: match (unlit, diffuse) {
@@ -76,10 +76,10 @@ impl Reader<'_> {
                 (_, true) => Reflection::Lambert,
                 _ => Reflection::MetalRough,
             },
-            base: Vec4::from(base.to_array().map(sane)),
-            metallic: sane(metallic).min(1.0),
-            roughness: sane(roughness).min(1.0),
-            emissive: Vec3::from(emissive.to_array().map(sane)),
+            base: Vec4::from(base.to_array().map(valid)),
+            metallic: valid(metallic).min(1.0),
+            roughness: valid(roughness).min(1.0),
+            emissive: Vec3::from(emissive.to_array().map(valid)),
             base_texture,
             alpha_texture: None,
             roughness_texture: metal_rough_texture,
@@ -107,7 +107,7 @@ impl Reader<'_> {
     fn texture(
         &mut self,
         material: &str,
-        used: &Use<'_>,
+        used: &TextureUse<'_>,
         srgb: bool,
     ) -> Result<Option<TextureRef>, Error> {
         let name = format!("{material}, texture {}", used.texture);
@@ -115,11 +115,14 @@ impl Reader<'_> {
             return Err(self.fault(name, "there is no such texture"));
         };
         let uv_set = used.transform.and_then(|t| t.tex_coord).unwrap_or(used.uv_set);
-        // The crate's mark of an absent source: another extension brings the image.
-        if texture.source.value() == u32::MAX as usize || uv_set > 1 {
-            self.model.notes.push(format!(
-                "{name} has no plain image, or a third set of coordinates, and is left out"
-            ));
+        // The gltf crate's index for a missing source: the image is defined by an extension.
+        let unsupported = if texture.source.value() == u32::MAX as usize {
+            Some("its image is defined by an extension")
+        } else {
+            (uv_set > 1).then_some("it uses a third set of texture coordinates")
+        };
+        if let Some(reason) = unsupported {
+            self.model.notes.push(format!("{name} is ignored: {reason}"));
             return Ok(None);
         }
         let image = texture.source.value();
@@ -135,7 +138,7 @@ impl Reader<'_> {
         let sampler = match texture.sampler {
             None => Sampler::default(),
             Some(index) => match self.root.samplers.get(index.value()) {
-                Some(sampler) => sampler_of(sampler),
+                Some(sampler) => convert_sampler(sampler),
                 None => {
                     let problem = format!("there is no sampler {}", index.value());
                     return Err(self.fault(name, problem));
@@ -168,15 +171,15 @@ impl Reader<'_> {
     }
 }
 
-fn of_info(info: &json::texture::Info) -> Use<'_> {
-    Use {
+fn texture_use(info: &json::texture::Info) -> TextureUse<'_> {
+    TextureUse {
         texture: info.index.value(),
         uv_set: info.tex_coord,
         transform: info.extensions.as_ref().and_then(|e| e.texture_transform.as_ref()),
     }
 }
 
-fn sampler_of(sampler: &json::texture::Sampler) -> Sampler {
+fn convert_sampler(sampler: &json::texture::Sampler) -> Sampler {
     let wrap = |mode| match mode {
         Checked::Valid(WrappingMode::ClampToEdge) => Wrap::Clamp,
         Checked::Valid(WrappingMode::MirroredRepeat) => Wrap::Mirror,

@@ -1,14 +1,14 @@
 //! Loads glTF 2.0, as `.gltf` with files or data URIs and as `.glb`.
 //!
-//! The `gltf` crate's types describe the JSON; indices, offsets and counts are checked here, as its
-//! own readers index without looking. Skins, morph targets and animations are left as they are at
-//! rest. Occlusion textures are ignored: the tracer computes occlusion when asked.
+//! The types of the `gltf` crate describe the JSON. Indices, offsets and counts are checked here, as the
+//! crate's readers do not check them. Skins, morph targets and animations are ignored: meshes are rendered in
+//! their rest pose. Occlusion textures are ignored, as the tracer can compute occlusion.
 //!
 //! Errors that cannot change the result are ignored: alignments, bounds of accessors, targets of
 //! buffer views, names of attributes that are not read, morph targets, and objects that the scene
-//! does not use. `tests/shared.rs` lists the outcome for each of a validator's test files.
+//! does not use. `tests/shared.rs` lists the outcome for each test file of a validator.
 //!
-//! One piece: a node's mesh, camera and light share its walk.
+//! Over 400 lines, as mesh, camera and light of a node are read in the same traversal.
 
 mod accessors;
 mod materials;
@@ -29,16 +29,16 @@ use crate::mesh::{FileCamera, Light, LightKind, Model, pad};
 use crate::resource;
 use accessors::Buffers;
 
-/// Largest JSON part `[bytes]`. (serde_json bounds the depth to 128.)
+/// Largest JSON part `[bytes]`. (serde_json limits its depth to 128.)
 const MAX_JSON: usize = 64 << 20;
-/// Most nodes, meshes, accessors, buffers, images or materials.
+/// Maximum number of nodes, meshes, accessors, buffers, images or materials.
 const MAX_ITEMS: usize = 1_000_000;
-/// Deepest node hierarchy.
+/// Maximum depth of the node hierarchy.
 const MAX_DEPTH: usize = 256;
-/// Most triangles of a scene, instances counted.
+/// Maximum number of triangles of a scene, including instances.
 const MAX_TRIANGLES: usize = 1 << 26;
 const REMEDY: &str = "correct the file or export it again";
-/// Extensions that may be required.
+/// Extensions that files may require.
 const SUPPORTED: [&str; 5] = [
     "KHR_lights_punctual",
     "KHR_materials_emissive_strength",
@@ -47,8 +47,8 @@ const SUPPORTED: [&str; 5] = [
     "KHR_texture_transform",
 ];
 
-/// Extensions that change how surfaces look and not where they are: files that require them are
-/// rendered with their core materials, and a note says so.
+/// Extensions that change the appearance of surfaces but not their geometry: files that require them are
+/// rendered with their core materials, and a note lists them.
 const APPEARANCE: [&str; 9] = [
     "KHR_materials_anisotropy",
     "KHR_materials_clearcoat",
@@ -66,9 +66,9 @@ struct Reader<'a> {
     path: &'a Path,
     root: &'a json::Root,
     buffers: Buffers<'a>,
-    /// Numbers of materials in the model, by those in the file; None is glTF's default material.
+    /// The model's index of each of the file's materials; `None` is glTF's default material.
     materials: HashMap<Option<usize>, u32>,
-    /// Textures of the model, by image and whether it is sRGB.
+    /// The model's textures, by image and colour space (true for sRGB).
     images: HashMap<(usize, bool), u32>,
     model: Model,
 }
@@ -104,16 +104,15 @@ pub(crate) fn load(path: &Path) -> Result<Model, Error> {
     };
     reader.notes();
     reader.scene()?;
-    reader.model.of_file(path)
+    reader.model.finish(path)
 }
 
 pub(super) fn fault(path: &Path, element: impl Display, problem: impl Display) -> Error {
     Error::malformed(path, element, problem, REMEDY)
 }
 
-/// The JSON part. Where the crate's types refuse it, it is written anew as they expect it: whole numbers
-/// may be written as 1.0 (glTF 2.0, 2.7.1), `extras` may be of any type (3.2), and a scene need not have
-/// nodes (5.25).
+/// Parses the JSON part. If the crate's types refuse it, it is rewritten in the form they expect, as glTF 2.0
+/// allows integers written as 1.0 (2.7.1), `extras` of any type (3.2), and scenes without nodes (5.25).
 fn parse(path: &Path, text: &[u8]) -> Result<json::Root, Error> {
     let error = match json::deserialize::from_slice(text) {
         Ok(root) => return Ok(root),
@@ -128,11 +127,11 @@ fn parse(path: &Path, text: &[u8]) -> Result<json::Root, Error> {
             scene.entry("nodes").or_insert_with(|| Value::Array(Vec::new()));
         }
     }
-    // What is wrong besides is where it was.
+    // The original error has the line and column.
     serde_json::from_value(value).map_err(|_| error)
 }
 
-/// Leaves out what applications add for themselves, and writes whole numbers without a fraction.
+/// Removes `extras`, and writes integers without a fraction.
 fn normalise(value: &mut Value) {
     match value {
         Value::Array(list) => list.iter_mut().for_each(normalise),
@@ -141,7 +140,7 @@ fn normalise(value: &mut Value) {
             map.values_mut().for_each(normalise);
         }
         Value::Number(number) => {
-            // Beyond 2^53 not every whole number is a float.
+            // Beyond 2^53 not every integer is a float.
             let float = number.as_f64().filter(|v| v.fract() == 0.0 && (0.0..9e15).contains(v));
             if let Some(float) = float {
                 *value = Value::from(float as u64);
@@ -151,7 +150,7 @@ fn normalise(value: &mut Value) {
     }
 }
 
-/// The JSON and the binary chunk of a file; plain JSON has none.
+/// The JSON and the binary chunk of a file; a plain JSON file has no binary chunk.
 fn split<'a>(path: &Path, bytes: &'a [u8]) -> Result<(&'a [u8], Option<&'a [u8]>), Error> {
     if !bytes.starts_with(b"glTF") {
         return Ok((bytes, None));
@@ -178,8 +177,8 @@ fn split<'a>(path: &Path, bytes: &'a [u8]) -> Result<(&'a [u8], Option<&'a [u8]>
         match &kind {
             b"JSON" if first => json = Some(data),
             b"BIN\0" if json.is_some() && blob.is_none() => blob = Some(data),
-            // Chunks of other kinds are to be skipped.
-            _ if first => return Err(fault(path, "GLB chunk 0", "it is no JSON")),
+            _ if first => return Err(fault(path, "GLB chunk 0", "it is not JSON")),
+            // The specification says to skip other chunks.
             _ => {}
         }
         first = false;
@@ -191,8 +190,8 @@ fn split<'a>(path: &Path, bytes: &'a [u8]) -> Result<(&'a [u8], Option<&'a [u8]>
     }
 }
 
-/// Refuses versions and required extensions, before anything else is looked at: what they change
-/// may look like an error.
+/// Refuses unsupported versions and required extensions. This comes first, as the changes they make may look
+/// like errors.
 fn refuse_required(path: &Path, text: &[u8]) -> Result<(), Error> {
     #[derive(serde::Deserialize)]
     #[serde(rename_all = "camelCase")]
@@ -245,10 +244,11 @@ impl Reader<'_> {
         if !ignored.is_empty() {
             let names = ignored.iter().map(|name| name.chars().take(40).collect::<String>());
             let names = names.take(10).collect::<Vec<_>>().join(", ");
-            notes.push(format!("extensions that are not rendered: {names}"));
+            notes.push(format!("these extensions are ignored: {names}"));
         }
         if !self.root.animations.is_empty() || !self.root.skins.is_empty() {
-            notes.push("skins and animations are left at rest".to_owned());
+            notes
+                .push("skins and animations are ignored: meshes are in their rest pose".to_owned());
         }
     }
 
@@ -262,7 +262,7 @@ impl Reader<'_> {
                 return Err(self.fault(format!("scene {number}"), "there is no such scene"));
             }
             None => {
-                // Without scenes, everything that is no one's child.
+                // Without scenes, all nodes that have no parent.
                 let mut is_child = vec![false; root.nodes.len()];
                 for child in root.nodes.iter().flat_map(|node| node.children.iter().flatten()) {
                     if let Some(mark) = is_child.get_mut(child.value()) {
@@ -324,7 +324,7 @@ impl Reader<'_> {
         world: &DAffine3,
     ) -> Result<(), Error> {
         let Checked::Valid(mode) = primitive.mode else {
-            return Err(self.fault(element, "its mode is none of 0 to 6"));
+            return Err(self.fault(element, "its mode is not in 0 to 6"));
         };
         if !matches!(mode, Mode::Triangles | Mode::TriangleStrip | Mode::TriangleFan) {
             let note = "points and lines are not rendered".to_owned();
@@ -335,7 +335,7 @@ impl Reader<'_> {
         }
         let attribute = |semantic| primitive.attributes.get(&Checked::Valid(semantic));
         let Some(positions) = attribute(Semantic::Positions) else {
-            // Allowed (glTF 2.0, 3.7.2.1): positions may come from an extension.
+            // Valid (glTF 2.0, 3.7.2.1), as an extension may define positions.
             let note = format!("{element} has no positions and is not rendered");
             self.model.notes.push(note);
             return Ok(());
@@ -418,7 +418,7 @@ impl Reader<'_> {
             return Err(self.fault(name, format!("there is no camera {index}")));
         };
         let Some(perspective) = &camera.perspective else {
-            self.model.notes.push(format!("camera {index} is orthographic and not used"));
+            self.model.notes.push(format!("camera {index} is ignored: it is orthographic"));
             return Ok(());
         };
         let yfov = f64::from(perspective.yfov);
@@ -430,7 +430,7 @@ impl Reader<'_> {
         if !(yfov > 0.0 && yfov < std::f64::consts::PI) || right.length_squared() < 0.5 {
             return Err(self.fault(
                 format!("camera {index}"),
-                "its field of view or its node's axes are no camera's",
+                "its field of view or its node's axes are invalid",
             ));
         }
         self.model.cameras.push(FileCamera {
@@ -450,7 +450,7 @@ impl Reader<'_> {
         let intensity = Vec3::from(light.color) * light.intensity;
         let element = format!("light {index}");
         if !(intensity.is_finite() && intensity.min_element() >= 0.0) {
-            return Err(self.fault(element, "its intensity is no finite positive number"));
+            return Err(self.fault(element, "its intensity is negative or not finite"));
         }
         let direction = (-world.matrix3.z_axis).normalize_or(DVec3::NEG_Z);
         let position = world.translation;
@@ -478,7 +478,7 @@ impl Reader<'_> {
     }
 }
 
-/// The values of an attribute, if a primitive has it.
+/// The converted values of an attribute; none if the primitive lacks it.
 fn converted<T, const N: usize>(
     values: Option<&accessors::Floats>,
     convert: impl Fn([f32; N]) -> T,
@@ -506,7 +506,7 @@ fn local(node: &json::Node) -> DAffine3 {
     )
 }
 
-/// Triangles of a list, strip or fan, counter-clockwise; turned round where the node mirrors.
+/// Triangles of a list, strip or fan, counter-clockwise; the order is reversed if the node mirrors them.
 fn triangles(mode: Mode, indices: &[u32], mirrored: bool) -> Vec<[u32; 3]> {
     let mut triangles: Vec<[u32; 3]> = match mode {
         Mode::TriangleStrip => indices
@@ -515,7 +515,7 @@ fn triangles(mode: Mode, indices: &[u32], mirrored: bool) -> Vec<[u32; 3]> {
             .map(|(i, t)| if i % 2 == 0 { [t[0], t[1], t[2]] } else { [t[1], t[0], t[2]] })
             .collect(),
         Mode::TriangleFan => indices.windows(2).skip(1).map(|t| [t[0], t[1], indices[0]]).collect(),
-        // An unfinished triangle at the end is left out.
+        // An incomplete triangle at the end is ignored.
         _ => indices.chunks_exact(3).map(|t| [t[0], t[1], t[2]]).collect(),
     };
     if mirrored {

@@ -1,4 +1,4 @@
-//! glTF as other programs write it, as the specification allows it, and damaged.
+//! Tests with valid, unusual and damaged glTF files.
 
 use serde_json::json;
 
@@ -26,7 +26,7 @@ fn load_bytes(bytes: &[u8]) -> Result<Model, Error> {
     load(&path)
 }
 
-/// A square of four corners in the plane z = 0, interleaved with junk, and 16-bit indices.
+/// A square of four corners in the plane z = 0, with unused bytes between them, and 16-bit indices.
 fn square() -> (Value, Vec<u8>) {
     let mut bin = Vec::new();
     for (x, y) in [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)] {
@@ -81,7 +81,7 @@ fn interleaved_accessors_and_nodes_are_read() {
     let (json, bin) = square();
     let model = load_bytes(&glb(&json, &bin)).expect("square");
     assert_eq!(area(&model), DVec3::Z);
-    // Twice as large, turned about x, moved; and the same as a matrix.
+    // Scaled by 2, rotated about x and translated; and the same as a matrix.
     let turn = json!({
         "mesh": 0, "scale": [2, 2, 2], "translation": [1, 2, 3],
         "rotation": [0.5_f64.sqrt(), 0.0, 0.0, 0.5_f64.sqrt()],
@@ -92,7 +92,7 @@ fn interleaved_accessors_and_nodes_are_read() {
         assert!(area(&model).distance(-4.0 * DVec3::Y) < 1e-6, "{}", area(&model));
         assert!(model.positions[2].distance(DVec3::new(3.0, 2.0, 5.0)) < 1e-6);
     }
-    // Mirrored, the same side stays the front.
+    // Mirrored in x, the front stays the same.
     let model = with("/nodes/0", json!({ "mesh": 0, "scale": [-1, 1, 1] })).expect("node");
     assert_eq!(area(&model), DVec3::Z);
     // Mirrored along the view, it faces the other way.
@@ -101,7 +101,7 @@ fn interleaved_accessors_and_nodes_are_read() {
 }
 
 #[test]
-fn strips_fans_and_instances_cover_the_same() {
+fn strips_fans_and_instances_have_the_same_area() {
     let (mut json, bin) = square();
     json["meshes"][0]["primitives"][0]["mode"] = json!(6);
     json["meshes"][0]["primitives"][0].as_object_mut().expect("object").remove("indices");
@@ -198,7 +198,7 @@ fn bad_values_are_errors_that_name_the_element() {
     bin[16..20].copy_from_slice(&f32::NAN.to_le_bytes());
     let message = load_bytes(&glb(&json, &bin)).expect_err("NaN").to_string();
     assert!(message.contains("vertex 1"), "{message}");
-    // Cut anywhere, it is an error or a load.
+    // A truncated file is an error or loads.
     let (json, bin) = square();
     let whole = glb(&json, &bin);
     for length in 0..whole.len() {
@@ -229,7 +229,7 @@ fn whole_numbers_may_be_written_as_floats() {
 }
 
 #[test]
-fn what_applications_add_for_themselves_may_be_anything() {
+fn extras_may_be_of_any_type() {
     for extras in [json!("a word"), json!([1.5, null]), json!(7), json!({ "deep": { "er": [] } })] {
         for place in
             ["/extras", "/asset/extras", "/meshes/0/primitives/0/extras", "/nodes/0/extras"]

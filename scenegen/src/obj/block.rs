@@ -1,4 +1,4 @@
-//! Hands faces to `tobj`, a bounded number at a time.
+//! Passes faces to `tobj`, a bounded number at a time.
 
 use std::collections::HashMap;
 use std::fmt::Write as _;
@@ -7,7 +7,7 @@ use tobj::{LoadError, LoadOptions, Mesh};
 
 use super::Corner;
 
-/// Corners from which on a block is full: it then takes some 10 MiB.
+/// Number of corners at which a block is full; it then takes about 10 MiB.
 const CORNERS: usize = 1 << 14;
 
 /// Faces of one material and smoothing group.
@@ -17,9 +17,9 @@ pub(super) struct Block {
     pub(super) group: u32,
     /// The corners of all faces.
     pub(super) corners: Vec<Corner>,
-    /// The faces, with the positions, texture coordinates and normals that they use.
+    /// OBJ text of the faces, with the positions, texture coordinates and normals that they use.
     text: String,
-    /// Numbers of those in the text, by their numbers in the file.
+    /// Numbers of positions, texture coordinates and normals in the text, by their numbers in the file.
     numbers: [HashMap<u32, usize>; 3],
 }
 
@@ -28,8 +28,8 @@ impl Block {
         self.corners.len() >= CORNERS
     }
 
-    /// Adds a face. `line` is the statement of a position (0), texture coordinate (1) or normal (2)
-    /// with its number in the file.
+    /// Adds a face. `line` returns the statement of a position (0), texture coordinate (1) or normal (2), given
+    /// its number in the file.
     pub(super) fn add(&mut self, face: &[Corner], line: impl Fn(usize, usize) -> String) {
         self.corners.extend(face);
         let mut statement = "f".to_owned();
@@ -48,7 +48,7 @@ impl Block {
         self.text.push('\n');
     }
 
-    /// The faces as `tobj` reads them: one vertex for all corners that are equal.
+    /// Parses the faces with `tobj`, which merges equal corners into one vertex.
     pub(super) fn read(&self) -> Result<Mesh, LoadError> {
         let options = LoadOptions { single_index: true, ..LoadOptions::default() };
         let no_library = |_: &_| Err(LoadError::OpenFileFailed);

@@ -11,17 +11,17 @@ use crate::mesh::{AlphaMode, Material, Model, Reflection};
 use crate::resource::{self, Folder};
 use crate::texture::{TextureRef, Wrap};
 
-/// Linear base colour of materials that state none, and of faces without a material.
+/// Linear base colour of materials without a colour, and of faces without a material.
 pub(super) const GREY: [f32; 3] = [0.6; 3];
 
 /// The materials of all libraries of an OBJ file.
 pub(super) struct Materials {
     folder: Folder,
-    /// Numbers of the materials that are defined; None for those that were noted as missing.
+    /// The model's indices of materials; `None` for those already noted as missing.
     numbers: HashMap<String, Option<u32>>,
-    /// Numbers of the textures, by file and whether it is sRGB.
+    /// The model's indices of textures, by file and colour space (true for sRGB).
     textures: HashMap<(PathBuf, bool), u32>,
-    /// The model that gets the materials, textures and notes.
+    /// The model that materials, textures and notes are added to.
     pub(super) model: Model,
 }
 
@@ -31,42 +31,42 @@ impl Materials {
         Ok(Self { folder: Folder::around(obj)?, numbers, textures, model: Model::default() })
     }
 
-    /// The model's number of a material. One that is not defined is noted once.
+    /// The model's index of a material. An undefined material is noted once.
     pub(super) fn number(&mut self, name: &str) -> Option<u32> {
         if let Some(&number) = self.numbers.get(name) {
             return number;
         }
         self.numbers.insert(name.to_owned(), None);
         let name = shortened(name);
-        self.model.notes.push(format!("there is no material {name}; a grey one is used"));
+        self.model.notes.push(format!("material {name} is not defined; it is replaced by grey"));
         None
     }
 
-    /// Reads the libraries that a `mtllib` statement names. Missing ones are noted.
+    /// Reads the libraries named by a `mtllib` statement. Missing ones are noted.
     pub(super) fn read_libraries(&mut self, s: Statement<'_>) -> Result<(), Error> {
         let element = format!("line {}: mtllib", s.line);
-        // One name with spaces, or several names.
-        let names: Vec<&str> = match self.folder.resolve(&element, &slashed(s.text)) {
+        // The statement may be one name with spaces, or several names.
+        let names: Vec<&str> = match self.folder.resolve(&element, &with_slashes(s.text)) {
             Ok(path) if path.is_file() => vec![s.text],
             _ => s.words().collect(),
         };
         for name in names {
-            let path = self.folder.resolve(&element, &slashed(name))?;
+            let path = self.folder.resolve(&element, &with_slashes(name))?;
             if path.is_file() {
                 self.read(&path)?;
             } else {
                 let name = shortened(name);
-                self.model.notes.push(format!("there is no {name}; its materials are grey"));
+                self.model.notes.push(format!("{name} is missing; its materials are grey"));
             }
         }
         Ok(())
     }
 
-    /// Reads a library. `tobj` gets its statements checked: it panics if a colour has not three
-    /// numbers (`Kd 1 1`), and its errors name no line.
+    /// Reads a library. Statements are checked before `tobj` parses them, as it panics if a colour does not have
+    /// three numbers (`Kd 1 1`), and its errors do not name the line.
     fn read(&mut self, path: &Path) -> Result<(), Error> {
         let mut text = String::new();
-        statements::each(path, |statement| {
+        statements::for_each(path, |statement| {
             text += &checked(statement)?;
             Ok(())
         })?;
@@ -90,7 +90,7 @@ impl Materials {
             material.reflection = Reflection::MetalRough;
         }
         material.roughness = number("Pr").unwrap_or(material.roughness);
-        // A map without a number beside it is the metalness itself.
+        // Without a number, the map itself is the metalness.
         let alone = if more.contains_key("map_Pm") { 1.0 } else { material.metallic };
         material.metallic = number("Pm").unwrap_or(alone);
         let mut texture = |map: Option<&String>, srgb| match map.and_then(|map| Map::read(map)) {
@@ -137,7 +137,7 @@ impl Materials {
             found.sampler.wrap_u = Wrap::Clamp;
             found.sampler.wrap_v = Wrap::Clamp;
         }
-        // Scale and offset are meant with v pointing up.
+        // Scale and offset assume that v points up.
         let (s, o) = (map.scale, map.offset);
         found.transform = [[s.x, 0.0, o.x], [0.0, s.y, 1.0 - s.y - o.y]];
         Ok(found)
@@ -148,8 +148,8 @@ fn linear(colour: [f64; 3]) -> Vec3 {
     Vec3::from(colour.map(|v| v as f32)).max(Vec3::ZERO)
 }
 
-/// Returns the lines that `tobj` reads in place of a statement. Texture statements get their line's
-/// number in front, for messages.
+/// Checks a statement and returns the text to pass to `tobj`. Texture statements are prefixed with their line
+/// number, for messages.
 fn checked(statement: Statement<'_>) -> Result<String, Error> {
     let (key, line) = (statement.key, statement.line);
     let fault = |problem: &str| statement.fault(format!("{key} {problem}"));
@@ -157,7 +157,7 @@ fn checked(statement: Statement<'_>) -> Result<String, Error> {
         Ok(value) if value.is_finite() => Ok(value),
         _ => Err(fault("is not a finite number")),
     };
-    // `d -halo 0.5` is rendered without the halo.
+    // The halo of `d -halo 0.5` is ignored.
     let words = statement.words().filter(|word| *word != "-halo").take(3);
     let share = || -> Result<f32, Error> {
         let word = words.clone().next().ok_or_else(|| fault("has no value"))?;
@@ -166,7 +166,7 @@ fn checked(statement: Statement<'_>) -> Result<String, Error> {
     Ok(match key {
         "newmtl" if statement.value().is_empty() => return Err(fault("has no name")),
         "newmtl" => format!("newmtl {}\n", statement.value()),
-        // Spectral files are not read.
+        // Spectral and XYZ colours are ignored.
         "Kd" | "Ke" if !statement.text.starts_with(['s', 'x']) => {
             let [r, g, b] = match words.clone().map(number).collect::<Result<Vec<_>, _>>()?[..] {
                 [r, g, b] => [r, g, b],
@@ -193,7 +193,7 @@ pub(super) struct Map {
 }
 
 impl Map {
-    /// A line's number, options, and a file name that may hold spaces; None without a name.
+    /// Parses a line number, options, and a file name that may contain spaces; `None` if there is no name.
     pub(super) fn read(statement: &str) -> Option<Self> {
         let (line, mut rest) = split_word(statement);
         let line = line.parse().ok()?;
@@ -201,7 +201,7 @@ impl Map {
             Self { line, file: String::new(), scale: Vec2::ONE, offset: Vec2::ZERO, clamp: false };
         while rest.starts_with('-') {
             let (option, mut after) = split_word(rest);
-            // Up to three numbers for some; the second and third may be left out.
+            // Some options take up to three numbers, of which the later ones are optional.
             let most = match option {
                 "-o" | "-s" | "-t" => 3,
                 "-mm" => 2,
@@ -231,12 +231,12 @@ impl Map {
             }
             rest = after;
         }
-        map.file = slashed(rest);
+        map.file = with_slashes(rest);
         (!map.file.is_empty()).then_some(map)
     }
 }
 
-/// Names from other systems use backslashes.
-fn slashed(name: &str) -> String {
+/// Replaces the backslashes in names from other systems.
+fn with_slashes(name: &str) -> String {
     name.replace('\\', "/")
 }

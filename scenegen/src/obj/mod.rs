@@ -1,18 +1,17 @@
 //! Loads Wavefront OBJ files with their MTL libraries through `tobj`.
 //!
-//! Every statement is checked before, because errors of `tobj` name no line, and it misreads indices of
-//! 0 and files in which only some vertices have colours, texture coordinates or normals. It gets the
-//! faces in blocks: it holds about 100 bytes for each face of an object until the object ends. Its
-//! objects share no vertices, so the blocks' vertices are joined here. Polygons are cut by ear clipping
-//! rather than as fans.
+//! Every statement is checked first, because errors of `tobj` do not name the line, and it misreads indices
+//! of 0 and files in which only some vertices have colours, texture coordinates or normals. Faces are passed
+//! in blocks, as `tobj` holds about 100 bytes per face until an object ends. Its objects share no vertices, so
+//! the vertices of the blocks are merged here. Polygons are triangulated by ear clipping rather than as fans.
 //!
 //! Faces are visible from both sides. Materials are diffuse unless they have one of the PBR keys `Pr`,
 //! `Pm`, `map_Pr` or `map_Pm`. `norm` is a tangent-space normal map as in glTF; height maps (`bump`,
-//! `map_bump`) are noted and left out.
+//! `map_bump`) are ignored with a note.
 //!
-//! A corner without a normal is flat, or smooth within its smoothing group (`s 1`): the mean of the
-//! normals of the group's faces there, weighted by their angles (Thürmer and Wüthrich, "Computing
-//! Vertex Normals from Polygonal Facets", 1998).
+//! A corner without a normal is flat, or smooth within its smoothing group (`s 1`). A smooth normal is the mean
+//! of the normals of the group's faces, weighted by their angles (Thürmer and Wüthrich, "Computing Vertex
+//! Normals from Polygonal Facets", 1998).
 
 mod block;
 mod materials;
@@ -32,39 +31,39 @@ use block::Block;
 use materials::{GREY, Materials};
 use statements::{Statement, shortened};
 
-/// Most triangles of a file.
+/// Maximum number of triangles of a file.
 const MAX_TRIANGLES: usize = 1 << 26;
 
-/// A face's corner. There is one for each vertex of the model, so it is small.
+/// A face's corner. Kept small, as one is stored for each vertex of the model.
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 struct Corner {
-    /// Numbers of position, texture coordinates and normal, counted from 1; 0 is none.
+    /// Numbers of position, texture coordinates and normal, counted from 1; 0: none.
     numbers: [u32; 3],
-    /// Smoothing group; 0 is none. Faces with normals need none.
+    /// Smoothing group; 0: none, also for faces with normals.
     group: u32,
 }
 
-/// A file as far as it is read.
+/// A file being read.
 struct Reader {
     materials: Materials,
     positions: Vec<DVec3>,
-    /// Empty, or one per position up to the last that has one.
+    /// Empty, or one per position up to the last one with a colour.
     colours: Vec<Vec3>,
     uvs: Vec<Vec2>,
     normals: Vec<Vec3>,
-    /// Triangles so far.
+    /// Number of triangles so far.
     triangles: usize,
-    /// Faces that are not in the model yet.
+    /// Faces that are not yet in the model.
     block: Block,
     /// The model's vertices.
     vertices: HashMap<Corner, u32>,
     /// Sums of face normals weighted by angles, by position and smoothing group.
     sums: HashMap<(u32, u32), DVec3>,
-    /// Material of the faces to come, if it is defined.
+    /// Material of the next faces, if it is defined.
     material: Option<u32>,
-    /// The material of faces without one.
+    /// Material of faces without one.
     grey: Option<u32>,
-    /// Smoothing group of the faces to come; 0 is none.
+    /// Smoothing group of the next faces; 0: none.
     group: u32,
 }
 
@@ -84,9 +83,9 @@ pub(crate) fn load(path: &Path) -> Result<Model, Error> {
         grey: None,
         group: 0,
     };
-    statements::each(path, |statement| reader.read(statement))?;
+    statements::for_each(path, |statement| reader.read(statement))?;
     reader.add_block(path)?;
-    reader.finish().of_file(path)
+    reader.into_model().finish(path)
 }
 
 impl Reader {
@@ -115,7 +114,7 @@ impl Reader {
             }
             "usemtl" => self.material = self.materials.number(statement.value()),
             "mtllib" => self.materials.read_libraries(statement)?,
-            // Lines, points, groups and curves: nothing to render.
+            // Lines, points, groups and curves are not rendered.
             _ => {}
         }
         Ok(())
@@ -140,7 +139,7 @@ impl Reader {
     fn face(&mut self, statement: Statement<'_>) -> Result<(), Error> {
         let mut corners: Vec<Corner> =
             statement.words().map(|word| self.corner(statement, word)).collect::<Result<_, _>>()?;
-        // Points and lines written as faces.
+        // A point or line written as a face.
         if corners.len() < 3 {
             return Ok(());
         }
@@ -162,19 +161,19 @@ impl Reader {
             self.add_block(statement.path)?;
             (self.block.material, self.block.group) = (material, group);
         }
-        // All have everything: `tobj` would mix up what only some have.
+        // Every corner gets all attributes, as `tobj` would mix up those that only some have.
         self.block.add(&corners, |i, number| {
-            let place = number.wrapping_sub(1);
+            let index = number.wrapping_sub(1);
             if i == 0 {
-                let [x, y, z] = self.positions[place].to_array();
-                let [r, g, b] = self.colours.get(place).map_or([1.0; 3], Vec3::to_array);
+                let [x, y, z] = self.positions[index].to_array();
+                let [r, g, b] = self.colours.get(index).map_or([1.0; 3], Vec3::to_array);
                 format!("v {x} {y} {z} {r} {g} {b}\n")
             } else if i == 1 {
-                let uv = self.uvs.get(place).copied().unwrap_or_default().as_dvec2();
+                let uv = self.uvs.get(index).copied().unwrap_or_default().as_dvec2();
                 format!("vt {} {}\n", uv.x, uv.y)
             } else {
                 let [x, y, z] =
-                    self.normals.get(place).copied().unwrap_or_default().as_dvec3().to_array();
+                    self.normals.get(index).copied().unwrap_or_default().as_dvec3().to_array();
                 format!("vn {x} {y} {z}\n")
             }
         });
@@ -192,7 +191,7 @@ impl Reader {
             let value: i64 = text.parse().map_err(|_| {
                 statement.fault(format!("{:?} is not a {what} index", shortened(text)))
             })?;
-            // Negative ones count back from the last.
+            // Negative indices count back from the last element.
             let found = if value < 0 { count as i64 + 1 + value } else { value };
             *number = u32::try_from(found)
                 .ok()
@@ -205,7 +204,7 @@ impl Reader {
         Ok(Corner { numbers, group: self.group })
     }
 
-    /// Adds the faces of the block to the model and begins a new one.
+    /// Adds the faces of the block to the model and starts a new block.
     fn add_block(&mut self, path: &Path) -> Result<(), Error> {
         let block = mem::take(&mut self.block);
         let mesh = block.read().map_err(|error| {
@@ -214,12 +213,12 @@ impl Reader {
         })?;
         let mut vertices = Vec::new();
         for (&corner, &vertex) in block.corners.iter().zip(&mesh.indices) {
-            // They are numbered as they come.
+            // `tobj` numbers vertices in the order of their first use.
             if vertex as usize == vertices.len() {
                 vertices.push(self.model_vertex(corner, &mesh, vertices.len()));
             }
         }
-        // There are no arities where all faces are triangles.
+        // `face_arities` is empty if all faces are triangles.
         let mut arities = mesh.face_arities.iter();
         let mut first = 0;
         while first < mesh.indices.len() {
@@ -227,14 +226,14 @@ impl Reader {
             let face = &mesh.indices[first..end];
             let place = |&i: &u32| DVec3::from_slice(&mesh.positions[3 * i as usize..]);
             let places: Vec<DVec3> = face.iter().map(place).collect();
-            for triangle in polygons::cut(&places) {
+            for triangle in polygons::triangulate(&places) {
                 for i in 0..3 {
                     let [a, b, c] = [i, (i + 1) % 3, (i + 2) % 3].map(|k| places[triangle[k]]);
                     let Corner { numbers: [position, ..], group } =
                         block.corners[first + triangle[i]];
                     if group > 0 {
                         let (u, v) = (b - a, c - a);
-                        // Nothing for triangles without area: they have no normal.
+                        // A triangle without area has no normal and adds nothing.
                         let angle = u.cross(v).length().atan2(u.dot(v));
                         let sum = self.sums.entry((position, group)).or_default();
                         *sum += angle * u.cross(v).normalize_or_zero();
@@ -249,7 +248,7 @@ impl Reader {
         Ok(())
     }
 
-    /// The model's vertex of a corner that is vertex `i` of a block.
+    /// The model's vertex for a corner that is vertex `i` of a block.
     fn model_vertex(&mut self, corner: Corner, mesh: &Mesh, i: usize) -> u32 {
         let model = &mut self.materials.model;
         *self.vertices.entry(corner).or_insert_with(|| {
@@ -267,8 +266,8 @@ impl Reader {
         })
     }
 
-    /// The model, with the normals of smoothing groups.
-    fn finish(self) -> Model {
+    /// Sets the normals of smoothing groups and returns the model.
+    fn into_model(self) -> Model {
         let mut model = self.materials.model;
         if !self.sums.is_empty() {
             model.normals.resize(model.positions.len(), Vec3::ZERO);

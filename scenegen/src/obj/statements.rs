@@ -9,7 +9,7 @@ use glam::DVec3;
 use crate::error::Error;
 use crate::resource;
 
-/// Longest line `[bytes]`: a polygon of a million corners.
+/// Longest line `[bytes]`, enough for a polygon of a million corners.
 const MAX_LINE: u64 = 1 << 24;
 
 /// A line of an OBJ or MTL file.
@@ -18,7 +18,7 @@ pub(super) struct Statement<'a> {
     pub(super) path: &'a Path,
     pub(super) line: usize,
     pub(super) key: &'a str,
-    /// The text after the key, with comments.
+    /// The text after the key, including comments.
     pub(super) text: &'a str,
 }
 
@@ -54,8 +54,8 @@ impl<'a> Statement<'a> {
     }
 }
 
-/// Hands the statements of a file to `read`. However large it is, only one line is in memory.
-pub(super) fn each(
+/// Passes the statements of a file to `read`, holding only one line in memory.
+pub(super) fn for_each(
     path: &Path,
     mut read: impl FnMut(Statement<'_>) -> Result<(), Error>,
 ) -> Result<(), Error> {
@@ -95,13 +95,13 @@ fn fault(path: &Path, line: usize, problem: impl Display) -> Error {
     Error::malformed(path, format!("line {line}"), problem, remedy)
 }
 
-/// The first word and what follows it.
+/// The first word and the rest.
 pub(super) fn split_word(text: &str) -> (&str, &str) {
     let (word, rest) = text.split_once(char::is_whitespace).unwrap_or((text, ""));
     (word, rest.trim_start())
 }
 
-/// Text of the file, short enough for a message.
+/// Shortens text of the file for a message.
 pub(super) fn shortened(text: &str) -> String {
     text.chars().take(80).collect()
 }
@@ -115,7 +115,7 @@ mod tests {
         let path = folder.path().join("lines.obj");
         std::fs::write(&path, text).expect("written");
         let mut all = String::new();
-        each(&path, |s| {
+        for_each(&path, |s| {
             all += &format!("{} {} {}\n", s.line, s.key, s.text);
             Ok(())
         })?;

@@ -1,4 +1,4 @@
-//! Tests of the OBJ reader: what `tobj` alone would misread, smoothing groups, materials.
+//! Tests of the OBJ reader: files that `tobj` alone would misread, smoothing groups, materials.
 
 #![allow(clippy::float_cmp, reason = "exact values")]
 
@@ -9,7 +9,7 @@ use super::*;
 use crate::mesh::Reflection;
 use crate::texture::TextureRef;
 
-/// Loads an OBJ file with files beside it.
+/// Loads an OBJ file with other files in its folder.
 fn loaded(obj: &str, files: &[(&str, &[u8])]) -> Result<Model, Error> {
     let folder = tempfile::tempdir().expect("folder");
     for (name, bytes) in files {
@@ -39,7 +39,7 @@ fn smoothing_groups_share_normals_and_no_group_is_flat() {
         ("s 1\nf 1 3 4 2\ns 2\nf 5 1 2 6\n", [z, x], [z, x]),
         ("f 1 3 4 2\nf 5 1 2 6\n", [Vec3::ZERO; 2], [Vec3::ZERO; 2]),
         ("s 1\ns off\nf 1 3 4 2\ns 0\nf 5 1 2 6\n", [Vec3::ZERO; 2], [Vec3::ZERO; 2]),
-        // A normal of its own comes before the group's.
+        // A face's own normal takes precedence over the group's.
         (
             "vn 0 1 0\ns 1\nf 1//1 3//1 4//1 2//1\ns off\nf 5 1 2 6\n",
             [Vec3::Y, Vec3::ZERO],
@@ -81,11 +81,11 @@ fn maps_of_roughness_and_metalness_are_read() {
         let image = &model.textures[texture.texture as usize];
         image.sample(Vec2::splat(0.5), &texture.sampler, 0.0)
     };
-    // Where shading looks: green for roughness, blue for metalness.
+    // Shading reads roughness from green and metalness from blue.
     assert!((value(&material.roughness_texture).y - 0.2).abs() < 1e-6);
     assert!((value(&material.metallic_texture).z - 0.8).abs() < 1e-6);
     assert!(model.notes.iter().any(|note| note.contains("bump")), "{:?}", model.notes);
-    // Without the map of one of them, it is the number's, and no metal by default.
+    // Without a map the number applies; the default is no metal.
     let model = load("newmtl m\nmap_Pr r.png\n");
     let material = &model.materials[0];
     assert_eq!((material.roughness, material.metallic), (1.0, 0.0));

@@ -1,13 +1,12 @@
-//! Light from all around as an equirectangular image: Radiance `.hdr` or OpenEXR.
+//! Environment light from an equirectangular image: Radiance `.hdr` or OpenEXR.
 //!
-//! +y is up; the image's middle shows what lies towards +x, and its right half what lies towards
-//! +z, as it looks from within. Files are untrusted: sizes are checked before anything is decoded, NaN
-//! becomes black, and infinity the largest half float.
+//! +y is up. Seen from inside, the centre of the image is towards +x and its right half towards +z. Files are
+//! untrusted: sizes are checked before anything is decoded, NaN becomes black, and infinity the largest half
+//! float.
 //!
-//! Blurred copies are made once, so that a surface that asks for no occlusion needs no secondary
-//! ray: each is the image averaged with a power of the cosine as weight. Of the exponent k that is
-//! chosen for a roughness, the mean cosine (k + 1) / (k + 2) is 1 − roughness² / 3, and so the
-//! roughest copy is irradiance / pi.
+//! Blurred copies are made once, so that surfaces without occlusion need no secondary rays. Each copy is the
+//! image averaged with a power of the cosine as weight. The exponent k for a roughness is chosen such that the
+//! mean cosine (k + 1) / (k + 2) is 1 − roughness² / 3; the roughest copy is therefore irradiance / pi.
 
 use std::f32::consts::{PI, TAU};
 use std::path::Path;
@@ -20,16 +19,17 @@ use serde::{Serialize, Serializer, ser::SerializeStruct};
 use crate::error::Error;
 use crate::resource::{self, EXPANSION, MAX_DECODED};
 
-/// Largest radiance, a half float's.
+/// Largest radiance: the largest half float.
 const BRIGHTEST: f32 = 65_504.0;
-/// Columns of the cells that are averaged, and of the averages; half as many rows. Both suffice for
-/// the sharpest lobe, which is some 20 degrees wide.
+/// Number of columns of the image that is averaged; half as many rows. This and the next are sufficient for the
+/// sharpest lobe, which is about 20 degrees wide.
 const CELLS: usize = 96;
+/// Number of columns of the averages.
 const AVERAGES: usize = 48;
-/// Blurred copies, for roughness 1/4, 2/4, 3/4 and 1.
+/// Number of blurred copies, for roughness 1/4, 2/4, 3/4 and 1.
 const LEVELS: usize = 4;
 
-/// An image of the sky.
+/// An environment image.
 #[derive(Debug)]
 pub struct Panorama {
     name: String,
@@ -45,13 +45,13 @@ struct Sphere {
     values: Vec<Vec3>,
 }
 
-/// The pixels of a small part of the sphere in one.
+/// A small part of the sphere: its pixels combined.
 struct Cell {
-    /// Their mean direction.
+    /// Mean direction.
     direction: Vec3,
-    /// Their solid angle, up to a factor that all cells share.
+    /// Solid angle, up to a factor that is the same for all cells.
     weight: f32,
-    /// Their mean.
+    /// Mean radiance.
     value: Vec3,
 }
 
@@ -59,11 +59,11 @@ impl Panorama {
     /// Reads a file.
     ///
     /// # Errors
-    /// When it cannot be read, is no `.hdr` or `.exr` image of moderate size, or is not twice as wide
+    /// When it cannot be read, is not an `.hdr` or `.exr` image of moderate size, or is not twice as wide
     /// as high.
     pub fn load(path: &Path) -> Result<Self, Error> {
         let bytes = resource::read(path)?;
-        let remedy = "give an equirectangular .hdr or .exr image, at most 11584 px wide";
+        let remedy = "use an equirectangular .hdr or .exr image, at most 11584 px wide";
         let fault = |problem: String| Error::malformed(path, "the sky", problem, remedy);
         let formats = [ImageFormat::Hdr, ImageFormat::OpenExr];
         let problem = "it is neither Radiance HDR nor OpenEXR";
@@ -71,13 +71,15 @@ impl Panorama {
             || resource::image_reader(&bytes, &formats, problem).map_err(|e| fault(e.to_string()));
         let (width, height) = reader()?.into_dimensions().map_err(|e| fault(e.to_string()))?;
         if height == 0 || width != 2 * height {
-            return Err(fault(format!("it has {width}x{height} px, and is not twice as wide")));
+            return Err(fault(format!(
+                "it has {width}x{height} px and is not twice as wide as high"
+            )));
         }
         // Decoders may hold four floats per pixel.
         let decoded = u64::from(width) * u64::from(height) * 16;
         if decoded > MAX_DECODED || decoded > (bytes.len() as u64).saturating_mul(EXPANSION) {
             return Err(fault(format!(
-                "it has {width}x{height} px, which is too many or not in the file"
+                "it claims {width}x{height} px, which is too large or more than the file can hold"
             )));
         }
         let image = reader()?.decode().map_err(|e| fault(e.to_string()))?.into_rgb32f();
@@ -89,7 +91,7 @@ impl Panorama {
     /// A panorama of `width` x `width / 2` linear RGB pixels, the upper row first.
     pub(crate) fn new(name: String, width: usize, mut pixels: Vec<Vec3>) -> Self {
         for value in pixels.iter_mut().flat_map(Vec3::as_mut) {
-            // NaN becomes 0 too.
+            // NaN also becomes 0.
             *value = if *value > 0.0 { value.min(BRIGHTEST) } else { 0.0 };
         }
         let image = Sphere { width, values: pixels };
@@ -104,8 +106,7 @@ impl Panorama {
         self.image.at(direction)
     }
 
-    /// Mean radiance of a lobe about a direction: the image itself at roughness 0, with a cosine as
-    /// weight at 1.
+    /// Mean radiance of a lobe around a direction: the image itself at roughness 0, a cosine lobe at 1.
     pub(crate) fn blurred(&self, direction: Vec3, roughness: f32) -> Vec3 {
         let level = roughness.clamp(0.0, 1.0) * LEVELS as f32;
         let (below, share) = (level as usize, level.fract());
@@ -140,7 +141,7 @@ impl Sphere {
         self.width / 2
     }
 
-    /// Bilinear between pixels' centres, round the horizon and not across the poles.
+    /// Bilinear interpolation between pixel centres, wrapping around the horizon but not across the poles.
     fn at(&self, direction: Vec3) -> Vec3 {
         let (width, height) = (self.width, self.height());
         let u = direction.z.atan2(direction.x) / TAU + 0.5;
@@ -155,7 +156,7 @@ impl Sphere {
         above.lerp(below, y - upper)
     }
 
-    /// The image in [`CELLS`] columns.
+    /// Reduces the image to [`CELLS`] columns.
     fn cells(&self) -> Vec<Cell> {
         if self.width < CELLS {
             let at = |i: usize| self.at(direction(i, CELLS));
@@ -179,13 +180,13 @@ impl Sphere {
         sums.into_iter().filter(|sum| sum.1 > 0.0).map(cell).collect()
     }
 
-    /// Means of cells with the cosine to the power `exponent` as weight.
+    /// Averages the cells with the cosine to the power `exponent` as weight.
     fn averaged(cells: &[Cell], exponent: f32) -> Self {
         let mean = |i: usize| {
-            let about = direction(i, AVERAGES);
+            let axis = direction(i, AVERAGES);
             let (mut sum, mut total) = (Vec3::ZERO, 0.0);
             for cell in cells {
-                let cos = about.dot(cell.direction);
+                let cos = axis.dot(cell.direction);
                 if cos > 0.0 {
                     let weight = cell.weight * cos.powf(exponent);
                     sum += weight * cell.value;
@@ -199,12 +200,12 @@ impl Sphere {
     }
 }
 
-/// Angle of a row's middle from the zenith `[rad]`.
+/// Angle of a row's centre from the zenith `[rad]`.
 fn polar(row: usize, height: usize) -> f32 {
     (row as f32 + 0.5) / height as f32 * PI
 }
 
-/// The direction of a pixel's middle.
+/// The direction of a pixel's centre.
 fn direction(i: usize, width: usize) -> Vec3 {
     let (x, y) = (i % width, i / width);
     let turn = ((x as f32 + 0.5) / width as f32 - 0.5) * TAU;

@@ -1,4 +1,4 @@
-//! Skies from images against gradients, by direction, and as files.
+//! Tests of environment images: against gradients, by direction, and as files.
 
 use std::fs;
 use std::path::PathBuf;
@@ -62,7 +62,7 @@ fn an_image_of_a_gradient_lights_like_the_gradient() {
 
 #[test]
 fn a_bright_pixel_shines_from_where_it_is() {
-    // (column, row) of 16 x 8 pixels, and the direction of its middle.
+    // (column, row) of 16 x 8 pixels, and the direction of the pixel's centre.
     let turned = |degrees: f32, height: f32| {
         let (sin, cos) = degrees.to_radians().sin_cos();
         Vec3::new(cos, height, sin).normalize()
@@ -78,7 +78,7 @@ fn a_bright_pixel_shines_from_where_it_is() {
         let mut pixels = vec![Vec3::ZERO; 128];
         pixels[row * 16 + column] = Vec3::new(9.0, 6.0, 3.0);
         let sky = Sky::Image(Panorama::new("test".into(), 16, pixels).into());
-        // A pole is where all pixels of a row meet.
+        // At a pole all pixels of a row meet, so interpolation mixes them.
         if row != 0 && row != 7 {
             assert!(sky.radiance(towards).x > 4.0);
         }
@@ -96,7 +96,7 @@ fn a_bright_pixel_shines_from_where_it_is() {
     }
 }
 
-/// The same pixels, all of them finite, in both formats.
+/// Files of both formats with the same pixels, all of them finite.
 fn files(folder: &Path, width: u32, height: u32, pixels: &[[f32; 3]]) -> [PathBuf; 2] {
     let path = folder.join("sky.hdr");
     let colours: Vec<Rgb<f32>> = pixels.iter().map(|&p| Rgb(p)).collect();
@@ -114,7 +114,7 @@ fn exr(folder: &Path, width: u32, height: u32, pixels: &[[f32; 3]]) -> PathBuf {
 }
 
 #[test]
-fn files_of_both_formats_are_read_and_made_sane() {
+fn files_of_both_formats_are_read_and_clamped() {
     let folder = tempfile::tempdir().expect("folder");
     let mut pixels = [[0.5, 1.0, 2.0]; 32];
     pixels[0] = [16.0, 0.0, 0.25];
@@ -142,7 +142,7 @@ fn bad_files_are_errors_that_name_them() {
     }
     for path in files(folder.path(), 8, 4, &[[1.0; 3]; 32]) {
         let whole = fs::read(&path).expect("read");
-        // Cut anywhere, it is an error or a sky.
+        // A truncated file is an error or loads.
         for length in 0..whole.len() - 1 {
             fs::write(&path, &whole[..length]).expect("write");
             let _ = Panorama::load(&path);

@@ -1,8 +1,7 @@
-//! Makes initial points as structure-from-motion would find them, with errors of known size.
+//! Initial points like those of structure-from-motion, with errors of known size.
 //!
-//! Candidates are pixels of training views, drawn with probability by the local gradient of
-//! luminance: where an image is flat, feature matching finds nothing. A candidate counts when at
-//! least three training views see it.
+//! Candidates are pixels of training views, drawn in proportion to the local gradient of luminance, as feature
+//! matching finds nothing in flat regions. A candidate is used if at least three training views see it.
 
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
@@ -14,27 +13,27 @@ use crate::trace::{Frame, Tracer};
 
 /// Views that must see a point.
 const MIN_VIEWS: usize = 3;
-/// Candidates per point wanted: most are seen by three views.
+/// Candidates per requested point, as some are seen by fewer than three views.
 const CANDIDATES: f64 = 2.0;
-/// Gradient every pixel counts as having: half a step of eight bits.
+/// Added to every pixel's gradient: half a step of eight bits.
 const GRADIENT_FLOOR: f64 = 0.5;
-/// Side of the cubes that drop out together, as a share of the diagonal.
+/// Side of the cubes that are dropped as a whole, as a share of the diagonal.
 const PATCH: f64 = 0.02;
 /// Relative depth difference up to which a view sees a point.
 const SAME_DEPTH: f64 = 1e-3;
 
-/// How many points, and how wrong.
+/// Number and errors of initial points.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct PointOptions {
-    /// Points wanted; fewer where the views see fewer.
+    /// Number of points; fewer if the views do not see enough.
     pub count: usize,
     /// Standard deviation of each coordinate, as a share of the diagonal.
     pub noise: f64,
-    /// Share of points that lie anywhere in the bounding box enlarged by a fifth.
+    /// Share of points that are placed anywhere in the bounding box enlarged by a fifth.
     pub outliers: f64,
-    /// Share of space, in cubes of 2 % of the diagonal, in which no point is found.
+    /// Share of space, in cubes of 2 % of the diagonal, without points.
     pub dropout: f64,
-    /// Whether thin structures yield no points.
+    /// If true, thin structures yield no points.
     pub without_thin: bool,
 }
 
@@ -51,24 +50,24 @@ pub struct InitPoints {
     pub positions: Vec<DVec3>,
     /// sRGB colours. Shape: `[points]`.
     pub colours: Vec<[u8; 3]>,
-    /// Where on the surface each was found, in world coordinates: `positions` before noise, and for
-    /// an outlier what was mistaken for it. Shape: `[points]`.
+    /// True surface points in world coordinates: `positions` before noise, and for outliers the points that
+    /// their features show. Shape: `[points]`.
     pub found_at: Vec<DVec3>,
-    /// Numbers of the training views that see each, ascending. An outlier lies in front of all of
-    /// them. Shape: `[points]`.
+    /// Indices of the training views that see each point, ascending. Outliers are in front of all of their
+    /// cameras. Shape: `[points]`.
     pub seen_by: Vec<Vec<u32>>,
-    /// Number of outliers among them.
+    /// Number of outliers.
     pub outliers: usize,
 }
 
 struct Candidate {
-    /// Decides which candidates are taken.
+    /// Random number by which candidates are sorted.
     order: u64,
     position: DVec3,
     colour: [u8; 3],
 }
 
-/// Gathers candidates from training views as they are rendered.
+/// Collects candidates from training views as they are rendered.
 pub struct PointCollector<'a> {
     tracer: Tracer<'a>,
     cameras: &'a [Camera],
@@ -83,7 +82,7 @@ impl<'a> PointCollector<'a> {
         Self { tracer, cameras, options, bounds, candidates: Vec::new() }
     }
 
-    /// Draws candidates from training view number `view`.
+    /// Draws candidates from training view `view`.
     pub fn observe(&mut self, view: usize, frame: &Frame) {
         if self.options.count == 0 {
             return;
@@ -114,7 +113,7 @@ impl<'a> PointCollector<'a> {
         }
     }
 
-    /// The weight of each pixel.
+    /// The sampling weight of each pixel.
     fn weights(&self, frame: &Frame) -> Vec<f64> {
         let (width, height) = (frame.width as usize, frame.height as usize);
         let luminance = |i: usize| {
@@ -142,7 +141,7 @@ impl<'a> PointCollector<'a> {
         (0..width * height).map(weight).collect()
     }
 
-    /// The points of all views observed.
+    /// The points of all observed views.
     #[must_use]
     pub fn finish(mut self) -> InitPoints {
         let PointOptions { count, noise, outliers, .. } = self.options;
@@ -152,7 +151,7 @@ impl<'a> PointCollector<'a> {
         let mut points = InitPoints::default();
         self.candidates.sort_by_key(|candidate| candidate.order);
         let needed = MIN_VIEWS.min(self.cameras.len());
-        // In blocks: visibility is tested only until there are enough points.
+        // In blocks, so that visibility is tested only until there are enough points.
         for block in self.candidates.chunks(4096) {
             let seen: Vec<Vec<u32>> = block.par_iter().map(|c| self.viewers(c.position)).collect();
             for (candidate, seen) in block.iter().zip(seen) {
@@ -180,7 +179,7 @@ impl<'a> PointCollector<'a> {
                 let shift = DVec3::new(draws.normal(), draws.normal(), draws.normal());
                 *position += noise * diagonal * shift;
             }
-            // It may lie behind a camera now.
+            // The shifted point may be behind a camera.
             seen.retain(|&view| self.cameras[view as usize].project(*position).1 > 0.0);
         }
         points

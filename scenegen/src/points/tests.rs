@@ -1,4 +1,4 @@
-//! Initial points: how many, where, and how far off.
+//! Tests of the number, positions and errors of initial points.
 
 use super::*;
 use crate::{Options, Scene, Source, generate};
@@ -31,16 +31,16 @@ fn exact_points_lie_on_surfaces_that_three_views_see() {
             let camera = &scene.views[view as usize].camera;
             let (pixel, depth) = camera.project(*position);
             assert!(depth > 0.0 && camera.contains(pixel));
-            // Nothing is in the way, up to the stated tolerance.
-            let way = *position - camera.centre;
-            let first = scene.surface.cast(camera.centre, way, 2.0).expect("a surface");
+            // Nothing is in front of it, up to the tolerance.
+            let ray = *position - camera.centre;
+            let first = scene.surface.cast(camera.centre, ray, 2.0).expect("a surface");
             assert!(first.t > 1.0 - 2.0 * SAME_DEPTH, "{}", first.t);
         }
     }
 }
 
 #[test]
-fn noise_and_outliers_are_as_stated() {
+fn noise_and_outliers_have_the_requested_size() {
     let options = PointOptions { noise: 2e-3, outliers: 0.1, count: 1500, ..EXACT };
     let (scene, points) = points("spheres", 64, options);
     assert!((100..200).contains(&points.outliers), "{} outliers", points.outliers);
@@ -56,7 +56,7 @@ fn noise_and_outliers_are_as_stated() {
 }
 
 #[test]
-fn detail_draws_points_and_plain_walls_few() {
+fn detail_has_more_points_than_plain_walls() {
     let (scene, points) = points("chirp", 96, EXACT);
     let plain = |p: &&DVec3| {
         let triangle = scene.surface.nearest(**p).triangle as usize;

@@ -1,4 +1,4 @@
-//! `chirp`: where is detail worth rows? Siemens stars, a chirp, and walls without texture.
+//! `chirp`: detail of every scale. Siemens stars, a chirp, and walls without texture.
 //!
 //! Three walls, 1.6 m wide and high, each at y = 0 to 1.6: the middle one at z = −0.8, |x| <= 0.8,
 //! with four Siemens stars of 36 spokes; the left one from (−0.8, −0.8) to (−1.6, 0.585786) in

@@ -3,7 +3,7 @@
 //! The inside of |x| <= 1, 0 <= y <= 2, −1 <= z <= 1, open towards +z: white floor, ceiling and back,
 //! red left and green right wall. A lamp of 0.5 x 0.5 m at y = 1.99, facing down, radiance 14. Two
 //! white boxes: 0.6 x 1.2 x 0.6 m at (−0.35, −0.3) in (x, z), turned by 18 degrees, and a cube of
-//! 0.6 m at (0.35, 0.35), turned by −16 degrees. All Lambert. One bounce, 64 rays per pixel.
+//! 0.6 m at (0.35, 0.35), turned by −16 degrees. All Lambert. One light bounce, 64 rays per pixel.
 
 use glam::{DQuat, DVec3, Vec3};
 

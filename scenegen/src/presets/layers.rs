@@ -1,10 +1,9 @@
-//! `layers`: near, middle and far, as outdoors.
+//! `layers`: near, middle and far layers, as in outdoor scenes.
 //!
 //! Far: the inside of a sphere of radius 30 m about the origin (20,480 triangles), painted with
 //! hills under a sky. Ground: the square |x|, |z| <= 12 at y = 0. Middle: twelve boxes of 1 x (1 to
 //! 3) x 1 m on a circle of 6 m. Near: six posts of radius 8 cm and height 1.2 m on a circle of
-//! 1.2 m, and a sphere of radius 0.4 m at (0, 0.4, 0). The dome is unlit: it is its own light. The
-//! rest is Lambert.
+//! 1.2 m, and a sphere of radius 0.4 m at (0, 0.4, 0). The dome is unlit; everything else is Lambert.
 
 use std::f64::consts::TAU;
 
@@ -39,7 +38,7 @@ fn build() -> Staging {
         ..Material::lambert("dome", [1.0; 3])
     });
     model.sphere(DVec3::ZERO, 30.0, 5, dome);
-    // Seen from inside: the winding and the normals are turned round.
+    // Seen from inside, so winding and normals are reversed.
     for triangle in &mut model.triangles {
         triangle.swap(1, 2);
     }
@@ -86,14 +85,14 @@ fn build() -> Staging {
         elevation: [8.0, 35.0],
         ..Rig::default()
     };
-    // The sky's light is in the closed form; the dome is only its picture.
+    // The sky lights the scene in closed form; the dome only depicts it.
     let mut staging = Staging { rig, ..Staging::outdoors(model) };
-    // The sun is inside the dome: its rays start there and not beyond it.
+    // A sun outside the dome would be occluded by it.
     staging.model.lights = vec![inside_sun()];
     staging
 }
 
-/// A light so far up that its rays are nearly parallel, yet within the dome.
+/// A light within the dome that is far enough for its rays to be nearly parallel.
 fn inside_sun() -> crate::mesh::Light {
     let sun = super::sun();
     let position = DVec3::new(0.5, 0.8, 0.6).normalize() * 29.0;

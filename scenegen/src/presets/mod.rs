@@ -1,20 +1,20 @@
-//! The built-in scenes: exact geometry, no external data.
+//! The built-in scenes: exact geometry without external data.
 //!
-//! A scene's file documents its geometry. Lengths are in metres; +y is up.
+//! Each scene's file documents its geometry. Lengths are in metres; +y is up.
 
-mod ask;
 mod chirp;
 mod cornell;
 mod glossy;
 mod layers;
 mod room;
+mod spec;
 mod spheres;
 mod table;
 mod thin;
 mod town;
 
-pub use ask::AskedPreset;
 use glam::{DVec3, Vec3};
+pub use spec::PresetSpec;
 
 use crate::mesh::{Light, LightKind, Model};
 use crate::rig::Rig;
@@ -31,16 +31,16 @@ pub struct Preset {
     pub(crate) build: Build,
 }
 
-/// How a preset is built.
+/// The function that builds a preset.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Build {
-    /// Always the same.
+    /// Always builds the same scene.
     Fixed(fn() -> Staging),
-    /// As large as is asked for, and another one for each seed.
+    /// Builds a scene of a given size, which also depends on the seed.
     Sized {
-        /// Its size where none is named.
-        usual: u32,
-        /// Its greatest size; the least is 1.
+        /// Default size.
+        default: u32,
+        /// Largest size; the smallest is 1.
         most: u32,
         build: fn(size: u32, seed: u64) -> Staging,
     },
@@ -68,7 +68,7 @@ pub const PRESETS: [Preset; 9] = [
 ];
 
 impl Staging {
-    /// Lit by the sun and an open sky, seen by the default rig.
+    /// A scene lit by the sun and an open sky, with the default rig.
     fn outdoors(model: Model) -> Self {
         let mut model = model;
         model.lights.push(sun());
@@ -76,7 +76,7 @@ impl Staging {
     }
 }
 
-/// Parallel light from the upper front right; with the open sky, white reflects at most 1.
+/// Parallel light from the upper front right. Together with the open sky, white surfaces reflect at most 1.
 pub(crate) fn sun() -> Light {
     let direction = -DVec3::new(0.5, 0.8, 0.6).normalize();
     let intensity = Vec3::new(1.0, 0.96, 0.9) * (0.55 * std::f32::consts::PI);
@@ -93,14 +93,11 @@ mod tests {
     use super::*;
     use crate::surface::Surface;
 
-    fn asked(name: &str) -> AskedPreset {
-        name.parse().unwrap_or_else(|error| panic!("{error}"))
-    }
-
     #[test]
     fn every_preset_builds_and_is_described() {
         for preset in PRESETS {
-            let staging = asked(preset.name).build(0);
+            let spec: PresetSpec = preset.name.parse().expect("a preset");
+            let staging = spec.build(0);
             assert!(!preset.summary.is_empty(), "{}", preset.name);
             let surface = Surface::new(&staging.model).expect("triangles");
             let (train, test) = staging.rig.cameras(&surface, &[]).expect("cameras");

@@ -1,7 +1,7 @@
-//! `room`: a room from inside, its walls without texture but for small text.
+//! `room`: a room from inside. Its walls have no texture except small text.
 //!
 //! The inside of |x| <= 2.5, 0 <= y <= 2.6, |z| <= 2: floor of boards, plain walls and ceiling. Posters
-//! of 0.9 x 0.6 m, 1 cm before the middle of each wall at height 1.5 m, with five lines of text whose
+//! of 0.9 x 0.6 m, 1 cm in front of the middle of each wall at height 1.5 m, with five lines of text whose
 //! strokes are 6 mm wide. A table (top 1.2 x 0.04 x 0.7 m at height 0.72 m, four legs of 5 cm) in the
 //! middle, a shelf (0.8 x 1.8 x 0.3 m) at the wall x = −2.5, a sphere of 0.25 m and a cube of 0.4 m.
 //! Lit by a point light at (0, 1.9, 0) and an even ambient. All Lambert.
@@ -38,7 +38,7 @@ fn build() -> Staging {
         }
     });
     model.cuboid(DVec3::Y * HALF.y, -HALF, DQuat::IDENTITY, wall);
-    // The floor lies a hair above the box's bottom.
+    // The floor lies 1 mm above the box's bottom.
     let corner = DVec3::new(-HALF.x, 1e-3, HALF.z);
     model.quad(corner, 2.0 * HALF.x * DVec3::X, -2.0 * HALF.z * DVec3::Z, boards);
     let poster = model.painted("poster", 512, poster);
@@ -55,10 +55,10 @@ fn build() -> Staging {
     let wood = model.painted("wood", 256, |at| {
         marbled(at * DVec2::new(1.0, 6.0), 4, 62, [0.2, 0.1, 0.04], [0.5, 0.3, 0.15])
     });
-    let still = DQuat::IDENTITY;
-    model.cuboid(DVec3::new(0.0, 0.72, 0.0), DVec3::new(0.6, 0.02, 0.35), still, wood);
+    let upright = DQuat::IDENTITY;
+    model.cuboid(DVec3::new(0.0, 0.72, 0.0), DVec3::new(0.6, 0.02, 0.35), upright, wood);
     for (x, z) in [(-0.55, -0.3), (0.55, -0.3), (0.55, 0.3), (-0.55, 0.3)] {
-        model.cuboid(DVec3::new(x, 0.35, z), DVec3::new(0.025, 0.35, 0.025), still, wood);
+        model.cuboid(DVec3::new(x, 0.35, z), DVec3::new(0.025, 0.35, 0.025), upright, wood);
     }
     let shelf = model.painted("shelf", 256, |at| {
         let (row, book) = ((at.y * 5.0).floor(), (at.x * 14.0).floor());
@@ -68,7 +68,7 @@ fn build() -> Staging {
         if edge { Vec3::new(0.3, 0.18, 0.1) } else { Vec3::new(tone(0.0), tone(2.0), tone(4.0)) }
     });
     let half = DVec3::new(0.15, 0.9, 0.4);
-    model.cuboid(DVec3::new(-HALF.x + half.x, half.y, -1.2), half, still, shelf);
+    model.cuboid(DVec3::new(-HALF.x + half.x, half.y, -1.2), half, upright, shelf);
     let ball =
         model.painted("ball", 256, |at| marbled(at, 6, 63, [0.7, 0.25, 0.1], [0.95, 0.8, 0.5]));
     model.sphere(DVec3::new(1.7, 0.25, -1.3), 0.25, 4, ball);

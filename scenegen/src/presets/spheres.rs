@@ -2,7 +2,7 @@
 //!
 //! Floor: the square |x|, |z| <= 1.6 at y = 0. Spheres of radius 0.5, 0.35, 0.3, 0.25 and 0.2 rest
 //! on it at (x, z) = (0, 0), (0.8, 0.25), (−0.7, 0.45), (0.3, −0.85), (−0.45, −0.6); each has 5,120
-//! triangles whose corners lie on the sphere. All Lambert. Finest feature: a marble vein, 2 cm.
+//! triangles whose corners lie on the sphere. All Lambert. The finest features are marble veins of 2 cm.
 
 use glam::DVec3;
 

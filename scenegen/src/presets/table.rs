@@ -1,4 +1,4 @@
-//! `table`: clutter that hides itself.
+//! `table`: clutter with much occlusion.
 //!
 //! A table top of 1.6 x 0.06 x 1 m whose upper side is y = 0.76, on four legs of 6 x 6 cm, on a
 //! floor |x|, |z| <= 1.5 at y = 0. On it, placed by a fixed seed on a grid of 5 x 3 cells of 30 cm:
@@ -29,11 +29,11 @@ fn build() -> Staging {
     });
     let floor = model.painted("floor", 512, |at| marbled(at, 24, 22, [0.3; 3], [0.55, 0.55, 0.5]));
     model.quad(DVec3::new(-1.5, 0.0, 1.5), 3.0 * DVec3::X, -3.0 * DVec3::Z, floor);
-    let still = DQuat::IDENTITY;
-    model.cuboid(DVec3::new(0.0, TOP - 0.03, 0.0), DVec3::new(0.8, 0.03, 0.5), still, wood);
+    let upright = DQuat::IDENTITY;
+    model.cuboid(DVec3::new(0.0, TOP - 0.03, 0.0), DVec3::new(0.8, 0.03, 0.5), upright, wood);
     for (x, z) in [(-0.75, -0.45), (0.75, -0.45), (0.75, 0.45), (-0.75, 0.45)] {
         let half = DVec3::new(0.03, 0.5 * (TOP - 0.06), 0.03);
-        model.cuboid(DVec3::new(x, half.y, z), half, still, wood);
+        model.cuboid(DVec3::new(x, half.y, z), half, upright, wood);
     }
     let mut draws = Draws::new(23, &[]);
     for cell in 0..15_u32 {

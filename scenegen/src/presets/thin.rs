@@ -1,10 +1,10 @@
-//! `thin`: wires of known radius before a textured wall.
+//! `thin`: wires of known radius in front of a textured wall.
 //!
 //! Wall: the rectangle |x| <= 1.4, 0 <= y <= 2 at z = −0.6, floor: |x| <= 1.4, −0.6 <= z <= 0.8 at
 //! y = 0. Wires of radius 6, 12, 24 and 48 mm; at the default 256 px, 50 degrees and distance
 //! their radii are 0.5, 1, 2 and 4 px. Eight stand upright at z = 0 from y = 0 to 1.8, at x = −1.05
-//! to 1.05 every 0.3 m, radii in turn; four run along x at z = 0.15 and y = 0.5, 0.9, 1.3, 1.7,
-//! thinnest at the top. Each has 16 sides with corners on the circle. All Lambert.
+//! to 1.05 every 0.3 m, with alternating radii; four run along x at z = 0.15 and y = 0.5, 0.9, 1.3, 1.7,
+//! the thinnest at the top. Each has 16 sides with corners on the circle. All Lambert.
 
 use glam::{DVec3, Vec3};
 
@@ -15,7 +15,7 @@ use crate::rig::{Rig, RigKind};
 
 pub(super) const PRESET: Preset = Preset {
     name: "thin",
-    summary: "wires of radius 0.5 to 4 px before a textured wall",
+    summary: "wires of radius 0.5 to 4 px in front of a textured wall",
     build: Build::Fixed(build),
 };
 

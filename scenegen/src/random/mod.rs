@@ -1,5 +1,5 @@
-//! Draws random numbers without state: each is a hash of its purpose, so that images do not depend on
-//! which thread traces which pixel.
+//! Random numbers as hashes of their purpose, so that images do not depend on the threads that trace their
+//! pixels.
 
 use std::f32::consts::{PI, TAU};
 
@@ -13,7 +13,7 @@ fn mix(mut z: u64) -> u64 {
     z ^ (z >> 31)
 }
 
-/// A stream of draws for one purpose; two streams with different keys share nothing.
+/// A stream of random numbers for one purpose; streams with different keys are independent.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Draws {
     key: u64,
@@ -21,12 +21,12 @@ pub(crate) struct Draws {
 }
 
 impl Draws {
-    /// The stream of a seed and what identifies the purpose: view, pixel, sample.
+    /// The stream of a seed and a key that identifies the purpose, such as view, pixel and sample.
     pub(crate) fn new(seed: u64, parts: &[u64]) -> Self {
         parts.iter().fold(Self { key: mix(seed), count: 0 }, |draws, &part| draws.with(part))
     }
 
-    /// The stream that [`Draws::new`] makes with one more part; nothing was drawn before.
+    /// The stream whose key has one more part. Nothing must have been drawn from `self`.
     pub(crate) fn with(self, part: u64) -> Self {
         Self { key: mix(self.key ^ mix(part)), count: 0 }
     }
@@ -64,13 +64,13 @@ pub(crate) fn stratum(i: u32, n: u32, jitter: Vec2) -> Vec2 {
     (cell + jitter) / n as f32
 }
 
-/// A direction about +z with density cos / pi.
+/// A direction around +z with density cos / pi.
 pub(crate) fn cosine_hemisphere(u: Vec2) -> Vec3 {
     let (radius, angle) = (u.x.sqrt(), TAU * u.y);
     Vec3::new(radius * angle.cos(), radius * angle.sin(), (1.0 - u.x).max(0.0).sqrt())
 }
 
-/// A visible normal of the GGX distribution about +z, for a view direction with z >= 0
+/// A visible normal of the GGX distribution around +z, for a view direction with z >= 0
 /// (Heitz, "Sampling the GGX Distribution of Visible Normals", JCGT 2018).
 pub(crate) fn ggx_visible_normal(view: Vec3, alpha: f32, u: Vec2) -> Vec3 {
     let stretched = Vec3::new(alpha * view.x, alpha * view.y, view.z).normalize();
@@ -94,7 +94,7 @@ pub(crate) fn ggx_distribution(cos: f32, alpha: f32) -> f32 {
     a2 / (PI * d * d)
 }
 
-/// An orthonormal frame whose z is `normal` (Duff et al., "Building an Orthonormal Basis,
+/// x and y of an orthonormal frame whose z is `normal` (Duff et al., "Building an Orthonormal Basis,
 /// Revisited", JCGT 2017).
 pub(crate) fn frame(normal: Vec3) -> (Vec3, Vec3) {
     let sign = 1.0_f32.copysign(normal.z);

@@ -1,4 +1,4 @@
-//! Samplers against their distributions, by chi-square.
+//! Chi-square tests of the samplers against their distributions.
 
 use super::*;
 
@@ -9,8 +9,8 @@ fn limit(bins: usize) -> f64 {
     k * (1.0 - spread + 4.75 * spread.sqrt()).powi(3)
 }
 
-/// Whether counts follow probabilities; bins that expect fewer than 10 are merged.
-fn follows(counts: &[u64], probabilities: &[f64]) -> Result<(), String> {
+/// Tests counts against probabilities; bins with an expectation below 10 are merged.
+fn check_distribution(counts: &[u64], probabilities: &[f64]) -> Result<(), String> {
     let total: u64 = counts.iter().sum();
     let (mut chi, mut bins) = (0.0, 0);
     let (mut merged, mut merged_expected) = (0.0, 0.0);
@@ -67,7 +67,7 @@ fn check_directions(
             probabilities[height / FINE * TURNS + turn / FINE] += density(d) * solid_angle;
         }
     }
-    follows(&counts, &probabilities).unwrap_or_else(|e| panic!("{what}: {e}"));
+    check_distribution(&counts, &probabilities).unwrap_or_else(|e| panic!("{what}: {e}"));
 }
 
 #[test]
@@ -114,16 +114,16 @@ fn units_are_uniform_and_streams_differ() {
         }
     }
     let even = vec![1.0 / 256.0; 256];
-    follows(&counts, &even).expect("units");
-    follows(&pairs, &even).expect("pairs");
-    // First draws of neighbouring streams are as independent.
+    check_distribution(&counts, &even).expect("units");
+    check_distribution(&pairs, &even).expect("pairs");
+    // The first draws of neighbouring streams are independent.
     let mut firsts = vec![0_u64; 256];
     for view in 0..300 {
         for pixel in 0..300 {
             firsts[(Draws::new(0, &[view, pixel]).unit() * 256.0) as usize] += 1;
         }
     }
-    follows(&firsts, &even).expect("streams");
+    check_distribution(&firsts, &even).expect("streams");
 }
 
 #[test]
@@ -139,7 +139,7 @@ fn strata_are_filled_evenly_and_jitter_within() {
             counts[within.x as usize + 8 * within.y as usize] += 1;
         }
     }
-    follows(&counts, &[1.0 / 64.0; 64]).expect("jitter");
+    check_distribution(&counts, &[1.0 / 64.0; 64]).expect("jitter");
 }
 
 #[test]
@@ -158,17 +158,16 @@ fn normals_are_normal() {
             .sum()
     };
     let probabilities: Vec<f64> = (0..40).map(mass).collect();
-    follows(&counts, &probabilities).expect("normal");
+    check_distribution(&counts, &probabilities).expect("normal");
 }
 
 #[test]
-fn the_test_itself_can_fail() {
-    // Uniform directions are not cosine-distributed.
+fn wrong_distributions_are_found() {
     let uneven: Vec<u64> = (0..100).map(|i| 1000 + 5 * i).collect();
-    assert!(follows(&uneven, &[0.01; 100]).is_err());
+    assert!(check_distribution(&uneven, &[0.01; 100]).is_err());
     let even = vec![1000; 100];
-    assert!(follows(&even, &[0.01; 100]).is_ok());
-    assert!(follows(&even, &[0.02; 100]).is_err());
+    assert!(check_distribution(&even, &[0.01; 100]).is_ok());
+    assert!(check_distribution(&even, &[0.02; 100]).is_err());
 }
 
 #[test]

@@ -1,8 +1,7 @@
-//! Places the cameras.
+//! Camera placement.
 //!
-//! Training and test views follow different paths. No camera stands in a solid or closer to a
-//! surface than [`Rig::clearance`] of the geometry's diagonal: a view from inside a wall has no use as
-//! ground truth.
+//! Training and test views follow different paths. No camera is inside a solid or closer to a surface than
+//! [`Rig::clearance`] of the geometry's diagonal, as a view from inside a wall is useless as ground truth.
 
 mod survey;
 
@@ -18,25 +17,25 @@ use crate::random::Draws;
 use crate::surface::Surface;
 pub use survey::Survey;
 
-/// How cameras are arranged.
+/// A kind of camera arrangement.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum RigKind {
-    /// Rings around the scene, looking at its middle.
+    /// On rings around the scene, looking at its centre.
     Orbit,
-    /// A Fibonacci lattice on the upper hemisphere, looking at the middle.
+    /// On a Fibonacci lattice over the upper hemisphere, looking at the centre.
     Dome,
-    /// Inside the scene, looking in all directions: for rooms.
+    /// Inside the scene, looking in all directions, for rooms.
     Inside,
-    /// An ellipse as wide and deep as the scene, looking at the middle.
+    /// On an ellipse as wide and deep as the scene, looking at the centre.
     Ellipse,
-    /// In rows above the scene, looking obliquely down, and along its streets, where it names any.
+    /// In rows above the scene, looking obliquely down, and along its streets, if it has any.
     Survey,
     /// At and around the file's own cameras.
     File,
 }
 
-/// An arrangement of cameras, complete.
+/// A camera arrangement with all its parameters.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Rig {
     /// Arrangement.
@@ -51,24 +50,24 @@ pub struct Rig {
     pub height: u32,
     /// Horizontal field of view `[degrees]`.
     pub fov: f64,
-    /// Distance from the middle, in multiples of that at which the scene's bounding sphere fills
-    /// the image; inside, the path's radius as a share of the room; of a survey, a factor on its height.
+    /// Distance from the centre, in multiples of the distance at which the scene's bounding sphere fills the
+    /// image. For `Inside`, the path's radius as a share of the room; for `Survey`, a factor on its height.
     pub radius: f64,
     /// Lowest and highest elevation `[degrees]`.
     pub elevation: [f64; 2],
-    /// The part of a full turn that cameras stand in, about +z `[degrees]`.
+    /// Range of azimuths, centred on +z `[degrees]`.
     pub arc: f64,
-    /// Standard deviation of the cameras' places, as a share of their distance.
+    /// Standard deviation of camera positions, as a share of their distance.
     pub jitter: f64,
-    /// Least distance from any surface, as a share of the diagonal.
+    /// Smallest distance from any surface, as a share of the diagonal.
     pub clearance: f64,
-    /// The point that the cameras look at; by default the middle of the bounding box.
+    /// The point that the cameras look at; by default the centre of the bounding box.
     pub target: Option<[f64; 3]>,
-    /// Radius that fills the image; by default the bounding sphere's.
+    /// Radius that fills the image; by default that of the bounding sphere.
     pub focus: Option<f64>,
     /// Seed of the jitter.
     pub seed: u64,
-    /// Where a survey flies and walks; by default over the bounding box.
+    /// Area and streets of a survey; by default it covers the bounding box.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub survey: Option<Survey>,
 }
@@ -97,17 +96,17 @@ impl Default for Rig {
 
 /// The golden angle `[rad]`.
 const GOLDEN: f64 = TAU * 0.381_966_011_250_105;
-/// Places tried for a camera before giving up.
+/// Number of positions tried for a camera before giving up.
 const ATTEMPTS: u64 = 200;
 
-/// A place and what it looks at.
+/// A position and the point that it looks at.
 type Viewpoint = (DVec3, DVec3);
 
 impl Rig {
     /// The cameras of training and test views.
     ///
     /// # Errors
-    /// When an option is out of range, the file has no camera to start from, or no place outside the
+    /// When an option is out of range, the file has no camera to start from, or no position outside the
     /// geometry is found.
     pub fn cameras(
         &self,
@@ -130,15 +129,15 @@ impl Rig {
     fn check(&self) -> Result<(), Error> {
         for side in [self.width, self.height] {
             if !(1..=16_384).contains(&side) {
-                return Err(Error::option("--size", format!("{side} px is not in 1..=16384")));
+                return Err(Error::option("--size", format!("{side} px is not in 1 to 16384")));
             }
         }
         if u64::from(self.width) * u64::from(self.height) > 1 << 28 {
-            return Err(Error::option("--size", "an image has at most 2^28 pixels"));
+            return Err(Error::option("--size", "an image may have at most 2^28 pixels"));
         }
         for (option, least, count) in [("--train", 1, self.train), ("--test", 0, self.test)] {
             if !(least..=100_000).contains(&count) {
-                let problem = format!("{count} views are not in {least}..=100000");
+                let problem = format!("{count} views are not in {least} to 100000");
                 return Err(Error::option(option, problem));
             }
         }
@@ -149,10 +148,11 @@ impl Rig {
             ));
         }
         if !(self.radius > 0.0 && self.radius <= 1e3) {
-            return Err(Error::option("--radius", format!("{} is not in (0, 1000]", self.radius)));
+            let problem = format!("{} is not above 0 and at most 1000", self.radius);
+            return Err(Error::option("--radius", problem));
         }
         if !(self.jitter >= 0.0 && self.jitter <= 0.5) {
-            return Err(Error::option("--jitter", format!("{} is not in 0..=0.5", self.jitter)));
+            return Err(Error::option("--jitter", format!("{} is not in 0 to 0.5", self.jitter)));
         }
         Ok(())
     }
@@ -167,12 +167,12 @@ impl Rig {
         let mut draws = Draws::new(self.seed, &[u64::from(i), u64::from(test)]);
         for attempt in 0..ATTEMPTS {
             if self.kind == RigKind::File && attempt == 0 && !test && (i as usize) < file.len() {
-                // The file's author chose this place.
+                // The file's author chose this position, so it is not tested.
                 return Ok(self.file_camera(&file[i as usize]));
             }
-            let (place, target) = self.stand(surface, file, (i, test), attempt);
+            let (place, target) = self.viewpoint(surface, file, (i, test), attempt);
             let reach = (place - target).length();
-            // First by the requested jitter, then farther each time.
+            // The requested jitter first, then more at each attempt.
             let spread = self.jitter.max(0.005 * attempt as f64) * reach;
             let mut shift = || DVec3::new(draws.normal(), draws.normal(), draws.normal());
             let offset = if spread > 0.0 { shift() * spread } else { DVec3::ZERO };
@@ -186,8 +186,8 @@ impl Rig {
             }
         }
         Err(Error::Input(format!(
-            "view {i}: no place for the camera outside the geometry was found; choose another --rig or a \
-             larger --radius"
+            "view {i}: found no camera position outside the geometry; choose another --rig or a larger \
+             --radius"
         )))
     }
 
@@ -211,8 +211,8 @@ impl Rig {
         Camera::centred(self.size(), focal, file.world_from_camera, file.centre)
     }
 
-    /// Where view `i` of its split stands before jitter, and what it looks at.
-    fn stand(
+    /// The viewpoint of a view, given by its index within its split, before jitter.
+    fn viewpoint(
         &self,
         surface: &Surface,
         file: &[FileCamera],
@@ -230,7 +230,7 @@ impl Rig {
         let count = f64::from(if test { self.test } else { self.train });
         let (i, low, high) =
             (f64::from(number), self.elevation[0].to_radians(), self.elevation[1].to_radians());
-        // Test views stand between training views in every coordinate.
+        // Test views are between training views in every coordinate.
         let shift = if test { 0.5 } else { 0.0 };
         let along = |share: f64| self.arc.to_radians() * (share - 0.5);
         match self.kind {
@@ -265,7 +265,7 @@ impl Rig {
                 let pitch = low + (i * 0.754_877_666_246_693 + shift).fract() * (high - low);
                 (place, place + on_sphere(yaw, pitch) * half.length())
             }
-            RigKind::Survey => self.on_survey(surface, (number, test), attempt),
+            RigKind::Survey => self.survey_viewpoint(surface, (number, test), attempt),
             RigKind::File => {
                 let camera = &file[number as usize % file.len()];
                 let forward = camera.world_from_camera.z_axis;
@@ -281,7 +281,7 @@ impl Rig {
         }
     }
 
-    /// Whether a camera may stand here.
+    /// True if a camera may be placed here.
     fn is_free(&self, surface: &Surface, place: DVec3) -> bool {
         let (lo, hi) = surface.bounds();
         let outside = (lo - place).max(place - hi).max_element();
@@ -293,7 +293,7 @@ impl Rig {
     }
 }
 
-/// Whether a place is inside a solid: most surfaces seen from there show their back.
+/// True if a point is inside a solid, as most surfaces seen from there show their back.
 fn is_inside(surface: &Surface, place: DVec3) -> bool {
     const RAYS: i32 = 26;
     let (mut fronts, mut backs) = (0, 0);

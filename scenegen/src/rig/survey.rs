@@ -1,5 +1,5 @@
-//! Surveys a scene as a town is surveyed: rows of views from above that look obliquely down, to every side
-//! in turn, and views at eye height along streets. A test view is half way between two training views.
+//! Camera paths like those of an aerial survey: rows of oblique views from above, looking to every side in
+//! turn, and views at eye height along streets. A test view is halfway between two training views.
 
 use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
@@ -8,35 +8,36 @@ use super::{ATTEMPTS, GOLDEN, Rig, Viewpoint, on_sphere};
 use crate::camera::Camera;
 use crate::surface::Surface;
 
-/// Steepness of the views from above: least and greatest angle below the horizon `[degrees]`.
+/// Range of angles below the horizon of the views from above `[degrees]`.
 const DOWN: [f64; 2] = [45.0, 65.0];
-/// Of the street's views, against the horizon: lowest and highest `[degrees]`.
+/// Range of angles above the horizon of the street views `[degrees]`.
 const AHEAD: [f64; 2] = [-4.0, 10.0];
-/// Distance of a street's views from its middle, to either side in turn `[share of eye height]`.
+/// Distance of street views from the street's centre line, alternating sides `[share of eye height]`.
 const ASIDE: f64 = 0.35;
-/// One view in so many is taken from a street.
+/// One view in this many is a street view.
 const STREET: u32 = 3;
-/// Share of a view that must show a surface, and the rays that tell: columns and rows.
+/// Share of a view that must show a surface.
 const SHOWN: f64 = 0.65;
+/// Columns and rows of the rays that are tested for this.
 const RAYS: [u32; 2] = [12, 9];
-/// The golden ratio's fraction: multiples of it are spread evenly over `[0, 1)`.
+/// The golden ratio's fraction, whose multiples are spread evenly over `[0, 1)`.
 const SPREAD: f64 = 0.618_033_988_749_895;
 
-/// Where the cameras of a survey are.
+/// The area and streets that the cameras of a survey cover.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Survey {
     /// Opposite corners, (x, z), of the rectangle that is flown over and looked at.
     pub ground: [[f64; 2]; 2],
-    /// Height that is looked at, and height of the flight above it.
+    /// Height of the points looked at, and height of the cameras above it.
     pub height: [f64; 2],
-    /// Both ends of every street, at the height of the eye.
+    /// Both ends of every street, at eye height.
     pub streets: Vec<[[f64; 3]; 2]>,
-    /// Height of the eye above the street.
+    /// Eye height above the street.
     pub eye: f64,
 }
 
 impl Survey {
-    /// Over a scene that names no streets: flown as high above it as shows a third of it at once.
+    /// A survey of a scene without streets, at a height from which a view shows about a third of it.
     fn over((lo, hi): (DVec3, DVec3)) -> Self {
         let (middle, half) = (0.5 * (lo + hi), 0.45 * (hi - lo));
         let ground = [middle - half, middle + half].map(|corner| [corner.x, corner.z]);
@@ -44,25 +45,26 @@ impl Survey {
         Self { ground, height, streets: Vec::new(), eye: 0.0 }
     }
 
-    /// Views of so many that are taken from above; the others are from the streets.
+    /// Number of views from above among `views`; the others are street views.
     fn above(&self, views: u32) -> u32 {
         if self.streets.is_empty() { views } else { views - views / STREET }
     }
 
+    /// Total length of all streets.
     fn length(&self) -> f64 {
         self.streets.iter().map(|[a, b]| DVec3::from(*a).distance(DVec3::from(*b))).sum()
     }
 
-    /// The place so far along the streets, one after the other, and the street's direction there.
-    fn along(&self, mut way: f64) -> (DVec3, DVec3) {
+    /// The point at a distance along the concatenated streets, and the street's direction there.
+    fn along(&self, mut distance: f64) -> (DVec3, DVec3) {
         let mut end = (DVec3::ZERO, DVec3::Z);
         for [from, to] in &self.streets {
             let (from, to) = (DVec3::from(*from), DVec3::from(*to));
             let (ahead, length) = ((to - from).normalize_or(DVec3::Z), from.distance(to));
-            if way <= length {
-                return (from + way * ahead, ahead);
+            if distance <= length {
+                return (from + distance * ahead, ahead);
             }
-            way -= length;
+            distance -= length;
             end = (to, ahead);
         }
         end
@@ -70,8 +72,8 @@ impl Survey {
 }
 
 impl Rig {
-    /// Where a view of a survey stands, and what it looks at; another side at each attempt.
-    pub(super) fn on_survey(
+    /// The viewpoint of a view of a survey, looking to another side at each attempt.
+    pub(super) fn survey_viewpoint(
         &self,
         surface: &Surface,
         (i, test): (u32, bool),
@@ -89,15 +91,15 @@ impl Rig {
         let (above, trained) = (survey.above(views), survey.above(self.train));
         let shift = if test { 0.5 } else { 0.0 };
         if i < above {
-            let beside = if test { beside(i, above, trained) } else { i };
+            let place = if test { neighbour(i, above, trained) } else { i };
             let turn = f64::from(i) + shift + attempt as f64;
-            self.above_ground(survey, (beside, trained, test), turn)
+            self.above_ground(survey, (place, trained, test), turn)
         } else {
             let (i, views, trained) = (i - above, views - above, (self.train - trained).max(1));
-            let beside = if test { beside(i, views, trained) } else { i };
-            let way = (f64::from(beside) + 0.5 + shift) / f64::from(trained) * survey.length();
-            let (middle, ahead) = survey.along(way);
-            let side = if test { 0.0 } else { f64::from(beside % 2) * 2.0 - 1.0 };
+            let place = if test { neighbour(i, views, trained) } else { i };
+            let distance = (f64::from(place) + 0.5 + shift) / f64::from(trained) * survey.length();
+            let (middle, ahead) = survey.along(distance);
+            let side = if test { 0.0 } else { f64::from(place % 2) * 2.0 - 1.0 };
             let place = middle + side * ASIDE * survey.eye * ahead.cross(DVec3::Y);
             let turn = f64::from(i) + shift + attempt as f64;
             let [low, high] = AHEAD.map(f64::to_radians);
@@ -107,7 +109,7 @@ impl Rig {
         }
     }
 
-    /// The view from a grid's place number `i` of `count`, or half way from there to the next.
+    /// The viewpoint above position `i` of `count` in a grid, or for test views halfway to the next position.
     fn above_ground(
         &self,
         survey: &Survey,
@@ -119,7 +121,7 @@ impl Rig {
         let middle = 0.5 * (lo + hi);
         let mut place = lo + place;
         if test {
-            // Towards the middle: half way to the next place outwards there may be nothing to see.
+            // Towards the centre, as there may be nothing to see farther out.
             place -= 0.5 * cell * (place - middle + 1e-9 * cell).signum();
         }
         let [low, high] = DOWN.map(f64::to_radians);
@@ -127,7 +129,7 @@ impl Rig {
         let down = low + (turn * SPREAD).fract() * (high - low);
         let reach = height / down.tan();
         let mut way = reach * DVec2::from(turn_to(turn * GOLDEN));
-        // From the edge a view looks inwards.
+        // Views from the edge look inwards.
         for axis in 0..2 {
             if !(lo[axis]..=hi[axis]).contains(&(place[axis] + way[axis])) {
                 way[axis] = way[axis].abs() * (middle[axis] - place[axis]).signum();
@@ -145,13 +147,13 @@ fn turn_to(azimuth: f64) -> [f64; 2] {
     [flat.x, flat.z]
 }
 
-/// The training view beside which a test view stands.
-fn beside(i: u32, tests: u32, trained: u32) -> u32 {
+/// The training view that a test view is next to.
+fn neighbour(i: u32, tests: u32, trained: u32) -> u32 {
     let share = (f64::from(i) + 0.5) / f64::from(tests.max(1));
     ((share * f64::from(trained)) as u32).min(trained.saturating_sub(1))
 }
 
-/// Place number `i` of `count` in rows over a rectangle of the given sides, flown to and fro, and the sides
+/// Position `i` of `count` in rows of alternating direction over a rectangle with the given sides, and the sides
 /// of its cell.
 fn place_in_rows(i: u32, count: u32, sides: DVec2) -> (DVec2, DVec2) {
     let wanted = (f64::from(count) * sides.y / sides.x.max(f64::MIN_POSITIVE)).sqrt().round();
@@ -165,7 +167,7 @@ fn place_in_rows(i: u32, count: u32, sides: DVec2) -> (DVec2, DVec2) {
     (cell * (DVec2::new(number as f64, row as f64) + 0.5), cell)
 }
 
-/// Whether a view shows a surface, not sky, in enough of it: of the last attempt, in any of it.
+/// True if enough of a view shows a surface rather than sky; the required share falls to 0 at the last attempt.
 pub(super) fn shows_enough(surface: &Surface, camera: &Camera, attempt: u64) -> bool {
     let size = DVec2::new(f64::from(camera.width), f64::from(camera.height));
     let [columns, rows] = RAYS;
@@ -186,7 +188,7 @@ mod tests {
     use crate::rig::RigKind;
 
     #[test]
-    fn rows_hold_every_place_once_and_evenly() {
+    fn positions_in_rows_are_distinct_and_even() {
         for (count, sides) in
             [(1, [3.0, 9.0]), (12, [4.0, 3.0]), (17, [50.0, 20.0]), (64, [1.0; 2])]
         {
@@ -215,7 +217,7 @@ mod tests {
         for camera in train.iter().chain(&test) {
             let down = camera.forward().y.asin().to_degrees();
             assert!((-65.1..=-44.9).contains(&down), "{down} degrees");
-            // Around the scene is nothing: half of a view may be empty, as after 40 attempts.
+            // There is nothing around the scene, so the share required after 40 attempts is used.
             assert!(shows_enough(&surface, camera, 40), "{camera:?}");
         }
         // Every corner of the ground that is looked at is shown.

@@ -1,17 +1,15 @@
-//! Holds the geometry as traced: one BVH over all triangles, for rays and for nearest points.
+//! The traced geometry: one BVH over all triangles, for rays and nearest points.
 //!
-//! The tree is the library's binary one: on a CPU its traversal is a quarter faster than that of its
-//! eight-way compressed one (`benches/scenegen.rs` measures both).
+//! The tree is obvhs's binary one: on a CPU its traversal is a quarter faster than that of the eight-way
+//! compressed tree (`benches/scenegen.rs` measures both). A triangle's index in the order of the tree's leaves
+//! is called its slot.
 //!
-//! Vertices are moved to local coordinates in which the geometry's largest half side is 1024:
-//! single precision then has the same meaning for a mesh of any size and place, and the absolute
-//! tolerances of the tree's builder (1e-4) lie below an ulp of the geometry.
+//! Vertices are converted to local coordinates in which the geometry's largest half side is 1024. Single
+//! precision is then equivalent for meshes of any size and position, and the absolute tolerances of the tree's
+//! builder (1e-4) are below an ulp of the geometry.
 //!
-//! Boxes handed to the builder are wider than their triangles by [`PADDING`], so that rounding in
-//! the box tests cannot lose a triangle that the watertight intersection would hit: there are no
-//! cracks.
-//!
-//! One piece: both traversals share the tree, its coordinates and its rounding bounds.
+//! Boxes passed to the builder exceed their triangles by [`PADDING`], so that rounding in the box tests cannot
+//! miss a triangle that the watertight intersection would hit: there are no cracks.
 
 use glam::{DVec3, Vec3, Vec3A};
 use obvhs::aabb::Aabb;
@@ -27,17 +25,17 @@ use crate::tree;
 
 /// Largest half side of the geometry in local coordinates.
 const HALF_SIDE: f64 = 1024.0;
-/// Added to all sides of a triangle's box. Rounding of a box test is at most 3 ulps of the largest
-/// coordinate difference (Ize, "Robust BVH Ray Traversal", JCGT 2013); rays start within twice the
-/// half side, so that is 3 · 2⁻²⁴ · 4096 = 7e-4.
+/// Added to all sides of a triangle's box. The rounding error of a box test is at most 3 ulps of the largest
+/// coordinate difference (Ize, "Robust BVH Ray Traversal", JCGT 2013); as rays start within twice the half
+/// side, this is 3 · 2⁻²⁴ · 4096 = 7e-4.
 const PADDING: f32 = 1e-3;
-/// Deepest tree for which the traversal stack lies on the stack.
+/// Maximum depth of a tree whose traversal stack is not allocated on the heap.
 const SHALLOW: usize = 96;
 
 /// A triangle mesh for ray casts and nearest-point queries. World coordinates are the source's own.
 pub struct Surface {
     pub(crate) bvh: Bvh2,
-    /// In the order of the tree's leaves, local coordinates.
+    /// Triangles by slot, in local coordinates.
     pub(crate) triangles: Vec<[Vec3; 3]>,
     centre: DVec3,
     /// Local units per world unit.
@@ -46,18 +44,18 @@ pub struct Surface {
     bounds: (DVec3, DVec3),
 }
 
-/// Where a ray hits the surface.
+/// The hit of a ray on the surface.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SurfaceHit {
     /// Ray parameter: distance in units of the direction's length.
     pub t: f64,
-    /// The point, world coordinates.
+    /// Hit point, in world coordinates.
     pub point: DVec3,
     /// Unit geometric normal by the triangle's winding; zero for a triangle without area.
     pub normal: DVec3,
-    /// Number of the triangle in the model.
+    /// Index of the triangle in the model.
     pub triangle: u32,
-    /// Whether the ray comes from the side the normal points to.
+    /// True if the ray comes from the side that the normal points to.
     pub front: bool,
 }
 
@@ -66,9 +64,9 @@ pub struct SurfaceHit {
 pub(crate) struct LocalRay {
     pub(crate) origin: Vec3,
     pub(crate) direction: Vec3,
-    /// Intersections up to and including this parameter do not count.
+    /// Smallest ray parameter (exclusive).
     pub(crate) tmin: f32,
-    /// Nor do those beyond this one.
+    /// Largest ray parameter (inclusive).
     pub(crate) tmax: f32,
 }
 
@@ -78,7 +76,7 @@ impl LocalRay {
         Self { origin: Vec3::ZERO, direction: Vec3::Z, tmin: 0.0, tmax: 0.0 };
 }
 
-/// An intersection with a triangle, which `slot` gives by its place in leaf order.
+/// An intersection with the triangle in `slot`.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct LocalHit {
     pub(crate) slot: u32,
@@ -110,8 +108,8 @@ impl Surface {
         Ok(Self { bvh, triangles, centre, scale, depth, bounds })
     }
 
-    /// The first triangle a ray meets, seen from either side, nearer than `range` (a ray
-    /// parameter). None for a direction without length.
+    /// The first triangle that a ray hits from either side, up to the ray parameter `range`. `None` for a
+    /// direction of length 0.
     #[must_use]
     pub fn cast(&self, origin: DVec3, direction: DVec3, range: f64) -> Option<SurfaceHit> {
         let ray = self.enter(origin, direction, range)?;
@@ -120,18 +118,18 @@ impl Surface {
         (hit.t <= range).then_some(hit)
     }
 
-    /// Whether anything lies strictly between two places; both ends are left out by a millionth of
-    /// the geometry's size, so that they may lie on the surface.
+    /// True if the surface separates two points. The segment is shortened at both ends by a millionth of the
+    /// diagonal, so that its ends may lie on the surface.
     #[must_use]
     pub fn blocked(&self, from: DVec3, to: DVec3) -> bool {
-        let way = to - from;
-        let length = way.length();
+        let segment = to - from;
+        let length = segment.length();
         let margin = 1e-6 * self.diagonal();
         if length <= 2.0 * margin {
             return false;
         }
-        let step = way * (margin / length);
-        let (origin, direction) = (from + step, way - 2.0 * step);
+        let step = segment * (margin / length);
+        let (origin, direction) = (from + step, segment - 2.0 * step);
         let ray = self.enter(origin, direction, 1.0);
         ray.is_some_and(|ray| self.occluder(&ray, |_, _| true).is_some())
     }
@@ -148,14 +146,14 @@ impl Surface {
         (self.bounds.1 - self.bounds.0).length()
     }
 
-    /// Bytes of tree and triangles.
+    /// Memory of tree and triangles `[bytes]`.
     #[must_use]
     pub fn bytes(&self) -> usize {
         self.bvh.nodes.len() * size_of::<Bvh2Node>()
             + self.triangles.len() * (size_of::<[Vec3; 3]>() + size_of::<u32>())
     }
 
-    /// All triangles as traced, in the model's order.
+    /// All triangles as traced, in the order of the model.
     #[must_use]
     pub fn triangles(&self) -> Vec<[DVec3; 3]> {
         let mut all = vec![[DVec3::ZERO; 3]; self.triangles.len()];
@@ -166,7 +164,7 @@ impl Surface {
         all
     }
 
-    /// A corner of the model as it is traced: rounded in local coordinates.
+    /// A vertex of the model as it is traced, that is, rounded in local coordinates.
     pub(crate) fn traced(&self, corner: DVec3) -> DVec3 {
         self.world_from_local(self.local_from_world(corner).as_vec3().as_dvec3())
     }
@@ -184,23 +182,23 @@ impl Surface {
         self.scale
     }
 
-    /// Levels of the tree, an upper bound of what a stack must hold.
+    /// Number of levels of the tree, an upper bound for the size of a traversal stack.
     pub(crate) fn depth(&self) -> usize {
         self.depth
     }
 
+    /// The model's index of the triangle in a slot.
     pub(crate) fn triangle_of(&self, slot: u32) -> u32 {
         self.bvh.primitive_indices[slot as usize]
     }
 
-    /// The local ray for a world ray, its origin moved to where the ray enters the bounding box:
-    /// single precision is spent on the geometry, not on the way to it. Its parameter counts from
-    /// there. None where it misses the box.
+    /// The local ray for a world ray. Its origin is moved to the point where it enters the bounding box, to use
+    /// single precision for the geometry and not for the distance to it. `None` if it misses the box.
     pub(crate) fn enter(&self, origin: DVec3, direction: DVec3, range: f64) -> Option<LocalRay> {
         self.enter_after(origin, direction, range).map(|(ray, _)| ray)
     }
 
-    /// [`Surface::enter`], and the length of the way to the box `[local units]`.
+    /// [`Surface::enter`], and the distance to the box `[local units]`.
     pub(crate) fn enter_after(
         &self,
         origin: DVec3,
@@ -209,8 +207,8 @@ impl Surface {
     ) -> Option<(LocalRay, f32)> {
         let (o, d) = (self.local_from_world(origin), direction * self.scale);
         let half = 0.5 * (self.bounds.1 - self.bounds.0) * self.scale + DVec3::splat(1.0);
-        // Infinite along axes on which the ray does not move, and NaN on the box's very rim, which is
-        // not the geometry's; then the ray misses.
+        // Infinite along axes perpendicular to the ray. NaN exactly on the box's side, which is outside of the
+        // geometry, so that the ray may miss it.
         let inverse = d.recip();
         let (a, b) = ((-half - o) * inverse, (half - o) * inverse);
         let near = a.min(b).max_element().max(0.0);
@@ -219,16 +217,16 @@ impl Surface {
         if !(near <= far && length > 0.0 && length.is_finite()) {
             return None;
         }
-        let way = near * length;
+        let distance = near * length;
         let direction = (d * length.recip()).as_vec3();
-        // Half an ulp more than the exact range: callers compare again in f64.
-        let tmax = ((far * length - way) * (1.0 + 1e-6)) as f32;
+        // Slightly more than the exact range; callers compare again in f64.
+        let tmax = ((far * length - distance) * (1.0 + 1e-6)) as f32;
         let origin = (o + near * d).as_vec3();
-        Some((LocalRay { origin, direction, tmin: 0.0, tmax }, way as f32))
+        Some((LocalRay { origin, direction, tmin: 0.0, tmax }, distance as f32))
     }
 
-    /// The hit in world coordinates; its parameter comes from the triangle's plane in f64 and
-    /// belongs to the world ray.
+    /// The hit in world coordinates; the parameter of the world ray is computed from the triangle's plane in
+    /// f64.
     pub(crate) fn describe(&self, origin: DVec3, direction: DVec3, hit: LocalHit) -> SurfaceHit {
         let [a, b, c] = self.triangles[hit.slot as usize].map(Vec3::as_dvec3);
         let (o, d) = (self.local_from_world(origin), direction * self.scale);
@@ -237,7 +235,7 @@ impl Surface {
         let by_weights = a + f64::from(hit.at.v) * (b - a) + f64::from(hit.at.w) * (c - a);
         let by_plane = normal.dot(a - o) / along;
         let by_point = (by_weights - o).dot(d) / d.length_squared();
-        // Along a triangle seen edge-on the plane says nothing; the weights still do.
+        // The plane of a triangle seen edge-on is useless, but the barycentric weights are not.
         let edge_on = along.abs() <= 1e-6 * normal.length() * d.length();
         let t = if edge_on || !by_plane.is_finite() { by_point } else { by_plane };
         SurfaceHit {
@@ -249,9 +247,9 @@ impl Surface {
         }
     }
 
-    /// The first meeting that counts; of several at the same parameter, that with the model's
-    /// first triangle. With `after`, the first one behind that one in the same order. The triangle
-    /// `hint` is tried first.
+    /// The first accepted hit; of several at the same parameter, that of the model's first triangle. With
+    /// `after` (parameter and triangle), the first one that follows in this order. The triangle in slot `hint`
+    /// is tested first.
     #[inline]
     pub(crate) fn closest(
         &self,
@@ -281,9 +279,9 @@ impl Surface {
         let sheared = ShearedRay::new(ray.origin, ray.direction);
         let mut boxes = box_ray(ray);
         let mut best: Option<LocalHit> = None;
-        // Whether a meeting is nearer than the best so far.
+        // The intersection if it is accepted and precedes the best one so far.
         let nearer = |slot: u32, tmax: f32, best: &Option<LocalHit>| -> Option<Intersection> {
-            let at = self.meet(slot, &sheared, ray.tmin, tmax)?;
+            let at = self.intersect(slot, &sheared, ray.tmin, tmax)?;
             let first = best.is_none_or(|best| {
                 at.t < best.at.t || self.triangle_of(slot) < self.triangle_of(best.slot)
             });
@@ -298,7 +296,7 @@ impl Surface {
             boxes.tmax = at.t;
             best = Some(LocalHit { slot, at });
         }
-        let look = |node: &Bvh2Node, boxes: &mut Ray, _: &mut RayHit| {
+        let visit = |node: &Bvh2Node, boxes: &mut Ray, _: &mut RayHit| {
             for slot in node.first_index..node.first_index + node.prim_count {
                 if let Some(at) = nearer(slot, boxes.tmax, &best) {
                     boxes.tmax = at.t;
@@ -307,25 +305,25 @@ impl Surface {
             }
             true
         };
-        self.bvh.ray_traverse_dynamic(&mut stack, boxes, &mut RayHit::none(), look);
+        self.bvh.ray_traverse_dynamic(&mut stack, boxes, &mut RayHit::none(), visit);
         best
     }
 
-    /// Whether a triangle, by its place in leaf order, is met in a way that counts.
+    /// True if the ray has an accepted intersection with the triangle in `slot`.
     #[inline]
-    pub(crate) fn hides(
+    pub(crate) fn occludes(
         &self,
         slot: u32,
         ray: &LocalRay,
         accept: impl Fn(u32, &Intersection) -> bool,
     ) -> bool {
         let sheared = ShearedRay::new(ray.origin, ray.direction);
-        self.meet(slot, &sheared, ray.tmin, ray.tmax).is_some_and(|at| accept(slot, &at))
+        self.intersect(slot, &sheared, ray.tmin, ray.tmax).is_some_and(|at| accept(slot, &at))
     }
 
-    /// Where a ray meets a triangle, by its place in leaf order, after `tmin` and up to `tmax`.
+    /// The intersection of a ray with the triangle in `slot`, after `tmin` and up to `tmax`.
     #[inline]
-    pub(crate) fn meet(
+    pub(crate) fn intersect(
         &self,
         slot: u32,
         ray: &ShearedRay,
@@ -335,7 +333,7 @@ impl Surface {
         ray.intersect(&self.triangles[slot as usize]).filter(|at| at.t > tmin && at.t <= tmax)
     }
 
-    /// Any triangle whose meeting counts, by its place in leaf order.
+    /// The slot of any triangle with an accepted intersection.
     #[inline]
     pub(crate) fn occluder(
         &self,
@@ -357,15 +355,15 @@ impl Surface {
         accept: impl Fn(u32, &Intersection) -> bool,
     ) -> Option<u32> {
         let sheared = ShearedRay::new(ray.origin, ray.direction);
-        let counts = |slot: &u32| {
-            self.meet(*slot, &sheared, ray.tmin, ray.tmax).is_some_and(|at| accept(*slot, &at))
+        let is_hit = |slot: &u32| {
+            self.intersect(*slot, &sheared, ray.tmin, ray.tmax).is_some_and(|at| accept(*slot, &at))
         };
         let mut found = None;
-        let look = |node: &Bvh2Node, _: &mut Ray, _: &mut RayHit| {
-            found = (node.first_index..node.first_index + node.prim_count).find(counts);
+        let visit = |node: &Bvh2Node, _: &mut Ray, _: &mut RayHit| {
+            found = (node.first_index..node.first_index + node.prim_count).find(is_hit);
             found.is_none()
         };
-        self.bvh.ray_traverse_dynamic(&mut stack, box_ray(ray), &mut RayHit::none(), look);
+        self.bvh.ray_traverse_dynamic(&mut stack, box_ray(ray), &mut RayHit::none(), visit);
         found
     }
 }
@@ -375,7 +373,7 @@ fn box_ray(ray: &LocalRay) -> Ray {
     Ray::new(Vec3A::from(ray.origin), Vec3A::from(ray.direction), 0.0, ray.tmax)
 }
 
-/// The box that is tested for a triangle.
+/// The padded bounding box of a triangle.
 #[inline]
 pub(crate) fn padded([a, b, c]: &[Vec3; 3]) -> Aabb {
     let [a, b, c] = [Vec3A::from(*a), Vec3A::from(*b), Vec3A::from(*c)];

@@ -1,9 +1,9 @@
-//! Rays and nearest points against brute force, degenerate meshes and cracks.
+//! Tests of rays and nearest points against brute force, with degenerate meshes, and for cracks.
 
 use glam::DQuat;
 
 use super::*;
-use crate::nearest::on_triangle;
+use crate::nearest::nearest_on_triangle;
 use crate::packet::{LANES, has};
 use crate::primitives::icosphere;
 use crate::random::Draws;
@@ -28,15 +28,15 @@ fn soup(count: usize, seed: u64) -> Vec<[DVec3; 3]> {
         let (p, size) = (point(&mut draws), 10.0_f64.powf(0.3 - 3.0 * draws.unit64()));
         let (u, v) = (size * point(&mut draws), size * point(&mut draws));
         all.push(match i % 12 {
-            // A point, a line, a line with its corners in another order, a needle.
+            // A point, a line, a line with its corners in a different order, a needle.
             0 => [p, p, p],
             1 => [p, p + u, p + 2.0 * u],
             2 => [p, p + u, p],
             3 => [p, p + u, p + u + 1e-9 * v],
-            // Another one, exactly or turned round, or the next size of the same.
+            // An earlier triangle, identical or reversed.
             4 if i > 12 => all[i - 7],
             5 if i > 12 => [all[i - 8][2], all[i - 8][1], all[i - 8][0]],
-            // In a plane of two coordinates, through many others.
+            // Axis-aligned, through many others.
             6 => {
                 [p * DVec3::new(1., 1., 0.), u * DVec3::new(1., 1., 0.), v * DVec3::new(1., 1., 0.)]
             }
@@ -47,24 +47,24 @@ fn soup(count: usize, seed: u64) -> Vec<[DVec3; 3]> {
     all
 }
 
-/// All meetings in order, by trying every triangle.
-fn meetings(surface: &Surface, ray: &LocalRay) -> Vec<(f32, u32)> {
+/// All hits in order, by testing every triangle.
+fn all_hits(surface: &Surface, ray: &LocalRay) -> Vec<(f32, u32)> {
     let sheared = ShearedRay::new(ray.origin, ray.direction);
-    let meet = |slot: u32| {
-        let at = surface.meet(slot, &sheared, ray.tmin, ray.tmax)?;
+    let hit = |slot: u32| {
+        let at = surface.intersect(slot, &sheared, ray.tmin, ray.tmax)?;
         Some((at.t, surface.triangle_of(slot)))
     };
-    let mut all: Vec<_> = (0..surface.triangles.len() as u32).filter_map(meet).collect();
+    let mut all: Vec<_> = (0..surface.triangles.len() as u32).filter_map(hit).collect();
     all.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
     all
 }
 
-/// The first meeting by trying every triangle.
+/// The first hit, by testing every triangle.
 fn brute_force(surface: &Surface, ray: &LocalRay) -> Option<(f32, u32)> {
-    meetings(surface, ray).first().copied()
+    all_hits(surface, ray).first().copied()
 }
 
-/// The first meeting as the tree finds it, a triangle tried first or not.
+/// The first hit, by the tree, with or without a hint.
 fn closest(surface: &Surface, ray: &LocalRay, hint: Option<u32>) -> Option<(f32, u32)> {
     let hit = surface.closest(ray, None, hint, |_, _| true)?;
     Some((hit.at.t, surface.triangle_of(hit.slot)))
@@ -77,7 +77,7 @@ fn rays(surface: &Surface, count: usize, seed: u64) -> Vec<LocalRay> {
         let origin = 1.6 * point(&mut draws);
         let direction = match all.len() % 4 {
             0 => point(&mut draws),
-            // At a corner, where several triangles may meet.
+            // Towards a corner, where several triangles may meet.
             1 => {
                 let at = (draws.bits() % surface.triangles.len() as u64) as usize;
                 surface.world_from_local(surface.triangles[at][0].as_dvec3()) - origin
@@ -97,14 +97,14 @@ fn rays(surface: &Surface, count: usize, seed: u64) -> Vec<LocalRay> {
 }
 
 #[test]
-fn the_closest_hit_is_that_of_trying_every_triangle() {
+fn the_closest_hit_agrees_with_brute_force() {
     let mut hits = 0;
     for (count, seed) in [(1, 1), (2, 2), (7, 3), (60, 4), (1500, 5)] {
         let surface = Surface::new(&model(&soup(count, seed))).expect("triangles");
         for ray in rays(&surface, 4000, seed + 100) {
             let expected = brute_force(&surface, &ray);
             assert_eq!(surface.occluder(&ray, |_, _| true).is_some(), expected.is_some());
-            // Whatever is tried first, and whichever triangle it is.
+            // With any hint.
             for hint in [None, Some(0), Some(surface.triangles.len() as u32 / 2)] {
                 let found = closest(&surface, &ray, hint);
                 assert_eq!(found, expected, "{count} triangles, {ray:?}");
@@ -116,7 +116,7 @@ fn the_closest_hit_is_that_of_trying_every_triangle() {
 }
 
 #[test]
-fn intersections_behind_the_first_come_in_order_and_all() {
+fn later_intersections_are_complete_and_in_order() {
     let surface = Surface::new(&model(&soup(300, 8))).expect("triangles");
     for ray in rays(&surface, 500, 9) {
         let (mut after, mut found) = (None, Vec::new());
@@ -124,14 +124,14 @@ fn intersections_behind_the_first_come_in_order_and_all() {
             after = Some((hit.at.t, surface.triangle_of(hit.slot)));
             found.extend(after);
         }
-        assert_eq!(found, meetings(&surface, &ray));
+        assert_eq!(found, all_hits(&surface, &ray));
     }
 }
 
 #[test]
 fn no_ray_leaks_through_a_sphere() {
     let (corners, triangles) = icosphere(5);
-    // Off the origin and turned, so that nothing is symmetric in single precision.
+    // Translated and rotated, so that nothing is symmetric in single precision.
     let (centre, turn) = (DVec3::new(0.37, -1.91, 12.3), DQuat::from_rotation_x(0.7));
     let place = |p: DVec3| centre + turn * p * 1.7;
     let mut sphere = Model::default();
@@ -143,7 +143,7 @@ fn no_ray_leaks_through_a_sphere() {
     for i in 0..1_000_000_u32 {
         let [a, b, c] = triangles[(draws.bits() % triangles.len() as u64) as usize]
             .map(|corner| placed[corner as usize]);
-        // At corners, edges and anywhere, from inside; and from outside, where it must hit twice.
+        // Towards corners, edges and faces, from inside.
         let target = match i % 3 {
             0 => a,
             1 => a.lerp(b, draws.unit64()),
@@ -154,7 +154,7 @@ fn no_ray_leaks_through_a_sphere() {
         let hit = surface.cast(inside, direction, f64::INFINITY);
         leaks += u32::from(hit.is_none_or(|hit| (hit.t - 1.0).abs() > 1e-3));
         if i % 10 == 0 {
-            // Past the target, towards the inside: something must be met within the sphere.
+            // From outside, past the target: something must be hit before the inside.
             let outside = inside + 3.0 * direction.normalize() * 1.7;
             leaks += u32::from(surface.cast(outside, inside - outside, 1.0).is_none());
         }
@@ -164,7 +164,7 @@ fn no_ray_leaks_through_a_sphere() {
 
 #[test]
 fn trees_of_any_depth_are_traversed() {
-    // Sizes fall by half: every level of the tree splits off one triangle.
+    // Sizes fall geometrically, which makes the tree deep.
     let chain: Vec<[DVec3; 3]> = (0..900)
         .map(|i| {
             let size = 0.97_f64.powi(i);
@@ -197,7 +197,7 @@ fn trees_of_any_depth_are_traversed() {
 }
 
 #[test]
-fn the_nearest_point_is_that_of_trying_every_triangle() {
+fn the_nearest_point_agrees_with_brute_force() {
     for (count, seed) in [(1, 11), (5, 12), (800, 13)] {
         let triangles = soup(count, seed);
         let surface = Surface::new(&model(&triangles)).expect("triangles");
@@ -205,7 +205,7 @@ fn the_nearest_point_is_that_of_trying_every_triangle() {
         let mut draws = Draws::new(seed, &[1]);
         for _ in 0..500 {
             let place = 1.5 * point(&mut draws);
-            let distance = |t: &[DVec3; 3]| on_triangle(place, *t).distance(place);
+            let distance = |t: &[DVec3; 3]| nearest_on_triangle(place, *t).distance(place);
             let expected = traced.iter().map(distance).fold(f64::INFINITY, f64::min);
             let found = surface.nearest(place);
             assert!((found.distance - expected).abs() < 1e-9, "{found:?} for {expected}");
@@ -225,15 +225,15 @@ fn nearest_points_of_a_triangle() {
         (DVec3::new(2.0, 2.0, 1.0), DVec3::new(1.0, 1.0, 0.0)),
         (DVec3::new(5.0, -1.0, 0.0), 2.0 * DVec3::X),
     ] {
-        assert!(on_triangle(place, triangle).distance(expected) < 1e-12, "{place}");
+        assert!(nearest_on_triangle(place, triangle).distance(expected) < 1e-12, "{place}");
     }
     let line = [DVec3::ZERO, DVec3::X, 3.0 * DVec3::X];
-    assert_eq!(on_triangle(DVec3::new(2.0, 1.0, 0.0), line), 2.0 * DVec3::X);
-    assert_eq!(on_triangle(DVec3::Y, [DVec3::ONE; 3]), DVec3::ONE);
+    assert_eq!(nearest_on_triangle(DVec3::new(2.0, 1.0, 0.0), line), 2.0 * DVec3::X);
+    assert_eq!(nearest_on_triangle(DVec3::Y, [DVec3::ONE; 3]), DVec3::ONE);
 }
 
 #[test]
-fn size_and_place_of_a_mesh_do_not_matter() {
+fn size_and_position_of_a_mesh_do_not_matter() {
     let triangle = [DVec3::ZERO, DVec3::X, DVec3::Y];
     for (scale, offset) in [(1e-6, 0.0), (1.0, 1e6), (1e9, -1e12), (1e-30, 0.0)] {
         let moved = triangle.map(|p| p * scale + offset);
@@ -244,7 +244,7 @@ fn size_and_place_of_a_mesh_do_not_matter() {
         assert!(hit.front && hit.normal.distance(DVec3::Z) < 1e-6);
         assert!(surface.cast(from, DVec3::Z * scale, f64::INFINITY).is_none());
     }
-    // Neither a direction without length nor a mesh of one point is a panic.
+    // Neither a direction of length 0 nor a mesh of one point causes a panic.
     let surface = Surface::new(&model(&[[DVec3::ONE; 3]])).expect("triangles");
     assert!(surface.cast(DVec3::ZERO, DVec3::ZERO, 1.0).is_none());
     assert!(surface.cast(DVec3::ZERO, DVec3::ONE, 9.0).is_none());
@@ -255,7 +255,7 @@ fn size_and_place_of_a_mesh_do_not_matter() {
 }
 
 #[test]
-fn surfaces_between_two_places_block() {
+fn surfaces_between_two_points_block() {
     let wall = [DVec3::new(0., -9., -9.), DVec3::new(0., 9., -9.), DVec3::new(0., 0., 9.)];
     let surface = Surface::new(&model(&[wall])).expect("triangles");
     assert!(surface.blocked(DVec3::NEG_X, DVec3::X));
@@ -271,7 +271,7 @@ fn packets_find_the_same_as_single_rays() {
         let surface = Surface::new(&model(&soup(count, seed))).expect("triangles");
         let mut draws = Draws::new(seed, &[1]);
         for round in 0..600 {
-            // From nearly parallel, as from a pixel, to all over the place.
+            // From nearly parallel, as from a pixel, to random directions.
             let spread = [1e-6, 1e-3, 0.1, 2.0][round % 4];
             let (eye, aim) = (1.6 * point(&mut draws), point(&mut draws));
             let mut rays = Vec::new();
@@ -285,15 +285,15 @@ fn packets_find_the_same_as_single_rays() {
                 let range = if round % 7 == 0 { 1.0 } else { f64::INFINITY };
                 rays.extend(surface.enter(origin, direction, range));
             }
-            // Every other triangle is not there.
+            // Accept all triangles, or every other one.
             for accept in [|_: u32| true, |slot: u32| slot.is_multiple_of(2)] {
                 let found = surface.closest_each(&rays, |slot, _| accept(slot));
                 let mut hint = Some(0).filter(|_| round % 2 == 0);
                 let hidden = surface.occluded_each(&rays, &mut hint, |slot, _| accept(slot));
                 for (lane, ray) in rays.iter().enumerate() {
                     let alone = surface.closest(ray, None, None, |slot, _| accept(slot));
-                    let told = |hit: Option<LocalHit>| hit.map(|hit| (hit.slot, hit.at));
-                    assert_eq!(told(found[lane]), told(alone), "{count} triangles, {ray:?}");
+                    let summary = |hit: Option<LocalHit>| hit.map(|hit| (hit.slot, hit.at));
+                    assert_eq!(summary(found[lane]), summary(alone), "{count} triangles, {ray:?}");
                     assert_eq!(has(hidden, lane), alone.is_some(), "{count} triangles, {ray:?}");
                     met += usize::from(alone.is_some());
                 }
@@ -307,7 +307,7 @@ fn packets_find_the_same_as_single_rays() {
 }
 
 #[test]
-fn no_ray_of_a_pyramid_hits_a_mesh_that_the_pyramid_misses() {
+fn no_ray_hits_a_mesh_that_its_pyramid_misses() {
     let surface = Surface::new(&model(&soup(40, 21))).expect("triangles");
     let mut draws = Draws::new(22, &[]);
     let (mut beside, mut wrong) = (0, Vec::new());

@@ -1,6 +1,6 @@
 //! Renders a camera's view: colour with alpha, depth and normals.
 //!
-//! Pixels do not depend on the thread that computes them.
+//! Pixels do not depend on the threads that compute them.
 
 use glam::{DVec2, DVec3, Vec2, Vec3};
 use rayon::prelude::*;
@@ -14,13 +14,13 @@ use crate::shade::{Lighting, Point, Sampling, ShadedSurface, TriangleFlags, Visi
 use crate::surface::{LocalHit, LocalRay, Surface};
 use crate::texture::encode;
 
-/// Most surfaces a ray passes through.
+/// Maximum number of surfaces that a ray passes through.
 const MAX_LAYERS: usize = 64;
-/// Transmittance below which nothing behind is visible: half a step of eight bits.
+/// Transmittance at which a ray ends: half a step of eight bits.
 const MIN_TRANSMITTANCE: f32 = 1.0 / 512.0;
-/// Rows that one task traces.
+/// Number of rows traced by one task.
 const BAND: usize = 4;
-/// Columns of the tiles of a band that are skipped where they show nothing.
+/// Width of the tiles of a band; empty tiles are skipped.
 const TILE: usize = 8;
 
 /// One rendered view.
@@ -30,22 +30,20 @@ pub struct Frame {
     pub width: u32,
     /// Image height `[px]`.
     pub height: u32,
-    /// sRGB colour and straight alpha, which is coverage. Shape: `[height, width, 4]`.
+    /// sRGB colour and straight alpha (coverage). Shape: `[height, width, 4]`.
     pub rgba: Vec<u8>,
-    /// The same as it is photographed, with an exposure of its own or with passers-by, if it has either. Same
-    /// shape.
+    /// The photograph, if it differs from `rgba` by its exposure or by passers-by. Same shape.
     pub exposed: Option<Vec<u8>>,
-    /// 0 where passers-by hide the scene, 255 elsewhere, where [some walk
-    /// through](crate::Options::passers_by). Shape: `[height, width]`.
+    /// 0 where [passers-by](crate::Options::passers_by) cover the scene, 255 elsewhere; `None` for views without
+    /// passers-by. Shape: `[height, width]`.
     pub mask: Option<Vec<u8>>,
-    /// Camera z of the first surface with alpha of at least 0.5, through the pixel's centre; 0
-    /// where there is none. Shape: `[height, width]`.
+    /// Camera z of the first surface with alpha of at least 0.5 on the ray through the pixel's centre; 0 if
+    /// there is none. Shape: `[height, width]`.
     pub depth: Vec<f32>,
-    /// Its geometric normal in the world, unit length, towards the camera; zero where there is
+    /// Geometric normal of that surface in world space, unit length, towards the camera; zero if there is
     /// none. Shape: `[height, width]`.
     pub normals: Vec<[f32; 3]>,
-    /// Its triangle's number in the model; `u32::MAX` where there is none. Shape:
-    /// `[height, width]`.
+    /// Index of that surface's triangle in the model; `u32::MAX` if there is none. Shape: `[height, width]`.
     pub triangles: Vec<u32>,
 }
 
@@ -60,12 +58,12 @@ pub(crate) struct Tracer<'a> {
     pub(crate) seed: u64,
 }
 
-/// Rays of a pixel from the camera, at most [`LANES`].
+/// Camera rays of a pixel, at most [`LANES`].
 struct Rays {
     rays: [LocalRay; LANES],
-    /// Number of the subsample that each is.
+    /// Index of each ray's subsample.
     index: [u32; LANES],
-    /// Distance at which each one's parameter starts, local units.
+    /// Distance from the camera to each ray's origin, in local units.
     entry: [f32; LANES],
     count: usize,
     /// Width of a ray's cone at distance 1.
@@ -78,7 +76,7 @@ impl Rays {
         Self { rays, index, entry, count: 0, spread }
     }
 
-    /// Adds one if it comes near the surface.
+    /// Adds a ray, if it hits the bounding box.
     fn add(&mut self, surface: &Surface, index: u32, origin: DVec3, direction: DVec3) {
         if let Some((ray, entry)) = surface.enter_after(origin, direction, f64::INFINITY) {
             self.rays[self.count] = ray;
@@ -108,7 +106,7 @@ impl Rays {
 }
 
 impl Frame {
-    /// The view as it is photographed. Shape: as that of `rgba`.
+    /// The photograph, in the same shape as `rgba`.
     pub(crate) fn photograph(&self) -> &[u8] {
         self.exposed.as_ref().unwrap_or(&self.rgba)
     }
@@ -129,14 +127,13 @@ impl Frame {
 }
 
 impl Tracer<'_> {
-    /// Renders a view, whose number seeds its random numbers; also with these factors on the light of each
-    /// channel.
+    /// Renders a view, whose index seeds the random numbers. With `gains`, also renders the exposed photograph
+    /// with these factors on the channels.
     pub(crate) fn render(&self, camera: &Camera, view: u64, gains: Option<[f32; 3]>) -> Frame {
         let mut frame = Frame::empty(camera.width, camera.height);
         let row = camera.width as usize;
         let mut exposed = vec![0; if gains.is_some() { frame.rgba.len() } else { 0 }];
         let gains = gains.map(Vec3::from);
-        // Nothing where there are no factors.
         let per_band = if gains.is_some() { 4 * BAND * row } else { 0 };
         let mut rest = &mut exposed[..];
         let exposed_bands: Vec<&mut [u8]> = (0..(camera.height as usize).div_ceil(BAND))
@@ -154,7 +151,7 @@ impl Tracer<'_> {
             let rows = depth.len() / row;
             for left in (0..row).step_by(TILE) {
                 let tile = (left, top, TILE.min(row - left), rows);
-                // A lens bends the sides of a tile.
+                // With a lens the sides of a tile are not planes.
                 if camera.lens.is_none() && self.is_empty(camera, tile) {
                     continue;
                 }
@@ -163,14 +160,14 @@ impl Tracer<'_> {
                     let i = y * row + x;
                     let pixel = DVec2::new(x as f64, (top + y) as f64);
                     let draws = Draws::new(self.seed, &[view, ((top + y) * row + x) as u64]);
-                    let (light, coverage, met) = self.pixel(camera, pixel, draws);
+                    let (light, coverage, hint) = self.pixel(camera, pixel, draws);
                     rgba[4 * i..4 * i + 4].copy_from_slice(&encoded(light, coverage));
                     if let Some(gains) = gains {
                         exposed[4 * i..4 * i + 4]
                             .copy_from_slice(&encoded(light * gains, coverage));
                     }
                     let direction = camera.direction(pixel + 0.5);
-                    if let Some(first) = self.first_solid(camera.centre, direction, met) {
+                    if let Some(first) = self.first_solid(camera.centre, direction, hint) {
                         depth[i] = first.0 as f32;
                         normals[i] = first.1.as_vec3().to_array();
                         triangles[i] = first.2;
@@ -182,13 +179,13 @@ impl Tracer<'_> {
         frame
     }
 
-    /// Whether no ray through a tile of pixels (left, top, width, height) meets anything.
+    /// True if no ray through a tile of pixels (left, top, width, height) hits anything.
     fn is_empty(
         &self,
         camera: &Camera,
         (x, y, width, height): (usize, usize, usize, usize),
     ) -> bool {
-        // Single precision rounds the pyramid by less than 3e-7 of the distance.
+        // The rounding error of the pyramid in single precision is less than 3e-7 of the distance.
         let margin = 1e-6 * camera.fx.max(camera.fy);
         let (left, top) = (x as f64 - margin, y as f64 - margin);
         let (right, bottom) = ((x + width) as f64 + margin, (y + height) as f64 + margin);
@@ -201,20 +198,20 @@ impl Tracer<'_> {
         ShadedSurface { surface: self.surface, model: self.model, flags: self.flags }
     }
 
-    /// Light and coverage of a pixel, whose upper left corner is at `corner`; also a triangle that one
-    /// of its rays met, by place in leaf order.
+    /// Radiance and coverage of the pixel whose top left corner is `corner`, and the slot of a triangle that one
+    /// of its rays hit.
     fn pixel(&self, camera: &Camera, corner: DVec2, draws: Draws) -> (Vec3, f32, Option<u32>) {
         let grid = self.lighting.grid;
         let (mut colour, mut alpha) = (Vec3::ZERO, 0.0);
-        let mut sampling = Sampling { draws, met: None, hid: None };
+        let mut sampling = Sampling { draws, hit_hint: None, occluder_hint: None };
         // Width of a subsample at depth 1.
         let spread = 1.0 / (camera.fx * f64::from(grid)) as f32;
         let mut indices = 0..grid * grid;
         while !indices.is_empty() {
             let mut rays = Rays::new(spread);
             for index in indices.by_ref().take(LANES) {
-                let place = stratum(index, grid, sampling.draws.square());
-                let direction = camera.direction(corner + place.as_dvec2());
+                let offset = stratum(index, grid, sampling.draws.square());
+                let direction = camera.direction(corner + offset.as_dvec2());
                 rays.add(self.surface, index, camera.centre, direction);
             }
             let (c, a) = self.sum_rays(&rays, &mut sampling);
@@ -222,20 +219,20 @@ impl Tracer<'_> {
             alpha += a;
         }
         if alpha <= 0.0 {
-            return (Vec3::ZERO, 0.0, sampling.met);
+            return (Vec3::ZERO, 0.0, sampling.hit_hint);
         }
         let straight = colour * (self.exposure / alpha);
-        (straight, alpha / (grid * grid) as f32, sampling.met)
+        (straight, alpha / (grid * grid) as f32, sampling.hit_hint)
     }
 
-    /// Sums over rays: colour, weighted with alpha, and alpha.
+    /// Sums over rays of premultiplied colour and alpha.
     fn sum_rays(&self, rays: &Rays, sampling: &mut Sampling) -> (Vec3, f32) {
         let shaded = self.shaded();
         let visible = |slot, at: &Intersection| shaded.is_visible(slot, at);
         let (mut colours, mut alphas) = (Vec3::ZERO, 0.0);
-        // The first surfaces in one packet, as most are opaque; those behind them ray by ray.
+        // One packet for the first surfaces, as most are opaque; single rays for those behind them.
         let hits = self.surface.closest_each(rays.all(), visible);
-        sampling.met = hits[rays.count / 2].map(|hit| hit.slot).or(sampling.met);
+        sampling.hit_hint = hits[rays.count / 2].map(|hit| hit.slot).or(sampling.hit_hint);
         let mut alphas_of = [0.0; LANES];
         let mut seen = Vec::with_capacity(LANES);
         for (lane, hit) in hits.iter().enumerate() {
@@ -275,8 +272,8 @@ impl Tracer<'_> {
         (colours, alphas)
     }
 
-    /// Depth, normal and triangle of the first surface with alpha of at least one half. The triangle
-    /// `hint`, by place in leaf order, is tried first.
+    /// Depth, normal and triangle of the first surface with alpha of at least one half. The triangle in slot
+    /// `hint` is tested first.
     pub(crate) fn first_solid(
         &self,
         origin: DVec3,
@@ -293,9 +290,8 @@ impl Tracer<'_> {
         Some((hit.t, normal, hit.triangle))
     }
 
-    /// Visits the visible surfaces along a ray behind its first, front to back, while `go_on` says
-    /// so.
-    fn layers(&self, ray: &LocalRay, first: LocalHit, mut go_on: impl FnMut(LocalHit) -> bool) {
+    /// Visits the visible surfaces along a ray behind its first one, front to back, until `visit` returns false.
+    fn layers(&self, ray: &LocalRay, first: LocalHit, mut visit: impl FnMut(LocalHit) -> bool) {
         let shaded = self.shaded();
         let visible = |slot, at: &Intersection| shaded.is_visible(slot, at);
         let mut last = first;
@@ -304,7 +300,7 @@ impl Tracer<'_> {
             let Some(hit) = self.surface.closest(ray, Some(after), None, visible) else {
                 return;
             };
-            if !go_on(hit) {
+            if !visit(hit) {
                 return;
             }
             last = hit;
@@ -312,7 +308,7 @@ impl Tracer<'_> {
     }
 }
 
-/// A pixel of an image: sRGB and straight alpha; nothing where nothing is covered.
+/// Encodes a pixel as sRGB with straight alpha.
 fn encoded(light: Vec3, coverage: f32) -> [u8; 4] {
     if coverage <= 0.0 {
         return [0; 4];
@@ -321,7 +317,7 @@ fn encoded(light: Vec3, coverage: f32) -> [u8; 4] {
     [encode(light.x), encode(light.y), encode(light.z), a]
 }
 
-/// Mean radiance of a pixel grid over a view, for choosing an exposure: one ray per `step` pixels.
+/// Luminances on a grid over a view, one ray every `step` pixels, for choosing an exposure.
 pub(crate) fn luminances(tracer: &Tracer<'_>, camera: &Camera, step: u32) -> Vec<f32> {
     let mut all = Vec::new();
     for y in (0..camera.height).step_by(step as usize) {
@@ -331,7 +327,8 @@ pub(crate) fn luminances(tracer: &Tracer<'_>, camera: &Camera, step: u32) -> Vec
             let direction = camera.direction(corner + Vec2::splat(0.5).as_dvec2());
             let mut ray = Rays::new(0.0);
             ray.add(tracer.surface, 0, camera.centre, direction);
-            let (c, a) = tracer.sum_rays(&ray, &mut Sampling { draws, met: None, hid: None });
+            let mut sampling = Sampling { draws, hit_hint: None, occluder_hint: None };
+            let (c, a) = tracer.sum_rays(&ray, &mut sampling);
             if a > 0.5 {
                 all.push(c.dot(Vec3::new(0.2126, 0.7152, 0.0722)));
             }

@@ -1,4 +1,4 @@
-//! Frames against what can be worked out by hand.
+//! Tests of frames against values worked out by hand.
 
 use std::f32::consts::PI;
 use std::sync::Arc;
@@ -39,7 +39,7 @@ fn sun(towards: DVec3, irradiance: f32) -> Light {
 }
 
 #[test]
-fn a_lit_plane_has_the_colour_and_depth_of_the_formula() {
+fn a_lit_plane_has_the_expected_colour_and_depth() {
     let mut model = floor(Material::lambert("grey", [0.5, 0.25, 0.1]));
     let towards = DVec3::new(1.0, 2.0, 0.5);
     model.lights.push(sun(towards, 2.0));
@@ -62,7 +62,7 @@ fn a_lit_plane_has_the_colour_and_depth_of_the_formula() {
 }
 
 #[test]
-fn lights_follow_their_laws() {
+fn lights_have_the_expected_irradiance() {
     let at = DVec3::new(0.0, 2.0, 0.0);
     let down = DVec3::NEG_Y;
     // Irradiance straight below: I / d², cut off beyond the range and outside the cone.
@@ -137,8 +137,8 @@ fn a_sphere_has_its_depth_and_normals() {
         }
         let t = (-b - root.sqrt()) / a;
         let exact = (o + t * d) / radius;
-        // Corners lie on the sphere: flat faces are inside it by at most the sagitta of an edge of
-        // 1.1 / 64 radians, 3.7e-5 radii, and more along grazing rays.
+        // Corners lie on the sphere, so faces are inside it by at most the sagitta of an edge of 1.1 / 64
+        // radians, 3.7e-5 radii; more along grazing rays.
         let grazing = -exact.dot(d.normalize());
         if grazing > 0.1 {
             let beyond = (f64::from(frame.depth[i]) - t) * d.length() * grazing;
@@ -173,7 +173,7 @@ fn the_white_furnace_is_white() {
         let mean = furnace(lambert.clone(), ambient);
         assert!((mean - white).abs() < 0.6, "{ambient:?}: {mean}, not {white}");
     }
-    // GGX loses what bounces within its microsurface, more the rougher, and never gains.
+    // GGX loses the light that bounces within its microsurface, more for rougher surfaces, and never gains any.
     let metal = |roughness| Material {
         reflection: Reflection::MetalRough,
         metallic: 1.0,
@@ -197,13 +197,13 @@ fn only_occluders_cast_shadows() {
     let sky = || Sky::uniform(0.1);
     let lit = render(&model, &camera, sky(), Ambient::Open).rgba[0];
     assert_eq!(lit, encode(1.1));
-    // A lid over the place.
+    // With a lid above.
     let lid = model.material(Material::default());
     model.quad(DVec3::new(-1.0, 1.0, -1.0), 2.0 * DVec3::X, 2.0 * DVec3::Z, lid);
     assert_eq!(render(&model, &camera, sky(), Ambient::Open).rgba[0], encode(0.1));
     let hidden = render(&model, &camera, sky(), Ambient::Occlusion(256)).rgba[0];
     assert!(hidden < encode(0.1), "{hidden}");
-    // Through holes in a mask, and through little opacity, light passes.
+    // Light passes through holes in a mask and through surfaces of low opacity.
     for alpha in [AlphaMode::Mask(0.5), AlphaMode::Blend] {
         model.materials[lid as usize].base = Vec4::new(1.0, 1.0, 1.0, 0.3);
         model.materials[lid as usize].alpha = alpha;
@@ -262,8 +262,8 @@ fn images_are_the_same_at_any_number_of_threads() {
 }
 
 #[test]
-fn cameras_keep_out_of_solids() {
-    // A block fills most of the box that an inside rig walks in.
+fn cameras_are_outside_of_solids() {
+    // A block fills most of the room of an inside rig.
     let mut model = Model::default();
     let material = model.material(Material::default());
     model.cuboid(DVec3::ZERO, -DVec3::splat(2.0), DQuat::IDENTITY, material);
@@ -285,7 +285,7 @@ fn cameras_keep_out_of_solids() {
 }
 
 #[test]
-fn an_image_as_sky_lights_like_the_same_sky_and_sampling_agrees() {
+fn image_and_gradient_skies_agree_and_so_does_sampling() {
     let mut model = floor(Material::lambert("grey", [0.5; 3]));
     let shiny = Material {
         reflection: Reflection::MetalRough,
@@ -296,19 +296,19 @@ fn an_image_as_sky_lights_like_the_same_sky_and_sampling_agrees() {
     let shiny = model.material(shiny);
     model.cuboid(DVec3::new(0.0, 0.3, 0.0), DVec3::splat(0.3), DQuat::IDENTITY, shiny);
     let camera = above(3.0);
-    // A sky of one colour, as a formula and as an image.
+    // A uniform sky, as a gradient and as an image.
     let image = |width: usize, radiance: &dyn Fn(usize) -> Vec3| {
         let pixels = (0..width * width / 2).map(radiance).collect();
         Sky::Image(Arc::new(Panorama::new("sky".into(), width, pixels)))
     };
     for ambient in [Ambient::Open, Ambient::Occlusion(64), Ambient::Bounce(64)] {
         let plain = render(&model, &camera, Sky::uniform(0.6), ambient);
-        let pictured = render(&model, &camera, image(32, &|_| Vec3::splat(0.6)), ambient);
-        for (a, b) in plain.rgba.iter().zip(&pictured.rgba) {
+        let by_image = render(&model, &camera, image(32, &|_| Vec3::splat(0.6)), ambient);
+        for (a, b) in plain.rgba.iter().zip(&by_image.rgba) {
             assert!(a.abs_diff(*b) <= 1, "{ambient:?}: {a} and {b}");
         }
     }
-    // One bright side: what is sampled is in the mean what is computed, on an empty floor.
+    // One bright side, on an empty floor: on average sampling agrees with the closed form.
     let model = floor(Material::lambert("grey", [0.5; 3]));
     let side = image(64, &|i| if i % 64 < 32 { Vec3::splat(2.0) } else { Vec3::ZERO });
     let mean = |ambient| {

@@ -1,4 +1,4 @@
-//! Reads the float images that this program writes.
+//! Reads the float images written by this program.
 
 use std::fs;
 use std::io::Cursor;
@@ -11,7 +11,7 @@ use super::REMEDY;
 use crate::error::Error;
 use crate::resource::EXPANSION;
 
-/// The channels of the image, in the order named; `None` if it has another size.
+/// The channels of the image, in the given order; `None` if it has a different size.
 pub(super) fn read<const N: usize>(
     path: &Path,
     channels: [&str; N],
@@ -36,7 +36,7 @@ pub(super) fn read<const N: usize>(
     if (header.layer_size.0, header.layer_size.1) != size {
         return Ok(None);
     }
-    // The size is the camera's, which is bounded; the file must be able to fill it.
+    // The camera bounds the size, but the file must also be large enough for it.
     let needed = u64::from(width) * u64::from(height) * 4 * N as u64;
     if needed > (bytes.len() as u64).saturating_mul(EXPANSION) {
         return Err(bad("header", format!("{width}x{height} px cannot be in so small a file")));

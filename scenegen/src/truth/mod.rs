@@ -1,8 +1,7 @@
-//! Gives a scene's ground truth, to measure a trained scene against: the surface, and depth and normals
-//! of each view.
+//! A scene's ground truth, for evaluating a trained scene: the surface, and depth and normals of each view.
 //!
-//! It comes from a scene in memory, or from a folder that [`write`](crate::write) wrote. Files are
-//! untrusted: sizes are checked against the file's length before anything is allocated.
+//! It comes from a scene in memory, or from a folder written by [`write`](crate::write). Files are untrusted:
+//! sizes are checked against the file's length before anything is allocated.
 
 mod exr;
 mod ply;
@@ -23,11 +22,11 @@ use crate::write::SCENE_FILE;
 
 /// Longest `scene.json` that is read `[bytes]`.
 const LONGEST_RECORD: u64 = 1 << 24;
-/// Depths agree if they differ by less than this share: depth files hold f32.
+/// Largest relative difference of equal depths, as depth files hold f32.
 const SAME_DEPTH: f64 = 1e-5;
 /// The remedy for damaged files.
 const REMEDY: &str = "write the scene again with densify scenegen --overwrite";
-/// Step into the surface before its thickness is measured, in diagonals.
+/// Offset into the surface for measuring its thickness, in diagonals.
 const STEP: f64 = 1e-7;
 
 /// The geometry that a scene was rendered from.
@@ -40,7 +39,7 @@ enum Kind {
     Folder { root: PathBuf, surface: Box<Surface>, thin: Vec<bool>, has_lens: bool },
 }
 
-/// Depth and normals of a view: what renderers call a G-buffer.
+/// Depth and normals of a view.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GBuffer {
     /// Image width `[px]`.
@@ -60,16 +59,16 @@ impl GroundTruth {
         Self { kind: Kind::Scene(Box::new(scene)) }
     }
 
-    /// Whether a folder holds a scene that this program wrote, by its `scene.json`.
+    /// True if a folder holds a scene written by this program, according to its `scene.json`.
     #[must_use]
     pub fn is_in(root: &Path) -> bool {
         record_in(root)["generator"].as_str().is_some_and(|by| by.starts_with("densify-scenegen"))
     }
 
-    /// The ground truth in a folder; `None` where the folder holds no scene of this program.
+    /// The ground truth in a folder; `None` if the folder does not hold a scene of this program.
     ///
     /// # Errors
-    /// When there is one but its mesh cannot be read.
+    /// When it does, but its mesh cannot be read.
     pub fn open(root: &Path) -> Result<Option<Self>, Error> {
         let mesh = root.join("mesh.ply");
         if !Self::is_in(root) {
@@ -95,12 +94,12 @@ impl GroundTruth {
         }
     }
 
-    /// Depth and normals as `camera` sees them. In a folder, `view` (the view's name in a dataset)
-    /// selects the files to read. Where these are missing or of another size, the mesh is traced:
-    /// the same, but surfaces with alpha below one half count too.
+    /// Depth and normals seen by `camera`. In a folder, `view` (the view's name in a dataset) selects the files
+    /// to read. If they are missing or have a different size, the mesh is traced instead, which also includes
+    /// surfaces with alpha below one half.
     ///
     /// # Errors
-    /// When a file is there but damaged.
+    /// When a file is damaged.
     pub fn g_buffer(&self, view: &str, camera: &Camera) -> Result<GBuffer, Error> {
         match &self.kind {
             Kind::Scene(scene) => Ok(trace(camera, |ray| {
@@ -108,11 +107,11 @@ impl GroundTruth {
                 Some((depth, normal))
             })),
             Kind::Folder { root, surface, has_lens, .. } => {
-                // What a lens saw is not what a camera without sees.
-                let is_bent = *has_lens && view.contains("train/");
+                // Stored images seen through a lens do not fit this camera, which has none.
+                let is_distorted = *has_lens && view.contains("train/");
                 let size = (camera.width, camera.height);
                 if let Some(stored) =
-                    (!is_bent).then(|| stored(root, view, size)).transpose()?.flatten()
+                    (!is_distorted).then(|| stored(root, view, size)).transpose()?.flatten()
                 {
                     return Ok(stored);
                 }
@@ -124,7 +123,7 @@ impl GroundTruth {
         }
     }
 
-    /// Whether any part of it is a thin structure, such as a wire.
+    /// True if there are thin structures, such as wires.
     #[must_use]
     pub fn has_thin(&self) -> bool {
         match &self.kind {
@@ -133,10 +132,9 @@ impl GroundTruth {
         }
     }
 
-    /// Thickness of the thin structure `[world units]` that the ray from `origin` along `direction`
-    /// hits first, at ray parameter `depth`: the shortest of the way through it against its normal
-    /// and of two ways across that through its middle; for a wire its diameter. `None` where the
-    /// surface hit is not thin, or not at that depth.
+    /// Thickness `[world units]` of the thin structure that the ray from `origin` along `direction` hits first,
+    /// at ray parameter `depth`: the smallest of its extents along the normal and along two perpendicular
+    /// directions; the diameter for a wire. `None` if the first hit is not thin or at a different depth.
     #[must_use]
     pub fn thickness(&self, origin: DVec3, direction: DVec3, depth: f64) -> Option<f64> {
         let surface = self.surface();
@@ -155,7 +153,7 @@ impl GroundTruth {
         let middle = hit.point + 0.5 * through * inward;
         let across = |axis: DVec3| {
             let reach =
-                |way| surface.cast(middle, way, f64::INFINITY).map_or(f64::INFINITY, |h| h.t);
+                |axis| surface.cast(middle, axis, f64::INFINITY).map_or(f64::INFINITY, |h| h.t);
             reach(axis) + reach(-axis)
         };
         let (u, v) = inward.any_orthonormal_pair();
@@ -169,7 +167,7 @@ impl std::fmt::Debug for GroundTruth {
     }
 }
 
-/// The `scene.json` in a folder; null where it is none of this program's size.
+/// The `scene.json` in a folder; null if it is missing, too long or malformed.
 fn record_in(root: &Path) -> Value {
     let record = root.join(SCENE_FILE);
     let is_short = fs::metadata(&record).is_ok_and(|data| data.len() <= LONGEST_RECORD);
@@ -177,7 +175,7 @@ fn record_in(root: &Path) -> Value {
     serde_json::from_slice(&text).unwrap_or_default()
 }
 
-/// Traces the rays through the pixels' centres.
+/// Traces the rays through the pixel centres.
 fn trace(camera: &Camera, first: impl Fn(DVec3) -> Option<(f64, DVec3)> + Sync) -> GBuffer {
     let (width, height) = (camera.width as usize, camera.height as usize);
     let seen: Vec<(f32, [f32; 3])> = (0..width * height)
@@ -192,9 +190,9 @@ fn trace(camera: &Camera, first: impl Fn(DVec3) -> Option<(f64, DVec3)> + Sync) 
     GBuffer { width: camera.width, height: camera.height, depth, normals }
 }
 
-/// The depth and normals stored for a view, if there are files of its name and size.
+/// The stored depth and normals of a view, if there are files with its name and size.
 fn stored(root: &Path, view: &str, size: (u32, u32)) -> Result<Option<GBuffer>, Error> {
-    // Datasets name views by their image's path, with or without the images' folder.
+    // Datasets name views by the path of their image, with or without the `images` folder.
     let name = view.trim_start_matches("./");
     let name = Path::new(name.strip_prefix("images/").unwrap_or(name)).with_extension("exr");
     if !name.components().all(|part| matches!(part, std::path::Component::Normal(_))) {

@@ -1,4 +1,4 @@
-//! Tests that files and scenes agree and damaged files are refused.
+//! Tests that files agree with their scene, and that damaged files are refused.
 
 use std::fs;
 
@@ -37,12 +37,12 @@ fn folders_agree_with_their_scene() {
     for name in ["test/r_000.png", "images/test/r_000.png", "./images/test/r_000"] {
         assert!(there.g_buffer(name, &test.camera).expect("read") == g_buffer, "{name}");
     }
-    // Read, and not traced: what the files say counts.
+    // The files are read instead of tracing the mesh.
     let (from, to) = (target.join("depth/train/r_000.exr"), target.join("depth/test/r_000.exr"));
     fs::copy(from, to).expect("copy");
     let other = there.g_buffer(&test.name, &test.camera).expect("read");
     assert!(other.depth != g_buffer.depth && other.normals == g_buffer.normals);
-    // Without a file, and at another size, the mesh is traced.
+    // Without a file, or for a different size, the mesh is traced.
     let close = |a: &GBuffer, b: &GBuffer| {
         let apart = a.depth.iter().zip(&b.depth).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         assert!(apart < 1e-4, "{apart}");
@@ -54,7 +54,7 @@ fn folders_agree_with_their_scene() {
         &here.g_buffer("", &half).expect("traced"),
     );
     assert!(GroundTruth::open(root.path()).expect("no scene").is_none());
-    // Another program's files of these names are not ours to read.
+    // Files of other programs with these names are ignored.
     fs::write(root.path().join("mesh.ply"), "ply").expect("write");
     for record in ["{\"generator\": \"other\"}", "[1, 2]", "{"] {
         fs::write(root.path().join("scene.json"), record).expect("write");
@@ -72,17 +72,17 @@ fn wires_have_their_true_thickness() {
     assert!((0.0115..=0.012).contains(&thickness), "{thickness}");
     let beside = DVec3::new(-0.9, 0.7, 2.0);
     assert!(truth.thickness(beside, DVec3::NEG_Z, 2.6).is_none());
-    // At its end, where the wire is all the way along it, it is as thick as across: radius 12 mm.
+    // At the end of a wire of radius 12 mm, the thickness is the diameter and not the length.
     let above = DVec3::new(-0.75, 3.0, 0.003);
     let depth = truth.surface().cast(above, DVec3::NEG_Y, 10.0).expect("an end").t;
     let thickness = truth.thickness(above, DVec3::NEG_Y, depth).expect("thin");
     assert!((0.02..=0.025).contains(&thickness), "{thickness}");
-    // Something else stands before it.
+    // Something else is in front.
     assert!(truth.thickness(from, DVec3::NEG_Z, depth + 0.1).is_none());
 }
 
 #[test]
-fn damaged_files_are_refused_and_nothing_panics() {
+fn damaged_files_are_refused_without_panics() {
     let root = tempfile::tempdir().expect("folder");
     let target = root.path().join("scene");
     let scene = scene("spheres");
@@ -119,7 +119,7 @@ fn damaged_files_are_refused_and_nothing_panics() {
         let message = error.unwrap_or_else(|| panic!("{length} bytes accepted")).to_string();
         assert!(message.contains("r_000.exr"), "{message}");
     }
-    // Any byte may be wrong; what is read is then wrong or refused, but nothing breaks.
+    // With any wrong byte the values are wrong or refused, but nothing panics.
     for at in 0..whole.len().min(600) {
         for flip in [0x01, 0x80, 0xff] {
             let mut bytes = whole.clone();

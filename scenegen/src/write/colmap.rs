@@ -1,7 +1,7 @@
 //! Writes COLMAP's text model under `sparse/0`; image names are relative to `images`.
 //!
-//! A view's features lie exactly where its points were found on the surface; the points carry the
-//! noise. So the reprojection errors are those of the noise.
+//! Features are at the exact projections of true surface points, and only the points have noise. Reprojection
+//! errors are therefore those of the noise.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -20,7 +20,7 @@ pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(
     let mut images = String::from(
         "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n",
     );
-    // The points that each view sees, and their places in its list.
+    // The points that each view sees, and for each point its views with the index of the feature.
     let mut seen: Vec<Vec<usize>> = vec![Vec::new(); scene.views.len()];
     let mut tracks: Vec<Vec<(usize, usize)>> = vec![Vec::new(); points.positions.len()];
     for (point, views) in points.seen_by.iter().enumerate() {
@@ -69,7 +69,7 @@ pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(
     write_file(&folder.join("points3D.txt"), cloud.as_bytes())
 }
 
-/// COLMAP's model of a lens, and the parameters after those of a pinhole.
+/// COLMAP's camera model of a lens, and its parameters after those of a pinhole.
 fn model(lens: Option<&Lens>) -> (&'static str, String) {
     let Some(Lens { kind, k: [a, b, c, d] }) = lens else { return ("PINHOLE", String::new()) };
     match kind {
@@ -78,15 +78,15 @@ fn model(lens: Option<&Lens>) -> (&'static str, String) {
     }
 }
 
-/// Mean distance from where a point was found to where it is drawn, over the views that see it `[px]`;
-/// -1, as COLMAP has it, where none does.
+/// Mean distance between a point's features and its projections over the views that see it `[px]`; -1, as in
+/// COLMAP, if there are none.
 fn reprojection_error(scene: &Scene, points: &InitPoints, point: usize) -> f64 {
     let views = &points.seen_by[point];
     let error = |&view: &u32| {
         let camera = &scene.views[view as usize].camera;
-        let [found, drawn] =
+        let [feature, projection] =
             [&points.found_at, &points.positions].map(|p| camera.project(p[point]).0);
-        found.distance(drawn)
+        feature.distance(projection)
     };
     if views.is_empty() {
         return -1.0;

@@ -9,7 +9,7 @@ use super::write_file;
 use crate::error::Error;
 use crate::trace::Frame;
 
-/// Depth `[world units]`, 0 where there is no surface.
+/// Writes depth `[world units]`, 0 where there is no surface.
 pub(super) fn write_depth(path: &Path, frame: &Frame) -> Result<(), Error> {
     let width = frame.width as usize;
     let channels = SpecificChannels::build()
@@ -22,7 +22,7 @@ pub(super) fn write_depth(path: &Path, frame: &Frame) -> Result<(), Error> {
     write_file(path, bytes.get_ref())
 }
 
-/// World-space unit normals, zero where there is no surface.
+/// Writes world-space unit normals, zero where there is no surface.
 pub(super) fn write_normals(path: &Path, frame: &Frame) -> Result<(), Error> {
     let width = frame.width as usize;
     let channels = SpecificChannels::build()

@@ -1,7 +1,7 @@
-//! Writes a scene as files that trainers read.
+//! Writes a scene as files for trainers.
 //!
-//! Everything is written into a temporary folder beside the target, which is then renamed: there is
-//! a complete scene or none. Views stream: one image is held at a time.
+//! Everything is written into a temporary folder next to the target, which is then renamed, so that there is
+//! either a complete scene or none. Only one image is held in memory at a time.
 
 mod colmap;
 mod exr;
@@ -32,9 +32,8 @@ pub struct Written {
     pub points: usize,
 }
 
-/// Renders all views of a scene and writes it to the folder `target`, which must not exist or be
-/// empty; with `overwrite`, it may hold a scene that this function wrote. `progress` is told each
-/// view's number as it is done.
+/// Renders all views of a scene and writes it to the folder `target`, which must be missing or empty. With
+/// `overwrite` it may hold a scene, which is replaced. `progress` is called with the index of each finished view.
 ///
 /// # Errors
 /// When the folder holds anything else, or a file cannot be written.
@@ -44,7 +43,7 @@ pub fn write(
     overwrite: bool,
     mut progress: impl FnMut(usize),
 ) -> Result<Written, Error> {
-    let replaces = may_be_written(target, overwrite)?;
+    let replaces = holds_scene(target, overwrite)?;
     let parent = match target.parent() {
         Some(parent) if !parent.as_os_str().is_empty() => parent,
         _ => Path::new("."),
@@ -69,7 +68,7 @@ pub fn write(
     }
     let points = collector.finish();
     write_rest(scene, root, &points)?;
-    readable(root)?;
+    make_readable(root)?;
     if replaces {
         let old = tempfile::Builder::new()
             .prefix(".densify-old-")
@@ -79,26 +78,26 @@ pub fn write(
         fs::rename(target, &aside).map_err(Error::write(target))?;
         if let Err(error) = fs::rename(folder.path(), target) {
             if fs::rename(&aside, target).is_err() {
-                // The earlier scene stays there.
+                // Keeps the earlier scene in the temporary folder.
                 let _ = old.keep();
             }
             return Err(Error::write(target)(error));
         }
     } else {
-        // An empty folder is in a rename's way on some systems.
+        // On some systems an empty folder prevents renaming.
         if target.is_dir() {
             fs::remove_dir(target).map_err(Error::write(target))?;
         }
         fs::rename(folder.path(), target).map_err(Error::write(target))?;
     }
-    // It has another name now.
+    // Prevents the deletion of the temporary folder, which has been renamed.
     let _ = folder.keep();
     Ok(Written { views: scene.views.len(), points: points.positions.len() })
 }
 
-/// Whether the target holds an earlier scene; an error if it holds one that is to stay, or anything
-/// else.
-fn may_be_written(target: &Path, overwrite: bool) -> Result<bool, Error> {
+/// True if the target holds an earlier scene. An error if it must not be overwritten, or if the target holds
+/// anything else.
+fn holds_scene(target: &Path, overwrite: bool) -> Result<bool, Error> {
     let refuse =
         |what: &str| Err(Error::option("--output", format!("{} {what}", target.display())));
     let taken = match fs::read_dir(target) {
@@ -112,20 +111,20 @@ fn may_be_written(target: &Path, overwrite: bool) -> Result<bool, Error> {
     match (target.join(record::NAME).is_file(), overwrite) {
         (true, true) => Ok(true),
         (true, false) => refuse("holds a scene; add --overwrite to replace it"),
-        (false, _) => refuse("is not empty and holds no scene.json; name another folder"),
+        (false, _) => refuse("is not empty and holds no scene.json; choose another folder"),
     }
 }
 
-/// Checks that [`write()`] may use a folder, before anything is rendered.
+/// Checks before rendering that [`write()`] can use a folder.
 ///
 /// # Errors
 /// As [`write()`].
 pub fn check_target(target: &Path, overwrite: bool) -> Result<(), Error> {
-    may_be_written(target, overwrite).map(|_| ())
+    holds_scene(target, overwrite).map(|_| ())
 }
 
-/// Temporary folders are for their owner only; scenes are as other files.
-fn readable(folder: &Path) -> Result<(), Error> {
+/// Gives the folder the usual permissions, as temporary folders are accessible to their owner only.
+fn make_readable(folder: &Path) -> Result<(), Error> {
     #[cfg(unix)]
     {
         use std::os::unix::fs::PermissionsExt;
@@ -146,16 +145,16 @@ fn write_frame(root: &Path, name: &str, frame: &Frame) -> Result<(), Error> {
     exr::write_normals(&root.join("normals").join(format!("{name}.exr")), frame)
 }
 
-/// The mask of a view, white where nobody is: nerfstudio wants one of every view or of none.
+/// Writes the mask of a view; all white without passers-by, as nerfstudio needs masks for all views or none.
 fn write_mask(root: &Path, name: &str, frame: &Frame) -> Result<(), Error> {
-    let path = root.join(mask_of(name));
+    let path = root.join(mask_path(name));
     let white = || vec![255; frame.depth.len()];
     let mask = frame.mask.clone().unwrap_or_else(white);
     write_png(&path, frame.width, frame.height, &mask, ExtendedColorType::L8)
 }
 
 /// The file of a view's mask.
-fn mask_of(name: &str) -> String {
+fn mask_path(name: &str) -> String {
     format!("masks/{name}.png")
 }
 
@@ -188,8 +187,7 @@ fn write_file(path: &Path, bytes: &[u8]) -> Result<(), Error> {
     fs::write(path, bytes).map_err(Error::write(path))
 }
 
-/// One picture of eight training views, evenly chosen, over light grey. Width, height and RGBA
-/// pixels.
+/// One image of eight evenly spaced training views over light grey: width, height and RGBA pixels.
 #[must_use]
 pub fn contact_sheet(scene: &Scene) -> (u32, u32, Vec<u8>) {
     const COLUMNS: usize = 4;

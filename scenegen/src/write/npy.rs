@@ -1,7 +1,7 @@
 //! Writes depth as a NumPy array for nerfstudio, in its default unit: thousandths of a world unit.
 //!
-//! Not as the 16-bit PNG that it also reads: that has too few steps, or too small a range, for scenes
-//! that are not some metres large. Format: numpy.org/doc/stable/reference/generated/numpy.lib.format.html
+//! The 16-bit PNG that nerfstudio also reads has too low a precision or range, except for scenes of a few
+//! metres. Format: numpy.org/doc/stable/reference/generated/numpy.lib.format.html
 
 use std::path::Path;
 
@@ -11,12 +11,12 @@ use crate::trace::Frame;
 
 /// Depth `[world units / 1000]`, 0 where there is no surface. Shape: `[height, width]`.
 pub(super) fn write_depth(path: &Path, frame: &Frame) -> Result<(), Error> {
-    // Magic, version and length.
+    // Size of magic, version and length.
     const PREFIX: usize = 10;
     let (height, width) = (frame.height, frame.width);
     let header =
         format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({height}, {width}), }}");
-    // With its line end the header is padded to a multiple of 64 bytes.
+    // The header is padded to a multiple of 64 bytes, including its line end.
     let padded = (PREFIX + header.len() + 1).next_multiple_of(64) - PREFIX;
     let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
     bytes.extend((padded as u16).to_le_bytes());

@@ -9,7 +9,7 @@ use crate::error::Error;
 use crate::points::InitPoints;
 use crate::scene::Scene;
 
-/// Points with colours, and with the zero normals that the original 3DGS reader asks for.
+/// Writes points with colours, and with zero normals, which the original 3DGS reader needs.
 pub(super) fn write_points(path: &Path, points: &InitPoints) -> Result<(), Error> {
     let mut header = format!(
         "ply\nformat binary_little_endian 1.0\nelement vertex {}\n",
@@ -31,10 +31,10 @@ pub(super) fn write_points(path: &Path, points: &InitPoints) -> Result<(), Error
     write_file(path, &bytes)
 }
 
-/// The header of a mesh of `faces` triangles; `knows_thin` is whether each says if it is thin.
-pub(crate) fn mesh_header(faces: u32, knows_thin: bool) -> String {
+/// The header of a mesh of `faces` triangles, with or without flags of thin ones.
+pub(crate) fn mesh_header(faces: u32, has_flags: bool) -> String {
     let vertices = 3 * u64::from(faces);
-    let thin = if knows_thin { "property uchar thin\n" } else { "" };
+    let thin = if has_flags { "property uchar thin\n" } else { "" };
     format!(
         "ply\nformat binary_little_endian 1.0\nelement vertex {vertices}\nproperty double x\n\
          property double y\nproperty double z\nelement face {faces}\n\
@@ -42,11 +42,11 @@ pub(crate) fn mesh_header(faces: u32, knows_thin: bool) -> String {
     )
 }
 
-/// The triangles as traced, in world coordinates, each with its own corners; f64, as a mesh far from
-/// the origin needs it. With each triangle goes whether it is of a thin structure. Written as it is
-/// made: the file is larger than the mesh.
+/// Writes the triangles as traced, in world coordinates, each with its own corners and a flag for thin
+/// structures. Corners are f64, which meshes far from the origin need. Streams to the file, which is larger than
+/// the mesh.
 pub(super) fn write_mesh(path: &Path, scene: &Scene) -> Result<(), Error> {
-    // Numbers of corners are 32 bits wide.
+    // Indices of corners have 32 bits.
     let count = scene.model.triangles.len() as u32;
     let write = || -> std::io::Result<()> {
         let mut out = BufWriter::new(File::create(path)?);

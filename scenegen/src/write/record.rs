@@ -1,4 +1,4 @@
-//! Writes `scene.json`: all that is needed to render the scene again.
+//! Writes `scene.json`, which has everything needed to render the scene again.
 
 use std::path::Path;
 
@@ -9,7 +9,7 @@ use crate::error::Error;
 use crate::points::InitPoints;
 use crate::scene::Scene;
 
-/// Name of the file; a folder that holds it holds a scene.
+/// Name of the file, which identifies a folder as a scene.
 pub(crate) const NAME: &str = "scene.json";
 
 pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(), Error> {
@@ -51,7 +51,7 @@ pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(
     write_file(&root.join(NAME), format!("{record:#}").as_bytes())
 }
 
-/// The exposures of the views that differ, by name; null where none does.
+/// The exposures of views by name, if they vary; otherwise null.
 fn exposures(scene: &Scene) -> Value {
     let named = scene.views.iter().enumerate();
     let named = named.filter_map(|(at, view)| Some((view.name.clone(), json!(scene.gains(at)?))));

@@ -1,4 +1,4 @@
-//! Tests that scenes are written completely or not at all, and as other programs' readers ask for.
+//! Tests that scenes are written completely or not at all, and as the readers of other programs expect.
 
 use std::collections::{BTreeSet, HashMap};
 
@@ -20,7 +20,7 @@ fn small() -> Scene {
     Scene::prepare(&Source::Preset("spheres".into()), &options).expect("preset")
 }
 
-/// Files of `small` as it is, and with other options, in two folders.
+/// Writes `small` with its own options and with `options`, to two folders.
 fn written(options: Options) -> (tempfile::TempDir, [std::path::PathBuf; 2]) {
     let plain = small();
     let other = Scene::prepare(&Source::Preset("spheres".into()), &options).expect("preset");
@@ -33,9 +33,9 @@ fn written(options: Options) -> (tempfile::TempDir, [std::path::PathBuf; 2]) {
     (root, targets)
 }
 
-/// A lens is in the files of training views, for every reader, and in no test view.
+/// The files of training views have the lens in every format, and those of test views do not.
 #[test]
-fn a_lens_bends_training_views_alone() {
+fn a_lens_affects_training_views_only() {
     let lens = Some("fisheye:0.05,-0.01".parse().expect("a lens"));
     let (_root, [a, b]) = written(Options { lens, ..small().options });
     let read = |folder: &Path, name: &str| fs::read(folder.join(name)).expect(name);
@@ -62,7 +62,7 @@ fn a_lens_bends_training_views_alone() {
     }
 }
 
-/// Where people walk through, the mask hides every pixel that they change; all else stays, the truth too.
+/// The mask hides every pixel changed by passers-by; everything else, including the ground truth, is unchanged.
 #[test]
 fn passers_by_are_in_some_training_views_and_masked() {
     let (_root, [a, b]) = written(Options { passers_by: 0.5, ..small().options });
@@ -112,9 +112,9 @@ fn names(folder: &Path) -> Vec<String> {
     names
 }
 
-/// Training views are exposed by the factors that the record has; test views, depth and points stay.
+/// Training views are exposed by the recorded factors; test views, depth and points are unchanged.
 #[test]
-fn exposures_differ_in_training_views_alone() {
+fn exposures_vary_in_training_views_only() {
     let plain = small();
     let options = Options { exposure_jitter: 1.0, ..plain.options.clone() };
     let scene = Scene::prepare(&Source::Preset("spheres".into()), &options).expect("preset");
@@ -152,7 +152,7 @@ fn exposures_differ_in_training_views_alone() {
         for (plain, exposed) in pairs.filter(|(plain, _)| plain[3] > 0) {
             assert_eq!(plain[3], exposed[3], "coverage stays");
             for c in 0..3 {
-                // Where nothing is clipped, and steps of eight bits are small.
+                // Values that are not clipped and for which steps of eight bits are small.
                 if exposed[c] < 255 && plain[c] < 255 && plain[c] > 60 && exposed[c] > 60 {
                     let ratio = light(exposed[c]) / light(plain[c]) / factors[c];
                     assert!((ratio - 1.0).abs() < 0.05, "{number}: {plain:?} {exposed:?}");
@@ -167,7 +167,7 @@ fn exposures_differ_in_training_views_alone() {
 }
 
 #[test]
-fn everything_is_written_and_nothing_else_stays() {
+fn everything_is_written_and_nothing_else_is_left() {
     let scene = small();
     let root = tempfile::tempdir().expect("folder");
     let target = root.path().join("deep").join("scene");
@@ -194,7 +194,7 @@ fn everything_is_written_and_nothing_else_stays() {
         assert_eq!(names(&target.join(kind).join("train")).len(), 4 * files, "{kind}");
         assert_eq!(names(&target.join(kind).join("test")).len(), 2 * files, "{kind}");
     }
-    // Depth comes back bit for bit.
+    // Depth is stored exactly.
     let frame = scene.render(4);
     let path = target.join("depth/test/r_000.exr");
     let image = ::exr::prelude::read_first_flat_layer_from_file(&path).expect("EXR");
@@ -202,10 +202,10 @@ fn everything_is_written_and_nothing_else_stays() {
     assert_eq!(channel.name.to_string(), "Z");
     let values: Vec<f32> = channel.sample_data.values_as_f32().collect();
     assert_eq!(values, frame.depth);
-    // So do colour and alpha.
+    // So are colour and alpha.
     let png = image::open(target.join("images/test/r_000.png")).expect("PNG").into_rgba8();
     assert_eq!(png.into_raw(), frame.rgba);
-    // The same scene again makes the same files.
+    // Writing the same scene again gives the same files.
     let again = root.path().join("again");
     write(&small(), &again, false, |_| ()).expect("write");
     for name in
@@ -217,7 +217,7 @@ fn everything_is_written_and_nothing_else_stays() {
 }
 
 #[test]
-fn existing_files_stay_unless_they_are_a_scene_to_replace() {
+fn only_scenes_are_overwritten() {
     let scene = small();
     let root = tempfile::tempdir().expect("folder");
     let target = root.path().join("scene");
@@ -228,7 +228,7 @@ fn existing_files_stay_unless_they_are_a_scene_to_replace() {
     fs::write(target.join("old"), "old").expect("write");
     write(&scene, &target, true, |_| ()).expect("write");
     assert!(!target.join("old").exists() && target.join("scene.json").exists());
-    // A folder of something else is never touched.
+    // Other folders are never changed.
     let other = root.path().join("other");
     fs::create_dir(&other).expect("folder");
     fs::write(other.join("thesis.txt"), "words").expect("write");
@@ -239,17 +239,17 @@ fn existing_files_stay_unless_they_are_a_scene_to_replace() {
     assert_eq!(names(root.path()), ["other", "scene"]);
 }
 
-/// A name and whether what it names is so.
+/// A requirement, and a function that checks it.
 type Rule = (&'static str, fn(&Path, &Value, &[Value]) -> bool);
 
-/// What nerfstudio 1.1's `nerfstudio_dataparser.py` and `data_utils.py` ask of transforms.json: of the
-/// folder, the whole and its frames.
+/// Requirements of nerfstudio 1.1's `nerfstudio_dataparser.py` and `data_utils.py` on a folder, its
+/// transforms.json, and the frames therein.
 const NERFSTUDIO: [Rule; 7] = [
-    ("the camera model is one it knows", |_, top, _| top["camera_model"] == "OPENCV"),
-    ("every image is there under its full name", |root, _, frames| {
+    ("the camera model is known", |_, top, _| top["camera_model"] == "OPENCV"),
+    ("every image exists under its full name", |root, _, frames| {
         frames.iter().all(|frame| image::open(root.join(text(&frame["file_path"]))).is_ok())
     }),
-    ("every view has depth that NumPy reads, of the image's size", |root, top, frames| {
+    ("every view has a NumPy depth file of the image's size", |root, top, frames| {
         frames.iter().all(|frame| {
             let bytes = fs::read(root.join(text(&frame["depth_file_path"]))).unwrap_or_default();
             let length =
@@ -267,7 +267,7 @@ const NERFSTUDIO: [Rule; 7] = [
                 && bytes.len() as u64 == 10 + length as u64 + 4 * side("w") * side("h")
         })
     }),
-    ("every pose is a rotation and a place", |_, _, frames| {
+    ("every pose is a rotation and a translation", |_, _, frames| {
         frames.iter().all(|frame| {
             let at = |row: usize, column: usize| frame["transform_matrix"][row][column].as_f64();
             let column = |c: usize| DVec3::from_array([0, 1, 2].map(|r| at(r, c).unwrap_or(9.0)));
@@ -277,14 +277,14 @@ const NERFSTUDIO: [Rule; 7] = [
                 && [0, 1, 2, 3].map(|c| at(3, c)) == [0.0, 0.0, 0.0, 1.0].map(Some)
         })
     }),
-    ("each intrinsic is at the top, or else in every frame", |_, top, frames| {
+    ("each intrinsic is at the top or in every frame", |_, top, frames| {
         ["fl_x", "fl_y", "cx", "cy", "w", "h"].iter().all(|key| {
             let everywhere = frames.iter().all(|frame| frame[key].is_number());
             top[key].is_number() && frames.iter().all(|frame| frame.get(key).is_none())
                 || everywhere
         })
     }),
-    ("the split is all three lists or none, of images that there are", |_, top, frames| {
+    ("the split has all three lists or none, of existing images", |_, top, frames| {
         let list = |key: &str| -> Option<BTreeSet<&str>> {
             Some(top.get(key)?.as_array()?.iter().map(text).collect())
         };
@@ -302,7 +302,7 @@ const NERFSTUDIO: [Rule; 7] = [
             _ => false,
         }
     }),
-    ("the points are there", |root, top, _| root.join(text(&top["ply_file_path"])).is_file()),
+    ("the points exist", |root, top, _| root.join(text(&top["ply_file_path"])).is_file()),
 ];
 
 fn text(value: &Value) -> &str {
@@ -310,7 +310,7 @@ fn text(value: &Value) -> &str {
 }
 
 #[test]
-fn nerfstudio_can_open_what_is_written() {
+fn nerfstudio_can_open_the_files() {
     let root = tempfile::tempdir().expect("folder");
     let mut zoomed = small();
     zoomed.views[1].camera.fx *= 1.5;
@@ -331,7 +331,7 @@ fn nerfstudio_can_open_what_is_written() {
             assert_eq!(focal(i), Some(view.camera.fx), "{name}: {}", view.name);
         }
     }
-    // Its default factor makes world units of what is stored.
+    // Its default factor converts stored depth to world units.
     let stored = fs::read(root.path().join("small/depth/test/r_000.npy")).expect("depth");
     let depth = &small().render(4).depth;
     let stored = stored[stored.len() - 4 * depth.len()..].as_chunks().0.iter();
@@ -341,10 +341,10 @@ fn nerfstudio_can_open_what_is_written() {
 }
 
 #[test]
-fn colmap_finds_every_point_where_its_track_says_and_as_wrong_as_it_says() {
+fn colmap_tracks_and_reprojection_errors_are_consistent() {
     let root = tempfile::tempdir().expect("folder");
     let folder = root.path().join("scene");
-    // Inside, outliers come to lie behind cameras.
+    // In a room, some outliers are behind cameras.
     let options = Options {
         size: Some((48, 48)),
         train: Some(24),
@@ -389,15 +389,15 @@ fn colmap_finds_every_point_where_its_track_says_and_as_wrong_as_it_says() {
         observed += distances.len();
         let mean = distances.iter().sum::<f64>() / distances.len() as f64;
         let expected = if distances.is_empty() { -1.0 } else { mean };
-        let told = number(&point[7]);
-        assert!((told - expected).abs() <= 1e-6 * (1.0 + expected), "{told}, not {expected}");
-        errors.push(told);
+        let error = number(&point[7]);
+        assert!((error - expected).abs() <= 1e-6 * (1.0 + expected), "{error}, not {expected}");
+        errors.push(error);
     }
     // Each feature belongs to one track.
     let features: usize = views.values().map(|(_, features)| features.len() / 3).sum();
     assert_eq!((errors.len(), features), (300, observed));
     errors.sort_by(f64::total_cmp);
-    // The room is some 50 px wide in its views: noise of a thousandth moves points by less than a pixel,
-    // outliers by many.
+    // The room is about 50 px wide in its views: noise of a thousandth moves points by less than a pixel, and
+    // outliers move by many.
     assert!((0.01..1.0).contains(&errors[150]) && errors[290] > 5.0, "{errors:?}");
 }

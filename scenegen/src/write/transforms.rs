@@ -1,11 +1,11 @@
 //! Writes `transforms_train.json` and `transforms_test.json` for readers of NeRF-synthetic (paths without
-//! ending), and `transforms.json` for nerfstudio (all views, files by their full names, depth).
+//! extension), and `transforms.json` for nerfstudio (all views, full file names, depth).
 
 use std::path::Path;
 
 use serde_json::{Value, json};
 
-use super::{mask_of, write_file};
+use super::{mask_path, write_file};
 use crate::camera::Camera;
 use crate::error::Error;
 use crate::lens::{Lens, LensKind};
@@ -27,10 +27,10 @@ pub(super) fn write(scene: &Scene, root: &Path) -> Result<(), Error> {
     Ok(())
 }
 
-/// The views of a split, with the fields of `first` at the top; views that differ repeat them.
+/// The views of a split, with the intrinsics `first` at the top; views with different ones have their own.
 fn synthetic(scene: &Scene, first: &Value, split: Split) -> Value {
     let frame = |view: &View| {
-        let mut frame = posed(view, format!("./images/{}", view.name));
+        let mut frame = frame_with_pose(view, format!("./images/{}", view.name));
         extend(&mut frame, &intrinsics(scene, &view.camera), |key, value| first[key] != *value);
         frame
     };
@@ -40,17 +40,17 @@ fn synthetic(scene: &Scene, first: &Value, split: Split) -> Value {
     top
 }
 
-/// All views. What nerfstudio finds at the top it takes for all of them, so intrinsics stand there
-/// only if all have the same.
+/// All views. nerfstudio applies intrinsics at the top to all views, so they are there only if all views have
+/// the same.
 fn nerfstudio(scene: &Scene, first: &Value) -> Value {
     let shared = scene.views.iter().all(|view| intrinsics(scene, &view.camera) == *first);
     let image = |view: &View| format!("images/{}.png", view.name);
     let frame = |view: &View| {
-        let mut frame = posed(view, image(view));
+        let mut frame = frame_with_pose(view, image(view));
         frame["depth_file_path"] = json!(format!("depth/{}.npy", view.name));
         extend(&mut frame, &intrinsics(scene, &view.camera), |_, _| !shared);
         if scene.options.passers_by > 0.0 {
-            frame["mask_path"] = json!(mask_of(&view.name));
+            frame["mask_path"] = json!(mask_path(&view.name));
         }
         frame
     };
@@ -63,7 +63,7 @@ fn nerfstudio(scene: &Scene, first: &Value) -> Value {
     let files = |split: Split| -> Value {
         scene.views.iter().filter(|view| view.split == split).map(image).collect()
     };
-    // Without views held out nerfstudio chooses some itself; an empty list would stop it.
+    // Without test views nerfstudio chooses some itself; an empty list would be an error.
     if scene.views.iter().any(|view| view.split == Split::Test) {
         for (key, split) in [("train", Split::Train), ("val", Split::Test), ("test", Split::Test)] {
             top[format!("{key}_filenames")] = files(split);
@@ -72,7 +72,7 @@ fn nerfstudio(scene: &Scene, first: &Value) -> Value {
     top
 }
 
-fn posed(view: &View, file: String) -> Value {
+fn frame_with_pose(view: &View, file: String) -> Value {
     json!({ "file_path": file, "transform_matrix": world_from_opengl(&view.camera) })
 }
 
@@ -85,7 +85,8 @@ fn extend(to: &mut Value, from: &Value, wanted: impl Fn(&str, &Value) -> bool) {
     }
 }
 
-/// The fields of a camera; of its lens too where any view has one, which the others must not inherit.
+/// The intrinsics of a camera, including lens parameters if any view has a lens, so that views without one do
+/// not inherit them.
 fn intrinsics(scene: &Scene, camera: &Camera) -> Value {
     let angle = |side: u32, focal: f64| 2.0 * (0.5 * f64::from(side) / focal).atan();
     let mut fields = json!({

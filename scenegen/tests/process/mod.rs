@@ -1,6 +1,6 @@
-//! What the system says of this process.
+//! Memory of this process, as reported by the system.
 
-/// A line of `/proc/self/status` `[bytes]`, where the system has one (proc(5): kB means 1,024 bytes).
+/// An entry of `/proc/self/status` `[bytes]`, on systems that have it (proc(5): kB means 1,024 bytes).
 pub(crate) fn status(key: &str) -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find_map(|line| line.strip_prefix(key))?;

@@ -1,25 +1,27 @@
-//! Builds houses: walls of bays and floors under a gabled or a flat roof.
+//! Houses: walls of bays and floors under a gabled or a flat roof.
 
 use glam::{DVec3, Vec2, dvec3};
 
-use super::skins::{BAYS, Walls};
-use super::{BLOCK, Place, Town};
+use super::materials::{BAYS, Walls};
+use super::{BLOCK, LocalFrame, Town};
 use crate::random::Draws;
 
 /// Height of a floor.
 const FLOOR: f64 = 2.9;
-/// Width of a bay, about.
+/// Approximate width of a bay.
 const BAY: f64 = 2.6;
-/// How far a gabled roof reaches beyond its walls, and how thick it is.
+/// Overhang of a gabled roof.
 const EAVES: f64 = 0.45;
+/// Thickness of a gabled roof.
 const ROOF: f64 = 0.2;
-/// Height and thickness of the wall about a flat roof.
+/// Height and thickness of the wall around a flat roof.
 const PARAPET: [f64; 2] = [0.6, 0.25];
 
-/// The walls of a house: half its width and depth, floors.
+/// The walls of a house.
 #[derive(Debug, Clone, Copy)]
 struct Shell {
-    place: Place,
+    place: LocalFrame,
+    /// Half its width and depth.
     half: [f64; 2],
     floors: u32,
     walls: Walls,
@@ -35,25 +37,26 @@ pub(super) fn between(draws: &mut Draws, low: f64, high: f64) -> f64 {
     low + (high - low) * draws.unit64()
 }
 
-/// One of a list.
+/// A random element of a list.
 pub(super) fn one_of<T: Copy>(draws: &mut Draws, list: &[T]) -> T {
     list[(draws.unit64() * list.len() as f64) as usize]
 }
 
 impl Town {
-    /// Four houses on each of two sides, gardens with hedges and trees between them.
+    /// Four houses on each of two sides, with gardens, hedges and trees between them.
     pub(super) fn houses(&mut self, middle: DVec3, draws: &mut Draws) {
-        let grass = self.skins.grass;
+        let grass = self.materials.grass;
         self.level(middle, [BLOCK; 2], [3.25; 2], grass);
         for front in [DVec3::Z, DVec3::NEG_Z] {
-            let side = Place::facing(middle, front);
+            let side = LocalFrame::facing(middle, front);
             for plot in 0..4 {
                 let aside = 9.4 * (f64::from(plot) - 1.5);
                 let half = [between(draws, 3.3, 4.2), between(draws, 3.9, 4.6)];
                 let set_back = between(draws, 1.2, 2.4);
-                let place = Place::facing(side.at(aside, 0.0, BLOCK - set_back - half[1]), front);
+                let place =
+                    LocalFrame::facing(side.at(aside, 0.0, BLOCK - set_back - half[1]), front);
                 let floors = 2 + (draws.unit64() * 2.4) as u32;
-                let walls = one_of(draws, &self.skins.houses);
+                let walls = one_of(draws, &self.materials.houses);
                 let shell = Shell { place, half, floors, walls };
                 if draws.unit64() < 0.72 {
                     self.gabled(shell, draws);
@@ -63,28 +66,28 @@ impl Town {
                 self.garden(&side, aside, draws);
             }
         }
-        let hedge = Place::facing(middle, DVec3::Z);
+        let hedge = LocalFrame::facing(middle, DVec3::Z);
         for plot in 1..4 {
             let at = hedge.at(9.4 * (f64::from(plot) - 2.0), 0.6, 0.0);
-            let skin = self.skins.crowns[2];
-            self.block(&hedge, at, dvec3(0.25, 0.6, 7.5), skin);
+            let material = self.materials.crowns[2];
+            self.block(&hedge, at, dvec3(0.25, 0.6, 7.5), material);
         }
     }
 
-    /// Two slabs of flats about a paved yard with a row of trees.
+    /// Two slabs of flats on either side of a paved yard with a row of trees.
     pub(super) fn flats(&mut self, middle: DVec3, draws: &mut Draws) {
-        let paving = self.skins.paving;
+        let paving = self.materials.paving;
         self.level(middle, [BLOCK; 2], [6.5; 2], paving);
         let way = if draws.unit64() < 0.5 { DVec3::Z } else { DVec3::X };
         for front in [way, -way] {
             let half = [between(draws, 15.0, 17.5), 5.2];
-            let place = Place::facing(middle + (BLOCK - 1.8 - half[1]) * front, front);
+            let place = LocalFrame::facing(middle + (BLOCK - 1.8 - half[1]) * front, front);
             let floors = 4 + (draws.unit64() * 3.0) as u32;
-            let shell = Shell { place, half, floors, walls: one_of(draws, &self.skins.flats) };
+            let shell = Shell { place, half, floors, walls: one_of(draws, &self.materials.flats) };
             self.flat(shell, draws);
             self.balconies(&shell);
         }
-        let yard = Place::facing(middle, way);
+        let yard = LocalFrame::facing(middle, way);
         for tree in 0..5 {
             let aside = 6.5 * (f64::from(tree) - 2.0) + between(draws, -0.8, 0.8);
             let front = between(draws, -2.0, 2.0);
@@ -92,14 +95,14 @@ impl Town {
         }
     }
 
-    /// The four walls: a ground floor and the floors above it.
+    /// The four walls of a house, with different images for the ground floor and the floors above.
     fn walls(&mut self, shell: &Shell, draws: &mut Draws) {
         let ([w, d], place) = (shell.half, shell.place);
         let sides = [
-            (place.at(-w, 0.0, d), place.way(2.0 * w, 0.0, 0.0)),
-            (place.at(w, 0.0, d), place.way(0.0, 0.0, -2.0 * d)),
-            (place.at(w, 0.0, -d), place.way(-2.0 * w, 0.0, 0.0)),
-            (place.at(-w, 0.0, -d), place.way(0.0, 0.0, 2.0 * d)),
+            (place.at(-w, 0.0, d), place.direction(2.0 * w, 0.0, 0.0)),
+            (place.at(w, 0.0, d), place.direction(0.0, 0.0, -2.0 * d)),
+            (place.at(w, 0.0, -d), place.direction(-2.0 * w, 0.0, 0.0)),
+            (place.at(-w, 0.0, -d), place.direction(0.0, 0.0, 2.0 * d)),
         ];
         for (corner, along) in sides {
             let bays = (along.length() / BAY).round().max(1.0) as f32 / BAYS as f32;
@@ -121,19 +124,19 @@ impl Town {
         let place = if across { shell.place.turned() } else { shell.place };
         let slope = between(draws, 33.0, 47.0).to_radians();
         let (eaves, rise) = (shell.top(), d * slope.tan());
-        let tiles = one_of(draws, &self.skins.tiles);
+        let tiles = one_of(draws, &self.materials.tiles);
         for side in [place, place.turned().turned()] {
-            // The wall under the roof's end.
+            // The gable wall.
             let corners =
                 [side.at(w, eaves, d), side.at(w, eaves, -d), side.at(w, eaves + rise, 0.0)];
             let (wide, high) = (2.0 * d as f32 / 3.0, rise as f32 / 3.0);
             let uvs = [Vec2::ZERO, Vec2::new(wide, 0.0), Vec2::new(0.5 * wide, -high)];
             self.model.add(&corners, &[], &uvs, &[[0, 1, 2]], shell.walls.plain);
-            // The roof's slope to the front. Both meet over the ridge.
+            // The slope to the front. Both slopes meet at the ridge.
             let (down, out) = (EAVES * slope.sin(), EAVES * slope.cos());
             let corner = side.at(-w - EAVES, eaves - down, d + out);
-            let along = side.way(2.0 * (w + EAVES), 0.0, 0.0);
-            let up = side.way(0.0, rise + down, -d - out);
+            let along = side.direction(2.0 * (w + EAVES), 0.0, 0.0);
+            let up = side.direction(0.0, rise + down, -d - out);
             let times = [along.length() / 3.0, up.length() / 3.0];
             self.slab(corner, [along, up, ROOF / slope.cos() * DVec3::Y], times, tiles);
         }
@@ -143,14 +146,15 @@ impl Town {
         self.block(&place, middle, dvec3(0.35, 0.5 * (top - bottom), 0.3), shell.walls.plain);
     }
 
-    /// A house with a flat roof behind a parapet, and a hut for the stairs on it.
+    /// A house with a flat roof behind a parapet, and a stairwell hut on the roof.
     fn flat(&mut self, shell: Shell, draws: &mut Draws) {
         self.walls(&shell, draws);
         let ([w, d], place, top) = (shell.half, shell.place, shell.top());
         let roof = place.at(-w, top, d);
-        let (along, back) = (place.way(2.0 * w, 0.0, 0.0), place.way(0.0, 0.0, -2.0 * d));
+        let (along, back) =
+            (place.direction(2.0 * w, 0.0, 0.0), place.direction(0.0, 0.0, -2.0 * d));
         let times = [w as f32 / 2.0, d as f32 / 2.0];
-        let (gravel, concrete) = (self.skins.gravel, self.skins.concrete);
+        let (gravel, concrete) = (self.materials.gravel, self.materials.concrete);
         self.model.tiled(roof, along, back, [0.0, 1.0], times, gravel);
         let [high, thick] = PARAPET.map(|side| 0.5 * side);
         for sign in [-1.0, 1.0] {
@@ -165,11 +169,11 @@ impl Town {
         self.block(&place, middle, hut, shell.walls.plain);
     }
 
-    /// A balcony in every other bay of the upper floors' fronts.
+    /// A balcony in every other bay of the front, on all upper floors.
     fn balconies(&mut self, shell: &Shell) {
         let ([w, d], place) = (shell.half, shell.place);
         let count = (2.0 * w / BAY).round();
-        let concrete = self.skins.concrete;
+        let concrete = self.materials.concrete;
         for floor in 1..shell.floors {
             for bay in (0..count as u32).skip(1).step_by(2) {
                 let aside = 2.0 * w * ((f64::from(bay) + 0.5) / count - 0.5);

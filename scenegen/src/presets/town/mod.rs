@@ -1,22 +1,22 @@
-//! `town`: streets, houses and trees, as large as is asked for: `town:4` has 4 x 4 blocks.
+//! `town`: streets, houses and trees of a given size: `town:4` has 4 x 4 blocks.
 //!
-//! Ground at y = 0, without relief. Streets 11 m wide, of which 2 m on each side are pavement, run along x
-//! and z every 50 m, about every block and about the town's edge; the middle of the town is the origin.
-//! Between them are blocks of 39 x 39 m, in turn of houses, flats, houses, a park (the seed says with which
-//! the turn begins), and around the town 30 m of meadow with trees.
+//! The ground is flat at y = 0. Streets 11 m wide, including 2 m of pavement on each side, run along x and z
+//! every 50 m, around every block and around the town; the centre of the town is the origin. Blocks are
+//! 39 x 39 m and cycle through houses, flats and parks, starting at a position given by the seed. Around the
+//! town is a meadow of 30 m with trees.
 //!
 //! Houses (`houses.rs`) are closed solids, eight to a block, of two to four floors of 2.9 m, with gabled or
 //! flat roofs; blocks of flats have two slabs of four to six floors with balconies. Trees (`outdoors.rs`) have a
 //! trunk and a lumpy crown of 320 triangles. Cars are parked along the streets, lamps (thin structures, 12 cm)
-//! stand on the pavement. Windows, doors and road markings are painted. All Lambert. About 9,000 triangles
-//! per block; the layout follows from the seed.
+//! stand on the pavement. Windows, doors and road markings are painted. All Lambert. There are about 9,000
+//! triangles per block; the seed determines the layout.
 //!
-//! For each block there are 24 training views, two thirds from 45 m above and a third from the street
-//! at 1.7 m, and 6 test views.
+//! Each block has 24 training views, two thirds from 45 m above and a third from the street at 1.7 m, and 6
+//! test views.
 
 mod houses;
+mod materials;
 mod outdoors;
-mod skins;
 
 use glam::{DVec3, dvec3};
 
@@ -24,30 +24,30 @@ use super::{Build, Preset, Staging};
 use crate::mesh::Model;
 use crate::random::Draws;
 use crate::rig::{Rig, RigKind, Survey};
-use skins::Skins;
+use materials::Materials;
 
 pub(super) const PRESET: Preset = Preset {
     name: "town",
-    summary: "streets of houses and trees, from above and from the street; town:4 has 4x4 blocks (1 to 16, else 2)",
-    build: Build::Sized { usual: 2, most: 16, build },
+    summary: "streets, houses and trees, from above and from the street; town:4 has 4x4 blocks (1 to 16; default 2)",
+    build: Build::Sized { default: 2, most: 16, build },
 };
 
-/// From the middle of a street to that of the next.
+/// Distance between the centre lines of neighbouring streets.
 const PITCH: f64 = 50.0;
-/// Half a street, pavement included.
+/// Half the width of a street, including pavements.
 const STREET: f64 = 5.5;
-/// Half a block.
+/// Half the side of a block.
 const BLOCK: f64 = 0.5 * PITCH - STREET;
 /// Width of the meadow around the town.
 const MEADOW: f64 = 30.0;
-/// Height of the flight over the town.
+/// Height of the views from above.
 const FLIGHT: f64 = 45.0;
-/// Height of the eye in the street.
+/// Height of the views from the street.
 const EYE: f64 = 1.7;
-/// Least distance of a camera from any surface.
+/// Smallest distance of a camera from any surface.
 const CLEARANCE: f64 = 0.5;
 
-/// What stands on a block.
+/// The use of a block.
 #[derive(Debug, Clone, Copy)]
 enum Use {
     Houses,
@@ -55,19 +55,19 @@ enum Use {
     Park,
 }
 
-/// What blocks are, one after the other.
+/// The cycle of uses of consecutive blocks.
 const USES: [Use; 6] = [Use::Houses, Use::Flats, Use::Houses, Use::Park, Use::Houses, Use::Flats];
 
-/// The town as it is built.
+/// A town under construction.
 struct Town {
     model: Model,
-    skins: Skins,
+    materials: Materials,
 }
 
 fn build(size: u32, seed: u64) -> Staging {
     let mut model = Model::default();
-    let skins = Skins::paint(&mut model);
-    let mut town = Town { model, skins };
+    let materials = Materials::paint(&mut model);
+    let mut town = Town { model, materials };
     town.ground(size);
     for block in 0..size * size {
         let (column, row) = (block % size, block / size);
@@ -107,12 +107,12 @@ fn build(size: u32, seed: u64) -> Staging {
     Staging { rig, ..Staging::outdoors(town.model) }
 }
 
-/// Where the middle of street number `i` of the `size + 1` in a direction is, along the other direction.
+/// Position of the centre line of the `i`-th of `size + 1` parallel streets.
 fn crossing(size: u32, i: u32) -> f64 {
     PITCH * (f64::from(i) - 0.5 * f64::from(size))
 }
 
-/// Both ends of each street's middle: those along x and those along z, in turn.
+/// Both ends of each street's centre line, alternately along x and along z.
 fn streets(size: u32) -> impl Iterator<Item = [DVec3; 2]> {
     let end = crossing(size, size);
     (0..=size).flat_map(move |i| {
@@ -122,54 +122,54 @@ fn streets(size: u32) -> impl Iterator<Item = [DVec3; 2]> {
     })
 }
 
-/// A direction on the ground and that to its right: where a thing has its front and how wide it is.
+/// The local coordinate frame of an object on the ground.
 #[derive(Debug, Clone, Copy)]
-struct Place {
+struct LocalFrame {
     origin: DVec3,
     right: DVec3,
     front: DVec3,
 }
 
-impl Place {
-    /// With its front towards `front`, which is an axis.
+impl LocalFrame {
+    /// A frame whose front is towards `front`, a coordinate axis.
     fn facing(origin: DVec3, front: DVec3) -> Self {
         Self { origin, right: DVec3::Y.cross(front), front }
     }
 
-    /// The same place, a quarter turn on.
+    /// The frame after a quarter turn.
     fn turned(self) -> Self {
         Self::facing(self.origin, self.right)
     }
 
-    /// A direction: to the right, up, to the front.
-    fn way(&self, right: f64, up: f64, front: f64) -> DVec3 {
+    /// A vector from its components to the right, up, and to the front.
+    fn direction(&self, right: f64, up: f64, front: f64) -> DVec3 {
         right * self.right + up * DVec3::Y + front * self.front
     }
 
     fn at(&self, right: f64, up: f64, front: f64) -> DVec3 {
-        self.origin + self.way(right, up, front)
+        self.origin + self.direction(right, up, front)
     }
 }
 
 impl Town {
-    /// The horizontal rectangle about a place, its image repeated so often.
-    fn level(&mut self, middle: DVec3, half: [f64; 2], times: [f64; 2], skin: u32) {
+    /// A horizontal rectangle around `middle`, its image repeated `times` in each direction.
+    fn level(&mut self, middle: DVec3, half: [f64; 2], times: [f64; 2], material: u32) {
         let [x, z] = half;
         let (u, v) = (2.0 * x * DVec3::X, -2.0 * z * DVec3::Z);
         let times = times.map(|times| times as f32);
-        self.model.tiled(middle + dvec3(-x, 0.0, z), u, v, [0.0, 1.0], times, skin);
+        self.model.tiled(middle + dvec3(-x, 0.0, z), u, v, [0.0, 1.0], times, material);
     }
 
-    /// A box that stands upright on `place`, with half sides to the right, up and to the front.
-    fn block(&mut self, place: &Place, middle: DVec3, half: DVec3, skin: u32) {
-        let corner = middle - place.way(half.x, half.y, half.z);
+    /// An upright box in the frame `place`, with half sides to the right, up and to the front.
+    fn block(&mut self, place: &LocalFrame, middle: DVec3, half: DVec3, material: u32) {
+        let corner = middle - place.direction(half.x, half.y, half.z);
         let sides = [(half.x, 0.0, 0.0), (0.0, 0.0, half.z), (0.0, half.y, 0.0)]
-            .map(|(right, up, front)| 2.0 * place.way(right, up, front));
-        self.slab(corner, sides, [1.0; 2], skin);
+            .map(|(right, up, front)| 2.0 * place.direction(right, up, front));
+        self.slab(corner, sides, [1.0; 2], material);
     }
 
-    /// The solid of three sides from a corner, its image repeated on the faces of the first two.
-    fn slab(&mut self, corner: DVec3, sides: [DVec3; 3], times: [f64; 2], skin: u32) {
+    /// A parallelepiped of three sides from a corner, its image repeated along the first two.
+    fn slab(&mut self, corner: DVec3, sides: [DVec3; 3], times: [f64; 2], material: u32) {
         let [mut a, mut b, c] = sides;
         if a.cross(b).dot(c) < 0.0 {
             (a, b) = (b, a);
@@ -184,13 +184,13 @@ impl Town {
             (corner, c, b, [1.0, y]),
         ];
         for (corner, u, v, times) in faces {
-            self.model.tiled(corner, u, v, [0.0, 1.0], times, skin);
+            self.model.tiled(corner, u, v, [0.0, 1.0], times, material);
         }
     }
 
-    /// Streets, crossings, and the meadow around them. Blocks bring their own ground.
+    /// Streets, crossings, and the meadow around them. Each block adds its own ground.
     fn ground(&mut self, size: u32) {
-        let Skins { street, street_across, crossing: crossed, grass, .. } = self.skins;
+        let Materials { street, street_across, crossing: crossed, grass, .. } = self.materials;
         for column in 0..=size {
             for row in 0..=size {
                 let at = dvec3(crossing(size, column), 0.0, crossing(size, row));

@@ -1,4 +1,4 @@
-//! A town's views are of its outside, and it grows with its size.
+//! Tests of a town's views and of its growth with its size.
 
 use glam::DVec2;
 
@@ -15,7 +15,7 @@ fn town(size: u32, seed: u64) -> (Staging, Surface, [Vec<Camera>; 2]) {
     (staging, surface, [train, test])
 }
 
-/// What a view shows at the middles of 16 x 12 cells.
+/// The surface that a view shows at the centres of 16 x 12 cells.
 fn seen(surface: &Surface, camera: &Camera) -> Vec<Option<SurfaceHit>> {
     let cell = DVec2::new(f64::from(camera.width) / 16.0, f64::from(camera.height) / 12.0);
     let ray = |i: u32| {
@@ -47,13 +47,13 @@ fn no_view_is_from_inside_a_solid_and_most_of_each_is_surface() {
 fn views_are_from_above_and_from_the_street() {
     let (staging, _, [train, test]) = town(2, 0);
     let [above, below] = [true, false].map(|is_above| {
-        let of = |views: &[Camera]| {
+        let count = |views: &[Camera]| {
             views.iter().filter(|c| (c.centre.y > 0.5 * FLIGHT) == is_above).count()
         };
-        (of(&train), of(&test))
+        (count(&train), count(&test))
     });
     assert_eq!((above, below), ((64, 16), (32, 8)));
-    // On the carriageway of a street, whose ends are crossings.
+    // Street views are on a carriageway.
     let streets: Vec<[DVec3; 2]> = streets(2).collect();
     for camera in train.iter().chain(&test).filter(|c| c.centre.y < 0.5 * FLIGHT) {
         let off = |[a, b]: &[DVec3; 2]| {
@@ -68,7 +68,7 @@ fn views_are_from_above_and_from_the_street() {
 }
 
 #[test]
-fn a_town_grows_with_its_size_and_follows_from_its_seed() {
+fn a_town_grows_with_its_size_and_is_determined_by_its_seed() {
     let sizes = [1, 2, 4].map(|size| build(size, 0));
     for (staging, blocks) in sizes.iter().zip([1, 4, 16]) {
         assert_eq!((staging.rig.train, staging.rig.test), (24 * blocks, 6 * blocks));
@@ -88,7 +88,7 @@ fn a_town_grows_with_its_size_and_follows_from_its_seed() {
 
 #[test]
 fn houses_are_closed() {
-    // From within the walls every way but that to the ground ends at the house, most at a wall's back.
+    // Every horizontal or upward ray from inside hits the house, and most hit the back of a wall.
     let (_, surface, _) = town(1, 0);
     for plot in 0..4 {
         let middle = dvec3(9.4 * (f64::from(plot) - 1.5), 1.5, 13.0);

@@ -1,4 +1,4 @@
-//! Reads how a built-in scene is asked for: by its name and, if it has one, its size: `room`, `town:4`.
+//! Parses the name and optional size of a built-in scene: `room`, `town:4`.
 
 use std::fmt;
 use std::str::FromStr;
@@ -6,24 +6,24 @@ use std::str::FromStr;
 use super::{Build, PRESETS, Preset, Staging};
 use crate::error::Error;
 
-/// A built-in scene and its size. Written as it is read, without a size that is the usual one.
+/// A built-in scene and its size. Printed in the form that is parsed, without a default size.
 #[derive(Debug, Clone, Copy)]
-pub struct AskedPreset {
+pub struct PresetSpec {
     preset: Preset,
     size: Option<u32>,
 }
 
-impl AskedPreset {
-    /// The scene. Only those that have a size depend on the seed.
+impl PresetSpec {
+    /// Builds the scene. Only scenes with a size depend on the seed.
     pub(crate) fn build(&self, seed: u64) -> Staging {
         match self.preset.build {
             Build::Fixed(build) => build(),
-            Build::Sized { usual, build, .. } => build(self.size.unwrap_or(usual), seed),
+            Build::Sized { default, build, .. } => build(self.size.unwrap_or(default), seed),
         }
     }
 }
 
-impl FromStr for AskedPreset {
+impl FromStr for PresetSpec {
     type Err = Error;
 
     fn from_str(text: &str) -> Result<Self, Error> {
@@ -37,15 +37,15 @@ impl FromStr for AskedPreset {
         let size = match (size, preset.build) {
             (None, _) => None,
             (Some(_), Build::Fixed(_)) => {
-                let problem = format!("the preset {name} has one size only; write {name}");
+                let problem = format!("the preset {name} has a fixed size; write {name}");
                 return Err(Error::Input(format!("{text}: {problem}")));
             }
-            (Some(size), Build::Sized { usual, most, .. }) => {
+            (Some(size), Build::Sized { default, most, .. }) => {
                 match size.parse().ok().filter(|size| (1..=most).contains(size)) {
-                    Some(size) => Some(size).filter(|&size| size != usual),
+                    Some(size) => Some(size).filter(|&size| size != default),
                     None => {
                         return Err(Error::Input(format!(
-                            "{text}: {size:?} is no size of the preset {name}; write {name}:1 to {name}:{most}"
+                            "{text}: {size:?} is not a size of the preset {name}; write {name}:1 to {name}:{most}"
                         )));
                     }
                 }
@@ -55,7 +55,7 @@ impl FromStr for AskedPreset {
     }
 }
 
-impl fmt::Display for AskedPreset {
+impl fmt::Display for PresetSpec {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.preset.name)?;
         self.size.map_or(Ok(()), |size| write!(f, ":{size}"))
@@ -71,7 +71,7 @@ mod tests {
         for (text, written) in
             [("room", "room"), ("town", "town"), ("town:2", "town"), ("town:04", "town:4")]
         {
-            let read: AskedPreset = text.parse().unwrap_or_else(|e| panic!("{text}: {e}"));
+            let read: PresetSpec = text.parse().unwrap_or_else(|e| panic!("{text}: {e}"));
             assert_eq!(read.to_string(), written, "{text}");
         }
         for (text, word) in [
@@ -85,7 +85,7 @@ mod tests {
             ("town:4:4", "town:1 to town:16"),
             ("../town", "spheres, thin"),
         ] {
-            let error = text.parse::<AskedPreset>().expect_err(text).to_string();
+            let error = text.parse::<PresetSpec>().expect_err(text).to_string();
             assert!(error.contains(word) && error.contains(text), "{error}");
         }
     }

@@ -1,5 +1,5 @@
-//! Paints what a town is covered with. An image shows some metres and repeats; colours that differ from house
-//! to house are factors on it.
+//! Materials of a town. Each image covers some metres and repeats; colours that vary between houses are factors
+//! on it.
 
 use glam::{DVec2, Vec3, Vec4, dvec2};
 
@@ -8,7 +8,7 @@ use crate::primitives::{marbled, noise};
 use crate::random::Draws;
 use crate::texture::TextureRef;
 
-/// Bays along a wall, and floors up it, that an image of windows shows.
+/// Number of bays and of floors in an image of windows.
 pub(super) const BAYS: u32 = 4;
 
 /// The materials of a house's walls.
@@ -22,9 +22,9 @@ pub(super) struct Walls {
     pub(super) plain: u32,
 }
 
-/// All materials, by what they are for.
+/// All materials, by their use.
 #[derive(Debug, Clone)]
-pub(super) struct Skins {
+pub(super) struct Materials {
     /// 12 x 12 m.
     pub(super) grass: u32,
     /// A street along z, its whole width.
@@ -52,7 +52,7 @@ pub(super) struct Skins {
     pub(super) globe: u32,
 }
 
-impl Skins {
+impl Materials {
     pub(super) fn paint(model: &mut Model) -> Self {
         let ground = |at: DVec2| marbled(at, 12, 71, [0.1, 0.19, 0.04], [0.3, 0.4, 0.14]);
         let grass = model.painted("grass", 256, ground);
@@ -122,8 +122,8 @@ impl Skins {
     }
 }
 
-/// What a wall is made of, within the unit square of its image: 3 m, or a bay.
-type Surfacing = fn(DVec2) -> Vec3;
+/// The colour of a wall over the unit square of an image, which covers 3 m or a bay.
+type WallPattern = fn(DVec2) -> Vec3;
 
 fn tinted(model: &mut Model, name: &str, image: TextureRef, tint: [f32; 3]) -> u32 {
     let base: Vec4 = Vec3::from(tint).extend(1.0);
@@ -137,8 +137,8 @@ fn tinted(model: &mut Model, name: &str, image: TextureRef, tint: [f32; 3]) -> u
 
 /// The walls of houses, of plaster and of brick, and those of flats.
 fn all_walls(model: &mut Model) -> (Vec<Walls>, Vec<Walls>) {
-    let plaster: Surfacing = |at| marbled(at, 8, 74, [0.72; 3], [0.88; 3]);
-    let brick: Surfacing = |at| {
+    let plaster: WallPattern = |at| marbled(at, 8, 74, [0.72; 3], [0.88; 3]);
+    let brick: WallPattern = |at| {
         let row = (at.y * 40.0).floor();
         let joint = (at.y * 40.0).fract() < 0.16 || (at.x * 14.0 + 0.5 * row).fract() < 0.06;
         let tone = marbled(at, 32, 75, [0.55; 3], [1.0; 3]);
@@ -146,7 +146,7 @@ fn all_walls(model: &mut Model) -> (Vec<Walls>, Vec<Walls>) {
     };
     let plastered = walls(model, plaster, 0.46);
     let bricks = walls(model, brick, 0.42);
-    let panels: Surfacing = |at| {
+    let panels: WallPattern = |at| {
         let joint = (at * 4.0).fract().min_element() < 0.02;
         marbled(at, 16, 76, [0.7; 3], [0.85; 3]) * if joint { 0.6 } else { 1.0 }
     };
@@ -178,12 +178,12 @@ fn roofs(model: &mut Model) -> Vec<u32> {
     roofs.map(|tint| tinted(model, "roof", tiles, tint)).to_vec()
 }
 
-/// Images of a ground floor, of windows, and of neither.
-fn walls(model: &mut Model, surfacing: Surfacing, width: f64) -> [TextureRef; 3] {
+/// Images of a ground floor, of upper floors with windows, and of a plain wall.
+fn walls(model: &mut Model, pattern: WallPattern, width: f64) -> [TextureRef; 3] {
     [
-        model.paint(256, |at| bay(dvec2(at.x, 0.0), at, surfacing, width, true)),
-        model.paint(512, |at| bay(at, (at * f64::from(BAYS)).fract(), surfacing, width, false)),
-        model.paint(256, surfacing),
+        model.paint(256, |at| bay(dvec2(at.x, 0.0), at, pattern, width, true)),
+        model.paint(512, |at| bay(at, (at * f64::from(BAYS)).fract(), pattern, width, false)),
+        model.paint(256, pattern),
     ]
 }
 
@@ -192,16 +192,16 @@ fn of_tint(model: &mut Model, images: [TextureRef; 3], tint: [f32; 3]) -> Walls 
     Walls { ground, upper, plain }
 }
 
-/// A bay of a wall: a window as wide as the given share of it, or a door. `at` is the place in the image;
-/// in `within`, y is that in the floor.
-fn bay(at: DVec2, within: DVec2, surfacing: Surfacing, width: f64, with_door: bool) -> Vec3 {
+/// The colour of a bay of a wall, with a window whose width is a share of the bay's, or a door. `at` is the
+/// position in the image; y of `within` is the position within the floor.
+fn bay(at: DVec2, within: DVec2, pattern: WallPattern, width: f64, with_door: bool) -> Vec3 {
     let (number, floor) = ((at.x * f64::from(BAYS)).floor(), (at.y * f64::from(BAYS)).floor());
     let within = dvec2((at.x * f64::from(BAYS)).fract(), within.y);
     let is_door = with_door && number as u32 == 1;
     let (top, bottom) = if is_door { (0.22, 1.0) } else { (0.2, 0.74) };
     let half = if is_door { 0.2 } else { 0.5 * width };
     let aside = (within.x - 0.5).abs();
-    let wall = surfacing(within);
+    let wall = pattern(within);
     if aside > half || within.y < top || within.y > bottom {
         let sill = !is_door && aside < half + 0.03 && (bottom..bottom + 0.05).contains(&within.y);
         let base = with_door && within.y > 0.9;
@@ -231,7 +231,7 @@ fn bay(at: DVec2, within: DVec2, surfacing: Surfacing, width: f64, with_door: bo
     if curtain { Vec3::new(tone, 0.95 * tone, 0.85 * tone) * fold } else { glass }
 }
 
-/// 10 m of a street along y, the pavements left and right.
+/// 10 m of a street along y, with pavements left and right.
 fn street(at: DVec2) -> Vec3 {
     let side = 11.0 * (at.x - 0.5);
     let along = 10.0 * at.y;
@@ -247,7 +247,7 @@ fn street(at: DVec2) -> Vec3 {
     }
 }
 
-/// Where two streets meet, with pavement at its corners and zebras on all sides.
+/// A crossing with pavement at its corners and zebra crossings on all sides.
 fn crossing(at: DVec2) -> Vec3 {
     let out = (11.0 * (at - 0.5)).abs();
     if out.min_element() > 3.5 {

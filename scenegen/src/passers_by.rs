@@ -1,5 +1,5 @@
-//! People who walk through while photographs are taken: figures of ellipsoids between the camera and the
-//! scene, in another place in each view, with a mask of where they hide it.
+//! People who walk through the scene while it is photographed: figures of ellipsoids between camera and scene,
+//! in a different position in each view, with a mask of the pixels they cover.
 
 use glam::{DVec2, DVec3, Vec3};
 
@@ -8,22 +8,22 @@ use crate::random::Draws;
 use crate::texture::encode;
 use crate::trace::Frame;
 
-/// Stream of the random passers-by.
+/// Key of the random stream.
 const STREAM: u64 = 0x7061_7373_6572_7300;
-/// Rays along each side of a pixel.
+/// Number of rays along each side of a pixel.
 const GRID: u32 = 3;
-/// Towards the light, in the camera's axes.
+/// Direction towards the light, in camera axes.
 const LIGHT: DVec3 = DVec3::new(-0.48, -0.64, -0.6);
 
-/// An ellipsoid along the camera's axes.
+/// An ellipsoid aligned with the camera's axes.
 struct Part {
     centre: DVec3,
     half: DVec3,
     colour: Vec3,
 }
 
-/// Which of so many views have passers-by: this share of them, rounded, drawn by the seed.
-pub(crate) fn chosen(seed: u64, views: usize, share: f64) -> Vec<bool> {
+/// Selects the views with passers-by: the rounded share of all `views`, drawn by the seed.
+pub(crate) fn select_views(seed: u64, views: usize, share: f64) -> Vec<bool> {
     let mut order: Vec<usize> = (0..views).collect();
     order.sort_by_key(|&view| (Draws::new(seed, &[STREAM, view as u64, 1]).bits(), view));
     let mut chosen = vec![false; views];
@@ -33,8 +33,8 @@ pub(crate) fn chosen(seed: u64, views: usize, share: f64) -> Vec<bool> {
     chosen
 }
 
-/// Draws one or two figures into the photograph of a view, and their mask.
-pub(crate) fn walk_into(
+/// Draws one or two figures into the photograph of a view and into its mask.
+pub(crate) fn draw(
     frame: &mut Frame,
     camera: &Camera,
     seed: u64,
@@ -42,7 +42,7 @@ pub(crate) fn walk_into(
     gains: Option<[f32; 3]>,
 ) {
     let mut draws = Draws::new(seed, &[STREAM, view as u64, 2]);
-    let Some(depth) = middle_depth(frame) else { return };
+    let Some(depth) = median_depth(frame) else { return };
     let count = 1 + draws.bits() % 2;
     let parts: Vec<Part> = (0..count).flat_map(|_| figure(camera, depth, &mut draws)).collect();
     let gains = gains.map_or(Vec3::ONE, Vec3::from);
@@ -57,7 +57,7 @@ pub(crate) fn walk_into(
             0.0 => f64::INFINITY,
             depth => f64::from(depth),
         };
-        let (colour, cover) = seen(&parts, camera, corner, behind);
+        let (colour, cover) = trace(&parts, camera, corner, behind);
         if cover > 0.0 {
             *mask = 0;
             *pixel = over(colour * gains / cover, cover, *pixel);
@@ -67,15 +67,15 @@ pub(crate) fn walk_into(
     frame.mask = Some(mask);
 }
 
-/// The median depth of a view; `None` where it shows nothing.
-fn middle_depth(frame: &Frame) -> Option<f64> {
+/// The median depth of a view; `None` if the view is empty.
+fn median_depth(frame: &Frame) -> Option<f64> {
     let mut depths: Vec<f32> = frame.depth.iter().copied().filter(|&depth| depth > 0.0).collect();
     let middle = depths.len() / 2;
     (!depths.is_empty())
         .then(|| f64::from(*depths.select_nth_unstable_by(middle, f32::total_cmp).1))
 }
 
-/// A figure of a third to two thirds of the picture's height, well before what the view shows.
+/// A figure of one to two thirds of the image's height, well in front of the scene.
 fn figure(camera: &Camera, depth: f64, draws: &mut Draws) -> [Part; 4] {
     let mut between = |low: f64, high: f64| low + (high - low) * draws.unit64();
     let distance = depth * between(0.35, 0.65);
@@ -102,31 +102,31 @@ fn figure(camera: &Camera, depth: f64, draws: &mut Draws) -> [Part; 4] {
     ]
 }
 
-/// Sum of the light, and share of the rays, of a pixel that meets a figure before this depth.
-fn seen(parts: &[Part], camera: &Camera, corner: DVec2, behind: f64) -> (Vec3, f32) {
+/// Sum of the radiance, and share of the rays, of a pixel that hit a figure nearer than this depth.
+fn trace(parts: &[Part], camera: &Camera, corner: DVec2, behind: f64) -> (Vec3, f32) {
     let axes = camera.world_from_camera.transpose();
-    let (mut sum, mut met) = (Vec3::ZERO, 0);
+    let (mut sum, mut hits) = (Vec3::ZERO, 0);
     for ray in 0..GRID * GRID {
-        let place = DVec2::new(f64::from(ray % GRID), f64::from(ray / GRID)) + 0.5;
-        let direction = axes * camera.direction(corner + place / f64::from(GRID));
+        let offset = DVec2::new(f64::from(ray % GRID), f64::from(ray / GRID)) + 0.5;
+        let direction = axes * camera.direction(corner + offset / f64::from(GRID));
         let first = parts.iter().filter_map(|part| {
-            let (way, start) = (direction / part.half, part.centre / part.half);
-            let (a, b) = (way.length_squared(), way.dot(start));
-            let root = b * b - a * (start.length_squared() - 1.0);
+            let (scaled, centre) = (direction / part.half, part.centre / part.half);
+            let (a, b) = (scaled.length_squared(), scaled.dot(centre));
+            let root = b * b - a * (centre.length_squared() - 1.0);
             let depth = (b - root.max(0.0).sqrt()) / a;
             (root > 0.0 && depth > 0.0 && depth < behind).then_some((depth, part))
         });
         if let Some((depth, part)) = first.min_by(|a, b| a.0.total_cmp(&b.0)) {
             let normal = ((depth * direction - part.centre) / (part.half * part.half)).normalize();
             sum += part.colour * (0.35 + 0.65 * normal.dot(LIGHT).max(0.0)) as f32;
-            met += 1;
+            hits += 1;
         }
     }
     let share = 1.0 / (GRID * GRID) as f32;
-    (sum * share, met as f32 * share)
+    (sum * share, hits as f32 * share)
 }
 
-/// A colour of light that covers a share of a pixel, with what was there behind it.
+/// Blends linear light that covers a share of a pixel over the pixel behind it.
 fn over(light: Vec3, cover: f32, behind: [u8; 4]) -> [u8; 4] {
     let rest = (1.0 - cover) * f32::from(behind[3]) / 255.0;
     let alpha = cover + rest;
@@ -142,16 +142,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_share_of_the_views_is_chosen_and_another_by_another_seed() {
+    fn the_share_and_the_seed_select_the_views() {
         for (share, expected) in [(0.0, 0), (0.3, 6), (1.0, 20)] {
-            let chosen = chosen(1, 20, share);
-            assert_eq!(chosen.iter().filter(|&&is| is).count(), expected, "{share}");
+            let selected = select_views(1, 20, share);
+            assert_eq!(selected.iter().filter(|&&is| is).count(), expected, "{share}");
         }
-        assert_ne!(chosen(1, 20, 0.3), chosen(2, 20, 0.3));
+        assert_ne!(select_views(1, 20, 0.3), select_views(2, 20, 0.3));
     }
 
     #[test]
-    fn what_covers_a_pixel_in_part_mixes_with_what_is_behind() {
+    fn partial_coverage_blends_with_the_pixel_behind() {
         assert_eq!(over(Vec3::ZERO, 1.0, [200, 10, 20, 255]), [0, 0, 0, 255]);
         assert_eq!(over(Vec3::ZERO, 0.5, [200, 100, 0, 255]), [100, 50, 0, 255]);
         assert_eq!(over(Vec3::ONE, 0.5, [200, 100, 0, 0]), [255, 255, 255, 128]);
