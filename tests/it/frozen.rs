@@ -94,7 +94,7 @@ fn nothing_changes_them() {
                 plan.grow(1, split_by(1.6)).expect("there is room");
                 plan.decay(Decay { opacity: 0.01, scale: 0.1, seen_only: false }).expect("sound");
                 plan.clamp_opacity(0.02).expect("a sound bound");
-                backend.apply(&plan.compile().behind(FROZEN), 5, 6).expect("a plan is applied");
+                backend.apply(&plan.compile().after_frozen(FROZEN), 5, 6).expect("a plan is applied");
                 step(&mut *backend, 7, needs);
                 let after = backend.download().expect("a model");
                 assert_eq!(after.len(), ROWS - 2);
@@ -126,7 +126,7 @@ fn the_others_step_as_ever() {
             }
             let mut plan = EditPlan::new(ROWS - frozen, 2 * ROWS - frozen).allowing(&needs);
             plan.decay(Decay { opacity: 0.01, scale: 0.1, seen_only: true }).expect("sound");
-            backend.apply(&plan.compile().behind(frozen), 5, 2).expect("a plan is applied");
+            backend.apply(&plan.compile().after_frozen(frozen), 5, 2).expect("a plan is applied");
             let (model, state) = saved(&*backend);
             let signals = backend.take_signals(needs.signals).expect("signals");
             let column = |signal| signals.get(signal).expect("it was asked for")[FROZEN..].to_vec();

@@ -180,7 +180,7 @@ fn every_signal_whatever_else_is_asked_for() {
             reference(&views.model, view, target)
         })
         .collect();
-    let is_accumulated = |s: &Signal| s.is_reset() || s.kind() == SignalKind::EpochMaximum;
+    let is_accumulated = |s: &Signal| s.is_resettable() || s.kind() == SignalKind::EpochMaximum;
     let everything: Vec<Signal> = Signal::ALL.into_iter().filter(is_accumulated).collect();
     let mut base = everything.clone();
     base.retain(|signal| signal.pixel_sums().is_empty());

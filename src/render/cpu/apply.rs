@@ -3,8 +3,8 @@
 use std::ops::Range;
 
 use densify_policies::plan::{
-    Decay, OPACITY_LEAST, Offspring, OpacityRule, ParentFate, Placement, RowOps, ScaleRule, Seed,
-    UNTURNED,
+    Decay, MIN_DECAYED_OPACITY, Offspring, OpacityRule, ParentFate, Placement, RowOps, ScaleRule, Seed,
+    NO_ROTATION,
 };
 use densify_policies::policy::Signal;
 use densify_policies::rng::{PolicyRng, Purpose};
@@ -130,7 +130,7 @@ impl Model<'_> {
         self.masks.clear_row(row);
         self.params.set_n(row, plane::MEAN, seed.position);
         self.params.set_n(row, plane::LOG_SCALE, seed.scales.map(f32::ln));
-        self.params.set_n(row, plane::QUAT, turned(UNTURNED, seed.orientation));
+        self.params.set_n(row, plane::QUAT, turned(NO_ROTATION, seed.orientation));
         self.params.set(row, plane::OPACITY, logit(seed.opacity));
         self.params.set_n(row, plane::SH, seed.colour.map(rgb_to_dc));
         self.reborn(row);
@@ -170,7 +170,7 @@ impl Model<'_> {
             // What is not finite is left to the audit, and no loss must not change a bit.
             if decay.opacity > 0.0 && was.is_finite() {
                 let opacity = sigmoid(was);
-                let left = (opacity - decay.opacity).max(OPACITY_LEAST);
+                let left = (opacity - decay.opacity).max(MIN_DECAYED_OPACITY);
                 // 1 − o from the logit, so that nothing cancels.
                 let off = sigmoid(-was) + (opacity - left);
                 self.params.set(row, plane::OPACITY, was.min((left / off).ln()));
@@ -236,7 +236,7 @@ fn quaternion([w, x, y, z]: [f32; 4]) -> glam::Quat {
 /// The orientation that is turned about its own axes; it keeps its length.
 fn turned(quat: [f32; 4], turn: [f32; 4]) -> [f32; 4] {
     // No turn must not change a bit.
-    if turn.map(f32::to_bits) == UNTURNED.map(f32::to_bits) {
+    if turn.map(f32::to_bits) == NO_ROTATION.map(f32::to_bits) {
         return quat;
     }
     let [x, y, z, w] = (quaternion(quat) * quaternion(turn).normalize()).to_array();

@@ -278,7 +278,7 @@ impl Backend for CpuBackend {
     fn take_signals(&mut self, wanted: SignalSet) -> Result<Signals, BackendError> {
         // The sums are not used between two steps.
         let memory = std::mem::take(&mut self.sums);
-        let mut signals = Signals::within(memory, self.rows, wanted);
+        let mut signals = Signals::zeros_in(memory, self.rows, wanted);
         let of_rows = (&self.params, &self.masks, &self.ages);
         self.signals.read(&self.threads, &mut signals, wanted, of_rows);
         Ok(signals)

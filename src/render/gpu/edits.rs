@@ -329,7 +329,7 @@ impl GpuBackend {
 mod tests {
     use std::collections::HashSet;
 
-    use densify_policies::plan::{EditPlan, Offspring, UNTURNED};
+    use densify_policies::plan::{EditPlan, Offspring, NO_ROTATION};
     use rand::SeedableRng;
     use rand::seq::SliceRandom;
     use rand_chacha::ChaCha8Rng;
@@ -365,7 +365,7 @@ mod tests {
                 parent: if row % 2 == 0 { ParentFate::BecomesChild } else { ParentFate::Stays },
                 placement: Placement::Sampled,
                 scale: ScaleRule::Uniform(0.5),
-                turn: UNTURNED,
+                turn: NO_ROTATION,
                 opacity: OpacityRule::Conserved,
             };
             let _ = plan.grow(row, offspring);

@@ -44,7 +44,7 @@ impl<V: ViewSource> Trainer<V> {
     ) -> Result<Option<EditEvent>, TrainError> {
         let mut ops = plan.compile();
         self.check_plan(step, &ops)?;
-        ops = ops.behind(self.options.frozen);
+        ops = ops.after_frozen(self.options.frozen);
         // The backend checks the budget, which the trainer's own limit may be below.
         ops.budget = self.backend.budget();
         self.backend

@@ -2,7 +2,7 @@
 
 use densify_policies::plan::{
     Decay, EditPlan, Offspring, OpacityRule, ParentFate, Placement, Reset, ScaleRule, Seed,
-    UNTURNED, Update,
+    NO_ROTATION, Update,
 };
 use densify_policies::policy::SignalSet;
 use proptest::prelude::*;
@@ -43,7 +43,7 @@ fn scale_rule() -> impl Strategy<Value = ScaleRule> {
 
 fn quaternion() -> impl Strategy<Value = [f32; 4]> {
     let any = (0.2_f32..2.0, prop::array::uniform3(-1.0_f32..1.0));
-    prop_oneof![Just(UNTURNED), any.prop_map(|(w, [x, y, z])| [w, x, y, z])]
+    prop_oneof![Just(NO_ROTATION), any.prop_map(|(w, [x, y, z])| [w, x, y, z])]
 }
 
 fn offspring() -> impl Strategy<Value = Offspring> {

@@ -1,7 +1,7 @@
 //! The plain vector: one struct per row, executed by the words of the plan's documentation.
 
 use densify_policies::plan::{
-    Decay, OPACITY_LEAST, Offspring, OpacityRule, ParentFate, Placement, ScaleRule, Seed,
+    Decay, MIN_DECAYED_OPACITY, Offspring, OpacityRule, ParentFate, Placement, ScaleRule, Seed,
 };
 use densify_policies::policy::{Signal, SignalKind, SignalSet};
 use densify_policies::rng::{PolicyRng, Purpose};
@@ -82,7 +82,7 @@ impl Row {
 
     fn wither(&mut self, how: Decay) {
         if how.opacity > 0.0 {
-            let least = f64::from(OPACITY_LEAST);
+            let least = f64::from(MIN_DECAYED_OPACITY);
             let left = logit((sigmoid(self.logit) - f64::from(how.opacity)).max(least));
             self.logit = self.logit.min(left);
             self.has_decayed = true;
@@ -226,7 +226,7 @@ pub(super) fn execute(
             row.opacity_rests = true;
         }
         for (signal, value) in SIGNALS.into_iter().zip(&mut row.signals) {
-            if signal.is_reset() && reset.contains(signal) {
+            if signal.is_resettable() && reset.contains(signal) {
                 *value = empty(signal);
             }
         }

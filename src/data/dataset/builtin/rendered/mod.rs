@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 pub use densify_scenegen::GroundTruth;
 use densify_scenegen::{
-    AskedPreset, Frame, InitPoints, Options, Scene, Source, Split, View as RenderedView,
+    PresetSpec, Frame, InitPoints, Options, Scene, Source, Split, View as RenderedView,
 };
 use serde::{Deserialize, Serialize};
 
@@ -55,7 +55,7 @@ pub(in crate::dataset) fn load(
 ) -> Result<Dataset, DatasetError> {
     let (source, parameters) = (Source::Preset(name.to_owned()), Options::default());
     // Of an unknown one no file is named.
-    let asked: AskedPreset = name.parse()?;
+    let asked: PresetSpec = name.parse()?;
     let entry = options.cache.as_deref();
     let entry = entry.and_then(|folder| Entry::of(folder, &asked.to_string(), &parameters));
     let kept = entry.as_ref().and_then(Entry::read);
