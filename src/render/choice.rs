@@ -7,9 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::cpu::CpuBackend;
 use super::gpu::{GpuDevice, adapters, may_be_present};
-use super::{
-    Accumulation, AdapterChoice, AdapterKind, AdapterSummary, Backend, BackendError, Setup,
-};
+use super::{Accumulation, AdapterChoice, AdapterSummary, Backend, BackendError, Setup};
 use densify_core::gaussians::Gaussians;
 use densify_core::memory::Ledger;
 
@@ -71,6 +69,12 @@ impl BackendKind {
         }
     }
 
+    /// Whether this program was built with it.
+    #[must_use]
+    pub const fn is_built(self) -> bool {
+        matches!(self, Self::Cpu) || cfg!(feature = "gpu")
+    }
+
     /// The choice that asks for it.
     #[must_use]
     pub const fn choice(self) -> BackendChoice {
@@ -104,9 +108,7 @@ impl Device {
     ) -> Result<Self, BackendError> {
         let is_there = || may_be_present() && adapters().iter().any(AdapterSummary::is_gpu);
         match (choice, name) {
-            (BackendChoice::Cpu, Some(_)) => Err(BackendError::OverLimit(
-                "--gpu names an adapter, but --backend cpu uses none; leave one of them out".into(),
-            )),
+            (BackendChoice::Cpu, Some(_)) => Err(BackendError::AdapterUnused),
             (BackendChoice::Cpu, None) => Ok(Self::Processor),
             (BackendChoice::Auto, None) if !is_there() => Ok(Self::Processor),
             _ => {
@@ -148,25 +150,6 @@ impl Device {
         match self {
             Self::Processor => None,
             Self::Gpu(device) => Some(device.accumulation()),
-        }
-    }
-
-    /// A line about it.
-    #[must_use]
-    pub fn describe(&self) -> String {
-        match self {
-            Self::Processor if cfg!(feature = "gpu") => {
-                "processor (`densify devices` lists GPUs)".to_owned()
-            }
-            Self::Processor => "processor".to_owned(),
-            Self::Gpu(device) => {
-                let adapter = device.adapter();
-                let note = match adapter.kind {
-                    AdapterKind::Software => ", a software driver: --backend cpu is faster",
-                    _ => "",
-                };
-                format!("{} ({}){note}", adapter.name, adapter.interface)
-            }
         }
     }
 

@@ -10,11 +10,13 @@ mod candidates;
 mod choice;
 pub mod cpu;
 mod differentiable;
+mod error;
 #[cfg(feature = "gpu")]
 pub mod gpu;
 #[cfg(not(feature = "gpu"))]
 #[path = "without_gpu.rs"]
 pub mod gpu;
+mod inspect;
 mod pixel_map;
 mod setup;
 mod signals;
@@ -38,6 +40,8 @@ use densify_core::image::Image8;
 use densify_core::memory::Ledger;
 pub use densify_shaders::Accumulation;
 pub use differentiable::{Differentiable, ImageGradient};
+pub use error::{BackendError, Fit};
+pub use inspect::Inspect;
 pub use setup::{KeptPhotographs, MomentStorage, ParameterStorage, Setup, Shortcuts, Storage};
 pub use state::{StateArray, StateError, Tensor, Values};
 
@@ -189,58 +193,6 @@ fn assert_fits(ops: &RowOps, frozen: usize, rows: usize, budget: usize) {
     }
 }
 
-/// Why a backend cannot go on.
-#[derive(Debug, thiserror::Error)]
-pub enum BackendError {
-    /// Memory for the promised buffers could not be had.
-    #[error("cannot allocate {bytes} bytes for {what}; lower --budget, --sh-degree or --tile-cap")]
-    OutOfMemory {
-        /// The buffer.
-        what: &'static str,
-        /// Its size.
-        bytes: u64,
-    },
-    /// The worker threads could not be started.
-    #[error("cannot start the worker threads: {0}; lower --threads")]
-    Threads(String),
-    /// The image is larger than the backend supports.
-    #[error(
-        "an image of {width}x{height} px is too large: sides of at most {max} px; use --resolution to shrink it"
-    )]
-    ImageTooLarge {
-        /// Its width `[px]`.
-        width: u32,
-        /// Its height `[px]`.
-        height: u32,
-        /// The largest side supported `[px]`.
-        max: u32,
-    },
-    /// No adapter does.
-    #[error("{0}; `densify devices` lists the adapters, and --backend cpu needs none")]
-    NoAdapter(String),
-    /// A buffer beyond what the device can bind, with the remedy.
-    #[error("{0}")]
-    OverLimit(String),
-    /// The device was lost: what was on it is gone.
-    #[error(
-        "the device {device} was lost ({why}); start again from what was saved, or use --backend cpu"
-    )]
-    DeviceLost {
-        /// Its name.
-        device: String,
-        /// The driver's words.
-        why: String,
-    },
-    /// The device has refused a command.
-    #[error("the device {device} has failed ({why}); try another driver, or --backend cpu")]
-    Device {
-        /// Its name.
-        device: String,
-        /// The driver's words.
-        why: String,
-    },
-}
-
 /// A differentiable rasteriser with its optimiser and the model's only copy.
 pub trait Backend: Send {
     /// Rows now.
@@ -314,34 +266,13 @@ pub trait Backend: Send {
         sh_degree: u8,
     ) -> Result<Rendering, BackendError>;
 
-    /// Whether [`render_counts`](Self::render_counts) counts.
-    fn counts_rows(&self) -> bool {
-        false
-    }
-
-    /// Renders a view and, where the backend [can](Self::counts_rows), counts the rows that are blended into
-    /// each pixel: in place of depth.
+    /// The renderings for inspection; an error if the backend has none.
     ///
     /// # Errors
-    /// See [`BackendError`].
-    fn render_counts(&mut self, camera: &Camera) -> Result<Rendering, BackendError> {
-        self.render(camera, [0.0; 3], 0)
+    /// [`BackendError::Unsupported`].
+    fn inspect(&mut self) -> Result<&mut dyn Inspect, BackendError> {
+        Err(BackendError::Unsupported("inspection"))
     }
-
-    /// Renders a view with the rows in these colours instead of their own, from everywhere the same; >= 0, sRGB-encoded.
-    /// Changes nothing of the model.
-    ///
-    /// # Errors
-    /// See [`BackendError`].
-    ///
-    /// # Panics
-    /// When there is not one colour per row: a bug in the caller.
-    fn render_painted(
-        &mut self,
-        camera: &Camera,
-        background: [f32; 3],
-        colours: &[[f32; 3]],
-    ) -> Result<Rendering, BackendError>;
 
     /// Copies the model to the host.
     ///

@@ -13,11 +13,7 @@ pub enum GpuDevice {}
 #[expect(missing_docs, clippy::missing_errors_doc, reason = "as with the feature `gpu`")]
 impl GpuDevice {
     pub fn open(_: &AdapterChoice) -> Result<Self, BackendError> {
-        Err(BackendError::OverLimit(
-            "--backend gpu and --gpu NAME: this program was built without the feature `gpu` of the crate densify; add \
-             it to the features of densify in Cargo.toml"
-                .into(),
-        ))
+        Err(BackendError::WithoutGpu)
     }
 
     #[must_use]

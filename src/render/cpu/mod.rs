@@ -52,7 +52,7 @@ use pulp::Arch;
 use super::candidates::{Candidates, Shown, error_weights};
 use super::signals::{Field, counts_dominant};
 use super::{
-    AuxInput, AuxOutput, Backend, BackendError, Rendering, Setup, Shortcuts, StateArray,
+    AuxInput, AuxOutput, Backend, BackendError, Inspect, Rendering, Setup, Shortcuts, StateArray,
     StateError, StepInput, StepOutput, Tensor, Unsound, assert_fits, assert_same_size,
 };
 use adam::BiasCorrection;
@@ -327,24 +327,8 @@ impl Backend for CpuBackend {
         Ok(self.rendering(&frame))
     }
 
-    fn counts_rows(&self) -> bool {
-        true
-    }
-
-    fn render_counts(&mut self, camera: &Camera) -> Result<Rendering, BackendError> {
-        let frame = self.forward(camera, [0.0; 3], 0, Beside::Count)?;
-        Ok(self.rendering(&frame))
-    }
-
-    fn render_painted(
-        &mut self,
-        camera: &Camera,
-        background: [f32; 3],
-        colours: &[[f32; 3]],
-    ) -> Result<Rendering, BackendError> {
-        assert_eq!(colours.len(), self.rows, "colours of other rows");
-        let frame = self.forward_painted(camera, background, 0, Beside::Depth, Some(colours))?;
-        Ok(self.rendering(&frame))
+    fn inspect(&mut self) -> Result<&mut dyn Inspect, BackendError> {
+        Ok(self)
     }
 
     fn download_array(
@@ -383,5 +367,27 @@ impl Backend for CpuBackend {
 
     fn stage_times(&self) -> &[(&'static str, Duration)] {
         &self.clock.laps
+    }
+}
+
+impl Inspect for CpuBackend {
+    fn render_painted(
+        &mut self,
+        camera: &Camera,
+        background: [f32; 3],
+        colours: &[[f32; 3]],
+    ) -> Result<Rendering, BackendError> {
+        assert_eq!(colours.len(), self.rows, "colours of other rows");
+        let frame = self.forward_painted(camera, background, 0, Beside::Depth, Some(colours))?;
+        Ok(self.rendering(&frame))
+    }
+
+    fn counts_rows(&self) -> bool {
+        true
+    }
+
+    fn render_counts(&mut self, camera: &Camera) -> Result<Rendering, BackendError> {
+        let frame = self.forward(camera, [0.0; 3], 0, Beside::Count)?;
+        Ok(self.rendering(&frame))
     }
 }
