@@ -12,7 +12,7 @@ use super::render::{Extras, write_pictures};
 use crate::animation::{self, Animation};
 use densify_core::camera::Camera;
 use densify_core::camera_path;
-use densify_core::camera_path::SavedFlight;
+use densify_core::camera_path::SavedCameraPath;
 use densify_core::files::one_line;
 use densify_core::files::write_atomically;
 use densify_core::memory::Bytes;
@@ -87,13 +87,13 @@ impl FromStr for Size {
             Some([Ok(width), Ok(height)])
                 if [width, height]
                     .iter()
-                    .all(|side| (1..=camera_path::MOST_SIDE).contains(side)) =>
+                    .all(|side| (1..=camera_path::MAX_SIDE).contains(side)) =>
             {
                 Ok(Self(width, height))
             }
             _ => Err(format!(
                 "give WIDTHxHEIGHT, such as 640x480, each from 1 to {}",
-                camera_path::MOST_SIDE
+                camera_path::MAX_SIDE
             )),
         }
     }
@@ -176,7 +176,7 @@ pub(super) fn run(
 ) -> Result<(), Failure> {
     let Filmed { mut backend, sh_degree, background, normalisation, cameras } = filmed;
     let first = cameras.first().map(|first| (first.width, first.height));
-    let own = |flight| SavedFlight { flight, frames: FRAMES, fps: None, size: None };
+    let own = |path| SavedCameraPath { path, frames: FRAMES, fps: None, size: None };
     let (saved, in_world) = match route {
         Route::Orbit => (own(camera_path::orbit(&cameras)), false),
         Route::Spiral => (own(camera_path::spiral(&cameras)), false),
@@ -184,7 +184,7 @@ pub(super) fn run(
             (camera_path::read(path).map_err(|e| Failure::input(format!("--path: {e}")))?, true)
         }
     };
-    let SavedFlight { flight, frames, fps, size } = saved;
+    let SavedCameraPath { path, frames, fps, size } = saved;
     let frames = args.frames.unwrap_or(frames);
     let fps = args.fps.or(fps).unwrap_or(FPS);
     let size = args.size.map(|Size(width, height)| (width, height)).or(size);
@@ -197,7 +197,7 @@ pub(super) fn run(
     let mut film = args.video.as_deref().map(|path| Film::new(path, size, fps)).transpose()?;
     let mut depths = extras.depths(&normalisation);
     for frame in 0..frames {
-        let camera = flight.frame(frame, frames).camera(size);
+        let camera = path.frame(frame, frames).camera(size);
         let camera = match in_world {
             true => normalisation.scene_from_world_camera(&camera),
             false => camera,

@@ -136,8 +136,13 @@ fn remedy(error: &BackendError) -> String {
 
 impl From<OutputError> for Failure {
     fn from(error: OutputError) -> Self {
-        let code = if matches!(error, OutputError::Unfit(_)) { INPUT } else { OTHER };
-        Self { code, message: error.to_string() }
+        match error {
+            OutputError::Occupied { .. } => Self::input(format!(
+                "{error}; choose another folder with -o, or replace it with --overwrite"
+            )),
+            OutputError::Unfit(_) => Self::input(error),
+            _ => Self { code: OTHER, message: error.to_string() },
+        }
     }
 }
 
