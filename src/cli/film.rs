@@ -6,7 +6,7 @@ use std::str::FromStr;
 use clap::Args;
 
 use super::console::Console;
-use densify_core::camera_path::MOST_SIDE;
+use densify_core::camera_path::MAX_SIDE;
 use densify_inspect::{CameraRoute, Channels, Film, FilmError, FilmOptions, FilmSource};
 use densify_run::failure::{DEVICE, Failure, OTHER};
 
@@ -48,11 +48,11 @@ impl FromStr for Size {
         let sides = text.split_once('x').map(|(width, height)| [width, height].map(str::parse));
         match sides {
             Some([Ok(width), Ok(height)])
-                if [width, height].iter().all(|side| (1..=MOST_SIDE).contains(side)) =>
+                if [width, height].iter().all(|side| (1..=MAX_SIDE).contains(side)) =>
             {
                 Ok(Self(width, height))
             }
-            _ => Err(format!("give WIDTHxHEIGHT, such as 640x480, each from 1 to {MOST_SIDE}")),
+            _ => Err(format!("give WIDTHxHEIGHT, such as 640x480, each from 1 to {MAX_SIDE}")),
         }
     }
 }

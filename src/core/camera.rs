@@ -1,4 +1,4 @@
-//! A pinhole camera. OpenCV axes: x right, y down, z forward; pixel centres at +0.5.
+//! Pinhole cameras with OpenCV axes: x right, y down, z forward; pixel centres are at +0.5.
 
 use glam::{DMat3, DVec2, DVec3};
 use serde::{Deserialize, Serialize};
@@ -56,20 +56,20 @@ impl Camera {
         (DVec2::new(self.fx * p.x / p.z + self.cx, self.fy * p.y / p.z + self.cy), p.z)
     }
 
-    /// The depth of a world point that lies before the camera and in its image, or as near to that as a share `beside` of
-    /// its sides; `None` of another.
+    /// The depth of a world point in front of the camera whose projection is in the image; `None` for other points.
+    /// The image is extended on every side by `margin`, a fraction of that side.
     #[must_use]
-    pub fn depth_in_image(&self, world: DVec3, beside: f64) -> Option<f64> {
+    pub fn depth_in_image(&self, world: DVec3, margin: f64) -> Option<f64> {
         let (pixel, depth) = self.project(world);
         let within = |x: f64, size: u32| {
-            let (size, beside) = (f64::from(size), beside * f64::from(size));
-            (-beside..size + beside).contains(&x)
+            let (size, margin) = (f64::from(size), margin * f64::from(size));
+            (-margin..size + margin).contains(&x)
         };
         (depth > 0.0 && within(pixel.x, self.width) && within(pixel.y, self.height))
             .then_some(depth)
     }
 
-    /// The same camera with an image of another size; intrinsics scale per axis.
+    /// The same view with an image of another size; intrinsics scale per axis.
     #[must_use]
     pub fn resized(&self, width: u32, height: u32) -> Self {
         let sx = f64::from(width) / f64::from(self.width);

@@ -1,31 +1,31 @@
-//! Affine transforms of colours, and their gradients: how a photograph was exposed.
+//! Affine colour transforms, which model the exposure of a photograph, and their gradients.
 
 use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
 
-/// An affine transform of colours.
+/// An affine colour transform: c ↦ `matrix`·c + `offset`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ColourTransform {
-    /// Row by row.
+    /// Row-major.
     pub matrix: [[f32; 3]; 3],
-    /// Added to each channel.
+    /// Per channel.
     pub offset: [f32; 3],
 }
 
-/// Derivatives of a loss by the numbers of a [`ColourTransform`].
+/// Derivatives of a loss with respect to a [`ColourTransform`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ColourGradient {
-    /// Row by row.
+    /// Row-major.
     pub matrix: [[f32; 3]; 3],
-    /// By the offset of each channel.
+    /// Per channel.
     pub offset: [f32; 3],
 }
 
-/// What a backend adds up over the pixels of an exposed image, of the derivative g of the loss by its colours
-/// C' and of its transmittance T.
+/// Sums over the pixels of a transformed image from which [`ColourTransform::gradient`] follows. C' is the
+/// transformed colour, g the derivative of the loss with respect to it, T the transmittance.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct ExposureSums {
-    /// Σ gᵢ·C'ⱼ, row by row.
+    /// Σ gᵢ·C'ⱼ, row-major.
     pub by_colour: [[f64; 3]; 3],
     /// Σ gᵢ.
     pub plain: [f64; 3],
@@ -34,11 +34,11 @@ pub struct ExposureSums {
 }
 
 impl ColourTransform {
-    /// Changes nothing.
+    /// The transform that changes nothing.
     pub const IDENTITY: Self =
         Self { matrix: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], offset: [0.0; 3] };
 
-    /// A colour as the photograph shows it.
+    /// The transformed colour.
     #[must_use]
     pub fn apply(&self, colour: [f32; 3]) -> [f32; 3] {
         let [r, g, b] = colour;
@@ -48,7 +48,7 @@ impl ColourTransform {
         })
     }
 
-    /// The transform that takes this one back; the identity where none does.
+    /// The inverse transform; the identity if this one is singular.
     #[must_use]
     pub fn inverse(&self) -> Self {
         let inverse = self.inverse_matrix();
@@ -58,14 +58,14 @@ impl ColourTransform {
         if back.is_finite() { back } else { Self::IDENTITY }
     }
 
-    /// The background that becomes `background` when pixels are transformed whole: what is behind the scene
-    /// then looks the same in every photograph.
+    /// The colour that the transform turns into `background`. Rendering over it keeps the background the same in
+    /// every photograph, whatever its exposure.
     #[must_use]
     pub fn behind(&self, background: [f32; 3]) -> [f32; 3] {
         self.inverse().apply(background)
     }
 
-    /// Whether every number is finite.
+    /// Whether all coefficients are finite.
     #[must_use]
     pub fn is_finite(&self) -> bool {
         self.matrix.as_flattened().iter().chain(&self.offset).all(|x| x.is_finite())
@@ -76,15 +76,15 @@ impl ColourTransform {
         DMat3::from_cols_array_2d(&rows).transpose().inverse()
     }
 
-    /// Derivatives by the numbers of this transform of an image that was rendered over
-    /// [`behind`](Self::behind) of `background`.
+    /// The gradient with respect to this transform, for an image rendered over [`behind`](Self::behind) of
+    /// `background`.
     #[must_use]
     pub fn gradient(&self, background: [f32; 3], sums: &ExposureSums) -> ColourGradient {
         let inverse = self.inverse_matrix();
         let behind = self.behind(background);
         let offset = self.offset.map(f64::from);
         let matrix = std::array::from_fn(|i| {
-            // Σ gᵢ·C of the colours before the transform, then without what shows through.
+            // Σ gᵢ·C of the colours before the transform, without their share of background.
             let exposed = DVec3::from(sums.by_colour[i]) - sums.plain[i] * DVec3::from(offset);
             let plain = inverse * exposed;
             let through = sums.behind[i] * DVec3::from(behind.map(f64::from));
@@ -94,7 +94,7 @@ impl ColourTransform {
         ColourGradient { matrix, offset }
     }
 
-    /// The same as three rows of four, as INRIA's trainer writes it.
+    /// The transform as a 3×4 matrix, as INRIA's trainer writes it.
     #[must_use]
     pub fn rows(&self) -> [[f32; 4]; 3] {
         std::array::from_fn(|i| {
@@ -108,7 +108,7 @@ impl ColourTransform {
 mod tests {
     use super::*;
 
-    pub const SOME: ColourTransform = ColourTransform {
+    const SOME: ColourTransform = ColourTransform {
         matrix: [[1.25, 0.0625, -0.125], [0.0, 0.75, 0.25], [-0.0625, 0.125, 1.5]],
         offset: [0.03, -0.05, 0.1],
     };

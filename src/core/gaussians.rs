@@ -1,7 +1,7 @@
-//! Gaussians on the host: the parametrisation, stated once.
+//! Gaussians on the host, and their parametrisation.
 //!
 //! A row is one Gaussian: mean, log of the standard deviation per axis, orientation as a
-//! quaternion (w, x, y, z; need not be normalised), opacity as a logit, and spherical-harmonic
+//! quaternion (w, x, y, z; not necessarily normalised), opacity as a logit, and spherical-harmonic
 //! coefficients of its colour: colour = max(0, ½ + Σ Y_k(direction)·sh_k).
 
 /// Number of spherical-harmonic coefficients per channel at `degree`: (degree + 1)².
@@ -29,11 +29,11 @@ pub enum ModelArray {
 }
 
 impl ModelArray {
-    /// All of them, in the order in which a row has its parameters.
+    /// All arrays, in the order of a row's parameters.
     pub const ALL: [Self; 5] =
         [Self::Means, Self::LogScales, Self::Quats, Self::OpacityLogits, Self::Sh];
 
-    /// Where a row of a model of this degree has the array's numbers, of all its parameters.
+    /// The array's part of a row's parameters at a degree.
     #[must_use]
     pub const fn parameters(self, sh_degree: u8) -> std::ops::Range<usize> {
         match self {
@@ -46,7 +46,7 @@ impl ModelArray {
     }
 }
 
-/// A model: structure of arrays, one entry per row in each.
+/// A model as a structure of arrays, each with one entry per row.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Gaussians {
     /// Spherical-harmonic degree, 0..=3; decides the length of `sh`.
@@ -64,7 +64,10 @@ pub struct Gaussians {
 }
 
 impl Gaussians {
-    /// A model of this degree from its arrays, each row after row.
+    /// Builds a model from its arrays, each row-major.
+    ///
+    /// # Errors
+    /// The first error of `array`.
     pub fn from_arrays<E>(
         sh_degree: u8,
         mut array: impl FnMut(ModelArray) -> Result<Vec<f32>, E>,
@@ -79,7 +82,7 @@ impl Gaussians {
         })
     }
 
-    /// So many rows of zeros.
+    /// A model whose parameters are all 0.
     #[must_use]
     pub fn zeros(rows: usize, sh_degree: u8) -> Self {
         Self {
@@ -92,7 +95,7 @@ impl Gaussians {
         }
     }
 
-    /// The same model with another degree: higher bands are dropped, new ones are zero.
+    /// Changes the degree: higher bands are dropped, new ones are zero.
     #[must_use]
     pub fn with_degree(mut self, sh_degree: u8) -> Self {
         if sh_degree != self.sh_degree {
@@ -111,7 +114,7 @@ impl Gaussians {
     /// # Panics
     /// When the degrees differ.
     pub fn append(&mut self, mut other: Self) {
-        assert_eq!(self.sh_degree, other.sh_degree, "degrees of models that are joined");
+        assert_eq!(self.sh_degree, other.sh_degree, "models of different degrees cannot be joined");
         self.means.append(&mut other.means);
         self.log_scales.append(&mut other.log_scales);
         self.quats.append(&mut other.quats);
@@ -119,10 +122,10 @@ impl Gaussians {
         self.sh.append(&mut other.sh);
     }
 
-    /// These rows, in this order.
+    /// The given rows, in that order.
     ///
     /// # Panics
-    /// When there is no such row.
+    /// When a row does not exist.
     #[must_use]
     pub fn gather(&self, rows: &[usize]) -> Self {
         Self {
@@ -141,7 +144,7 @@ impl Gaussians {
         self.means.len()
     }
 
-    /// Whether there is no row.
+    /// Whether the model has no rows.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.means.is_empty()
@@ -155,31 +158,31 @@ impl Gaussians {
     }
 }
 
-/// The same numbers, N to a row; where they are, if that can be.
+/// Groups numbers by N; in place if the allocation permits.
 fn in_rows<const N: usize>(values: Vec<f32>) -> Vec<[f32; N]> {
     bytemuck::try_cast_vec(values).unwrap_or_else(|(_, values)| values.as_chunks().0.to_vec())
 }
 
-/// Opacity of a logit: 1 / (1 + exp(−x)), without overflow at either end.
+/// The opacity of a logit: 1 / (1 + exp(−x)), without overflow.
 #[must_use]
 pub fn sigmoid(x: f32) -> f32 {
     let e = (-x.abs()).exp();
     if x >= 0.0 { 1.0 / (1.0 + e) } else { e / (1.0 + e) }
 }
 
-/// Logit of an opacity in (0, 1): ln(o / (1 − o)).
+/// The logit of an opacity in (0, 1): ln(o / (1 − o)).
 #[must_use]
 pub fn logit(opacity: f32) -> f32 {
     opacity.ln() - (-opacity).ln_1p()
 }
 
-/// Band-0 coefficient of a colour seen the same from everywhere: (c − ½)/Y₀.
+/// The band-0 coefficient of a view-independent colour: (c − ½)/Y₀.
 #[must_use]
 pub fn rgb_to_dc(colour: f32) -> f32 {
     (colour - 0.5) / crate::sh::C0
 }
 
-/// The colour that a band-0 coefficient alone shows, not clamped: ½ + Y₀·c.
+/// The view-independent colour of a band-0 coefficient, not clamped: ½ + Y₀·c.
 #[must_use]
 pub fn dc_to_rgb(coefficient: f32) -> f32 {
     0.5 + crate::sh::C0 * coefficient

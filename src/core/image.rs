@@ -1,10 +1,10 @@
-//! An image as it is held: eight bits a channel.
+//! Decoded images with eight bits per channel.
 
 use std::sync::Arc;
 
 use crate::resample;
 
-/// A decoded image, packed 8 bits per channel.
+/// A decoded image.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Image8 {
     /// Width `[px]`.
@@ -13,10 +13,10 @@ pub struct Image8 {
     pub height: u32,
     /// sRGB-encoded, row-major, RGB interleaved. Shape: `[height, width, 3]`.
     pub rgb: Vec<u8>,
-    /// Straight alpha for compositing on the background, if the file has any.
+    /// Straight (not premultiplied) alpha, if the file has any.
     /// Shape: `[height, width]`.
     pub alpha: Option<Vec<u8>>,
-    /// Weight of each pixel in the loss: 0 = ignored, 255 = counted, if there is a mask.
+    /// Weight of each pixel in the loss, if there is a mask: 0 ignores it, 255 counts it in full.
     /// Shape: `[height, width]`.
     pub mask: Option<Vec<u8>>,
 }
@@ -28,13 +28,13 @@ pub struct Window {
     pub x: u32,
     /// First row `[px]`.
     pub y: u32,
-    /// `[px]`, >= 1.
+    /// Width `[px]`, >= 1.
     pub width: u32,
-    /// `[px]`, >= 1.
+    /// Height `[px]`, >= 1.
     pub height: u32,
 }
 
-/// A decoded image shared between cache and user.
+/// An image shared between a cache and its users.
 pub type SharedImage = Arc<Image8>;
 
 impl Image8 {
@@ -49,7 +49,7 @@ impl Image8 {
         })
     }
 
-    /// A smaller copy, each pixel the mean of those that it covers.
+    /// A smaller copy; each pixel is the mean of the pixels that it covers.
     #[must_use]
     pub fn shrunk(&self, width: u32, height: u32) -> Self {
         resample::shrink(self, width, height)
@@ -62,7 +62,8 @@ impl Image8 {
         (self.rgb.len() + length(&self.alpha) + length(&self.mask)) as u64
     }
 
-    /// An image without pixels yet, with reserved memory and the channels of `like`.
+    /// An image without pixels yet: memory is reserved, with the channels of `like`.
+    #[must_use]
     pub fn blank(width: u32, height: u32, like: &Self) -> Self {
         let pixels = width as usize * height as usize;
         let channel =
@@ -76,7 +77,7 @@ impl Image8 {
         }
     }
 
-    /// The pixels of a window, which lies in the image.
+    /// A copy of a window, which must lie within the image.
     #[must_use]
     pub fn windowed(&self, window: Window) -> Self {
         let cut = |values: &[u8], channels: usize| {

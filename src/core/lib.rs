@@ -1,5 +1,5 @@
-//! What every layer of `densify` knows: cameras, Gaussians, images, colours, the memory ledger, and files that are
-//! written whole. Nothing here knows a file format of models or datasets, a device, or a thread.
+//! The basic types that every layer of `densify` uses: cameras, Gaussians, images, colours, the memory ledger, and
+//! safe file access. Formats of models and datasets, devices and threads belong to the layers above.
 
 pub mod camera;
 pub mod camera_path;

@@ -1,4 +1,4 @@
-//! Numbers as people write and read them: `28k`, `1.5M`, `1GiB`; 28,000; 2 min 5 s.
+//! Parses and formats numbers for people: `28k`, `1.5M`, `1GiB`; 28,000; 2 min 5 s.
 
 use std::fmt::Display;
 use std::str::FromStr;
@@ -8,12 +8,15 @@ use serde::de::Error as _;
 use serde::{Deserialize, Deserializer};
 use serde_json::Value;
 
-/// Rows that a slot number can name.
-const MOST_ROWS: f64 = u32::MAX as f64;
+/// The most rows that 32-bit row numbers can address.
+const MAX_ROWS: f64 = u32::MAX as f64;
 
 /// Parses a number of rows: `200000`, `28k`, `1.5M`.
+///
+/// # Errors
+/// A message with the spellings accepted.
 pub fn rows(text: &str) -> Result<usize, String> {
-    let wrong = || format!("`{text}` is no number of rows; write it as 200000, 200k or 1.5M");
+    let wrong = || format!("`{text}` is not a number of rows; write it as 200000, 200k or 1.5M");
     let (number, factor) = match text.char_indices().last() {
         Some((at, 'k' | 'K')) => (&text[..at], 1e3),
         Some((at, 'm' | 'M')) => (&text[..at], 1e6),
@@ -29,13 +32,16 @@ pub fn rows(text: &str) -> Result<usize, String> {
     if !rows.is_finite() || (rows - whole).abs() > 1e-6 * factor {
         return Err(wrong());
     }
-    if !(1.0..=MOST_ROWS).contains(&whole) {
+    if !(1.0..=MAX_ROWS).contains(&whole) {
         return Err(format!("`{text}` is out of range; a model has between 1 and 4 billion rows"));
     }
     Ok(whole as usize)
 }
 
 /// Parses a number of bytes: `1GiB`, `512MiB`, `800MB`, `1000000`.
+///
+/// # Errors
+/// A message with the spellings accepted.
 pub fn bytes(text: &str) -> Result<u64, String> {
     const UNITS: [(&str, f64); 10] = [
         ("KiB", 1024.0),
@@ -50,7 +56,7 @@ pub fn bytes(text: &str) -> Result<u64, String> {
         ("B", 1.0),
     ];
     let wrong =
-        || format!("`{text}` is no number of bytes; write it as 1GiB, 512MiB, 800MB or 1000000");
+        || format!("`{text}` is not a number of bytes; write it as 1GiB, 512MiB, 800MB or 1000000");
     let unit = UNITS.iter().find_map(|(unit, factor)| Some((text.strip_suffix(unit)?, *factor)));
     let (number, factor) = unit.unwrap_or((text, 1.0));
     let number = number.trim();
@@ -58,7 +64,7 @@ pub fn bytes(text: &str) -> Result<u64, String> {
         return Err(wrong());
     }
     let bytes = number.parse::<f64>().map_err(|_| wrong())? * factor;
-    // Beyond 2⁵³ bytes a number is a slip of the pen.
+    // More than 2⁵³ bytes must be a typing error.
     if !(0.0..=9e15).contains(&bytes) {
         return Err(wrong());
     }
@@ -66,6 +72,9 @@ pub fn bytes(text: &str) -> Result<u64, String> {
 }
 
 /// Parses a fraction above 0 and below 1.
+///
+/// # Errors
+/// A message with the range.
 pub fn fraction(text: &str) -> Result<f64, String> {
     let value: f64 = text.parse().map_err(|_| format!("`{text}` is not a number"))?;
     if value > 0.0 && value < 1.0 {
@@ -75,17 +84,20 @@ pub fn fraction(text: &str) -> Result<f64, String> {
     }
 }
 
-/// A fraction as a percentage; a dash where there is none.
+/// Formats a fraction as a percentage; a non-finite one as a dash.
+#[must_use]
 pub fn percent(value: f64) -> String {
     if value.is_finite() { format!("{:.3} %", 100.0 * value) } else { "–".into() }
 }
 
-/// So many Gaussians.
+/// Formats a number of Gaussians: `1 Gaussian`, `2,000 Gaussians`.
+#[must_use]
 pub fn gaussians(number: usize) -> String {
     format!("{} Gaussian{}", grouped(number), if number == 1 { "" } else { "s" })
 }
 
-/// 1234567 as 1,234,567.
+/// Formats 1234567 as 1,234,567.
+#[must_use]
 pub fn grouped(number: usize) -> String {
     let digits = number.to_string();
     let mut shown = String::with_capacity(digits.len() + digits.len() / 3);
@@ -98,7 +110,8 @@ pub fn grouped(number: usize) -> String {
     shown
 }
 
-/// A duration to the second: 45 s, 2 min 5 s, 3 h 0 min.
+/// Formats a duration: 4.2 s, 45 s, 2 min 5 s, 3 h 0 min.
+#[must_use]
 pub fn duration(time: Duration) -> String {
     let seconds = time.as_secs_f64().round() as u64;
     match (seconds / 3600, seconds / 60 % 60, seconds % 60) {
@@ -109,10 +122,10 @@ pub fn duration(time: Duration) -> String {
     }
 }
 
-/// Reads from a file what may be a number or a text there, as the command line would read it.
+/// Deserialises a number or a string by the type's `FromStr`, as the command line would.
 ///
 /// # Errors
-/// Those of the type's `FromStr`.
+/// The errors of `FromStr`.
 pub fn number_or_text<'de, D, T>(deserializer: D) -> Result<T, D::Error>
 where
     D: Deserializer<'de>,

@@ -1,8 +1,8 @@
-//! Coverage-aware means of pixels, and the area filter that shrinks images.
+//! The area filter that shrinks images, and means of pixels weighted by coverage.
 
 use crate::image::Image8;
 
-/// A weighted mean of pixels. Colours are also weighted by coverage: the colour of a transparent
+/// A weighted mean of pixels. Colours are also weighted by alpha, as the colour of a transparent
 /// pixel must not bleed into its neighbours.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct PixelMean {
@@ -14,6 +14,7 @@ pub struct PixelMean {
 }
 
 impl PixelMean {
+    /// Adds a pixel.
     pub fn add(&mut self, image: &Image8, x: u32, y: u32, weight: f32) {
         let at = y as usize * image.width as usize + x as usize;
         let alpha = image.alpha.as_ref().map_or(255.0, |alpha| f32::from(alpha[at]));
@@ -44,6 +45,7 @@ impl PixelMean {
 
 /// Shrinks an image with an area filter: every source pixel is weighted by its overlap with the
 /// target pixel.
+#[must_use]
 pub fn shrink(image: &Image8, width: u32, height: u32) -> Image8 {
     let columns = spans(image.width, width);
     let rows = spans(image.height, height);
@@ -51,8 +53,8 @@ pub fn shrink(image: &Image8, width: u32, height: u32) -> Image8 {
     for row in &rows {
         for column in &columns {
             let mut mean = PixelMean::default();
-            for (y, wy) in row.each() {
-                for (x, wx) in column.each() {
+            for (y, wy) in row.pixels() {
+                for (x, wx) in column.pixels() {
                     mean.add(image, x, y, wx * wy);
                 }
             }
@@ -62,15 +64,15 @@ pub fn shrink(image: &Image8, width: u32, height: u32) -> Image8 {
     out
 }
 
-/// Resamples one channel with the same filter.
+/// Resamples one channel with the filter of [`shrink`].
 pub fn shrink_channel(channel: &[u8], from: (u32, u32), to: (u32, u32)) -> Vec<u8> {
     let columns = spans(from.0, to.0);
     let mut out = Vec::with_capacity(to.0 as usize * to.1 as usize);
     for row in spans(from.1, to.1) {
         for column in &columns {
             let (mut sum, mut weight) = (0.0, 0.0);
-            for (y, wy) in row.each() {
-                for (x, wx) in column.each() {
+            for (y, wy) in row.pixels() {
+                for (x, wx) in column.pixels() {
                     sum += wx * wy * f32::from(channel[y as usize * from.0 as usize + x as usize]);
                     weight += wx * wy;
                 }
@@ -81,7 +83,7 @@ pub fn shrink_channel(channel: &[u8], from: (u32, u32), to: (u32, u32)) -> Vec<u
     out
 }
 
-/// The source pixels under one target pixel, along one axis.
+/// The source pixels that a target pixel covers, along one axis.
 struct Span {
     first: u32,
     last: u32,
@@ -90,7 +92,8 @@ struct Span {
 }
 
 impl Span {
-    fn each(&self) -> impl Iterator<Item = (u32, f32)> + '_ {
+    /// The source pixels with their weights.
+    fn pixels(&self) -> impl Iterator<Item = (u32, f32)> + '_ {
         (self.first..=self.last).map(|i| {
             let weight = match i {
                 _ if i == self.first => self.first_weight,

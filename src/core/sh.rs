@@ -5,7 +5,7 @@
 
 use std::ops::{Add, Mul, Neg, Sub};
 
-/// Band 0.
+/// The constant basis function of band 0.
 pub const C0: f32 = 0.282_094_79;
 const C1: f32 = 0.488_602_51;
 const C2: [f32; 5] = [1.092_548_4, -1.092_548_4, 0.315_391_57, -1.092_548_4, 0.546_274_2];
@@ -19,7 +19,7 @@ const C3: [f32; 7] = [
     -0.590_043_6,
 ];
 
-/// What the formulas need of a number.
+/// The arithmetic that the formulas need.
 pub trait Real:
     Copy
     + Add<Output = Self>
@@ -43,7 +43,7 @@ impl<T> Real for T where
 {
 }
 
-/// Y_1 … Y_15 at the unit vector `d`, as far as `degree` goes; the rest of `y` stays. Y_0 is the
+/// Evaluates Y_1 … Y_15 at the unit vector `d`, up to `degree`; the rest of `y` is unchanged. Y_0 is the
 /// constant [`C0`].
 #[inline(always)]
 pub fn basis<T: Real>(degree: u8, d: [T; 3], y: &mut [T; 16]) {

@@ -1,62 +1,62 @@
-//! What is known of a GPU before it is used, whether or not this program has the GPU backend.
+//! Descriptions of adapters, also in programs built without the GPU backend.
 
 use super::Accumulation;
 
-/// What an adapter is.
+/// Kinds of adapters.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum AdapterKind {
     /// A graphics card.
     Discrete,
     /// Graphics that share the processor's memory.
     Integrated,
-    /// A card that a virtual machine is lent.
+    /// A GPU assigned to a virtual machine.
     Virtual,
-    /// A program on the processor.
+    /// A software driver.
     Software,
-    /// The driver does not say.
+    /// Not reported by the driver.
     Unknown,
 }
 
-/// An adapter and the limits that matter.
+/// An adapter with its relevant limits.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AdapterSummary {
-    /// As the driver names it.
+    /// The name that the driver reports.
     pub name: String,
     /// The interface: vulkan, metal, dx12.
     pub interface: String,
     /// The driver and its version.
     pub driver: String,
-    /// What it is.
+    /// The kind of adapter.
     pub kind: AdapterKind,
     /// Largest buffer that a kernel can use `[bytes]`.
     pub largest_binding: u64,
     /// Largest buffer `[bytes]`.
     pub largest_buffer: u64,
-    /// What it lacks to be usable; empty if it is.
+    /// Missing features and limits; empty if the adapter is usable.
     pub missing: Vec<String>,
-    /// The ways of adding up gradients that it has, the fastest last; always [`Accumulation::Slots`].
+    /// The supported methods of accumulating gradients, the fastest last; [`Accumulation::Slots`] always is.
     pub accumulations: Vec<Accumulation>,
 }
 
 impl AdapterSummary {
-    /// How it adds up gradients by default: the fastest way it supports.
+    /// The default method of accumulating gradients: the fastest one supported.
     #[must_use]
     pub fn accumulation(&self) -> Accumulation {
         self.accumulations.last().copied().unwrap_or(Accumulation::Slots)
     }
 
-    /// Whether `auto` may take it: a GPU that lacks nothing.
+    /// Whether the automatic choice may take it: a usable GPU that is not a software driver.
     #[must_use]
     pub fn is_gpu(&self) -> bool {
         self.kind != AdapterKind::Software && self.missing.is_empty()
     }
 }
 
-/// Which adapter to take, and how it adds up gradients.
+/// The requested adapter.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct AdapterChoice {
-    /// Part of its name or its driver's, in upper or lower case; `None` takes the best.
+    /// Part of the name of the adapter or its driver, case-insensitive; `None` takes the best adapter.
     pub name: Option<String>,
-    /// How it adds up gradients; [its own choice](AdapterSummary::accumulation) without one.
+    /// The method of accumulating gradients; `None` takes the adapter's [default](AdapterSummary::accumulation).
     pub accumulation: Option<Accumulation>,
 }

@@ -1,13 +1,12 @@
-//! Rows with a number that is not finite.
+//! Rows with a non-finite number, as [`Backend::audit`](super::Backend::audit) reports them.
 //!
-//! One NaN or infinity in a gradient makes the parameter that it steps NaN, or its second moment
-//! infinite, and neither ever leaves it again: [`Backend::audit`](super::Backend::audit) finds them
-//! whenever it looks. Until then such a row does no harm, as projection skips every row that has a
-//! parameter that is not finite.
+//! A single NaN or infinity in a gradient makes the parameter NaN or its second moment infinite for good, so that
+//! an audit at any later time finds it. Until then the row does no harm, as projection skips rows with a non-finite
+//! parameter.
 
 use std::fmt;
 
-/// A class of a row's numbers.
+/// A class of parameters.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Attribute {
     /// The mean.
@@ -23,10 +22,9 @@ pub enum Attribute {
 }
 
 impl Attribute {
-    /// Of a number of a row, in the order in which backends keep them: mean, log-scales, quaternion,
-    /// opacity logit, coefficients.
-    pub(super) fn of(number: usize) -> Self {
-        match number {
+    /// The class of a row's parameter, by its index: mean, log-scales, quaternion, opacity logit, coefficients.
+    pub(super) fn of_parameter(index: usize) -> Self {
+        match index {
             0..3 => Self::Mean,
             3..6 => Self::LogScale,
             6..10 => Self::Quat,
@@ -48,24 +46,23 @@ impl fmt::Display for Attribute {
     }
 }
 
-/// Where a number that is not finite was found.
+/// The array in which a non-finite number was found.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kept {
-    /// Among the parameters.
+    /// The parameters.
     Parameter,
-    /// Among the optimiser's first or second moments: its gradient was no number, or too large to be
-    /// squared.
+    /// The optimiser's first or second moments: the gradient was NaN, or too large to be squared.
     Moment,
 }
 
-/// A row that holds a number that is NaN or infinite; the first such number.
+/// A row with a non-finite number, and the first such number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Unsound {
     /// The row.
     pub row: u32,
-    /// The class of the number.
+    /// The class of the parameter.
     pub attribute: Attribute,
-    /// Whose number it is.
+    /// The array that holds the number.
     pub kept: Kept,
 }
 

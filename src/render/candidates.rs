@@ -1,4 +1,4 @@
-//! The list of candidates for new rows, the same for every backend: the worst pixels of a view
+//! The list of candidates for new rows, shared by both backends: surface points of the pixels with the largest error
 //! (*Gaussians on a Diet*, arXiv 2604.20046, "compensation").
 
 use std::cmp::Ordering;
@@ -10,7 +10,7 @@ use super::{StateError, Tensor};
 use densify_core::colour::ColourTransform;
 use densify_core::image::Image8;
 
-/// The list, and what goes into it.
+/// The candidates collected so far, and the request that selects them.
 #[derive(Debug)]
 pub(super) struct Candidates {
     request: Option<CandidateRequest>,
@@ -18,33 +18,33 @@ pub(super) struct Candidates {
     ranking: Vec<Ranked>,
 }
 
-/// What a photograph shows of the scene.
+/// A photograph with the background and exposure of its view.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Shown<'a> {
+pub(super) struct Photograph<'a> {
     pub(super) target: &'a Image8,
     pub(super) background: [f32; 3],
     pub(super) exposure: Option<&'a ColourTransform>,
 }
 
-impl<'a> Shown<'a> {
-    /// The scene's colour in a pixel (x, y), without the photograph's exposure.
-    pub(super) fn colours(self) -> impl Fn(usize, usize) -> [f32; 3] + Sync + 'a {
+impl<'a> Photograph<'a> {
+    /// A function that returns the scene's colour at a pixel (x, y), with the exposure undone.
+    pub(super) fn scene_colours(self) -> impl Fn(usize, usize) -> [f32; 3] + Sync + 'a {
         let Self { target, background, exposure } = self;
-        let back = exposure.map(ColourTransform::inverse);
+        let inverse = exposure.map(ColourTransform::inverse);
         move |x, y| {
             let seen = target.composited(x, y, background);
-            back.map_or(seen, |back| back.apply(seen))
+            inverse.map_or(seen, |inverse| inverse.apply(seen))
         }
     }
 }
 
-/// Error and number of a pixel of one view.
+/// The error and the number of a pixel.
 pub(super) type Ranked = (f32, u32);
 
-/// Pixels ranked beyond those wanted, so that enough remain after spacing.
-const SPARE: usize = 16;
-/// Numbers of a candidate in a checkpoint.
-const NUMBERS: usize = 8;
+/// Pixels ranked per candidate, so that enough remain after spacing.
+const RANKED_PER_CANDIDATE: usize = 16;
+/// Values per candidate in a checkpoint.
+const VALUES: usize = 8;
 
 impl Candidates {
     pub(super) fn new(request: Option<CandidateRequest>) -> Self {
@@ -52,7 +52,7 @@ impl Candidates {
         Self { request, list: Vec::with_capacity(capacity), ranking: Vec::new() }
     }
 
-    /// Bytes of the list, and of the ranking of an image of so many pixels.
+    /// Bytes of the list and of the ranking of an image's pixels.
     pub(super) fn bytes(request: Option<CandidateRequest>, pixels: usize) -> u64 {
         let ranking = pixels * size_of::<Ranked>();
         request.map_or(0, |r| (r.capacity * size_of::<Candidate>() + ranking) as u64)
@@ -70,30 +70,32 @@ impl Candidates {
         self.list.clear();
     }
 
-    /// Whether a policy wants any.
-    pub(super) fn is_wanted(&self) -> bool {
+    /// Whether the policy requests candidates.
+    pub(super) fn is_requested(&self) -> bool {
         self.request.is_some()
     }
 
-    /// The list as an array of a backend's state.
+    /// The list as a state array.
     pub(super) fn tensor(&self, name: &str) -> Tensor {
         let numbers = |c: &Candidate| {
             let ([x, y, z], [r, g, b]) = (c.position, c.colour);
             [x, y, z, r, g, b, c.pixel_size, c.error]
         };
         let values = self.list.iter().flat_map(numbers).collect();
-        Tensor::f32(name, &[self.list.len(), NUMBERS], values)
+        Tensor::f32(name, &[self.list.len(), VALUES], values)
     }
 
-    /// Takes back what [`tensor`](Self::tensor) returned.
+    /// Restores the list from [`tensor`](Self::tensor).
     pub(super) fn restore(&mut self, tensor: Tensor) -> Result<(), StateError> {
         let most = self.request.map_or(0, |r| r.capacity);
         let count = tensor.shape.first().copied().unwrap_or(0);
         if count > most {
-            return Err(tensor.error(format!("{count} of them; this run holds {most}")));
+            return Err(
+                tensor.error(format!("it has {count} candidates; this run holds at most {most}"))
+            );
         }
-        let values = tensor.into_f32(&[count, NUMBERS])?;
-        let candidate = |&[x, y, z, r, g, b, pixel_size, error]: &[f32; NUMBERS]| Candidate {
+        let values = tensor.into_f32(&[count, VALUES])?;
+        let candidate = |&[x, y, z, r, g, b, pixel_size, error]: &[f32; VALUES]| Candidate {
             position: [x, y, z],
             colour: [r, g, b],
             pixel_size,
@@ -104,7 +106,7 @@ impl Candidates {
         Ok(())
     }
 
-    /// What to take of the view of `step`, if anything: the request, and how many.
+    /// The request and the number of candidates to take in the view of `step`, if any.
     pub(super) fn open(&self, step: u32, rows: usize) -> Option<(CandidateRequest, usize)> {
         let r = self.request.filter(|r| r.from < step && step < r.until)?;
         let count = rows / r.rows_per_candidate.max(1) as usize;
@@ -112,11 +114,11 @@ impl Candidates {
         Some((r, count.min(room))).filter(|&(_, count)| count > 0)
     }
 
-    /// The `count` worst pixels, worst first; `error(x, y)` is None where no candidate may be.
-    /// Equal errors are ordered by pixel number.
+    /// The `count` pixels with the largest error, in descending order, ties by pixel number. `error(x, y)` is `None`
+    /// where no candidate is allowed.
     #[cfg_attr(
         not(any(test, feature = "gpu")),
-        expect(dead_code, reason = "only the GPU backend asks")
+        expect(dead_code, reason = "used by the GPU backend only")
     )]
     pub(super) fn worst(
         &mut self,
@@ -140,9 +142,8 @@ impl Candidates {
         self.worst_by([width, height], count, spaced, rank, &error)
     }
 
-    /// The same, where the pixels that may be among them are known, and their errors: at least
-    /// [`ranked`] of the worst.
-    #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "only the GPU backend asks"))]
+    /// The same for a list of pixels with their errors, which includes at least the worst [`ranked`] of them.
+    #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "used by the GPU backend only"))]
     pub(super) fn worst_of(
         &mut self,
         size: [usize; 2],
@@ -152,7 +153,7 @@ impl Candidates {
     ) -> Vec<(usize, usize, f32)> {
         let known: Vec<Ranked> = known.into_iter().collect();
         let errors: HashMap<u32, f32> = known.iter().map(|&(e, pixel)| (pixel, e)).collect();
-        // What is not known is less.
+        // Pixels that are not listed have smaller errors.
         let error = |x: usize, y: usize| errors.get(&((y * size[0] + x) as u32)).copied();
         let rank = |ranking: &mut Vec<Ranked>, _| {
             *ranking = known;
@@ -161,8 +162,8 @@ impl Candidates {
         self.worst_by(size, count, spaced, rank, error)
     }
 
-    /// The same, where `rank(list, n)` writes pixels to the head of the list, the `n` worst among them,
-    /// and returns how many.
+    /// The same for a function `rank(list, n)` that writes pixels, the `n` worst among them, to the head of the list,
+    /// and returns their number.
     pub(super) fn worst_by(
         &mut self,
         [width, height]: [usize; 2],
@@ -196,12 +197,12 @@ impl Candidates {
     }
 }
 
-/// A larger error comes first; of equal ones, the pixel with the lower number.
+/// Orders by descending error, then by pixel number.
 fn worse(a: &Ranked, b: &Ranked) -> Ordering {
     b.0.total_cmp(&a.0).then(a.1.cmp(&b.1))
 }
 
-/// Brings the `most` worst to the head, in any order; returns how many they are.
+/// Moves the `most` worst pixels to the head, in any order, and returns their number.
 pub(super) fn keep_worst(ranking: &mut [Ranked], most: usize) -> usize {
     if ranking.len() > most {
         ranking.select_nth_unstable_by(most, worse);
@@ -209,13 +210,12 @@ pub(super) fn keep_worst(ranking: &mut [Ranked], most: usize) -> usize {
     ranking.len().min(most)
 }
 
-/// How many of the worst pixels are looked at for `count` candidates.
+/// The number of pixels to rank for `count` candidates.
 pub(super) fn ranked(count: usize, spaced: bool) -> usize {
-    if spaced { count.saturating_mul(SPARE) } else { count }
+    if spaced { count.saturating_mul(RANKED_PER_CANDIDATE) } else { count }
 }
 
-/// Whether the error of a pixel needs the loss's error map, and then its weights of |e| and
-/// 1 − SSIM.
+/// The weights of |e| and 1 − SSIM in the loss's error map; `None` if the error is not based on it.
 pub(super) fn error_weights(mode: ErrorMode) -> Option<[f32; 2]> {
     match mode {
         ErrorMode::Gradient => None,

@@ -1,5 +1,4 @@
-//! Which backends there are: the one place that turns a choice into limits, a promise of bytes, and a
-//! backend.
+//! The choice of a backend: the one place that turns it into limits, a promise of memory, and a backend.
 
 use clap::ValueEnum;
 use densify_policies::policy::Needs;
@@ -7,13 +6,11 @@ use serde::{Deserialize, Serialize};
 
 use super::cpu::CpuBackend;
 use super::gpu::{GpuDevice, adapters, may_be_present};
-use super::{
-    Accumulation, AdapterChoice, AdapterKind, AdapterSummary, Backend, BackendError, Setup,
-};
+use super::{Accumulation, AdapterChoice, AdapterSummary, Backend, BackendError, Setup};
 use densify_core::gaussians::Gaussians;
 use densify_core::memory::Ledger;
 
-/// Where to compute, as it is asked for.
+/// The backend requested.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum BackendChoice {
@@ -27,7 +24,7 @@ pub enum BackendChoice {
 }
 
 impl BackendChoice {
-    /// Its word for `--backend`.
+    /// The name of the choice.
     #[must_use]
     pub const fn word(self) -> &'static str {
         match self {
@@ -47,7 +44,7 @@ pub enum BackendKind {
     Gpu,
 }
 
-/// Knobs that only one backend has; all others work on both.
+/// Knobs that exist on one backend only.
 const KNOBS_OF_ONE: [(&str, BackendKind); 4] = [
     ("pairs_per_row", BackendKind::Cpu),
     ("param_storage", BackendKind::Cpu),
@@ -56,13 +53,13 @@ const KNOBS_OF_ONE: [(&str, BackendKind); 4] = [
 ];
 
 impl BackendKind {
-    /// The kind that alone has a knob; `None` where both have it.
+    /// The only backend that has a knob; `None` if both do.
     #[must_use]
     pub fn only_one_with(knob: &str) -> Option<Self> {
         KNOBS_OF_ONE.iter().find(|(name, _)| *name == knob).map(|(_, kind)| *kind)
     }
 
-    /// As it is called in messages.
+    /// The name in messages.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -71,7 +68,13 @@ impl BackendKind {
         }
     }
 
-    /// The choice that asks for it.
+    /// Whether this program was built with the backend.
+    #[must_use]
+    pub const fn is_built(self) -> bool {
+        matches!(self, Self::Cpu) || cfg!(feature = "gpu")
+    }
+
+    /// The choice that requests this backend.
     #[must_use]
     pub const fn choice(self) -> BackendChoice {
         match self {
@@ -81,34 +84,32 @@ impl BackendKind {
     }
 }
 
-/// What a backend runs on.
+/// The device that a backend runs on.
 #[derive(Debug, Clone, Default)]
 pub enum Device {
     /// The processor.
     #[default]
     Processor,
-    /// An adapter that has been opened.
+    /// An open adapter.
     Gpu(GpuDevice),
 }
 
 impl Device {
-    /// Opens what is chosen: with [`BackendChoice::Auto`] a GPU where there is one or its name is given,
-    /// else the processor. Without an `accumulation` a GPU takes the fastest that it has.
+    /// Opens the requested device. [`BackendChoice::Auto`] takes a GPU if there is one or if `name` is given,
+    /// else the processor. Without an `accumulation`, a GPU uses the fastest that it supports.
     ///
     /// # Errors
-    /// When no adapter has the name or the accumulation, and when a name is given for the processor.
+    /// When no adapter has the name or supports the accumulation, and when a name is given for the processor.
     pub fn open(
         choice: BackendChoice,
         name: Option<&str>,
         accumulation: Option<Accumulation>,
     ) -> Result<Self, BackendError> {
-        let is_there = || may_be_present() && adapters().iter().any(AdapterSummary::is_gpu);
+        let gpu_exists = || may_be_present() && adapters().iter().any(AdapterSummary::is_gpu);
         match (choice, name) {
-            (BackendChoice::Cpu, Some(_)) => Err(BackendError::OverLimit(
-                "--gpu names an adapter, but --backend cpu uses none; leave one of them out".into(),
-            )),
+            (BackendChoice::Cpu, Some(_)) => Err(BackendError::AdapterUnused),
             (BackendChoice::Cpu, None) => Ok(Self::Processor),
-            (BackendChoice::Auto, None) if !is_there() => Ok(Self::Processor),
+            (BackendChoice::Auto, None) if !gpu_exists() => Ok(Self::Processor),
             _ => {
                 let name = name.map(str::to_owned);
                 GpuDevice::open(&AdapterChoice { name, accumulation }).map(Self::Gpu)
@@ -116,15 +117,15 @@ impl Device {
         }
     }
 
-    /// The same to render on: nothing is needed but what all adapters have.
+    /// Opens a device for rendering only, with an accumulation that every adapter supports.
     ///
     /// # Errors
-    /// As [`open`](Self::open).
+    /// The errors of [`open`](Self::open).
     pub fn open_to_render(choice: BackendChoice, name: Option<&str>) -> Result<Self, BackendError> {
         Self::open(choice, name, Some(Accumulation::Slots))
     }
 
-    /// Which backend runs on it.
+    /// The kind of backend that runs on the device.
     #[must_use]
     pub fn kind(&self) -> BackendKind {
         match self {
@@ -133,7 +134,7 @@ impl Device {
         }
     }
 
-    /// The adapter's name; `None` for the processor.
+    /// The name of the adapter; `None` for the processor.
     #[must_use]
     pub fn adapter(&self) -> Option<&str> {
         match self {
@@ -142,7 +143,7 @@ impl Device {
         }
     }
 
-    /// How gradients are added up on a GPU; `None` for the processor, which has one way.
+    /// The method of accumulating gradients on a GPU; `None` for the processor, which has only one.
     #[must_use]
     pub fn accumulation(&self) -> Option<Accumulation> {
         match self {
@@ -151,26 +152,7 @@ impl Device {
         }
     }
 
-    /// A line about it.
-    #[must_use]
-    pub fn describe(&self) -> String {
-        match self {
-            Self::Processor if cfg!(feature = "gpu") => {
-                "processor (`densify devices` lists GPUs)".to_owned()
-            }
-            Self::Processor => "processor".to_owned(),
-            Self::Gpu(device) => {
-                let adapter = device.adapter();
-                let note = match adapter.kind {
-                    AdapterKind::Software => ", a software driver: --backend cpu is faster",
-                    _ => "",
-                };
-                format!("{} ({}){note}", adapter.name, adapter.interface)
-            }
-        }
-    }
-
-    /// Most rows that a backend on it can hold at a degree.
+    /// The largest budget that the device can hold at a degree.
     #[must_use]
     pub fn largest_budget(&self, sh_degree: u8) -> usize {
         match self {
@@ -179,7 +161,7 @@ impl Device {
         }
     }
 
-    /// Most (row, tile) pairs that a backend on it can hold at a time with these needs.
+    /// The most (row, tile) pairs that the device can hold at a time.
     #[must_use]
     pub fn most_pairs(&self, needs: &Needs) -> usize {
         match self {
@@ -188,8 +170,8 @@ impl Device {
         }
     }
 
-    /// Bytes per buffer of a backend with these options for models of this degree; nothing is allocated.
-    /// The promise is for `threads` threads, whatever the options say.
+    /// The ledger of a backend with these options for models of this degree. Nothing is allocated.
+    /// `threads` takes precedence over [`Setup::threads`].
     #[must_use]
     pub fn promise(&self, sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
         match self {
@@ -198,7 +180,7 @@ impl Device {
         }
     }
 
-    /// Bytes of a ledger that `--memory` limits: those on the device where there is one, else all.
+    /// Bytes of a ledger that count against a memory limit: those on the GPU if it is used, else all.
     #[must_use]
     pub fn limited_bytes(&self, ledger: &Ledger) -> u64 {
         match self {
@@ -207,8 +189,8 @@ impl Device {
         }
     }
 
-    /// f32 columns of a row that the host needs beside the backend while signals are read: none where
-    /// the backend lends its own memory for them.
+    /// The f32 columns that the host needs in addition to the backend while signals are read; none if the backend
+    /// lends its own memory.
     #[must_use]
     pub fn columns_on_host(&self, columns: usize) -> usize {
         match self {
@@ -217,11 +199,11 @@ impl Device {
         }
     }
 
-    /// Has a GPU's driver compile what a backend with these needs runs, and shows that it computes soundly: what it
-    /// takes of the process, a promise must know.
+    /// Compiles the GPU kernels for these needs and verifies their results on a small scene. Done before a promise,
+    /// which must include the memory that the driver takes.
     ///
     /// # Errors
-    /// When it does not.
+    /// When a kernel does not compile or its results are wrong.
     pub fn prove(&self, needs: &Needs) -> Result<(), BackendError> {
         match self {
             Self::Processor => Ok(()),
@@ -229,10 +211,10 @@ impl Device {
         }
     }
 
-    /// A backend that holds the model.
+    /// Makes a backend that holds the model.
     ///
     /// # Errors
-    /// When device or memory do not suffice.
+    /// When the limits of the device or the memory do not suffice.
     pub fn backend(
         &self,
         model: &Gaussians,

@@ -1,23 +1,23 @@
-//! Gradients and losses on their own: tools for tests and for research, not part of training.
+//! Gradients and losses outside of training, for tests and research.
 
 use super::cpu::ModelGradient;
 use super::{Backend, BackendError, Rendering, StepOutput};
 use densify_core::camera::Camera;
 use densify_core::image::Image8;
 
-/// dL/dpixel of an image.
+/// The gradient of a loss with respect to an image.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ImageGradient {
-    /// Shape: `[height, width, 3]`.
+    /// By colour. Shape: `[height, width, 3]`.
     pub rgb: Vec<f32>,
-    /// Shape: `[height, width]`.
+    /// By alpha. Shape: `[height, width]`.
     pub alpha: Vec<f32>,
-    /// Shape: `[height, width]`.
+    /// By depth. Shape: `[height, width]`.
     pub depth: Vec<f32>,
 }
 
 impl ImageGradient {
-    /// Panics unless it is of a camera's image.
+    /// Panics unless it has the size of the camera's image.
     pub(super) fn assert_size(&self, camera: &Camera) {
         let pixels = camera.width as usize * camera.height as usize;
         assert_eq!(self.rgb.len(), 3 * pixels, "upstream.rgb");
@@ -26,13 +26,12 @@ impl ImageGradient {
     }
 }
 
-/// A backend with gradients and losses on their own.
+/// A backend that computes gradients and losses outside of training.
 pub trait Differentiable: Backend {
     /// Renders a view and differentiates Σ rgb·upstream.rgb + Σ alpha·upstream.alpha +
-    /// Σ depth·upstream.depth with respect to every parameter. Changes nothing of the model.
+    /// Σ depth·upstream.depth with respect to every parameter. The model is unchanged.
     ///
-    /// Needs every field of a record, so that it allocates more than the ledger says where the
-    /// policy's needs are smaller.
+    /// Uses every field of the gradient records, so it may allocate more than the ledger promises.
     ///
     /// # Errors
     /// See [`BackendError`].
@@ -47,8 +46,8 @@ pub trait Differentiable: Backend {
         upstream: &ImageGradient,
     ) -> Result<(Rendering, ModelGradient), BackendError>;
 
-    /// The training loss of a rendering against a target and its gradient by the rendering's
-    /// pixels. Shape of the gradient: `[height, width, 3]`.
+    /// The training loss of a rendering against a target, and its gradient with respect to the rendering's
+    /// colours. Shape of the gradient: `[height, width, 3]`.
     ///
     /// # Errors
     /// See [`BackendError`].

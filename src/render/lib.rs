@@ -1,8 +1,7 @@
-//! What a renderer-and-optimiser does for the trainer, whatever it runs on.
+//! The interface between the trainer and its backends, each a differentiable rasteriser with an optimiser.
 //!
-//! Data flows one way: a view goes in, a step is taken on the device, a few scalars come back.
-//! Signals come down when a policy is due, row operations go up; parameters stay where they are. One piece: the trait
-//! with what goes in and comes out of it.
+//! A step takes a view, runs on the device and returns a few scalars. Signals are downloaded when a policy is due,
+//! and row operations are uploaded; parameters stay on the device.
 
 mod adapter;
 mod audit;
@@ -10,11 +9,13 @@ mod candidates;
 mod choice;
 pub mod cpu;
 mod differentiable;
+mod error;
 #[cfg(feature = "gpu")]
 pub mod gpu;
 #[cfg(not(feature = "gpu"))]
 #[path = "without_gpu.rs"]
 pub mod gpu;
+mod inspect;
 mod pixel_map;
 mod setup;
 mod signals;
@@ -38,16 +39,17 @@ use densify_core::image::Image8;
 use densify_core::memory::Ledger;
 pub use densify_shaders::Accumulation;
 pub use differentiable::{Differentiable, ImageGradient};
+pub use error::{BackendError, Fit};
+pub use inspect::Inspect;
 pub use setup::{KeptPhotographs, MomentStorage, ParameterStorage, Setup, Shortcuts, Storage};
 pub use state::{StateArray, StateError, Tensor, Values};
 
-/// Step sizes of one iteration, one per parameter class.
+/// Learning rates of one iteration.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LearningRates {
     /// Means `[scene units per step]`.
     pub mean: f32,
-    /// Means, without the [boost](densify_train::schedule::RateOptions::boost) of short runs: what noise is
-    /// proportional to `[scene units per step]`.
+    /// Means, without the boost that short runs get; noise is proportional to it `[scene units per step]`.
     pub noise: f32,
     /// Log-scales `[ln scene units per step]`.
     pub log_scale: f32,
@@ -62,7 +64,7 @@ pub struct LearningRates {
 }
 
 impl LearningRates {
-    /// Steps of length zero: the model stays as it is, and signals are measured all the same.
+    /// All rates 0: the model is unchanged, while signals are still measured.
     pub const STILL: Self = Self {
         mean: 0.0,
         noise: 0.0,
@@ -74,40 +76,40 @@ impl LearningRates {
     };
 }
 
-/// One training step: what to render, what it should look like, how far to go.
+/// The input of a training step.
 #[derive(Debug, Clone, Copy)]
 pub struct StepInput<'a> {
-    /// Iteration, 1-based.
+    /// The iteration, 1-based.
     pub step: u32,
-    /// The view's number; a view has one image, which a backend may keep.
+    /// The view's number. Its image never changes, so that a backend may keep it.
     pub view: usize,
     /// The view's camera.
     pub camera: &'a Camera,
     /// The view's image, of the camera's size.
     pub target: &'a Image8,
-    /// Background colour, sRGB-encoded in `[0, 1]`; a target with alpha is composited on it too.
+    /// Background colour, sRGB-encoded in `[0, 1]`; targets with alpha are composited on it as well.
     pub background: [f32; 3],
-    /// How the image was exposed, in a backend [made](Setup::exposures) for it: the loss sees the rendering
-    /// so transformed, but for the background.
+    /// The exposure of the photograph, in a backend [set up](Setup::exposures) for it: the loss compares the
+    /// transformed rendering, whose background is left unchanged.
     pub exposure: Option<&'a ColourTransform>,
-    /// Spherical-harmonic degree evaluated and trained now, <= the model's.
+    /// Spherical-harmonic degree to evaluate and train, <= the model's.
     pub sh_degree: u8,
-    /// Step sizes.
+    /// Learning rates.
     pub rates: LearningRates,
     /// Terms added to the loss.
     pub loss_terms: LossTerms,
     /// Noise on the means.
     pub noise: Option<NoiseTerm>,
-    /// How often the optimiser steps, no longer than the backend was made for.
+    /// Intervals of the optimiser's steps, no longer than those the backend was set up for.
     pub cadence: Cadence,
     /// Seed of the run, for noise on the means.
     pub seed: u64,
 }
 
-/// A training view to be measured for a policy's event.
+/// A training view to measure for a policy's event.
 #[derive(Debug, Clone, Copy)]
 pub struct AuxInput<'a> {
-    /// Iteration just finished, 1-based.
+    /// The iteration just finished, 1-based.
     pub step: u32,
     /// The view's number, for random draws.
     pub view: usize,
@@ -119,29 +121,29 @@ pub struct AuxInput<'a> {
     pub target: &'a Image8,
     /// Background colour, sRGB-encoded in `[0, 1]`.
     pub background: [f32; 3],
-    /// As [`StepInput::exposure`].
+    /// See [`StepInput::exposure`].
     pub exposure: Option<&'a ColourTransform>,
-    /// Spherical-harmonic degree evaluated now, <= the model's.
+    /// Spherical-harmonic degree to evaluate, <= the model's.
     pub sh_degree: u8,
-    /// What to measure.
+    /// The measurements requested.
     pub request: &'a AuxRequest,
 }
 
-/// What was measured in a view.
+/// The measurements of a view.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct AuxOutput {
     /// 0.8·L1 + 0.2·(1 − SSIM).
     pub loss: f32,
-    /// The columns asked for, in their order. Shape of each: `[rows]`.
+    /// The requested columns, in order. Shape of each: `[rows]`.
     pub columns: Vec<(AuxColumn, Vec<f32>)>,
-    /// Surface points; their error is the pixel's alpha.
+    /// Surface points, each with its pixel's alpha as its error.
     pub points: Vec<Candidate>,
 }
 
 /// The scalars of one training step.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct StepOutput {
-    /// 0.8·L1 + 0.2·(1 − SSIM), without the terms that a policy adds; L1 where SSIM is left out.
+    /// 0.8·L1 + 0.2·(1 − SSIM), without the terms that a policy adds.
     pub loss: f32,
     /// Mean over pixels and channels of |I − G|.
     pub l1: f32,
@@ -149,11 +151,11 @@ pub struct StepOutput {
     pub ssim: f32,
     /// Rows whose projection is on screen.
     pub visible: usize,
-    /// (row, tile) pairs rendered.
+    /// Rendered (row, tile) pairs.
     pub entries: u64,
-    /// Passes in which the tile lists were processed; 1 unless the cap made it more.
+    /// Bands in which the tile lists were processed: 1 unless they exceeded the cap.
     pub bands: u32,
-    /// Derivatives of the loss by the exposure, where there is one.
+    /// Gradient of the loss with respect to the exposure, if there is one.
     pub exposure: Option<ColourGradient>,
 }
 
@@ -164,7 +166,7 @@ pub struct Rendering {
     pub width: u32,
     /// Height `[px]`.
     pub height: u32,
-    /// Background included, not clamped. Shape: `[height, width, 3]`.
+    /// Colours, background included, not clamped. Shape: `[height, width, 3]`.
     pub rgb: Vec<f32>,
     /// 1 − final transmittance, in `[0, 1]`. Shape: `[height, width]`.
     pub alpha: Vec<f32>,
@@ -172,132 +174,79 @@ pub struct Rendering {
     pub depth: Vec<f32>,
 }
 
-/// Panics unless they have the same size.
+/// Panics unless camera and image have the same size.
 fn assert_same_size(camera: &Camera, image: &Image8) {
     let [camera, image] = [[camera.width, camera.height], [image.width, image.height]];
     assert_eq!(camera, image, "camera and image differ in size");
 }
 
-/// Panics unless a plan fits the rows; in release builds too, as this is the promise.
+/// Panics unless a plan fits the rows, in release builds too: the memory promise depends on it.
 fn assert_fits(ops: &RowOps, frozen: usize, rows: usize, budget: usize) {
     assert_eq!(ops.first_row, frozen, "a plan for another number of frozen rows");
     assert_eq!(ops.rows_before, rows, "a plan for another number of rows");
     assert_eq!(ops.budget, budget, "a plan for another budget");
     assert!(ops.rows_after <= budget, "{} rows over the budget", ops.rows_after);
     if let Err(broken) = ops.check() {
-        panic!("a plan that breaks its own rules: {broken}");
+        panic!("an inconsistent plan: {broken}");
     }
 }
 
-/// Why a backend cannot go on.
-#[derive(Debug, thiserror::Error)]
-pub enum BackendError {
-    /// Memory for the promised buffers could not be had.
-    #[error("cannot allocate {bytes} bytes for {what}; lower --budget, --sh-degree or --tile-cap")]
-    OutOfMemory {
-        /// The buffer.
-        what: &'static str,
-        /// Its size.
-        bytes: u64,
-    },
-    /// The worker threads could not be started.
-    #[error("cannot start the worker threads: {0}; lower --threads")]
-    Threads(String),
-    /// The image is larger than the backend supports.
-    #[error(
-        "an image of {width}x{height} px is too large: sides of at most {max} px; use --resolution to shrink it"
-    )]
-    ImageTooLarge {
-        /// Its width `[px]`.
-        width: u32,
-        /// Its height `[px]`.
-        height: u32,
-        /// The largest side supported `[px]`.
-        max: u32,
-    },
-    /// No adapter does.
-    #[error("{0}; `densify devices` lists the adapters, and --backend cpu needs none")]
-    NoAdapter(String),
-    /// A buffer beyond what the device can bind, with the remedy.
-    #[error("{0}")]
-    OverLimit(String),
-    /// The device was lost: what was on it is gone.
-    #[error(
-        "the device {device} was lost ({why}); start again from what was saved, or use --backend cpu"
-    )]
-    DeviceLost {
-        /// Its name.
-        device: String,
-        /// The driver's words.
-        why: String,
-    },
-    /// The device has refused a command.
-    #[error("the device {device} has failed ({why}); try another driver, or --backend cpu")]
-    Device {
-        /// Its name.
-        device: String,
-        /// The driver's words.
-        why: String,
-    },
-}
-
-/// A differentiable rasteriser with its optimiser and the model's only copy.
+/// A differentiable rasteriser with its optimiser, which holds the only copy of the model.
 pub trait Backend: Send {
-    /// Rows now.
+    /// Current number of rows.
     fn rows(&self) -> usize;
 
     /// Spherical-harmonic degree of the model.
     fn sh_degree(&self) -> u8;
 
-    /// Most rows there may ever be; all buffers have this size from the start.
+    /// The largest number of rows; all buffers have this size from the start.
     fn budget(&self) -> usize;
 
-    /// Bytes per buffer, as promised and at their peak.
+    /// The promised bytes of each buffer.
     fn ledger(&self) -> &Ledger;
 
-    /// Says that a new epoch begins (`WeightMax` is kept by epoch).
+    /// Starts a new epoch; `WeightMax` is kept per epoch.
     fn begin_epoch(&mut self);
 
-    /// One forward pass, backward pass and optimiser step; accumulates signals.
+    /// Runs a forward pass, a backward pass and an optimiser step, and accumulates signals.
     ///
     /// # Errors
     /// See [`BackendError`].
     fn train_step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError>;
 
-    /// Renders a view as the model is now and measures what is asked for. Changes nothing of the
-    /// model, of the optimiser, or of the signals.
+    /// Renders a view and takes the requested measurements. Model, optimiser and signals are unchanged.
     ///
     /// # Errors
     /// See [`BackendError`].
     fn observe(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError>;
 
-    /// Copies these signals to the host.
+    /// Copies the requested signals to the host.
     ///
     /// # Errors
     /// See [`BackendError`].
     fn take_signals(&mut self, wanted: SignalSet) -> Result<Signals, BackendError>;
 
-    /// Takes back the signals when they have been read: a backend may have lent memory of its own for
-    /// them, which it has to allocate anew otherwise.
+    /// Returns the signals after they have been read. Their memory may belong to the backend, which otherwise has
+    /// to allocate it again.
     fn give_back(&mut self, signals: Signals) {
         drop(signals);
     }
 
-    /// The candidates collected since their last reset.
+    /// The candidates collected since the last reset.
     fn candidates(&self) -> &[Candidate];
 
-    /// Executes a plan of iteration `step`: parameters, moments and age in place.
+    /// Executes a plan of iteration `step` in place, on parameters, moments and ages.
     ///
     /// # Errors
     /// See [`BackendError`].
     ///
     /// # Panics
-    /// When `ops` was made for another number of rows or another budget: that is a bug in the
-    /// caller, and going on would exceed the budget or corrupt the model.
+    /// When `ops` was made for another number of rows or another budget: a bug in the caller that would
+    /// exceed the budget or corrupt the model.
     fn apply(&mut self, ops: &RowOps, seed: u64, step: u32) -> Result<(), BackendError>;
 
-    /// The rows with a parameter or a moment that is NaN or infinite, in order. Until they are
-    /// removed they are not rendered, and nothing else depends on them.
+    /// Lists the rows with a non-finite parameter or moment, in order. Such rows are not rendered and affect
+    /// nothing else until they are removed.
     ///
     /// # Errors
     /// See [`BackendError`].
@@ -314,34 +263,13 @@ pub trait Backend: Send {
         sh_degree: u8,
     ) -> Result<Rendering, BackendError>;
 
-    /// Whether [`render_counts`](Self::render_counts) counts.
-    fn counts_rows(&self) -> bool {
-        false
-    }
-
-    /// Renders a view and, where the backend [can](Self::counts_rows), counts the rows that are blended into
-    /// each pixel: in place of depth.
+    /// The backend's renderings for inspection.
     ///
     /// # Errors
-    /// See [`BackendError`].
-    fn render_counts(&mut self, camera: &Camera) -> Result<Rendering, BackendError> {
-        self.render(camera, [0.0; 3], 0)
+    /// [`BackendError::Unsupported`] if it has none.
+    fn inspect(&mut self) -> Result<&mut dyn Inspect, BackendError> {
+        Err(BackendError::Unsupported("inspection"))
     }
-
-    /// Renders a view with the rows in these colours instead of their own, from everywhere the same; >= 0, sRGB-encoded.
-    /// Changes nothing of the model.
-    ///
-    /// # Errors
-    /// See [`BackendError`].
-    ///
-    /// # Panics
-    /// When there is not one colour per row: a bug in the caller.
-    fn render_painted(
-        &mut self,
-        camera: &Camera,
-        background: [f32; 3],
-        colours: &[[f32; 3]],
-    ) -> Result<Rendering, BackendError>;
 
     /// Copies the model to the host.
     ///
@@ -357,32 +285,32 @@ pub trait Backend: Send {
     /// See [`BackendError`].
     ///
     /// # Panics
-    /// When there are no such rows: a bug in the caller.
+    /// When a row does not exist: a bug in the caller.
     fn download_rows(&self, rows: Range<usize>) -> Result<Gaussians, BackendError> {
         let array = |array| self.download_array(array, rows.clone());
         Gaussians::from_arrays(self.sh_degree(), array)
     }
 
-    /// Copies some rows of one of the model's arrays to the host, row after row.
+    /// Copies some rows of one of the model's arrays to the host, row-major.
     ///
     /// # Errors
     /// See [`BackendError`].
     ///
     /// # Panics
-    /// When there are no such rows: a bug in the caller.
+    /// When a row does not exist: a bug in the caller.
     fn download_array(
         &self,
         array: ModelArray,
         rows: Range<usize>,
     ) -> Result<Vec<f32>, BackendError>;
 
-    /// Takes back what [`download_array`](Self::download_array) returned for the same rows.
+    /// Uploads an array that [`download_array`](Self::download_array) returned for the same rows.
     ///
     /// # Errors
     /// See [`BackendError`].
     ///
     /// # Panics
-    /// When there are no such rows: a bug in the caller.
+    /// When a row does not exist: a bug in the caller.
     fn upload_array(
         &mut self,
         array: ModelArray,
@@ -390,8 +318,8 @@ pub trait Backend: Send {
         values: &[f32],
     ) -> Result<(), BackendError>;
 
-    /// The arrays that hold, beside the model, all that the future depends on: moments, ages,
-    /// accumulated signals, and whatever else outlives a step. See [`Tensor`] for their order.
+    /// The arrays that hold everything except the model that later steps depend on, such as moments, ages and
+    /// accumulated signals.
     fn state(&self) -> Vec<StateArray>;
 
     /// Copies one array of [`state`](Self::state) to the host.
@@ -400,42 +328,40 @@ pub trait Backend: Send {
     /// See [`BackendError`].
     ///
     /// # Panics
-    /// When there is no such array: a bug in the caller.
+    /// When the array does not exist: a bug in the caller.
     fn save(&self, name: &str) -> Result<Tensor, BackendError> {
         self.save_rows(name, 0..self.rows())
     }
 
-    /// Copies some rows of an array to the host; one that is not [by rows](StateArray::by_rows) is whole,
-    /// whatever the rows.
+    /// Copies some rows of an array to the host; an array that is not [by rows](StateArray::by_rows) is copied
+    /// whole.
     ///
     /// # Errors
     /// See [`BackendError`].
     ///
     /// # Panics
-    /// When there is no such array, or there are no such rows: a bug in the caller.
+    /// When the array or a row does not exist: a bug in the caller.
     fn save_rows(&self, name: &str, rows: Range<usize>) -> Result<Tensor, BackendError>;
 
-    /// Takes back what [`save`](Self::save) returned, into a backend made with the same options for
-    /// the [model](Self::download) of that moment. When all arrays are back, the future is the same
-    /// to the bit.
+    /// Restores an array that [`save`](Self::save) returned, in a backend set up with the same options for the
+    /// [model](Self::download) of that step. With all arrays restored, later steps are the same to the bit.
     ///
     /// # Errors
     /// [`StateError`] when this backend has no such array, or one of another type or shape. The
-    /// array may come from a file that cannot be trusted.
+    /// array may come from an untrusted file.
     fn restore(&mut self, tensor: Tensor) -> Result<(), StateError> {
         self.restore_rows(tensor, 0..self.rows())
     }
 
-    /// Takes back what [`save_rows`](Self::save_rows) returned for the same rows.
+    /// Restores rows that [`save_rows`](Self::save_rows) returned for the same range.
     ///
     /// # Errors
-    /// As [`restore`](Self::restore).
+    /// The errors of [`restore`](Self::restore).
     ///
     /// # Panics
-    /// When there are no such rows: a bug in the caller.
+    /// When a row does not exist: a bug in the caller.
     fn restore_rows(&mut self, tensor: Tensor, rows: Range<usize>) -> Result<(), StateError>;
 
-    /// Wall time of each stage of the last step, in order; a stage that ran more than once stands
-    /// there as often.
+    /// Wall time of each stage of the last step, in order; one entry per execution of a stage.
     fn stage_times(&self) -> &[(&'static str, Duration)];
 }

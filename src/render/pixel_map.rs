@@ -1,5 +1,5 @@
-//! Measurements of auxiliary views that every backend makes on the host: the pixel map, the choice of
-//! pixels for surface points, and a row's radius.
+//! Measurements of auxiliary views that both backends take on the host: the pixel map, the pixels of surface
+//! points, and the radius of a row.
 
 use densify_policies::policy::{ErrorScore, PixelMap};
 use densify_policies::rng::PolicyRng;
@@ -41,9 +41,9 @@ pub(super) fn draw_pixels(
     width: usize,
     input: &AuxInput<'_>,
 ) -> Vec<(usize, usize, f32)> {
-    // Views of one step draw apart from each other.
-    let of_view = (input.view as u64 + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
-    let rng = PolicyRng::new(input.seed ^ of_view, input.step);
+    // Views of one step use different draws.
+    let view_hash = (input.view as u64 + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+    let rng = PolicyRng::new(input.seed ^ view_hash, input.step);
     let drawn = weighted(alpha, input.request.points as usize, &rng);
     drawn
         .into_iter()
@@ -63,7 +63,7 @@ pub(super) fn radius_px(inv_l1: f32, shear: f32, inv_l3: f32) -> f32 {
     (3.0 * (mid + root).sqrt()).ceil()
 }
 
-/// The edges of an image. Shape: `[height, width]`.
+/// Edge strength per pixel. Shape: `[height, width]`.
 fn edges(target: &Image8, background: [f32; 3]) -> Vec<u8> {
     let size = [target.width as usize, target.height as usize];
     let mut luma = vec![0; size[0] * size[1]];
@@ -73,7 +73,7 @@ fn edges(target: &Image8, background: [f32; 3]) -> Vec<u8> {
     (0..luma.len()).map(|at| edge_at(&luma, size, at)).collect()
 }
 
-/// Writes the 8-bit luma of a line of pixels.
+/// Writes the 8-bit luma of an image row.
 pub(super) fn luma_line(target: &Image8, background: [f32; 3], y: usize, line: &mut [u8]) {
     for (x, luma) in line.iter_mut().enumerate() {
         let rgb = target.composited(x, y, background);
@@ -83,7 +83,7 @@ pub(super) fn luma_line(target: &Image8, background: [f32; 3], y: usize, line: &
     }
 }
 
-/// 8-neighbour Laplacian of the 8-bit luma in a pixel, clipped to 0..255; borders are repeated.
+/// The 8-neighbour Laplacian of the luma at a pixel, clipped to 0..255; border pixels are repeated.
 pub(super) fn edge_at(luma: &[u8], [width, height]: [usize; 2], pixel: usize) -> u8 {
     let at = |x: usize, y: usize| i32::from(luma[y * width + x]);
     let (x, y) = (pixel % width, pixel / width);
@@ -93,14 +93,14 @@ pub(super) fn edge_at(luma: &[u8], [width, height]: [usize; 2], pixel: usize) ->
     (9 * at(x, y) - sum).clamp(0, 255) as u8
 }
 
-/// What an edge of 1 adds to the weight of a pixel, where edges weigh so much at their mean, in an image
-/// whose edges have this sum.
+/// The weight that one unit of edge strength adds to a pixel, such that the mean edge adds `weight`. `sum` is the sum
+/// of edge strengths over all `pixels`.
 pub(super) fn edge_factor(weight: f32, sum: u64, pixels: usize) -> f32 {
     if sum == 0 { 0.0 } else { (f64::from(weight) * pixels as f64 / sum as f64) as f32 }
 }
 
-/// Weights of all pixels for [`ErrorScore::edge`]. Shape: `[height, width]`.
-#[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "only the GPU backend asks"))]
+/// The weights of all pixels by [`ErrorScore::edge`]. Shape: `[height, width]`.
+#[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "used by the GPU backend only"))]
 pub(super) fn edge_weights(target: &Image8, background: [f32; 3], score: &ErrorScore) -> Vec<f32> {
     let edges = edges(target, background);
     let sum = edges.iter().map(|&edge| u64::from(edge)).sum();
@@ -108,7 +108,7 @@ pub(super) fn edge_weights(target: &Image8, background: [f32; 3], score: &ErrorS
     edges.iter().map(|&edge| 1.0 + factor * f32::from(edge)).collect()
 }
 
-/// Brings values to 0..1 by their least and their largest; all 0 where they are equal.
+/// Maps values linearly to 0..1 by their minimum and maximum; to 0 if they are all equal.
 fn stretch(values: &mut [f32]) {
     let range = values
         .iter()

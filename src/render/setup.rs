@@ -1,50 +1,48 @@
-//! How a backend is set up.
+//! The settings of a backend.
 
 use densify_policies::policy::Needs;
 
 use super::cpu::InstructionSet;
 
-/// How to set up a backend, whichever it is. The default has room for one row.
+/// The settings of a backend of either kind. The default has room for one row.
 #[derive(Debug, Clone)]
 pub struct Setup {
-    /// Most rows there may ever be, >= 1 and >= the model's.
+    /// The largest number of rows, >= 1 and >= the model's.
     pub budget: usize,
-    /// Rows at the front that are rendered, and never change: no optimiser steps them, and they have memory for
-    /// nothing but what rendering needs.
+    /// Number of frozen rows at the front: they are rendered but not trained, and have memory only for rendering.
     pub frozen: usize,
-    /// Near plane `[scene units]`, > 0: rows nearer to the camera are not rendered.
+    /// Near plane `[scene units]`, > 0: rows closer to the camera are not rendered.
     pub near: f32,
-    /// Most (row, tile) pairs held at a time, beyond which an image is processed in bands; `None`: 16
-    /// per row, or as many as the device can hold. At least the budget is taken, as one tile's list
+    /// The most (row, tile) pairs held at a time; an image with more is processed in bands. `None` means 16
+    /// per row, or as many as the device can hold. Raised to the budget if smaller, as one tile's list
     /// must fit.
     pub tile_cap: Option<usize>,
-    /// Most gradient records, one per pair, held at a time, >= 1; where there are more pairs, the
-    /// backward pass takes them in parts (native backend).
+    /// The most gradient records, one per pair, held at a time, >= 1; the backward pass processes more pairs in
+    /// parts (native backend).
     pub record_cap: usize,
-    /// What the kernels may use of the processor (native backend).
+    /// Instruction set of the kernels (native backend).
     pub instructions: InstructionSet,
-    /// Processor threads; `None`: all cores.
+    /// Processor threads; `None` means one per core.
     pub threads: Option<usize>,
-    /// Largest image that will be rendered (width, height) `[px]`. Larger ones still work, with more
-    /// memory than the ledger says.
+    /// The largest image to render (width, height) `[px]`. Larger ones work, but need more memory than the
+    /// ledger promises.
     pub largest_image: (u32, u32),
-    /// Photographs that stay on a GPU instead of being uploaded at every step.
+    /// Photographs kept in GPU memory instead of being uploaded at every step.
     pub photographs: KeptPhotographs,
-    /// How parameters and moments are stored (native backend).
+    /// Storage formats of parameters and moments (native backend).
     pub storage: Storage,
-    /// Where to compute less than could be.
+    /// Thresholds of blending.
     pub shortcuts: Shortcuts,
     /// Signals and candidates to collect.
     pub needs: Needs,
-    /// Whether steps and measured views may have exposures of their own.
+    /// Whether steps and measured views may have exposures.
     pub exposures: bool,
-    /// Whether nothing but rendering will be asked for: then there is no room for what only training needs
-    /// (native backend).
+    /// Whether the backend only renders, and so needs no memory for training (native backend).
     pub only_renders: bool,
 }
 
 impl Setup {
-    /// Options for models of at most `budget` rows.
+    /// Default settings for models of at most `budget` rows.
     #[must_use]
     pub fn new(budget: usize) -> Self {
         Self {
@@ -72,17 +70,17 @@ impl Default for Setup {
     }
 }
 
-/// Photographs that may stay on the device.
+/// Photographs kept on the device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct KeptPhotographs {
-    /// How many.
+    /// Number of photographs.
     pub count: usize,
     /// Whether any of them has a mask.
     pub with_masks: bool,
 }
 
 impl KeptPhotographs {
-    /// Bytes that one takes on the device, where the largest has this size: its pixels, and its mask.
+    /// Bytes per photograph on the device, given the largest size: of its pixels and of its mask.
     #[must_use]
     pub fn bytes((width, height): (u32, u32), with_masks: bool) -> [u64; 2] {
         let pixels = u64::from(width) * u64::from(height);
@@ -90,12 +88,10 @@ impl KeptPhotographs {
     }
 }
 
-/// The formats in which the numbers of a model and of its optimiser are stored between steps; arithmetic
-/// is always f32.
+/// Storage formats of the model and of its optimiser between steps; arithmetic is always f32.
 ///
 /// Numbers stored in fewer bits are rounded stochastically, without bias: a step of Adam is often
-/// smaller than half the distance between two neighbours and would always be lost if it were rounded
-/// to the nearest.
+/// smaller than half the distance between two representable numbers, and rounding to nearest would always lose it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Storage {
     /// The model.
@@ -104,37 +100,37 @@ pub struct Storage {
     pub moments: MomentStorage,
 }
 
-/// How parameters are stored.
+/// Storage formats of the parameters.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum ParameterStorage {
     /// 4 bytes each.
     #[default]
     F32,
-    /// Means 4 bytes each, all others 2. Coefficients of colour are IEEE 754 binary16: 11 significant
-    /// bits, up to 65,504. Log-scales and opacity logits (within ±16) and quaternions (±2), which are
-    /// bounded, are in fixed point, steps of 2⁻¹¹ and 2⁻¹⁴.
+    /// 4 bytes each for means, 2 for all others. Colour coefficients are IEEE 754 binary16: 11 significant
+    /// bits, up to 65,504. Log-scales and opacity logits (within ±16) and quaternions (within ±2) are bounded and
+    /// in fixed point, in steps of 2⁻¹¹ and 2⁻¹⁴.
     F16,
 }
 
-/// How the optimiser's moments are stored.
+/// Storage formats of the optimiser's moments.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum MomentStorage {
     /// 4 bytes each.
     #[default]
     F32,
-    /// 1 byte each: the second, a squared gradient, as a float of one significant digit after the first,
-    /// from 2⁻⁹⁶ (whose root is near Adam's ε) to 1.5·2³⁰; the first as a multiple of the root of the
+    /// 1 byte each. The second moment, a squared gradient, is a float with one mantissa bit
+    /// from 2⁻⁹⁶ (whose root is near Adam's ε) to 1.5·2³⁰. The first is a multiple of the root of the
     /// second, which bounds it.
     Both8,
 }
 
-/// Where a backend computes less than it could. The default is the renderer as published, and what
-/// every other renderer of Gaussian splats does.
+/// Thresholds below which blending is skipped. The defaults are those of the published renderer, which other
+/// renderers of Gaussian splats use as well.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Shortcuts {
     /// Alpha below this is not blended; above 0.
     pub alpha_min: f32,
-    /// A pixel stops before its transmittance reaches this; above 0.
+    /// A pixel is finished before its transmittance falls to this; above 0.
     pub transmittance_min: f32,
 }
 
@@ -145,10 +141,9 @@ impl Default for Shortcuts {
 }
 
 impl Shortcuts {
-    /// log₂ of 1/[`alpha_min`](Self::alpha_min): a splat reaches as far as its exponent stays above
-    /// minus this.
-    #[must_use]
-    pub fn log2_reach(&self) -> f32 {
+    /// log₂ of 1/[`alpha_min`](Self::alpha_min): a splat covers the pixels where its exponent is at least the
+    /// negative of this.
+    pub(crate) fn log2_reach(&self) -> f32 {
         -f64::from(self.alpha_min).log2() as f32
     }
 }

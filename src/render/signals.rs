@@ -1,8 +1,7 @@
-//! The memory layout of signals, for both backends: fields of gradient records and planes of
-//! accumulators.
+//! The memory layout of signals in both backends: fields of gradient records, and planes of accumulators.
 //!
-//! A signal is one entry in the policies' table ([`Signal`]); record layouts, strides, planes and the
-//! shaders' constants follow from it. Only requested signals have memory.
+//! Record layouts, strides, planes and the shaders' constants all follow from the policies' table of signals
+//! ([`Signal`]). Only requested signals have memory.
 
 use std::ops::Range;
 
@@ -12,14 +11,14 @@ use densify_policies::policy::{
 
 use densify_core::gaussians::{ModelArray, dc_to_rgb};
 
-/// Numbers of a record that training itself needs: Σq, Σq·u, Σq·z, Σq·u², Σq·u·z, Σq·z² and the
-/// gradients by colour.
+/// Values per record that training itself needs: Σq, Σq·u, Σq·z, Σq·u², Σq·u·z, Σq·z² and the
+/// gradient with respect to the colour.
 pub(super) const BASE: usize = 9;
 
-/// An optional number of a record, in the order in which records have them.
+/// The optional values of a record, in the order of the record.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Field {
-    /// Σ|q·u|; with the next one, the absolute gradients of the projected mean.
+    /// Σ|q·u|; together with `AbsY` the absolute gradients of the projected mean.
     AbsX,
     /// Σ|q·(l3·z − l1·shear·u)|.
     AbsY,
@@ -27,11 +26,11 @@ pub(super) enum Field {
     WeightSum,
     /// Number of pixels with w > 0.
     PixelCount,
-    /// Σw·(gradient by depth): for given gradients of an image, never in training.
+    /// Σw·(gradient by depth); only for [`Differentiable`](super::Differentiable), never in training.
     Depth,
-    /// Σw·(error of the pixel): in training, and never beside [`Depth`](Self::Depth).
+    /// Σw·(error of the pixel); only in training, never together with [`Depth`](Self::Depth).
     Error,
-    /// max w; the last one, as it is the only one that is not a sum.
+    /// max w; the last, as it is the only value that is not a sum.
     WeightMax,
 }
 
@@ -46,7 +45,7 @@ impl Field {
         Self::WeightMax,
     ];
 
-    const fn of(sum: PixelSum) -> &'static [Self] {
+    const fn of_sum(sum: PixelSum) -> &'static [Self] {
         match sum {
             PixelSum::AbsGradient => &[Self::AbsX, Self::AbsY],
             PixelSum::Weight => &[Self::WeightSum],
@@ -56,14 +55,14 @@ impl Field {
         }
     }
 
-    /// The place of this number among all that a record can have; one place for depth and error.
+    /// The index of this value in a complete record; depth and error share one.
     pub(super) const fn number(self) -> usize {
         let is_late = self as usize >= Self::Error as usize;
         BASE + self as usize - is_late as usize
     }
 
-    /// The shaders' constant for its place in a record.
-    #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "only the GPU backend asks"))]
+    /// The shaders' constant for the index in a record.
+    #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "used by the GPU backend only"))]
     pub(super) const fn constant(self) -> &'static str {
         match self {
             Self::AbsX => "ABS_X_AT",
@@ -77,24 +76,25 @@ impl Field {
     }
 }
 
-/// Which numbers the records of a backend have: the base, and the fields that its signals need.
+/// The values in a backend's records: the base, and the fields that its signals need.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct RecordLayout {
     /// A bit per [`Field`].
     fields: u8,
-    /// The optional fields by their place among all numbers that a record can have, in order.
+    /// The optional fields in order, by their index in a complete record.
     extras: [u8; RecordLayout::MOST - BASE],
 }
 
 impl RecordLayout {
-    /// Every field but the error: what [`Differentiable`](super::Differentiable) needs.
+    /// All fields except the error, as [`Differentiable`](super::Differentiable) needs them.
     pub(super) const ALL: Self =
         Self::with(((1 << Field::ALL.len()) - 1) & !(1 << Field::Error as u8));
-    /// Most numbers of a record.
+    /// Values in a complete record.
     pub(super) const MOST: usize = Field::WeightMax.number() + 1;
 
     pub(super) fn new(signals: SignalSet) -> Self {
-        let fields = signals.iter().flat_map(Signal::pixel_sums).flat_map(|&sum| Field::of(sum));
+        let fields =
+            signals.iter().flat_map(Signal::pixel_sums).flat_map(|&sum| Field::of_sum(sum));
         Self::with(fields.fold(0, |bits, &field| bits | 1 << field as u8))
     }
 
@@ -115,32 +115,32 @@ impl RecordLayout {
         self.fields >> field as u8 & 1 == 1
     }
 
-    /// Numbers per record.
+    /// Values per record.
     pub(super) const fn stride(self) -> usize {
         BASE + self.fields.count_ones() as usize
     }
 
-    /// Where in a record the field is.
-    #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "only the GPU backend asks"))]
+    /// The index of a field in the records of this layout.
+    #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "used by the GPU backend only"))]
     pub(super) fn at(self, field: Field) -> Option<usize> {
         let before = self.fields & ((1 << field as u8) - 1);
         self.has(field).then(|| BASE + before.count_ones() as usize)
     }
 
-    /// For each number of a record beyond the base, its place among all that a record can have.
+    /// For each value beyond the base, its index in a complete record.
     pub(super) fn extras(&self) -> &[u8] {
         &self.extras[..self.stride() - BASE]
     }
 }
 
-/// Whether pixels must be counted for the row with their largest blend weight.
+/// Whether pixels are counted for the row with the largest blend weight.
 pub(super) fn counts_dominant(needs: &Needs) -> bool {
     let in_views = |aux: &AuxRequest| aux.columns.contains(&AuxColumn::DominantPixels);
     needs.signals.contains(Signal::DominantPixels) || needs.aux.as_ref().is_some_and(in_views)
 }
 
-/// What a plane holds of a signal, as the policy reads it. Of the smallest values the largest inverse is
-/// kept, which starts at 0 like all others.
+/// Converts an accumulated value to the policy's signal. A minimum is accumulated as the largest inverse, which
+/// starts at 0 like all other values.
 pub(super) fn as_read(signal: Signal, kept: f32) -> f32 {
     if signal.kind() == SignalKind::Minimum { 1.0 / kept } else { kept }
 }
@@ -156,11 +156,11 @@ pub(super) struct SignalPlanes {
     pub(super) full_depth: f32,
     /// See [`Needs::error_score`].
     pub(super) score: ErrorScore,
-    /// Whether the current epoch's plane is the first of two, rather than the second.
+    /// Whether the first of an epoch signal's two planes belongs to the current epoch, not the second.
     swapped: bool,
 }
 
-/// How many planes a signal has.
+/// Planes per signal.
 const fn planes(kind: SignalKind) -> usize {
     match kind {
         SignalKind::Sum | SignalKind::Count | SignalKind::Maximum | SignalKind::Minimum => 1,
@@ -183,24 +183,24 @@ impl SignalPlanes {
         Self { first, count, full_depth, score, swapped: false }
     }
 
-    /// The planes of a signal; its value is the largest of theirs.
+    /// The planes of a signal, whose value is their maximum.
     pub(super) fn of(&self, signal: Signal) -> Range<usize> {
         self.first[signal as usize].map_or(0..0, |first| first..first + planes(signal.kind()))
     }
 
-    /// The plane to which a view adds.
+    /// The plane that accumulates the current view.
     #[inline(always)]
     pub(super) fn current(&self, signal: Signal) -> Option<usize> {
         let is_second = matches!(signal.kind(), SignalKind::EpochMaximum) && !self.swapped;
         self.first[signal as usize].map(|first| first + usize::from(is_second))
     }
 
-    /// Those of some signals, which start anew when a policy resets them.
+    /// The planes of several signals.
     pub(super) fn of_all(&self, signals: SignalSet) -> Vec<usize> {
         signals.iter().flat_map(|signal| self.of(signal)).collect()
     }
 
-    /// The current epoch becomes the previous one: planes change places. Returns those to clear.
+    /// Swaps the planes of the current and the previous epoch. Returns the planes to clear.
     pub(super) fn begin_epoch(&mut self) -> Vec<usize> {
         self.swapped = !self.swapped;
         let by_epoch = |signal: &Signal| matches!(signal.kind(), SignalKind::EpochMaximum);
@@ -229,18 +229,19 @@ impl SignalPlanes {
     }
 }
 
-/// A signal that some of the rows' parameters are: which ones, and what makes a parameter a number of the
-/// signal.
+/// A signal that is read from the parameters.
 pub(super) struct ParameterSignal {
+    /// The parameters of a row.
     pub(super) parameters: Range<usize>,
-    pub(super) shown: fn(f32) -> f32,
+    /// Converts a parameter to the signal's value.
+    pub(super) convert: fn(f32) -> f32,
 }
 
 impl ParameterSignal {
-    /// `None` for signals that are computed.
+    /// `None` for signals that are not parameters.
     pub(super) fn of(signal: Signal) -> Option<Self> {
         let as_stored = |x| x;
-        let (array, shown): (_, fn(f32) -> f32) = match signal {
+        let (array, convert): (_, fn(f32) -> f32) = match signal {
             Signal::Position => (ModelArray::Means, as_stored),
             Signal::LogScale => (ModelArray::LogScales, as_stored),
             Signal::Orientation => (ModelArray::Quats, as_stored),
@@ -269,8 +270,8 @@ impl ParameterSignal {
             | Signal::Mask
             | Signal::Age => return None,
         };
-        // Of the coefficients, those of band 0.
-        Some(Self { parameters: array.parameters(0), shown })
+        // Degree 0: only band 0 of the coefficients.
+        Some(Self { parameters: array.parameters(0), convert })
     }
 }
 

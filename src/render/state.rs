@@ -1,22 +1,20 @@
-//! A backend's state beside the model, as named arrays: how it is saved in checkpoints and restored.
+//! A backend's state other than the model, as named arrays for checkpoints.
 //!
-//! An array has one entry per row in use, in the order of the rows, however a backend lays them out
-//! itself. Parameters of a row stand in this order: mean 3, log-scale 3, quaternion (w, x, y, z) 4,
+//! An array has one entry per row in use, in the order of the rows, whatever the backend's own layout. The
+//! parameters of a row are in this order: mean 3, log-scale 3, quaternion (w, x, y, z) 4,
 //! opacity logit 1, then three per spherical-harmonic coefficient (red, green, blue).
 
 use std::io;
-use std::ops::Range;
 
-/// Values that are converted to bytes at a time.
-const ENCODED: usize = 1 << 14;
+/// Values converted to bytes at a time.
+const CHUNK: usize = 1 << 14;
 
-/// An array that a backend keeps beside the model.
+/// The name and kind of a state array.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StateArray {
-    /// Its name, unique among a backend's.
+    /// The name, unique within a backend.
     pub name: String,
-    /// Whether its first side is that of the rows, so that it can be taken in pieces. All others are
-    /// small.
+    /// Whether its first dimension is the rows, so that it can be copied in pieces. All other arrays are small.
     pub by_rows: bool,
 }
 
@@ -26,7 +24,7 @@ impl StateArray {
         Self { name: name.into(), by_rows: true }
     }
 
-    /// An array of another shape.
+    /// A small array of another shape.
     pub(super) fn small(name: impl Into<String>) -> Self {
         Self { name: name.into(), by_rows: false }
     }
@@ -35,28 +33,28 @@ impl StateArray {
 /// A named array.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tensor {
-    /// Its name, unique within a checkpoint.
+    /// The name, unique within a checkpoint.
     pub name: String,
-    /// Its sides; row-major.
+    /// The dimensions; row-major.
     pub shape: Vec<usize>,
-    /// As many values as the sides say.
+    /// The values, as many as the product of the dimensions.
     pub values: Values,
 }
 
 impl Tensor {
-    /// Whether an array of this name has the optimiser's [ages](Self::ages).
+    /// Whether the array of this name holds the optimiser's [ages](Self::ages).
     pub fn has_ages(name: &str) -> bool {
-        // Of the native and of the GPU backend.
+        // Of the native and the GPU backend.
         matches!(name, "ages" | "device.ages")
     }
 
-    /// Steps since each row was made or rewritten last, if this is the array that has them. Shape: `[rows]`.
+    /// Steps since each row was last created or rewritten; `None` for an array without ages. Shape: `[rows]`.
     #[must_use]
     pub fn ages(&self) -> Option<Vec<u32>> {
         match &self.values {
             _ if !Self::has_ages(&self.name) => None,
             Values::U16(ages) => Some(ages.iter().map(|&age| age.into()).collect()),
-            // A word per row, whose upper half is that of colours that step on their own.
+            // One word per row; the upper half is the age of bands 1–3, which may step separately.
             Values::U8(bytes) => {
                 let words = bytes.as_chunks::<4>().0.iter();
                 Some(words.map(|&[low, high, ..]| u16::from_le_bytes([low, high]).into()).collect())
@@ -77,13 +75,13 @@ pub enum Values {
     U8(Vec<u8>),
 }
 
-/// An array that is not what it should be.
+/// Wrong name, type or shape of a state array.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("tensor `{name}`: {problem}")]
 pub struct StateError {
     /// The array's name.
     pub name: String,
-    /// What is wrong with it.
+    /// The problem.
     pub problem: String,
 }
 
@@ -98,22 +96,25 @@ impl Values {
         }
     }
 
-    /// Whether there is none.
+    /// Whether there are no values.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Passes the values on as little-endian bytes, some at a time.
+    /// Writes the values to `sink` as little-endian bytes, in chunks.
+    ///
+    /// # Errors
+    /// The first error of `sink`.
     pub fn encode(&self, mut sink: impl FnMut(&[u8]) -> io::Result<()>) -> io::Result<()> {
         let mut bytes = Vec::new();
         match self {
-            Self::F32(values) => values.chunks(ENCODED).try_for_each(|chunk| {
+            Self::F32(values) => values.chunks(CHUNK).try_for_each(|chunk| {
                 bytes.clear();
                 bytes.extend(chunk.iter().flat_map(|value| value.to_le_bytes()));
                 sink(&bytes)
             }),
-            Self::U16(values) => values.chunks(ENCODED).try_for_each(|chunk| {
+            Self::U16(values) => values.chunks(CHUNK).try_for_each(|chunk| {
                 bytes.clear();
                 bytes.extend(chunk.iter().flat_map(|value| value.to_le_bytes()));
                 sink(&bytes)
@@ -122,7 +123,7 @@ impl Values {
         }
     }
 
-    /// The type's name, as safetensors has it.
+    /// The name of the type in safetensors.
     #[must_use]
     pub fn kind(&self) -> &'static str {
         match self {
@@ -157,10 +158,10 @@ impl Tensor {
         Self { name: name.into(), shape: shape.to_owned(), values }
     }
 
-    /// The numbers, if this is an array of this shape.
+    /// Takes the numbers of an array with this shape.
     ///
     /// # Errors
-    /// [`StateError`] with both shapes, or both types.
+    /// [`StateError`] when shape or type differ.
     pub fn into_f32(self, shape: &[usize]) -> Result<Vec<f32>, StateError> {
         self.check(shape)?;
         match self.values {
@@ -169,10 +170,10 @@ impl Tensor {
         }
     }
 
-    /// The counts, if this is an array of this shape.
+    /// Takes the counts of an array with this shape.
     ///
     /// # Errors
-    /// [`StateError`] with both shapes, or both types.
+    /// [`StateError`] when shape or type differ.
     pub fn into_u16(self, shape: &[usize]) -> Result<Vec<u16>, StateError> {
         self.check(shape)?;
         match self.values {
@@ -181,10 +182,10 @@ impl Tensor {
         }
     }
 
-    /// The flags, if this is an array of this shape.
+    /// Takes the flags of an array with this shape.
     ///
     /// # Errors
-    /// [`StateError`] with both shapes, or both types.
+    /// [`StateError`] when shape or type differ.
     pub fn into_u8(self, shape: &[usize]) -> Result<Vec<u8>, StateError> {
         self.check(shape)?;
         match self.values {
@@ -193,7 +194,7 @@ impl Tensor {
         }
     }
 
-    /// A complaint about this array.
+    /// An error about this array.
     #[must_use]
     pub fn error(&self, problem: impl Into<String>) -> StateError {
         StateError { name: self.name.clone(), problem: problem.into() }

@@ -1,4 +1,4 @@
-//! In place of the GPU backend where a program is built without the feature `gpu`: there is no adapter.
+//! Stands in for the GPU backend in programs built without the feature `gpu`: there is no adapter.
 
 use densify_policies::policy::Needs;
 
@@ -6,18 +6,14 @@ use super::{Accumulation, AdapterChoice, AdapterSummary, BackendError, Different
 use densify_core::gaussians::Gaussians;
 use densify_core::memory::Ledger;
 
-/// An open device, of which there is none.
+/// An open device, which cannot exist.
 #[derive(Debug, Clone)]
 pub enum GpuDevice {}
 
 #[expect(missing_docs, clippy::missing_errors_doc, reason = "as with the feature `gpu`")]
 impl GpuDevice {
     pub fn open(_: &AdapterChoice) -> Result<Self, BackendError> {
-        Err(BackendError::OverLimit(
-            "--backend gpu and --gpu NAME: this program was built without the feature `gpu` of the crate densify; add \
-             it to the features of densify in Cargo.toml"
-                .into(),
-        ))
+        Err(BackendError::WithoutGpu)
     }
 
     #[must_use]
@@ -61,7 +57,7 @@ pub fn adapters() -> Vec<AdapterSummary> {
     Vec::new()
 }
 
-/// Whether there may be a GPU.
+/// Whether there may be a GPU: never.
 pub(super) fn may_be_present() -> bool {
     false
 }

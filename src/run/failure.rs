@@ -9,7 +9,7 @@ use crate::knobs::KnobError;
 use densify_core::files::OutputError;
 use densify_data::dataset::DatasetError;
 use densify_data::export::FormatError;
-use densify_render::BackendError;
+use densify_render::{Accumulation, BackendError, Fit};
 use densify_train::checkpoint::CheckpointError;
 use densify_train::evaluate::EvaluateError;
 use densify_train::init::InitError;
@@ -73,25 +73,76 @@ impl<E: BadInput> From<E> for Failure {
 
 impl From<BackendError> for Failure {
     fn from(error: BackendError) -> Self {
-        let code = if is_input(&error) { INPUT } else { DEVICE };
-        Self { code, message: error.to_string() }
+        Self::of_backend(&error, &error)
     }
 }
 
-/// Whether other arguments would do.
+impl Failure {
+    /// A failure of a backend: the message, which ends with the error, and its remedy.
+    fn of_backend(error: &BackendError, message: impl Display) -> Self {
+        let code = if is_input(error) { INPUT } else { DEVICE };
+        Self { code, message: format!("{message}; {}", remedy(error)) }
+    }
+}
+
+/// Whether other arguments would avoid the error.
 fn is_input(error: &BackendError) -> bool {
-    matches!(
-        error,
+    match error {
         BackendError::ImageTooLarge { .. }
-            | BackendError::NoAdapter(_)
-            | BackendError::OverLimit(_)
-    )
+        | BackendError::NoAdapter(_)
+        | BackendError::AdapterUnused
+        | BackendError::WithoutGpu
+        | BackendError::TooManyRows { .. }
+        | BackendError::BufferTooLarge { .. }
+        | BackendError::Unsupported(_) => true,
+        BackendError::OutOfMemory { .. }
+        | BackendError::Threads(_)
+        | BackendError::DeviceLost { .. }
+        | BackendError::Device { .. }
+        | BackendError::LoopCut { .. } => false,
+    }
+}
+
+/// The remedy for a backend's error, with options as the command line spells them.
+fn remedy(error: &BackendError) -> String {
+    let remedy = match error {
+        BackendError::OutOfMemory { .. } => "lower --budget, --sh-degree or --tile-cap",
+        BackendError::Threads(_) => "lower --threads",
+        BackendError::ImageTooLarge { .. } => "use --resolution to shrink it",
+        BackendError::NoAdapter(_) => {
+            "`densify devices` lists the adapters, and --backend cpu needs none"
+        }
+        BackendError::AdapterUnused => "leave out --gpu or --backend cpu",
+        BackendError::WithoutGpu => {
+            "add it to the features of densify in Cargo.toml, or leave out --backend gpu and --gpu"
+        }
+        BackendError::TooManyRows { most, .. } => return format!("use --budget {most}"),
+        BackendError::BufferTooLarge { fit, .. } => match fit {
+            Fit::TileCap(pairs) => return format!("use --tile-cap {pairs}"),
+            Fit::Budget(rows) => return format!("use --budget {rows}"),
+            Fit::ImageSize => "shrink the images with --resolution",
+        },
+        BackendError::Unsupported(_) => "use --backend cpu",
+        BackendError::DeviceLost { .. } => "start again from what was saved, or use --backend cpu",
+        BackendError::LoopCut { accumulation, .. } if *accumulation != Accumulation::Slots => {
+            "--knob accumulation=slots goes through more; otherwise try another driver, or --backend cpu"
+        }
+        BackendError::Device { .. } | BackendError::LoopCut { .. } => {
+            "try another driver, or --backend cpu"
+        }
+    };
+    remedy.to_owned()
 }
 
 impl From<OutputError> for Failure {
     fn from(error: OutputError) -> Self {
-        let code = if matches!(error, OutputError::Unfit(_)) { INPUT } else { OTHER };
-        Self { code, message: error.to_string() }
+        match error {
+            OutputError::Occupied { .. } => Self::input(format!(
+                "{error}; choose another folder with -o, or replace it with --overwrite"
+            )),
+            OutputError::Unfit(_) => Self::input(error),
+            _ => Self { code: OTHER, message: error.to_string() },
+        }
     }
 }
 
@@ -99,8 +150,7 @@ impl From<TrainError> for Failure {
     fn from(error: TrainError) -> Self {
         let code = match &error {
             TrainError::BadOption(_) | TrainError::View { .. } => INPUT,
-            TrainError::Backend { source, .. } if is_input(source) => INPUT,
-            TrainError::Backend { .. } => DEVICE,
+            TrainError::Backend { source, .. } => return Self::of_backend(source, &error),
             _ => OTHER,
         };
         Self { code, message: error.to_string() }
@@ -122,10 +172,8 @@ impl From<EvaluateError> for Failure {
     fn from(error: EvaluateError) -> Self {
         let code = match &error {
             EvaluateError::Stopped => OTHER,
-            EvaluateError::Backend { source, .. } | EvaluateError::Model(source)
-                if !is_input(source) =>
-            {
-                DEVICE
+            EvaluateError::Backend { source, .. } | EvaluateError::Model(source) => {
+                return Self::of_backend(source, &error);
             }
             _ => INPUT,
         };

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use densify_policies::policy::Needs;
 
 use super::{DataSpec, DeviceSpec, Observer, RunConfig, use_threads};
+use crate::device::describe;
 use crate::failure::Failure;
 use densify_core::files;
 use densify_core::gaussians::Gaussians;
@@ -32,7 +33,7 @@ impl Machine {
     /// Opens what the options say.
     pub fn open(spec: &DeviceSpec, observer: &dyn Observer) -> Result<Self, Failure> {
         let device = Device::open_to_render(spec.backend, spec.gpu.as_deref())?;
-        observer.say(format_args!("device   {}", device.describe()));
+        observer.say(format_args!("device   {}", describe(&device)));
         use_threads(spec.threads);
         Ok(Self { threads: spec.threads.map(|threads| threads.0 as usize), device })
     }

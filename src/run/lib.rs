@@ -4,6 +4,7 @@
 mod companion;
 mod config;
 mod derived;
+mod device;
 pub mod failure;
 pub mod finished;
 pub mod knobs;

@@ -22,7 +22,8 @@ fn rows_are_drawn_in_the_colours_given_and_keep_their_own() {
         let share = |row: usize| row as f32 / ROWS as f32;
         let colours: Vec<[f32; 3]> =
             (0..ROWS).map(|row| [share(row), 0.5, 1.0 - share(row)]).collect();
-        let painted = backend.render_painted(&view, GREY, &colours).expect("a rendering");
+        let painted = backend.inspect().and_then(|it| it.render_painted(&view, GREY, &colours));
+        let painted = painted.expect("a rendering");
 
         let mut flat = before.0.clone().with_degree(0);
         flat.sh = colours.as_flattened().iter().copied().map(rgb_to_dc).collect();

@@ -1,4 +1,4 @@
-//! Tests of flights: their shapes, their smoothness, and files.
+//! Tests of camera paths: shapes, smoothness, files.
 
 use std::f64::consts::{PI, TAU};
 
@@ -14,14 +14,15 @@ fn circle(count: u32, around: DVec3, inward: bool) -> Vec<Camera> {
         let away = DVec3::new(angle.cos(), angle.sin(), 0.0);
         let centre = around + 2.0 * away + UP;
         let target = if inward { around } else { centre + away };
-        Key::looking_at(centre, target, UP, 1.0).camera((64, 48))
+        Keyframe::looking_at(centre, target, UP, 1.0).camera((64, 48))
     };
     (0..count).map(camera).collect()
 }
 
 #[test]
-fn a_key_looks_where_it_should_with_the_world_upright() {
-    let key = Key::looking_at(DVec3::new(1.0, 2.0, 3.0), DVec3::new(1.0, 5.0, 3.0), UP, 0.5 * PI);
+fn a_keyframe_looks_at_its_target_with_the_world_upright() {
+    let key =
+        Keyframe::looking_at(DVec3::new(1.0, 2.0, 3.0), DVec3::new(1.0, 5.0, 3.0), UP, 0.5 * PI);
     let camera = key.camera((80, 60));
     let (pixel, depth) = camera.project(DVec3::new(1.0, 5.0, 3.0));
     assert!((depth - 3.0).abs() < 1e-12 && (pixel.x - 40.0).abs() < 1e-9, "{pixel} {depth}");
@@ -33,12 +34,12 @@ fn a_key_looks_where_it_should_with_the_world_upright() {
 }
 
 #[test]
-fn an_orbit_goes_around_what_the_cameras_look_at() {
+fn an_orbit_circles_the_focus_of_the_cameras() {
     let around = DVec3::new(5.0, -3.0, 0.5);
-    let flight = orbit(&circle(12, around, true));
-    assert!(flight.is_loop);
+    let path = orbit(&circle(12, around, true));
+    assert!(path.is_loop);
     for frame in 0..90 {
-        let key = flight.frame(frame, 90);
+        let key = path.frame(frame, 90);
         let offset = key.centre - around;
         let level = DVec3::new(offset.x, offset.y, 0.0).length();
         assert!((level - 2.0).abs() < 1e-3 && (offset.z - 1.0).abs() < 1e-6, "{offset}");
@@ -46,9 +47,9 @@ fn an_orbit_goes_around_what_the_cameras_look_at() {
         assert!(depth > 2.0 && pixel.distance(glam::DVec2::new(32.0, 24.0)) < 0.1, "{pixel}");
     }
     // From inside a room one looks around.
-    let flight = orbit(&circle(12, around, false));
+    let path = orbit(&circle(12, around, false));
     for frame in 0..30 {
-        let key = flight.frame(frame, 30);
+        let key = path.frame(frame, 30);
         let outward = key.centre - (around + UP);
         assert!(key.camera((9, 9)).forward().dot(outward.normalize()) > 0.99, "{outward}");
     }
@@ -64,9 +65,9 @@ fn cameras_in_a_circle_say_what_is_up_even_if_they_lie_on_their_side() {
         camera.rotation = DMat3::from_rotation_z(0.5 * PI) * camera.rotation;
         camera.translation = -(camera.rotation * centre);
     }
-    let flight = orbit(&cameras);
+    let path = orbit(&cameras);
     for frame in 0..24 {
-        let key = flight.frame(frame, 24);
+        let key = path.frame(frame, 24);
         assert!((key.centre.z - around.z - 1.0).abs() < 1e-6, "{}", key.centre);
         let up = -key.camera((9, 9)).rotation.row(1);
         assert!(up.z > 0.8, "{up}");
@@ -79,11 +80,11 @@ fn a_spiral_stays_within_the_cameras_and_looks_ahead() {
     let place = |i: u32| DVec3::new(f64::from(i % 5) - 2.0, 0.0, f64::from(i / 5) - 2.0);
     let target = DVec3::new(0.0, 4.0, 0.0);
     let cameras: Vec<Camera> =
-        (0..25).map(|i| Key::looking_at(place(i), target, UP, 0.8).camera((64, 48))).collect();
-    let flight = spiral(&cameras);
+        (0..25).map(|i| Keyframe::looking_at(place(i), target, UP, 0.8).camera((64, 48))).collect();
+    let path = spiral(&cameras);
     let mut widest = 0.0_f64;
     for frame in 0..60 {
-        let key = flight.frame(frame, 60);
+        let key = path.frame(frame, 60);
         assert!(key.centre.abs().max_element() < 2.1, "{}", key.centre);
         widest = widest.max(key.centre.x.abs());
         let (pixel, depth) = key.camera((64, 48)).project(target);
@@ -95,58 +96,66 @@ fn a_spiral_stays_within_the_cameras_and_looks_ahead() {
 #[test]
 fn a_single_camera_is_enough() {
     let one = circle(1, DVec3::ZERO, true);
-    for flight in [orbit(&one), spiral(&one)] {
+    for path in [orbit(&one), spiral(&one)] {
         for frame in 0..5 {
-            let key = flight.frame(frame, 5);
-            assert!(key.centre.is_finite() && key.turn.is_finite() && key.fov_y > 0.0, "{key:?}");
+            let key = path.frame(frame, 5);
+            assert!(
+                key.centre.is_finite() && key.world_from_camera.is_finite() && key.fov_y > 0.0,
+                "{key:?}"
+            );
         }
     }
 }
 
 #[test]
-fn a_flight_passes_its_keys_smoothly() {
-    let key = |x: f64, angle: f64| Key {
+fn a_path_passes_its_keyframes_smoothly() {
+    let key = |x: f64, angle: f64| Keyframe {
         centre: DVec3::new(x, x * x, 0.0),
-        turn: DQuat::from_rotation_z(angle),
+        world_from_camera: DQuat::from_rotation_z(angle),
         fov_y: 1.0 + 0.1 * x,
     };
     // The third turn is written as the other of its two quaternions.
     let mut keys = vec![key(0.0, 0.0), key(1.0, 0.5), key(2.0, 1.5), key(3.0, 3.0)];
-    keys[2].turn = -keys[2].turn;
-    let flight = Flight { keys: keys.clone(), is_loop: false };
+    keys[2].world_from_camera = -keys[2].world_from_camera;
+    let path = CameraPath { keyframes: keys.clone(), is_loop: false };
     for (at, key) in keys.iter().enumerate() {
-        let found = flight.frame(10 * at as u32, 31);
+        let found = path.frame(10 * at as u32, 31);
         assert!(found.centre.distance(key.centre) < 1e-9, "{at}: {found:?}");
-        assert!(found.turn.dot(key.turn).abs() > 1.0 - 1e-9, "{at}: {found:?}");
+        assert!(
+            found.world_from_camera.dot(key.world_from_camera).abs() > 1.0 - 1e-9,
+            "{at}: {found:?}"
+        );
         assert!((found.fov_y - key.fov_y).abs() < 1e-9, "{at}: {found:?}");
     }
     // Steps between frames change little: no stop and no jump at a key.
-    let frames: Vec<Key> = (0..301).map(|frame| flight.frame(frame, 301)).collect();
+    let frames: Vec<Keyframe> = (0..301).map(|frame| path.frame(frame, 301)).collect();
     let steps: Vec<DVec3> = frames.windows(2).map(|pair| pair[1].centre - pair[0].centre).collect();
     for pair in steps.windows(2) {
         assert!(pair[0].distance(pair[1]) < 0.1 * pair[0].length() + 1e-9, "{pair:?}");
     }
-    let turns = frames.windows(2).map(|pair| pair[0].turn.angle_between(pair[1].turn));
+    let turns = frames
+        .windows(2)
+        .map(|pair| pair[0].world_from_camera.angle_between(pair[1].world_from_camera));
     assert!(turns.into_iter().all(|angle| angle < 0.05));
     // A loop returns.
-    let closed = Flight { keys, is_loop: true };
+    let closed = CameraPath { keyframes: keys, is_loop: true };
     assert!(closed.frame(40, 40).centre.distance(closed.frame(0, 40).centre) < 1e-9);
-    let single = Flight { keys: vec![key(1.0, 1.0)], is_loop: false };
+    let single = CameraPath { keyframes: vec![key(1.0, 1.0)], is_loop: false };
     assert_eq!(single.frame(0, 1).centre, single.frame(7, 9).centre);
 }
 
 #[test]
-fn paths_of_nerfstudio_are_read() {
-    let path = r#"{"camera_type": "perspective", "render_height": 4, "fps": 24, "is_cycle": true,
+fn nerfstudio_files_are_read() {
+    let text = r#"{"camera_type": "perspective", "render_height": 4, "fps": 24, "is_cycle": true,
         "seconds": null, "camera_path": [{"fov": 90.0, "aspect": 1.5,
         "camera_to_world": [1, 0, 0, 7, 0, 0, -1, 8, 0, 1, 0, 9, 0, 0, 0, 1]}]}"#;
-    let SavedFlight { flight, frames, fps, size } = parse(path).unwrap();
-    assert_eq!((flight.is_loop, frames, fps, size), (true, 1, Some(24), None));
-    // As long as it lasts.
-    let lasting = path.replace(r#""seconds": null"#, r#""seconds": 2.02, "render_width": 6.0"#);
-    let SavedFlight { frames, size, .. } = parse(&lasting).unwrap();
+    let SavedCameraPath { path, frames, fps, size } = parse(text).unwrap();
+    assert_eq!((path.is_loop, frames, fps, size), (true, 1, Some(24), None));
+    // Duration times rate.
+    let lasting = text.replace(r#""seconds": null"#, r#""seconds": 2.02, "render_width": 6.0"#);
+    let SavedCameraPath { frames, size, .. } = parse(&lasting).unwrap();
     assert_eq!((frames, size), (48, Some((6, 4))));
-    let key = flight.keys[0];
+    let key = path.keyframes[0];
     assert_eq!(key.centre, DVec3::new(7.0, 8.0, 9.0));
     let camera = key.camera((40, 40));
     // Its z axis, (0, −1, 0), points backward, and its y axis, (0, 0, 1), upward.
@@ -156,7 +165,7 @@ fn paths_of_nerfstudio_are_read() {
 }
 
 #[test]
-fn what_is_no_path_is_refused_with_the_reason() {
+fn invalid_files_are_refused_with_the_reason() {
     let pose = |numbers: &str, fov: &str| {
         format!(r#"{{"camera_path": [{{"camera_to_world": [{numbers}], "fov": {fov}}}]}}"#)
     };

@@ -7,20 +7,21 @@ use std::path::Path;
 use super::OutputError;
 use super::disk::{Operation, WatchedFile, attempt};
 
-/// Prefix of the names of incomplete files and folders.
+/// Prefix of the names of temporary files and folders.
 pub const TEMPORARY: &str = ".densify-";
 
-/// Whether this is the name of an incomplete file or folder.
+/// Whether this is the name of a temporary file or folder.
+#[must_use]
 pub fn is_temporary(name: &OsStr) -> bool {
     name.to_string_lossy().starts_with(TEMPORARY)
 }
 
-/// Writes a file under a temporary name in the same folder, syncs it and renames it: readers see the
-/// old or the new content, even after a crash. Creates missing folders.
+/// Writes a file under a temporary name in the same folder, syncs it and renames it, so that readers see either
+/// the old or the new content, even after a crash. Creates missing folders.
 ///
 /// # Errors
-/// [`OutputError::Io`], also for an error that `write` returns. An existing file is then unchanged and
-/// nothing is left behind.
+/// [`OutputError::Io`], also for an error that `write` returns. An existing file then stays unchanged, and no
+/// temporary file remains.
 pub fn write_atomically(
     path: &Path,
     write: impl FnOnce(&mut dyn Write) -> io::Result<()>,
@@ -28,12 +29,12 @@ pub fn write_atomically(
     write_atomically_from(path, |out| Ok::<_, WriteError<OutputError>>(write(out)?))
 }
 
-/// Why writing a file was stopped.
+/// An error while a file was being written.
 #[derive(Debug)]
 pub enum WriteError<E> {
     /// The file cannot be written.
     Io(io::Error),
-    /// Its contents cannot be obtained.
+    /// The contents cannot be produced.
     Source(E),
 }
 
@@ -43,11 +44,11 @@ impl<E> From<io::Error> for WriteError<E> {
     }
 }
 
-/// As [`write_atomically`], for contents that may not be obtainable.
+/// Does the same as [`write_atomically`], for contents whose production may fail.
 ///
 /// # Errors
-/// [`OutputError::Io`], and the error in a [`WriteError::Source`]. An existing file is then unchanged
-/// and nothing is left behind.
+/// [`OutputError::Io`], and the error in a [`WriteError::Source`]. An existing file then stays unchanged, and no
+/// temporary file remains.
 pub fn write_atomically_from<E: From<OutputError>>(
     path: &Path,
     write: impl FnOnce(&mut dyn Write) -> Result<(), WriteError<E>>,
@@ -70,7 +71,7 @@ fn replace<E>(
 ) -> Result<(), WriteError<E>> {
     let mut builder = tempfile::Builder::new();
     builder.prefix(TEMPORARY);
-    // Temporary files are private by default; results are to be as readable as other new files.
+    // Temporary files are private by default; results should be as readable as other new files.
     #[cfg(unix)]
     builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
     attempt(Operation::Create, path)?;
@@ -90,10 +91,10 @@ fn replace<E>(
     Ok(())
 }
 
-/// Depth of the folders of a run: `point_cloud/iteration_N`.
+/// The depth of a run's folders: `point_cloud/iteration_N`.
 pub const RUN_FOLDER_DEPTH: u32 = 2;
 
-/// Removes incomplete files, down to a depth of `deeper` folders.
+/// Removes temporary files, down to a depth of `deeper` folders.
 pub fn remove_incomplete(folder: &Path, deeper: u32) {
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
     for entry in entries {

@@ -1,10 +1,10 @@
-//! Lets tests make disk operations fail: everything that a run writes passes through here. Without a requested
-//! fault it costs one look at a variable of the thread.
+//! Fault injection for tests: everything that a run writes passes through here and can be made to fail. Without a
+//! fault this costs one look at a thread-local variable.
 
 use std::io::{self, Write};
 use std::path::Path;
 
-/// An operation on a file or folder.
+/// Operations on files and folders.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Operation {
     /// Creates a file or folder.
@@ -21,11 +21,11 @@ pub enum Operation {
 
 pub use faults::{Fault, attempt, with_fault};
 
-/// A file whose operations can be made to fail.
+/// A writer whose operations can be made to fail.
 pub struct WatchedFile<'a, W> {
-    /// What is written to.
+    /// The writer.
     pub file: W,
-    /// Its path, by which faults are requested.
+    /// Its path, which selects the fault.
     pub path: &'a Path,
 }
 
@@ -43,20 +43,22 @@ impl<W: Write> Write for WatchedFile<'_, W> {
 }
 
 mod faults {
-    //! Faults requested by a test, for its own thread.
+    //! The fault that a test has set, for its own thread.
 
     use std::cell::RefCell;
 
     use super::{Operation, Path, io};
 
-    /// An operation that is to fail.
+    /// A fault: an operation that fails.
     #[derive(Debug, Clone, Copy)]
     pub struct Fault {
+        /// The operation.
         pub operation: Operation,
-        /// End of the path.
+        /// The end of the file's path.
         pub file: &'static str,
-        /// How many times it succeeds first.
+        /// The number of times that the operation succeeds first.
         pub spared: u32,
+        /// The error returned.
         pub kind: io::ErrorKind,
     }
 
@@ -64,7 +66,7 @@ mod faults {
     struct Plan {
         fault: Option<Fault>,
         met: u32,
-        /// Whether every write takes one byte at most.
+        /// Whether every write accepts one byte at most.
         short: bool,
     }
 
@@ -72,7 +74,7 @@ mod faults {
         static PLAN: RefCell<Plan> = RefCell::default();
     }
 
-    /// Runs `f` with a fault, or with short writes if there is none. Also returns how often the fault
+    /// Runs `f` with a fault, or with short writes if there is none. Also returns the number of times that the fault
     /// occurred.
     pub fn with_fault<T>(fault: Option<Fault>, f: impl FnOnce() -> T) -> (T, u32) {
         PLAN.replace(Plan { fault, met: 0, short: fault.is_none() });
@@ -80,6 +82,10 @@ mod faults {
         (done, PLAN.take().met)
     }
 
+    /// Fails if the operation has a fault.
+    ///
+    /// # Errors
+    /// The error of the fault.
     pub fn attempt(operation: Operation, path: &Path) -> io::Result<()> {
         PLAN.with_borrow_mut(|plan| match &mut plan.fault {
             Some(fault)
@@ -97,7 +103,7 @@ mod faults {
         })
     }
 
-    pub fn shortened(bytes: &[u8]) -> &[u8] {
+    pub(super) fn shortened(bytes: &[u8]) -> &[u8] {
         let short = PLAN.with_borrow(|plan| plan.short);
         if short { &bytes[..bytes.len().min(1)] } else { bytes }
     }

@@ -1,4 +1,4 @@
-//! Why a file could not be written or read.
+//! Errors of reading and writing files.
 
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
@@ -6,11 +6,17 @@ use std::path::{Path, PathBuf};
 /// Errors of writing and reading files.
 #[derive(Debug, thiserror::Error)]
 pub enum OutputError {
-    /// The folder, or a file in it, will not do: another run is in it or trains there, there is none, or
-    /// the file is invalid. What will do.
+    /// The folder holds another run.
+    #[error("{} holds another run", folder.display())]
+    Occupied {
+        /// The folder.
+        folder: PathBuf,
+    },
+    /// The folder, or a file in it, cannot be used: a process trains there, it holds no run, or the file is
+    /// invalid. With the remedy.
     #[error("{0}")]
     Unfit(String),
-    /// The folder is no longer that of the run.
+    /// The folder was moved, removed or taken over while the run trained.
     #[error(
         "{path} was moved, removed or taken by another process while the run trained; nothing more is \
          written there"
@@ -19,7 +25,7 @@ pub enum OutputError {
         /// The folder.
         path: PathBuf,
     },
-    /// A run cannot replace the existing one.
+    /// A finished run cannot replace the existing one.
     #[error(
         "{source}; {}",
         match aside {
@@ -36,17 +42,17 @@ pub enum OutputError {
         }
     )]
     NotReplaced {
-        /// Folder of the new run.
+        /// The folder that holds the new run.
         staging: PathBuf,
-        /// Where the files of the old run are, if they could not be moved back.
+        /// The folder with files of the old run, if they could not be moved back.
         aside: Option<PathBuf>,
-        /// Which file could not be moved.
+        /// The error of the file that could not be moved.
         source: Box<OutputError>,
     },
     /// Reading or writing failed.
     #[error("cannot {action} {path}: {source}{}", remedy(source))]
     Io {
-        /// The attempted action.
+        /// The attempted action, a verb with its object.
         action: &'static str,
         /// The file or folder.
         path: PathBuf,
@@ -55,7 +61,7 @@ pub enum OutputError {
     },
 }
 
-/// What to do where a disk is full.
+/// The remedy for a full disk.
 fn remedy(source: &std::io::Error) -> &'static str {
     use std::io::ErrorKind::{FileTooLarge, QuotaExceeded, StorageFull};
     match source.kind() {
@@ -65,23 +71,23 @@ fn remedy(source: &std::io::Error) -> &'static str {
 }
 
 impl OutputError {
+    /// An error about a folder that holds another run.
+    #[must_use]
     pub fn occupied(folder: &Path) -> Self {
-        let folder = folder.display();
-        Self::Unfit(format!(
-            "{folder} holds another run; choose another folder with -o, or replace it with --overwrite"
-        ))
+        Self::Occupied { folder: folder.to_owned() }
     }
 
-    /// A run's folder lacks this.
+    /// An error about a folder in which `missing` was expected.
+    #[must_use]
     pub fn no_run(folder: &Path, missing: &str) -> Self {
         let name = folder.display();
         Self::Unfit(if folder.is_dir() {
             format!(
-                "{name} holds no run: there is no {missing}; name the folder that `densify train` wrote"
+                "{name} holds no run: it has no {missing}; name the folder that `densify train` wrote"
             )
         } else if folder.exists() {
             format!(
-                "{name} is no model and no run; name a file of Gaussian splats, or the folder that `densify train` wrote"
+                "{name} is neither a model nor a run; name a file of Gaussian splats, or the folder that `densify train` wrote"
             )
         } else {
             format!(
@@ -90,6 +96,8 @@ impl OutputError {
         })
     }
 
+    /// An error about the contents of a file that densify had written.
+    #[must_use]
     pub fn malformed(file: &Path, problem: impl Display) -> Self {
         let file = file.display();
         Self::Unfit(format!(
@@ -97,6 +105,7 @@ impl OutputError {
         ))
     }
 
+    /// Turns an error of the system into an error about `path`, for `map_err`.
     pub fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.to_owned();
         move |source| Self::Io { action, path, source }

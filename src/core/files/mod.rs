@@ -1,4 +1,4 @@
-//! Files: those of others are opened with care, and what is written is complete or not there at all.
+//! File access: untrusted files are read defensively, and files are written completely or not at all.
 
 mod atomic;
 pub mod disk;
@@ -10,4 +10,4 @@ pub use atomic::{
     write_atomically_from,
 };
 pub use error::OutputError;
-pub use read::{MAX_OPTIONS, NOT_UTF8, lines, mistaken, most_unpacked, one_line, open, read_text};
+pub use read::{MAX_OPTIONS, lines, most_unpacked, one_line, open, read_text, wrong_kind};

@@ -1,19 +1,19 @@
-//! Files and texts that others have made. Only regular files are read, and no more of them than is
-//! sensible; text from them is shown without its control characters.
+//! Reading of untrusted files. Only regular files are read, up to a limit of size, and control characters are
+//! escaped before their text is shown.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Read};
 use std::path::Path;
 
-/// What is wrong with a text in another encoding, often for a name in it, with the remedy.
-pub const NOT_UTF8: &str = "it is not text in UTF-8; save it as UTF-8, and rename files whose names are in another encoding";
-/// Most bytes of a file of options.
+/// The message about text in another encoding, often because of a name in it.
+pub(super) const NOT_UTF8: &str = "it is not text in UTF-8; save it as UTF-8, and rename files whose names are in another encoding";
+/// The largest size of a file of options `[bytes]`.
 pub const MAX_OPTIONS: u64 = 4 << 20;
 
-/// Opens a file for reading. A pipe, a socket or a device is refused at once, not waited for.
+/// Opens a file for reading. Pipes, sockets and devices are refused without waiting for their data.
 ///
 /// # Errors
-/// When it cannot be opened, or is no regular file.
+/// When it cannot be opened, or is not a regular file.
 pub fn open(path: &Path) -> io::Result<File> {
     let mut options = OpenOptions::new();
     options.read(true);
@@ -30,10 +30,10 @@ pub fn open(path: &Path) -> io::Result<File> {
     }
 }
 
-/// Reads a text of at most `limit` bytes, without the byte-order mark that some editors put before it.
+/// Reads a text of at most `limit` bytes, without the byte-order mark that some editors write.
 ///
 /// # Errors
-/// As [`open`]; when it is larger, or no text in UTF-8.
+/// The errors of [`open`]; when the file is larger, or not text in UTF-8.
 pub fn read_text(path: &Path, limit: u64) -> io::Result<String> {
     let mut bytes = Vec::new();
     open(path)?.take(limit + 1).read_to_end(&mut bytes)?;
@@ -43,7 +43,7 @@ pub fn read_text(path: &Path, limit: u64) -> io::Result<String> {
             limit >> 20
         )));
     }
-    if let Some(problem) = mistaken(&bytes) {
+    if let Some(problem) = wrong_kind(&bytes) {
         return Err(io::Error::other(problem));
     }
     let text = String::from_utf8(bytes).map_err(|_| io::Error::other(NOT_UTF8))?;
@@ -53,18 +53,21 @@ pub fn read_text(path: &Path, limit: u64) -> io::Result<String> {
     })
 }
 
-/// Most bytes that a packed file of this many may be unpacked to.
+/// The most bytes that a compressed file of `packed` bytes may be unpacked to.
+#[must_use]
 pub fn most_unpacked(packed: u64) -> u64 {
-    /// Most bytes that any file may unpack to.
+    /// The limit for small files.
     const LEAST: u64 = 64 << 20;
-    /// Most bytes that a byte of a larger file may unpack to: models take 2 to 5, those with little colour up
-    /// to 20, tables of text up to 10.
+    /// Limit per byte of a larger file. Models unpack to 2 to 5 times their size, those with little colour to up
+    /// to 20 times, tables of text to up to 10 times.
     const RATIO: u64 = 100;
     LEAST.max(packed.saturating_mul(RATIO))
 }
 
-/// What a file is that begins so, if it is often found where data is expected, with the remedy.
-pub fn mistaken(start: &[u8]) -> Option<&'static str> {
+/// Recognises, by its first bytes, a kind of file that is often found in place of data. Returns a message with the
+/// remedy.
+#[must_use]
+pub fn wrong_kind(start: &[u8]) -> Option<&'static str> {
     if start.starts_with(b"version https://git-lfs") {
         Some("it is a pointer of Git LFS, not the file itself; fetch that with `git lfs pull`")
     } else if start.starts_with(&[0xff, 0xfe]) || start.starts_with(&[0xfe, 0xff]) {
@@ -74,12 +77,14 @@ pub fn mistaken(start: &[u8]) -> Option<&'static str> {
     }
 }
 
-/// Text with its control characters escaped, so that it stays on one line and no terminal obeys them.
+/// Escapes control characters, so that a text stays on one line and no terminal executes them.
+#[must_use]
 pub fn one_line(text: &str) -> String {
     escaped(text, &[])
 }
 
-/// The same for a text of several lines.
+/// Escapes control characters except line breaks and tabs.
+#[must_use]
 pub fn lines(text: &str) -> String {
     escaped(text, &['\n', '\t'])
 }
@@ -87,9 +92,10 @@ pub fn lines(text: &str) -> String {
 fn escaped(text: &str, kept: &[char]) -> String {
     let mut shown = String::with_capacity(text.len());
     for c in text.chars() {
-        match c.is_control() && !kept.contains(&c) {
-            true => shown.extend(c.escape_default()),
-            false => shown.push(c),
+        if c.is_control() && !kept.contains(&c) {
+            shown.extend(c.escape_default());
+        } else {
+            shown.push(c);
         }
     }
     shown

@@ -219,7 +219,7 @@ pub(super) fn probe(path: &Path) -> Result<ImageHeader, DatasetError> {
     let file_bytes = file.metadata().map_err(DatasetError::io(path))?.len();
     let mut start = Vec::new();
     file.by_ref().take(HEADER_BYTES).read_to_end(&mut start).map_err(DatasetError::io(path))?;
-    if let Some(problem) = files::mistaken(&start) {
+    if let Some(problem) = files::wrong_kind(&start) {
         return Err(DatasetError::malformed(path, "the image", problem, "put the image there"));
     }
     let header = read_header(ImageReader::new(Cursor::new(&start)), file_bytes);

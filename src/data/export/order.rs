@@ -1,6 +1,6 @@
 //! The order in which formats want the rows that pack neighbours together: along a Z-curve through space.
 
-use densify_core::curve;
+use densify_core::curve::morton_code;
 use densify_core::gaussians::Gaussians;
 
 /// Rows of a model from one end of the curve to the other. Remote ones do not matter to its scale.
@@ -21,7 +21,7 @@ pub(super) fn along_a_curve(model: &Gaussians) -> Vec<usize> {
     }
     let place = |row: usize| {
         let mean = model.means[row].map(f64::from);
-        curve::place(std::array::from_fn(|i| (mean[i] - frame[i].0) / (2.0 * frame[i].1)))
+        morton_code(std::array::from_fn(|i| (mean[i] - frame[i].0) / (2.0 * frame[i].1)))
     };
     let mut rows: Vec<usize> = (0..model.len()).collect();
     rows.sort_by_cached_key(|&row| (place(row), row));

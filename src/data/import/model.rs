@@ -56,7 +56,7 @@ pub fn read_model(path: &Path) -> Result<SplatFile, DatasetError> {
     let mut start = Vec::new();
     (&mut file).take(64).read_to_end(&mut start).map_err(DatasetError::io(path))?;
     file.rewind().map_err(DatasetError::io(path))?;
-    if let Some(problem) = files::mistaken(&start) {
+    if let Some(problem) = files::wrong_kind(&start) {
         return Err(DatasetError(format!("{}: the file: {problem}", path.display())));
     }
     if start.starts_with(b"ply") {

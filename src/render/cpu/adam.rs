@@ -1,10 +1,10 @@
 //! Stage 7: Adam (Kingma and Ba 2015, algorithm 1), with the bias correction of each row's own age.
 //!
-//! A newborn row starts with zero moments and age 0, so that its first step is one learning rate
-//! long; with a step counter shared by all rows, as elsewhere, it would be 3.2 of them
+//! A new row starts with zero moments and age 0, so that its first step has the length of one learning rate. With
+//! the shared step counter of other implementations it would have 3.2 times that length
 //! (√((1 − β₁)²/(1 − β₂))).
 //!
-//! After the step parameters are brought back to where the renderer's arithmetic is safe: unit
+//! After the step parameters are confined to a range in which the renderer's arithmetic is safe: unit
 //! quaternions, and opacities and scales beyond which nothing visible changes.
 
 use std::ops::Range;
@@ -18,11 +18,11 @@ use crate::LearningRates;
 pub(super) const BETA1: f32 = 0.9;
 pub(super) const BETA2: f32 = 0.999;
 pub(super) const EPSILON: f32 = 1e-15;
-/// Opacities within 1e-4 of 0 and 1: their gradient is then still a number of full precision.
+/// Keeps opacities 1e-4 away from 0 and 1, where their gradient still has full precision.
 pub(super) const LOGIT_MAX: f32 = 9.2;
-/// Standard deviations from 1e-6 to 10 of the scene's size; scenes are normalised to size 1.
+/// Allows standard deviations from 1e-6 to 10 times the scene's size; scenes are normalised to size 1.
 const LOG_SCALE_RANGE: [f32; 2] = [-13.8, 2.3];
-/// Age from which 1 − 0.999^age is 1 in f32: ln(2⁻²⁵)/ln(0.999) = 17,320.
+/// The age from which 1 − 0.999^age is 1 in f32: ln(2⁻²⁵)/ln(0.999) = 17,320.
 const MATURE: usize = 17_400;
 
 /// 1/(1 − β₁^age) and √(1/(1 − β₂^age)), by age.
@@ -48,7 +48,7 @@ impl BiasCorrection {
         ((MATURE + 1) * size_of::<[f32; 2]>()) as u64
     }
 
-    pub(super) fn of(&self, age: u16) -> [f32; 2] {
+    pub(super) fn at(&self, age: u16) -> [f32; 2] {
         self.table[usize::from(age).min(MATURE)]
     }
 }
@@ -65,7 +65,7 @@ fn rate(rates: &LearningRates, p: usize) -> f32 {
     }
 }
 
-/// One step for the sixteen rows of a block, and for the parameters in `planes`.
+/// Steps the parameters in `planes` of the sixteen rows of a block.
 #[inline(always)]
 #[expect(clippy::too_many_arguments, reason = "a kernel: each is a buffer of its own")]
 pub(super) fn step<S: Simd>(
@@ -82,7 +82,7 @@ pub(super) fn step<S: Simd>(
     let mut correction = [[0.0_f32; WIDTH]; 2];
     for (lane, age) in ages.iter_mut().enumerate() {
         *age = age.saturating_add(1);
-        let [first, second] = bias.of(*age);
+        let [first, second] = bias.at(*age);
         correction[0][lane] = first;
         correction[1][lane] = second;
     }
@@ -105,8 +105,8 @@ pub(super) fn step<S: Simd>(
     }
 }
 
-/// Brings the parameters of a block back to where they are safe. Quaternions whose squared length is
-/// no farther from 1 than `slack` stay.
+/// Confines the parameters of a block to their safe range. Quaternions whose squared length differs from 1 by
+/// at most `slack` stay unchanged.
 #[inline(always)]
 pub(super) fn confine<S: Simd>(s: S, params: &mut [f32], slack: f32) {
     let c = |x: f32| V::splat(s, x);
@@ -114,8 +114,8 @@ pub(super) fn confine<S: Simd>(s: S, params: &mut [f32], slack: f32) {
         let at = |p: usize| p * WIDTH + lane;
         let q = each!(i in 4 => V::load(s, &params[at(plane::QUAT + i)..]));
         let norm2 = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
-        // A quaternion this short has no direction left; it starts again without rotation. Here and
-        // below, NaN stays NaN: an audit shall find it.
+        // A quaternion this short has no direction left; it is reset to the identity. Here and
+        // below, NaN stays NaN, so that an audit finds it.
         let lost = norm2.le(c(1e-12));
         let inv = (norm2 - c(1.0)).abs().le(c(slack)).select(c(1.0), c(1.0) / norm2.sqrt());
         for (i, x) in q.into_iter().enumerate() {
@@ -131,7 +131,7 @@ pub(super) fn confine<S: Simd>(s: S, params: &mut [f32], slack: f32) {
     }
 }
 
-/// x in [least, most]; NaN stays NaN.
+/// Clamps x to [least, most]; NaN stays NaN.
 #[inline(always)]
 fn clamp<S: Simd>(s: S, x: V<S>, bounds: [f32; 2]) -> V<S> {
     let [least, most] = each!(i in 2 => V::splat(s, bounds[i]));

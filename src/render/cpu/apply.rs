@@ -1,4 +1,4 @@
-//! Stage 9: executes a compiled plan in place. The only code that changes the number of rows.
+//! Stage 9: executes a compiled plan in place. No other code changes the number of rows.
 
 use std::ops::Range;
 
@@ -18,7 +18,7 @@ use super::summed::Summed;
 use super::threads::Threads;
 use densify_core::gaussians::{logit, rgb_to_dc, sigmoid};
 
-/// The buffers that are re-indexed together.
+/// The buffers that an edit changes together.
 pub(super) struct Model<'a> {
     pub(super) params: &'a mut Parameters,
     pub(super) moments: &'a mut Moments,
@@ -32,7 +32,7 @@ pub(super) struct Model<'a> {
 /// Executes `ops`; the order and the invariants are those of [`RowOps`].
 pub(super) fn apply(model: &mut Model<'_>, ops: &RowOps, rng: &PolicyRng) {
     for family in &ops.families {
-        model.breed(family.parent, &ops.offspring(family), ops.children(family), rng);
+        model.write_family(family.parent, &ops.offspring(family), ops.children(family), rng);
     }
     for &(row, update) in &ops.updates {
         let row = row as usize;
@@ -49,11 +49,11 @@ pub(super) fn apply(model: &mut Model<'_>, ops: &RowOps, rng: &PolicyRng) {
             model.drop_bands(row, degree);
         }
         if !update.keep_moments {
-            model.reborn(row);
+            model.reset_row(row);
         }
     }
     for &(row, seed) in &ops.seeds {
-        model.sow(row as usize, &seed);
+        model.insert(row as usize, &seed);
     }
     for &(from, to) in &ops.moves {
         model.relocate(from as usize, to as usize);
@@ -66,24 +66,24 @@ pub(super) fn apply(model: &mut Model<'_>, ops: &RowOps, rng: &PolicyRng) {
         for row in ops.first_row..ops.rows_after {
             let clamped = model.params.get(row, plane::OPACITY).min(logit(most));
             model.params.set(row, plane::OPACITY, clamped);
-            model.moments.forget(row, plane::OPACITY);
-            model.summed.forget(row, plane::OPACITY);
+            model.moments.reset(row, plane::OPACITY);
+            model.summed.reset(row, plane::OPACITY);
         }
     }
     model.signals.reset(ops.reset_signals, model.threads, ops.rows_after);
 }
 
 impl Model<'_> {
-    /// Writes a parent's children, then the parent itself.
-    fn breed(&mut self, row: u32, offspring: &Offspring, children: &[u32], rng: &PolicyRng) {
+    /// Writes the children of a parent, then the parent itself.
+    fn write_family(&mut self, row: u32, offspring: &Offspring, children: &[u32], rng: &PolicyRng) {
         let parent = row as usize;
         let mean: [f32; 3] = self.params.get_n(parent, plane::MEAN);
         let log_scale: [f32; 3] = self.params.get_n(parent, plane::LOG_SCALE);
         let quat: [f32; 4] = self.params.get_n(parent, plane::QUAT);
         let scales = scales_of(log_scale, offspring.scale);
-        let turned = turned(quat, offspring.turn);
+        let rotated = rotated(quat, offspring.turn);
         let siblings = offspring.siblings();
-        let stand = |child: u32| -> [f32; 3] {
+        let position = |child: u32| -> [f32; 3] {
             let offset = match offspring.placement {
                 Placement::Offset(_) if child == 0 => [0.0; 3],
                 Placement::Offset(offset) => offset,
@@ -110,30 +110,31 @@ impl Model<'_> {
             let slot = slot as usize;
             self.params.copy_row(parent, slot);
             self.masks.inherit(parent, slot);
-            self.params.set_n(slot, plane::MEAN, stand(i as u32 + 1));
+            self.params.set_n(slot, plane::MEAN, position(i as u32 + 1));
             self.params.set_n(slot, plane::LOG_SCALE, scales);
-            self.params.set_n(slot, plane::QUAT, turned);
+            self.params.set_n(slot, plane::QUAT, rotated);
             self.set_opacity(slot, offspring.opacity, siblings);
-            self.reborn(slot);
+            self.reset_row(slot);
         }
         if offspring.parent == ParentFate::BecomesChild {
-            self.params.set_n(parent, plane::MEAN, stand(0));
+            self.params.set_n(parent, plane::MEAN, position(0));
             self.params.set_n(parent, plane::LOG_SCALE, scales);
-            self.params.set_n(parent, plane::QUAT, turned);
+            self.params.set_n(parent, plane::QUAT, rotated);
             self.set_opacity(parent, offspring.opacity, siblings);
-            self.reborn(parent);
+            self.reset_row(parent);
         }
     }
 
-    fn sow(&mut self, row: usize, seed: &Seed) {
+    /// Writes a new row that has no parent.
+    fn insert(&mut self, row: usize, seed: &Seed) {
         self.params.clear_row(row);
         self.masks.clear_row(row);
         self.params.set_n(row, plane::MEAN, seed.position);
         self.params.set_n(row, plane::LOG_SCALE, seed.scales.map(f32::ln));
-        self.params.set_n(row, plane::QUAT, turned(NO_ROTATION, seed.orientation));
+        self.params.set_n(row, plane::QUAT, rotated(NO_ROTATION, seed.orientation));
         self.params.set(row, plane::OPACITY, logit(seed.opacity));
         self.params.set_n(row, plane::SH, seed.colour.map(rgb_to_dc));
-        self.reborn(row);
+        self.reset_row(row);
     }
 
     fn set_opacity(&mut self, row: usize, rule: OpacityRule, siblings: u32) {
@@ -149,12 +150,12 @@ impl Model<'_> {
         self.params.set(row, plane::OPACITY, logit);
     }
 
-    /// No colour beyond a degree, nor moments of it.
+    /// Clears the SH bands above a degree, and their moments.
     fn drop_bands(&mut self, row: usize, degree: u8) {
         for plane in planes(degree)..self.params.planes() {
             self.params.set(row, plane, 0.0);
-            self.moments.forget(row, plane);
-            self.summed.forget(row, plane);
+            self.moments.reset(row, plane);
+            self.summed.reset(row, plane);
         }
     }
 
@@ -167,7 +168,7 @@ impl Model<'_> {
                 continue;
             }
             let was = self.params.get(row, plane::OPACITY);
-            // What is not finite is left to the audit, and no loss must not change a bit.
+            // Non-finite numbers are left to the audit, and a decay of 0 must not change a bit.
             if decay.opacity > 0.0 && was.is_finite() {
                 let opacity = sigmoid(was);
                 let left = (opacity - decay.opacity).max(MIN_DECAYED_OPACITY);
@@ -182,10 +183,10 @@ impl Model<'_> {
         }
     }
 
-    /// Zero moments, age 0, no past.
-    fn reborn(&mut self, row: usize) {
+    /// Resets moments, age, signals and summed gradients.
+    fn reset_row(&mut self, row: usize) {
         self.moments.clear_row(row);
-        self.masks.forget(row);
+        self.masks.reset_moments(row);
         self.ages.clear_row(row);
         self.signals.blocks.clear_row(row);
         self.summed.clear_row(row);
@@ -233,9 +234,9 @@ fn quaternion([w, x, y, z]: [f32; 4]) -> glam::Quat {
     glam::Quat::from_xyzw(x, y, z, w)
 }
 
-/// The orientation that is turned about its own axes; it keeps its length.
-fn turned(quat: [f32; 4], turn: [f32; 4]) -> [f32; 4] {
-    // No turn must not change a bit.
+/// Rotates an orientation about its own axes; the length of the quaternion is preserved.
+fn rotated(quat: [f32; 4], turn: [f32; 4]) -> [f32; 4] {
+    // The identity must not change a bit.
     if turn.map(f32::to_bits) == NO_ROTATION.map(f32::to_bits) {
         return quat;
     }

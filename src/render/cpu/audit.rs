@@ -1,4 +1,4 @@
-//! Finds rows with a number that is not finite; see [`audit`](crate::audit).
+//! Finds rows with non-finite numbers; see [`audit`](crate::audit).
 
 use super::blocks::{Scratch, planes};
 use super::simd::WIDTH;
@@ -6,7 +6,7 @@ use super::{BLOCKS_PER_TASK, CpuBackend};
 use crate::{Attribute, Kept, Unsound};
 
 impl CpuBackend {
-    /// The rows with a number that is not finite, in order.
+    /// The rows with a non-finite number, in order.
     pub(super) fn unsound(&self) -> Vec<Unsound> {
         let rows = self.rows;
         let first_block = self.moments.first() / WIDTH;
@@ -15,7 +15,7 @@ impl CpuBackend {
         let find = |row: usize| {
             let first = |get: &dyn Fn(usize) -> f32, kept| {
                 let number = (0..planes).position(|plane| !get(plane).is_finite())?;
-                Some(Unsound { row: row as u32, attribute: Attribute::of(number), kept })
+                Some(Unsound { row: row as u32, attribute: Attribute::of_parameter(number), kept })
             };
             let moment = |which: usize| {
                 let of_row = |plane| self.moments.get(row, plane)[which];
@@ -28,11 +28,13 @@ impl CpuBackend {
         let blocks = rows.div_ceil(WIDTH);
         let is_suspect = |block: usize| {
             let mut scratch = [Scratch::ZERO; 2];
-            let have_unsound = |block: usize, scratch| {
+            let moments_are_unsound = |block: usize, scratch| {
                 !moments.open(block, planes, scratch).into_iter().all(is_sound)
             };
             !is_sound(params.open(block, planes, &mut scratch[0]))
-                || block.checked_sub(first_block).is_some_and(|it| have_unsound(it, &mut scratch))
+                || block
+                    .checked_sub(first_block)
+                    .is_some_and(|at| moments_are_unsound(at, &mut scratch))
         };
         let of_task = |task: usize| -> Vec<Unsound> {
             let blocks = task * BLOCKS_PER_TASK..blocks.min((task + 1) * BLOCKS_PER_TASK);
@@ -45,9 +47,9 @@ impl CpuBackend {
     }
 }
 
-/// Whether all numbers of some planes are finite.
+/// Whether all numbers are finite.
 fn is_sound(numbers: &[f32]) -> bool {
-    // 0 · x is 0 but for NaN and infinity; sixteen sums go side by side.
+    // 0 · x is 0 unless x is NaN or infinite; sixteen sums run side by side.
     let mut sums = [0.0_f32; WIDTH];
     for numbers in numbers.chunks_exact(WIDTH) {
         sums.iter_mut().zip(numbers).for_each(|(sum, x)| *sum += 0.0 * x);

@@ -1,8 +1,8 @@
-//! Some splats of a tile's list, side by side, with everything about them that is constant over a patch
-//! of the tile or over the patches.
+//! Batches of splats from a tile's list, copied side by side with the values that are constant over a patch or over
+//! all patches.
 //!
-//! A batch is set before any of its patches is drawn. Which patches a splat reaches is then known long
-//! before a loop over them ends, so that a mispredicted end waits for no arithmetic.
+//! A batch is filled before any of its patches is drawn. The patches that a splat reaches are then known long
+//! before the loop over them ends, so that a mispredicted end waits for no arithmetic.
 
 use std::sync::atomic::AtomicU64;
 
@@ -13,7 +13,7 @@ use super::rasterize::{PATCH, PATCHES, TilePlace};
 use super::simd::{V, WIDTH};
 use super::tiles::Entry;
 
-/// Splats of a batch: copied side by side before use, so that their cache misses overlap.
+/// Splats of a batch. They are copied before use, so that their cache misses overlap.
 pub(super) const BATCH: usize = 32;
 
 /// Pixel centres within a patch, and corners of a tile's patches.
@@ -34,7 +34,7 @@ const fn grid(x: bool, step: f32, first: f32) -> [f32; WIDTH] {
     values
 }
 
-/// Splats of one tile's list. Arrays per splat are set for as many as were given.
+/// A batch of splats. The arrays per splat are valid up to the number of splats given.
 #[repr(C, align(64))]
 pub(super) struct Batch {
     pub(super) splats: [Splat; BATCH],
@@ -44,9 +44,9 @@ pub(super) struct Batch {
     /// u and z of the patches' corners, per splat.
     corner_u: [[f32; PATCHES]; BATCH],
     corner_z: [[f32; PATCHES]; BATCH],
-    /// Bit per splat, for each patch: whether it may hold a pixel that the splat is blended into.
+    /// For each patch a bit per splat: whether the splat may be blended into one of its pixels.
     pub(super) splats_of: [u32; PATCHES],
-    /// The same: bit per patch, for each splat.
+    /// The same as a bit per patch, for each splat.
     pub(super) patches_of: [u32; BATCH],
 }
 
@@ -63,7 +63,7 @@ impl Batch {
         }
     }
 
-    /// Takes the splats of these entries of the tile's list, at most [`BATCH`].
+    /// Fills the batch with the splats of at most [`BATCH`] entries of the tile's list.
     #[inline(always)]
     pub(super) fn set<S: Simd>(
         &mut self,
@@ -76,7 +76,7 @@ impl Batch {
         for (splat, entry) in self.splats.iter_mut().zip(entries) {
             *splat = splats[Entry::load(entry).row];
         }
-        // From a patch's corner to the middle of its pixels' centres, and on to the outermost.
+        // Distances from a patch's corner to its centre, and from there to the outermost pixel centres.
         let (middle, half) = (0.5 * PATCH as f32, 0.5 * (PATCH - 1) as f32);
         self.patches_of.fill(0);
         for at in (0..WIDTH).step_by(S::F32_LANES) {
@@ -93,7 +93,7 @@ impl Batch {
                 let (u, z) = (dx * l1, dy * l3);
                 u.store(&mut self.corner_u[i][at..]);
                 z.store(&mut self.corner_z[i][at..]);
-                // The least |u| and |z| of the patch, with slack for rounding.
+                // The smallest |u| and |z| in the patch, with slack for rounding.
                 let (u_middle, z_middle) = (c(l1 * (1.0 - shear) * middle), c(l3 * middle));
                 let u_half = c(l1 * (1.0 + shear.abs()) * half * 1.0001 + 1e-3);
                 let z_half = c(l3 * half * 1.0001 + 1e-3);
@@ -107,7 +107,7 @@ impl Batch {
         }
     }
 
-    /// Takes the splats from `end` on away from patch `p`.
+    /// Removes the splats from `end` on from patch `p`.
     #[inline(always)]
     pub(super) fn cut(&mut self, p: usize, end: usize) {
         if end < BATCH {

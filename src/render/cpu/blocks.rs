@@ -1,11 +1,11 @@
 //! Parameters in blocks of sixteen rows: `[block][plane][lane]`.
 //!
-//! A kernel works on sixteen rows at a time and finds each parameter of theirs in one aligned
-//! line; a thread owns whole blocks, so that stages split without locks; and one row's parameters
-//! lie within four kilobytes, where planes over all rows would touch sixty pages.
+//! A kernel processes sixteen rows at a time and finds each of their parameters in one aligned cache line. A thread
+//! owns whole blocks, so that stages need no locks. The parameters of a row are within four kilobytes, while planes
+//! over all rows would touch sixty pages.
 //!
 //! Parameters and moments may be [stored](crate::Storage) in fewer bits. A kernel then
-//! widens the planes of a block that it needs to an array of f32 and works on that; see
+//! converts the planes that it needs to an array of f32 and works on that; see
 //! [`Parameters`](super::parameters::Parameters) and [`Moments`](super::moments::Moments).
 
 use std::ops::Range;
@@ -35,7 +35,7 @@ pub(super) const fn planes(sh_degree: u8) -> usize {
     plane::SH + 3 * sh_coefficients(sh_degree)
 }
 
-/// Numbers of whole planes of a block, as a kernel reads them: an array that they are widened to.
+/// Scratch memory for the planes of a block, converted to f32.
 #[derive(Clone)]
 #[repr(align(64))]
 pub(super) struct Scratch(pub(super) [f32; plane::MOST * WIDTH]);
@@ -44,11 +44,11 @@ impl Scratch {
     pub(super) const ZERO: Self = Self([0.0; plane::MOST * WIDTH]);
 }
 
-/// Rows of `planes` numbers each, from a first one on: those before it have none.
+/// Rows of `planes` numbers each, from a first row on; earlier rows have no numbers.
 #[derive(Debug, Clone)]
 pub(super) struct Blocks<T = f32> {
     planes: usize,
-    /// A multiple of [`ROWS_PER_TASK`], so that blocks and tasks are those of all rows.
+    /// The first row, a multiple of [`ROWS_PER_TASK`], so that blocks and tasks are aligned with those of all rows.
     first: usize,
     data: Vec<T>,
 }
@@ -60,12 +60,12 @@ impl<T: Copy + Default> Blocks<T> {
         Self { planes, first: rows.start, data }
     }
 
-    /// Bytes for these rows.
+    /// Bytes for a range of rows.
     pub(super) fn bytes(rows: Range<usize>, planes: usize) -> u64 {
         (rows.len().next_multiple_of(WIDTH) * planes * size_of::<T>()) as u64
     }
 
-    /// Bytes that are there.
+    /// Allocated bytes.
     #[cfg(test)]
     pub(super) fn held(&self) -> u64 {
         (self.data.capacity() * size_of::<T>()) as u64
@@ -81,28 +81,28 @@ impl<T: Copy + Default> Blocks<T> {
         self.planes
     }
 
-    /// The first row that has numbers.
+    /// The first row with numbers.
     pub(super) fn first(&self) -> usize {
         self.first
     }
 
-    /// Numbers of the blocks that hold the rows before `rows`.
+    /// Numbers in the blocks of the rows before `rows`.
     fn numbers(&self, rows: usize) -> usize {
         rows.saturating_sub(self.first).div_ceil(WIDTH) * self.stride()
     }
 
-    /// The blocks that hold the rows before `rows`.
+    /// The blocks of the rows before `rows`.
     pub(super) fn of_rows_mut(&mut self, rows: usize) -> &mut [T] {
         let numbers = self.numbers(rows);
         &mut self.data[..numbers]
     }
 
-    /// The same, to be read block by block.
+    /// A read-only view of these blocks.
     pub(super) fn view(&self, rows: usize) -> BlockView<'_, T> {
         BlockView { stride: self.stride(), data: &self.data[..self.numbers(rows)] }
     }
 
-    /// The same, cut for the optimiser's tasks.
+    /// These blocks, split for the optimiser's tasks.
     pub(super) fn tasks(
         &mut self,
         rows: usize,
@@ -137,11 +137,11 @@ impl<T: Copy + Default> Blocks<T> {
         }
     }
 
-    /// Row i becomes what row `order[i]` was; rows before the first are where they were.
+    /// Moves row `order[i]` to row i; rows before the first stay.
     pub(super) fn reorder(&mut self, order: &[u32]) {
         let order = order.get(self.first..).unwrap_or_default();
         let mut values = vec![T::default(); order.len()];
-        // Plane by plane: rows mostly move a little, so that what is read lies mostly in a row.
+        // Plane by plane: rows mostly move by little, so that reads are mostly sequential.
         for plane in 0..self.planes {
             for (value, &row) in values.iter_mut().zip(order) {
                 *value = self.get(row as usize, plane);
@@ -158,7 +158,7 @@ impl<T: Copy + Default> Blocks<T> {
         }
     }
 
-    /// Some planes of some rows, row by row; zeros of rows before the first. Shape: `[rows.len(), planes.len()]`.
+    /// Copies some planes of some rows, row-major; 0 for rows before the first. Shape: `[rows.len(), planes.len()]`.
     pub(super) fn to_rows(&self, rows: Range<usize>, planes: Range<usize>) -> Vec<T> {
         let mut values = Vec::with_capacity(rows.len() * planes.len());
         let without = rows.end.min(self.first).saturating_sub(rows.start);
@@ -169,7 +169,7 @@ impl<T: Copy + Default> Blocks<T> {
         values
     }
 
-    /// The opposite of [`to_rows`](Self::to_rows).
+    /// Sets the numbers that [`to_rows`](Self::to_rows) returns.
     pub(super) fn set_rows(&mut self, rows: Range<usize>, planes: Range<usize>, values: &[T]) {
         let without = rows.end.min(self.first).saturating_sub(rows.start);
         let mut values = values.iter().skip(without * planes.len());
@@ -181,7 +181,7 @@ impl<T: Copy + Default> Blocks<T> {
     }
 }
 
-/// Blocks that follow each other, to read.
+/// A read-only view of consecutive blocks.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct BlockView<'a, T> {
     stride: usize,
@@ -189,20 +189,20 @@ pub(super) struct BlockView<'a, T> {
 }
 
 impl<'a, T> BlockView<'a, T> {
-    /// Those of some numbers, from 0 on.
+    /// A range of the blocks.
     pub(super) fn part(self, blocks: Range<usize>) -> Self {
         let data = &self.data[blocks.start * self.stride..blocks.end * self.stride];
         Self { data, ..self }
     }
 
-    /// The one of a number, from 0 on.
+    /// A block by its index.
     #[inline(always)]
     pub(super) fn block(&self, block: usize) -> &'a [T] {
         &self.data[block * self.stride..(block + 1) * self.stride]
     }
 }
 
-/// Blocks that follow each other, to change.
+/// The consecutive blocks of a task.
 #[derive(Debug)]
 pub(super) struct BlockTask<'a, T> {
     stride: usize,
@@ -210,18 +210,18 @@ pub(super) struct BlockTask<'a, T> {
 }
 
 impl<T> BlockTask<'_, T> {
-    /// The one of a number, from 0 on.
+    /// A block by its index.
     #[inline(always)]
     pub(super) fn block(&mut self, block: usize) -> &mut [T] {
         &mut self.data[block * self.stride..(block + 1) * self.stride]
     }
 }
 
-/// Cuts a buffer for so many tasks of a region, into parts of one length but the last; a buffer of nothing
-/// has nothing for each task.
+/// Splits a buffer for the tasks of a region into parts of equal length, except the last; an empty buffer gives every
+/// task an empty part.
 ///
-/// It is one type whatever the buffer has: were it one of two iterators, a region over ten buffers would be
-/// compiled for each of their thousand combinations.
+/// The type is the same for both cases: with two types of iterators, a region over ten buffers would be
+/// compiled for each of a thousand combinations.
 pub(super) fn parts<T: Send>(
     buffer: &mut [T],
     per_task: usize,

@@ -1,4 +1,4 @@
-//! The memory of the native backend: bytes per buffer, and the reservation before training.
+//! The memory of the native backend: the ledger, and the reservation before training.
 
 use std::ops::Range;
 
@@ -22,35 +22,32 @@ use crate::signals::{Field, counts_dominant};
 use crate::{BackendError, Setup};
 use densify_core::memory::{Ledger, Section};
 
-/// A single tile's list holds each row at most once, so that the budget is always enough.
+/// The most (row, tile) pairs held at a time; at least the budget, as one tile's list holds each row at most once.
 pub(super) fn tile_cap(options: &Setup) -> usize {
     let cap = options.tile_cap.unwrap_or(options.budget.saturating_mul(16));
     cap.max(options.budget).max(1).min(u32::MAX as usize)
 }
 
-/// As many as there are entries, at most.
+/// The most gradient records held at a time; no more than pairs.
 pub(super) fn record_cap(options: &Setup) -> usize {
     if options.only_renders { 1 } else { options.record_cap.clamp(1, tile_cap(options)) }
 }
 
-/// The rows that may be trained, from a whole task on: those before them are frozen, and have nothing but what
-/// rendering needs.
+/// The trainable rows, starting at a whole task. Earlier rows are frozen and have memory only for rendering.
 pub(super) fn trained(options: &Setup) -> Range<usize> {
-    match options.only_renders {
-        true => 0..0,
-        false => {
-            let budget = options.budget.max(1);
-            options.frozen.min(budget) / ROWS_PER_TASK * ROWS_PER_TASK..budget
-        }
+    if options.only_renders {
+        return 0..0;
     }
+    let budget = options.budget.max(1);
+    options.frozen.min(budget) / ROWS_PER_TASK * ROWS_PER_TASK..budget
 }
 
-/// Rows for which there is room where gradients of splats are summed in a step, frozen or not.
+/// Rows in the buffer of summed records, frozen ones included.
 pub(super) fn summed_rows(options: &Setup) -> usize {
     if options.only_renders { 0 } else { options.budget.max(1).next_multiple_of(WIDTH) }
 }
 
-/// Bytes per buffer for these options.
+/// The ledger of a backend with these options.
 pub(super) fn ledger(sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
     let budget = options.budget.max(1);
     let cap = tile_cap(options) as u64;
@@ -73,7 +70,7 @@ pub(super) fn ledger(sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
         "optimiser ages and bias tables",
         Blocks::<u16>::bytes(trained.clone(), 1) + BiasCorrection::bytes(),
     );
-    if Summed::is_wanted(needs.cadence) {
+    if Summed::is_needed(needs.cadence) {
         let bytes = Summed::bytes(trained.clone(), per_row, needs.cadence);
         ledger.add_to(Section::Gradients, "gradients summed between steps", bytes);
     }
@@ -107,14 +104,14 @@ pub(super) fn ledger(sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
     let loss = LossBuffers::bytes(grid.width, grid.height, threads, by_pixel);
     let per_tile = size_of::<TileCanvas>() + size_of::<TileGradient>();
     ledger.add_to(Section::Renderer, "image and image gradient", (grid.tiles() * per_tile) as u64);
-    let of_threads = loss + (threads * size_of::<Blended>()) as u64;
+    let loss_and_backward = loss + (threads * size_of::<Blended>()) as u64;
     let what = format!("loss and backward pass, for up to {threads} threads");
-    ledger.add_to(Section::Renderer, what, of_threads);
+    ledger.add_to(Section::Renderer, what, loss_and_backward);
     ledger
 }
 
-/// Asks for all of the ledger at once and gives it back, so that a refusal is an error before
-/// training and not an abort within it.
+/// Allocates the whole ledger at once and frees it, so that a lack of memory is an error before
+/// training instead of an abort during it.
 pub(super) fn reserve(ledger: &Ledger) -> Result<(), BackendError> {
     let bytes = ledger.total();
     let failed = BackendError::OutOfMemory { what: "the training buffers", bytes };
@@ -161,7 +158,7 @@ mod tests {
             let CpuBackend { params, moments, records, sums, splats, visible, .. } = &backend;
             assert_eq!(line("parameters"), Some(params.held()));
             assert_eq!(line("optimiser moments"), Some(moments.held()));
-            let bytes = |of: usize| Some(of as u64);
+            let bytes = |size: usize| Some(size as u64);
             assert_eq!(line("gradients per entry"), bytes(size_of_val(&records[..])));
             assert_eq!(line("splat gradients, signals at events"), bytes(size_of_val(&sums[..])));
             let seen = size_of_val(&visible[..]);
@@ -194,7 +191,7 @@ mod tests {
         assert!(found == expected);
     }
 
-    /// Around 2³¹ and 2³² rows, and as many as a slot can name and more.
+    /// Budgets around 2³¹ and 2³² rows, and more than a slot number can address.
     #[test]
     fn huge_budgets_are_refused_and_do_not_wrap() {
         let model = Gaussians { sh_degree: 3, ..Gaussians::default() };
@@ -206,7 +203,7 @@ mod tests {
             assert!(u128::from(ledger.total()) >= model_bytes, "{budget} rows");
             assert!(tile_cap(&options) <= u32::MAX as usize, "a slot is a u32");
         }
-        // More than there are addresses for: refused before anything is allocated.
+        // More than the address space: refused before anything is allocated.
         let options = Setup { threads: Some(1), ..Setup::new(1 << 40) };
         let refused = CpuBackend::new(&model, &options).expect_err("a petabyte");
         assert!(matches!(refused, BackendError::OutOfMemory { .. }), "{refused}");

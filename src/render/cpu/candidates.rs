@@ -1,9 +1,9 @@
-//! The surface points of a view's worst pixels, which are candidates for new rows (*Gaussians on a
+//! Candidates for new rows: the surface points of the pixels with the largest error (*Gaussians on a
 //! Diet*, arXiv 2604.20046, "compensation").
 //!
-//! Only the chosen pixels are looked at again: each walks its tile's list once more, in plain
-//! scalar code, to find the Gaussian that stands for its surface. That is a few thousand
-//! operations per step, where a per-pixel record of the whole image would burden every pixel.
+//! Each chosen pixel walks its tile's list once more, in scalar code, to find the Gaussian that represents its
+//! surface. That takes a few thousand operations per step, while recording surfaces during rendering would
+//! slow down every pixel.
 
 use std::sync::atomic::AtomicU64;
 
@@ -20,13 +20,13 @@ use super::tiles::Entry;
 use crate::Shortcuts;
 use crate::candidates::{Ranked, keep_worst};
 
-/// Image rows that one task ranks.
+/// Image rows ranked per task.
 const LINES: usize = 2;
-/// Lists that one task makes into one.
+/// Lists merged per task.
 const LISTS: usize = 8;
 
-/// Writes the `most` worst pixels of an image to the head of `ranking`, in any order; returns how many
-/// they are. Each task keeps its own worst, and these are joined until one list is left.
+/// Writes the `most` worst pixels of an image to the head of `ranking`, in any order, and returns their number. Each
+/// task keeps its own worst pixels; their lists are merged until one is left.
 pub(super) fn rank(
     threads: &Threads,
     ranking: &mut Vec<Ranked>,
@@ -67,8 +67,8 @@ pub(super) fn rank(
     kept.first().copied().unwrap_or(0)
 }
 
-/// The row that stands for the surface at pixel centre `at`: the one with the largest blend weight
-/// or the one at which half the light is gone.
+/// The row that represents the surface at pixel centre `at`: the one with the largest blend weight, or the one at which
+/// transmittance falls below ½.
 pub(super) fn surface_row(
     splats: &[Splat],
     list: &[AtomicU64],
@@ -103,8 +103,8 @@ pub(super) fn surface_row(
     best
 }
 
-/// Where the ray through pixel centre `at` comes closest to the Gaussian of `row`, in its
-/// Mahalanobis metric, with the depth there. `None` where that is not in front of `near`.
+/// The point on the ray through pixel centre `at` that is closest to the Gaussian of `row` in its
+/// Mahalanobis metric, with its depth; `None` if that is not beyond the near plane.
 pub(super) fn closest_approach(
     params: &Parameters,
     row: usize,
@@ -114,15 +114,15 @@ pub(super) fn closest_approach(
     let r = view.rotation.map(Vec3::from);
     let x = (at[0] - view.principal[0]) / view.focal[0];
     let y = (at[1] - view.principal[1]) / view.focal[1];
-    // Camera z along this vector is 1, so that the parameter of the ray is the depth.
+    // Camera z of this vector is 1, so that the ray's parameter is the depth.
     let ray = r[0] * x + r[1] * y + r[2];
     let centre = Vec3::from(view.centre);
     let mean = Vec3::from(params.get_n::<3>(row, plane::MEAN));
     let scale = Vec3::from(params.get_n::<3>(row, plane::LOG_SCALE).map(f32::exp));
     let [qw, qx, qy, qz] = params.get_n::<4>(row, plane::QUAT);
-    let turn = Quat::from_xyzw(qx, qy, qz, qw).normalize().inverse();
-    let direction = turn * ray / scale;
-    let offset = turn * (centre - mean) / scale;
+    let local_from_world = Quat::from_xyzw(qx, qy, qz, qw).normalize().inverse();
+    let direction = local_from_world * ray / scale;
+    let offset = local_from_world * (centre - mean) / scale;
     let depth = -direction.dot(offset) / direction.length_squared();
     (depth.is_finite() && depth > view.near).then(|| (centre + ray * depth, depth))
 }
@@ -134,7 +134,7 @@ mod tests {
     use super::*;
     use crate::candidates::Candidates;
 
-    /// Of images of one line, of a few tasks, and of several rounds; with equal errors.
+    /// Images of one line, of a few tasks, and of several rounds of merging, with equal errors among them.
     #[test]
     fn the_worst_are_those_of_a_list_of_all() {
         let threads = Threads::new(Some(2)).expect("threads");

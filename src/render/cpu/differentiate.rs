@@ -1,4 +1,4 @@
-//! Gradients and losses on their own: tools for tests and for research, not part of training.
+//! Gradients and losses outside of training; see [`Differentiable`].
 
 use super::loss::ImageTerms;
 use super::optimise::Differentiate;

@@ -1,8 +1,8 @@
-//! The exposure of the photograph at hand: between stages 3 and 4 the rendered colours become those of the
-//! photograph, and after stage 4 the derivative by them becomes that by the rendered colours, and sums by the
-//! transform itself. Nothing runs where a step has no exposure.
+//! The exposure of the current photograph. Between stages 3 and 4 it transforms the rendered colours; after stage 4
+//! it takes the gradient back to the colours before the transform, and sums up the gradient of the transform itself.
+//! Steps without an exposure skip both.
 //!
-//! Strips of tiles are the tasks. Each returns its own sums, which are added in order.
+//! A task is a row of tiles. Each returns its own sums, which are added in order.
 
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
@@ -14,7 +14,7 @@ use super::simd::WIDTH;
 use super::tiles::Grid;
 use densify_core::colour::{ColourGradient, ColourTransform, ExposureSums};
 
-/// Sums of a task: nine by colour, three plain, three behind.
+/// Sums of a task; see [`ExposureSums`].
 const SUMS: usize = 15;
 
 impl CpuBackend {
@@ -28,8 +28,8 @@ impl CpuBackend {
         clock.lap("exposure");
     }
 
-    /// Takes the derivative of the loss back to the colours before the transform, and returns that by the
-    /// transform of an image over this background.
+    /// Takes the gradient of the loss back to the colours before the transform, and returns the gradient of the
+    /// transform, for an image over `background`.
     pub(super) fn exposure_bwd(
         &mut self,
         grid: &Grid,
@@ -55,14 +55,14 @@ impl CpuBackend {
                 *total += part;
             }
         }
-        let of = |from: usize| std::array::from_fn(|i| total[from + i]);
-        let by_colour = [of(0), of(3), of(6)];
-        let sums = ExposureSums { by_colour, plain: of(9), behind: of(12) };
+        let three = |from: usize| std::array::from_fn(|i| total[from + i]);
+        let by_colour = [three(0), three(3), three(6)];
+        let sums = ExposureSums { by_colour, plain: three(9), behind: three(12) };
         exposure.gradient(background, &sums)
     }
 }
 
-/// Transforms the pixels of some tiles.
+/// Transforms the pixels of a row of tiles.
 struct Expose<'a> {
     exposure: &'a ColourTransform,
     tiles: &'a mut [TileCanvas],
@@ -71,7 +71,7 @@ struct Expose<'a> {
 impl WithSimd for Expose<'_> {
     type Output = ();
 
-    /// Plain loops, which the compiler turns into vectors of the dispatched instruction set.
+    /// Scalar loops, which the compiler vectorises for the dispatched instruction set.
     #[inline(always)]
     fn with_simd<S: Simd>(self, _: S) {
         let Self { exposure: ColourTransform { matrix, offset }, tiles } = self;
@@ -80,23 +80,23 @@ impl WithSimd for Expose<'_> {
             let pixels = red.as_flattened_mut().iter_mut();
             let pixels = pixels.zip(green.as_flattened_mut()).zip(blue.as_flattened_mut());
             for ((r, g), b) in pixels {
-                let of = |i: usize| {
+                let transformed = |i: usize| {
                     let [x, y, z] = matrix[i];
                     x * *r + y * *g + z * *b + offset[i]
                 };
-                [*r, *g, *b] = [of(0), of(1), of(2)];
+                [*r, *g, *b] = [transformed(0), transformed(1), transformed(2)];
             }
         }
     }
 }
 
-/// Differentiates the transform in the pixels of some tiles.
+/// Differentiates the transform in the pixels of a row of tiles.
 struct ExposeBwd<'a> {
     grid: &'a Grid,
-    /// Number of the first tile.
+    /// The number of the first tile.
     first: usize,
     exposure: &'a ColourTransform,
-    /// As the loss has seen it.
+    /// The transformed image.
     canvas: &'a [TileCanvas],
     gradient: &'a mut [TileGradient],
 }
@@ -110,7 +110,7 @@ impl WithSimd for ExposeBwd<'_> {
         let [from_red, from_green, from_blue] = &exposure.matrix;
         let mut total = [0.0_f64; SUMS];
         for (number, (canvas, gradient)) in (first..).zip(canvas.iter().zip(gradient)) {
-            // Beyond the image there may be a gradient of no pixel.
+            // Lanes outside the image may hold an arbitrary gradient.
             let (inside, _) = TilePlace::new(grid, number).inside();
             let mut sums = [[0.0_f32; WIDTH]; SUMS];
             for (p, inside) in inside.iter().enumerate() {

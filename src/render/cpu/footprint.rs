@@ -1,9 +1,9 @@
-//! Which tiles a splat's ellipse (where alpha is at least what is blended, 1/255 by default) touches.
+//! The tiles that a splat's ellipse covers. The ellipse is the region where alpha is at least the blending threshold,
+//! 1/255 by default.
 //!
-//! Per row of tiles, the ellipse's leftmost and rightmost points within that row bound the tiles: no
-//! tile is listed whose pixels it does not come near. The answer is kept as a few bits, which the
-//! projection finds for a vector of rows at a time. Only of rows that reach farther than the bits do,
-//! the tiles are found one by one: by the same function, on one lane.
+//! In each row of tiles, the ellipse's leftmost and rightmost points bound the tiles, so that no tile is listed
+//! whose pixels are not near the ellipse. The result is stored as a few bits, which the projection computes for a
+//! vector of rows at a time. For larger ellipses the tiles are found one by one, by the same function on one lane.
 
 use std::ops::Range;
 
@@ -13,12 +13,12 @@ use super::project::Splat;
 use super::simd::{Mask, V};
 use super::tiles::{Grid, TILE};
 
-/// Slack for the bounds of an ellipse [px]: their rounding errors, f32's at 16,384 px, are far less
-/// relative to the ellipse's size, and a pixel missed at the bound has the least alpha that is blended.
+/// Slack for the bounds of an ellipse `[px]`. Rounding errors, those of f32 at 16,384 px, are far smaller, and a
+/// pixel missed at the bound has the smallest alpha that is blended.
 const SLACK: f32 = 0.02;
 
-/// The tiles of a band that a row touches, as a number of the first and a bit for each of those to
-/// its right and below, [`REACH_X`] × [`REACH_Y`] of them; or [`FAR`](Self::FAR).
+/// The tiles of a band that a splat covers: the number of the first tile, and a bit for each of the
+/// [`REACH_X`] × [`REACH_Y`] tiles to its right and below; or [`FAR`](Self::FAR).
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(super) struct Footprint(pub(super) [u32; 2]);
 
@@ -27,11 +27,10 @@ const REACH_Y: usize = 4;
 const _: () = assert!(REACH_X * REACH_Y == 32, "bits of a footprint");
 
 impl Footprint {
-    /// The row reaches farther than the bits do: its ellipse must be evaluated again.
+    /// The splat is larger than the bits allow: its ellipse must be evaluated again.
     const FAR: Self = Self([u32::MAX, 0]);
 
-    /// Calls `f` with the number, relative to the band, of every tile of the band that the splat's
-    /// ellipse touches, in ascending order.
+    /// Calls `f` with the number, relative to the band, of every tile that the splat covers, in ascending order.
     #[inline]
     pub(super) fn new(
         splat: &Splat,
@@ -44,7 +43,7 @@ impl Footprint {
             return Self::FAR;
         }
         let [x, y] =
-            Ellipse::<Scalar>::of(splat).first_tile(grid).map(|first| first.lane() as usize);
+            Ellipse::<Scalar>::new(splat).first_tile(grid).map(|first| first.lane() as usize);
         let corner = y * grid.columns + x;
         let mut bits = splat.tiles;
         if band.len() < grid.tiles() {
@@ -59,7 +58,7 @@ impl Footprint {
         footprint
     }
 
-    /// Does the same again.
+    /// Calls `f` with the same tiles as [`new`](Self::new).
     #[inline]
     pub(super) fn for_each_tile(
         self,
@@ -81,15 +80,15 @@ impl Footprint {
     }
 }
 
-/// The tiles of a row that reaches farther than the bits of a footprint do.
+/// The tiles of a splat that is too large for the bits of a footprint.
 #[inline(never)]
 fn far_tiles(splat: &Splat, grid: &Grid, band: &Range<usize>, mut f: impl FnMut(usize)) {
-    let ellipse = Ellipse::<Scalar>::of(splat);
-    let around = ellipse.around(grid);
+    let ellipse = Ellipse::<Scalar>::new(splat);
+    let bounds = ellipse.bounds(grid);
     let (first, last) = (band.start / grid.columns, band.end.div_ceil(grid.columns));
-    let [_, [y0, y1]] = around.sides;
+    let [_, [y0, y1]] = bounds.sides;
     for ty in first.max(y0.lane() as usize)..last.min(y1.lane() as usize + 1) {
-        let [from, to] = ellipse.columns_in(&around, V::splat(Scalar, ty as f32), grid);
+        let [from, to] = ellipse.columns_in(&bounds, V::splat(Scalar, ty as f32), grid);
         for tx in from.lane() as usize..=to.lane() as usize {
             let tile = ty * grid.columns + tx;
             if band.contains(&tile) {
@@ -99,7 +98,7 @@ fn far_tiles(splat: &Splat, grid: &Grid, band: &Range<usize>, mut f: impl FnMut(
     }
 }
 
-/// The ellipses of some rows. In folded units one is u² + z² <= reach, u = l1·(dx − shear·dy), z = l3·dy.
+/// The ellipses of several splats. In folded units an ellipse is u² + z² <= reach, u = l1·(dx − shear·dy), z = l3·dy.
 /// Its rightmost point is at dy = peak, its leftmost at dy = −peak. See [`Splat`].
 pub(super) struct Ellipse<S: Simd> {
     pub(super) s: S,
@@ -112,17 +111,17 @@ pub(super) struct Ellipse<S: Simd> {
     pub(super) reach: V<S>,
 }
 
-/// The rectangle of tiles around an ellipse.
-struct Around<S: Simd> {
-    /// Columns from and to, rows from and to, inclusive: whole numbers.
+/// The bounding rectangle of an ellipse, in tiles.
+struct Bounds<S: Simd> {
+    /// First and last column, first and last row: whole numbers.
     sides: [[V<S>; 2]; 2],
-    /// Whether the rectangle is more than one tile wide and high, and so has corners to cut.
+    /// Whether the rectangle is more than one tile wide and high, so that its corners may be outside the ellipse.
     wide: Mask<S>,
 }
 
 impl Ellipse<Scalar> {
     #[inline(always)]
-    fn of(splat: &Splat) -> Self {
+    fn new(splat: &Splat) -> Self {
         let c = |x| V::splat(Scalar, x);
         Self {
             s: Scalar,
@@ -138,14 +137,14 @@ impl Ellipse<Scalar> {
 }
 
 impl<S: Simd> Ellipse<S> {
-    /// Half the sides of the rectangle around the ellipse [px], with slack.
+    /// Half the sides of the bounding rectangle `[px]`, with slack.
     #[inline(always)]
     fn half(&self) -> [V<S>; 2] {
         let [w, h] = self.half_sides;
         [w * 1.0001 + SLACK, h * 1.0001 + SLACK]
     }
 
-    /// Column and row of the first tile of the rectangle around the ellipse.
+    /// Column and row of the first tile of the bounding rectangle.
     #[inline(always)]
     fn first_tile(&self, grid: &Grid) -> [V<S>; 2] {
         let ([x, y], [hw, hh]) = (self.mean, self.half());
@@ -153,19 +152,19 @@ impl<S: Simd> Ellipse<S> {
     }
 
     #[inline(always)]
-    fn around(&self, grid: &Grid) -> Around<S> {
+    fn bounds(&self, grid: &Grid) -> Bounds<S> {
         let ([x, y], [hw, hh]) = (self.mean, self.half());
         let [x0, y0] = self.first_tile(grid);
         let x1 = tile_of(x + hw - 0.5, grid.columns);
         let y1 = tile_of(y + hh - 0.5, grid.rows);
-        Around { sides: [[x0, x1], [y0, y1]], wide: x0.lt(x1).and(y0.lt(y1)) }
+        Bounds { sides: [[x0, x1], [y0, y1]], wide: x0.lt(x1).and(y0.lt(y1)) }
     }
 
-    /// First and last tile that the ellipse touches in row `ty` of tiles: none if the first is later.
+    /// First and last tile that the ellipse covers in row `ty` of tiles; none if the first is greater.
     #[inline(always)]
-    fn columns_in(&self, around: &Around<S>, ty: V<S>, grid: &Grid) -> [V<S>; 2] {
+    fn columns_in(&self, bounds: &Bounds<S>, ty: V<S>, grid: &Grid) -> [V<S>; 2] {
         let Self { mean: [mx, my], shear, peak, .. } = *self;
-        let Around { sides: [[x0, x1], _], wide } = *around;
+        let Bounds { sides: [[x0, x1], _], wide } = *bounds;
         let [hw, hh] = self.half();
         let top = (ty * TILE as f32 + 0.5 - my).max(-hh);
         let bottom = (ty * TILE as f32 + (TILE as f32 - 0.5) - my).min(hh);
@@ -186,12 +185,12 @@ impl<S: Simd> Ellipse<S> {
         (self.reach - z * z).max(V::zero(self.s)).sqrt() * self.inv_l1
     }
 
-    /// For each lane the bits of a [`Footprint`]; 0 where they do not reach.
+    /// The bits of a [`Footprint`] per lane; 0 if it is too large for them.
     #[inline(always)]
     pub(super) fn tiles(&self, grid: &Grid) -> S::u32s {
         let s = self.s;
-        let around = self.around(grid);
-        let [[x0, x1], [y0, y1]] = around.sides;
+        let bounds = self.bounds(grid);
+        let [[x0, x1], [y0, y1]] = bounds.sides;
         let fits = (x1 - x0).lt(V::splat(s, REACH_X as f32));
         let fits = fits.and((y1 - y0).lt(V::splat(s, REACH_Y as f32)));
         let mut bits = s.splat_u32s(0);
@@ -201,9 +200,9 @@ impl<S: Simd> Ellipse<S> {
             if !within.any() {
                 break;
             }
-            let [from, to] = self.columns_in(&around, ty, grid);
+            let [from, to] = self.columns_in(&bounds, ty, grid);
             let touched = within.and(from.le(to));
-            // As many ones as there are tiles, at the place of the first.
+            // One bit per tile, starting at the first.
             let above = s.wrapping_dyn_shl_u32s(s.splat_u32s(2), (to - x0).whole());
             let below = s.wrapping_dyn_shl_u32s(s.splat_u32s(1), (from - x0).whole());
             let ones = s.sub_u32s(above, below);
@@ -214,9 +213,9 @@ impl<S: Simd> Ellipse<S> {
     }
 }
 
-/// Index of the tile whose pixel centres are the first at or after (last at or before) a bound.
+/// The index of the tile that contains a bound, given relative to the first pixel centre.
 ///
-/// Rounded down by adding 2²³, above which f32 has whole numbers only.
+/// Rounds down by adding 2²³, above which f32 has only whole numbers.
 #[inline(always)]
 fn tile_of<S: Simd>(x: V<S>, most: usize) -> V<S> {
     let c = |number| V::splat_like(x, number);
@@ -269,7 +268,7 @@ mod tests {
         }
     }
 
-    /// A needle or a disc somewhere near the image, of up to some `size` [px].
+    /// A needle or a disc near the image, of up to `size` `[px]`.
     fn splat(rng: &mut ChaCha8Rng, grid: &Grid, size: f32) -> Splat {
         let mut between = |from: f32, to: f32| rng.random_range(from..to);
         let mean = [grid.width, grid.height].map(|side| between(-40.0, side as f32 + 40.0));
@@ -322,8 +321,8 @@ mod tests {
                     splat.tiles = bits;
                     assert_eq!(listed(splat, &grid, 0..grid.tiles()), one_by_one, "{splat:?}");
                     far += usize::from(bits == 0 && !one_by_one.is_empty());
-                    let Around { sides: [[x0, x1], [y0, y1]], .. } =
-                        Ellipse::<Scalar>::of(splat).around(&grid);
+                    let Bounds { sides: [[x0, x1], [y0, y1]], .. } =
+                        Ellipse::<Scalar>::new(splat).bounds(&grid);
                     let rectangle = (x1.lane() - x0.lane() + 1.0) * (y1.lane() - y0.lane() + 1.0);
                     cut += usize::from(one_by_one.len() < rectangle as usize);
                     // Bands that begin and end within rows of tiles.

@@ -4,20 +4,20 @@ use std::fmt;
 
 use pulp::Arch;
 
-/// What the kernels of the native backend may use of a processor.
+/// Instruction sets of the native backend's kernels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum InstructionSet {
-    /// All that the machine has.
+    /// The best that the machine supports.
     #[default]
     Best,
-    /// One number at a time.
+    /// No vectors.
     Scalar,
-    /// Eight numbers at a time; as [`Best`](Self::Best) where the machine lacks AVX2.
+    /// AVX2, eight numbers at a time; [`Best`](Self::Best) on machines without it.
     Avx2,
 }
 
 impl InstructionSet {
-    /// Those that differ on this machine, the plainest first.
+    /// The sets that differ on this machine, the simplest first.
     #[must_use]
     pub fn available() -> Vec<Self> {
         let mut all = vec![Self::Best, Self::Avx2, Self::Scalar];
@@ -35,7 +35,7 @@ impl InstructionSet {
         }
     }
 
-    /// Numbers that are processed at a time.
+    /// Numbers processed at a time.
     fn lanes(self) -> usize {
         struct Lanes;
         impl pulp::WithSimd for Lanes {

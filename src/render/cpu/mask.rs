@@ -1,5 +1,5 @@
-//! A number per row that learns whether the row is worth its place (*Compact 3D Gaussian Representation*,
-//! Lee et al. 2024, section 3.1): between stages 6 and 7, where a policy declares it.
+//! Learned masks: a number per row that decides whether the row is needed (*Compact 3D Gaussian Representation*,
+//! Lee et al. 2024, section 3.1). They step between stages 6 and 7, if a policy declares them.
 
 use std::ops::Range;
 
@@ -12,24 +12,25 @@ use super::simd::WIDTH;
 use crate::{StateError, Tensor};
 use densify_core::gaussians::{logit, sigmoid};
 
-/// Planes: how far the mask's logit is from where it began, so that 0 is a fresh mask; its two moments.
+/// Plane of the mask's logit, relative to its start, so that 0 is a new mask.
 const OFFSET: usize = 0;
+/// Planes of its two moments.
 const FIRST: usize = 1;
 const SECOND: usize = 2;
 const PLANES: usize = 3;
 
-/// The masks of the rows that may be trained; nothing where none are declared.
+/// The masks of the trainable rows; empty unless they are declared.
 #[derive(Debug)]
 pub(super) struct Masks {
     term: Option<MaskTerm>,
     blocks: Blocks<f32>,
 }
 
-/// The masks of one task, and how they step.
+/// The masks of a task's blocks.
 #[derive(Debug)]
 pub(super) struct MaskTask<'a> {
     term: MaskTerm,
-    /// Derivative of the term by σ(m), per row.
+    /// Derivative of the loss term with respect to σ(m), per row.
     weight: f32,
     blocks: BlockTask<'a, f32>,
 }
@@ -52,7 +53,7 @@ impl Masks {
         self.term.map_or(0.0, |term| sigmoid(term.start + self.blocks.get(row, OFFSET)))
     }
 
-    /// Cut for the optimiser's tasks; the term is the mean over the rows that are `trained`.
+    /// Splits the masks for the optimiser's tasks; the loss term is the mean over `trained` rows.
     pub(super) fn tasks(
         &mut self,
         rows: usize,
@@ -65,15 +66,15 @@ impl Masks {
         })
     }
 
-    /// A newborn row has its parent's mask.
+    /// Gives a new row its parent's mask.
     pub(super) fn inherit(&mut self, parent: usize, row: usize) {
         if self.is_declared() {
             self.blocks.set(row, OFFSET, self.blocks.get(parent, OFFSET));
         }
     }
 
-    /// Zero moments.
-    pub(super) fn forget(&mut self, row: usize) {
+    /// Resets the moments.
+    pub(super) fn reset_moments(&mut self, row: usize) {
         if self.is_declared() {
             self.blocks.set(row, FIRST, 0.0);
             self.blocks.set(row, SECOND, 0.0);
@@ -105,8 +106,8 @@ impl Masks {
 }
 
 impl MaskTask<'_> {
-    /// One step of Adam for the masks of a block, from the gradient of the image loss; `ages` are those
-    /// before the step. A row whose mask is at the threshold becomes transparent.
+    /// Steps the masks of a block by Adam, from the gradient of the image loss; `ages` are the ages
+    /// before the step. A row whose mask falls to the threshold becomes transparent.
     pub(super) fn step(
         &mut self,
         block: usize,
@@ -119,24 +120,24 @@ impl MaskTask<'_> {
         let MaskTerm { start, rate, threshold, .. } = self.term;
         let least = logit(threshold);
         for (lane, &age) in ages.iter().enumerate() {
-            let of = |plane: usize| plane * WIDTH + lane;
-            // The row renders with its opacity and its scales times 1[σ(m) > threshold], whose derivative is
-            // taken to be that of σ(m).
-            let transparency = sigmoid(-params[of(plane::OPACITY)]);
-            let by_scales: f32 = (plane::LOG_SCALE..plane::QUAT).map(|p| gradient[of(p)]).sum();
-            let by_factor = gradient[of(plane::OPACITY)] / transparency + by_scales;
-            let m = start + masks[of(OFFSET)];
+            let at = |plane: usize| plane * WIDTH + lane;
+            // Opacity and scales are multiplied by 1[σ(m) > threshold], whose derivative is approximated by that of
+            // σ(m).
+            let transparency = sigmoid(-params[at(plane::OPACITY)]);
+            let by_scales: f32 = (plane::LOG_SCALE..plane::QUAT).map(|p| gradient[at(p)]).sum();
+            let by_factor = gradient[at(plane::OPACITY)] / transparency + by_scales;
+            let m = start + masks[at(OFFSET)];
             let slope = sigmoid(m) * sigmoid(-m);
             let g = (by_factor + self.weight) * slope;
-            let first = masks[of(FIRST)] * BETA1 + g * (1.0 - BETA1);
-            let second = masks[of(SECOND)] * BETA2 + g * g * (1.0 - BETA2);
-            let [of_first, of_second] = bias.of(age.saturating_add(1));
-            let step = first * of_first * rate / (second.sqrt() * of_second + EPSILON);
-            masks[of(OFFSET)] -= step;
-            masks[of(FIRST)] = first;
-            masks[of(SECOND)] = second;
-            if start + masks[of(OFFSET)] <= least {
-                params[of(plane::OPACITY)] = -LOGIT_MAX;
+            let first = masks[at(FIRST)] * BETA1 + g * (1.0 - BETA1);
+            let second = masks[at(SECOND)] * BETA2 + g * g * (1.0 - BETA2);
+            let [first_bias, second_bias] = bias.at(age.saturating_add(1));
+            let step = first * first_bias * rate / (second.sqrt() * second_bias + EPSILON);
+            masks[at(OFFSET)] -= step;
+            masks[at(FIRST)] = first;
+            masks[at(SECOND)] = second;
+            if start + masks[at(OFFSET)] <= least {
+                params[at(plane::OPACITY)] = -LOGIT_MAX;
             }
         }
     }

@@ -1,10 +1,10 @@
 //! The native backend: rayon over tiles and rows, SIMD with run-time dispatch, one file per stage.
 //!
 //! It is the default on machines without a GPU and the reference for the shaders. The same inputs
-//! and the same seed give the same bytes at any thread count: work is cut at fixed places, every
-//! sum has a fixed order, and nothing is accumulated from two threads.
+//! and the same seed give the same bytes at any thread count: work is split at fixed places, every
+//! sum has a fixed order, and no sum is accumulated by two threads.
 //!
-//! All buffers are allocated once, at the budget; the ledger lists them.
+//! All buffers are allocated once, at the size of the budget; the ledger lists them.
 
 mod adam;
 mod apply;
@@ -49,10 +49,10 @@ use densify_policies::policy::{Candidate, SignalSet, Signals};
 use densify_policies::rng::PolicyRng;
 use pulp::Arch;
 
-use super::candidates::{Candidates, Shown, error_weights};
+use super::candidates::{Candidates, Photograph, error_weights};
 use super::signals::{Field, counts_dominant};
 use super::{
-    AuxInput, AuxOutput, Backend, BackendError, Rendering, Setup, Shortcuts, StateArray,
+    AuxInput, AuxOutput, Backend, BackendError, Inspect, Rendering, Setup, Shortcuts, StateArray,
     StateError, StepInput, StepOutput, Tensor, Unsound, assert_fits, assert_same_size,
 };
 use adam::BiasCorrection;
@@ -79,10 +79,10 @@ pub use instructions::InstructionSet;
 pub use optimise::ModelGradient;
 pub use threads::StepTasks;
 
-/// Largest image side [y][x]; at this size every index of the stages still fits its type.
+/// The largest side of an image `[px]`, at which every index of the stages still fits its type.
 const MAX_SIDE: u32 = 16_384;
-/// Blocks per task: 128 rows, a hundred kilobytes of parameters and moments at degree 3. Of 50,000 rows
-/// that is six tasks for each of 64 threads.
+/// Blocks per task: 128 rows, which have 100 kB of parameters and moments at degree 3. 50,000 rows give each of 64
+/// threads six tasks.
 const BLOCKS_PER_TASK: usize = 8;
 const ROWS_PER_TASK: usize = BLOCKS_PER_TASK * WIDTH;
 
@@ -93,7 +93,7 @@ pub struct CpuBackend {
     threads: Arc<Threads>,
     ledger: Ledger,
     budget: usize,
-    /// Rows at the front that never change.
+    /// Number of frozen rows, which come first.
     frozen: usize,
     rows: usize,
     sh_degree: u8,
@@ -101,19 +101,19 @@ pub struct CpuBackend {
     shortcuts: Shortcuts,
     params: Parameters,
     moments: Moments,
-    /// Steps of each row that may be trained: one plane.
+    /// Optimiser steps per row, without whole tasks of frozen rows: one plane.
     ages: Blocks<u16>,
     bias: BiasCorrection,
     summed: Summed,
     masks: Masks,
     signals: Accumulators,
     candidates: Candidates,
-    /// Pixels that each row dominates in the view at hand. Shape: `[budget]`, or empty if they are not
-    /// counted.
+    /// Pixels of the current view in which each row has the largest blend weight. Shape: `[budget]`, or empty if
+    /// they are not counted.
     dominant: Vec<AtomicU32>,
     /// Shape: `[budget]`.
     splats: Vec<Splat>,
-    /// Bit per lane: on screen in the view at hand. Shape: `[blocks]`.
+    /// Bit per lane: on screen in the current view. Shape: `[blocks]`.
     visible: Vec<u16>,
     lists: TileLists,
     /// Shape: `[tiles]`.
@@ -121,31 +121,30 @@ pub struct CpuBackend {
     /// Shape: `[tiles]`.
     gradient: Vec<TileGradient>,
     loss: LossBuffers,
-    /// Bits of one record per entry, as far as there is room. Shape: `[record cap, stride of the
-    /// records]`.
+    /// The bits of one record per entry, up to the cap. Shape: `[record cap, stride of the records]`.
     records: Vec<AtomicU32>,
     record_cap: usize,
-    /// One record per row. Between steps it is lent to the host's copy of the signals, and has room
-    /// for these. Shape: `[budget, stride of the records]`, or more.
+    /// The sum of each row's records. Between steps the memory is lent to the host's copy of the signals, and is
+    /// large enough for them. Shape: `[budget, stride of the records]`, or more.
     sums: Vec<f32>,
     clock: StageClock,
 }
 
 impl CpuBackend {
-    /// Bytes per buffer of a backend made with these options for models of this degree, on so many
-    /// threads; [`Setup::threads`] is not looked at.
+    /// The ledger of a backend with these options for models of this degree, on `threads` threads, whatever
+    /// [`Setup::threads`] says.
     #[must_use]
     pub fn promise(sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
         budget::ledger(sh_degree, options, threads)
     }
 
-    /// Takes over `model` and allocates everything for `options.budget` rows.
+    /// Takes over `model` and allocates all buffers for `options.budget` rows.
     ///
     /// # Errors
-    /// [`BackendError::OutOfMemory`] when the memory cannot be had.
+    /// [`BackendError::OutOfMemory`] when the memory is not available; [`BackendError::Threads`].
     ///
     /// # Panics
-    /// When the model has more rows than the budget: the caller subsamples before.
+    /// When the model has more rows than the budget: a bug in the caller, which must subsample.
     pub fn new(model: &Gaussians, options: &Setup) -> Result<Self, BackendError> {
         let budget = options.budget.max(1);
         assert!(model.len() <= budget, "{} rows over a budget of {budget}", model.len());
@@ -196,8 +195,8 @@ impl CpuBackend {
         })
     }
 
-    /// Records what the tasks of training steps take, from now on. Only on one thread: several would
-    /// slow each other down.
+    /// Starts recording the durations of the tasks of training steps; on one thread only, as several would slow each
+    /// other down.
     ///
     /// # Panics
     /// When the backend has more than one thread.
@@ -205,13 +204,13 @@ impl CpuBackend {
         self.threads.record();
     }
 
-    /// The tasks of the last training step; none unless they are [recorded](Self::record_tasks).
+    /// The tasks of the last training step; empty unless they are [recorded](Self::record_tasks).
     #[must_use]
     pub fn recorded_tasks(&self) -> StepTasks {
         self.threads.recorded()
     }
 
-    /// One training step, on a thread of the pool.
+    /// Runs a training step on a thread of the pool.
     fn step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
         let StepInput { camera, target, background, exposure, .. } = *input;
         let behind = exposure.map_or(background, |exposure| exposure.behind(background));
@@ -228,8 +227,8 @@ impl CpuBackend {
         let by_exposure =
             exposure.map(|exposure| self.exposure_bwd(&frame.grid, exposure, background));
         if let Some((request, count)) = picks {
-            let shown = Shown { target, background, exposure };
-            self.collect_candidates(&frame, shown, &request, count);
+            let photograph = Photograph { target, background, exposure };
+            self.collect_candidates(&frame, photograph, &request, count);
         }
         self.backward(&frame, self.signals.layout());
         self.optimise(&frame, input);
@@ -276,7 +275,7 @@ impl Backend for CpuBackend {
     }
 
     fn take_signals(&mut self, wanted: SignalSet) -> Result<Signals, BackendError> {
-        // The sums are not used between two steps.
+        // The memory of the sums is unused between steps.
         let memory = std::mem::take(&mut self.sums);
         let mut signals = Signals::zeros_in(memory, self.rows, wanted);
         let of_rows = (&self.params, &self.masks, &self.ages);
@@ -327,24 +326,8 @@ impl Backend for CpuBackend {
         Ok(self.rendering(&frame))
     }
 
-    fn counts_rows(&self) -> bool {
-        true
-    }
-
-    fn render_counts(&mut self, camera: &Camera) -> Result<Rendering, BackendError> {
-        let frame = self.forward(camera, [0.0; 3], 0, Beside::Count)?;
-        Ok(self.rendering(&frame))
-    }
-
-    fn render_painted(
-        &mut self,
-        camera: &Camera,
-        background: [f32; 3],
-        colours: &[[f32; 3]],
-    ) -> Result<Rendering, BackendError> {
-        assert_eq!(colours.len(), self.rows, "colours of other rows");
-        let frame = self.forward_painted(camera, background, 0, Beside::Depth, Some(colours))?;
-        Ok(self.rendering(&frame))
+    fn inspect(&mut self) -> Result<&mut dyn Inspect, BackendError> {
+        Ok(self)
     }
 
     fn download_array(
@@ -383,5 +366,27 @@ impl Backend for CpuBackend {
 
     fn stage_times(&self) -> &[(&'static str, Duration)] {
         &self.clock.laps
+    }
+}
+
+impl Inspect for CpuBackend {
+    fn render_painted(
+        &mut self,
+        camera: &Camera,
+        background: [f32; 3],
+        colours: &[[f32; 3]],
+    ) -> Result<Rendering, BackendError> {
+        assert_eq!(colours.len(), self.rows, "one colour per row");
+        let frame = self.forward_painted(camera, background, 0, Beside::Depth, Some(colours))?;
+        Ok(self.rendering(&frame))
+    }
+
+    fn counts_rows(&self) -> bool {
+        true
+    }
+
+    fn render_counts(&mut self, camera: &Camera) -> Result<Rendering, BackendError> {
+        let frame = self.forward(camera, [0.0; 3], 0, Beside::Count)?;
+        Ok(self.rendering(&frame))
     }
 }

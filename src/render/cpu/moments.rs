@@ -1,9 +1,9 @@
 //! Adam's two moments: as f32, or in a byte each; see [`MomentStorage`].
 //!
-//! The first moment is at most 7.3 roots of the second, whatever the gradients were: what a step
-//! uses is that ratio, and [`MomentStorage::Both8`] stores nothing else of it, in steps of 0.057.
-//! Noise alone gives ratios of about 0.23, to whose variance the rounding adds a twentieth; it has no
-//! scale that neighbours would share, and so none that a neighbour could spoil.
+//! The first moment is at most 7.3 times the root of the second, whatever the gradients were. A step uses only
+//! this ratio, and [`MomentStorage::Both8`] stores it in place of the first moment, in steps of 0.057.
+//! Pure noise gives ratios of about 0.23, whose variance the rounding increases by a twentieth. Numbers share no
+//! scale, so that an outlier cannot spoil its neighbours.
 
 use std::ops::Range;
 
@@ -14,18 +14,18 @@ use super::narrow::{Draws, F8, Narrow, first_moment, first_moments, narrow, rati
 use super::simd::WIDTH;
 use crate::{MomentStorage, StateError, Tensor};
 
-/// The moments of the rows that may be trained.
+/// The moments of the trainable rows.
 #[derive(Debug)]
 pub(super) struct Moments {
-    /// The first and the second, or none.
+    /// The first and the second moments; no planes if they are stored in bytes.
     wide: [Blocks; 2],
-    /// None, or the first as multiples of the roots of the second.
+    /// The first moments as multiples of the roots of the second, if they are stored in bytes.
     ratios: Blocks<i8>,
-    /// None, or the second.
+    /// The second moments, if they are stored in bytes.
     seconds: Blocks<F8>,
 }
 
-/// Planes of f32, and in bytes.
+/// Numbers of planes stored as f32 and in bytes.
 fn split(planes: usize, storage: MomentStorage) -> [usize; 2] {
     match storage {
         MomentStorage::F32 => [planes, 0],
@@ -43,20 +43,20 @@ impl Moments {
         }
     }
 
-    /// Bytes for these rows.
+    /// Bytes for a range of rows.
     pub(super) fn bytes(rows: Range<usize>, planes: usize, storage: MomentStorage) -> u64 {
         let [wide, narrow] = split(planes, storage);
         2 * (Blocks::<f32>::bytes(rows.clone(), wide) + Blocks::<F8>::bytes(rows, narrow))
     }
 
-    /// Bytes that are there.
+    /// Allocated bytes.
     #[cfg(test)]
     pub(super) fn held(&self) -> u64 {
         let wide: u64 = self.wide.iter().map(Blocks::held).sum();
         wide + self.ratios.held() + self.seconds.held()
     }
 
-    /// The first row that has moments.
+    /// The first row with moments.
     pub(super) fn first(&self) -> usize {
         self.ratios.first()
     }
@@ -71,7 +71,7 @@ impl Moments {
         self.seconds.clear_row(row);
     }
 
-    /// Copies what is stored, to the bit.
+    /// Copies the stored bits.
     pub(super) fn copy_row(&mut self, from: usize, to: usize) {
         self.wide.iter_mut().for_each(|blocks| blocks.copy_row(from, to));
         self.ratios.copy_row(from, to);
@@ -84,8 +84,8 @@ impl Moments {
         self.seconds.reorder(order);
     }
 
-    /// Zero moments of one parameter.
-    pub(super) fn forget(&mut self, row: usize, plane: usize) {
+    /// Resets the moments of one parameter.
+    pub(super) fn reset(&mut self, row: usize, plane: usize) {
         if self.is_narrow() {
             self.ratios.set(row, plane, 0);
             self.seconds.set(row, plane, F8::default());
@@ -103,7 +103,7 @@ impl Moments {
         [first_moment(self.ratios.get(row, plane), second), second]
     }
 
-    /// The blocks of the first `rows` rows, to read.
+    /// A read-only view of the blocks of the first `rows` rows.
     pub(super) fn view(&self, rows: usize) -> MomentView<'_> {
         MomentView {
             is_narrow: self.is_narrow(),
@@ -113,7 +113,7 @@ impl Moments {
         }
     }
 
-    /// The blocks of the first `rows` rows, cut for the optimiser's tasks.
+    /// The blocks of the first `rows` rows, split for the optimiser's tasks.
     pub(super) fn tasks(
         &mut self,
         rows: usize,
@@ -129,8 +129,8 @@ impl Moments {
         })
     }
 
-    /// The first (0) or second (1) moments of some rows, as they are stored: numbers; or ratios in
-    /// two's complement, and codes of [`F8`]. Shape: `[rows.len(), planes]`.
+    /// The first (0) or second (1) moments of some rows as they are stored: f32, or ratios in
+    /// two's complement and codes of [`F8`]. Shape: `[rows.len(), planes]`.
     pub(super) fn tensor(
         &self,
         which: usize,
@@ -150,7 +150,7 @@ impl Moments {
         Tensor::u8(name, &shape, codes)
     }
 
-    /// Takes back what [`tensor`](Self::tensor) returned.
+    /// Restores an array that [`tensor`](Self::tensor) returned.
     pub(super) fn restore(
         &mut self,
         which: usize,
@@ -174,7 +174,7 @@ impl Moments {
     }
 }
 
-/// The moments of some blocks, to read.
+/// A read-only view of the moments of some blocks.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct MomentView<'a> {
     is_narrow: bool,
@@ -184,7 +184,7 @@ pub(super) struct MomentView<'a> {
 }
 
 impl<'a> MomentView<'a> {
-    /// The first `planes` planes, or more, of a block, of both moments.
+    /// Both moments of a block as f32: at least the first `planes` planes.
     pub(super) fn open<'b>(
         self,
         block: usize,
@@ -203,7 +203,7 @@ impl<'a> MomentView<'a> {
     }
 }
 
-/// The moments of some blocks, to change.
+/// The moments of a task's blocks.
 #[derive(Debug)]
 pub(super) struct MomentTask<'a> {
     is_narrow: bool,
@@ -213,7 +213,7 @@ pub(super) struct MomentTask<'a> {
 }
 
 impl MomentTask<'_> {
-    /// The first `planes` planes, or more, of a block, of both moments.
+    /// Both moments of a block as f32: at least the first `planes` planes.
     #[inline(always)]
     pub(super) fn open<'b>(
         &'b mut self,
@@ -230,8 +230,8 @@ impl MomentTask<'_> {
         [&mut m.0, &mut v.0]
     }
 
-    /// Stores the planes that were opened, where they are not what is stored: the first moments as
-    /// multiples of what is stored of the second.
+    /// Stores the opened planes unless they are stored as f32; the first moments as multiples of the roots of the
+    /// second as stored.
     #[inline(always)]
     pub(super) fn close(
         &mut self,
@@ -249,7 +249,7 @@ impl MomentTask<'_> {
         ratios(&m.0[..used], second, &mut self.ratios.block(block)[..used], of_m);
     }
 
-    /// Whether what is stored is not what was computed.
+    /// Whether the stored format is not f32.
     #[inline(always)]
     pub(super) fn is_narrow(&self) -> bool {
         self.is_narrow

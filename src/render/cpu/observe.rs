@@ -1,9 +1,9 @@
-//! Auxiliary views: training views that are rendered for a policy's event, and measured row by row.
+//! Auxiliary views: training views that are rendered for a policy's event and measured row by row.
 //!
-//! Blending is replayed front to back, with the arithmetic of the forward pass, and each row's sums
-//! over the pixels that it is blended into, and its largest weight, are written to one record per
-//! (row, tile); these are added in order of tile number. Records and sums borrow the backward pass's
-//! buffers, and the pixel map the plane of the image gradient that belongs to alpha.
+//! Blending is replayed front to back with the arithmetic of the forward pass. Each row's sums over the pixels that
+//! it is blended into, and its largest weight, go to one record per (row, tile); these are added in order of tile
+//! number. Records and sums use the backward pass's buffers, and the pixel map uses the alpha plane of the image
+//! gradient.
 
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
@@ -23,18 +23,18 @@ use super::simd::{V, WIDTH};
 use super::tiles::{Entry, Grid, Visible};
 use super::{AuxInput, AuxOutput, BackendError, CpuBackend};
 use crate::assert_same_size;
-use crate::candidates::Shown;
+use crate::candidates::Photograph;
 use crate::pixel_map::{draw_pixels, pixel_map, radius_px};
 use densify_core::image::Image8;
 
-/// Numbers per record: sums of the map, of pixels, of weights, of distances; the largest weight.
+/// Values per record: sums of the map, of pixels, of weights and of distances, and the largest weight.
 const STRIDE: usize = 5;
-/// The last, which is no sum.
+/// The index of the largest weight, the only value that is not a sum.
 const MAXIMUM: usize = STRIDE - 1;
-/// The plane of a tile's gradient that holds the pixel map meanwhile.
+/// The plane of a tile's gradient that temporarily holds the pixel map.
 const MAP: usize = 3;
 
-/// Bytes for an image of so many pixels: its colours, error, edge and luma, and the drawing of points.
+/// Bytes for an image of `pixels` pixels: colours, error, edge and luma, and the drawing of points.
 pub(super) fn bytes(request: &AuxRequest, pixels: usize) -> u64 {
     let drawing =
         if request.points > 0 { 2 * size_of::<f32>() + size_of::<(f64, u32)>() } else { 0 };
@@ -43,12 +43,12 @@ pub(super) fn bytes(request: &AuxRequest, pixels: usize) -> u64 {
 }
 
 impl CpuBackend {
-    /// Measures one view.
+    /// Renders and measures a view.
     pub(super) fn observe_view(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {
         let AuxInput { camera, target, background, exposure, request, .. } = *input;
         let behind = exposure.map_or(background, |exposure| exposure.behind(background));
         assert_same_size(camera, target);
-        // Stage times stay those of training.
+        // Stage times remain those of training.
         let clock = std::mem::take(&mut self.clock);
         let frame = self.forward(camera, behind, input.sh_degree, Beside::Nothing);
         let measured = frame.map(|frame| {
@@ -75,7 +75,7 @@ impl CpuBackend {
         measured
     }
 
-    /// Surface points of pixels drawn in proportion to their alpha.
+    /// The surface points of pixels drawn in proportion to their alpha.
     fn draw_points(&mut self, frame: &Frame, input: &AuxInput<'_>) -> Vec<Candidate> {
         if input.request.points == 0 {
             return Vec::new();
@@ -89,11 +89,11 @@ impl CpuBackend {
         }
         let pixels = draw_pixels(&alpha, grid.width, input);
         let AuxInput { target, background, exposure, .. } = *input;
-        let shown = Shown { target, background, exposure };
-        self.surface_points(frame, shown, &pixels, DepthMode::MaxWeight)
+        let photograph = Photograph { target, background, exposure };
+        self.surface_points(frame, photograph, &pixels, DepthMode::MaxWeight)
     }
 
-    /// Writes the pixel map to its plane.
+    /// Writes the pixel map to its plane of the gradient.
     fn write_map(&mut self, grid: &Grid, target: &Image8, background: [f32; 3], map: PixelMap) {
         let mut rgb = vec![[0.0; 3]; grid.width * grid.height];
         for (tile, canvas) in self.canvas[..grid.tiles()].iter().enumerate() {
@@ -110,11 +110,11 @@ impl CpuBackend {
         }
     }
 
-    /// The columns of the view at hand.
+    /// Measures the requested columns in the current view.
     fn columns(&mut self, frame: &Frame, wanted: &[AuxColumn]) -> Vec<(AuxColumn, Vec<f32>)> {
         let Frame { grid, bands, .. } = frame;
         let blending = self.shortcuts.into();
-        self.have_sums(self.signals.layout());
+        self.reserve_sums(self.signals.layout());
         let Self { threads, arch, lists, splats, records, sums, visible, gradient, rows, .. } =
             self;
         let rows = *rows;
@@ -165,7 +165,7 @@ impl CpuBackend {
     }
 }
 
-/// [`radius_px`] of a splat.
+/// The [radius](radius_px) of a splat `[px]`.
 fn radius(splat: &Splat) -> f32 {
     let unfold = super::project::FOLD;
     radius_px(unfold / splat.l1, splat.shear, unfold / splat.l3)
@@ -177,10 +177,10 @@ struct Replay<'a> {
     /// Sorted.
     list: &'a [AtomicU64],
     place: TilePlace,
-    /// Those of the forward pass.
+    /// The settings of the forward pass.
     blending: Blending,
     map: &'a Plane,
-    /// This tile writes the records of its own entries, those that are held.
+    /// The records of the tile's own entries, as far as they are held.
     records: TileRecords<'a>,
 }
 
@@ -193,7 +193,7 @@ impl WithSimd for Replay<'_> {
         let c = |x: f32| V::splat(s, x);
         let least_light = c(blending.transmittance_min);
         let zero = V::zero(s);
-        // Transmittance while a pixel takes light; 0 once it has stopped, and outside the image.
+        // Transmittance of unfinished pixels; 0 for finished ones and outside the image.
         let (mut light, mut alive) = place.inside();
         let mut batch = Batch::new();
         for (n, chunk) in list.chunks(BATCH).enumerate() {
@@ -227,7 +227,7 @@ impl WithSimd for Replay<'_> {
                         let left = stopped.select(zero, blends.select(next, t));
                         left.store(&mut light[p][at..]);
                     }
-                    #[expect(clippy::float_cmp, reason = "who has stopped has exactly none")]
+                    #[expect(clippy::float_cmp, reason = "finished pixels have exactly 0")]
                     let all_stopped = light[p] == [0.0; WIDTH];
                     if all_stopped {
                         alive &= !(1 << p);

@@ -1,5 +1,5 @@
-//! Stages 6–8 together, block by block: parameter gradients, signals, Adam. A block's gradients
-//! live in the cache only; there is no gradient buffer of the model's size, unless a policy wants
+//! Stages 6–8 combined, block by block: parameter gradients, signals, Adam. A block's gradients
+//! stay in the cache; there is no gradient buffer of the model's size, unless a policy requests
 //! gradients summed between optimiser steps.
 
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
@@ -23,21 +23,21 @@ use crate::LearningRates;
 use crate::signals::{Field, RecordLayout, SignalPlanes};
 use densify_core::gaussians::sh_coefficients;
 
-/// How far from 1 the squared length of a quaternion may be where it is stored in fewer bits. Were it
-/// brought to 1 at each step, and then rounded, a row at rest would turn at random.
+/// Tolerance of a quaternion's squared length where it is stored in fewer bits. Normalised and rounded at each step,
+/// a row at rest would rotate randomly.
 const NARROW_SLACK: f32 = 1.0 / 16.0;
 
-/// One optimiser step for a run of whole blocks.
+/// An optimiser step for consecutive blocks.
 pub(super) struct Optimise<'a> {
     pub(super) params: ParameterTask<'a>,
     pub(super) moments: MomentTask<'a>,
-    /// Draws for rounding what is stored in fewer bits.
+    /// Random numbers for stochastic rounding.
     pub(super) storing: &'a PolicyRng,
     pub(super) ages: &'a mut [u16],
-    /// Accumulators of these blocks; empty if no sum is requested.
+    /// Signal accumulators of these blocks; empty without any.
     pub(super) signals: &'a mut [f32],
     pub(super) planes: SignalPlanes,
-    /// Pixels that each row dominates; empty if they are not counted. Shape: `[rows]`.
+    /// Pixels in which each row has the largest weight; empty if they are not counted. Shape: `[rows]`.
     pub(super) dominant: &'a [AtomicU32],
     /// Shape: `[rows, layout.stride()]`.
     pub(super) sums: &'a [f32],
@@ -47,18 +47,17 @@ pub(super) struct Optimise<'a> {
     pub(super) view: &'a ViewParams,
     pub(super) rates: &'a LearningRates,
     pub(super) bias: &'a BiasCorrection,
-    /// Masks of these rows, where they are declared.
+    /// Masks of these rows, if declared.
     pub(super) masks: Option<MaskTask<'a>>,
     /// Gradients kept for a later step.
     pub(super) summed: TaskSums<'a>,
-    /// Which parameters step now.
+    /// The parameters that step now.
     pub(super) due: Due,
-    /// Terms of the loss that concern every row, if there are any.
+    /// Loss terms of every row, if there are any.
     pub(super) terms: Option<Terms>,
     /// Noise on the means, if there is any.
     pub(super) noise: Option<Noise>,
-    /// Row of the first block's first lane, and numbers of rows from there on: of those that never change, and of
-    /// all.
+    /// The first row of the first block, and from there on the numbers of frozen rows and of all rows.
     pub(super) first_row: usize,
     pub(super) frozen: usize,
     pub(super) rows: usize,
@@ -86,7 +85,7 @@ impl WithSimd for Optimise<'_> {
             if frozen == WIDTH {
                 continue;
             }
-            // What is not seen has no gradient.
+            // Frozen rows have no gradient.
             let seen = seen & (u16::MAX << frozen);
             let params = stored.open(b, trained, &mut scratch);
             if frozen > 0 {
@@ -114,7 +113,7 @@ impl WithSimd for Optimise<'_> {
                 terms.add(s, params, &mut gradient.params);
                 was_zero = false;
             }
-            if due.sums_matter() {
+            if due.uses_sums() {
                 was_zero &= !summed.exchange(b, &mut gradient.params, trained, due);
             }
             let lanes = b * WIDTH..(b + 1) * WIDTH;
@@ -144,7 +143,7 @@ impl WithSimd for Optimise<'_> {
                     noise.add(params, first, self.rows.saturating_sub(b * WIDTH).min(WIDTH));
                 }
             }
-            // Terms, masks, noise and limits know nothing of frozen rows.
+            // Terms, masks, noise and limits also changed frozen rows.
             if frozen > 0 {
                 for plane in (0..trained * WIDTH).step_by(WIDTH) {
                     params[plane..plane + frozen].copy_from_slice(&kept.0[plane..plane + frozen]);
@@ -164,7 +163,7 @@ impl WithSimd for Optimise<'_> {
     }
 }
 
-/// Gradients of every parameter and of what signals are made of, for one view.
+/// Gradients of every parameter, and the values from which signals follow, for one view.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ModelGradient {
     /// dL/d(mean). Shape: `[rows]`.
@@ -179,7 +178,7 @@ pub struct ModelGradient {
     pub sh: Vec<f32>,
     /// dL/d(projected mean) `[1/px]`. Shape: `[rows]`.
     pub mean2d: Vec<[f32; 2]>,
-    /// Σ over pixels of the absolute values of the same `[1/px]`. Shape: `[rows]`.
+    /// Σ over pixels of the absolute values of dL/d(projected mean) `[1/px]`. Shape: `[rows]`.
     pub mean2d_abs: Vec<[f32; 2]>,
     /// dL/d(colour as blended). Shape: `[rows]`.
     pub colour: Vec<[f32; 3]>,
@@ -187,7 +186,7 @@ pub struct ModelGradient {
     pub max_weight: Vec<f32>,
     /// Sum of the blend weights. Shape: `[rows]`.
     pub sum_weight: Vec<f32>,
-    /// Pixels blended into. Shape: `[rows]`.
+    /// Pixels that the row is blended into. Shape: `[rows]`.
     pub pixel_count: Vec<u32>,
     /// Whether the row's projection is on screen. Shape: `[rows]`.
     pub visible: Vec<bool>,
@@ -212,7 +211,7 @@ impl ModelGradient {
     }
 }
 
-/// The gradients of a whole model, without a step.
+/// Computes the gradients of a whole model without a step.
 pub(super) struct Differentiate<'a> {
     pub(super) params: ParameterView<'a>,
     /// Records with every field.

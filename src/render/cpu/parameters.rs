@@ -1,12 +1,12 @@
 //! The model's parameters in blocks: all as f32, or all but the means in 16 bits.
 //!
 //! In 16 bits, colour is f16. Log-scales, quaternions and opacity logits, which the optimiser keeps
-//! within bounds, are in fixed point: around −5 the values of f16 are 0.004 apart, four times an
-//! ordinary step of a log-scale.
+//! within bounds, are in fixed point: around −5 the spacing of f16 is 0.004, four times a typical
+//! step of a log-scale.
 //!
-//! Kernels read and write planes of f32. Where a block is f32 they get the block itself; else its
-//! planes are widened to an array ([`open`](ParameterTask::open)) and stored from it, rounded at
-//! random ([`close`](ParameterTask::close)). Edits, which happen once, are rounded to the nearest.
+//! Kernels read and write planes of f32. They access f32 blocks directly; the planes of other blocks are
+//! converted to scratch memory ([`open`](ParameterTask::open)) and stored from there with stochastic
+//! rounding ([`close`](ParameterTask::close)). Edits, which happen once, are rounded to nearest.
 
 use std::ops::Range;
 
@@ -19,12 +19,12 @@ use super::simd::WIDTH;
 use crate::ParameterStorage;
 use densify_core::gaussians::Gaussians;
 
-/// Planes of means: the ones that are f32 in any case.
+/// Planes of the means, which are always f32.
 const MEANS: usize = plane::LOG_SCALE;
-/// Planes of what is bounded.
+/// Planes of bounded parameters.
 const BOUNDED: usize = plane::SH - plane::LOG_SCALE;
 
-/// Digits after the point of the bounded planes: from −16 to 16, and quaternions from −2 to 2.
+/// Fractional bits of a bounded plane: 14 for quaternions within ±2, 11 for the others within ±16.
 const fn digits(bounded: usize) -> u32 {
     match bounded + MEANS {
         plane::QUAT..plane::OPACITY => 14,
@@ -35,15 +35,15 @@ const fn digits(bounded: usize) -> u32 {
 /// The parameters of all rows.
 #[derive(Debug)]
 pub(super) struct Parameters {
-    /// All planes, or the means.
+    /// All planes, or only the means.
     wide: Blocks,
-    /// None, or the bounded planes.
+    /// The bounded planes, if stored in 16 bits.
     fixed: Blocks<i16>,
-    /// None, or the planes of colour.
+    /// The colour planes, if stored in 16 bits.
     half: Blocks<F16>,
 }
 
-/// Planes of f32, in fixed point, and of f16.
+/// Numbers of planes in f32, in fixed point and in f16.
 fn split(planes: usize, storage: ParameterStorage) -> [usize; 3] {
     match storage {
         ParameterStorage::F32 => [planes, 0, 0],
@@ -69,7 +69,7 @@ impl Parameters {
             + Blocks::<F16>::bytes(0..capacity, half)
     }
 
-    /// Bytes that are there.
+    /// Allocated bytes.
     #[cfg(test)]
     pub(super) fn held(&self) -> u64 {
         self.wide.held() + self.fixed.held() + self.half.held()
@@ -121,7 +121,7 @@ impl Parameters {
         }
     }
 
-    /// Copies what is stored, to the bit.
+    /// Copies the stored bits.
     pub(super) fn copy_row(&mut self, from: usize, to: usize) {
         self.wide.copy_row(from, to);
         self.fixed.copy_row(from, to);
@@ -140,7 +140,7 @@ impl Parameters {
         self.half.clear_row(row);
     }
 
-    /// Packs a host model; `self` must have room and the model's planes.
+    /// Stores a host model; `self` must have room for its rows, and its number of planes.
     pub(super) fn pack(&mut self, model: &Gaussians) {
         for row in 0..model.len() {
             self.set_n(row, plane::MEAN, model.means[row]);
@@ -153,7 +153,7 @@ impl Parameters {
         }
     }
 
-    /// Some planes of some rows, row after row.
+    /// Copies some planes of some rows, row-major.
     pub(super) fn to_rows(&self, rows: Range<usize>, planes: Range<usize>) -> Vec<f32> {
         let mut values = Vec::with_capacity(rows.len() * planes.len());
         for row in rows {
@@ -162,7 +162,7 @@ impl Parameters {
         values
     }
 
-    /// Takes back what [`to_rows`](Self::to_rows) returned.
+    /// Sets the numbers that [`to_rows`](Self::to_rows) returns.
     pub(super) fn set_rows(&mut self, rows: Range<usize>, planes: Range<usize>, values: &[f32]) {
         for (row, values) in rows.zip(values.chunks_exact(planes.len())) {
             for (plane, &value) in planes.clone().zip(values) {
@@ -171,7 +171,7 @@ impl Parameters {
         }
     }
 
-    /// The blocks of the first `rows` rows, to read.
+    /// A read-only view of the blocks of the first `rows` rows.
     pub(super) fn view(&self, rows: usize) -> ParameterView<'_> {
         ParameterView {
             blocks: rows.div_ceil(WIDTH),
@@ -182,7 +182,7 @@ impl Parameters {
         }
     }
 
-    /// The blocks of the first `rows` rows, cut for the optimiser's tasks.
+    /// The blocks of the first `rows` rows, split for the optimiser's tasks.
     pub(super) fn tasks(
         &mut self,
         rows: usize,
@@ -194,7 +194,7 @@ impl Parameters {
     }
 }
 
-/// Some blocks, to read.
+/// A read-only view of consecutive blocks.
 #[derive(Debug, Clone)]
 pub(super) struct ParameterView<'a> {
     blocks: usize,
@@ -205,7 +205,7 @@ pub(super) struct ParameterView<'a> {
 }
 
 impl<'a> ParameterView<'a> {
-    /// The blocks of task `i`.
+    /// The blocks of a task.
     pub(super) fn task(&self, i: usize) -> Self {
         let first = (i * BLOCKS_PER_TASK).min(self.blocks);
         let part = first..self.blocks.min(first + BLOCKS_PER_TASK);
@@ -222,7 +222,7 @@ impl<'a> ParameterView<'a> {
         self.blocks
     }
 
-    /// The first `planes` planes, or more, of a block. Whole planes, one after the other.
+    /// A block as f32: at least the first `planes` planes.
     #[inline(always)]
     pub(super) fn open<'b>(
         &self,
@@ -242,7 +242,7 @@ impl<'a> ParameterView<'a> {
     }
 }
 
-/// Some blocks, to change.
+/// The blocks of a task.
 #[derive(Debug)]
 pub(super) struct ParameterTask<'a> {
     is_narrow: bool,
@@ -252,13 +252,13 @@ pub(super) struct ParameterTask<'a> {
 }
 
 impl ParameterTask<'_> {
-    /// Whether what is stored is not what was computed.
+    /// Whether the stored format is not f32.
     #[inline(always)]
     pub(super) fn is_narrow(&self) -> bool {
         self.is_narrow
     }
 
-    /// The first `planes` planes, or more, of a block.
+    /// A block as f32: at least the first `planes` planes.
     #[inline(always)]
     pub(super) fn open<'b>(
         &'b mut self,
@@ -274,7 +274,7 @@ impl ParameterTask<'_> {
         &mut scratch.0
     }
 
-    /// Stores the planes that were opened, where they are not what is stored.
+    /// Stores the opened planes, unless they are stored as f32.
     #[inline(always)]
     pub(super) fn close(
         &mut self,

@@ -1,6 +1,5 @@
-//! The passes over a view: forward, image loss, backward, optimiser and candidates. They cut the
-//! work into tasks for the pool, at fixed places, and run the stages' kernels on them. One piece, as all share a view's
-//! frame.
+//! The passes over a view: forward, image loss, backward, optimiser and candidates. Each splits its work into tasks
+//! at fixed places and runs the stages' kernels on them. The file is one piece because the passes share a frame.
 
 use std::ops::Range;
 use std::sync::atomic::Ordering::Relaxed;
@@ -24,13 +23,13 @@ use super::regularise::{Noise, Terms};
 use super::simd::WIDTH;
 use super::tiles::{Grid, TILE, Visible};
 use super::{BLOCKS_PER_TASK, CpuBackend, MAX_SIDE, ROWS_PER_TASK};
-use crate::candidates::Shown;
+use crate::candidates::Photograph;
 use crate::signals::RecordLayout;
 use crate::{BackendError, Rendering, StepInput, StepOutput};
 use densify_core::camera::Camera;
 use densify_core::image::Image8;
 
-/// One view between its forward and its backward pass.
+/// A view between its forward and its backward pass.
 pub(super) struct Frame {
     pub(super) view: ViewParams,
     pub(super) grid: Grid,
@@ -43,7 +42,7 @@ pub(super) struct Frame {
 impl CpuBackend {
     pub(super) fn resize_images(&mut self, grid: &Grid) {
         let tiles = grid.tiles();
-        // A smaller view leaves the rest as it is, so that views of two sizes do not fill it in turn.
+        // Never shrinks, so that views of alternating sizes do not initialise the rest again and again.
         if self.canvas.len() < tiles {
             self.canvas.resize(tiles, TileCanvas::EMPTY);
             self.gradient.resize(tiles, TileGradient { planes: [DARK; 5] });
@@ -66,8 +65,7 @@ impl CpuBackend {
         value
     }
 
-    /// Stages 1–3. Afterwards the canvas holds the image and, if there is one band only, the
-    /// lists hold its entries.
+    /// Stages 1–3. Afterwards the canvas holds the image and, if there is only one band, the lists hold its entries.
     pub(super) fn forward(
         &mut self,
         camera: &Camera,
@@ -78,7 +76,7 @@ impl CpuBackend {
         self.forward_painted(camera, background, sh_degree, beside, None)
     }
 
-    /// The same, with the rows in other colours than their own, where there are some.
+    /// The same, with `colours` instead of the rows' own, if given.
     pub(super) fn forward_painted(
         &mut self,
         camera: &Camera,
@@ -164,11 +162,11 @@ impl CpuBackend {
         })
     }
 
-    /// Stage 5: from `self.gradient` to one record per row in `self.sums`.
+    /// Stage 5: computes the sum of each row's records, `self.sums`, from `self.gradient`.
     pub(super) fn backward(&mut self, frame: &Frame, layout: RecordLayout) {
         let Frame { grid, background, bands, .. } = frame;
         let blending = self.shortcuts.into();
-        self.have_sums(layout);
+        self.reserve_sums(layout);
         let Self {
             threads,
             arch,
@@ -185,7 +183,7 @@ impl CpuBackend {
         } = self;
         let stride = layout.stride();
         threads.install(|| {
-            // Slots of rows that are gone are those of an older frame.
+            // Rows that no longer exist still have the slots of an older frame.
             let visible = &visible[..rows.div_ceil(WIDTH)];
             for band in bands {
                 if bands.len() > 1 {
@@ -222,8 +220,8 @@ impl CpuBackend {
         });
     }
 
-    /// Allocates the sums anew where they were lent, or are too few for these records.
-    pub(super) fn have_sums(&mut self, layout: RecordLayout) {
+    /// Reallocates the sums if they were lent or are too small for these records.
+    pub(super) fn reserve_sums(&mut self, layout: RecordLayout) {
         let whole = self.visible.len() * WIDTH * layout.stride();
         if self.sums.len() < whole {
             self.sums.resize(whole, 0.0);
@@ -234,7 +232,7 @@ impl CpuBackend {
     pub(super) fn collect_candidates(
         &mut self,
         frame: &Frame,
-        shown: Shown<'_>,
+        photograph: Photograph<'_>,
         request: &CandidateRequest,
         count: usize,
     ) {
@@ -258,22 +256,21 @@ impl CpuBackend {
             threads.install(|| candidates::rank(threads, ranking, size, most, error))
         };
         let worst = candidates.worst_by(size, count, request.spaced, rank, error);
-        for candidate in self.surface_points(frame, shown, &worst, request.depth) {
+        for candidate in self.surface_points(frame, photograph, &worst, request.depth) {
             self.candidates.push(candidate);
         }
     }
 
-    /// The surface points of some pixels (x, y, error) of the view, in their order; none for a pixel
-    /// that shows no surface.
+    /// The surface points of pixels (x, y, error) of the view, in order, without pixels that show no surface.
     pub(super) fn surface_points(
         &mut self,
         frame: &Frame,
-        shown: Shown<'_>,
+        photograph: Photograph<'_>,
         pixels: &[(usize, usize, f32)],
         mode: DepthMode,
     ) -> Vec<Candidate> {
         let Frame { grid, bands, view, .. } = frame;
-        let colour = shown.colours();
+        let colour = photograph.scene_colours();
         let shortcuts = self.shortcuts;
         let Self { threads, lists, splats, params, visible, .. } = self;
         let visible = Visible { splats: &splats[..self.rows], seen: visible };
@@ -330,7 +327,7 @@ impl CpuBackend {
         out
     }
 
-    /// Stages 6–8 in one sweep over the rows, so that gradients never leave the cache.
+    /// Stages 6–8 in one pass over the rows, so that gradients stay in the cache.
     pub(super) fn optimise(&mut self, frame: &Frame, input: &StepInput<'_>) {
         let Self {
             threads, arch, params, moments, masks, ages, signals, sums, visible, bias, ..
@@ -343,7 +340,7 @@ impl CpuBackend {
         let (planes, layout) = (signals.planes(), signals.layout());
         let signal_stride = signals.blocks.stride();
         let storing = PolicyRng::new(input.seed, input.step);
-        // Whole tasks of frozen rows have nothing to do.
+        // Tasks of frozen rows only are skipped.
         let first_row = moments.first();
         let blocks = first_row / WIDTH..rows.div_ceil(WIDTH);
         let tasks = blocks.len().div_ceil(BLOCKS_PER_TASK);

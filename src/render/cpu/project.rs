@@ -6,8 +6,8 @@
 //!   terms positive, where a·c − b² loses everything from 1,000:1 needles on.
 //! - Its inverse is kept as the Cholesky factor L, Σ⁻¹ = L·Lᵀ: with (u, z) = Lᵀ·d the exponent is
 //!   −½(u² + z²), never positive. L = [[l₁, 0], `[−l₁·r, l₃]`], l₁ = √(c/det), r = b/c, l₃ = 1/√c.
-//!   Inside a splat's footprint the error of u does not depend on which axis is eliminated, so
-//!   the one that makes z constant along an image row is taken.
+//!   Inside a splat's footprint the error of u does not depend on which axis is eliminated; the
+//!   choice here makes z constant along an image row.
 //!
 //! The file is one piece because the backward pass needs what the forward pass computes on its way.
 
@@ -25,16 +25,15 @@ use densify_core::sh;
 
 /// Variance added to both diagonal entries of a projected covariance `[px²]`.
 pub(super) const BLUR: f32 = 0.3;
-/// Margin of the image beyond which the direction used in J is clamped, as a fraction of its size:
+/// Margin around the image, as a fraction of its size, beyond which the direction used in J is clamped:
 /// 0.15 = 0.3/2 (the original clamps at 1.3 tan(fov/2)).
 const FOV_MARGIN: f64 = 0.15;
-/// A row whose colour is beyond this is broken, and not drawn: its neighbours in a pixel would
-/// lose all their bits to it.
+/// Rows with a larger colour are broken and not drawn: added to a pixel, it would cancel all bits of the others.
 const COLOUR_MAX: f32 = 1e6;
 /// √(½·log₂ e): folded into the conic so that exp(−p) becomes 2^(−u² − z²).
 pub(super) const FOLD: f32 = 0.849_321_8;
 
-/// A camera as the kernels want it.
+/// A camera in the form that the kernels use.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct ViewParams {
     /// Rows of camera_from_world's rotation.
@@ -92,17 +91,17 @@ pub(super) struct Splat {
     pub(super) colour: [f32; 3],
     /// Camera z `[scene units]`.
     pub(super) depth: f32,
-    /// Half the height of the region where alpha is at least what is blended `[px]`.
+    /// Half the height of the region where alpha is at least the blending threshold `[px]`.
     pub(super) half_height: f32,
     /// Half the width of that region `[px]`.
     pub(super) half_width: f32,
     /// 1/l1 `[px]`.
     pub(super) inv_l1: f32,
-    /// How far below the mean that region's rightmost point is `[px]`.
+    /// Vertical offset of that region's rightmost point from the mean `[px]`.
     pub(super) peak: f32,
-    /// How far the exponent may fall from the centre to the region's edge.
+    /// The decrease of the exponent from the centre to the edge of that region.
     pub(super) reach: f32,
-    /// Bits of the [`Footprint`](super::footprint::Footprint); 0 where it is larger. With them, a splat
+    /// Bits of the [`Footprint`](super::footprint::Footprint); 0 if it is too large for them. With this field a splat
     /// fills one cache line.
     pub(super) tiles: u32,
 }
@@ -110,7 +109,7 @@ pub(super) struct Splat {
 /// Numbers of a [`Splat`].
 const SPLAT_FIELDS: usize = 16;
 
-/// Everything of the forward projection that the backward pass needs again.
+/// Intermediate results of the forward projection that the backward pass uses too.
 pub(super) struct Geometry<S: Simd> {
     /// exp(log-scale).
     pub(super) scale: [V<S>; 3],
@@ -137,7 +136,7 @@ pub(super) fn dot<S: Simd>(a: [V<S>; 3], b: [V<S>; 3]) -> V<S> {
     a[0].mul_add(b[0], a[1].mul_add(b[1], a[2] * b[2]))
 }
 
-/// The rows of the view's rotation as vectors of equal lanes.
+/// The rows of the view's rotation, each number in every lane.
 #[inline(always)]
 pub(super) fn rotation<S: Simd>(s: S, view: &ViewParams) -> [[V<S>; 3]; 3] {
     each!(i in 3 => each!(k in 3 => V::splat(s, view.rotation[i][k])))
@@ -203,7 +202,7 @@ pub(super) fn geometry<S: Simd>(s: S, block: &[f32], at: usize, view: &ViewParam
     }
 }
 
-/// a·b − c·d with one rounding error of each product given back (Kahan).
+/// a·b − c·d with the rounding error of c·d compensated (Kahan).
 #[inline(always)]
 fn difference_of_products<S: Simd>(a: V<S>, b: V<S>, c: V<S>, d: V<S>) -> V<S> {
     let cd = c * d;
@@ -219,7 +218,7 @@ pub(super) fn conic<S: Simd>(g: &Geometry<S>) -> [V<S>; 3] {
     [(d / g.det).sqrt(), b / d, l3]
 }
 
-/// Unit vector from the camera to each mean, and 1/distance; both 0 where they coincide.
+/// The unit vector from the camera to each mean, and 1/distance; both 0 where they coincide.
 #[inline(always)]
 pub(super) fn direction<S: Simd>(
     s: S,
@@ -229,7 +228,7 @@ pub(super) fn direction<S: Simd>(
 ) -> ([V<S>; 3], V<S>) {
     let v = each!(i in 3 => lanes(s, block, plane::MEAN + i, at) - view.centre[i]);
     let norm2 = dot(v, v);
-    // Below this the square has lost its bits; the direction is then undefined and its gradient 0.
+    // Below this the square underflows; the direction is then undefined and its gradient 0.
     let far = V::splat(s, 1e-30).lt(norm2);
     let inv = far.keep(V::splat(s, 1.0) / norm2.sqrt());
     (each!(i in 3 => v[i] * inv), inv)
@@ -269,28 +268,28 @@ fn log2_sigmoid<S: Simd>(s: S, x: V<S>) -> V<S> {
     x.min(V::zero(s)) * std::f32::consts::LOG2_E - tail
 }
 
-/// |x| <= most; false for NaN.
+/// Whether |x| <= most; false for NaN.
 #[inline(always)]
 fn below<S: Simd>(x: V<S>, most: f32) -> Mask<S> {
     x.abs().le(V::splat_like(x, most))
 }
 
-/// Whether a splat reaches any pixel centre, from ½ to size − ½. Comparisons are false for NaN, so
-/// that a poisoned row is nowhere.
+/// Whether a splat reaches any pixel centre, from ½ to size − ½. False for NaN, so that rows with NaN are not
+/// drawn.
 #[inline(always)]
 fn reaches<S: Simd>(s: S, centre: V<S>, half: V<S>, size: u32) -> Mask<S> {
     let last = V::splat(s, size as f32 - 0.5);
     V::splat(s, 0.5).le(centre + half).and((centre - half).le(last))
 }
 
-/// Projects a run of whole blocks and lists the rows that are on screen.
+/// Projects consecutive blocks and marks the rows on screen.
 pub(super) struct Project<'a> {
     pub(super) view: &'a ViewParams,
     /// [`Shortcuts::log2_reach`](crate::Shortcuts::log2_reach).
     pub(super) log2_reach: f32,
-    /// Parameter blocks of these rows.
+    /// The parameter blocks.
     pub(super) params: ParameterView<'a>,
-    /// Number of rows (the last block may be partly empty).
+    /// Number of rows; the last block may be partly empty.
     pub(super) rows: usize,
     /// Shape: `[rows]`.
     pub(super) splats: &'a mut [Splat],
@@ -315,15 +314,15 @@ impl WithSimd for Project<'_> {
                 let g = geometry(s, block, at, view);
                 let in_front = V::splat(s, view.near).lt(g.p[2]);
                 let logit = lanes(s, block, plane::OPACITY, at);
-                // Minimum and maximum may swallow a NaN, so these two are looked at themselves.
+                // Minimum and maximum may drop a NaN, so log-scales and logit are checked directly.
                 let sound =
                     each!(i in 3 => below(lanes(s, block, plane::LOG_SCALE + i, at), f32::MAX));
                 let sound = sound[0].and(sound[1]).and(sound[2]).and(below(logit, f32::MAX));
                 let log2_opacity = log2_sigmoid(s, logit);
-                // How far the exponent may fall; <= 0 where even the centre is too faint.
+                // The allowed decrease of the exponent; <= 0 if even the centre is too faint.
                 let reach = log2_opacity + self.log2_reach;
                 let opaque = V::zero(s).lt(reach);
-                // The determinant leaves f32 where a row is some 4·10⁹ px wide; its factors are none then.
+                // The determinant overflows where a row is about 4·10⁹ px wide, and its factors are then invalid.
                 let alive = in_front.and(opaque).and(sound).and(below(g.det, f32::MAX));
                 if !alive.any() {
                     continue;

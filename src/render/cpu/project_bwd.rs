@@ -1,12 +1,12 @@
 //! Stage 6: splat gradients to parameter gradients.
 //!
-//! The forward projection is evaluated again rather than stored. With the sums of stage 5 in
+//! The forward projection is evaluated again instead of stored. With the sums of stage 5 in
 //! whitened coordinates, M = Σ q·[u z]ᵀ[u z], the covariance's gradient is G = ½·L·M·Lᵀ. It is not
-//! formed: for a needle 1,000 px long its entries cancel when they meet the needle's axis. With
+//! formed: for a needle 1,000 px long its entries cancel along the needle's axis. With
 //! W = Lᵀ·V, whose entries are at most 1, and wₖ its columns (one per axis of the Gaussian),
 //! - dL/d(log sₖ) = wₖᵀ·M·wₖ,
-//! - the gradient by a rotation about local axis x is nᵧᵀ·M·n_z·(sᵧ² − s_z²), wₖ = sₖ·nₖ, and so
-//!   around; it vanishes exactly for a sphere, and maps to the quaternion as 2/|q|·q̂⊗(0, g), which
+//! - the gradient by a rotation about local axis x is nᵧᵀ·M·n_z·(sᵧ² − s_z²), wₖ = sₖ·nₖ, and cyclically for
+//!   the others; it vanishes exactly for a sphere, and maps to the quaternion as 2/|q|·q̂⊗(0, g), which
 //!   is orthogonal to q,
 //! - dL/dV = L·M·W leads on to J and the mean.
 //!
@@ -35,7 +35,7 @@ pub(super) struct BlockGradient {
     pub(super) mean2d_abs: [[f32; WIDTH]; 2],
     /// 1 / depth in the camera `[1/scene unit]`.
     pub(super) inv_z: [f32; WIDTH],
-    /// The record sums, number after number; those that records do not have are of no use.
+    /// The record sums by value; undefined for values that the layout lacks.
     pub(super) sums: [[f32; WIDTH]; RecordLayout::MOST],
     /// 1 for visible rows, 0 for others.
     pub(super) visible: [f32; WIDTH],
@@ -54,7 +54,7 @@ impl BlockGradient {
         dominant: [0.0; WIDTH],
     };
 
-    /// Differentiates the rows of `block` that are set in `visible`; the others get 0.
+    /// Differentiates the rows of `block` that are set in `visible`; other rows get 0.
     ///
     /// `sums` has one record per row. Shape: `[WIDTH, layout.stride()]`.
     #[inline(always)]
@@ -136,7 +136,7 @@ impl BlockGradient {
                 seen.keep(x).store(&mut slot[at..]);
             }
         }
-        // Columns of W without their scales, M·n, and so on.
+        // Columns of W without their scales, and their products with M.
         let n0 = each!(k in 3 => l1 * (g.n[0][k] - shear * g.n[1][k]));
         let n1 = each!(k in 3 => l3 * g.n[1][k]);
         let mn0 = each!(k in 3 => muu * n0[k] + muz * n1[k]);

@@ -1,13 +1,13 @@
 //! Stage 3: tile lists to pixels. Front to back alpha blending (Kerbl et al. 2023, section 3 and
-//! appendix C): alpha = min(0.99, o·exp(−p)), skipped below 1/255; a pixel stops, without that
-//! splat, where its transmittance would fall to 1e-4 or below. Both limits are knobs ([`Blending`]).
+//! appendix C): alpha = min(0.99, o·exp(−p)), skipped below 1/255. A pixel is finished before the first
+//! splat that would reduce its transmittance to 1e-4 or below. Both limits are knobs ([`Blending`]).
 //!
-//! One tile at a time, one batch of its splats at a time, and of these one patch of 4×4 pixels at a
-//! time: a vector, which stays in registers while the batch is blended into it. Most splats are a few
-//! pixels wide, and patches cover them with a third fewer vectors than rows of sixteen pixels do. In
+//! A task draws one tile. It processes one batch of splats after another, and for each batch one patch of 4×4 pixels
+//! after another. A patch is a vector that stays in registers while the batch is blended into it. Most splats are a
+//! few pixels wide, and patches cover them with a third fewer vectors than rows of sixteen pixels do. In
 //! the coordinates (u, z) = Lᵀ·d the exponent is e = log₂o − u² − z²; from patch to patch u and z only
-//! move by a constant each. A bit per patch says whether the splat reaches it, another whether any of
-//! its pixels still takes light.
+//! change by a constant each. One bit per patch marks whether the splat reaches it, another whether any of
+//! its pixels is unfinished.
 
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
@@ -19,14 +19,14 @@ use super::simd::{V, WIDTH, exp2_of, load_of, store_of};
 use super::tiles::{Entry, Grid, TILE};
 use crate::Shortcuts;
 
-/// Largest alpha: keeps 1 − alpha, and so the transmittance, recoverable.
+/// The largest alpha, which keeps 1 − alpha, and so the transmittance, recoverable.
 pub(super) const ALPHA_MAX: f32 = 0.99;
-/// What blending takes and where it ends; forward and backward pass must have the same.
+/// The thresholds of blending, which must be the same in the forward and the backward pass.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Blending {
     /// A splat is blended where its exponent is at least minus this.
     pub(super) log2_reach: f32,
-    /// A pixel stops before its transmittance reaches this.
+    /// A pixel is finished before its transmittance falls to this.
     pub(super) transmittance_min: f32,
 }
 
@@ -37,14 +37,14 @@ impl From<Shortcuts> for Blending {
     }
 }
 
-/// What is summed over the rows of a pixel beside its colour, in the plane of depth.
+/// The quantity accumulated in the depth plane.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Beside {
     /// Nothing.
     Nothing,
-    /// Depth, by the weights of blending.
+    /// Depth, weighted as in blending.
     Depth,
-    /// One for each.
+    /// The number of rows.
     Count,
 }
 
@@ -55,13 +55,12 @@ pub(super) const DEPTH: usize = 4;
 
 /// Side of a patch `[px]`: its pixels are one vector, row by row.
 pub(super) const PATCH: usize = 4;
-/// Patches along a tile's side, and, as it happens, in a vector: a tile has as many patches as a
-/// patch has pixels.
+/// Patches along a tile's side. A tile has as many patches as a patch has pixels.
 const ACROSS: usize = TILE / PATCH;
 pub(super) const PATCHES: usize = ACROSS * ACROSS;
 const _: () = assert!(PATCH * PATCH == WIDTH && PATCHES == WIDTH);
 
-/// The pixels of one tile, patch by patch, both row by row; see [`in_plane`].
+/// The pixels of a tile by patch and lane, both row-major; see [`in_plane`].
 pub(super) type Plane = [[f32; WIDTH]; PATCHES];
 
 /// Patch and lane of a tile's pixel.
@@ -70,8 +69,8 @@ pub(super) const fn in_plane(x: usize, y: usize) -> (usize, usize) {
     (y / PATCH * ACROSS + x / PATCH, y % PATCH * PATCH + x % PATCH)
 }
 
-/// Copies row `y` of a tile out of its plane. Patch by patch, straight to where it is wanted: loading it
-/// whole right afterwards would wait for all four stores.
+/// Copies row `y` of a tile out of its plane, patch by patch to its destination: loading the whole row right
+/// afterwards would stall on all four stores.
 #[inline(always)]
 pub(super) fn copy_row_of_plane(plane: &Plane, y: usize, row: &mut [f32; TILE]) {
     for (x, pixels) in (0..TILE).step_by(PATCH).zip(row.as_chunks_mut::<PATCH>().0) {
@@ -98,7 +97,7 @@ pub(super) const DARK: Plane = [[0.0; WIDTH]; PATCHES];
 pub(super) struct TileCanvas {
     /// Red, green, blue (background included), final transmittance, depth.
     pub(super) planes: [Plane; CANVAS_PLANES],
-    /// Place in the tile's list at which each pixel stopped; `u32::MAX` if it did not, 0 outside the
+    /// The index in the tile's list at which each pixel was finished; `u32::MAX` if it was not, 0 outside the
     /// image.
     pub(super) stop: [[u32; WIDTH]; PATCHES],
 }
@@ -108,13 +107,13 @@ impl TileCanvas {
         Self { planes: [DARK; CANVAS_PLANES], stop: [[u32::MAX; WIDTH]; PATCHES] };
 }
 
-/// Where a tile lies in the image.
+/// The position of a tile in the image.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct TilePlace {
-    /// Its upper left corner `[px]`.
+    /// Upper left corner `[px]`.
     pub(super) x: f32,
     pub(super) y: f32,
-    /// Its pixels inside the image.
+    /// Size of the part inside the image `[px]`.
     pub(super) width: usize,
     pub(super) height: usize,
 }
@@ -130,7 +129,7 @@ impl TilePlace {
         }
     }
 
-    /// 1 for the pixels inside the image, 0 for others, and a bit for each patch that has any.
+    /// A plane with 1 inside the image and 0 outside, and a bit for each patch with a pixel inside.
     pub(super) fn inside(&self) -> (Plane, u32) {
         if self.width == TILE && self.height == TILE {
             return ([[1.0; WIDTH]; PATCHES], (1 << PATCHES) - 1);
@@ -155,8 +154,8 @@ pub(super) struct Rasterize<'a> {
     pub(super) place: TilePlace,
     pub(super) background: [f32; 3],
     pub(super) beside: Beside,
-    /// Pixels of each row in which none has a larger blend weight, to which the tile adds its own; empty
-    /// if they are not counted. Whole numbers, so that it does not matter which tile is first.
+    /// The number of pixels in which each row has the largest blend weight, to which the tile adds its pixels; empty
+    /// if they are not counted. Integers, so that the order of tiles does not matter.
     pub(super) dominant: &'a [AtomicU32],
     pub(super) blending: Blending,
     pub(super) canvas: &'a mut TileCanvas,
@@ -167,8 +166,8 @@ impl WithSimd for Rasterize<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        // Halves or quarters of a patch go in twos: what is the same for both is loaded once. One kernel
-        // has all that is rarely wanted.
+        // Halves or quarters of a patch are processed in pairs, so that common values are loaded once. The rarely
+        // used features share one kernel.
         let with_more = self.beside != Beside::Nothing || !self.dominant.is_empty();
         match (with_more, matches!(S::F32_LANES, 4 | 8)) {
             (true, true) => self.run::<S, true, 2>(s),
@@ -180,7 +179,7 @@ impl WithSimd for Rasterize<'_> {
 }
 
 impl Rasterize<'_> {
-    /// `N` vectors of a patch at a time.
+    /// Draws the tile, `N` vectors of a patch at a time.
     #[inline(always)]
     #[expect(clippy::too_many_lines, reason = "a numeric kernel")]
     fn run<S: Simd, const WITH_MORE: bool, const N: usize>(self, s: S) {
@@ -194,15 +193,15 @@ impl Rasterize<'_> {
         for plane in [&mut *red, &mut *green, &mut *blue, &mut *finished, &mut *depth] {
             *plane = DARK;
         }
-        // Transmittance while the pixel takes light; 0 once it has stopped (its last value is then
-        // in `finished`) and from the start outside the image.
+        // Transmittance of unfinished pixels; 0 for finished ones, whose last value is in `finished`, and outside
+        // the image.
         let (inside, mut alive) = place.inside();
         let mut light = Aligned(inside);
         let light = &mut light.0;
         for (stop, light) in stop.as_flattened_mut().iter_mut().zip(light.as_flattened()) {
             *stop = if *light > 0.0 { u32::MAX } else { 0 };
         }
-        // The largest weight of each pixel, and the place of its splat in the list.
+        // The largest weight of each pixel, and the index of its splat in the list.
         let mut largest = Aligned(DARK);
         let mut largest_at = [[0_u32; WIDTH]; PATCHES];
         let mut batch = Batch::new();
@@ -219,7 +218,7 @@ impl Rasterize<'_> {
                 let mut takes_light = false;
                 for at in (0..WIDTH).step_by(N * S::F32_LANES) {
                     let mut t = load_of::<S, N>(s, &light[p][at..]);
-                    // Pixels without light have stopped, and must not do so again.
+                    // Finished pixels must not be finished again.
                     let mut least = t;
                     for n in 0..N {
                         least[n] = zero.lt(t[n]).select(least_light, never);
@@ -231,7 +230,7 @@ impl Rasterize<'_> {
                     let mut most = load_of::<S, N>(s, &largest.0[p][at..]);
                     let mut todo = reached;
                     while todo != 0 {
-                        // 32 bits; saying so again spares every load its bounds check.
+                        // The mask has 32 bits; the remainder removes the bounds check of every load.
                         let i = todo.trailing_zeros() as usize % BATCH;
                         todo &= todo - 1;
                         let splat = &batch.splats[i];
@@ -275,9 +274,10 @@ impl Rasterize<'_> {
                             g[n] = w.mul_add(c(splat.colour[1]), g[n]);
                             b[n] = w.mul_add(c(splat.colour[2]), b[n]);
                             if WITH_MORE {
-                                at_depth[n] = match counts {
-                                    false => w.mul_add(c(splat.depth), at_depth[n]),
-                                    true => at_depth[n] + zero.lt(w).keep(c(1.0)),
+                                at_depth[n] = if counts {
+                                    at_depth[n] + zero.lt(w).keep(c(1.0))
+                                } else {
+                                    w.mul_add(c(splat.depth), at_depth[n])
                                 };
                                 let here = s.splat_u32s(first + i as u32);
                                 let largest_at = &mut largest_at[p][at + n * S::F32_LANES..];
@@ -324,11 +324,12 @@ impl Rasterize<'_> {
     }
 }
 
-/// plane += w·x.
+/// Adds w·x to a plane.
 #[inline(always)]
 fn blend<S: Simd>(s: S, w: V<S>, x: V<S>, plane: &mut [f32]) {
     w.mul_add(x, V::load(s, plane)).store(plane);
 }
 
+/// A plane aligned to a cache line.
 #[repr(align(64))]
 pub(super) struct Aligned(pub(super) Plane);

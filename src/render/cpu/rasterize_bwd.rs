@@ -6,17 +6,16 @@
 //! a running convex combination, b ← b + α(c·g − b): nothing is subtracted from a total, so that
 //! nothing cancels however little light is left.
 //!
-//! A batch of splats is walked twice. Front to back, one patch at a time as in the forward pass: each
-//! alpha, its weight as if nothing were in front of the batch, and at last the product of all 1 − α, by
-//! which the light behind the batch is divided to have that in front of it. Back to front, one splat at
-//! a time: what depends on the gradient, whose sums so stay in registers.
+//! A batch of splats is walked twice. The first walk goes front to back, one patch at a time as in the forward
+//! pass. It computes each alpha, its weight as if nothing were in front of the batch, and the product of all 1 − α;
+//! dividing the transmittance behind the batch by it gives the one in front. The second walk goes back to front, one
+//! splat at a time, and computes the gradients, whose sums then stay in registers.
 //!
-//! In the whitened coordinates (u, z) = Lᵀ·d of the forward pass, all that the parameters need of
-//! a tile are sums of q, q·u, q·z, q·u², q·u·z, q·z² with q = α·dL/dα (and of w·g for the colour):
-//! the covariance's gradient is ½·L·M·Lᵀ with M the matrix of second moments, and it is never
-//! formed; see `project_bwd`.
+//! In the whitened coordinates (u, z) = Lᵀ·d of the forward pass, the parameters' gradients need only these sums of a
+//! tile: q, q·u, q·z, q·u², q·u·z, q·z² with q = α·dL/dα, and w·g for the colour. The covariance's gradient
+//! is ½·L·M·Lᵀ with M the matrix of second moments; it is never formed, see `project_bwd`.
 //!
-//! Records are summed per row in order of tile number, so the sum does not depend on threads.
+//! Records are summed per row in order of tile number, so that the sum does not depend on the number of threads.
 
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
@@ -33,7 +32,7 @@ use super::simd::{V, WIDTH, each, sums_of_four};
 use super::tiles::Entry;
 use crate::signals::{BASE, Field, RecordLayout};
 
-/// The numbers that every record has.
+/// Indices of the values that every record has.
 pub(super) mod field {
     pub(in super::super) const Q: usize = 0;
     pub(in super::super) const U: usize = 1;
@@ -44,7 +43,7 @@ pub(super) mod field {
     pub(in super::super) const COLOUR: usize = 6;
 }
 
-/// What the kernel is compiled for, beside the base of a record.
+/// The optional values for which the kernel is compiled, as a bit set.
 mod extra {
     /// The absolute gradients.
     pub(super) const ABS: u8 = 1;
@@ -52,15 +51,15 @@ mod extra {
     pub(super) const WEIGHTS: u8 = 2;
     /// The largest weight.
     pub(super) const LARGEST: u8 = 4;
-    /// The sum of the weighted error, beside the two above.
+    /// The sum of the weighted error, in addition to the two above.
     pub(super) const ERROR: u8 = 8 | WEIGHTS | LARGEST;
     pub(super) const ERROR_ABS: u8 = ERROR | ABS;
-    /// Everything but the error, with the gradients of alpha and depth.
+    /// Everything except the error, with the gradients of alpha and depth.
     pub(super) const ALL: u8 = 16 | ABS | WEIGHTS | LARGEST;
 }
 
-/// dL/dpixel of one tile: red, green, blue, alpha, depth. The last two are read for records with
-/// [`Field::Depth`] only; with [`Field::Error`], the last one is the error of the pixels.
+/// dL/dpixel of one tile: red, green, blue, alpha, depth. The last two are only read for records with
+/// [`Field::Depth`]; with [`Field::Error`], the last one holds the error of the pixels instead.
 #[derive(Debug, Clone)]
 #[repr(C, align(64))]
 pub(super) struct TileGradient {
@@ -74,12 +73,12 @@ pub(super) struct RasterizeBwd<'a> {
     pub(super) list: &'a [AtomicU64],
     pub(super) place: TilePlace,
     pub(super) background: [f32; 3],
-    /// Those of the forward pass.
+    /// The settings of the forward pass.
     pub(super) blending: Blending,
     pub(super) canvas: &'a TileCanvas,
     pub(super) upstream: &'a TileGradient,
     pub(super) layout: RecordLayout,
-    /// This tile writes the records of its own entries, those that are held.
+    /// The records of the tile's own entries, as far as they are held.
     pub(super) records: TileRecords<'a>,
     /// Scratch.
     pub(super) blended: &'a mut Blended,
@@ -91,12 +90,13 @@ impl WithSimd for RasterizeBwd<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
         let has = |field| self.layout.has(field);
-        // Where there are no vectors, records are not worth a kernel of their own: eleven, unrolled lane by
-        // lane, would be a tenth of the program, and what is not asked for is not written.
+        // Without vectors there are only two kernels: eleven, unrolled lane by lane, would be a tenth of the
+        // program. Values that are not requested are not written.
         if const { S::F32_LANES == 1 } {
-            return match has(Field::Depth) {
-                false => self.run::<S, { extra::ERROR_ABS }>(s),
-                true => self.run::<S, { extra::ALL }>(s),
+            return if has(Field::Depth) {
+                self.run::<S, { extra::ALL }>(s)
+            } else {
+                self.run::<S, { extra::ERROR_ABS }>(s)
             };
         }
         let mut extras = 0;
@@ -131,15 +131,15 @@ impl WithSimd for RasterizeBwd<'_> {
     }
 }
 
-/// Pairs of a splat and a patch in a batch, at most.
+/// The most (splat, patch) pairs of a batch.
 const PAIRS: usize = BATCH * PATCHES;
 
-/// What the first walk over a batch leaves for the second: pair after pair, patch by patch.
+/// Results of the first walk over a batch, pair after pair and patch by patch.
 #[derive(Zeroable)]
 #[repr(C, align(64))]
 pub(super) struct Blended {
     alpha: [[f32; WIDTH]; PAIRS],
-    /// α·Π(1 − α) over the splats of the batch in front.
+    /// α·Π(1 − α), the product over the splats of the batch in front.
     weight: [[f32; WIDTH]; PAIRS],
 }
 
@@ -155,14 +155,14 @@ struct Sums<S: Simd> {
     abs: [V<S>; 2],
     weight: V<S>,
     pixels: V<S>,
-    /// Of weights times the last plane of the gradient.
+    /// Weights times the last plane of the gradient.
     map: V<S>,
     weight_max: V<S>,
 }
 
 impl RasterizeBwd<'_> {
-    /// The first walk over a batch, whose first splat is entry `first` of the list. `light` is moved from
-    /// behind the batch to its front. Returns the end of each patch's pairs.
+    /// The first walk over a batch, whose first splat is entry `first` of the list. Changes `light` from the
+    /// transmittance behind the batch to the one in front. Returns the end of each patch's pairs.
     #[inline(always)]
     fn blend_again<S: Simd>(
         &mut self,
@@ -186,7 +186,7 @@ impl RasterizeBwd<'_> {
                 let mut product = c(1.0);
                 let (mut pair, mut todo) = (start, reached);
                 while todo != 0 {
-                    // The mask has 32 bits; saying so again spares every load its bounds check.
+                    // The mask has 32 bits; the remainder removes the bounds check of every load.
                     let i = todo.trailing_zeros() as usize % BATCH;
                     todo &= todo - 1;
                     let [u, z] = batch.u_and_z(s, i, p, at);
@@ -200,7 +200,7 @@ impl RasterizeBwd<'_> {
                     product = alpha.neg_mul_add(product, product);
                     pair += 1;
                 }
-                // Where the product leaves f32, the light behind has done so, too.
+                // Where the product underflows, so has the transmittance behind.
                 let light = &mut light[p][at..];
                 (V::load(s, light) / product.max(c(f32::MIN_POSITIVE))).store(light);
             }
@@ -217,11 +217,11 @@ impl RasterizeBwd<'_> {
         let c = |x: f32| V::splat(s, x);
         let [gr, gg, gb, ga, map] = &upstream.planes;
 
-        // State per pixel, as it is behind the splat at hand.
+        // State per pixel behind the current splat.
         let mut light = Aligned(canvas.planes[TRANSMITTANCE]);
         let mut behind = Aligned(DARK);
         let (light, behind) = (&mut light.0, &mut behind.0);
-        // One past the last list entry that any pixel of the patch takes.
+        // One past the last list entry that is blended into any pixel of the patch.
         let mut patch_end = [0_u32; WIDTH];
         for (p, end) in patch_end.iter_mut().enumerate() {
             for at in (0..WIDTH).step_by(S::F32_LANES) {
@@ -263,7 +263,7 @@ impl RasterizeBwd<'_> {
                     weight_max: zero,
                 };
                 while todo != 0 {
-                    // The mask has sixteen bits; saying so again spares every load its bounds check.
+                    // The mask has sixteen bits; the remainder removes the bounds check of every load.
                     let p = todo.trailing_zeros() as usize % WIDTH;
                     todo &= todo - 1;
                     ends[p] -= 1;
@@ -289,7 +289,7 @@ impl RasterizeBwd<'_> {
                         let was = V::load(s, &behind[p][at..]);
                         let ahead = own - was;
                         alpha.mul_add(ahead, was).store(&mut behind[p][at..]);
-                        // No gradient where alpha is at its clamp.
+                        // Alpha has no gradient at its clamp.
                         let q = alpha.lt(c(ALPHA_MAX)).keep(w * ahead);
                         let qu = q * u;
                         let qz = q * z;
@@ -342,7 +342,7 @@ impl RasterizeBwd<'_> {
     }
 }
 
-/// Writes those numbers that the records have.
+/// Writes the values that the layout has.
 #[inline(always)]
 fn write(to: Option<&[AtomicU32]>, all: &[f32; RecordLayout::MOST], layout: RecordLayout) {
     let Some((base, extras)) = to.and_then(|to| to.split_at_checked(BASE)) else { return };
@@ -354,8 +354,7 @@ fn write(to: Option<&[AtomicU32]>, all: &[f32; RecordLayout::MOST], layout: Reco
     }
 }
 
-/// The sums over the records of one row, which lie side by side, in order. `sums` has the shape of a
-/// record.
+/// Adds up the records of one row, which are adjacent, in order. `sums` has the shape of a record.
 pub(super) fn gather(sums: &mut [f32], layout: RecordLayout, records: &[AtomicU32]) {
     let maximum = layout.has(Field::WeightMax);
     match sums.len() {
@@ -369,7 +368,7 @@ pub(super) fn gather(sums: &mut [f32], layout: RecordLayout, records: &[AtomicU3
     }
 }
 
-/// Adds to what `sums` holds; the last number may be a maximum.
+/// Adds records of `STRIDE` values to `sums`; the last value may be a maximum.
 #[inline(always)]
 pub(super) fn gather_all<const STRIDE: usize>(
     sums: &mut [f32],
@@ -387,5 +386,6 @@ pub(super) fn gather_all<const STRIDE: usize>(
     sums.copy_from_slice(&total);
 }
 
-const _: () = assert!(BASE == 9 && RecordLayout::MOST == 15, "`gather` knows each length");
-const _: () = assert!(Field::Error.number() == Field::Depth.number(), "one sum for both");
+const _: () = assert!(BASE == 9 && RecordLayout::MOST == 15, "`gather` lists every length");
+const _: () =
+    assert!(Field::Error.number() == Field::Depth.number(), "depth and error share a value");

@@ -1,12 +1,11 @@
-//! Where the backward pass writes its gradient records, one per (row, tile) entry, and how they are summed.
+//! The memory of the gradient records that the backward pass writes, one per (row, tile) entry, and their summation.
 //!
-//! Where there is room for a record of every entry that the lists hold, an entry's record lies in its
-//! slot, and a row finds its records side by side. Records are three quarters of the
-//! memory of an entry, though, and are only needed to be summed. With room for fewer, a band is taken in parts:
-//! runs of tiles, whose records lie in the order of the lists, and of which each row takes its own
-//! before the next part. A tile with more entries than there is room for is done again for each piece
-//! of its list. A row's records are added in order of tile number in any case, so that parts, as bands,
-//! cost time and change no bit.
+//! If every entry of the lists has a record, it is stored in the entry's slot, so that the records of a row are
+//! adjacent. However, records take three quarters of the memory of an entry and are only needed until they are
+//! summed. With fewer records, a band is processed in parts: runs of tiles whose records are in the order of the
+//! lists, and which each row sums up before the next part. A tile with more entries than records is processed once
+//! for each piece of its list. A row's records are always added in order of tile number, so that parts, like bands,
+//! cost time but change no bit.
 
 use std::ops::Range;
 use std::sync::atomic::AtomicU32;
@@ -18,27 +17,27 @@ use super::threads::Threads;
 use super::tiles::{Entry, TileLists};
 use super::{BLOCKS_PER_TASK, ROWS_PER_TASK};
 
-/// Entries of a band whose records are held together.
+/// Entries of a band whose records are held at the same time.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Part {
-    /// Tiles of the band that hold them.
+    /// The tiles of these entries.
     pub(super) tiles: Range<usize>,
-    /// The entries, counted from the first of the band; `None`: all of them, each in its slot.
+    /// The entries, counted from the first of the band; `None` for all entries, each in its slot.
     entries: Option<Range<usize>>,
 }
 
-/// Where the records of one tile go.
+/// The records of one tile.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct TileRecords<'a> {
     /// Bits of the records. Shape: `[cap, stride]`.
     bits: &'a [AtomicU32],
     stride: usize,
-    /// The record of the list's first entry; it and others may lie outside. `None`: by slot.
+    /// The record of the list's first entry, which may be outside of the buffer; `None` for records by slot.
     first: Option<usize>,
 }
 
 impl<'a> TileRecords<'a> {
-    /// The record of the entry at place `at` of the tile's list, if it is held in this part.
+    /// The record of the entry at index `at` of the tile's list, if it belongs to this part.
     #[inline(always)]
     pub(super) fn of(&self, entry: Entry, at: usize) -> Option<&'a [AtomicU32]> {
         let record = match self.first {
@@ -50,28 +49,28 @@ impl<'a> TileRecords<'a> {
     }
 }
 
-/// Where records are summed.
+/// The sums of the records.
 pub(super) struct Sums<'a> {
     /// Shape: `[rows, stride]`, or more rows.
     pub(super) sums: &'a mut [f32],
     pub(super) stride: usize,
-    /// Whether the sums start anew.
+    /// Whether the sums start at 0.
     pub(super) fresh: bool,
-    /// Bit per lane of each block: who has records. Shape: `[blocks]`.
+    /// Bit per lane of each block: whether the row has records. Shape: `[blocks]`.
     pub(super) visible: &'a [u16],
 }
 
-/// The parts of a band of so many tiles, for at most `cap` records at a time, in order.
+/// Divides a band of `tiles` tiles into parts of at most `cap` records, in order.
 pub(super) fn parts(threads: &Threads, lists: &TileLists, tiles: usize, cap: usize) -> Vec<Part> {
-    let parts = cut(lists.firsts(tiles), cap);
+    let parts = divide(lists.firsts(tiles), cap);
     if parts.len() > 1 {
-        lists.note_positions(threads, tiles);
+        lists.store_positions(threads, tiles);
     }
     parts
 }
 
-/// `firsts` has the number of entries before each tile, and of all.
-fn cut(firsts: &[u32], cap: usize) -> Vec<Part> {
+/// Divides tiles into parts; `firsts` has the number of entries before each tile, and the number of all entries.
+fn divide(firsts: &[u32], cap: usize) -> Vec<Part> {
     let cap = cap.max(1);
     let tiles = firsts.len() - 1;
     if firsts[tiles] as usize <= cap {
@@ -84,7 +83,7 @@ fn cut(firsts: &[u32], cap: usize) -> Vec<Part> {
         let fit = firsts[start + 1..].partition_point(|&first| first as usize - from <= cap);
         let end = start + fit.max(1);
         let mut entries = from..firsts[end] as usize;
-        // More than one only of a tile that is too much by itself.
+        // More than one part only for a single tile with more than `cap` entries.
         while !entries.is_empty() {
             let some = entries.start..entries.end.min(entries.start + cap);
             entries.start = some.end;
@@ -96,7 +95,7 @@ fn cut(firsts: &[u32], cap: usize) -> Vec<Part> {
 }
 
 impl Part {
-    /// Where the records of a tile of the band go.
+    /// The records of a tile of the band.
     pub(super) fn records<'a>(
         &self,
         lists: &TileLists,
@@ -108,7 +107,7 @@ impl Part {
         TileRecords { bits, stride, first: self.entries.as_ref().map(first) }
     }
 
-    /// Shows each visible row its sum and its records, some at a time, in order of tile number.
+    /// Calls `add` with the sum of each visible row and its records, a few at a time, in order of tile number.
     pub(super) fn gather(
         &self,
         threads: &Threads,

@@ -1,5 +1,5 @@
-//! Terms of the loss and noise that a policy adds for every row, visible or not; noise is added to
-//! the means (*3D Gaussian Splatting as Markov Chain Monte Carlo*, Kheradmand et al. 2024).
+//! Loss terms and noise that a policy adds to every row, visible or not. Noise moves the means (*3D Gaussian
+//! Splatting as Markov Chain Monte Carlo*, Kheradmand et al. 2024).
 
 use densify_policies::policy::{LossTerms, NoiseTerm};
 use densify_policies::rng::{PolicyRng, Purpose};
@@ -12,7 +12,7 @@ use super::simd::{V, WIDTH};
 use crate::StepInput;
 use densify_core::gaussians::sigmoid;
 
-/// The derivatives of the loss terms, per row.
+/// The factors of the loss terms per row.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Terms {
     /// Coefficient / rows.
@@ -48,8 +48,8 @@ impl Terms {
     }
 }
 
-/// Shares of the noise below this are left out: 2⁻²⁴. At the published strength (5e5 times a step
-/// size of 1.6e-4) that is 5e-6 σ² per step, and after 30,000 steps a way of 1e-3 σ².
+/// Smaller shares of the noise are skipped: 2⁻²⁴. At the published strength (5e5 times a step
+/// size of 1.6e-4) that is 5e-6 σ² per step, and 1e-3 σ² after 30,000 steps.
 const LEAST_SHARE: f32 = 5.960_464_5e-8;
 
 /// The noise of one step.
@@ -67,8 +67,8 @@ impl Noise {
         Self { term, factor: term.strength * input.rates.noise, rng }
     }
 
-    /// Moves the means of the first `rows` rows of a block, the first of which is `first_row`. Draws
-    /// are keyed by row, so that it does not matter who makes them.
+    /// Adds noise to the means of the first `rows` rows of a block, which starts at `first_row`. Draws are keyed by
+    /// row, and so independent of threads.
     pub(super) fn add(&self, params: &mut [f32], first_row: usize, rows: usize) {
         for lane in 0..rows {
             let get = |p: usize| params[p * WIDTH + lane];
@@ -78,10 +78,10 @@ impl Noise {
             }
             let xi = self.rng.normal3((first_row + lane) as u32, Purpose::Noise, 0);
             let [w, x, y, z] = [0, 1, 2, 3].map(|i| get(plane::QUAT + i));
-            let turn = Quat::from_xyzw(x, y, z, w).normalize();
+            let rotation = Quat::from_xyzw(x, y, z, w).normalize();
             let scale = Vec3::from([0, 1, 2].map(|i| get(plane::LOG_SCALE + i).exp()));
             // Σ·ξ = R·S²·Rᵀ·ξ.
-            let step = turn * (scale * scale * (turn.inverse() * Vec3::from(xi)));
+            let step = rotation * (scale * scale * (rotation.inverse() * Vec3::from(xi)));
             let step = step * (self.factor * share);
             if step.is_finite() {
                 for (i, x) in step.to_array().into_iter().enumerate() {

@@ -1,4 +1,4 @@
-//! Stage 8: the signals that policies ask for, accumulated over views. Only requested signals have memory.
+//! Stage 8: accumulates the signals that a policy requests over views. Only requested signals have memory.
 
 use std::ops::Range;
 
@@ -60,7 +60,7 @@ impl SignalPlanes {
                 };
             }
             let mean = each!(i in 3 => lanes(s, &g.params, plane::MEAN + i, at));
-            // Infinite, so 1, where all depths count in full.
+            // Infinite, and so clamped to 1, if all depths count in full.
             let one = V::splat(s, 1.0);
             let depth = (one / (line!(g.inv_z) * self.full_depth)).min(one);
             let weight = depth * depth;
@@ -95,7 +95,7 @@ impl SignalPlanes {
                     Signal::DepthMin => seen.keep(line!(g.inv_z)),
                     Signal::PixelSizeMin => seen.keep(line!(g.inv_z) * focal),
                     Signal::DominantPixels => line!(g.dominant) * per_pixel,
-                    // Of the row as it is when it is read.
+                    // Read from the row when the policy is due.
                     Signal::Opacity
                     | Signal::ScaleMax
                     | Signal::ScaleProduct
@@ -116,7 +116,7 @@ impl SignalPlanes {
 }
 
 impl SignalPlanes {
-    /// [`Signal::ErrorScore`] of one view, in these lanes. Powers have no vectors.
+    /// [`Signal::ErrorScore`] of one view in the given lanes; scalar, as powers have no vector instruction.
     fn scores(&self, g: &BlockGradient, lanes: Range<usize>) -> [f32; WIDTH] {
         let [errors, weights] =
             [Field::Error, Field::WeightSum].map(|field| &g.sums[field.number()]);
@@ -142,24 +142,23 @@ impl Accumulators {
         self.planes
     }
 
-    /// Which numbers the requested signals need in a record.
+    /// The record layout of the requested signals.
     pub(super) fn layout(&self) -> RecordLayout {
         RecordLayout::new(self.requested)
     }
 
-    /// Numbers per row where gradients of splats are summed in a step, and the requested signals lie
-    /// while they are read.
+    /// Numbers per row of the buffer that holds summed records in a step and, between steps, the signals being read.
     pub(super) fn sums(&self) -> usize {
         self.layout().stride().max(self.requested.width())
     }
 
-    /// The current epoch's largest weights become the previous one's.
+    /// Starts a new epoch of the signals that are kept per epoch.
     pub(super) fn begin_epoch(&mut self, threads: &Threads, rows: usize) {
         let cleared = self.planes.begin_epoch();
         self.clear(threads, &cleared, rows);
     }
 
-    /// These signals start anew.
+    /// Resets signals to 0.
     pub(super) fn reset(&mut self, signals: SignalSet, threads: &Threads, rows: usize) {
         self.clear(threads, &self.planes.of_all(signals), rows);
     }
@@ -180,7 +179,7 @@ impl Accumulators {
         threads.install(|| threads.each("clear signals", tasks, clear));
     }
 
-    /// Writes the columns of the wanted signals; zeros of rows that have none.
+    /// Writes the columns of the wanted signals; 0 for rows without accumulators.
     pub(super) fn read(
         &self,
         threads: &Threads,
@@ -202,7 +201,7 @@ impl Accumulators {
             let of_row = |row: usize, numbers: &mut [f32]| match &attribute {
                 Some(attribute) => {
                     for (number, plane) in numbers.iter_mut().zip(attribute.parameters.clone()) {
-                        *number = (attribute.shown)(params.get(row, plane));
+                        *number = (attribute.convert)(params.get(row, plane));
                     }
                 }
                 None => numbers.fill(value(row)),
@@ -223,6 +222,7 @@ impl Accumulators {
     }
 }
 
+/// The value of a signal that follows from the row's present state.
 fn present(
     signal: Signal,
     row: usize,
@@ -243,6 +243,6 @@ fn present(
         }
         Signal::Mask => masks.value(row),
         Signal::Age => f32::from(ages.get(row, 0)),
-        summed => unreachable!("{summed:?} is no present value"),
+        summed => unreachable!("{summed:?} is accumulated, not read from the row"),
     }
 }

@@ -1,5 +1,5 @@
-//! The native backend's state as named arrays. Each stage that keeps something between steps says
-//! what it is; lanes beyond the last row are left out, and rows that have nothing, as they never change, have zeros.
+//! The native backend's state as named arrays. Lanes beyond the last row are left out, and frozen rows without state
+//! are zero.
 
 use std::ops::Range;
 
@@ -13,9 +13,9 @@ const MOMENTS: [&str; 2] = ["moments.first", "moments.second"];
 const AGES: &str = "ages";
 const MASKS: &str = "masks";
 const CANDIDATES: &str = "candidates";
-/// Before the name of a signal.
+/// Prefix of a signal's array.
 const SIGNAL: &str = "signals.";
-/// Before what is [summed](super::summed).
+/// Prefix of the arrays of [summed gradients](super::summed).
 const SUMMED: &str = "summed.";
 
 impl CpuBackend {
@@ -27,7 +27,7 @@ impl CpuBackend {
         arrays.extend(
             signals.into_iter().map(|(name, _)| StateArray::of_rows(format!("{SIGNAL}{name}"))),
         );
-        if self.candidates.is_wanted() {
+        if self.candidates.is_requested() {
             arrays.push(StateArray::small(CANDIDATES));
         }
         arrays.extend(self.summed.state().iter().map(|part| StateArray {
@@ -37,8 +37,10 @@ impl CpuBackend {
         arrays
     }
 
+    /// Copies some rows of an array.
+    ///
     /// # Panics
-    /// When there is no such array: a bug in the caller.
+    /// When the array does not exist: a bug in the caller.
     pub(super) fn state_tensor(&self, name: &str, rows: Range<usize>) -> Tensor {
         if let Some(i) = MOMENTS.iter().position(|moments| *moments == name) {
             let planes = planes(self.sh_degree);
@@ -59,7 +61,7 @@ impl CpuBackend {
             return Tensor::f32(name, &shape, values);
         }
         let summed = name.strip_prefix(SUMMED).and_then(|part| self.summed.tensor(part, rows));
-        summed.unwrap_or_else(|| panic!("there is no `{name}` in this backend's state"))
+        summed.unwrap_or_else(|| panic!("this backend has no state array `{name}`"))
     }
 
     pub(super) fn restore_tensor(
@@ -76,7 +78,7 @@ impl CpuBackend {
             self.ages.set_rows(rows, 0..1, &ages);
         } else if name == MASKS && self.masks.is_declared() {
             self.masks.restore(rows, tensor)?;
-        } else if name == CANDIDATES && self.candidates.is_wanted() {
+        } else if name == CANDIDATES && self.candidates.is_requested() {
             self.candidates.restore(tensor)?;
         } else if let Some(plane) = signal_plane(&self.signals, &name) {
             let values = tensor.into_f32(&[rows.len()])?;
@@ -84,7 +86,7 @@ impl CpuBackend {
         } else if let Some(part) = name.strip_prefix(SUMMED) {
             self.summed.restore(part, rows, tensor)?;
         } else {
-            return Err(tensor.error("this run keeps nothing of that name"));
+            return Err(tensor.error("this run has no such array"));
         }
         Ok(())
     }

@@ -1,8 +1,8 @@
-//! Gradients summed between optimiser steps, where a policy wants steps less often than every
-//! iteration ([`Cadence`]). Without such a policy there is no buffer and no cost.
+//! Gradients summed between optimiser steps, for policies that step less often than every
+//! iteration ([`Cadence`]). Other policies need no buffer and pay nothing.
 //!
-//! A step then takes the sum of the gradients of all views since the last one. Bands 1–3 of the
-//! colour can step less often than all others; they then have ages of their own, as Adam's bias
+//! A step uses the sum of the gradients of all views since the last one. SH bands 1–3 may
+//! step less often than all other parameters; they then have ages of their own, as Adam's bias
 //! correction counts steps.
 
 use std::ops::Range;
@@ -15,27 +15,27 @@ use super::blocks::{BlockTask, Blocks, parts, plane};
 use super::simd::WIDTH;
 use crate::{StateError, StepInput, Tensor};
 
-/// The sums of the rows that may be trained.
+/// The sums of the trainable rows.
 #[derive(Debug)]
 pub(super) struct Summed {
     longest: Cadence,
     /// First parameter plane that is summed.
     first: usize,
     sums: Blocks,
-    /// Steps of bands 1–3, where they may differ from the others': one plane, or none.
+    /// Optimiser steps of bands 1–3 in one plane, if they may differ from those of other parameters.
     rest_ages: Blocks<u16>,
-    /// Whether sums of bands 1–3, and of all others, wait for a step.
+    /// The parameter groups whose sums wait for a step.
     pending: Due,
 }
 
-/// Which parameters step, or wait.
+/// The parameter groups that step, or that wait.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Due {
     /// All but bands 1–3.
     pub(super) main: bool,
     /// Bands 1–3.
     pub(super) rest: bool,
-    /// Whether sums waited before this step, for the main parameters and bands 1–3.
+    /// Whether sums were waiting before this step: main parameters, bands 1–3.
     waited: [bool; 2],
 }
 
@@ -46,12 +46,12 @@ pub(super) struct TaskSums<'a> {
     rest_ages: &'a mut [u16],
 }
 
-/// Names of what is kept between steps.
+/// Names of the state arrays.
 const GRADIENTS: &str = "gradients";
 const WAITING: &str = "waiting";
 const REST_AGES: &str = "rest_ages";
 
-/// The first plane that sums for this cadence must hold; `planes` where none must.
+/// The first plane to sum for a cadence; `planes` if none is.
 fn first_plane(planes: usize, longest: Cadence) -> usize {
     match longest {
         Cadence { all: 2.., .. } => 0,
@@ -72,7 +72,7 @@ impl Summed {
         }
     }
 
-    pub(super) fn is_wanted(longest: Cadence) -> bool {
+    pub(super) fn is_needed(longest: Cadence) -> bool {
         longest.all > 1 || longest.sh_rest > 1
     }
 
@@ -81,11 +81,10 @@ impl Summed {
         sums + Blocks::<u16>::bytes(rows, usize::from(longest.sh_rest > 1))
     }
 
-    /// The parameter groups that step now; records those that wait.
+    /// Returns the parameter groups that step now, and records those that wait.
     ///
     /// # Panics
-    /// When the cadence needs sums that were not declared: a bug in the caller, and going on would
-    /// lose gradients.
+    /// When the cadence was not declared: a bug in the caller that would lose gradients.
     pub(super) fn advance(&mut self, input: &StepInput<'_>) -> Due {
         let (step, cadence) = (input.step, input.cadence);
         assert!(cadence.is_within(self.longest), "step {step}: {cadence:?} was not declared");
@@ -95,7 +94,7 @@ impl Summed {
         due
     }
 
-    /// The sums, cut for the optimiser's tasks.
+    /// The sums, split for the optimiser's tasks.
     pub(super) fn tasks(
         &mut self,
         rows: usize,
@@ -107,21 +106,23 @@ impl Summed {
         sums.tasks(rows).zip(ages).map(move |(sums, rest_ages)| TaskSums { first, sums, rest_ages })
     }
 
-    /// What is kept between steps, by name.
+    /// The names of the state arrays.
     pub(super) fn state(&self) -> &'static [&'static str] {
-        match (Self::is_wanted(self.longest), self.rest_ages.planes() == 0) {
-            (false, _) => &[],
-            (true, true) => &[GRADIENTS, WAITING],
-            (true, false) => &[GRADIENTS, WAITING, REST_AGES],
+        if !Self::is_needed(self.longest) {
+            &[]
+        } else if self.rest_ages.planes() == 0 {
+            &[GRADIENTS, WAITING]
+        } else {
+            &[GRADIENTS, WAITING, REST_AGES]
         }
     }
 
-    /// Whether an array of the state is by rows.
+    /// Whether a state array is by rows.
     pub(super) fn is_by_rows(part: &str) -> bool {
         part != WAITING
     }
 
-    /// An array of the state: sums `[rows, summed planes]`, who waits `[2]`, ages of bands 1–3
+    /// A state array: sums `[rows, summed planes]`, waiting groups `[2]`, or ages of bands 1–3
     /// `[rows]`.
     pub(super) fn tensor(&self, part: &str, rows: Range<usize>) -> Option<Tensor> {
         let planes = self.planes();
@@ -140,7 +141,7 @@ impl Summed {
         })
     }
 
-    /// Takes back what [`tensor`](Self::tensor) returned.
+    /// Restores an array that [`tensor`](Self::tensor) returned.
     pub(super) fn restore(
         &mut self,
         part: &str,
@@ -149,7 +150,7 @@ impl Summed {
     ) -> Result<(), StateError> {
         let planes = self.planes();
         match self.state().iter().find(|known| **known == part) {
-            None => return Err(tensor.error("this run keeps nothing of that name")),
+            None => return Err(tensor.error("this run has no such array")),
             Some(&GRADIENTS) => {
                 let values = tensor.into_f32(&[rows.len(), planes])?;
                 self.sums.set_rows(rows, 0..planes, &values);
@@ -167,7 +168,7 @@ impl Summed {
         Ok(())
     }
 
-    /// Planes that are summed.
+    /// Number of summed planes.
     fn planes(&self) -> usize {
         self.sums.planes()
     }
@@ -187,8 +188,8 @@ impl Summed {
         self.rest_ages.reorder(order);
     }
 
-    /// As the moments of a parameter are forgotten.
-    pub(super) fn forget(&mut self, row: usize, plane: usize) {
+    /// Resets the sum of one parameter.
+    pub(super) fn reset(&mut self, row: usize, plane: usize) {
         if let Some(summed) = plane.checked_sub(self.first).filter(|&p| p < self.planes()) {
             self.sums.set(row, summed, 0.0);
         }
@@ -196,20 +197,20 @@ impl Summed {
 }
 
 impl Due {
-    /// Whether gradients go into the sums, or come out of them.
-    pub(super) fn sums_matter(self) -> bool {
+    /// Whether gradients are added to the sums or taken from them.
+    pub(super) fn uses_sums(self) -> bool {
         !self.main || !self.rest || self.waited != [false; 2]
     }
 }
 
 impl TaskSums<'_> {
-    /// Ages of bands 1–3 in these lanes, if they have their own.
+    /// The ages of bands 1–3 in the given lanes, if they have their own.
     pub(super) fn rest_ages(&mut self, lanes: Range<usize>) -> Option<&mut [u16]> {
         self.rest_ages.get_mut(lanes)
     }
 
-    /// Adds the gradient of a block to the sums of those who wait, and the sums of those who step to
-    /// the gradient. Whether the gradient has changed.
+    /// Adds the gradient of a block to the sums of the waiting groups, and the sums of the stepping groups to the
+    /// gradient. Returns whether the gradient has changed.
     pub(super) fn exchange(
         &mut self,
         block: usize,

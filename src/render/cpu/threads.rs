@@ -1,6 +1,6 @@
-//! The threads of the native backend. Each loop that they share is a *region*: it has a name, and tasks
-//! that are cut at fixed places. What each task takes can be recorded, on one thread; the benchmark
-//! computes from it how a step would do on many cores.
+//! The thread pool of the native backend. Each parallel loop is a *region*: it has a name and is split into tasks at
+//! fixed places. On one thread the durations of tasks can be recorded, from which the benchmark estimates the time
+//! of a step on many cores.
 
 use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
@@ -9,39 +9,38 @@ use rayon::prelude::*;
 
 use crate::BackendError;
 
-/// The threads, and the recorder of their tasks once it is asked for.
+/// The thread pool, and the recorder of its tasks once recording has started.
 #[derive(Debug)]
 pub(super) struct Threads {
     pool: rayon::ThreadPool,
     recorder: OnceLock<Recorder>,
 }
 
-/// What one training step took, on one thread.
+/// The durations of a training step on one thread.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct StepTasks {
     /// The whole step.
     pub total: Duration,
-    /// The tasks of each region, in the order in which they ran. What of `total` is in none of them
-    /// would run on one thread however many there are.
+    /// The tasks of each region, in the order of execution. The rest of `total` is serial at any number of threads.
     pub regions: Vec<(&'static str, Vec<Duration>)>,
 }
 
 #[derive(Debug, Default)]
 struct Recorder(Mutex<Record>);
 
-/// Its vectors are kept from step to step: a step that allocated would not be the one to measure.
+/// The recording of one step. Its vectors are reused, as allocations would distort the durations.
 #[derive(Debug, Default)]
 struct Record {
     total: Duration,
-    /// Names, and the number of their first task.
+    /// The name of each region and the index of its first task.
     regions: Vec<(&'static str, usize)>,
     tasks: Vec<Duration>,
-    /// When the last task ended, or its region began.
+    /// The end of the last task, or the start of the region.
     last: Option<Instant>,
 }
 
 impl Threads {
-    /// So many threads; `None`: as many as the machine has.
+    /// Starts `count` threads; `None` means one per core.
     pub(super) fn new(count: Option<usize>) -> Result<Self, BackendError> {
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(count.unwrap_or(0))
@@ -55,19 +54,18 @@ impl Threads {
         self.pool.current_num_threads()
     }
 
-    /// Records tasks from now on.
+    /// Starts recording.
     pub(super) fn record(&self) {
         assert_eq!(self.count(), 1, "tasks are recorded on one thread");
         self.recorder.get_or_init(Recorder::default);
     }
 
-    /// The tasks of the last step; none unless they are recorded.
+    /// The tasks of the last step; empty unless they are recorded.
     pub(super) fn recorded(&self) -> StepTasks {
         self.recorder.get().map(Recorder::tasks).unwrap_or_default()
     }
 
-    /// Runs a whole step on one of the threads. Its regions then find it there, and need not be handed
-    /// over one by one.
+    /// Runs a whole step on a thread of the pool, so that its regions need not be handed over one by one.
     pub(super) fn step<R: Send>(&self, run: impl FnOnce() -> R + Send) -> R {
         self.install(|| {
             let Some(recorder) = self.recorder.get() else { return run() };
@@ -78,12 +76,12 @@ impl Threads {
         })
     }
 
-    /// Runs what has regions on one of the threads.
+    /// Runs code that contains regions on a thread of the pool.
     pub(super) fn install<R: Send>(&self, run: impl FnOnce() -> R + Send) -> R {
         self.pool.install(run)
     }
 
-    /// A region: runs all tasks.
+    /// Runs a region.
     pub(super) fn each<T>(
         &self,
         region: &'static str,
@@ -95,7 +93,7 @@ impl Threads {
         self.each_with(region, tasks, || (), |(), task| run(task));
     }
 
-    /// A region whose tasks need scratch memory, which some of them share one after the other.
+    /// Runs a region whose tasks need scratch memory, which successive tasks share.
     pub(super) fn each_with<T, S>(
         &self,
         region: &'static str,
@@ -110,7 +108,7 @@ impl Threads {
         tasks.for_each_init(scratch, |scratch, task| timed(recorder, || run(scratch, task)));
     }
 
-    /// A region whose tasks return something, in their order.
+    /// Runs a region and collects the results of its tasks in order.
     pub(super) fn collect<T, R: Send>(
         &self,
         region: &'static str,
@@ -123,7 +121,7 @@ impl Threads {
         self.collect_with(region, tasks, || (), |(), task| run(task))
     }
 
-    /// Both.
+    /// Runs a region with scratch memory and collects the results.
     pub(super) fn collect_with<T, S, R: Send>(
         &self,
         region: &'static str,
@@ -139,7 +137,7 @@ impl Threads {
         tasks.map_init(scratch, |scratch, task| timed(recorder, || run(scratch, task))).collect()
     }
 
-    /// A region whose tasks count something. The order of adding whole numbers does not matter.
+    /// Runs a region and adds up the counts that its tasks return; integer sums do not depend on order.
     pub(super) fn sum<T>(
         &self,
         region: &'static str,
@@ -154,7 +152,7 @@ impl Threads {
         tasks.map(|task| timed(recorder, || run(task))).sum()
     }
 
-    /// Begins a region; returns what records the ends of its tasks, if they are recorded.
+    /// Begins a region; returns the recorder of its tasks, if recording has started.
     fn begin(&self, region: &'static str, tasks: usize) -> Option<&Recorder> {
         self.recorder.get().inspect(|recorder| recorder.begin_region(region, tasks))
     }
@@ -193,8 +191,8 @@ impl Recorder {
         record.last = Some(Instant::now());
     }
 
-    /// One reading of the clock per task: what lies between two tasks is counted to the second. It is the
-    /// wall's clock, as the processor's takes twenty times as long to read.
+    /// Reads the clock once per task, so that the time between two tasks counts as part of the second. It is the wall
+    /// clock, as reading processor time takes twenty times as long.
     fn end_task(&self) {
         let mut record = self.record();
         let now = Instant::now();

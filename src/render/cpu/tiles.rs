@@ -1,24 +1,24 @@
 //! Stage 2: splats to tile lists. Every visible row is entered into the list of each 16×16 tile that
-//! its ellipse (where alpha >= 1/255) touches; each list is then sorted by depth, ties by row.
+//! its ellipse covers; each list is then sorted by depth, ties by row.
 //!
 //! Tiles are numbered row by row. Entries are counted per (chunk of rows, tile), and a prefix sum
-//! gives each its place, so that threads write without asking each other. Rows are walked in memory
-//! order: sorting all rows by depth first, and walking them in that order, costs a cache miss per
-//! row and pass, which was ten times the work. The short lists are sorted where they are used.
+//! gives each its position, so that threads write without synchronisation. Rows are processed in memory
+//! order: sorting all rows by depth first and processing them in that order costs a cache miss per
+//! row and pass, and took ten times as long. The short lists are sorted where they are used.
 //!
-//! An entry also has a *slot*: its place when entries are ordered by row and then by tile. The
-//! backward pass writes an entry's gradient into its slot, and a row finds all of its own side by
-//! side. Slots ascend with rows, so (depth, slot) sorts as (depth, row) does.
+//! An entry also has a *slot*: its position in the order by row and then by tile. The
+//! backward pass writes an entry's gradient into its slot, so that the gradients of a row are adjacent.
+//! Slots ascend with rows, so that (depth, slot) sorts like (depth, row).
 //!
 //! When all lists together would exceed the cap, the image is processed in bands: runs of
 //! consecutive tiles whose lists fit. Tiles are independent, and each row's gradients are summed in
-//! order of tile number, so bands change no bit of the result.
+//! order of tile number, so that bands change no bit of the result.
 //!
-//! The file is one piece because counting, placing and emitting share the counters and their cuts.
+//! The file is one piece because counting, placing and emitting share the counters and their division.
 //!
-//! Counting notes the tiles of a row as bits where its slots will stand. Only of rows that reach farther
-//! than the bits do, the ellipse is evaluated again when entries are emitted: by the same function on the
-//! same values, and Rust never contracts floating-point expressions; so the two passes agree.
+//! Counting stores the tiles of a row as bits in the memory of its slots. The ellipses of larger rows are evaluated
+//! again when entries are emitted, by the same function on the same values; as Rust never contracts floating-point
+//! expressions, the two passes agree.
 
 use std::ops::Range;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
@@ -32,14 +32,16 @@ use super::threads::Threads;
 
 /// Side of a tile `[px]`.
 pub(super) const TILE: usize = WIDTH;
-/// Bound for (chunks of rows) × (tiles) counters: 16 MiB of them.
-const MOST_COUNTERS: usize = 1 << 22;
-/// Four for each of 64 threads.
-const MOST_CHUNKS: usize = 256;
-const LEAST_ROWS_PER_CHUNK: usize = 128;
-/// Most tasks that add up counters, and the fewest tiles of one.
-const MOST_RUNS: usize = 64;
-const LEAST_TILES_PER_RUN: usize = 64;
+/// The most counters, one per (chunk of rows, tile): 16 MiB.
+const MAX_COUNTERS: usize = 1 << 22;
+/// The most chunks of rows: four for each of 64 threads.
+const MAX_CHUNKS: usize = 256;
+/// The smallest chunk.
+const MIN_ROWS_PER_CHUNK: usize = 128;
+/// The most tasks that add up counters.
+const MAX_RUNS: usize = 64;
+/// The fewest tiles of such a task.
+const MIN_TILES_PER_RUN: usize = 64;
 
 /// An image as a grid of tiles.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -76,7 +78,7 @@ impl Entry {
     }
 }
 
-/// The rows that are projected now, and which of them are on screen.
+/// The projected rows, and the mask of those on screen.
 #[derive(Clone, Copy)]
 pub(super) struct Visible<'a> {
     /// Shape: `[rows]`.
@@ -86,7 +88,7 @@ pub(super) struct Visible<'a> {
 }
 
 impl Visible<'_> {
-    /// The visible rows among `rows`, which start and end at blocks.
+    /// Calls `f` with the visible rows among `rows`, which must start at a block.
     fn each(self, rows: Range<usize>, mut f: impl FnMut(usize, &Splat)) {
         for block in rows.start / WIDTH..rows.end.div_ceil(WIDTH) {
             let mut todo = self.seen[block];
@@ -104,16 +106,15 @@ impl Visible<'_> {
 pub(super) struct TileLists {
     /// Tile after tile: (depth bits, slot) until the tile is sorted, then (row, slot). Shape: `[cap]`.
     entries: Vec<AtomicU64>,
-    /// The row of each slot; once lists are sorted, its [position](Self::note_positions) where that
-    /// is asked for. Shape: `[cap]`.
+    /// The row of each slot; after sorting, its [position](Self::store_positions) if that is needed. Shape: `[cap]`.
     row_of_slot: Vec<AtomicU32>,
-    /// First slot and number of slots of each row; meaningless for rows not visible. Between
-    /// counting and emitting, a [`Footprint`] instead. Shape: `[budget]`.
+    /// First slot and number of slots of each visible row. Between counting and emitting, a [`Footprint`] instead.
+    /// Shape: `[budget]`.
     slots: Vec<[u32; 2]>,
     /// First entry of each tile of the band. Shape: `[tiles of the band + 1]`.
     starts: Vec<u32>,
-    /// Entries per (chunk of rows, tile). While entries are emitted: their places in the tile's list.
-    /// Shape: `[chunks, tiles of the band]`, or more than these.
+    /// Entries per (chunk of rows, tile). While entries are emitted, their positions in the tile's list instead.
+    /// Shape: `[chunks, tiles of the band]`, or more.
     counters: Vec<u32>,
     /// Entries per chunk of rows.
     lengths: Vec<u64>,
@@ -122,7 +123,7 @@ pub(super) struct TileLists {
 impl TileLists {
     pub(super) fn new(budget: usize, cap: usize) -> Self {
         Self {
-            // Zeroed by the system, as needed: what no view fills is never resident.
+            // Zeroed lazily by the system: memory that no view fills never becomes resident.
             entries: bytemuck::zeroed_vec(cap),
             row_of_slot: bytemuck::zeroed_vec(cap),
             slots: vec![[0; 2]; budget],
@@ -132,21 +133,21 @@ impl TileLists {
         }
     }
 
-    /// Bytes for a budget of rows, a cap of entries and an image of so many tiles.
+    /// Bytes for a budget of rows, a cap of entries and an image of `tiles` tiles.
     pub(super) fn bytes(budget: usize, cap: usize, tiles: usize) -> u64 {
         let per_row = size_of::<[u32; 2]>();
         let per_entry = size_of::<AtomicU64>() + size_of::<AtomicU32>();
-        let counters = (tiles * MOST_CHUNKS).min(MOST_COUNTERS.max(tiles));
+        let counters = (tiles * MAX_CHUNKS).min(MAX_COUNTERS.max(tiles));
         let starts_and_counters = (tiles + 1 + counters) * size_of::<u32>();
         (budget * per_row + cap * per_entry + starts_and_counters) as u64
     }
 
-    /// Most entries held at a time.
+    /// The most entries held at a time.
     pub(super) fn cap(&self) -> usize {
         self.entries.len()
     }
 
-    /// Bands of the image: ranges of tiles whose lists fit the cap, and the number of entries.
+    /// Divides the image into bands, ranges of tiles whose lists fit the cap. Also returns the number of entries.
     pub(super) fn bands(
         &mut self,
         threads: &Threads,
@@ -170,10 +171,10 @@ impl TileLists {
                 }
             }
         });
-        cut(of_tiles.into_iter(), cap)
+        divide(of_tiles.into_iter(), cap)
     }
 
-    /// Fills the lists for one band. `counted` says that the counters already hold this band.
+    /// Fills the lists of one band. With `counted`, the counters already hold this band.
     pub(super) fn fill(
         &mut self,
         threads: &Threads,
@@ -188,7 +189,7 @@ impl TileLists {
         let tiles = band.len();
         self.find_places(threads, tiles);
         let chunk = chunk_rows(visible.splats.len(), tiles);
-        // Each chunk's slots lie side by side.
+        // The slots of a chunk are adjacent.
         let mut rest = &mut self.row_of_slot[..];
         let mut first = 0;
         let mut work = Vec::new();
@@ -221,9 +222,9 @@ impl TileLists {
         });
     }
 
-    /// From the counters of so many tiles, where each list starts, and in their stead where in each list
-    /// the entries of each chunk do: after those of the chunks before. Walked in the order of memory; down
-    /// the chunks of one tile, each number would be a cache miss.
+    /// Computes from the counters of `tiles` tiles where each list starts, and replaces the counters by the positions
+    /// in the list at which the entries of each chunk start. Counters are read in memory order; down the chunks of
+    /// one tile, each would be a cache miss.
     fn find_places(&mut self, threads: &Threads, tiles: usize) {
         let run = tiles_per_run(tiles);
         let mut runs: Vec<Vec<&mut [u32]>> = Vec::new();
@@ -258,7 +259,7 @@ impl TileLists {
         });
     }
 
-    /// Fills and sorts the lists of a band again, after other bands were in their place.
+    /// Fills and sorts the lists of a band again after other bands have used the memory.
     pub(super) fn refill(
         &mut self,
         threads: &Threads,
@@ -295,8 +296,7 @@ impl TileLists {
         });
     }
 
-    /// Brings the list of tile `tile` of the band into its final order, front to back. Positive
-    /// floats compare as their bits do.
+    /// Sorts the list of tile `tile` of the band front to back. Positive floats compare like their bits.
     pub(super) fn sort(&self, tile: usize, scratch: &mut Vec<u64>) {
         let list = self.of_tile(tile);
         scratch.clear();
@@ -314,19 +314,18 @@ impl TileLists {
         &self.entries[self.starts[tile] as usize..self.starts[tile + 1] as usize]
     }
 
-    /// Entries of the band, tile after tile, before tile `tile`.
+    /// The number of entries of the band before tile `tile`.
     pub(super) fn first_of(&self, tile: usize) -> usize {
         self.starts[tile] as usize
     }
 
-    /// The same before each of so many tiles, and all entries.
+    /// The number of entries before each of `tiles` tiles, and the number of all entries.
     pub(super) fn firsts(&self, tiles: usize) -> &[u32] {
         &self.starts[..=tiles]
     }
 
-    /// Notes of each slot which entry of the band it belongs to. After sorting, which needs the
-    /// place.
-    pub(super) fn note_positions(&self, threads: &Threads, tiles: usize) {
+    /// Stores for each slot the position of its entry in the band. Only after sorting, which uses the same memory.
+    pub(super) fn store_positions(&self, threads: &Threads, tiles: usize) {
         threads.each("positions", 0..tiles, |tile| {
             let first = self.first_of(tile);
             for (i, entry) in self.of_tile(tile).iter().enumerate() {
@@ -335,7 +334,7 @@ impl TileLists {
         });
     }
 
-    /// What was noted of a slot.
+    /// The stored position of a slot's entry.
     pub(super) fn position_of(&self, slot: usize) -> usize {
         self.row_of_slot[slot].load(Relaxed) as usize
     }
@@ -347,9 +346,9 @@ impl TileLists {
     }
 }
 
-/// Runs of consecutive tiles with these numbers of entries, of which each run has at most `cap` (a tile
-/// alone never has more), and all entries.
-fn cut(entries: impl Iterator<Item = u64>, cap: u64) -> (Vec<Range<usize>>, u64) {
+/// Divides tiles with the given numbers of entries into bands of at most `cap` entries, which a single tile never
+/// exceeds. Also returns the number of all entries.
+fn divide(entries: impl Iterator<Item = u64>, cap: u64) -> (Vec<Range<usize>>, u64) {
     let mut bands = Vec::with_capacity(1);
     let (mut start, mut end, mut held, mut total) = (0, 0, 0, 0);
     for here in entries {
@@ -365,29 +364,29 @@ fn cut(entries: impl Iterator<Item = u64>, cap: u64) -> (Vec<Range<usize>>, u64)
     (bands, total)
 }
 
-/// Rows per chunk, whole blocks: independent of the number of threads.
+/// Rows per chunk, in whole blocks; independent of the number of threads.
 fn chunk_rows(rows: usize, tiles: usize) -> usize {
-    let chunks = (MOST_COUNTERS / tiles.max(1)).clamp(1, MOST_CHUNKS);
-    rows.div_ceil(chunks).max(LEAST_ROWS_PER_CHUNK).next_multiple_of(WIDTH)
+    let chunks = (MAX_COUNTERS / tiles.max(1)).clamp(1, MAX_CHUNKS);
+    rows.div_ceil(chunks).max(MIN_ROWS_PER_CHUNK).next_multiple_of(WIDTH)
 }
 
-/// Tiles whose counters are added up by one task.
+/// Tiles whose counters one task adds up.
 fn tiles_per_run(tiles: usize) -> usize {
-    tiles.div_ceil(MOST_RUNS).max(LEAST_TILES_PER_RUN)
+    tiles.div_ceil(MAX_RUNS).max(MIN_TILES_PER_RUN)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// Full-HD images that rows fill: the first numbers of them whose entries pass 31 bits, and 32.
+    /// Full-HD images that every row fills, with numbers of rows whose entries exceed 31 and 32 bits.
     #[test]
     fn bands_are_cut_without_overflow() {
         const TILES: u64 = 120 * 68;
         for rows in [263_172_u64, 526_344, u64::from(u32::MAX)] {
             let entries = || std::iter::repeat_n(rows, TILES as usize);
             for cap in [rows, 16 * rows, u64::from(u32::MAX)] {
-                let (bands, total) = cut(entries(), cap);
+                let (bands, total) = divide(entries(), cap);
                 assert_eq!(total, rows * TILES);
                 let most = bands.iter().map(|band| band.len() as u64 * rows).max();
                 assert!(most.is_some_and(|most| most <= cap), "{rows} rows, cap {cap}");
@@ -399,7 +398,7 @@ mod tests {
                 assert_eq!(bands.len() as u64, TILES.div_ceil(per_band));
             }
         }
-        let (none, total) = cut(std::iter::empty(), 5);
+        let (none, total) = divide(std::iter::empty(), 5);
         assert!(none.len() == 1 && none[0].is_empty() && total == 0);
     }
 
@@ -408,9 +407,9 @@ mod tests {
         for rows in [0, 1, 127, 128, 1 << 31, (1_usize << 32) - 1, 1 << 40] {
             for tiles in [0, 1, 8160, 1 << 20] {
                 let chunk = chunk_rows(rows, tiles);
-                assert!(chunk.is_multiple_of(WIDTH) && chunk >= LEAST_ROWS_PER_CHUNK);
+                assert!(chunk.is_multiple_of(WIDTH) && chunk >= MIN_ROWS_PER_CHUNK);
                 let chunks = rows.div_ceil(chunk);
-                assert!(chunks <= MOST_CHUNKS && chunks * tiles <= MOST_COUNTERS.max(tiles));
+                assert!(chunks <= MAX_CHUNKS && chunks * tiles <= MAX_COUNTERS.max(tiles));
             }
         }
     }
@@ -418,9 +417,9 @@ mod tests {
     /// Of fewer tiles than a run has, of whole runs, and of more.
     #[test]
     fn places_are_sums_of_all_that_comes_before() {
-        const RUN: usize = LEAST_TILES_PER_RUN;
+        const RUN: usize = MIN_TILES_PER_RUN;
         let threads = Threads::new(Some(2)).expect("threads");
-        for tiles in [1, RUN - 1, RUN, 2 * RUN, 2 * RUN + 7, MOST_RUNS * RUN + 1] {
+        for tiles in [1, RUN - 1, RUN, 2 * RUN, 2 * RUN + 7, MAX_RUNS * RUN + 1] {
             let chunks = 5;
             let counters: Vec<u32> = (0..chunks * tiles).map(|i| (i * 7 % 11) as u32).collect();
             let mut lists = TileLists::new(1, 1);

@@ -25,7 +25,7 @@ impl GpuBackend {
         let marked = (0..).zip(&marks).filter_map(|(row, mark)| {
             let place = mark.to_bits().checked_sub(1)?;
             let kept = if place < MOMENTS { Kept::Parameter } else { Kept::Moment };
-            let attribute = Attribute::of((place % MOMENTS) as usize);
+            let attribute = Attribute::of_parameter((place % MOMENTS) as usize);
             Some(Unsound { row, attribute, kept })
         });
         Ok(marked.collect())

@@ -6,8 +6,7 @@ use wgpu::{Buffer, BufferDescriptor};
 
 use super::device::Device;
 use super::sizes::{MATURE, Planned, Sizes};
-use crate::BackendError;
-use densify_core::memory::Bytes;
+use crate::{BackendError, Fit};
 
 /// The buffers, by name.
 #[derive(Debug)]
@@ -82,21 +81,18 @@ fn check_sizes(device: &Device, planned: &[Planned], sizes: &Sizes) -> Result<()
     let Some(worst) = bound.max_by_key(|p| p.bytes).filter(|p| p.bytes > most) else {
         return Ok(());
     };
-    let name = &device.summary.name;
-    let (needs, has) = (Bytes(worst.bytes), Bytes(most));
-    let remedy = match worst.name {
-        "records" | "keys 0" | "sums" => {
-            format!("use --tile-cap {}", most / (worst.bytes / sizes.cap).max(1))
-        }
-        "canvas" | "finish" | "pixel gradient" | "derivatives" => {
-            "shrink the images with --resolution".into()
-        }
-        _ => format!("use --budget {}", device.summary.largest_budget(sizes.sh_degree)),
+    let fit = match worst.name {
+        "records" | "keys 0" | "sums" => Fit::TileCap(most / (worst.bytes / sizes.cap).max(1)),
+        "canvas" | "finish" | "pixel gradient" | "derivatives" => Fit::ImageSize,
+        _ => Fit::Budget(device.summary.largest_budget(sizes.sh_degree)),
     };
-    Err(BackendError::OverLimit(format!(
-        "{}: {needs} in one buffer, but {name} takes {has} at most; {remedy}",
-        worst.line
-    )))
+    Err(BackendError::BufferTooLarge {
+        buffer: worst.line,
+        bytes: worst.bytes,
+        device: device.summary.name.clone(),
+        most,
+        fit,
+    })
 }
 
 /// 1/(1 − β₁^age) and √(1/(1 − β₂^age)), by age.

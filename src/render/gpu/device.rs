@@ -276,7 +276,7 @@ mod tests {
 
     use super::super::adapter::adapters;
     use super::*;
-    use crate::{AdapterKind, Backend};
+    use crate::{AdapterKind, Backend, Inspect};
     use densify_core::camera::Camera;
 
     /// A software driver, opened anew: what is lost cannot be used again. Not SwiftShader, which opens slowly.

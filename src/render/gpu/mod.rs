@@ -45,8 +45,8 @@ use densify_policies::policy::{Cadence, Candidate, MaskTerm, SignalKind, SignalS
 use super::candidates::Candidates;
 use super::signals::{ParameterSignal, SignalPlanes, as_read};
 use super::{
-    AdapterSummary, AuxInput, AuxOutput, Backend, BackendError, Rendering, Setup, Shortcuts,
-    StateArray, StateError, StepInput, StepOutput, Tensor, Unsound, assert_fits,
+    AdapterSummary, AuxInput, AuxOutput, Backend, BackendError, Inspect, Rendering, Setup,
+    Shortcuts, StateArray, StateError, StepInput, StepOutput, Tensor, Unsound, assert_fits,
 };
 use densify_core::camera::Camera;
 use densify_core::gaussians::{Gaussians, ModelArray, rgb_to_dc};
@@ -111,10 +111,12 @@ impl GpuBackend {
         let device = device.0.clone();
         let most = device.summary.largest_budget(model.sh_degree);
         if budget as u64 > most {
-            return Err(BackendError::OverLimit(format!(
-                "a budget of {budget} rows: {} takes {most} at degree {}; use --budget {most}",
-                device.summary.name, model.sh_degree
-            )));
+            return Err(BackendError::TooManyRows {
+                budget,
+                device: device.summary.name.clone(),
+                most,
+                sh_degree: model.sh_degree,
+            });
         }
         let planes = SignalPlanes::new(&options.needs);
         let sizes = promise::sizes(&device, model.sh_degree, options);
@@ -298,22 +300,8 @@ impl Backend for GpuBackend {
         self.rendering(camera.width, camera.height)
     }
 
-    fn render_painted(
-        &mut self,
-        camera: &Camera,
-        background: [f32; 3],
-        colours: &[[f32; 3]],
-    ) -> Result<Rendering, BackendError> {
-        assert_eq!(colours.len(), self.rows, "colours of other rows");
-        // The colours take the place of band 0 meanwhile, which costs the device no memory.
-        let (band, rows) = (ModelArray::Sh.parameters(0), 0..self.rows);
-        let own = self.parameters_of(&band, rows.clone())?;
-        let painted: Vec<f32> = colours.as_flattened().iter().copied().map(rgb_to_dc).collect();
-        self.set_parameters(&band, rows.clone(), &painted)?;
-        let made = self.render(camera, background, 0);
-        // If that fails the device has: it takes no step with these colours.
-        self.set_parameters(&band, rows, &own)?;
-        made
+    fn inspect(&mut self) -> Result<&mut dyn Inspect, BackendError> {
+        Ok(self)
     }
 
     fn download_array(
@@ -351,5 +339,25 @@ impl Backend for GpuBackend {
 
     fn stage_times(&self) -> &[(&'static str, Duration)] {
         &self.laps
+    }
+}
+
+impl Inspect for GpuBackend {
+    fn render_painted(
+        &mut self,
+        camera: &Camera,
+        background: [f32; 3],
+        colours: &[[f32; 3]],
+    ) -> Result<Rendering, BackendError> {
+        assert_eq!(colours.len(), self.rows, "colours of other rows");
+        // The colours take the place of band 0 meanwhile, which costs the device no memory.
+        let (band, rows) = (ModelArray::Sh.parameters(0), 0..self.rows);
+        let own = self.parameters_of(&band, rows.clone())?;
+        let painted: Vec<f32> = colours.as_flattened().iter().copied().map(rgb_to_dc).collect();
+        self.set_parameters(&band, rows.clone(), &painted)?;
+        let made = self.render(camera, background, 0);
+        // If that fails the device has: it takes no step with these colours.
+        self.set_parameters(&band, rows, &own)?;
+        made
     }
 }

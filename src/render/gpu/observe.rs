@@ -12,7 +12,7 @@ use super::frame::Frame;
 use super::passes::{Search, Shape};
 use super::rows::GRADIENT;
 use super::sizes::OPS_BYTES;
-use crate::candidates::{Shown, ranked};
+use crate::candidates::{Photograph, ranked};
 use crate::pixel_map::{draw_pixels, pixel_map, radius_px};
 use crate::{AuxInput, AuxOutput, BackendError, assert_same_size};
 
@@ -23,7 +23,7 @@ const FOLD: f32 = 0.849_321_8;
 pub(super) struct DrawnView<'a> {
     pub(super) frame: Frame,
     pub(super) shape: Shape,
-    pub(super) shown: Shown<'a>,
+    pub(super) photograph: Photograph<'a>,
 }
 
 impl GpuBackend {
@@ -127,8 +127,8 @@ impl GpuBackend {
         pixels: &[(usize, usize, f32)],
         mode: DepthMode,
     ) -> Result<Vec<Candidate>, BackendError> {
-        let DrawnView { frame, shape, shown } = drawn;
-        let colour = shown.colours();
+        let DrawnView { frame, shape, photograph } = drawn;
+        let colour = photograph.scene_colours();
         let [width, ..] = frame.image;
         let focal = 0.5 * (frame.lens[0] + frame.lens[1]);
         let which = u32::from(mode == DepthMode::Median);
@@ -174,8 +174,8 @@ impl GpuBackend {
         })?;
         let loss = state.output().loss;
         let image = self.rendering(camera.width, camera.height)?;
-        let shown = Shown { target, background, exposure };
-        let drawn = DrawnView { frame, shape, shown };
+        let photograph = Photograph { target, background, exposure };
+        let drawn = DrawnView { frame, shape, photograph };
         let points = if request.points == 0 {
             Vec::new()
         } else {

@@ -39,7 +39,7 @@ impl GpuBackend {
         let signals = self.planes.kept().into_iter().map(|(name, _)| format!("{SIGNAL}{name}"));
         let mut arrays: Vec<StateArray> = buffers.chain(signals).map(StateArray::of_rows).collect();
         arrays.push(StateArray::small(WAITS));
-        if self.candidates.is_wanted() {
+        if self.candidates.is_requested() {
             arrays.push(StateArray::small(CANDIDATES));
         }
         arrays
@@ -83,7 +83,7 @@ impl GpuBackend {
             let waits = tensor.into_u8(&[2])?;
             let [main, rest] = [0, 1].map(|i| waits[i] != 0);
             self.waiting = super::Waiting { main, rest };
-        } else if name == CANDIDATES && self.candidates.is_wanted() {
+        } else if name == CANDIDATES && self.candidates.is_requested() {
             self.candidates.restore(tensor)?;
         } else if let Some(plane) = self.signal(&name) {
             let values = tensor.into_f32(&[rows.len()])?;

@@ -8,7 +8,7 @@ use super::frame::{due, target as of_target};
 use super::observe::DrawnView;
 use super::passes::{Passes, Recorder};
 use super::{GpuBackend, Waiting};
-use crate::candidates::{Shown, error_weights};
+use crate::candidates::{Photograph, error_weights};
 use crate::pixel_map::edge_weights;
 use crate::signals::Field;
 use crate::{BackendError, StepInput, StepOutput, assert_same_size};
@@ -83,8 +83,8 @@ impl GpuBackend {
                     passes.worst(to, search);
                 }
             })?;
-            let shown = Shown { target, background, exposure };
-            let drawn = DrawnView { frame, shape, shown };
+            let photograph = Photograph { target, background, exposure };
+            let drawn = DrawnView { frame, shape, photograph };
             self.collect_candidates(&drawn, &request, count, search)?;
             self.go_on(shape, step);
             state

@@ -4,7 +4,6 @@ use super::exposure::SUMS;
 use super::frame::{Frame, State};
 use super::passes::{Passes, Recorder, Shape};
 use super::{GpuBackend, readback};
-use crate::Accumulation;
 use crate::BackendError;
 
 impl GpuBackend {
@@ -79,15 +78,9 @@ impl GpuBackend {
 
     /// That the driver has not gone through all splats of a tile.
     fn broken_off(&self) -> BackendError {
-        let remedy = match self.device.accumulation {
-            Accumulation::Slots => "",
-            _ => "; --knob accumulation=slots goes through more",
-        };
-        BackendError::Device {
+        BackendError::LoopCut {
             device: self.device.summary.name.clone(),
-            why: format!(
-                "its driver ends loops before they have gone through the Gaussians of a tile{remedy}"
-            ),
+            accumulation: self.device.accumulation,
         }
     }
 }

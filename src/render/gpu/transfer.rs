@@ -173,7 +173,7 @@ impl GpuBackend {
         for rows in pieces(self.rows) {
             let values = self.parameters_of(&attribute.parameters, rows.clone())?;
             for (to, from) in column[width * rows.start..].iter_mut().zip(values) {
-                *to = (attribute.shown)(from);
+                *to = (attribute.convert)(from);
             }
         }
         Ok(())

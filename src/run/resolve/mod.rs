@@ -28,6 +28,7 @@ use super::observer::Observer;
 use super::spec::{RunSpec, StartSpec};
 use super::start::size_of_model;
 use super::values::{Budget, InitChoice, ShDegree, Threads};
+use crate::device::describe;
 use crate::failure::Failure;
 use crate::knobs::Knobs;
 use degree::Degree;
@@ -343,7 +344,7 @@ fn open(spec: &RunSpec, knobs: &mut Knobs, observer: &dyn Observer) -> Result<De
         (false, given) => given,
     };
     let device = Device::open(spec.device.backend, spec.device.gpu.as_deref(), accumulation)?;
-    observer.say(format_args!("device   {}", device.describe()));
+    observer.say(format_args!("device   {}", describe(&device)));
     check_knobs(knobs, device.kind())?;
     if let Some(taken) = device.accumulation() {
         knobs

@@ -6,7 +6,7 @@ use std::process::{Command, Output, Stdio};
 use std::str::FromStr;
 
 use densify_core::camera::Camera;
-use densify_core::camera_path::{self, FlightError, SavedFlight};
+use densify_core::camera_path::{self, CameraPathError, SavedCameraPath};
 use densify_core::files::{OutputError, one_line, write_atomically};
 use densify_core::memory::Bytes;
 use densify_data::dataset::normalise::Normalisation;
@@ -90,7 +90,7 @@ impl From<Opened> for FilmSource {
 pub enum FilmError {
     /// The file of the camera path is not one.
     #[error("{0}")]
-    Path(#[from] FlightError),
+    Path(#[from] CameraPathError),
     /// Neither the file nor a dataset says how large a frame is.
     #[error("the file does not say how large a frame is")]
     NoSize,
@@ -206,7 +206,7 @@ impl Film {
     ) -> Result<Self, FilmError> {
         let FilmSource { mut backend, sh_degree, background, normalisation, cameras } = source;
         let first = cameras.first().map(|first| (first.width, first.height));
-        let own = |flight| SavedFlight { flight, frames: FRAMES, fps: None, size: None };
+        let own = |path| SavedCameraPath { path, frames: FRAMES, fps: None, size: None };
         let (saved, in_world) = match route {
             CameraRoute::Orbit => (own(camera_path::orbit(&cameras)), false),
             CameraRoute::Spiral => (own(camera_path::spiral(&cameras)), false),
@@ -219,7 +219,7 @@ impl Film {
         let mut video = options.video.map(|path| Video::new(path, size, fps)).transpose()?;
         let mut pictures = PictureFolder::new(folder, channels, &normalisation);
         for frame in 0..frames {
-            let mut camera = saved.flight.frame(frame, frames).camera(size);
+            let mut camera = saved.path.frame(frame, frames).camera(size);
             if in_world {
                 camera = normalisation.scene_from_world_camera(&camera);
             }

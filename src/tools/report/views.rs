@@ -160,9 +160,9 @@ impl Eye {
         let cameras: Vec<Camera> = views.iter().map(|view| view.camera).collect();
         let Some(first) = cameras.first() else { return Ok(Vec::new()) };
         let (width, height) = within((first.width, first.height), FRAME);
-        let flight = orbit(&cameras);
+        let path = orbit(&cameras);
         let mut frame = |at: u32| {
-            let camera = flight.frame(at, FRAMES).camera((width, height));
+            let camera = path.frame(at, FRAMES).camera((width, height));
             let rendering = self.backend.render(&camera, self.background, self.degree)?;
             Embedded::jpeg(&picture(&rendering), FRAME_QUALITY)
         };

@@ -6,7 +6,7 @@ use super::http::Answer;
 use super::kinds::Kind;
 use super::stage::Extent;
 use densify_core::camera_path;
-use densify_core::camera_path::Key;
+use densify_core::camera_path::Keyframe;
 use densify_train::evaluate::Split;
 
 /// Longest side of a picture `[px]`.
@@ -71,7 +71,7 @@ pub(super) struct Wanted {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Viewpoint {
     /// Anywhere, in the dataset's own coordinates.
-    Free(Key),
+    Free(Keyframe),
     /// The camera of a view.
     View(Split, usize),
 }
@@ -123,8 +123,8 @@ fn check(asked: Asked, extent: &Extent) -> Result<Wanted, String> {
     Ok(Wanted { owner: (page, place), kind, model, size, is_moving, from })
 }
 
-fn key(camera: &AskedCamera, extent: &Extent) -> Result<Key, String> {
-    let key = camera_path::key(&camera.camera_to_world, camera.fov)?;
+fn key(camera: &AskedCamera, extent: &Extent) -> Result<Keyframe, String> {
+    let key = camera_path::parse_keyframe(&camera.camera_to_world, camera.fov)?;
     if !FIELDS.contains(&camera.fov) {
         let (least, most) = (FIELDS.start(), FIELDS.end());
         return Err(format!("fov is {}; {least} to {most} degrees can be shown", camera.fov));

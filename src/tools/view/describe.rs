@@ -90,7 +90,8 @@ fn all_but_points(stage: &Stage) -> Value {
     let (up, pivot) = match cameras.is_empty() {
         true => (UP, DVec3::ZERO),
         false => {
-            let camera_path::Bearings { up, focus, looks_inward } = camera_path::bearings(&cameras);
+            let camera_path::Orientation { up, focus, looks_inward } =
+                camera_path::orientation(&cameras);
             let ahead = first.map_or(DVec3::ZERO, |camera| camera.centre() + camera.forward());
             (up, if looks_inward { focus } else { ahead })
         }
@@ -123,7 +124,7 @@ fn all_but_points(stage: &Stage) -> Value {
 mod tests {
     use super::*;
     use crate::open::stage_of_one_view;
-    use densify_core::camera_path::Key;
+    use densify_core::camera_path::Keyframe;
 
     #[test]
     fn points_take_no_more_than_they_may() {
@@ -153,13 +154,17 @@ mod tests {
 
     #[test]
     fn a_camera_is_said_as_a_camera_path_has_it() {
-        let key =
-            Key::looking_at(DVec3::new(1.0, 2.0, 3.0), DVec3::new(-4.0, 0.5, 9.0), DVec3::Z, 0.8);
+        let key = Keyframe::looking_at(
+            DVec3::new(1.0, 2.0, 3.0),
+            DVec3::new(-4.0, 0.5, 9.0),
+            DVec3::Z,
+            0.8,
+        );
         let said = pose(&key.camera((300, 200)));
         let numbers: Vec<f64> = serde_json::from_value(said["camera_to_world"].clone()).unwrap();
-        let back = camera_path::key(&numbers, said["fov"].as_f64().unwrap()).unwrap();
+        let back = camera_path::parse_keyframe(&numbers, said["fov"].as_f64().unwrap()).unwrap();
         assert!((back.centre - key.centre).length() < 1e-9);
-        assert!(back.turn.dot(key.turn).abs() > 1.0 - 1e-12);
+        assert!(back.world_from_camera.dot(key.world_from_camera).abs() > 1.0 - 1e-12);
         assert!((back.fov_y - key.fov_y).abs() < 1e-12);
     }
 }

@@ -9,6 +9,7 @@ use densify_policies::policy::{Cadence, LossTerms, Needs, Signal, SignalSet};
 use super::stage::{Shown, Stage};
 use densify_data::views::ViewSource;
 use densify_render::{Backend, LearningRates, StepInput};
+use densify_run::failure::Failure;
 use densify_train::evaluate::Split;
 use densify_train::schedule::view_order;
 
@@ -37,11 +38,10 @@ impl std::fmt::Debug for Measured {
 
 impl Measured {
     /// Nothing yet, of the model in this backend.
-    pub(super) fn new(stage: &Stage, shown: &Shown, model: &dyn Backend) -> Result<Self, String> {
+    pub(super) fn new(stage: &Stage, shown: &Shown, model: &dyn Backend) -> Result<Self, Failure> {
         let needs = Needs { signals: SIGNALS.into(), ..Needs::default() };
-        let model = model.download().map_err(|error| error.to_string())?;
-        let backend = stage.machine.backend_to_measure(&model, shown.near, needs);
-        let mut backend = backend.map_err(|error| error.to_string())?;
+        let model = model.download()?;
+        let mut backend = stage.machine.backend_to_measure(&model, shown.near, needs)?;
         backend.begin_epoch();
         let (views, rows) = (stage.photographs(Split::Train).count(), model.len());
         Ok(Self {
@@ -64,13 +64,13 @@ impl Measured {
         stage: &Stage,
         sh_degree: u8,
         patience: Duration,
-    ) -> Result<(), String> {
+    ) -> Result<(), Failure> {
         let Some(backend) = &mut self.backend else { return Ok(()) };
         let (begun, views) = (Instant::now(), stage.photographs(Split::Train));
         while let Some(&view) = self.order.get(self.seen) {
             let ahead = &self.order[self.seen + 1..self.order.len().min(self.seen + 3)];
             views.prefetch(ahead);
-            let image = views.image(view).map_err(|error| error.to_string())?;
+            let image = views.image(view).map_err(Failure::input)?;
             let input = StepInput {
                 step: self.seen as u32 + 1,
                 view,
@@ -85,14 +85,13 @@ impl Measured {
                 cadence: Cadence::default(),
                 seed: 0,
             };
-            backend.train_step(&input).map_err(|error| error.to_string())?;
+            backend.train_step(&input)?;
             self.seen += 1;
             if begun.elapsed() >= patience {
                 break;
             }
         }
-        let taken = backend.take_signals(SignalSet::from(SIGNALS));
-        let taken = taken.map_err(|error| error.to_string())?;
+        let taken = backend.take_signals(SignalSet::from(SIGNALS))?;
         let of = |signal| taken.get(signal).unwrap_or_default();
         self.gradient = mean_over_views(of(Signal::ScreenGradient), of(Signal::VisibleCount));
         self.weight = of(Signal::WeightMax).to_vec();

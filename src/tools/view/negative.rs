@@ -12,6 +12,7 @@ use super::measured::Measured;
 use super::paint::{self, Colours, Known, colours};
 use super::stage::{Shown, Stage};
 use densify_render::{Backend, Rendering};
+use densify_run::failure::Failure;
 use densify_train::checkpoint::{Checkpoint, CheckpointError};
 use densify_train::trainer::RowHistory;
 
@@ -68,11 +69,11 @@ pub(super) fn expose(
         let shown = &stage.models[wanted.model];
         let measured = match measured {
             Some(measured) => measured,
-            None => measured.insert(Measured::new(stage, shown, backend).map_err(Unmade::Failed)?),
+            None => measured.insert(Measured::new(stage, shown, backend).map_err(failed)?),
         };
         // Who moves sees what is known.
         if !wanted.is_moving || measured.progress()[0] == 0 {
-            measured.go_on(stage, shown.sh_degree, PATIENCE).map_err(Unmade::Failed)?;
+            measured.go_on(stage, shown.sh_degree, PATIENCE).map_err(failed)?;
         }
         progress = Some(measured.progress());
     }
@@ -142,16 +143,18 @@ fn rendered(
     let camera = camera(stage, wanted);
     let rendering = match (wanted.kind, painted) {
         (Kind::Photograph, _) => return Ok(Negative::default()),
-        (_, Some(colours)) => backend.render_painted(&camera, paint::BACKGROUND, &colours.rows),
-        (Kind::Count, _) => backend.render_counts(&camera),
+        (_, Some(colours)) => backend
+            .inspect()
+            .and_then(|inspect| inspect.render_painted(&camera, paint::BACKGROUND, &colours.rows)),
+        (Kind::Count, _) => backend.inspect().and_then(|inspect| inspect.render_counts(&camera)),
         _ => backend.render(&camera, stage.background, stage.models[wanted.model].sh_degree),
     };
     let range = painted.and_then(|colours| colours.range.clone());
     Ok(Negative { rendering: rendering.map_err(failed)?, range, ..Negative::default() })
 }
 
-fn failed(error: impl std::fmt::Display) -> Unmade {
-    Unmade::Failed(error.to_string())
+fn failed(error: impl Into<Failure>) -> Unmade {
+    Unmade::Failed(error.into().message)
 }
 
 fn milliseconds(since: Instant) -> f64 {

@@ -7,7 +7,7 @@ use glam::{DMat3, DVec3};
 use super::kinds::Kind;
 use super::stage::{Exhibition, NO_MODEL, Shown, Stage};
 use densify_core::camera::Camera;
-use densify_core::camera_path::Key;
+use densify_core::camera_path::Keyframe;
 use densify_core::gaussians::{Gaussians, logit};
 use densify_data::dataset::normalise::{EXTENT, Normalisation};
 use densify_data::dataset::{Dataset, PointCloud, builtin};
@@ -190,7 +190,7 @@ fn without_cameras(
     // A little from above, y pointing down as structure from motion has it.
     let turn = DMat3::from_rotation_x(-0.25);
     let centre = turn * DVec3::new(0.0, 0.0, -2.5);
-    let key = Key::looking_at(centre, DVec3::ZERO, DVec3::NEG_Y, FOV);
+    let key = Keyframe::looking_at(centre, DVec3::ZERO, DVec3::NEG_Y, FOV);
     let camera: Camera = key.camera((1024, 768));
     stage.start = Some(camera);
     Ok(Exhibition { stage, backends: Vec::new() })

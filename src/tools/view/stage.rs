@@ -83,8 +83,8 @@ pub(super) struct Extent {
 
 impl Exhibition {
     /// Adds a model with what renders it.
-    pub(super) fn add(&mut self, shown: Shown, backend: Box<dyn Backend>) {
-        if !backend.counts_rows() {
+    pub(super) fn add(&mut self, shown: Shown, mut backend: Box<dyn Backend>) {
+        if !counts_rows(&mut *backend) {
             self.stage.lacks(&[Kind::Count], NO_COUNTS);
         }
         if shown.checkpoint.is_none() {
@@ -151,7 +151,7 @@ impl Stage {
 
     /// A run in training: rendered by what trains it, and in no larger pictures.
     pub(super) fn of_run(run: &mut Run) -> Self {
-        let counts = run.trainer().backend().counts_rows();
+        let counts = counts_rows(run.trainer().backend());
         let (rows, signals) = (run.trainer().rows(), run.trainer().signals());
         let points = run.take_points();
         let (config, dataset) = (run.config(), run.dataset());
@@ -208,4 +208,8 @@ impl Stage {
     pub(super) fn photographs(&self, split: Split) -> &DatasetViews {
         &self.photographs[split as usize]
     }
+}
+
+fn counts_rows(backend: &mut dyn Backend) -> bool {
+    backend.inspect().is_ok_and(|inspect| inspect.counts_rows())
 }

@@ -84,8 +84,9 @@ pub fn initialise(
         report.over_budget = chosen.len() - budget;
         schedule::draw(&mut chosen, budget, &mut ChaCha8Rng::seed_from_u64(seed));
     }
-    chosen
-        .sort_unstable_by_key(|&i| (densify_core::curve::place(points.positions[i].to_array()), i));
+    chosen.sort_unstable_by_key(|&i| {
+        (densify_core::curve::morton_code(points.positions[i].to_array()), i)
+    });
     report.rows = chosen.len();
 
     let positions: Vec<[f64; 3]> = chosen.iter().map(|&i| points.positions[i].to_array()).collect();

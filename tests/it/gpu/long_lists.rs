@@ -4,7 +4,8 @@
 use densify::core::camera::Camera;
 use densify::core::gaussians::Gaussians;
 use densify::render::gpu::GpuDevice;
-use densify::render::{Accumulation, BackendError, ImageGradient, Shortcuts};
+use densify::render::{Accumulation, ImageGradient, Shortcuts};
+use densify::run::failure::Failure;
 
 use crate::subject::{GREY, class, make_with, ways};
 use densify::selftest::compare::{Table, relative_error};
@@ -38,7 +39,7 @@ fn backend(model: &Gaussians, device: &GpuDevice) -> Box<dyn Differentiable> {
 }
 
 /// Holds that a driver that breaks off is found out, and that llvmpipe, which does, is.
-fn is_broken_off<T>(result: &Result<T, BackendError>, device: &GpuDevice, more: bool) -> bool {
+fn is_broken_off<T>(result: &Result<T, Failure>, device: &GpuDevice, more: bool) -> bool {
     let Err(error) = result else {
         let breaks_off = device.adapter().name.contains("llvmpipe");
         assert!(!breaks_off, "{} has gone through all of them", name(device));
@@ -58,7 +59,7 @@ fn a_list_too_long_to_be_drawn_is_an_error() {
     let model = pile(300_000, &camera);
     let expected = faint(&Subject::NATIVE, &model).render(&camera, GREY, 0).expect("a small image");
     for device in ways() {
-        let found = backend(&model, device).render(&camera, GREY, 0);
+        let found = backend(&model, device).render(&camera, GREY, 0).map_err(Failure::from);
         let more = device.accumulation() != Accumulation::Slots;
         if !is_broken_off(&found, device, more) {
             let mut table = Table::new(&format!("300,000 rows in a tile, {}", name(device)));
@@ -84,6 +85,7 @@ fn a_list_too_long_to_be_differentiated_is_an_error() {
         .expect("a small image");
     for device in ways() {
         let found = backend(&model, device).differentiate(&camera, GREY, 0, &upstream);
+        let found = found.map_err(Failure::from);
         if device.accumulation() != Accumulation::Slots && is_broken_off(&found, device, true) {
             continue;
         }

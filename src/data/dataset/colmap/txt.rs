@@ -51,7 +51,7 @@ impl<'a> Lines<'a> {
         let read = (&mut self.input).take(MAX_LINE).read_until(b'\n', &mut self.line);
         let read = read.map_err(DatasetError::io(self.path))?;
         if self.number == 1 {
-            if let Some(problem) = files::mistaken(&self.line) {
+            if let Some(problem) = files::wrong_kind(&self.line) {
                 return Err(self.fault("the file", problem));
             }
             if self.line.starts_with("\u{feff}".as_bytes()) {

@@ -3,19 +3,19 @@
 //!
 //! SSIM is written in terms of the difference e = x − y, by an exact identity:
 //! SSIM = (1 − μₑ²/A)·(1 − Var(e)/B), A = μₓ² + μᵧ² + C₁, B = Var(x) + Var(y) + C₂.
-//! Where the images agree it is 1 to the last bit; the usual form is off by up to 4e-7 there, and
+//! Where the images agree it is exactly 1; the usual form is off by up to 4e-7 there, and
 //! its gradient is noise. The identity holds for any linear window, also where zero padding takes
 //! part of the window's weight. Var(x) + Var(y) is 2·Cov(x, y) + Var(e), so that four means under the
 //! window are enough: of e, y, e² and x·y.
 //!
-//! Variances do not change when a constant is taken from y, if it is taken from the padding, too. With
-//! y − ½ they lose two bits less to rounding.
+//! Subtracting a constant from y, padding included, leaves the variances unchanged. With y − ½ they lose two bits
+//! less to rounding.
 //!
 //! The file is one piece because the passes share their planes and their strips. Each pass runs over
-//! strips of rows, which write nothing that others of the same pass read. Rows of the image are
-//! convolved vertically straight from the planes, into a few lines that stay in the cache, and these
-//! horizontally: nothing is computed twice, however the image is cut. How the pixels of a line are arranged
-//! for that, [`Segments`] says.
+//! strips of image rows that write nothing that other strips of the pass read. Image rows are
+//! convolved vertically from the planes into a few lines that stay in the cache, and then
+//! horizontally; nothing is computed twice, whatever the division into strips. [`Segments`] documents the
+//! arrangement of a line's pixels.
 
 mod pixel_weights;
 mod window;
@@ -41,34 +41,34 @@ const C1: f32 = 0.01 * 0.01;
 const C2: f32 = 0.03 * 0.03;
 /// Weight of 1 − SSIM; L1 has the rest.
 const SSIM_WEIGHT: f32 = 0.2;
-/// What is taken from y.
+/// The constant subtracted from y.
 const MIDDLE: f32 = 0.5;
 /// Rows per strip where tiles are written: a row of tiles.
 const STRIP: usize = TILE;
 /// Rows per strip elsewhere.
 const SHORT_STRIP: usize = TOGETHER;
-/// Lines that are convolved vertically for each row: of e, y, e² and x·y.
+/// Lines convolved vertically per image row: e, y, e² and x·y.
 const CONVOLVED: usize = 4;
-/// Lines of scratch of a pass, at most: those, and what is outside the image of e and of y.
-const MOST_LINES: usize = CONVOLVED * TOGETHER + 2;
+/// The most scratch lines of a pass: the convolved ones, and one each for e and y outside the image.
+const MAX_LINES: usize = CONVOLVED * TOGETHER + 2;
 
-/// Planes of image size that the loss keeps between its passes: e, y − ½, and three derivatives.
+/// The buffers of the loss.
 #[derive(Debug)]
 pub(super) struct LossBuffers {
-    /// Shape: `[rows, pitch]` each.
+    /// e, y − ½, and three derivatives. Shape: `[rows, pitch]` each.
     planes: [Vec<[f32; WIDTH]>; 5],
-    /// Errors per pixel, the mean over channels, if asked for. Same shape.
+    /// Errors per pixel, means over the channels, if requested. Same shape.
     errors: [Vec<[f32; WIDTH]>; 2],
     segments: Segments,
     weights: PixelWeights,
 }
 
-/// What of a loss is asked for.
+/// The optional results of a loss.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct ImageTerms {
-    /// Weights of |e| and of 1 − SSIM in the error of each pixel, if that is asked for.
+    /// Weights of |e| and 1 − SSIM in the error of each pixel, if that is requested.
     pub(super) error: Option<[f32; 2]>,
-    /// Whether an error of each pixel goes to the last plane of the gradient, weighed like this.
+    /// The score of the pixel errors to write to the last plane of the gradient, if requested.
     pub(super) by_pixel: Option<ErrorScore>,
 }
 
@@ -86,7 +86,7 @@ impl LossValue {
 }
 
 impl LossBuffers {
-    /// Bytes for an image of this size, and for the strips of so many threads.
+    /// Bytes for an image of the given size, and for the scratch memory of `threads` threads.
     pub(super) fn bytes(
         width: usize,
         height: usize,
@@ -96,7 +96,7 @@ impl LossBuffers {
         let segments = Segments::of(width);
         let weights = by_pixel.map_or(0, |score| PixelWeights::bytes(width * height, &score));
         let planes = (6 + usize::from(by_pixel.is_some())) * segments.pitch() * WIDTH * height;
-        let lines = threads * MOST_LINES * segments.padded() * WIDTH;
+        let lines = threads * MAX_LINES * segments.padded() * WIDTH;
         ((planes + lines) * size_of::<f32>()) as u64 + weights
     }
 
@@ -109,13 +109,16 @@ impl LossBuffers {
         }
     }
 
-    /// Makes room for an image; returns the vectors of its planes. Images of one size, or smaller ones,
-    /// allocate nothing more. What is there is left: clearing it would be work for one thread, and all of
-    /// it is written before it is read.
-    fn resize(&mut self, grid: &Grid, asked: [bool; 2]) -> usize {
+    /// Makes room for an image and returns the number of vectors per plane. Only a larger image allocates. Old contents
+    /// are not cleared, which would be serial work; everything is written before it is read.
+    fn resize(&mut self, grid: &Grid, requested: [bool; 2]) -> usize {
         self.segments = Segments::of(grid.width);
         let vectors = self.segments.pitch() * grid.height;
-        let errors = self.errors.iter_mut().zip(asked).filter_map(|(e, asked)| asked.then_some(e));
+        let errors = self
+            .errors
+            .iter_mut()
+            .zip(requested)
+            .filter_map(|(e, requested)| requested.then_some(e));
         for plane in self.planes.iter_mut().chain(errors) {
             if plane.len() < vectors {
                 plane.resize(vectors, [0.0; WIDTH]);
@@ -124,9 +127,8 @@ impl LossBuffers {
         vectors
     }
 
-    /// Computes the loss of `canvas` against `target`, and dL/dpixel into `gradient`; with weights
-    /// also the error of each pixel, as the mean over channels of their combination of |e| and
-    /// 1 − SSIM.
+    /// Computes the loss of `canvas` against `target`, writes dL/dpixel to `gradient`, and computes the error of each
+    /// pixel that `terms` requests: the mean over channels of a weighted sum of |e| and 1 − SSIM.
     #[expect(clippy::too_many_arguments, reason = "a kernel: each is a buffer of its own")]
     pub(super) fn run(
         &mut self,
@@ -140,15 +142,15 @@ impl LossBuffers {
         terms: ImageTerms,
     ) -> LossValue {
         let ImageTerms { error: error_weights, by_pixel } = terms;
-        let asked = [error_weights.is_some(), by_pixel.is_some()];
-        let vectors = self.resize(grid, asked);
+        let requested = [error_weights.is_some(), by_pixel.is_some()];
+        let vectors = self.resize(grid, requested);
         let Self { planes, errors, segments, .. } = self;
         let segments = *segments;
         let [e, y, p1, p2, p3] = planes.each_mut().map(|plane| &mut plane[..vectors]);
         let [ranking, errors_by_pixel] = errors;
-        // Of those that are not asked for, nothing.
-        let ranking = &mut ranking[..if asked[0] { vectors } else { 0 }];
-        let errors_by_pixel = &mut errors_by_pixel[..if asked[1] { vectors } else { 0 }];
+        // Empty unless requested.
+        let ranking = &mut ranking[..if requested[0] { vectors } else { 0 }];
+        let errors_by_pixel = &mut errors_by_pixel[..if requested[1] { vectors } else { 0 }];
         let by_map = by_pixel.map(|score| score.map.weights());
         let error_weights = [error_weights, by_map].map(Option::unwrap_or_default);
         let short = SHORT_STRIP * segments.pitch();
@@ -216,7 +218,7 @@ impl LossBuffers {
         LossValue { l1: l1 / samples, ssim: ssim / samples }
     }
 
-    /// Writes the second error to the last plane of the gradient, as rows are scored by it.
+    /// Writes the second error, weighted by `score`, to the last plane of the gradient.
     fn spread_over_tiles(
         &self,
         threads: &Threads,
@@ -242,16 +244,16 @@ impl LossBuffers {
         });
     }
 
-    /// Error of a pixel after a run with error weights.
+    /// The error of a pixel after a run with error weights.
     pub(super) fn error_at(&self, x: usize, y: usize) -> f32 {
         let [vector, lane] = self.segments.place(x);
         self.segments.line(&self.errors[0], y)[vector][lane]
     }
 }
 
-/// Multiplies a line by the weights of a mask's row.
+/// Multiplies a line by a row of the mask.
 #[inline(always)]
-fn masked(line: &mut [f32], mask: &[u8]) {
+fn apply_mask(line: &mut [f32], mask: &[u8]) {
     for (x, &m) in line.iter_mut().zip(mask) {
         *x *= f32::from(m) * (1.0 / 255.0);
     }
@@ -267,8 +269,8 @@ struct Source<'a> {
     channel: usize,
 }
 
-/// The planes' lines of one strip of one channel: e = rendering − target, 0 where masked, and y − ½ of the
-/// target; right of the image as outside of it.
+/// Computes the lines of e and y − ½ in one strip of one channel, where e = rendering − target, 0 where masked. The
+/// padding to the right has the values of pixels outside the image.
 struct Lines<'a> {
     source: Source<'a>,
     segments: Segments,
@@ -282,7 +284,7 @@ struct Lines<'a> {
 impl WithSimd for Lines<'_> {
     type Output = ();
 
-    /// Plain loops, which the compiler turns into vectors of the dispatched instruction set.
+    /// Scalar loops, which the compiler vectorises for the dispatched instruction set.
     #[inline(always)]
     fn with_simd<S: Simd>(self, _: S) {
         let Self { source, segments, first, scratch, e: to_e, y: to_y } = self;
@@ -315,7 +317,7 @@ impl WithSimd for Lines<'_> {
             e[width..].fill(0.0);
             y[width..].fill(-MIDDLE);
             if let Some(mask) = &target.mask {
-                masked(&mut e[..width], &mask[pixels]);
+                apply_mask(&mut e[..width], &mask[pixels]);
             }
             segments.arrange(e, &mut to_e[..length]);
             segments.arrange(y, &mut to_y[..length]);
@@ -323,7 +325,7 @@ impl WithSimd for Lines<'_> {
     }
 }
 
-/// `A` lines of scratch, and `B` padded ones for each of some rows.
+/// `A` scratch lines, and `B` padded ones for each of [`TOGETHER`] rows.
 fn scratch_lines<const A: usize, const B: usize>(
     scratch: &mut Vec<[f32; WIDTH]>,
     segments: Segments,
@@ -350,11 +352,11 @@ struct Similarity<'a> {
     y: &'a Line,
     /// The strip's lines.
     derivatives: [&'a mut Line; 3],
-    /// The strip's lines; empty unless asked for.
+    /// The strip's lines; empty unless requested.
     errors: [&'a mut Line; 2],
-    /// Weights of |e| and of 1 − SSIM in each of them.
+    /// Weights of |e| and 1 − SSIM in each error.
     error_weights: [[f32; 2]; 2],
-    /// Whether errors are written, not added.
+    /// Whether errors are written instead of added.
     first_channel: bool,
 }
 
@@ -379,7 +381,7 @@ impl WithSimd for Similarity<'_> {
             if row % TOGETHER == 0 {
                 let near_e = Near::new(segments, e, no_e, first + row);
                 let near_y = Near::new(segments, y, no_y, first + row);
-                // One after the other: all four sums of four rows would not stay in the registers.
+                // In two calls, as all four sums of four rows would not fit into the registers.
                 vertical_with_square(s, &near_e, [&mut of_e, &mut of_ee]);
                 vertical_with_product(s, [&near_y, &near_e], [&mut of_y, &mut of_xy]);
                 for row in 0..TOGETHER {
@@ -404,7 +406,7 @@ impl WithSimd for Similarity<'_> {
                     });
                     for n in 0..2 {
                         let means = [mu_e[n], mu_y[n], ee[n], xy[n]];
-                        let Similar { ssim, by_mu_e, by_ee, by_ey } = Similar::of(s, means);
+                        let Similar { ssim, by_mu_e, by_ee, by_ey } = Similar::new(s, means);
                         let i = 2 * pair + n;
                         let inside = (V::load(s, &firsts[lane..]) + i as f32).lt(width);
                         inside.keep(by_mu_e).store(&mut p1[n][lane..]);
@@ -418,9 +420,10 @@ impl WithSimd for Similarity<'_> {
                             if let Some(error) = error.get_mut(here + i) {
                                 let dssim = inside.keep(V::splat(s, 1.0) - ssim);
                                 let add = abs * by_abs + dssim * by_dssim;
-                                let sum = match first_channel {
-                                    true => add,
-                                    false => V::load(s, &error[lane..]) + add,
+                                let sum = if first_channel {
+                                    add
+                                } else {
+                                    V::load(s, &error[lane..]) + add
                                 };
                                 sum.store(&mut error[lane..]);
                             }
@@ -444,16 +447,16 @@ struct Similar<S: Simd> {
 }
 
 impl<S: Simd> Similar<S> {
-    /// From μₑ, the mean of y − ½, and those of e² and (x − ½)·(y − ½).
+    /// Computes them from the means of e, y − ½, e² and (x − ½)·(y − ½).
     #[inline(always)]
-    fn of(s: S, [mu_e, middle, mean_ee, mean_xy]: [V<S>; 4]) -> Self {
+    fn new(s: S, [mu_e, middle, mean_ee, mean_xy]: [V<S>; 4]) -> Self {
         let c = |x: f32| V::splat(s, x);
         let mu_y = middle + MIDDLE;
         let mu_x = mu_e + mu_y;
         let var_e = (mean_ee - mu_e * mu_e).max(V::zero(s));
         let cov = mean_xy - (middle + mu_e) * middle;
         let variances = (cov * 2.0 + var_e).max(V::zero(s));
-        // One division for both inverses: at least C₁·C₂ = 9e-8 is far from f32's least.
+        // One division for both inverses; the divisor is at least C₁·C₂ = 9e-8, far from underflow.
         let (a, b) = (mu_x * mu_x + mu_y * mu_y + C1, variances + C2);
         let inv_ab = c(1.0) / (a * b);
         let (inv_a, inv_b) = (inv_ab * b, inv_ab * a);
@@ -471,7 +474,7 @@ impl<S: Simd> Similar<S> {
     }
 }
 
-/// What the window reaches from some vectors of a padded line, from one on.
+/// The vectors of a padded line that the window covers, from vector `first` on.
 #[inline(always)]
 fn around<const M: usize>(line: &Line, first: usize) -> &[[f32; WIDTH]; M] {
     line[first..].first_chunk().expect("a padded line")
@@ -542,9 +545,9 @@ impl WithSimd for Gradient<'_> {
                 }
             }
             segments.restore(out, pixels);
-            // The loss sees e·mask, so the chain rule has the mask once more.
+            // The loss uses e·mask, so that the chain rule has the mask once more.
             if let Some(mask) = mask {
-                masked(pixels, &mask[(first + row) * grid.width..][..grid.width]);
+                apply_mask(pixels, &mask[(first + row) * grid.width..][..grid.width]);
             }
             for (tile, g) in tiles.iter_mut().zip(pixels.as_chunks::<TILE>().0) {
                 set_row_of_plane(&mut tile.planes[channel], row % TILE, g);

@@ -1,4 +1,4 @@
-//! Weights of pixels in the error that rows are scored by: a power of the error, more at edges.
+//! Weights of the pixel errors from which rows are scored: a power of the error, increased at edges.
 
 use densify_policies::policy::ErrorScore;
 use rayon::prelude::*;
@@ -8,24 +8,24 @@ use super::STRIP;
 use crate::pixel_map::{edge_at, edge_factor, luma_line};
 use densify_core::image::Image8;
 
-/// The edges of the image at hand, where they count.
+/// The edges of the current image, if they are used.
 #[derive(Debug, Default)]
 pub(super) struct PixelWeights {
-    /// Shape: `[height, width]` each.
+    /// Luma and edge strength. Shape: `[height, width]` each.
     luma: Vec<u8>,
     edges: Vec<u8>,
-    /// What an edge of 1 adds to the weight of a pixel.
+    /// The weight that one unit of edge strength adds to a pixel.
     per_edge: f32,
     width: usize,
 }
 
 impl PixelWeights {
-    /// Bytes for an image of so many pixels.
+    /// Bytes for an image of `pixels` pixels.
     pub(super) fn bytes(pixels: usize, score: &ErrorScore) -> u64 {
         if score.edge > 0.0 { 2 * pixels as u64 } else { 0 }
     }
 
-    /// Measures the edges of an image, if they count.
+    /// Measures the edges of an image, if they are used.
     pub(super) fn measure(
         &mut self,
         threads: &Threads,
@@ -64,7 +64,7 @@ impl PixelWeights {
         self.per_edge = edge_factor(score.edge, sums.iter().sum(), pixels);
     }
 
-    /// Makes errors of a line of pixels what rows are scored by.
+    /// Applies power and edge weights to the errors of an image row.
     pub(super) fn apply(&self, score: &ErrorScore, y: usize, line: &mut [f32]) {
         if !score.is_plain_map() {
             for error in &mut *line {
@@ -79,7 +79,7 @@ impl PixelWeights {
     }
 }
 
-/// x to a power, quickly where that is a small whole number.
+/// Raises x to a power, quickly if the power is 1, 2 or 4.
 fn power(x: f32, power: f32) -> f32 {
     match power {
         1.0 => x,

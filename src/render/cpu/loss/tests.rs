@@ -1,12 +1,11 @@
-//! Tests of the optional parts of the loss; the selftest compares its values and gradients with the
-//! reference.
+//! Tests of the optional results of the loss; the selftest compares values and gradients with the reference.
 
 use std::ops::Range;
 
 use super::super::tiles::Grid;
 use super::*;
 
-/// The scalars, dL/dpixel and each pixel's part of the loss, of an image with structure against another.
+/// The scalars, dL/dpixel and each pixel's part of the loss for two structured images.
 fn run(terms: ImageTerms, mask: bool) -> (LossValue, Vec<f32>, Vec<f32>) {
     run_in(&mut LossBuffers::new(), [37, 50], terms, mask)
 }
@@ -45,8 +44,7 @@ fn run_in(
     (value, of(0..3), of(4..5))
 }
 
-/// What else is asked for changes neither the loss nor its gradient, and each pixel's part of the loss is a
-/// part of it.
+/// Optional results change neither the loss nor its gradient, and the pixels' parts add up to the loss.
 #[test]
 fn parts_of_pixels_make_up_the_loss() {
     for mask in [false, true] {
@@ -62,8 +60,7 @@ fn parts_of_pixels_make_up_the_loss() {
     }
 }
 
-/// What images of other sizes, and steps that asked for other things, have left in the buffers is nothing to
-/// the next.
+/// Earlier images of other sizes, and steps with other results, do not affect the next.
 #[test]
 fn buffers_are_those_of_one_image() {
     let terms = ImageTerms { error: Some([0.3, 0.7]), by_pixel: Some(ErrorScore::default()) };

@@ -1,8 +1,8 @@
-//! The window of SSIM: down the columns for a few rows of the image together, then along the rows for a
-//! few vectors together. It is symmetric, so pairs are added first.
+//! The convolution with SSIM's window: vertically for a few image rows at a time, then horizontally for a
+//! few vectors at a time. The window is symmetric, so that pairs are added first.
 //!
-//! A line of the image is kept in sixteen segments side by side, one in each lane, so that the pixels left
-//! and right of a vector's are vectors, too, and no load is unaligned.
+//! A line is stored as sixteen segments side by side, one in each lane, so that the left and right neighbours of a
+//! vector's pixels are vectors too, and no load is unaligned.
 
 use glam::Mat4;
 use pulp::Simd;
@@ -25,15 +25,15 @@ const WINDOW: [f32; 2 * REACH + 1] = [
     0.007_598_758,
     0.001_028_380_2,
 ];
-/// Rows, or vectors of a row, that are convolved together: they share most of what is within their reach,
-/// so that it is loaded 3.5 times in all, not eleven. More would not stay in the registers.
+/// Rows, or vectors of a row, that are convolved together. They share most of their neighbours, which are loaded 3.5
+/// times instead of eleven. More would not fit into the registers.
 pub(super) const TOGETHER: usize = 4;
-/// Rows or vectors within reach of so many.
+/// Rows or vectors within reach of [`TOGETHER`] of them.
 const NEAR: usize = TOGETHER + 2 * REACH;
-/// Runs of pixels that a segment consists of.
+/// Pixels per run; a segment consists of whole runs.
 const RUN: usize = 4;
 
-/// How the pixels of a line are arranged: vector i has in lane l the pixel i of segment l.
+/// The arrangement of a line's pixels: lane l of vector i is pixel i of segment l.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Segments {
     /// Pixels of a segment.
@@ -41,14 +41,14 @@ pub(super) struct Segments {
 }
 
 impl Segments {
-    /// Of lines of so many pixels. Whole runs, and longer than the window reaches, so that it never
+    /// The segments of lines of `width` pixels. They are whole runs and longer than half the window, so that it never
     /// reaches beyond the next lane.
     pub(super) const fn of(width: usize) -> Self {
         let length = width.div_ceil(WIDTH).next_multiple_of(RUN);
         Self { length: if length < 2 * RUN { 2 * RUN } else { length } }
     }
 
-    /// Pixels of a segment, which are the vectors of a line.
+    /// Pixels per segment, which is also the number of vectors per line.
     pub(super) const fn length(self) -> usize {
         self.length
     }
@@ -58,8 +58,8 @@ impl Segments {
         self.length * WIDTH
     }
 
-    /// Vectors from a plane's line to the next: an odd number, as lines that are a power of two apart
-    /// drive each other out of the cache.
+    /// Vectors from one line of a plane to the next: an odd number, as lines at a distance of a power of two
+    /// evict each other from the cache.
     pub(super) const fn pitch(self) -> usize {
         self.length + 1
     }
@@ -69,7 +69,7 @@ impl Segments {
         &plane[row * self.pitch()..][..self.length]
     }
 
-    /// Vectors of a line that is convolved along the row: with those within reach of its ends.
+    /// Vectors of a line with padding at both ends, for horizontal convolution.
     pub(super) const fn padded(self) -> usize {
         self.length + 2 * REACH
     }
@@ -84,7 +84,7 @@ impl Segments {
         std::array::from_fn(|lane| (lane * self.length) as f32)
     }
 
-    /// From pixel after pixel to segments side by side. Both have [`stride`](Self::stride) numbers.
+    /// Arranges consecutive pixels in segments. Both have [`stride`](Self::stride) numbers.
     #[inline(always)]
     pub(super) fn arrange(self, pixels: &[f32], line: &mut Line) {
         for lane in (0..WIDTH).step_by(RUN) {
@@ -92,7 +92,7 @@ impl Segments {
             let segments = [segments(0), segments(1), segments(2), segments(3)];
             let segments = segments.map(|segment| segment.as_chunks::<RUN>().0);
             for (run, vectors) in line.as_chunks_mut::<RUN>().0.iter_mut().enumerate() {
-                let block = turned(segments.map(|segment| segment[run]));
+                let block = transposed(segments.map(|segment| segment[run]));
                 for (vector, part) in vectors.iter_mut().zip(block) {
                     vector[lane..lane + RUN].copy_from_slice(&part);
                 }
@@ -100,7 +100,7 @@ impl Segments {
         }
     }
 
-    /// The opposite of [`arrange`](Self::arrange).
+    /// The inverse of [`arrange`](Self::arrange).
     #[inline(always)]
     pub(super) fn restore(self, line: &Line, pixels: &mut [f32]) {
         let pixels = pixels.as_chunks_mut::<RUN>().0;
@@ -109,7 +109,7 @@ impl Segments {
             for (run, vectors) in line.as_chunks::<RUN>().0.iter().enumerate() {
                 let part =
                     |i: usize| -> [f32; RUN] { std::array::from_fn(|l| vectors[i][lane + l]) };
-                let block = turned([part(0), part(1), part(2), part(3)]);
+                let block = transposed([part(0), part(1), part(2), part(3)]);
                 for (l, part) in block.into_iter().enumerate() {
                     pixels[(lane + l) * runs + run] = part;
                 }
@@ -117,13 +117,13 @@ impl Segments {
         }
     }
 
-    /// Fills the vectors within reach of a padded line's ends: what stands in the next lane, and
-    /// `outside` beyond the line.
+    /// Fills the padding at both ends of a line: with the pixels of the neighbouring lane, and with `outside` beyond
+    /// the image.
     #[inline(always)]
     pub(super) fn pad(self, line: &mut Line, outside: f32) {
         let line = line.as_flattened_mut();
         for i in 0..REACH {
-            // A vector of neighbours is a number to the left, or to the right.
+            // The neighbouring lane is one number to the left or to the right.
             let before = (self.length + i) * WIDTH - 1;
             copy_vector(line, before, i * WIDTH);
             line[i * WIDTH] = outside;
@@ -141,23 +141,23 @@ fn copy_vector(line: &mut [f32], from: usize, to: usize) {
     }
 }
 
-/// Rows and columns exchanged. As a matrix, which has instructions for it: of a plain loop the compiler
-/// makes one load and store per number.
+/// Transposes a block, as a matrix, for which there are vector instructions: the compiler turns a plain loop into one
+/// load and store per number.
 #[inline(always)]
-fn turned(rows: [[f32; RUN]; RUN]) -> [[f32; RUN]; RUN] {
+fn transposed(rows: [[f32; RUN]; RUN]) -> [[f32; RUN]; RUN] {
     Mat4::from_cols_array_2d(&rows).transpose().to_cols_array_2d()
 }
 
-/// A line of the image, vector after vector.
+/// A line as consecutive vectors.
 pub(super) type Line = [[f32; WIDTH]];
-/// A padded line of scratch for each of the rows.
+/// A padded scratch line for each of [`TOGETHER`] rows.
 pub(super) type LinePerRow<'a> = [&'a mut Line; TOGETHER];
 
-/// The lines of a plane within reach of a few rows; another line outside the image.
+/// The lines of a plane within reach of [`TOGETHER`] rows; a constant line outside the image.
 pub(super) struct Near<'a>([&'a Line; NEAR]);
 
 impl<'a> Near<'a> {
-    /// The rows from `row` on.
+    /// The lines within reach of the rows from `row` on.
     #[inline(always)]
     pub(super) fn new(segments: Segments, plane: &'a Line, outside: &'a Line, row: usize) -> Self {
         let rows = plane.len() / segments.pitch();
@@ -171,16 +171,17 @@ impl<'a> Near<'a> {
     }
 }
 
-/// An array of an expression for each row or vector within reach.
+/// An array with an expression for each row or vector within reach.
 macro_rules! near {
     ($d:ident => $e:expr) => {
         near!(@ $d 0 1 2 3 4 5 6 7 8 9 10 11 12 13 => $e)
     };
     (@ $d:ident $($value:literal)* => $e:expr) => { [$({ let $d: usize = $value; $e }),*] };
 }
-const _: () = assert!(NEAR == 14 && TOGETHER == 4, "`near`, `cut` and `convolved` have them all");
+const _: () =
+    assert!(NEAR == 14 && TOGETHER == 4, "`near`, `cut` and `convolved` list all indices");
 
-/// Convolves what is within reach, for one row or vector after the other.
+/// Convolves for each of [`TOGETHER`] rows or vectors.
 #[inline(always)]
 fn convolved<S: Simd>(s: S, x: &[V<S>; NEAR]) -> [V<S>; TOGETHER] {
     each!(n in 4 => at(s, x, n))
@@ -195,7 +196,7 @@ fn at<S: Simd>(s: S, x: &[V<S>; NEAR], n: usize) -> V<S> {
     sum
 }
 
-/// Lines of the same length, cut to it once, so that their loads and stores need no bounds check each.
+/// Slices lines to a common length once, so that loads and stores need no bounds checks.
 macro_rules! cut {
     ($near:expr, $length:expr) => {
         near!(d => &$near.0[d][..$length])
@@ -223,7 +224,7 @@ pub(super) fn vertical<S: Simd>(s: S, plane: &Near<'_>, to: &mut LinePerRow<'_>)
     }
 }
 
-/// Convolves a plane, and its square, vertically.
+/// Convolves a plane and its square vertically.
 #[inline(always)]
 pub(super) fn vertical_with_square<S: Simd>(
     s: S,
@@ -247,7 +248,7 @@ pub(super) fn vertical_with_square<S: Simd>(
     }
 }
 
-/// Convolves a plane vertically, and its product with its sum with another.
+/// Convolves a plane p vertically, and p·(p + q) with another plane q.
 #[inline(always)]
 pub(super) fn vertical_with_product<S: Simd>(
     s: S,
@@ -271,8 +272,8 @@ pub(super) fn vertical_with_product<S: Simd>(
     }
 }
 
-/// Convolves a padded line horizontally: `N` vectors of it, at most [`TOGETHER`], and of each the lanes from
-/// `lane` on. `around` is what is within their reach, `M` = `N` + 2·[`REACH`] vectors.
+/// Convolves `N` vectors of a padded line horizontally, at most [`TOGETHER`], in the lanes from
+/// `lane` on. `around` are the `M` = `N` + 2·[`REACH`] vectors within reach.
 #[inline(always)]
 pub(super) fn horizontal<S: Simd, const N: usize, const M: usize>(
     s: S,
@@ -280,7 +281,7 @@ pub(super) fn horizontal<S: Simd, const N: usize, const M: usize>(
     lane: usize,
 ) -> [V<S>; N] {
     const { assert!(N <= TOGETHER && M == N + 2 * REACH) };
-    // Those beyond are in no one's reach.
+    // The indices from M on are not within reach.
     let x = near!(d => V::load(s, &around[if d < M { d } else { 0 }][lane..]));
     let mut sums = [V::zero(s); N];
     for (n, sum) in sums.iter_mut().enumerate() {

@@ -1,46 +1,46 @@
-//! Numbers in fewer bits than f32, sixteen at a time, and the random bits that round them.
+//! Formats of 8 and 16 bits, sixteen numbers at a time, and the random bits for rounding to them.
 //!
-//! A number between two that can be stored becomes one of them, the nearer more often, so that its
-//! mean is what it was (stochastic rounding; Gupta et al. 2015, section 3.1). One that can be stored stays as it is, whatever the draw.
+//! Rounding is stochastic (Gupta et al. 2015, section 3.1): a number becomes one of its two representable neighbours,
+//! the nearer more often, so that its mean is preserved. A representable number is unchanged, whatever the draw.
 //!
-//! Loops over arrays of integers and not `pulp`, which has no vectors of 8 and 16 bits to convert
-//! from: inlined into a dispatched kernel, the compiler makes vectors of them.
+//! The code loops over arrays of integers instead of using `pulp`, which has no vectors of 8 and 16 bits to convert
+//! from; inlined into a dispatched kernel, the loops are vectorised by the compiler.
 
 use densify_policies::rng::{PolicyRng, Purpose};
 
 use super::simd::WIDTH;
 
-/// 2⁻¹⁴: below it, numbers of f16 lie 2⁻²⁴ apart, whatever their size.
+/// 2⁻¹⁴: below it, f16 has a constant spacing of 2⁻²⁴.
 const F16_NORMAL: f32 = 6.103_515_6e-5;
 /// Bits of the significand that f16 lacks.
 const F16_DROPPED: u32 = 13;
-/// What the exponent of f32 is too large by in f16, at the place of the exponent.
+/// Difference of the exponents' biases of f32 and f16, at the position of the exponent.
 const F16_BIAS: u32 = 112 << 10;
 /// Largest finite number of f16: 65,504.
 const F16_MAX: u32 = 0x7bff;
 const F16_INFINITE: u32 = 0x7c00;
 const INFINITE: u32 = 0x7f80_0000;
-/// Bits that [`F8`] lacks: all digits but one.
+/// Bits of the significand that [`F8`] lacks: all but one.
 const F8_DROPPED: u32 = 22;
-/// What the upper bits of f32 are too large by in [`F8`]: its least number, 2⁻⁹⁶, has the code 1.
+/// Difference of the upper bits of f32 and the codes of [`F8`], whose smallest number, 2⁻⁹⁶, has the code 1.
 const F8_BIAS: u32 = ((127 - 96) << 1) - 1;
-/// 2⁹⁶: below its inverse there is nothing but 0.
+/// 2⁹⁶, the inverse of the smallest positive number of [`F8`].
 const F8_INVERSE_LEAST: f32 = 79_228_162_514_264_337_593_543_950_336.0;
-/// Code of the largest finite number of [`F8`], 1.5·2³⁰.
+/// The code of the largest finite number of [`F8`], 1.5·2³⁰.
 const F8_MAX: u32 = 0xfe;
-/// Whatever is no finite number.
-const F8_NONE: u32 = 0xff;
+/// The code of NaN.
+const F8_NAN: u32 = 0xff;
 /// |first moment| / √(second moment) is at most this: by Cauchy and Schwarz,
-/// (1 − β₁)/√((1 − β₂)·(1 − β₁²/β₂)) with β₁ = 0.9, β₂ = 0.999. Where the second is rounded down,
-/// large ratios may be cut; noise gives 0.23.
+/// (1 − β₁)/√((1 − β₂)·(1 − β₁²/β₂)) with β₁ = 0.9, β₂ = 0.999. Where the second moment was rounded down,
+/// large ratios may be clamped; noise gives 0.23.
 const RATIO_MAX: f32 = 7.3;
 const RATIO_STEP: f32 = RATIO_MAX / 127.0;
 
-/// Random bits for the rows of one block: a function of (seed, step, row, purpose, how many were
-/// drawn before), and so of nothing that depends on threads.
+/// Random bits for the rows of one block: a function of seed, step, row, purpose and the number of earlier draws, and
+/// so independent of threads.
 ///
-/// A hash begins the sequence of each row; a linear congruential generator (the constants of
-/// *Numerical Recipes*) goes on from there. Its upper bits are good, and only those are used.
+/// A hash starts the sequence of each row, and a linear congruential generator (the constants of
+/// *Numerical Recipes*) continues it. Only its upper bits are used, as the lower ones are poor.
 pub(super) struct Draws([u32; WIDTH]);
 
 impl Draws {
@@ -57,7 +57,7 @@ impl Draws {
         starts.map(Self)
     }
 
-    /// The next number of each row.
+    /// The next random bits of each row.
     #[inline(always)]
     fn next(&mut self) -> [u32; WIDTH] {
         for state in &mut self.0 {
@@ -67,25 +67,25 @@ impl Draws {
     }
 }
 
-/// A format of sixteen numbers side by side.
+/// A number format narrower than f32.
 pub(super) trait Narrow: Copy + Default {
-    /// Exact.
+    /// Converts exactly.
     fn to_f32(self) -> f32;
-    /// One of the two neighbours of `x`, by the upper bits of `random`. A finite number stays finite;
-    /// one that is not finite does not become so.
-    fn between(x: f32, random: u32) -> Self;
-    /// The nearest, as the draw in the middle gives it; of two, the larger.
+    /// Rounds to one of the two neighbours of `x`, by the upper bits of `random`. Finite numbers stay finite, and
+    /// non-finite ones non-finite.
+    fn round(x: f32, random: u32) -> Self;
+    /// Rounds to the nearest number, as the middle draw does; ties go up.
     #[inline(always)]
     fn nearest(x: f32) -> Self {
-        Self::between(x, 1 << 31)
+        Self::round(x, 1 << 31)
     }
 }
 
-/// A number of 16 bits with 11 significant ones (IEEE 754 binary16).
+/// IEEE 754 binary16: 16 bits, 11 of them significant.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct F16(pub(super) u16);
 
-/// A number that is not negative, in a byte: 7 bits of exponent and one digit. What is not finite is NaN.
+/// A non-negative number in a byte: 7 bits of exponent and one of significand. Non-finite numbers are NaN.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct F8(pub(super) u8);
 
@@ -95,7 +95,7 @@ impl Narrow for F16 {
         let bits = u32::from(self.0);
         let magnitude = bits & 0x7fff;
         let lifted = f32::from_bits((magnitude << F16_DROPPED) + (F16_BIAS << F16_DROPPED));
-        // Without exponent, the digits count 2⁻²⁴ from 0; with the least one, from 2⁻¹⁴.
+        // The significand counts steps of 2⁻²⁴: from 0 for subnormal numbers, from 2⁻¹⁴ for the smallest exponent.
         let one_up = f32::from_bits((magnitude << F16_DROPPED) + (113 << 23));
         let x = if magnitude < 0x400 { one_up - F16_NORMAL } else { lifted };
         let beyond = if magnitude >= F16_INFINITE { INFINITE } else { 0 };
@@ -103,17 +103,17 @@ impl Narrow for F16 {
     }
 
     #[inline(always)]
-    fn between(x: f32, random: u32) -> Self {
+    fn round(x: f32, random: u32) -> Self {
         let bits = x.to_bits();
         let magnitude = bits & 0x7fff_ffff;
         let size = f32::from_bits(magnitude);
-        // From 2⁻¹⁴ to 2⁻¹³ numbers lie as far apart as below; there the digits are the same.
+        // Numbers from 2⁻¹⁴ to 2⁻¹³ have the spacing of subnormal ones, and there the same significand.
         let is_small = size < F16_NORMAL;
         let lifted = if is_small { size + F16_NORMAL } else { size };
         let drawn = lifted.to_bits() + (random >> (32 - F16_DROPPED));
         let lowered = if is_small { F16_BIAS + 0x400 } else { F16_BIAS };
         let half = (drawn >> F16_DROPPED).wrapping_sub(lowered).min(F16_MAX);
-        // Infinite, or NaN, which keeps a digit.
+        // Infinity, or NaN, which keeps a bit set.
         let digit = u32::from(magnitude > INFINITE);
         let half = if magnitude >= INFINITE { F16_INFINITE | digit } else { half };
         Self((half | (bits >> 16 & 0x8000)) as u16)
@@ -126,34 +126,34 @@ impl Narrow for F8 {
         let code = u32::from(self.0);
         let x = f32::from_bits((code + F8_BIAS) << F8_DROPPED);
         let x = if code == 0 { 0.0 } else { x };
-        if code == F8_NONE { f32::NAN } else { x }
+        if code == F8_NAN { f32::NAN } else { x }
     }
 
-    /// Of a negative number, 0.
+    /// Negative numbers become 0.
     #[inline(always)]
-    fn between(x: f32, random: u32) -> Self {
+    fn round(x: f32, random: u32) -> Self {
         let size = x.max(0.0);
         let drawn = (size.to_bits() + (random >> (32 - F8_DROPPED))) >> F8_DROPPED;
         let code = drawn.wrapping_sub(F8_BIAS).min(F8_MAX);
         let share = size * F8_INVERSE_LEAST;
         let least = u32::from(share > unit(random, 23));
         let code = if share < 1.0 { least } else { code };
-        Self(if x.is_finite() { code } else { F8_NONE } as u8)
+        Self(if x.is_finite() { code } else { F8_NAN } as u8)
     }
 }
 
-/// The upper `digits` of some random bits as a number in [0, 1).
+/// The upper `digits` random bits as a number in [0, 1).
 #[inline(always)]
 fn unit(random: u32, digits: u32) -> f32 {
-    // A signed number, as vectors of those become floats in one instruction.
+    // Signed, as vectors of signed integers are converted to floats by one instruction.
     (random >> (32 - digits)) as i32 as f32 * (1.0 / (1_u32 << digits) as f32)
 }
 
-/// One of the two whole numbers next to `x`, which is within ±32,767, in the lower bits: the one that
-/// is farther where `draw` is below the distance to the nearer.
+/// Rounds `x`, within ±32,767, to one of its two neighbouring integers, in the lower bits: to the farther one if
+/// `draw` is below the distance to the nearer.
 #[inline(always)]
-fn whole(x: f32, draw: f32) -> i32 {
-    // 1.5·2²³, whose last digits then are the nearest whole number.
+fn round_to_integer(x: f32, draw: f32) -> i32 {
+    // Adding 1.5·2²³ leaves the nearest integer in the last bits.
     const SHIFT: f32 = 12_582_912.0;
     let shifted = x + SHIFT;
     let beside = x - (shifted - SHIFT);
@@ -162,36 +162,35 @@ fn whole(x: f32, draw: f32) -> i32 {
     shifted.to_bits() as i32 + away
 }
 
-/// A number that is no more than a few, in 16 bits with so many after the point: distances are the
-/// same at 9 as at 0, where those of f16 grow to 2⁻⁷.
+/// Fixed point in 16 bits, for bounded numbers: its spacing is the same everywhere, while that of f16 grows to 2⁻⁷
+/// at 9. `digits` is the number of fractional bits.
 pub(super) mod fixed {
-    /// What is not finite.
-    const NONE: i16 = i16::MIN;
-    const MOST: f32 = i16::MAX as f32;
+    /// The code of NaN.
+    const NAN: i16 = i16::MIN;
+    const MAX: f32 = i16::MAX as f32;
 
-    /// Exact.
+    /// Converts exactly.
     #[inline(always)]
     pub(in super::super) fn to_f32(stored: i16, digits: u32) -> f32 {
         let x = f32::from(stored) * (1.0 / (1_u32 << digits) as f32);
-        if stored == NONE { f32::NAN } else { x }
+        if stored == NAN { f32::NAN } else { x }
     }
 
-    /// One of the two neighbours of `x`, or the end of the range that is nearer; NaN for what is not
-    /// finite.
+    /// Rounds to one of the two neighbours of `x`, or to the nearer end of the range; non-finite numbers become NaN.
     #[inline(always)]
-    pub(in super::super) fn between(x: f32, digits: u32, random: u32) -> i16 {
-        let scaled = (x * (1_u32 << digits) as f32).clamp(-MOST, MOST);
-        let whole = super::whole(scaled, super::unit(random, 23)) as i16;
-        if x.is_finite() { whole } else { NONE }
+    pub(in super::super) fn round(x: f32, digits: u32, random: u32) -> i16 {
+        let scaled = (x * (1_u32 << digits) as f32).clamp(-MAX, MAX);
+        let whole = super::round_to_integer(scaled, super::unit(random, 23)) as i16;
+        if x.is_finite() { whole } else { NAN }
     }
 
-    /// The nearest; of two, the even one.
+    /// Rounds to the nearest number; ties go to even.
     pub(in super::super) fn nearest(x: f32, digits: u32) -> i16 {
-        between(x, digits, 1 << 31)
+        round(x, digits, 1 << 31)
     }
 }
 
-/// The numbers of a plane from fixed point.
+/// Converts a plane from fixed point.
 #[inline(always)]
 pub(super) fn widen_fixed(from: &[i16; WIDTH], to: &mut [f32; WIDTH], digits: u32) {
     for lane in 0..WIDTH {
@@ -199,7 +198,7 @@ pub(super) fn widen_fixed(from: &[i16; WIDTH], to: &mut [f32; WIDTH], digits: u3
     }
 }
 
-/// Stores the numbers of a plane in fixed point, rounded at random.
+/// Stores a plane in fixed point with stochastic rounding.
 #[inline(always)]
 pub(super) fn narrow_fixed(
     from: &[f32; WIDTH],
@@ -209,11 +208,11 @@ pub(super) fn narrow_fixed(
 ) {
     let random = draws.next();
     for lane in 0..WIDTH {
-        to[lane] = fixed::between(from[lane], digits, random[lane]);
+        to[lane] = fixed::round(from[lane], digits, random[lane]);
     }
 }
 
-/// The numbers of whole planes from what is stored.
+/// Converts whole planes to f32.
 #[inline(always)]
 pub(super) fn widen<T: Narrow>(from: &[T], to: &mut [f32]) {
     let (from, to) = (from.as_chunks::<WIDTH>().0, to.as_chunks_mut::<WIDTH>().0);
@@ -224,25 +223,25 @@ pub(super) fn widen<T: Narrow>(from: &[T], to: &mut [f32]) {
     }
 }
 
-/// Stores the numbers of whole planes, rounded at random.
+/// Stores whole planes with stochastic rounding.
 #[inline(always)]
 pub(super) fn narrow<T: Narrow>(from: &[f32], to: &mut [T], draws: &mut Draws) {
     let (from, to) = (from.as_chunks::<WIDTH>().0, to.as_chunks_mut::<WIDTH>().0);
     for (from, to) in from.iter().zip(to) {
         let random = draws.next();
         for lane in 0..WIDTH {
-            to[lane] = T::between(from[lane], random[lane]);
+            to[lane] = T::round(from[lane], random[lane]);
         }
     }
 }
 
-/// The first moment of a ratio and the second moment.
+/// The first moment, from its stored ratio and the second moment.
 #[inline(always)]
 pub(super) fn first_moment(ratio: i8, second: f32) -> f32 {
     f32::from(ratio) * RATIO_STEP * second.sqrt()
 }
 
-/// The same for whole planes.
+/// The first moments of whole planes.
 #[inline(always)]
 pub(super) fn first_moments(ratios: &[i8], seconds: &[f32], to: &mut [f32]) {
     for ((to, &ratio), &second) in to.iter_mut().zip(ratios).zip(seconds) {
@@ -250,10 +249,10 @@ pub(super) fn first_moments(ratios: &[i8], seconds: &[f32], to: &mut [f32]) {
     }
 }
 
-/// First moments as multiples of the roots of the second ones *as stored*, rounded at random.
+/// Stores first moments as multiples of the roots of the second moments *as stored*, with stochastic rounding.
 ///
-/// Draws are the middles of 2,048 steps, and so never as small as the rounding of the division: a ratio
-/// that is one already stays.
+/// Draws are the midpoints of 2,048 intervals, and so never as small as the rounding error of the division: a ratio
+/// that is already representable is unchanged.
 #[inline(always)]
 pub(super) fn ratios(first: &[f32], second: &[F8], to: &mut [i8], draws: &mut Draws) {
     let (first, second) = (first.as_chunks::<WIDTH>().0, second.as_chunks::<WIDTH>().0);
@@ -263,10 +262,10 @@ pub(super) fn ratios(first: &[f32], second: &[F8], to: &mut [i8], draws: &mut Dr
         for lane in 0..WIDTH {
             let root = RATIO_STEP * second[lane].to_f32().sqrt();
             let draw = unit(random[lane], 11) + 0.5 / 2048.0;
-            // Of nothing, nothing: also where the square has vanished in f32. NaN becomes 0, and
+            // 0 if the second moment is 0, also where the square underflowed in f32. NaN becomes 0 here, and
             // NaN again with its second moment.
             let ratio = if root > 0.0 { first[lane] / root } else { 0.0 };
-            to[lane] = whole(ratio.clamp(-127.0, 127.0), draw) as i8;
+            to[lane] = round_to_integer(ratio.clamp(-127.0, 127.0), draw) as i8;
         }
     }
 }

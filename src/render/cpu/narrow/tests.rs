@@ -1,10 +1,10 @@
-//! Tests of every number that can be stored, of rounding between them, and of the random draws.
+//! Tests of all representable numbers, of rounding between them, and of the random draws.
 
-#![expect(clippy::float_cmp, reason = "what can be stored comes back to the last bit")]
+#![expect(clippy::float_cmp, reason = "representable numbers are preserved to the last bit")]
 
 use super::*;
 
-/// All draws that f16 tells apart.
+/// All draws that f16 distinguishes.
 fn draws() -> impl Iterator<Item = u32> {
     (0..1 << F16_DROPPED).map(|k| k << (32 - F16_DROPPED))
 }
@@ -18,7 +18,7 @@ fn numbers() -> impl Iterator<Item = f32> {
     })
 }
 
-/// All codes are numbers of their own, and come back whatever the draw.
+/// Checks that all codes survive a round trip, whatever the draw.
 fn all_come_back<T, B>(of_bits: fn(B) -> T, codes: impl Iterator<Item = B>)
 where
     T: Narrow + PartialEq + std::fmt::Debug,
@@ -27,7 +27,7 @@ where
     for bits in codes {
         let (stored, x) = (of_bits(bits), of_bits(bits).to_f32());
         for random in [0, 1, 1 << 31, u32::MAX] {
-            let back = T::between(x, random);
+            let back = T::round(x, random);
             if x.is_nan() {
                 assert!(back.to_f32().is_nan(), "{bits:#x}: {back:?}");
             } else {
@@ -63,14 +63,14 @@ fn halves_are_what_the_standard_says() {
     }
 }
 
-/// Over all draws a number becomes its upper neighbour among all that can be stored as often as it is
-/// near to it, and nothing but its neighbours; beyond the ends it becomes the end.
+/// Checks that over all draws a number becomes one of its two neighbours with the right frequency, and the end of the
+/// range beyond it.
 fn is_fair<T: Narrow>(all: &[f32]) {
     let (least, most) = (all[0], all[all.len() - 1]);
     for x in numbers() {
         if x < least || x > most {
             let end = if x < least { least } else { most };
-            assert!(draws().all(|random| T::between(x, random).to_f32() == end), "{x:e}");
+            assert!(draws().all(|random| T::round(x, random).to_f32() == end), "{x:e}");
             continue;
         }
         let above = all.partition_point(|&y| y < x);
@@ -79,7 +79,7 @@ fn is_fair<T: Narrow>(all: &[f32]) {
         let share = if step == 0.0 { 1.0 } else { (f64::from(x) - f64::from(low)) / step };
         let mut ups = 0;
         for random in draws() {
-            let y = T::between(x, random).to_f32();
+            let y = T::round(x, random).to_f32();
             assert!(y == low || y == high, "{x:e} became {y:e}, not {low:e} or {high:e}");
             ups += u32::from(y == high);
         }
@@ -103,12 +103,12 @@ fn rounding_is_fair_and_stays_between_the_neighbours() {
     }
 }
 
-/// Bytes: 7 bits of exponent and one digit, without a sign.
+/// Bytes: 7 bits of exponent and one of significand, without a sign.
 #[test]
 fn bytes_are_fair_and_cover_what_adam_needs() {
     let all: Vec<f32> = (0..=F8_MAX as u8).map(|bits| F8(bits).to_f32()).collect();
     assert!(all.is_sorted() && all[0] == 0.0, "{all:?}");
-    assert!(F8(F8_NONE as u8).to_f32().is_nan());
+    assert!(F8(F8_NAN as u8).to_f32().is_nan());
     let (least, most) = (all[1], all[all.len() - 1]);
     assert_eq!((least, most), (2_f32.powi(-96), 1.5 * 2_f32.powi(30)));
     // The root of the least is no more than a few of Adam's epsilon, 1e-15.
@@ -117,7 +117,7 @@ fn bytes_are_fair_and_cover_what_adam_needs() {
     is_fair::<F8>(&all);
 }
 
-/// Fixed point: all that is stored comes back, and what lies between is fair.
+/// Fixed point: representable numbers are preserved, and rounding is fair.
 #[test]
 fn fixed_point_is_fair_and_stays() {
     for (digits, most) in [(11, 16.0_f32), (14, 2.0)] {
@@ -126,14 +126,14 @@ fn fixed_point_is_fair_and_stays() {
             let x = fixed::to_f32(stored, digits);
             assert_eq!(f64::from(x), f64::from(stored) * f64::from(step));
             for random in [0, 1, 1 << 31, u32::MAX] {
-                assert_eq!(fixed::between(x, digits, random), stored, "{x}");
+                assert_eq!(fixed::round(x, digits, random), stored, "{x}");
             }
         }
         for x in [0.1_f32, -0.1, 1e-6, -3e-5, 0.7311, -1.9, 0.99 * most] {
             let low = (x / step).floor();
             let mut ups = 0;
             for random in (0..1 << 14).map(|k| k << 18) {
-                let stored = f32::from(fixed::between(x, digits, random));
+                let stored = f32::from(fixed::round(x, digits, random));
                 assert!(stored == low || stored == low + 1.0, "{x}: {stored}");
                 ups += u32::from(stored > low);
             }
@@ -144,11 +144,11 @@ fn fixed_point_is_fair_and_stays() {
         }
         for random in [0, u32::MAX] {
             for x in [most, 9e9, f32::MAX] {
-                assert_eq!(fixed::between(x, digits, random), i16::MAX);
-                assert_eq!(fixed::between(-x, digits, random), -i16::MAX);
+                assert_eq!(fixed::round(x, digits, random), i16::MAX);
+                assert_eq!(fixed::round(-x, digits, random), -i16::MAX);
             }
             for x in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
-                assert!(fixed::to_f32(fixed::between(x, digits, random), digits).is_nan());
+                assert!(fixed::to_f32(fixed::round(x, digits, random), digits).is_nan());
             }
         }
     }
@@ -158,18 +158,18 @@ fn fixed_point_is_fair_and_stays() {
 fn what_is_no_number_stays_none() {
     for random in [0, 1 << 31, u32::MAX] {
         for x in [f32::INFINITY, f32::NEG_INFINITY] {
-            assert_eq!(F16::between(x, random).to_f32(), x);
-            assert!(F8::between(x, random).to_f32().is_nan());
+            assert_eq!(F16::round(x, random).to_f32(), x);
+            assert!(F8::round(x, random).to_f32().is_nan());
         }
         for bits in [0x7f80_0001, 0x7fff_ffff, 0xff80_0001, 0xffff_ffff, 0x7fc0_0000] {
             let x = f32::from_bits(bits);
-            assert!(F16::between(x, random).to_f32().is_nan(), "{bits:#x}");
-            assert!(F8::between(x, random).to_f32().is_nan(), "{bits:#x}");
+            assert!(F16::round(x, random).to_f32().is_nan(), "{bits:#x}");
+            assert!(F8::round(x, random).to_f32().is_nan(), "{bits:#x}");
         }
     }
 }
 
-/// Ratios stay, of any second moment; what lies between them becomes a neighbour, fairly.
+/// Representable ratios are preserved for any second moment; others are rounded fairly.
 #[test]
 fn ratios_are_fair_and_stay() {
     let rng = PolicyRng::new(3, 1);
@@ -201,8 +201,7 @@ fn ratios_are_fair_and_stay() {
     }
 }
 
-/// Without a second moment there is no first; and with one that is NaN, the first is NaN, so
-/// that an audit finds it.
+/// A second moment of 0 makes the first 0, and one of NaN makes it NaN, so that an audit finds it.
 #[test]
 fn ratios_of_nothing() {
     let [mut draws, ..] = Draws::of_block(&PolicyRng::new(0, 0), 0);
@@ -214,8 +213,7 @@ fn ratios_of_nothing() {
     }
 }
 
-/// Draws of a row, of a plane after another, of a step after another, and for the three arrays, are
-/// independent: so are the decisions that they make.
+/// Draws of different rows, planes, steps, seeds and arrays are independent.
 #[test]
 fn draws_are_independent() {
     const BLOCKS: usize = 256;

@@ -1,8 +1,8 @@
-//! A vector of `f32` lanes with operators, over whatever instruction set the machine has.
+//! A vector of `f32` lanes with operators, for every instruction set.
 //!
-//! `pulp` dispatches at run time (AVX-512, AVX2, NEON, baseline). Its methods take the token first
-//! and read poorly in formulas; [`V`] carries the token along and overloads the operators. All is
-//! inlined into the dispatched kernel, so the wrapper costs nothing. One piece: a vector and its
+//! `pulp` dispatches at run time (AVX-512, AVX2, NEON, baseline). Its methods take a token as their first argument
+//! and make formulas hard to read; [`V`] carries the token and overloads the operators. Everything is
+//! inlined into the dispatched kernel, so that the wrapper costs nothing. The file is one piece: a vector and its
 //! functions.
 
 use std::ops::{Add, Div, Mul, Neg, Sub};
@@ -12,13 +12,13 @@ use pulp::{Scalar, Simd};
 /// Rows per block, and pixels per tile row: every lane count divides it.
 pub(super) const WIDTH: usize = 16;
 
-/// The bit of a lane that says whether it is negative.
+/// The sign bit of a lane.
 const SIGN: u32 = 1 << 31;
 
 /// `[e(0), e(1), …]` without a closure: `each!(k in 3 => e(k))`.
 ///
-/// Closures, those given to `array::map` among them, are compiled without the kernel's instruction
-/// set unless they happen to be inlined, and then every operator in them is a call.
+/// Closures, including those given to `array::map`, are compiled without the kernel's instruction
+/// set unless they happen to be inlined; every operator in them is then a call.
 macro_rules! each {
     ($k:ident in 2 => $e:expr) => {
         [each!(@ $k 0 $e), each!(@ $k 1 $e)]
@@ -39,7 +39,7 @@ macro_rules! each {
 }
 pub(super) use each;
 
-/// `S::F32_LANES` numbers.
+/// A vector of `S::F32_LANES` numbers.
 #[derive(Clone, Copy)]
 pub(super) struct V<S: Simd> {
     s: S,
@@ -70,7 +70,7 @@ impl<S: Simd> V<S> {
         Self::splat(s, 0.0)
     }
 
-    /// The lanes `at * LANES ..` of `from`.
+    /// The first numbers of `from`.
     #[inline(always)]
     pub(super) fn load(s: S, from: &[f32]) -> Self {
         Self { s, v: S::as_simd_f32s(from).0[0] }
@@ -103,7 +103,7 @@ impl<S: Simd> V<S> {
         Self { s: self.s, v: self.s.max_f32s(self.v, b.v) }
     }
 
-    /// Not by `abs_f32s`, which in some builds is called instead of being one instruction: a third of a step's time.
+    /// The absolute value. Not by `abs_f32s`, which some builds compile to a call, at a third of a step's time.
     #[inline(always)]
     pub(super) fn abs(self) -> Self {
         let s = self.s;
@@ -132,7 +132,7 @@ impl<S: Simd> V<S> {
         Self { s, v: s.transmute_f32s_u32s(bits) }
     }
 
-    /// As integers; only for whole numbers in `[0, 2²³)`, which stand in the last bits after adding 2²³.
+    /// Converts whole numbers in `[0, 2²³)` to integers: adding 2²³ puts them in the last bits.
     #[inline(always)]
     pub(super) fn whole(self) -> S::u32s {
         let bits = self.s.transmute_u32s_f32s((self + 8_388_608.0).v);
@@ -149,14 +149,14 @@ impl<S: Simd> V<S> {
         self.s.reduce_max_f32s(self.v)
     }
 
-    /// 2^self for self in `[−126, 126]`; relative error below 2e-7. Outside, any value.
+    /// 2^self for self in `[−126, 126]`, with a relative error below 2e-7; undefined outside.
     #[inline(always)]
     pub(super) fn exp2(self) -> Self {
         let [power] = exp2_of([self]);
         power
     }
 
-    /// e^self, clamped to self in `[−87, 88]`; relative error below 2e-7.
+    /// e^self with self clamped to `[−87, 88]`; relative error below 2e-7.
     #[inline(always)]
     pub(super) fn exp(self) -> Self {
         let s = self.s;
@@ -165,7 +165,7 @@ impl<S: Simd> V<S> {
         let magic = c(12_582_912.0);
         let shifted = x.mul_add(c(std::f32::consts::LOG2_E), magic);
         let n = shifted - magic;
-        // ln 2 in two parts (Cody and Waite): the first has few bits, so n · first is exact.
+        // ln 2 in two parts (Cody and Waite): the first has few bits, so that n · first is exact.
         let f = n.neg_mul_add(c(0.693_145_75), x);
         let f = n.neg_mul_add(c(1.428_606_8e-6), f);
         let p = c(1.984_127e-4)
@@ -211,7 +211,7 @@ pub(super) fn load_of<S: Simd, const N: usize>(s: S, from: &[f32]) -> [V<S>; N] 
     vectors
 }
 
-/// The opposite.
+/// Stores `N` vectors.
 #[inline(always)]
 pub(super) fn store_of<S: Simd, const N: usize>(vectors: [V<S>; N], to: &mut [f32]) {
     for (n, vector) in vectors.into_iter().enumerate() {
@@ -219,12 +219,11 @@ pub(super) fn store_of<S: Simd, const N: usize>(vectors: [V<S>; N], to: &mut [f3
     }
 }
 
-/// [`V::exp2`] of some vectors, step by step: with sixteen registers a constant is loaded for each use, and
-/// so serves all of them.
+/// [`V::exp2`] of `N` vectors in lockstep: with only sixteen registers, constants are reloaded for each use, and one
+/// load then serves all vectors.
 ///
-/// The nearest integer comes from adding 1.5·2²³, whose last bits then hold it; the rest f, in
-/// `[−½, ½]`, goes through the minimax polynomial of 2^f of degree 6 (relative error of 2e-9
-/// before rounding).
+/// Adding 1.5·2²³ leaves the nearest integer in the last bits; 2^f of the remainder f in
+/// `[−½, ½]` is a minimax polynomial of degree 6 (relative error 2e-9 before rounding).
 #[inline(always)]
 pub(super) fn exp2_of<S: Simd, const N: usize>(x: [V<S>; N]) -> [V<S>; N] {
     let s = x[0].s;
@@ -259,8 +258,8 @@ impl V<Scalar> {
     }
 }
 
-/// The sums over the lanes of each of four vectors. With four lanes or more, the four are added up
-/// together, which takes half the operations of one after the other.
+/// The sum over the lanes of each of four vectors. With four lanes or more they are reduced
+/// together, which takes half the operations.
 #[inline(always)]
 pub(super) fn sums_of_four<S: Simd>([a, b, c, d]: [V<S>; 4]) -> [f32; 4] {
     if S::F32_LANES < 4 {
@@ -286,8 +285,7 @@ pub(super) fn sums_of_four<S: Simd>([a, b, c, d]: [V<S>; 4]) -> [f32; 4] {
 #[inline(always)]
 fn halves<S: Simd>(a: V<S>, c: V<S>) -> V<S> {
     let s = a.s;
-    // Not pulp's own cast: it does not compile for the one lane of a machine without vectors, for
-    // which this is never called.
+    // Not pulp's own cast, which does not compile for a single lane, where this is never called.
     let pairs = [pulp::bytemuck::cast(a.v), pulp::bytemuck::cast(c.v)];
     let [even, odd]: [S::f64s; 2] = s.deinterleave_shfl_f64s(pairs);
     V { s, v: s.add_f32s(pulp::bytemuck::cast(even), pulp::bytemuck::cast(odd)) }
@@ -304,7 +302,7 @@ impl<S: Simd> Mask<S> {
         Self { s: self.s, m: self.s.or_m32s(self.m, b.m) }
     }
 
-    /// `yes` where true, `no` elsewhere. Not by `select_f32s`, as [`V::abs`].
+    /// `yes` where true, `no` elsewhere. Not by `select_f32s`, for the reason given at [`V::abs`].
     #[inline(always)]
     pub(super) fn select(self, yes: V<S>, no: V<S>) -> V<S> {
         let s = self.s;
@@ -319,16 +317,16 @@ impl<S: Simd> Mask<S> {
         if size_of::<S::m32s>() != size_of::<S::u32s>() {
             return self.select(yes, V::zero(s));
         }
-        // All bits of a lane are set or none. The compiler does not know, and would look at their signs.
+        // The bits of a lane are all set or all clear. The compiler does not know this and would test the signs.
         let mask: S::u32s = pulp::bytemuck::cast(self.m);
         V::of_bits(s, s.and_u32s(mask, s.transmute_u32s_f32s(yes.v)))
     }
 
-    /// Bit i: lane i. AVX-512 masks are bits already; others have all bits of a lane set or none, and
-    /// where there are no vectors a lane is one byte.
+    /// The mask as an integer, bit i for lane i. AVX-512 masks are bits already; other masks have all bits of a lane
+    /// set or clear, and without vectors a lane is one byte.
     #[inline(always)]
     pub(super) fn bits(self) -> u32 {
-        // One instruction of AVX2. Without asking for it by name it would be two dozen.
+        // AVX2 has an instruction for this, which must be named; the generic code takes two dozen.
         #[cfg(target_arch = "x86_64")]
         if let Some(v3) = (&self.s as &dyn std::any::Any).downcast_ref::<pulp::x86::V3>() {
             return v3.avx._mm256_movemask_ps(pulp::bytemuck::cast(self.m)) as u32;
@@ -350,7 +348,7 @@ impl<S: Simd> Mask<S> {
         self.s.select_u32s(self.m, yes, no)
     }
 
-    /// `to`, with `bits` set where true.
+    /// Sets `bits` in `to` where true.
     #[inline(always)]
     pub(super) fn or_bits(self, to: S::u32s, bits: u32) -> S::u32s {
         self.s.or_u32s(to, self.select_u32s(self.s.splat_u32s(bits), self.s.splat_u32s(0)))
@@ -362,7 +360,7 @@ impl<S: Simd> Mask<S> {
     }
 }
 
-/// Lane by lane, whether `a < b` as unsigned integers.
+/// Whether `a < b`, lane by lane, as unsigned integers.
 #[inline(always)]
 pub(super) fn before<S: Simd>(s: S, a: S::u32s, b: S::u32s) -> Mask<S> {
     Mask { s, m: s.less_than_u32s(a, b) }

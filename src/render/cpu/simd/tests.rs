@@ -1,5 +1,5 @@
-//! Tests of the vector's functions. `tests/it/agreement.rs` compares every stage with every instruction
-//! set that this machine has.
+//! Tests of the vector's functions. `tests/it/agreement.rs` compares every stage on every instruction
+//! set of this machine.
 
 use pulp::{Arch, WithSimd};
 
@@ -80,7 +80,7 @@ fn sums_of_four_are_four_sums() {
     }
 }
 
-/// Bits, [`Mask::any`] and [`Mask::keep`] of the lanes that hold more than a number.
+/// [`Mask::bits`], [`Mask::any`] and [`Mask::keep`] of the lanes above a number.
 struct Above(f32);
 
 impl WithSimd for Above {

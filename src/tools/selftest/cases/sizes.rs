@@ -33,7 +33,7 @@ fn large(trial: &mut Trial<'_>, width: u32, height: u32) -> Result<(), BackendEr
     let what = format!("{width}x{height}");
     let image = match trial.subject.backend(&model)?.render(&camera, GREY, 1) {
         // A device with small buffers refuses such an image; there is nothing to compare then.
-        Err(BackendError::OverLimit(_)) => return Ok(()),
+        Err(BackendError::BufferTooLarge { .. }) => return Ok(()),
         other => other?,
     };
     let view = View { camera: &camera, background: GREY.map(f64::from), sh_degree: 1 };

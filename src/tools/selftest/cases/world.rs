@@ -51,8 +51,8 @@ fn picture(
     let normalisation = Normalisation::fit(&centres, &points);
     let colours = (0..points.len()).map(|i| [i as u8, 3 * i as u8, 255 - i as u8]).collect();
     let positions = points.iter().map(|p| normalisation.scene_from_world(*p)).collect();
-    let (mut model, _) = initialise(&PointCloud { positions, colours }, 100, 0, 1)
-        .map_err(|error| BackendError::OverLimit(error.to_string()))?;
+    let (mut model, _) =
+        initialise(&PointCloud { positions, colours }, 100, 0, 1).expect("a sound point cloud");
     model.opacity_logits.fill(0.5);
     let camera = normalisation.scene_from_world_camera(&cameras[0]);
     Ok(trial.subject.backend(&model)?.render(&camera, [0.1; 3], 0)?.rgb)

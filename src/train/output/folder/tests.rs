@@ -27,8 +27,9 @@ fn a_new_run_writes_in_place_beside_foreign_files() {
     write(&run.path().join("config.toml"), "a");
     assert_eq!(run.finish().unwrap(), root.path());
     assert_eq!(tree(root.path()), ["config.toml", "notes.txt"]);
-    let message = RunFolder::create(root.path(), false).unwrap_err().to_string();
-    assert!(message.contains("another run") && message.contains("--overwrite"), "{message}");
+    let error = RunFolder::create(root.path(), false).unwrap_err();
+    assert!(matches!(error, OutputError::Occupied { .. }), "{error}");
+    assert!(error.to_string().contains("another run"), "{error}");
 }
 
 #[test]

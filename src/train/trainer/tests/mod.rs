@@ -115,14 +115,6 @@ impl Backend for CountingBackend {
     ) -> Result<Rendering, BackendError> {
         Err(BackendError::ImageTooLarge { width: camera.width, height: camera.height, max: 0 })
     }
-    fn render_painted(
-        &mut self,
-        camera: &Camera,
-        background: [f32; 3],
-        _colours: &[[f32; 3]],
-    ) -> Result<Rendering, BackendError> {
-        self.render(camera, background, 0)
-    }
     fn download_array(
         &self,
         array: ModelArray,

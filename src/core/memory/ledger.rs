@@ -1,4 +1,4 @@
-//! The ledger: the bytes of every buffer, promised before training; and the memory measured.
+//! The ledger: the size of every buffer of a run, known before training.
 //!
 //! Every buffer is allocated once, at the size of the budget. The ledger lists them, so that users
 //! learn before training whether a run fits.
@@ -19,13 +19,13 @@ pub struct Ledger {
 /// One buffer.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LedgerLine {
-    /// Part of the program that it belongs to.
+    /// The part of the program that uses it.
     pub section: Section,
-    /// What it holds.
+    /// Its contents.
     pub what: String,
     /// Its size `[bytes]`.
     pub bytes: u64,
-    /// Whether it is in the memory of a GPU.
+    /// Whether it is in GPU memory.
     #[serde(default, skip_serializing_if = "is_false")]
     pub on_device: bool,
 }
@@ -35,33 +35,35 @@ fn is_false(flag: &bool) -> bool {
     !flag
 }
 
-/// Part of the program, in the order of the table.
+/// Parts of the program, in the order of the table.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Section {
-    /// Parameters, moments, age.
+    /// Parameters, optimiser moments and ages.
     Model,
     /// Gradients of the parameters.
     Gradients,
-    /// Lists of (row, tile) pairs and what belongs to each pair.
+    /// Lists of (row, tile) pairs and the data per pair.
     Tiles,
-    /// Buffers of the renderer that belong to no other section.
+    /// All other buffers of the renderer.
     Renderer,
     /// Signals, candidates and plans of the policy.
     Policy,
     /// Decoded images.
     Images,
-    /// Held only for a moment, one at a time: evaluation, export.
+    /// Held briefly during training, one at a time: evaluation, export.
     Passing,
-    /// Held only while loading, and freed before any of the above is allocated.
+    /// Held only while loading, and freed before training.
     Before,
-    /// Held only once training has ended and all of the above is freed.
+    /// Held only after training, when its buffers are freed.
     After,
-    /// The program itself before any of the above.
+    /// The program itself.
     Process,
 }
 
 impl Section {
+    /// The name in the table.
+    #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
             Self::Model => "model",
@@ -84,7 +86,7 @@ impl Ledger {
         self.lines.push(LedgerLine { section, what: what.into(), bytes, on_device: false });
     }
 
-    /// Adds a buffer in the memory of a GPU, or adds its bytes to the line of that name.
+    /// Adds a buffer in GPU memory; adds its bytes to the line of the same name if there is one.
     pub fn add_on_device(&mut self, section: Section, what: &str, bytes: u64) {
         let same =
             |line: &&mut LedgerLine| line.on_device && line.section == section && line.what == what;
@@ -97,22 +99,22 @@ impl Ledger {
         }
     }
 
-    /// The most memory held at a time `[bytes]`: the sum of the lines held when the most is: of training,
-    /// loading and measuring at the end those of the largest, and always those of the process.
+    /// The peak `[bytes]`: the process, and the largest of the three phases, which are loading, training and
+    /// measuring at the end.
     #[must_use]
     pub fn total(&self) -> u64 {
-        most_at_a_time(&self.lines.iter().collect::<Vec<_>>())
+        peak(&self.lines.iter().collect::<Vec<_>>())
     }
 
-    /// The same without the memory of a GPU, until training has ended `[bytes]`.
+    /// The peak of host memory until training has ended `[bytes]`.
     #[must_use]
     pub fn on_host(&self) -> u64 {
         let lines = self.lines.iter();
         let lines = lines.filter(|line| !line.on_device && line.section != Section::After);
-        most_at_a_time(&lines.collect::<Vec<_>>())
+        peak(&lines.collect::<Vec<_>>())
     }
 
-    /// Sum of the buffers in the memory of a GPU, which are all held throughout `[bytes]`.
+    /// The sum of all buffers in GPU memory, which are held throughout `[bytes]`.
     #[must_use]
     pub fn on_device(&self) -> u64 {
         sum(self.lines.iter().filter(|line| line.on_device).map(|line| line.bytes))
@@ -123,51 +125,53 @@ fn sum(bytes: impl Iterator<Item = u64>) -> u64 {
     bytes.fold(0, u64::saturating_add)
 }
 
-fn most_at_a_time(lines: &[&LedgerLine]) -> u64 {
-    let counts = counted(lines).into_iter();
-    sum(lines.iter().zip(counts).filter(|(_, counts)| *counts).map(|(line, _)| line.bytes))
+fn peak(lines: &[&LedgerLine]) -> u64 {
+    let held = held_at_peak(lines);
+    sum(lines.iter().zip(held).filter(|(_, is_held)| *is_held).map(|(line, _)| line.bytes))
 }
 
-/// Which lines are held when the most is: of training, loading and measuring at the end, those of the one
-/// that takes most, and always those of the process. Of [`Section::Passing`], [`Section::Before`] and
-/// [`Section::After`] only the largest line counts, as they are never held together. A device's memory is
-/// held beside [`Section::After`], not beside [`Section::Before`].
-fn counted(lines: &[&LedgerLine]) -> Vec<bool> {
+/// Finds the lines that are held at the peak: those of the process, and of the largest phase.
+///
+/// Of [`Section::Passing`], [`Section::Before`] and [`Section::After`] only the largest line counts, as these are
+/// never held together. GPU memory is held together with [`Section::After`], not with [`Section::Before`].
+fn held_at_peak(lines: &[&LedgerLine]) -> Vec<bool> {
     let largest = |section| {
-        let of = (0..lines.len()).filter(|&i| lines[i].section == section);
-        of.rev().max_by_key(|&i| lines[i].bytes)
+        let indices = (0..lines.len()).filter(|&i| lines[i].section == section);
+        indices.rev().max_by_key(|&i| lines[i].bytes)
     };
     let [passing, before, after] = [Section::Passing, Section::Before, Section::After].map(largest);
     let is_lasting = |i: usize| lines[i].section < Section::Passing;
-    let held: [&dyn Fn(usize) -> bool; 3] = [
+    let phases: [&dyn Fn(usize) -> bool; 3] = [
         &|i| Some(i) == before,
         &|i| after.is_some() && (Some(i) == after || lines[i].on_device),
         &|i| Some(i) == passing || is_lasting(i),
     ];
-    let bytes = |held: &&dyn Fn(usize) -> bool| {
-        sum((0..lines.len()).filter(|&i| held(i)).map(|i| lines[i].bytes))
+    let bytes = |is_held: &&dyn Fn(usize) -> bool| {
+        sum((0..lines.len()).filter(|&i| is_held(i)).map(|i| lines[i].bytes))
     };
-    // The last of equals: training.
-    let most = held.iter().copied().max_by_key(bytes);
-    let counts = |i: usize| lines[i].section == Section::Process || most.is_some_and(|it| it(i));
-    (0..lines.len()).map(counts).collect()
+    // Of equal phases the last one: training.
+    let largest = phases.iter().copied().max_by_key(bytes);
+    let is_held = |i: usize| {
+        lines[i].section == Section::Process || largest.is_some_and(|is_held| is_held(i))
+    };
+    (0..lines.len()).map(is_held).collect()
 }
 
-/// A table: section, buffer, size; the total below. In brackets is what is not held when the most is;
-/// the other lines add up to the total, to the last digit.
+/// A table of section, buffer and size, with the total below. Sizes not held at the peak are in parentheses;
+/// the others add up to the total, to the last digit.
 impl fmt::Display for Ledger {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut lines: Vec<_> = self.lines.iter().collect();
         lines.sort_by_key(|line| line.section);
-        let least = if self.on_device() > 0 { "on the device".len() } else { 5 };
+        let min_width = if self.on_device() > 0 { "on the device".len() } else { 5 };
         let what_width =
-            lines.iter().map(|line| line.what.chars().count()).max().unwrap_or(0).max(least);
+            lines.iter().map(|line| line.what.chars().count()).max().unwrap_or(0).max(min_width);
         let (mut previous, mut sum) = (None, 0_u64);
-        for (line, counts) in lines.iter().zip(counted(&lines)) {
+        for (line, is_held) in lines.iter().zip(held_at_peak(&lines)) {
             let name = if previous == Some(line.section) { "" } else { line.section.name() };
             previous = Some(line.section);
             let before = sum;
-            let size = if counts {
+            let size = if is_held {
                 sum = sum.saturating_add(line.bytes);
                 // The difference of two rounded sums, so that the lines add up.
                 format!("{:>14}", mebibytes(tenths(sum) - tenths(before)))
@@ -195,50 +199,6 @@ fn tenths(bytes: u64) -> u64 {
 fn mebibytes(tenths: u64) -> String {
     let whole = usize::try_from(tenths / 10).unwrap_or(usize::MAX);
     format!("{}.{} MiB", grouped(whole), tenths % 10)
-}
-
-/// A number of bytes, displayed with a binary unit.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Bytes(pub u64);
-
-impl fmt::Display for Bytes {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        const UNITS: [&str; 4] = ["KiB", "MiB", "GiB", "TiB"];
-        if self.0 < 1024 {
-            return write!(f, "{} B", self.0);
-        }
-        let mut value = self.0 as f64 / 1024.0;
-        let mut unit = 0;
-        // 1,023.95 would print as 1024.0.
-        while value >= 1023.95 && unit + 1 < UNITS.len() {
-            value /= 1024.0;
-            unit += 1;
-        }
-        write!(f, "{value:.1} {}", UNITS[unit])
-    }
-}
-
-/// Resident memory of this process now `[bytes]`; `None` if unknown.
-#[must_use]
-pub fn resident() -> Option<u64> {
-    status_line("VmRSS:")
-}
-
-/// Largest resident memory of this process so far `[bytes]`; `None` if unknown.
-#[must_use]
-pub fn peak_resident() -> Option<u64> {
-    status_line("VmHWM:")
-}
-
-pub fn status_line(key: &str) -> Option<u64> {
-    parse_status(&std::fs::read_to_string("/proc/self/status").ok()?, key)
-}
-
-/// Reads a line of `/proc/<pid>/status`, "VmRSS:     1234 kB" (proc(5): kB means 1,024 bytes).
-pub fn parse_status(status: &str, key: &str) -> Option<u64> {
-    let value = status.lines().find_map(|line| line.strip_prefix(key))?;
-    let kibibytes: u64 = value.trim().strip_suffix("kB")?.trim().parse().ok()?;
-    kibibytes.checked_mul(1024)
 }
 
 #[cfg(test)]
@@ -274,7 +234,7 @@ mod tests {
         assert_eq!(ledger.total(), total);
         ledger.add_to(Section::Before, "measuring more", 38 << 20);
         assert_eq!(ledger.total(), 41 << 20);
-        // What comes after has a device's memory beside it.
+        // GPU memory is held together with the buffers after training.
         ledger.add_to(Section::After, "measuring the model", 39 << 20);
         assert_eq!(ledger.total(), 42 << 20);
         ledger.add_on_device(Section::Renderer, "on the device", 2 << 20);
@@ -314,27 +274,6 @@ mod tests {
         let table = ledger.to_string();
         for words in ["(10.0 MiB)", "(7.0 MiB)", " 1,024.0 MiB", " 1,027.0 MiB"] {
             assert!(table.contains(words), "{words}: {table}");
-        }
-    }
-
-    #[test]
-    fn bytes_read_well() {
-        let shown = |n| Bytes(n).to_string();
-        assert_eq!(
-            [0, 1023, 1024, 1536, (1 << 20) - 1, 1 << 20, 1 << 30].map(shown),
-            ["0 B", "1023 B", "1.0 KiB", "1.5 KiB", "1.0 MiB", "1.0 MiB", "1.0 GiB"]
-        );
-    }
-
-    #[test]
-    fn status_lines() {
-        let status = "Name:\tx\nVmHWM:\t   2048 kB\nVmRSS:\t     10 kB\n";
-        assert_eq!(parse_status(status, "VmHWM:"), Some(2 << 20));
-        assert_eq!(parse_status(status, "VmRSS:"), Some(10 << 10));
-        assert_eq!(parse_status(status, "VmPeak:"), None);
-        assert_eq!(parse_status("VmHWM: many kB", "VmHWM:"), None);
-        if let (Some(now), Some(peak)) = (resident(), peak_resident()) {
-            assert!(now > 0 && peak > 0);
         }
     }
 }
