@@ -106,7 +106,7 @@ fn gradients_are_those_of_the_float64_renderer_and_of_differences() {
     for with_alpha in [false, true] {
         let scene = scene(with_alpha);
         let (width, height) = scene.size();
-        let model = Model::of(&scene.model);
+        let model = Model::from(&scene.model);
         let image = render(&model, scene.view(), &Rules::STANDARD);
         let (truth, at) = (scene.truth(), numbers(&SOME));
         let compared = |exposure: &[f64; 12]| {
