@@ -50,7 +50,7 @@ impl<'a> Trial<'a> {
     }
 
     /// Records a count that must be zero.
-    pub(super) fn require_zero(&mut self, label: &str, quantity: &str, count: usize) {
+    pub(super) fn count(&mut self, label: &str, quantity: &str, count: usize) {
         self.record(label, quantity, count as f64, 0.0);
     }
 
@@ -142,7 +142,7 @@ impl<'a> Trial<'a> {
             self.record(label, "sum_weight", off.abs(), tolerance * expected.sum_weight + flips);
             invisible += usize::from(expected.pixels > 0 && !measured.visible[row]);
         }
-        self.require_zero(label, "rows blended but not visible", invisible);
+        self.count(label, "rows blended but not visible", invisible);
     }
 
     /// Trains for some steps and applies an edit; then every number of the model, of the optimiser and of an
@@ -173,7 +173,7 @@ impl<'a> Trial<'a> {
         broken += backend.audit()?.len();
         let image = backend.render(camera, background, sh_degree)?;
         broken += count_broken(&[&image.rgb, &image.alpha, &image.depth]);
-        self.require_zero(label, BROKEN_BY_STEPS, broken);
+        self.count(label, BROKEN_BY_STEPS, broken);
         Ok(())
     }
 }

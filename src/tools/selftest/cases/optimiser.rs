@@ -72,14 +72,10 @@ pub(super) fn moments(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let found = backend.audit()?;
     let is_expected = |u: &densify_render::Unsound| u.row == OVERFLOWING && u.kept == Kept::Moment;
     let wrong = usize::from(found.is_empty()) + found.iter().filter(|u| !is_expected(u)).count();
-    trial.require_zero("gradient 1e30", "Gaussians missed or wrongly reported by the audit", wrong);
+    trial.count("gradient 1e30", "Gaussians missed or wrongly reported by the audit", wrong);
     let mut plan = EditPlan::new(backend.rows(), backend.budget());
     let _ = plan.prune(OVERFLOWING);
     backend.apply(&plan.compile(), 1, 1)?;
-    trial.require_zero(
-        "gradient 1e30",
-        "Gaussians not finite after its removal",
-        backend.audit()?.len(),
-    );
+    trial.count("gradient 1e30", "Gaussians not finite after its removal", backend.audit()?.len());
     Ok(())
 }

@@ -49,10 +49,10 @@ pub(super) fn poisoned(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let poisoned = with_value_in_each_slot(&model, value);
         let mut backend = trial.subject.backend(&poisoned)?;
         let different = count_different(&bits(&mut *backend)?, &clean);
-        trial.require_zero(&label, "bits of other Gaussians and of pixels changed", different);
+        trial.count(&label, "bits of other Gaussians and of pixels changed", different);
         let found: Vec<usize> = backend.audit()?.iter().map(|u| u.row as usize).collect();
         let expected: Vec<usize> = (SOUND..SOUND + SLOTS).collect();
-        trial.require_zero(
+        trial.count(
             &label,
             "Gaussians missed or wrongly reported by the audit",
             usize::from(found != expected),
@@ -66,12 +66,12 @@ pub(super) fn poisoned(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let (image, gradient) = run(&mut *backend)?;
         let label = format!("{value:e} in every parameter");
         let broken = count_broken(&[&image.rgb, &image.alpha, &image.depth]);
-        trial.require_zero(&label, "NaN or infinity in the image", broken);
+        trial.count(&label, "NaN or infinity in the image", broken);
         for name in CLASSES {
             let all = class(&gradient, name);
             let per_row = all.len() / extreme.len();
             let sound = &all[..per_row * (SOUND - 1)];
-            trial.require_zero(
+            trial.count(
                 &label,
                 "NaN or infinity in the gradients of others",
                 count_broken(&[sound]),
@@ -80,11 +80,7 @@ pub(super) fn poisoned(trial: &mut Trial<'_>) -> Result<(), BackendError> {
                 let row = SOUND - 1 + slot;
                 let own = &all[row * per_row..(row + 1) * per_row];
                 let label = format!("{value:e} in {}", slot_name(slot));
-                trial.require_zero(
-                    &label,
-                    "NaN or infinity in its own gradient",
-                    count_broken(&[own]),
-                );
+                trial.count(&label, "NaN or infinity in its own gradient", count_broken(&[own]));
             }
         }
     }
