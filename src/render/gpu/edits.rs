@@ -309,7 +309,7 @@ impl GpuBackend {
         let shrunk = (1.0 - decay.scale).ln();
         let immediates = [rows, decay.opacity.to_bits(), shrunk.to_bits(), seen];
         self.execute(&[first], |to| {
-            to.run(self.launches.get("decay"), immediates, rows.div_ceil(256))
+            to.run(self.launches.get("decay"), immediates, rows.div_ceil(256));
         });
     }
 

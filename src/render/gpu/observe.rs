@@ -8,7 +8,7 @@ use densify_policies::policy::{
 
 use super::GpuBackend;
 use super::frame::Frame;
-use super::passes::{Search, Shape};
+use super::passes::{Passes, Search, Shape};
 use super::rows::GRADIENT;
 use super::sizes::OPS_BYTES;
 use crate::candidates::{Shown, ranked};
@@ -138,7 +138,7 @@ impl GpuBackend {
                 chunk.iter().map(|&(x, y, _)| y as u32 * width + x as u32).collect();
             self.write("ops", bytemuck::cast_slice(&numbers));
             self.continue_view(*shape, |passes, to| {
-                passes.surface(to, numbers.len() as u32, is_median, 0)
+                passes.surface(to, numbers.len() as u32, is_median, 0);
             });
             let points = self.read("gradient", 0, 16 * chunk.len() as u64)?;
             for (&(x, y, error), &[px, py, pz, depth]) in
@@ -187,7 +187,7 @@ impl GpuBackend {
         } else {
             let map = pixel_map(image.rgb.as_chunks::<3>().0, target, background, request.map);
             self.write("pixel gradient", bytemuck::cast_slice(&map));
-            self.continue_view(shape, |passes, to| passes.columns(to));
+            self.continue_view(shape, Passes::columns);
             self.columns(request)?
         };
         Ok(AuxOutput { loss, columns, points })
