@@ -8,7 +8,7 @@ use densify_policies::policy::{
 
 use super::GpuBackend;
 use super::frame::Frame;
-use super::passes::{Passes, Search, Shape};
+use super::passes::{Search, Shape};
 use super::rows::GRADIENT;
 use super::sizes::OPS_BYTES;
 use crate::candidates::{Shown, ranked};
@@ -187,7 +187,9 @@ impl GpuBackend {
         } else {
             let map = pixel_map(image.rgb.as_chunks::<3>().0, target, background, request.map);
             self.write("pixel gradient", bytemuck::cast_slice(&map));
-            self.continue_view(shape, Passes::columns);
+            self.continue_view(shape, |passes, to| {
+                passes.columns(to);
+            });
             self.columns(request)?
         };
         Ok(AuxOutput { loss, columns, points })

@@ -127,7 +127,7 @@ pub(super) fn depth_order(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         z *= 7.3;
     }
     trial.count(&format!("{pairs} pairs"), "Gaussians in the wrong order", wrong);
-    // Zero of either sign and the smallest numbers lie in front of the near plane.
+    // Zero of either sign and the smallest numbers are closer than the near plane.
     let mut drawn = 0;
     for z in [0.0, -0.0, 1e-45, -1e-45, 1e-38, f32::MIN_POSITIVE] {
         let mut model = Gaussians::default();
