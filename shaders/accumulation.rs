@@ -1,27 +1,26 @@
-//! How a row's gradients are added up over tiles: in slots, always in the same order, or by atomics, in
-//! any order. The way is chosen when a device is opened.
+//! Accumulation of a row's gradients over tiles: in slots, always in the same order, or by atomics, in any order. It is
+//! chosen when a device is opened.
 
 use std::fmt;
 
-/// How the gradients that a row gets from its tiles are added up.
+/// Accumulation of the gradients that a row receives from tiles.
 ///
-/// On a device that adds by atomics the last bits of a sum depend on chance, and so does what training
-/// arrives at, from run to run.
+/// With atomics the last bits of a sum vary, so that results of training vary slightly between runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Accumulation {
-    /// One record per (row, tile) pair, and a row's records summed in order: the same bytes every time.
+    /// One record per (row, tile) pair; the records of a row are summed in order. Reproducible byte for byte.
     Slots,
-    /// Within subgroups, then to the rows by comparing and exchanging whole numbers.
+    /// Sums within subgroups, then atomic compare-and-exchange per row.
     SubgroupCas,
-    /// Within subgroups, then to the rows by atomic addition of `f32`.
+    /// Sums within subgroups, then atomic `f32` addition per row.
     SubgroupAtomics,
 }
 
 impl Accumulation {
-    /// All of them, the fastest last, as measured in docs/studies/accumulation.tsv.
+    /// All kinds, the fastest last, as measured in docs/studies/accumulation.tsv.
     pub const ALL: [Self; 3] = [Self::Slots, Self::SubgroupAtomics, Self::SubgroupCas];
 
-    /// Its name, as the knob `accumulation` has it.
+    /// Value of the knob `accumulation`.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -31,13 +30,13 @@ impl Accumulation {
         }
     }
 
-    /// The one of this name.
+    /// The kind with this value of the knob.
     #[must_use]
-    pub fn of_name(name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|way| way.name() == name)
+    pub fn from_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|accumulation| accumulation.name() == name)
     }
 
-    /// Whether a device gives the same bytes every time.
+    /// True if runs are reproducible byte for byte.
     #[must_use]
     pub const fn is_deterministic(self) -> bool {
         matches!(self, Self::Slots)

@@ -1,5 +1,5 @@
-//! The WGSL texts of the GPU backend, one file per stage with the name of its native twin, and the table that says
-//! which texts make up each module.
+//! The WGSL kernels of the GPU backend: one file per stage, named as the file of the native backend, and the table of the
+//! texts that make up each shader module.
 
 mod accumulation;
 
@@ -24,23 +24,23 @@ const BLENDED: &str = shader!("shared/blended");
 const RECORD: &str = shader!("shared/record");
 const STEPS: &str = shader!("shared/steps");
 
-/// Which devices have a stage.
+/// The devices that have a stage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum On {
-    /// Those that add up in slots.
+    /// Devices that accumulate gradients in slots.
     Slots,
-    /// Those that add up by atomics.
+    /// Devices that accumulate gradients by atomics.
     Atomics,
-    /// All, but the invocations of a tile share splats through subgroups where there are some.
+    /// All devices; the invocations of a tile share splats through subgroups if there are any.
     Tiles,
-    /// All.
+    /// All devices.
     All,
 }
 
-/// One shader module.
+/// A shader module.
 #[derive(Debug)]
 pub struct Stage {
-    /// Its name: that of its file, and of its native twin.
+    /// Name of the WGSL file, and of the native backend's file.
     pub name: &'static str,
     on: On,
     texts: &'static [&'static str],
@@ -50,7 +50,7 @@ const fn stage(name: &'static str, on: On, texts: &'static [&'static str]) -> St
     Stage { name, on, texts }
 }
 
-/// All stages; [`Stage::text`] adds what depends on the device.
+/// All stages. [`Stage::text`] adds the texts that depend on the device.
 pub const STAGES: &[Stage] = &[
     stage("project", On::All, &[VIEW, GAUSSIAN, shader!("project")]),
     stage("tiles", On::All, &[VIEW, shader!("tiles")]),
@@ -75,8 +75,7 @@ pub const STAGES: &[Stage] = &[
 ];
 
 impl Stage {
-    /// The text of the module for a device that adds up gradients in this way; `None` where the
-    /// device does not have the stage.
+    /// The WGSL of the module for a device with this accumulation; `None` if the device does not have the stage.
     #[must_use]
     pub fn text(&self, accumulation: Accumulation) -> Option<String> {
         let more: &[&str] = match (self.on, accumulation) {

@@ -11,7 +11,7 @@ use densify_render::gpu::{GpuDevice, adapters};
 use densify_render::{Accumulation, AdapterChoice, Device};
 use densify_run::DeviceSpec;
 use densify_run::failure::{Failure, OTHER};
-use densify_selftest::{Case, Finding, Subject, Tested, cases, markdown, table};
+use densify_selftest::{Case, Finding, Subject, SubjectReport, cases, markdown, table};
 
 /// Holds this machine against a renderer in float64, where numbers are hardest.
 ///
@@ -54,7 +54,7 @@ const SUMS: Option<Accumulation> = Some(Accumulation::Slots);
 
 pub(super) fn run(args: &SelftestArgs, console: &Console) -> Result<(), Failure> {
     let chosen = chosen(&args.only)?;
-    let mut tested: Vec<Tested> = Vec::new();
+    let mut tested: Vec<SubjectReport> = Vec::new();
     for subject in subjects(args)? {
         console.result(format_args!(
             "densify {} on {}: {}, {}",
@@ -63,7 +63,7 @@ pub(super) fn run(args: &SelftestArgs, console: &Console) -> Result<(), Failure>
             std::env::consts::OS,
             std::env::consts::ARCH
         ));
-        let mut here = Tested { subject: subject.name(), cases: Vec::new() };
+        let mut here = SubjectReport { subject: subject.name(), cases: Vec::new() };
         for &case in &chosen {
             let findings = case.run(&subject, args.long);
             console.result(table(&case, &findings));
@@ -81,9 +81,9 @@ pub(super) fn run(args: &SelftestArgs, console: &Console) -> Result<(), Failure>
 }
 
 /// The number of figures, if all are within their tolerances.
-fn verdict(tested: &[Tested]) -> Result<usize, Failure> {
-    let findings: Vec<&Finding> = tested.iter().flat_map(Tested::findings).collect();
-    let failed = findings.iter().filter(|finding| !finding.holds()).count();
+fn verdict(tested: &[SubjectReport]) -> Result<usize, Failure> {
+    let findings: Vec<&Finding> = tested.iter().flat_map(SubjectReport::findings).collect();
+    let failed = findings.iter().filter(|finding| !finding.passes()).count();
     let count = findings.len();
     if failed == 0 {
         return Ok(count);
@@ -149,7 +149,7 @@ mod tests {
     #[test]
     fn figures_beyond_their_tolerance_have_code_1() {
         let finding = |error| Finding {
-            number: 7,
+            case: 7,
             kind: "image".into(),
             place: "here".into(),
             error,
@@ -157,7 +157,7 @@ mod tests {
         };
         let tested = |errors: &[f64]| {
             let findings = errors.iter().map(|&error| finding(error)).collect();
-            vec![Tested { subject: "native".into(), cases: vec![(cases()[0], findings)] }]
+            vec![SubjectReport { subject: "native".into(), cases: vec![(cases()[0], findings)] }]
         };
         assert_eq!(verdict(&tested(&[0.0, 1e-5])).unwrap(), 2);
         for wrong in [1.1e-5, f64::NAN, f64::INFINITY] {

@@ -166,7 +166,7 @@ impl Device {
     pub fn most_pairs(&self, needs: &Needs) -> usize {
         match self {
             Self::Processor => u32::MAX as usize,
-            Self::Gpu(device) => device.most_pairs(needs) as usize,
+            Self::Gpu(device) => device.max_pairs(needs) as usize,
         }
     }
 
@@ -176,7 +176,7 @@ impl Device {
     pub fn promise(&self, sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
         match self {
             Self::Processor => CpuBackend::promise(sh_degree, options, threads),
-            Self::Gpu(device) => device.promise(sh_degree, options),
+            Self::Gpu(device) => device.memory_plan(sh_degree, options),
         }
     }
 
@@ -207,7 +207,7 @@ impl Device {
     pub fn prove(&self, needs: &Needs) -> Result<(), BackendError> {
         match self {
             Self::Processor => Ok(()),
-            Self::Gpu(device) => device.prove(needs),
+            Self::Gpu(device) => device.run_canary(needs),
         }
     }
 

@@ -30,15 +30,15 @@ impl GpuDevice {
         match *self {}
     }
 
-    pub(super) fn most_pairs(&self, _: &Needs) -> u64 {
+    pub(super) fn max_pairs(&self, _: &Needs) -> u64 {
         match *self {}
     }
 
-    pub(super) fn promise(&self, _: u8, _: &Setup) -> Ledger {
+    pub(super) fn memory_plan(&self, _: u8, _: &Setup) -> Ledger {
         match *self {}
     }
 
-    pub(super) fn prove(&self, _: &Needs) -> Result<(), BackendError> {
+    pub(super) fn run_canary(&self, _: &Needs) -> Result<(), BackendError> {
         match *self {}
     }
 

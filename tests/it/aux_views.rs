@@ -132,7 +132,7 @@ fn map(scene: &Scene, image: &Image, weights: PixelMap) -> Vec<f64> {
 #[test]
 fn every_column_is_that_of_the_reference() {
     let scene = scene();
-    let model = Model::of(&scene.model);
+    let model = Model::from(&scene.model);
     let view = View { camera: &scene.camera, background: BACKGROUND.map(f64::from), sh_degree: 2 };
     let image = render(&model, view, &Rules::STANDARD);
     let splats = project(&model, view, &Rules::STANDARD);

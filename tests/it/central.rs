@@ -55,7 +55,7 @@ fn gradients_of_every_class_at_every_degree() {
     let mut table = Table::new("reference against central differences");
     for degree in 0..=3 {
         let camera = scenes::camera(13, 11, 40 + u64::from(degree));
-        let model = Model::of(&scenes::cloud(7, degree, &camera, 70 + u64::from(degree)));
+        let model = Model::from(&scenes::cloud(7, degree, &camera, 70 + u64::from(degree)));
         let upstream = scenes::upstream(&camera, 3);
         check(&mut table, &format!("degree {degree}"), &model, view(&camera, degree), &upstream);
         if degree > 0 {
@@ -76,7 +76,7 @@ fn gradients_where_the_jacobian_is_clamped() {
     for (what, local) in
         [("x", [4.0, 0.2, 2.0]), ("y", [0.1, -3.5, 2.2]), ("both", [-2.6, 2.0, 2.1])]
     {
-        let model = Model::of(&scenes::one_at(&camera, local, [1.1, 0.9, 1.3]));
+        let model = Model::from(&scenes::one_at(&camera, local, [1.1, 0.9, 1.3]));
         let seen = render(&model, view(&camera, 1), &Rules::SMOOTH);
         assert!(seen.alpha.iter().any(|&alpha| alpha > 0.01), "{what}: the row is not seen");
         check(&mut table, what, &model, view(&camera, 1), &scenes::upstream(&camera, 9));

@@ -106,7 +106,7 @@ fn gradients_are_those_of_the_float64_renderer_and_of_differences() {
     for with_alpha in [false, true] {
         let scene = scene(with_alpha);
         let (width, height) = scene.size();
-        let model = Model::of(&scene.model);
+        let model = Model::from(&scene.model);
         let image = render(&model, scene.view(), &Rules::STANDARD);
         let (truth, at) = (scene.truth(), numbers(&SOME));
         let compared = |exposure: &[f64; 12]| {
@@ -146,7 +146,7 @@ fn gradients_are_those_of_the_float64_renderer_and_of_differences() {
             table.check(&what, "loss", off, 1e-5);
             let found = output.exposure.expect("a gradient");
             let found: Vec<f32> = found.matrix.concat().into_iter().chain(found.offset).collect();
-            let tolerance = 10.0 * subject.gradient();
+            let tolerance = 10.0 * subject.gradient_tolerance();
             table.check(&what, "exposure", relative_error(&found, &differences), tolerance);
             let rows = gradients(&*backend);
             let class = |first: usize, count: usize| -> Vec<f64> {

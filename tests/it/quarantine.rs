@@ -4,7 +4,7 @@
 
 use densify::core::gaussians::Gaussians;
 use densify::render::{Attribute, Backend, Kept, Storage, Unsound, Values};
-use densify::selftest::values::{POISON, SLOTS, remove, slot_of};
+use densify::selftest::values::{POISON, SLOTS, remove, slot_mut};
 use densify::selftest::{Setup, Subject, scenes};
 use densify_policies::plan::EditPlan;
 
@@ -36,8 +36,8 @@ fn every_parameter_that_is_none_is_found(subject: &Subject, storage: Storage) {
     for value in POISON {
         let mut poisoned = model.clone();
         // Beyond f16, and no reason to be removed.
-        *slot_of(&mut poisoned, SLOTS + 1, 20) = -1e30;
-        (0..SLOTS).for_each(|slot| *slot_of(&mut poisoned, slot, slot) = value);
+        *slot_mut(&mut poisoned, SLOTS + 1, 20) = -1e30;
+        (0..SLOTS).for_each(|slot| *slot_mut(&mut poisoned, slot, slot) = value);
         let expected: Vec<Unsound> = (0..SLOTS).map(|slot| unsound(slot, slot)).collect();
         assert_eq!(audit(&poisoned), expected, "{value}, {storage:?}");
     }
@@ -97,7 +97,7 @@ fn the_others_train_as_if_it_were_not_there() {
         // A number of each class.
         for slot in [1, 4, 8, 10, 12, 40] {
             let mut poisoned = model.clone();
-            *slot_of(&mut poisoned, POISONED, slot) = f32::NAN;
+            *slot_mut(&mut poisoned, POISONED, slot) = f32::NAN;
             let mut backend = make(subject, &poisoned);
             let others = remove(&train(&mut *backend), POISONED);
             let found = backend.audit().expect("an audit");

@@ -30,7 +30,7 @@ fn truth(
     rules: &Rules,
 ) -> (Image, Model, densify::selftest::reference::Upstream) {
     let view = View { camera, background: GREY.map(f64::from), sh_degree: 1 };
-    let exact = Model::of(model);
+    let exact = Model::from(model);
     let splats = project::project(&exact, view, rules);
     let order = project::by_depth(&splats);
     let image = blend::render(&splats, &order, view, rules);

@@ -74,7 +74,7 @@ pub(crate) fn reference(
     view: View<'_>,
     target: &Image8,
 ) -> (Gradient, Vec<f64>, Vec<f64>) {
-    let model = Model::of(model);
+    let model = Model::from(model);
     let (image, loss) = rendering_and_loss(&model, view, target);
     let splats = project(&model, view, &Rules::STANDARD);
     let mut errors = vec![0.0; splats.len()];
@@ -253,7 +253,7 @@ fn mixed([absolute, dissimilar]: [f64; 2], map: ErrorMap) -> f64 {
 
 /// Each row's score of one view, by the definition of [`ErrorScore`].
 fn scores(model: &Gaussians, view: View<'_>, target: &Image8, score: &ErrorScore) -> Vec<f64> {
-    let model = Model::of(model);
+    let model = Model::from(model);
     let (image, loss) = rendering_and_loss(&model, view, target);
     let edges: Vec<f64> = (0..image.alpha.len()).map(|pixel| edge(target, pixel)).collect();
     let mean = edges.iter().sum::<f64>() / edges.len() as f64;

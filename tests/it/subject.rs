@@ -132,7 +132,7 @@ pub(crate) fn make_with(
     model: &Gaussians,
     setup: Setup,
 ) -> Box<dyn Differentiable> {
-    subject.with(model, setup).expect("a small model fits")
+    subject.backend_with(model, setup).expect("a small model fits")
 }
 
 /// How proptest is set up for a backend: as many cases as `PROPTEST_CASES` says, or so many; on devices an eighth, as

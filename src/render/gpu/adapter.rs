@@ -1,4 +1,4 @@
-//! The available adapters: what they are, what they lack, and which one is chosen.
+//! Enumerates the adapters, checks what they lack, and chooses one.
 
 use wgpu::{
     Adapter, Backends, DeviceType, Features, Instance, InstanceDescriptor, InstanceFlags, Limits,
@@ -8,30 +8,34 @@ use super::device::wait;
 use super::rows::widest_row;
 use crate::{Accumulation, AdapterChoice, AdapterKind, AdapterSummary, BackendError};
 
-/// What a device must have to add up gradients in this way, beside what all kernels need.
-pub(super) fn features_for(way: Accumulation) -> Features {
-    match way {
+/// Features that a kind of accumulation requires, in addition to those of all kernels.
+pub(super) fn features_for(accumulation: Accumulation) -> Features {
+    match accumulation {
         Accumulation::Slots => Features::empty(),
         Accumulation::SubgroupCas => Features::SUBGROUP,
         Accumulation::SubgroupAtomics => Features::SUBGROUP | Features::SHADER_FLOAT32_ATOMIC,
     }
 }
 
-/// The features that an adapter lacks for it, in words.
-pub(super) fn missing_for(way: Accumulation, there: Features) -> Vec<&'static str> {
-    let lacking = features_for(way).difference(there);
+/// Names of the features that an adapter lacks for a kind of accumulation.
+fn missing_for(accumulation: Accumulation, available: Features) -> Vec<&'static str> {
+    let lacking = features_for(accumulation).difference(available);
     let names = [
         (Features::SUBGROUP, "subgroup operations (SUBGROUP)"),
         (Features::SHADER_FLOAT32_ATOMIC, "atomic addition of f32 (SHADER_FLOAT32_ATOMIC)"),
     ];
-    names.into_iter().filter(|(one, _)| lacking.contains(*one)).map(|(_, name)| name).collect()
+    names
+        .into_iter()
+        .filter(|(feature, _)| lacking.contains(*feature))
+        .map(|(_, name)| name)
+        .collect()
 }
 
 impl AdapterSummary {
     fn new(adapter: &Adapter) -> Self {
         let info = adapter.get_info();
         let (limits, features) = (adapter.limits(), adapter.features());
-        let has = |way: &Accumulation| missing_for(*way, features).is_empty();
+        let is_supported = |a: &Accumulation| missing_for(*a, features).is_empty();
         Self {
             kind: match info.device_type {
                 DeviceType::DiscreteGpu => AdapterKind::Discrete,
@@ -46,21 +50,21 @@ impl AdapterSummary {
             largest_binding: limits.max_storage_buffer_binding_size,
             largest_buffer: limits.max_buffer_size,
             missing: missing(&limits, features),
-            accumulations: Accumulation::ALL.into_iter().filter(has).collect(),
+            accumulations: Accumulation::ALL.into_iter().filter(is_supported).collect(),
         }
     }
 
-    /// Largest budget whose parameters this adapter can hold in one piece each, at a degree: one
-    /// band of the coefficients, or the geometry, or the gradients of a row.
+    /// Largest budget that this adapter supports at an SH degree: each array of rows (the geometry, a band of
+    /// coefficients, the gradients) must fit one buffer.
     #[must_use]
     pub fn largest_budget(&self, sh_degree: u8) -> u64 {
         let largest = self.largest_binding.min(self.largest_buffer);
-        (largest / widest_row(sh_degree)).min(MOST_ROWS)
+        (largest / widest_row(sh_degree)).min(MAX_ROWS)
     }
 }
 
-/// Whether there may be a GPU: on Linux, whether the kernel shows a device. To ask the drivers costs
-/// time, and memory that is never given back, software drivers' included.
+/// False if there is certainly no GPU: on Linux, if the kernel shows no device. Drivers, also software drivers,
+/// take time to load and memory that is never freed.
 #[must_use]
 pub fn may_be_present() -> bool {
     const NODES: [&str; 6] =
@@ -68,10 +72,10 @@ pub fn may_be_present() -> bool {
     !cfg!(target_os = "linux") || NODES.iter().any(|node| std::path::Path::new(node).exists())
 }
 
-/// Most rows whose numbers, times their width, fit the shaders' 32-bit indices.
-const MOST_ROWS: u64 = 1 << 25;
+/// Largest number of rows whose numbers have 32-bit indices in the shaders.
+const MAX_ROWS: u64 = 1 << 25;
 
-/// The limits that every kernel is written for: WebGPU promises them everywhere.
+/// Limits that the kernels rely on; every WebGPU device has them.
 const STORAGE_BUFFERS: u32 = 8;
 const INVOCATIONS: u32 = 256;
 const SHARED_BYTES: u32 = 16_384;
@@ -80,20 +84,20 @@ const IMMEDIATE_BYTES: u32 = 16;
 
 fn missing(limits: &Limits, features: Features) -> Vec<String> {
     let mut missing = Vec::new();
-    let mut need = |what: &str, has: u32, needs: u32| {
-        if has < needs {
-            missing.push(format!("{what}: {needs} needed, {has} there"));
+    let mut require = |limit: &str, available: u32, needed: u32| {
+        if available < needed {
+            missing.push(format!("{limit}: {needed} needed, {available} available"));
         }
     };
-    need(
+    require(
         "storage buffers per kernel",
         limits.max_storage_buffers_per_shader_stage,
         STORAGE_BUFFERS,
     );
-    need("invocations per workgroup", limits.max_compute_invocations_per_workgroup, INVOCATIONS);
-    need("bytes of workgroup memory", limits.max_compute_workgroup_storage_size, SHARED_BYTES);
-    need("workgroups per dimension", limits.max_compute_workgroups_per_dimension, GROUPS);
-    need("bytes of immediate data", limits.max_immediate_size, IMMEDIATE_BYTES);
+    require("invocations per workgroup", limits.max_compute_invocations_per_workgroup, INVOCATIONS);
+    require("bytes of workgroup memory", limits.max_compute_workgroup_storage_size, SHARED_BYTES);
+    require("workgroups per dimension", limits.max_compute_workgroups_per_dimension, GROUPS);
+    require("bytes of immediate data", limits.max_immediate_size, IMMEDIATE_BYTES);
     if !features.contains(Features::IMMEDIATES) {
         missing.push("immediate data (push constants)".into());
     }
@@ -104,32 +108,32 @@ fn instance() -> Instance {
     let mut descriptor = InstanceDescriptor::new_without_display_handle();
     descriptor.backends =
         Backends::from_env().unwrap_or(Backends::VULKAN | Backends::METAL | Backends::DX12);
-    // Indirect dispatches take numbers that our own kernels have bounded.
+    // No validation of indirect dispatches: their sizes are bounded by our own kernels.
     descriptor.flags = InstanceFlags::empty();
     Instance::new(descriptor)
 }
 
 pub(super) fn enumerate() -> Vec<(Adapter, AdapterSummary)> {
     let all = wait(instance().enumerate_adapters(Backends::all()));
-    all.into_iter()
-        .map(|a| {
-            let s = AdapterSummary::new(&a);
-            (a, s)
-        })
-        .collect()
+    let summarise = |adapter| {
+        let summary = AdapterSummary::new(&adapter);
+        (adapter, summary)
+    };
+    all.into_iter().map(summarise).collect()
 }
 
-/// All adapters, as `WGPU_BACKEND` and the drivers' own variables let them be seen.
+/// All adapters that `WGPU_BACKEND` and the variables of the drivers admit.
 #[must_use]
 pub fn adapters() -> Vec<AdapterSummary> {
     enumerate().into_iter().map(|(_, summary)| summary).collect()
 }
 
 impl AdapterChoice {
-    /// How the adapter that was taken adds up gradients.
+    /// The accumulation to use on an adapter: the requested one, or the adapter's fastest.
     ///
     /// # Errors
-    /// [`BackendError::NoAdapter`] where it does not support the way: what it lacks, and what it supports.
+    /// [`BackendError::NoAdapter`] if the adapter does not support the requested one: what it lacks, and what it
+    /// supports.
     pub(super) fn accumulation(
         &self,
         adapter: &AdapterSummary,
@@ -140,13 +144,13 @@ impl AdapterChoice {
         if missing.is_empty() {
             return Ok(wanted);
         }
-        let can: Vec<String> =
-            adapter.accumulations.iter().map(|way| format!("accumulation={way}")).collect();
+        let supported: Vec<String> =
+            adapter.accumulations.iter().map(|a| format!("accumulation={a}")).collect();
         Err(BackendError::NoAdapter(format!(
-            "accumulation={wanted}: {} lacks {}; what works there is {}",
+            "accumulation={wanted}: {} lacks {}; it supports {}",
             adapter.name,
             missing.join(" and "),
-            can.join(" or ")
+            supported.join(" or ")
         )))
     }
 
@@ -157,8 +161,7 @@ impl AdapterChoice {
     }
 }
 
-/// The place of the adapter to take: the best of those that match and lack nothing. Software comes
-/// last.
+/// Index of the best adapter that matches the choice and lacks nothing. Software drivers come last.
 ///
 /// # Errors
 /// [`BackendError::NoAdapter`] with the adapters found and what they lack.
@@ -186,10 +189,10 @@ pub(super) fn choose(
     Err(BackendError::NoAdapter(match (&choice.name, matching.is_empty()) {
         (_, false) => {
             let lacking: Vec<String> = matching.iter().map(describe).collect();
-            format!("no adapter can do what is needed: {}", lacking.join(", "))
+            format!("no adapter has all required features: {}", lacking.join(", "))
         }
         (Some(name), true) if !all.is_empty() => {
-            format!("no adapter is called `{name}`; there are: {}", names.join(", "))
+            format!("no adapter is called `{name}`; available: {}", names.join(", "))
         }
         _ => "no adapter was found; install a Vulkan, Metal or DX12 driver".into(),
     }))
@@ -217,36 +220,36 @@ mod tests {
         use Accumulation::{Slots, SubgroupAtomics, SubgroupCas};
         let subgroups = Features::SUBGROUP;
         let both = subgroups | Features::SHADER_FLOAT32_ATOMIC;
-        let of = |features| AdapterSummary {
+        let with = |features| AdapterSummary {
             accumulations: Accumulation::ALL
                 .into_iter()
-                .filter(|way| missing_for(*way, features).is_empty())
+                .filter(|a| missing_for(*a, features).is_empty())
                 .collect(),
             ..adapter("Card", AdapterKind::Discrete, &[])
         };
         let chosen = |features, accumulation| {
             let choice = AdapterChoice { name: None, accumulation };
-            choice.accumulation(&of(features), features)
+            choice.accumulation(&with(features), features)
         };
         // By default the fastest.
         for (features, expected) in [
             (Features::empty(), Slots),
             (subgroups, SubgroupCas),
             (both, SubgroupCas),
-            // Sums over tiles want subgroups, too.
+            // Atomics need subgroups as well.
             (Features::SHADER_FLOAT32_ATOMIC, Slots),
         ] {
             assert_eq!(chosen(features, None).unwrap(), expected, "{features:?}");
         }
-        // What is asked for, or a refusal; `tests/it/cli/accumulation.rs` has its words.
+        // The requested one, or an error; `tests/it/cli/accumulation.rs` checks the message.
         for wanted in Accumulation::ALL {
             assert_eq!(chosen(both, Some(wanted)).unwrap(), wanted);
-            assert_eq!(Accumulation::of_name(wanted.name()), Some(wanted));
+            assert_eq!(Accumulation::from_name(wanted.name()), Some(wanted));
         }
-        let told = |features, wanted| chosen(features, Some(wanted)).unwrap_err().to_string();
-        let without = told(subgroups, SubgroupAtomics);
+        let error = |features, wanted| chosen(features, Some(wanted)).unwrap_err().to_string();
+        let without = error(subgroups, SubgroupAtomics);
         assert!(without.contains("accumulation=slots or accumulation=cas"), "{without}");
-        assert!(!told(Features::empty(), SubgroupCas).contains("FLOAT32"));
+        assert!(!error(Features::empty(), SubgroupCas).contains("FLOAT32"));
     }
 
     #[test]
@@ -262,12 +265,12 @@ mod tests {
         assert_eq!(choose(&all[..3], &AdapterChoice::default()).unwrap(), 2);
         assert_eq!(choose(&all[..2], &AdapterChoice::default()).unwrap(), 0);
         assert_eq!(choose(&all, &named("LLVMPIPE")).unwrap(), 0);
-        let told = |all: &[AdapterSummary], choice| choose(all, &choice).unwrap_err().to_string();
-        assert!(told(&all, named("old")).contains("workgroups per dimension"));
-        assert!(told(&all, named("geforce")).contains("Shared"));
-        assert!(told(&[], named("x")).contains("install"));
+        let error = |all: &[AdapterSummary], choice| choose(all, &choice).unwrap_err().to_string();
+        assert!(error(&all, named("old")).contains("workgroups per dimension"));
+        assert!(error(&all, named("geforce")).contains("Shared"));
+        assert!(error(&[], named("x")).contains("install"));
         assert!(all[3].is_gpu() && !all[0].is_gpu() && !all[1].is_gpu());
-        // 128 MiB: the seven coefficients of band 3 decide.
+        // 128 MiB: the seven coefficients of band 3 are the widest array.
         assert_eq!(all[0].largest_budget(3), (128 << 20) / 84);
     }
 }

@@ -1,5 +1,4 @@
-//! Looks for rows with a number that is not finite; see [`audit`](crate::audit). A mark per
-//! row comes back, no parameter.
+//! Finds rows with a number that is not finite; see [`audit`](crate::audit). Only a mark per row is copied to the host.
 
 use super::GpuBackend;
 use super::launches::{Audit, MOMENTS};
@@ -8,16 +7,16 @@ use crate::{Attribute, BackendError, Kept, Unsound};
 
 impl GpuBackend {
     /// The rows with a number that is not finite, in order.
-    pub(super) fn unsound(&self) -> Result<Vec<Unsound>, BackendError> {
+    pub(super) fn find_unsound(&self) -> Result<Vec<Unsound>, BackendError> {
         let rows = self.rows as u32;
         let bytes = 4 * u64::from(rows);
         let mut encoder = self.device.device.create_command_encoder(&Default::default());
         encoder.clear_buffer(self.buffers.get("sums"), 0, Some(bytes.next_multiple_of(16)));
         let pass = encoder.begin_compute_pass(&Default::default());
         let mut to = Recorder::new(pass);
-        for Audit { launch, first_row, numbers, place } in &self.launches.audits {
+        for Audit { launch, first_row, numbers, mark } in &self.launches.audits {
             let groups = rows.saturating_sub(*first_row).div_ceil(256);
-            to.run(launch, [rows, *numbers, *place, *first_row], groups);
+            to.run(launch, [rows, *numbers, *mark, *first_row], groups);
         }
         drop(to);
         self.device.queue.submit([encoder.finish()]);

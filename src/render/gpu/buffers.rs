@@ -1,4 +1,4 @@
-//! The device's buffers, by name: allocated at the sizes that the ledger promises.
+//! Allocates the device's buffers at the planned sizes.
 
 use std::collections::HashMap;
 
@@ -16,7 +16,7 @@ pub(super) struct Buffers {
 }
 
 impl Buffers {
-    /// Allocates everything, or nothing that lasts.
+    /// Allocates all buffers.
     pub(super) fn new(device: &Device, sizes: &Sizes) -> Result<Self, BackendError> {
         let planned = sizes.planned();
         check_sizes(device, &planned, sizes)?;
@@ -52,13 +52,13 @@ impl Buffers {
         Ok(())
     }
 
-    /// The buffer of this name; where there is none, such as for bands beyond the model's degree, a few
-    /// bytes that are never read.
+    /// The buffer of this name. A buffer that does not exist, such as that of a band beyond the model's degree, is
+    /// replaced by a few bytes that are never read.
     pub(super) fn get(&self, name: &str) -> &Buffer {
         self.named.get(name).unwrap_or(&self.nothing)
     }
 
-    /// What is allocated now `[bytes]`.
+    /// Current size of all buffers `[bytes]`.
     pub(super) fn bytes(&self) -> u64 {
         self.named.values().map(Buffer::size).sum()
     }
@@ -73,12 +73,12 @@ fn create(device: &wgpu::Device, planned: &Planned) -> Buffer {
     })
 }
 
-/// Refuses what this device could not bind: a driver may take it and fail later.
+/// Fails if a buffer is larger than the device can bind: a driver may accept it and fail later.
 fn check_sizes(device: &Device, planned: &[Planned], sizes: &Sizes) -> Result<(), BackendError> {
     let most = device.largest_binding();
-    // Photographs that are kept are copied only, and as many as a buffer holds.
-    let bound = planned.iter().filter(|p| p.name != "photographs");
-    let Some(worst) = bound.max_by_key(|p| p.bytes).filter(|p| p.bytes > most) else {
+    // The buffer of photographs is only copied from and to, and is no larger than the device supports.
+    let bound_buffers = planned.iter().filter(|p| p.name != "photographs");
+    let Some(worst) = bound_buffers.max_by_key(|p| p.bytes).filter(|p| p.bytes > most) else {
         return Ok(());
     };
     let fit = match worst.name {
@@ -95,7 +95,7 @@ fn check_sizes(device: &Device, planned: &[Planned], sizes: &Sizes) -> Result<()
     })
 }
 
-/// 1/(1 − β₁^age) and √(1/(1 − β₂^age)), by age.
+/// Adam's bias corrections by age: 1/(1 − β₁^age) and √(1/(1 − β₂^age)).
 pub(super) fn bias_table() -> Vec<[f32; 2]> {
     (0..=MATURE as i32)
         .map(|age| {

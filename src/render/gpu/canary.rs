@@ -1,5 +1,5 @@
-//! The canary: before a device trains anything, two steps on a fixed small scene are compared with the
-//! native backend. A driver that miscompiles a kernel is then an error instead of a bad model.
+//! The canary: before a device trains, two steps on a small fixed scene are compared with the native backend, so that a
+//! driver that miscompiles a kernel causes an error instead of a bad model.
 
 use densify_policies::policy::{Cadence, LossTerms, Needs};
 use densify_policies::rng::{PolicyRng, Purpose};
@@ -16,12 +16,13 @@ use densify_core::image::Image8;
 const ROWS: u32 = 60;
 const SIZE: u32 = 40;
 const BACKGROUND: [f32; 3] = [0.1, 0.2, 0.4];
-/// How far colours and losses may differ: rounding stays below 1e-5, and a pixel in which a splat
-/// is at the threshold of 1/255 may gain or lose it.
+/// Largest difference of a colour: rounding stays below 1e-5, but a splat at the threshold of 1/255 may appear in a pixel
+/// or not.
 const TOLERANCE: f32 = 6e-3;
+/// Largest difference of a loss.
 const LOSS_TOLERANCE: f32 = 1e-3;
 
-/// Rows of all sizes and opacities before a camera, some beyond its image and behind it.
+/// Rows of all sizes and opacities in front of a camera, some outside of its image and behind it.
 fn scene() -> (Gaussians, Camera, Image8) {
     let rng = PolicyRng::new(17, 1);
     let draw = |row, counter| rng.normal3(row, Purpose::Noise, counter);
@@ -56,6 +57,7 @@ fn scene() -> (Gaussians, Camera, Image8) {
     (model, camera, target)
 }
 
+/// Trains two steps and renders.
 fn run(
     backend: &mut dyn Backend,
     camera: &Camera,
@@ -91,39 +93,38 @@ fn run(
 }
 
 impl GpuBackend {
-    /// Takes over `model` and allocates everything for `options.budget` rows, after the device has
-    /// shown on a small scene that it computes what the native backend does.
+    /// Runs the canary, allocates all buffers for `options.budget` rows, and uploads the model.
     ///
     /// # Errors
     /// [`BackendError`]: a limit of the device, its memory, or a driver that computes wrongly.
     ///
     /// # Panics
-    /// When the model has more rows than the budget: the caller subsamples before.
+    /// When the model has more rows than the budget: a bug in the caller.
     pub fn new(
         model: &Gaussians,
         options: &Setup,
         device: &GpuDevice,
     ) -> Result<Self, BackendError> {
-        device.prove(&options.needs)?;
+        device.run_canary(&options.needs)?;
         Self::without_canary(model, options, device)
     }
 }
 
 impl GpuDevice {
-    /// Has the device show, once, that it computes what the native backend does with the kernels that these
-    /// needs take. Afterwards the process holds what its driver takes.
+    /// Compares the device with the native backend, once per set of kernels that a policy's needs require. Afterwards
+    /// the memory of the driver is part of the process's.
     ///
     /// # Errors
     /// As [`GpuBackend::new`].
-    pub fn prove(&self, needs: &Needs) -> Result<(), BackendError> {
-        self.0.prove(RecordLayout::new(needs.signals), || check(self, needs))
+    pub fn run_canary(&self, needs: &Needs) -> Result<(), BackendError> {
+        self.0.check_once(RecordLayout::new(needs.signals), || check(self, needs))
     }
 }
 
-/// Compares the device with the native backend, with the kernels that these needs take.
+/// Compares the device with the native backend, with the kernels that these needs require.
 ///
 /// # Errors
-/// [`BackendError::Device`] with what differs.
+/// [`BackendError::Device`] with the difference.
 fn check(device: &GpuDevice, needs: &Needs) -> Result<(), BackendError> {
     let (model, camera, target) = scene();
     let mut options = Setup { threads: Some(1), ..Setup::new(model.len()) };
@@ -133,12 +134,12 @@ fn check(device: &GpuDevice, needs: &Needs) -> Result<(), BackendError> {
     let mut gpu = GpuBackend::without_canary(&model, &options, device)?;
     let (expected, image) = run(&mut cpu, &camera, &target)?;
     let (found, rendered) = run(&mut gpu, &camera, &target)?;
-    let wrong = |what: String| BackendError::Device {
+    let wrong = |difference: String| BackendError::Device {
         device: device.adapter().name.clone(),
-        why: format!("its driver computes wrongly: {what}"),
+        why: format!("its driver computes wrongly: {difference}"),
     };
     for (step, (found, expected)) in found.iter().zip(&expected).enumerate() {
-        // Not `>`: a NaN is wrong, too.
+        // `<=`, so that NaN is wrong.
         let is_close = (found.loss - expected.loss).abs() <= LOSS_TOLERANCE;
         if !is_close || found.visible != expected.visible {
             return Err(wrong(format!(
@@ -166,12 +167,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_scene_exercises_what_it_should() {
+    fn the_scene_exercises_the_kernels() {
         let (model, camera, target) = scene();
         let options = Setup { threads: Some(1), ..Setup::new(model.len()) };
         let mut cpu = CpuBackend::new(&model, &options).unwrap();
         let (outputs, _) = run(&mut cpu, &camera, &target).unwrap();
-        // Rows on screen and off it, several tiles, and steps that matter beyond the tolerance.
+        // Visible and invisible rows, several tiles, and steps whose effect exceeds the tolerance.
         assert!(outputs[0].visible > 30 && outputs[0].visible < model.len(), "{outputs:?}");
         assert!(outputs[0].entries > 100, "{outputs:?}");
         assert!(outputs[0].loss - outputs[1].loss > 3.0 * LOSS_TOLERANCE, "{outputs:?}");

@@ -1,4 +1,4 @@
-//! How long the stages of a step take on the device, for benchmarks: it writes the time at the beginning of each.
+//! Times the stages of a step on the device, for benchmarks: a timestamp is written at the beginning of each.
 
 use std::time::Duration;
 
@@ -11,24 +11,24 @@ use super::device::Device;
 use super::readback;
 use crate::BackendError;
 
-/// What it needs.
+/// Features that timestamps require.
 pub(super) const FEATURES: Features =
     Features::TIMESTAMP_QUERY.union(Features::TIMESTAMP_QUERY_INSIDE_PASSES);
-/// Most times of one submission; what comes later is not told apart.
-const MOST: u32 = 512;
-const BYTES: u64 = MOST as u64 * size_of::<u64>() as u64;
+/// Largest number of timestamps per submission; later stages are not timed.
+const MAX_TIMES: u32 = 512;
+const BYTES: u64 = MAX_TIMES as u64 * size_of::<u64>() as u64;
 
 #[derive(Debug)]
 pub(super) struct Clock {
     times: QuerySet,
     resolved: Buffer,
     staging: Buffer,
-    /// Of a unit of time `[ns]`.
+    /// Unit of the timestamps `[ns]`.
     period: f32,
 }
 
 impl Clock {
-    /// A clock of a device with [`FEATURES`].
+    /// Creates a clock on a device with [`FEATURES`].
     pub(super) fn new(device: &wgpu::Device, queue: &Queue) -> Self {
         let buffer = |usage| {
             let descriptor =
@@ -39,7 +39,7 @@ impl Clock {
             times: device.create_query_set(&QuerySetDescriptor {
                 label: None,
                 ty: QueryType::Timestamp,
-                count: MOST,
+                count: MAX_TIMES,
             }),
             resolved: buffer(BufferUsages::QUERY_RESOLVE | BufferUsages::COPY_SRC),
             staging: buffer(BufferUsages::MAP_READ | BufferUsages::COPY_DST),
@@ -47,8 +47,8 @@ impl Clock {
         }
     }
 
-    /// The time of each of these stages of what was submitted last, in order; those of one name are one.
-    pub(super) fn laps(
+    /// Duration of each stage of the last submission, in order. Stages of the same name are added up.
+    pub(super) fn stage_times(
         &self,
         device: &Device,
         stages: &[&'static str],
@@ -60,24 +60,24 @@ impl Clock {
         encoder.copy_buffer_to_buffer(&self.resolved, 0, &self.staging, 0, bytes);
         let read = readback::finish(device, &self.staging, encoder, bytes)?;
         let times: Vec<u64> = read.chunks_exact(8).map(bytemuck::pod_read_unaligned).collect();
-        let mut laps: Vec<(&'static str, Duration)> = Vec::new();
+        let mut times_by_stage: Vec<(&'static str, Duration)> = Vec::new();
         for (name, ends) in stages.iter().zip(times.windows(2)) {
             let units = ends[1].saturating_sub(ends[0]) as f64;
             let time = Duration::from_nanos((units * f64::from(self.period)) as u64);
-            match laps.iter_mut().find(|(known, _)| known == name) {
+            match times_by_stage.iter_mut().find(|(known, _)| known == name) {
                 Some((_, sum)) => *sum += time,
-                None => laps.push((name, time)),
+                None => times_by_stage.push((name, time)),
             }
         }
-        Ok(laps)
+        Ok(times_by_stage)
     }
 }
 
-/// The stages of a submission as it is encoded.
+/// The stages of a submission while it is encoded.
 #[derive(Debug, Default)]
 pub(super) struct Stages<'c> {
     pub(super) clock: Option<&'c Clock>,
-    /// As they began, and the end, which has no name.
+    /// Names in order; the end has an empty name.
     pub(super) names: Vec<&'static str>,
 }
 
@@ -86,7 +86,7 @@ impl Stages<'_> {
     pub(super) fn begin(&mut self, pass: &mut wgpu::ComputePass<'_>, name: &'static str) {
         let Some(clock) = self.clock else { return };
         let number = self.names.len() as u32;
-        if number < MOST {
+        if number < MAX_TIMES {
             pass.write_timestamp(&clock.times, number);
             self.names.push(name);
         }

@@ -1,4 +1,4 @@
-//! An open device with its kernels; translates its errors to [`BackendError`].
+//! An open device with its compiled kernels; translates its errors to [`BackendError`].
 
 use std::future::Future;
 use std::pin::pin;
@@ -11,20 +11,20 @@ use wgpu::{DeviceDescriptor, ErrorFilter, Features, MemoryHints};
 use super::adapter::{choose, enumerate, features_for};
 use super::clock::{self, Clock};
 use super::pipelines::{Pipelines, Variant};
-use super::{GpuBackend, promise};
+use super::{GpuBackend, memory_plan};
 use crate::signals::RecordLayout;
 use crate::{Accumulation, AdapterChoice, AdapterSummary, BackendError, Differentiable, Setup};
 use densify_core::gaussians::Gaussians;
 use densify_core::memory::Ledger;
 
-/// Errors that a device reports outside of any call.
+/// Errors that a device reports asynchronously.
 #[derive(Debug, Default)]
 struct Reported {
     lost: Option<String>,
     error: Option<String>,
 }
 
-/// An open device with its kernels, which several backends may share, one after the other.
+/// An open device with its compiled kernels. Several backends may use it, one after the other.
 #[derive(Debug, Clone)]
 pub struct GpuDevice(pub(super) Arc<Device>);
 
@@ -32,55 +32,54 @@ impl GpuDevice {
     /// Opens an adapter.
     ///
     /// # Errors
-    /// [`BackendError::NoAdapter`] with the adapters found and what they lack, in general or for the
-    /// requested accumulation.
+    /// [`BackendError::NoAdapter`] with the adapters found and what they lack.
     pub fn open(choice: &AdapterChoice) -> Result<Self, BackendError> {
         Ok(Self(Arc::new(Device::open(choice, Features::empty())?)))
     }
 
-    /// Opens an adapter to measure how long each stage of a step takes on it, which makes steps slower:
-    /// [`stage_times`](crate::Backend::stage_times) then tells the stages apart.
+    /// Opens an adapter and times each stage of a step, which makes steps slower. See
+    /// [`stage_times`](crate::Backend::stage_times).
     ///
     /// # Errors
-    /// As [`open`](Self::open), and where the adapter has no clock.
+    /// As [`open`](Self::open); also if the adapter has no timestamps.
     pub fn open_with_clock(choice: &AdapterChoice) -> Result<Self, BackendError> {
         Ok(Self(Arc::new(Device::open(choice, clock::FEATURES)?)))
     }
 
-    /// The adapter.
+    /// The adapter of the device.
     #[must_use]
     pub fn adapter(&self) -> &AdapterSummary {
         &self.0.summary
     }
 
-    /// How it adds up gradients.
+    /// The accumulation of gradients in use.
     #[must_use]
     pub fn accumulation(&self) -> Accumulation {
         self.0.accumulation
     }
 
-    /// Most rows that a backend on it can hold at a degree.
+    /// Largest budget at an SH degree.
     #[must_use]
     pub fn largest_budget(&self, sh_degree: u8) -> u64 {
         self.0.summary.largest_budget(sh_degree)
     }
 
-    /// Most (row, tile) pairs that a backend on it can hold at a time for such needs.
+    /// Largest number of (row, tile) pairs held at a time, for a policy's needs.
     #[must_use]
-    pub fn most_pairs(&self, needs: &Needs) -> u64 {
-        promise::most_pairs(&self.0, needs)
+    pub fn max_pairs(&self, needs: &Needs) -> u64 {
+        memory_plan::max_pairs(&self.0, needs)
     }
 
-    /// Bytes per buffer of a backend with these options for models of this degree; nothing is allocated.
+    /// Memory of a backend with these options for models of this SH degree. Nothing is allocated.
     #[must_use]
-    pub fn promise(&self, sh_degree: u8, options: &Setup) -> Ledger {
-        promise::ledger(&promise::sizes(&self.0, sh_degree, options), &options.needs)
+    pub fn memory_plan(&self, sh_degree: u8, options: &Setup) -> Ledger {
+        memory_plan::ledger(&memory_plan::sizes(&self.0, sh_degree, options), &options.needs)
     }
 
-    /// A backend that holds the model; see [`GpuBackend::new`].
+    /// Creates a backend for the model; see [`GpuBackend::new`].
     ///
     /// # Errors
-    /// As it.
+    /// As [`GpuBackend::new`].
     pub fn backend(
         &self,
         model: &Gaussians,
@@ -95,30 +94,30 @@ impl GpuDevice {
 pub(super) struct Device {
     pub(super) device: wgpu::Device,
     pub(super) queue: wgpu::Queue,
-    /// For benchmarks.
+    /// Timestamps, for benchmarks.
     pub(super) clock: Option<Clock>,
     pub(super) summary: AdapterSummary,
     pub(super) accumulation: Accumulation,
     reported: Arc<Mutex<Reported>>,
-    /// The compiled variants; there are few.
+    /// The compiled variants.
     pipelines: Mutex<Vec<(Variant, Arc<Pipelines>)>>,
-    /// The records for which the device has passed the canary.
-    proven: Mutex<Vec<RecordLayout>>,
+    /// The record layouts for which the device has passed the canary.
+    passed: Mutex<Vec<RecordLayout>>,
 }
 
 impl Device {
-    /// Opens the adapter of choice with all of its limits, and with such features beside those that steps need.
-    pub(super) fn open(choice: &AdapterChoice, more: Features) -> Result<Self, BackendError> {
+    /// Opens the chosen adapter with all of its limits and some features beyond those that steps need.
+    fn open(choice: &AdapterChoice, more: Features) -> Result<Self, BackendError> {
         let mut all = enumerate();
         let summaries: Vec<_> = all.iter().map(|(_, summary)| summary.clone()).collect();
         let (adapter, summary) = all.swap_remove(choose(&summaries, choice)?);
         let accumulation = choice.accumulation(&summary, adapter.features())?;
         let descriptor = DeviceDescriptor {
             label: Some("densify"),
-            // No more than is used: what is asked for can change how a driver compiles.
+            // No more than is used: requested features can change how a driver compiles.
             required_features: Features::IMMEDIATES | features_for(accumulation) | more,
             required_limits: adapter.limits(),
-            // Buffers are few and made once: no pools beyond what the ledger says.
+            // Buffers are few and allocated once: no pools beyond the ledger.
             memory_hints: MemoryHints::MemoryUsage,
             ..DeviceDescriptor::default()
         };
@@ -142,37 +141,37 @@ impl Device {
             accumulation,
             reported,
             pipelines: Mutex::default(),
-            proven: Mutex::default(),
+            passed: Mutex::default(),
         })
     }
 
-    /// The kernels, which are compiled once.
+    /// The kernels of a variant, compiled on first use.
     pub(super) fn pipelines(&self, variant: Variant) -> Result<Arc<Pipelines>, BackendError> {
         let mut all = self.pipelines.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some((_, pipelines)) = all.iter().find(|(known, _)| *known == variant) {
             return Ok(pipelines.clone());
         }
-        let made = self.guarded("the kernels", 0, |device| Pipelines::new(device, variant))?;
-        let made = Arc::new(made);
-        all.push((variant, made.clone()));
-        Ok(made)
+        let compiled = self.guarded("the kernels", 0, |device| Pipelines::new(device, variant))?;
+        let compiled = Arc::new(compiled);
+        all.push((variant, compiled.clone()));
+        Ok(compiled)
     }
 
-    /// Runs `prove` once for each layout of the records.
-    pub(super) fn prove(
+    /// Runs `check` once for each record layout.
+    pub(super) fn check_once(
         &self,
         records: RecordLayout,
-        prove: impl FnOnce() -> Result<(), BackendError>,
+        check: impl FnOnce() -> Result<(), BackendError>,
     ) -> Result<(), BackendError> {
-        let mut proven = self.proven.lock().unwrap_or_else(PoisonError::into_inner);
-        if !proven.contains(&records) {
-            prove()?;
-            proven.push(records);
+        let mut passed = self.passed.lock().unwrap_or_else(PoisonError::into_inner);
+        if !passed.contains(&records) {
+            check()?;
+            passed.push(records);
         }
         Ok(())
     }
 
-    /// An error that the device has reported, if any. A lost device ignores what it is given.
+    /// Returns an error that the device has reported, if any. A lost device ignores commands silently.
     pub(super) fn check(&self) -> Result<(), BackendError> {
         faults::lose(&self.device);
         let reported = lock(&self.reported);
@@ -186,15 +185,15 @@ impl Device {
         }
     }
 
-    /// The error of a device that has failed. It is kept: what should have been done was not, so that nothing that
-    /// the device does from now on is what it seems.
+    /// Records that the device has failed and returns the error. All later [checks](Self::check) fail too: a
+    /// command was not executed, so that later results would be wrong.
     pub(super) fn failed(&self, why: String) -> BackendError {
         lock(&self.reported).error.get_or_insert_with(|| why.clone());
         let device = self.summary.name.clone();
         self.check().err().unwrap_or(BackendError::Device { device, why })
     }
 
-    /// Runs `create`, with the device's errors as ours.
+    /// Runs `create` and returns the device's errors.
     pub(super) fn guarded<T>(
         &self,
         what: &'static str,
@@ -204,17 +203,17 @@ impl Device {
         let memory = self.device.push_error_scope(ErrorFilter::OutOfMemory);
         let internal = self.device.push_error_scope(ErrorFilter::Internal);
         let validation = self.device.push_error_scope(ErrorFilter::Validation);
-        let made = create(&self.device);
-        let broken = wait(validation.pop()).or(wait(internal.pop()));
+        let created = create(&self.device);
+        let failure = wait(validation.pop()).or(wait(internal.pop()));
         if wait(memory.pop()).is_some() {
             return Err(BackendError::OutOfMemory { what, bytes });
         }
-        if let Some(error) = broken {
+        if let Some(error) = failure {
             let device = self.summary.name.clone();
             return Err(BackendError::Device { device, why: format!("{what}: {error}") });
         }
         self.check()?;
-        Ok(made)
+        Ok(created)
     }
 
     /// Largest buffer that a kernel can use `[bytes]`.
@@ -227,7 +226,7 @@ fn lock(reported: &Mutex<Reported>) -> std::sync::MutexGuard<'_, Reported> {
     reported.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Runs a future of wgpu's to its end; on native systems they are ready at once.
+/// Waits for a future of wgpu; natively they are ready at once.
 pub(super) fn wait<T>(future: impl Future<Output = T>) -> T {
     let mut future = pin!(future);
     let mut context = Context::from_waker(Waker::noop());
@@ -240,20 +239,20 @@ pub(super) fn wait<T>(future: impl Future<Output = T>) -> T {
 }
 
 pub(crate) mod faults {
-    //! Devices that are lost on demand, as by a driver's reset, for the thread that asks for it.
+    //! Fault injection for tests: loses a device, as a driver reset does, in the thread that asks for it.
 
     use std::cell::Cell;
 
     thread_local! {
-        /// Checks until the loss.
+        /// Number of checks until the loss.
         static LEFT: Cell<Option<u32>> = const { Cell::new(None) };
     }
 
-    /// Runs `f`; the device that it uses is lost at the check after so many. Returns whether it was.
+    /// Runs `f`, and loses the device that it uses after this number of checks. Returns true if it was lost.
     pub fn with_device_lost_after<T>(checks: u32, f: impl FnOnce() -> T) -> (T, bool) {
         LEFT.set(Some(checks));
-        let done = f();
-        (done, LEFT.take().is_none())
+        let result = f();
+        (result, LEFT.take().is_none())
     }
 
     pub(super) fn lose(device: &wgpu::Device) {
@@ -279,17 +278,17 @@ mod tests {
     use crate::{AdapterKind, Backend, Inspect};
     use densify_core::camera::Camera;
 
-    /// A software driver, opened anew: what is lost cannot be used again. Not SwiftShader, which opens slowly.
+    /// A newly opened software driver, as a lost device cannot be used again. Not SwiftShader, which opens slowly.
     #[expect(clippy::print_stderr, reason = "a skipped test must say so")]
-    fn driver() -> Option<GpuDevice> {
-        let found = adapters().into_iter().find(|it| {
-            let is_slow = it.name.contains("SwiftShader");
-            it.kind == AdapterKind::Software && it.missing.is_empty() && !is_slow
+    fn software_device() -> Option<GpuDevice> {
+        let found = adapters().into_iter().find(|adapter| {
+            let is_slow = adapter.name.contains("SwiftShader");
+            adapter.kind == AdapterKind::Software && adapter.missing.is_empty() && !is_slow
         });
         let Some(AdapterSummary { name, .. }) = found else {
-            let needed = std::env::var_os("DENSIFY_REQUIRE_GPU").is_some();
-            assert!(!needed, "DENSIFY_REQUIRE_GPU is set, but there is no software driver");
-            eprintln!("skipped: there is no software driver whose device could be lost");
+            let is_required = std::env::var_os("DENSIFY_REQUIRE_GPU").is_some();
+            assert!(!is_required, "DENSIFY_REQUIRE_GPU is set, but there is no software driver");
+            eprintln!("skipped: no software driver to lose");
             return None;
         };
         let choice = AdapterChoice { name: Some(name), accumulation: None };
@@ -304,10 +303,10 @@ mod tests {
     }
 
     #[test]
-    fn a_model_whose_own_colours_are_not_restored_is_not_used_any_more() {
+    fn painting_restores_the_colours_or_fails_for_good() {
         let (model, camera) = model();
         for checks in 0.. {
-            let Some(device) = driver() else { return };
+            let Some(device) = software_device() else { return };
             let mut backend = GpuBackend::new(&model, &Setup::new(2), &device).expect("a backend");
             let paint = || backend.render_painted(&camera, [0.0; 3], &[[1.0, 0.0, 0.0]; 2]).err();
             let (error, lost) = faults::with_device_lost_after(checks, paint);
@@ -321,13 +320,13 @@ mod tests {
     }
 
     #[test]
-    fn a_device_that_has_failed_once_has_failed() {
+    fn a_failed_device_stays_failed() {
         let (model, camera) = model();
-        let Some(device) = driver() else { return };
+        let Some(device) = software_device() else { return };
         let mut backend = GpuBackend::new(&model, &Setup::new(2), &device).expect("a backend");
         assert!(backend.render(&camera, [0.0; 3], 0).is_ok());
         device.0.failed("nothing can be mapped".into());
-        let error = backend.render(&camera, [0.0; 3], 0).expect_err("it has failed");
+        let error = backend.render(&camera, [0.0; 3], 0).expect_err("the device has failed");
         assert!(error.to_string().contains("nothing can be mapped"), "{error}");
     }
 }

@@ -2,6 +2,7 @@
 
 use super::GpuBackend;
 use super::frame::{Frame, State, grid};
+use super::observe::FOLD;
 use crate::cpu::ModelGradient;
 use crate::signals::{Field, RecordLayout};
 use crate::{BackendError, Differentiable, ImageGradient, Rendering, StepOutput};
@@ -10,11 +11,8 @@ use densify_core::gaussians::sh_coefficients;
 use densify_core::image::Image8;
 use densify_core::sh;
 
-/// √(½·log₂ e): folded into the splats' factors.
-const FOLD: f32 = 0.849_321_8;
-
 impl GpuBackend {
-    /// What stages 5 and 6 have left.
+    /// Reads the gradients that stages 5 and 6 have computed.
     fn model_gradient(&self, degree: u8) -> Result<ModelGradient, BackendError> {
         let n = self.rows as u64;
         let gradient = self.read("gradient", 0, 80 * n)?;
@@ -69,8 +67,8 @@ impl Differentiable for GpuBackend {
     ) -> Result<(Rendering, ModelGradient), BackendError> {
         upstream.assert_size(camera);
         assert_eq!(self.sizes.frozen, 0, "frozen rows have no gradients");
-        if !self.sizes.more {
-            (self.sizes.more, self.sizes.records) = (true, RecordLayout::ALL);
+        if !self.sizes.alpha_and_depth {
+            (self.sizes.alpha_and_depth, self.sizes.records) = (true, RecordLayout::ALL);
             self.rebuild()?;
         }
         self.fit_image(camera.width, camera.height)?;
@@ -108,7 +106,7 @@ impl Differentiable for GpuBackend {
             draw: [0, 0, 0, self.upload_target(target)],
             ..bytemuck::Zeroable::zeroed()
         };
-        // Nothing was counted in this run, so that there is nothing for which bands might not do.
+        // Without a forward pass no entries are counted, and the bands of the last view must not seem too few.
         self.write("state", bytemuck::bytes_of(&<State as bytemuck::Zeroable>::zeroed()));
         let (state, _) = self.run(&frame, |passes, to| passes.loss(to, [[0.0; 2]; 2]))?;
         let planes = self.read("pixel gradient", 0, 12 * pixels.len() as u64)?;

@@ -1,5 +1,5 @@
-//! Executes a compiled plan on the device, in place: encodes its operations as numbers, in chunks of
-//! fixed size, and dispatches them. `shaders/apply.wgsl` says what the numbers mean.
+//! Executes a compiled edit plan on the device, in place: encodes its operations as words, in chunks of fixed size,
+//! and dispatches them. `shaders/apply.wgsl` documents the encoding.
 
 use densify_policies::plan::{
     Decay, OpacityRule, ParentFate, Placement, RowOps, ScaleRule, Update,
@@ -14,11 +14,11 @@ use super::rows::Edited;
 use super::sizes::OPS_BYTES;
 use densify_core::gaussians::{ModelArray, logit, rgb_to_dc};
 
-/// Numbers that fit one chunk.
+/// Words per chunk.
 const CHUNK: usize = (OPS_BYTES / 4) as usize;
-/// Numbers per operation.
+/// Words per operation.
 const WORDS: usize = 20;
-/// In place of a source: clear the row.
+/// Source that clears the row.
 const NOTHING: u32 = u32::MAX;
 
 fn scale_words(rule: ScaleRule) -> [u32; 4] {
@@ -32,14 +32,14 @@ fn scale_words(rule: ScaleRule) -> [u32; 4] {
     [rule, a, b, c]
 }
 
-/// Whether there are three numbers, and which.
-fn maybe_words(numbers: Option<[f32; 3]>) -> [u32; 4] {
+/// A flag for the presence of the numbers, then the numbers.
+fn optional_words(numbers: Option<[f32; 3]>) -> [u32; 4] {
     let [a, b, c] = numbers.unwrap_or_default().map(f32::to_bits);
     [u32::from(numbers.is_some()), a, b, c]
 }
 
-/// A quaternion at length 1.
-fn turn_words(quaternion: [f32; 4]) -> [u32; 4] {
+/// A normalised quaternion.
+fn quaternion_words(quaternion: [f32; 4]) -> [u32; 4] {
     let length = quaternion.iter().map(|v| v * v).sum::<f32>().sqrt();
     quaternion.map(|v| (v / length).to_bits())
 }
@@ -53,8 +53,8 @@ fn opacity_words(rule: OpacityRule, siblings: u32) -> [u32; 2] {
     }
 }
 
-/// Families cut into chunks of `room` numbers: operations first, then the slots of their children. A
-/// family too large for one chunk is cut; only its last part rewrites the parent.
+/// Encodes families in chunks of `room` words: the operations, then the slots of their children. A family too large
+/// for a chunk is split; only its last part rewrites the parent.
 fn family_chunks(ops: &RowOps, room: usize) -> Vec<(usize, Vec<u32>)> {
     let mut chunks = Vec::new();
     let mut heads: Vec<[u32; WORDS]> = Vec::new();
@@ -77,7 +77,7 @@ fn family_chunks(ops: &RowOps, room: usize) -> Vec<(usize, Vec<u32>)> {
         let offspring = ops.offspring(family);
         let mut children = ops.children(family);
         let mut number = 1;
-        let (placement, of) = match offspring.placement {
+        let (placement, offset) = match offspring.placement {
             Placement::Offset(offset) => (0, offset.map(f32::to_bits)),
             Placement::Sampled => (1, [0; 3]),
             Placement::LongAxis { sigmas } => (2, [sigmas.to_bits(), 0, 0]),
@@ -85,27 +85,27 @@ fn family_chunks(ops: &RowOps, room: usize) -> Vec<(usize, Vec<u32>)> {
         };
         let [scale, a, b, c] = scale_words(offspring.scale);
         let [opacity, value] = opacity_words(offspring.opacity, offspring.siblings());
-        let [w, x, y, z] = turn_words(offspring.turn);
+        let [w, x, y, z] = quaternion_words(offspring.turn);
         loop {
             let used = heads.len() * WORDS + slots.len();
             if used + WORDS >= room {
                 close(&mut heads, &mut slots);
                 continue;
             }
-            let now = children.len().min(room - used - WORDS);
-            let is_last = now == children.len();
+            let count = children.len().min(room - used - WORDS);
+            let is_last = count == children.len();
             let becomes = is_last && offspring.parent == ParentFate::BecomesChild;
             let first = slots.len() as u32;
             heads.push([
                 family.parent,
                 first,
-                now as u32,
+                count as u32,
                 number,
                 u32::from(becomes),
                 placement,
-                of[0],
-                of[1],
-                of[2],
+                offset[0],
+                offset[1],
+                offset[2],
                 scale,
                 a,
                 b,
@@ -118,9 +118,9 @@ fn family_chunks(ops: &RowOps, room: usize) -> Vec<(usize, Vec<u32>)> {
                 z,
                 0,
             ]);
-            slots.extend_from_slice(&children[..now]);
-            children = &children[now..];
-            number += now as u32;
+            slots.extend_from_slice(&children[..count]);
+            children = &children[count..];
+            number += count as u32;
             if is_last {
                 break;
             }
@@ -130,10 +130,11 @@ fn family_chunks(ops: &RowOps, room: usize) -> Vec<(usize, Vec<u32>)> {
     chunks
 }
 
-/// A permutation in which number i comes from `order[i]`, as two rounds of swaps. No number is in two swaps
-/// of a round, so that a device can make them all at once.
+/// Splits a permutation, in which position i receives `order[i]`, into two rounds of disjoint swaps, each of which a
+/// device can execute in parallel.
 ///
-/// In a cycle of k places each number goes one place down. Two reflections do that: j to −j, then j to −j − 1.
+/// In a cycle of length k each element moves down by one place, which is the product of two reflections: j to −j,
+/// then j to −j − 1.
 fn rounds_of_swaps(order: &[u32]) -> [Vec<[u32; 2]>; 2] {
     let mut rounds = [Vec::new(), Vec::new()];
     let mut is_done = vec![false; order.len()];
@@ -149,7 +150,7 @@ fn rounds_of_swaps(order: &[u32]) -> [Vec<[u32; 2]>; 2] {
         if length < 2 {
             continue;
         }
-        // Two places of a cycle are swapped where their numbers add up to this.
+        // Places of a cycle are swapped if their indices add up to `sum`.
         for (round, sum) in rounds.iter_mut().zip([length, length - 1]) {
             let pairs = (sum + 1 - length..).map(|j| (j, sum - j));
             let pairs = pairs.take_while(|(j, other)| j < other);
@@ -160,46 +161,46 @@ fn rounds_of_swaps(order: &[u32]) -> [Vec<[u32; 2]>; 2] {
 }
 
 impl GpuBackend {
-    /// Uploads one chunk of operations and executes what `encode` records.
+    /// Uploads one chunk of operations and submits the dispatches that `encode` records.
     fn execute(&self, words: &[u32], encode: impl FnOnce(&mut Recorder<'_>)) {
         self.device.queue.write_buffer(self.buffers.get("ops"), 0, bytemuck::cast_slice(words));
         self.submit(encode);
     }
 
-    /// Copies rows (from, to), or clears them, in all arrays that are edited in one of these ways.
-    fn copy_rows(&self, pairs: &[[u32; 2]], ways: &[Edited]) {
-        let arrays = self.launches.copy_rows.iter().filter(|a| ways.contains(&a.edited));
-        self.for_pairs(pairs, arrays);
+    /// Copies rows (from, to), or clears them, in all arrays with one of these edit rules.
+    fn copy_rows(&self, pairs: &[[u32; 2]], rules: &[Edited]) {
+        let arrays = self.launches.copy_rows.iter().filter(|a| rules.contains(&a.edited));
+        self.run_on_pairs(pairs, arrays);
     }
 
-    /// Brings the rows into an order, in which row i is what row `order[i]` was.
+    /// Permutes the rows: row i becomes the former row `order[i]`.
     fn reorder(&self, order: &[u32]) {
         for round in rounds_of_swaps(order) {
-            self.for_pairs(&round, self.launches.swap_rows.iter());
+            self.run_on_pairs(&round, self.launches.swap_rows.iter());
         }
     }
 
-    /// Dispatches what works on pairs of rows, for each of these arrays.
-    fn for_pairs<'a>(
+    /// Dispatches a kernel that works on pairs of rows, for each of these arrays.
+    fn run_on_pairs<'a>(
         &self,
         pairs: &[[u32; 2]],
         arrays: impl Iterator<Item = &'a RowLaunch<Launch>> + Clone,
     ) {
-        // Where arrays have no place for frozen rows, which no plan names, rows count from the first that they have.
+        // Rows are counted from the first row of each array. Plans contain no frozen rows, which some arrays do not store.
         let mut firsts: Vec<u32> = arrays.clone().map(|array| array.first_row).collect();
         firsts.sort_unstable();
         firsts.dedup();
         for (chunk, first) in
             pairs.chunks(CHUNK / 2).flat_map(|c| firsts.iter().map(move |f| (c, *f)))
         {
-            let own = |row: u32| if row == NOTHING { NOTHING } else { row - first };
-            let words: Vec<u32> = chunk.as_flattened().iter().map(|&row| own(row)).collect();
+            let local = |row: u32| if row == NOTHING { NOTHING } else { row - first };
+            let words: Vec<u32> = chunk.as_flattened().iter().map(|&row| local(row)).collect();
             self.execute(&words, |to| {
                 for array in arrays.clone().filter(|array| array.first_row == first) {
                     let RowLaunch { launch, numbers, pitch: [row, number], .. } = array;
                     let count = chunk.len() as u32;
-                    let now = [count, *numbers, *row, *number];
-                    to.run(launch, now, (count * numbers).div_ceil(256));
+                    let immediates = [count, *numbers, *row, *number];
+                    to.run(launch, immediates, (count * numbers).div_ceil(256));
                 }
             });
         }
@@ -215,25 +216,25 @@ impl GpuBackend {
         }
     }
 
-    /// Clears the colour of rows beyond their degree, and the moments of it.
+    /// Clears the SH bands of rows beyond their degree, and their moments.
     fn drop_bands(&self, updates: &[(u32, Update)]) {
         for degree in 0..self.sizes.sh_degree {
             let of_degree = updates.iter().filter(|(_, u)| u.sh_degree == Some(degree));
             let rows: Vec<_> = of_degree.map(|&(row, _)| [NOTHING, row]).collect();
             let last = ModelArray::Sh.parameters(degree).end;
             let arrays = self.launches.copy_rows.iter();
-            self.for_pairs(&rows, arrays.filter(|array| array.first_parameter >= last));
+            self.run_on_pairs(&rows, arrays.filter(|array| array.first_parameter >= last));
         }
     }
 
-    /// Executes a plan that holds, in the order of [`RowOps`].
+    /// Executes a checked plan, in the order of [`RowOps`].
     pub(super) fn edit(&mut self, ops: &RowOps, seed: u64, step: u32) {
         let launches = &self.launches;
         let clear = |row: u32| [NOTHING, row];
         for (count, words) in family_chunks(ops, CHUNK) {
-            let now = [count as u32, folded_seed(seed), step, 0];
+            let immediates = [count as u32, folded_seed(seed), step, 0];
             self.execute(&words, |to| {
-                to.run(launches.get("breed"), now, (count as u32).div_ceil(256));
+                to.run(launches.get("breed"), immediates, (count as u32).div_ceil(256));
             });
         }
         let mut births: Vec<[u32; 2]> = Vec::new();
@@ -255,9 +256,9 @@ impl GpuBackend {
                 words[0] = row;
                 words[1..5].copy_from_slice(&scale_words(update.scale));
                 words[5..7].copy_from_slice(&opacity_words(update.opacity, 1));
-                words[7..11].copy_from_slice(&maybe_words(update.position));
+                words[7..11].copy_from_slice(&optional_words(update.position));
                 let colour = update.colour.map(|colour| colour.map(rgb_to_dc));
-                words[11..15].copy_from_slice(&maybe_words(colour));
+                words[11..15].copy_from_slice(&optional_words(colour));
                 words
             })
             .collect();
@@ -274,7 +275,7 @@ impl GpuBackend {
                 words[0] = row;
                 words[1..4].copy_from_slice(&seed.position.map(f32::to_bits));
                 words[4..7].copy_from_slice(&seed.scales.map(|scale| scale.ln().to_bits()));
-                words[7..11].copy_from_slice(&turn_words(seed.orientation));
+                words[7..11].copy_from_slice(&quaternion_words(seed.orientation));
                 words[11] = logit(seed.opacity).to_bits();
                 words[12..15].copy_from_slice(&seed.colour.map(|c| rgb_to_dc(c).to_bits()));
                 words
@@ -291,11 +292,11 @@ impl GpuBackend {
         }
         if let Some(most) = ops.clamp_opacity {
             let rows = ops.rows_after as u32;
-            let waits = u32::from(self.sizes.waits()[0]);
-            let now = [rows, logit(most).to_bits(), waits, 0];
+            let waits = u32::from(self.sizes.may_wait()[0]);
+            let immediates = [rows, logit(most).to_bits(), waits, 0];
             let first = ops.first_row as u32;
             self.execute(&[first], |to| {
-                to.run(launches.get("clamp_opacity"), now, rows.div_ceil(256));
+                to.run(launches.get("clamp_opacity"), immediates, rows.div_ceil(256));
             });
         }
         self.clear_planes(&self.planes.of_all(ops.reset_signals));
@@ -306,11 +307,13 @@ impl GpuBackend {
         let seen = self.planes.current(Signal::VisibleCount).filter(|_| decay.seen_only);
         let seen = seen.map_or(NOTHING, |plane| (plane as u64 * self.sizes.trained()) as u32);
         let shrunk = (1.0 - decay.scale).ln();
-        let now = [rows, decay.opacity.to_bits(), shrunk.to_bits(), seen];
-        self.execute(&[first], |to| to.run(self.launches.get("decay"), now, rows.div_ceil(256)));
+        let immediates = [rows, decay.opacity.to_bits(), shrunk.to_bits(), seen];
+        self.execute(&[first], |to| {
+            to.run(self.launches.get("decay"), immediates, rows.div_ceil(256));
+        });
     }
 
-    /// Sets planes of the signals to 0.
+    /// Clears planes of the signals.
     pub(super) fn clear_planes(&self, planes: &[usize]) {
         if planes.is_empty() {
             return;

@@ -1,5 +1,5 @@
-//! The exposure of a photograph on the device: what is uploaded before a view's passes, and what comes back
-//! with the scalars of a step.
+//! A photograph's exposure on the device: uploads the colour transform before a view's passes, and converts the sums
+//! that a step returns to derivatives.
 
 use super::GpuBackend;
 use super::frame::{Frame, target};
@@ -7,19 +7,19 @@ use densify_core::colour::{ColourGradient, ColourTransform, ExposureSums};
 
 /// Bytes of the transform: three rows and the background.
 pub(super) const TRANSFORM: u64 = 4 * 16;
-/// Bytes of the sums of a group, or of the image.
+/// Bytes of the sums of a workgroup, or of the image.
 pub(super) const SUMS: u64 = 4 * 16;
-/// Pixels of a group; see `shaders/exposure.wgsl`.
+/// Pixels per workgroup; see `shaders/exposure.wgsl`.
 const GROUP: u64 = 256;
 
-/// Groups of an image of so many pixels.
+/// Number of workgroups of an image with this number of pixels.
 pub(super) fn groups(pixels: u64) -> u64 {
     pixels.div_ceil(GROUP)
 }
 
 impl GpuBackend {
-    /// Uploads the exposure of the view at hand, and lets the frame know of it.
-    pub(super) fn bring_exposure(&self, frame: &mut Frame, exposure: Option<&ColourTransform>) {
+    /// Uploads the exposure of the current view, if any, and sets its flag in the frame.
+    pub(super) fn load_exposure(&self, frame: &mut Frame, exposure: Option<&ColourTransform>) {
         let Some(exposure) = exposure else { return };
         assert!(self.sizes.exposures, "the backend was not made for exposures");
         let [r, g, b, _] = frame.background;
@@ -30,7 +30,7 @@ impl GpuBackend {
         frame.draw[3] |= target::EXPOSED;
     }
 
-    /// The derivatives by the exposure of an image over this background, from what a step has left.
+    /// Derivatives of the loss with respect to the exposure, from the sums of the last step.
     pub(super) fn exposure_gradient(
         &self,
         exposure: &ColourTransform,

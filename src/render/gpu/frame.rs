@@ -1,5 +1,5 @@
-//! The uniform buffer that all stages read and the scalars that they return: the Rust side of
-//! `shaders/shared/view.wgsl`. A test compares both sides field by field.
+//! The uniform buffer that all stages read and the scalars that they return: the Rust side of `shaders/shared/view.wgsl`. A
+//! test compares the layouts.
 
 use bytemuck::{Pod, Zeroable};
 use densify_policies::policy::{ErrorScore, Signal};
@@ -10,7 +10,7 @@ use densify_core::camera::Camera;
 
 /// Side of a tile `[px]`.
 pub(super) const TILE: u32 = 16;
-/// Margin of the image beyond which the direction used in J is clamped, as a fraction of its size.
+/// Margin around the image beyond which the direction in the Jacobian is clamped, as a fraction of the image's size.
 const FOV_MARGIN: f64 = 0.15;
 /// Weight of 1 − SSIM in the loss; L1 has the rest.
 const SSIM_WEIGHT: f32 = 0.2;
@@ -35,7 +35,7 @@ pub(super) struct Frame {
     pub(super) planes: [[u32; 4]; 8],
 }
 
-/// See `State` in `shaders/shared/view.wgsl`; the cuts of the bands follow it.
+/// See `State` in `shaders/shared/view.wgsl`; the limits of the bands follow in the same buffer.
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub(super) struct State {
@@ -58,7 +58,7 @@ impl State {
         u64::from(self.entries_high) << 32 | u64::from(self.entries_low)
     }
 
-    /// What comes back of a step.
+    /// The output of a step.
     pub(super) fn output(&self) -> StepOutput {
         let Self { l1, ssim, visible, bands, .. } = *self;
         StepOutput {
@@ -73,7 +73,7 @@ impl State {
     }
 }
 
-/// Bits of `Frame::draw[2]`: what steps, what waited for it, what policies add.
+/// Bits of `Frame::draw[2]`: parameter groups that step, groups with waiting gradients, and terms of policies.
 pub(super) mod due {
     pub(in super::super) const MAIN_STEPS: u32 = 1;
     pub(in super::super) const REST_STEPS: u32 = 2;
@@ -84,8 +84,8 @@ pub(super) mod due {
     pub(in super::super) const NOISE: u32 = 64;
 }
 
-/// Bits of `Frame::draw[3]`: what the target has, whether the error per pixel is wanted for candidates and for
-/// signals, and whether the image is exposed.
+/// Bits of `Frame::draw[3]`: planes of the target, outputs of the error per pixel for candidates and for signals, and
+/// exposure.
 pub(super) mod target {
     pub(in super::super) const HAS_ALPHA: u32 = 1;
     pub(in super::super) const HAS_MASK: u32 = 2;
@@ -94,17 +94,17 @@ pub(super) mod target {
     pub(in super::super) const EXPOSED: u32 = 16;
 }
 
-const _: () = assert!(Signal::ALL.len() <= 4 * 8, "a place in `Frame::planes` for each signal");
+const _: () = assert!(Signal::ALL.len() <= 4 * 8, "`Frame::planes` has an element for each signal");
 
-/// An image as a grid of tiles: columns and tiles.
+/// Number of columns and of tiles of an image.
 pub(super) fn grid(width: u32, height: u32) -> [u32; 2] {
     let columns = width.div_ceil(TILE);
     [columns, columns * height.div_ceil(TILE)]
 }
 
 impl Frame {
-    /// A view of a model; nothing steps.
-    pub(super) fn of_view(
+    /// The frame of a view, without an optimiser step.
+    pub(super) fn for_view(
         camera: &Camera,
         background: [f32; 3],
         near: f32,
@@ -138,8 +138,8 @@ impl Frame {
         }
     }
 
-    /// Adds what an optimiser step needs.
-    pub(super) fn for_step(&mut self, input: &StepInput<'_>, due: u32, planes: &SignalPlanes) {
+    /// Adds the values of an optimiser step.
+    pub(super) fn add_step(&mut self, input: &StepInput<'_>, due: u32, planes: &SignalPlanes) {
         let StepInput { rates, loss_terms: terms, noise, .. } = input;
         let rows = (self.model[0] - self.frozen[0]).max(1) as f32;
         self.rates = [rates.mean, rates.log_scale, rates.quat, rates.opacity];
@@ -154,14 +154,14 @@ impl Frame {
         self.background[3] = planes.full_depth;
         let ErrorScore { power, edge, footprint, view_power, .. } = planes.score;
         self.score = [power, edge, footprint, view_power];
-        // To which planes the view adds.
+        // Plane of each signal that the view adds to.
         for (signal, plane) in Signal::ALL.into_iter().zip(self.planes.as_flattened_mut()) {
             *plane = planes.current(signal).map_or(u32::MAX, |plane| plane as u32);
         }
     }
 }
 
-/// The seed as the draws take it; see `PolicyRng::new`.
+/// The seed folded to 32 bits; see `PolicyRng::new`.
 pub(super) fn folded_seed(seed: u64) -> u32 {
     (seed ^ (seed >> 32).wrapping_mul(0x9e37_79b9)) as u32
 }

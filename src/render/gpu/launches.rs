@@ -1,7 +1,7 @@
-//! Every dispatch of a kernel with the buffers that it works on.
+//! The kernels with their bound buffers, ready to dispatch.
 //!
-//! A kernel's variable is bound to the buffer of its own name. Where one kernel works on several
-//! buffers, or on one that is only borrowed, the pairs here say which.
+//! A kernel's variable is bound to the buffer of the same name. [`rebound`] lists the exceptions: kernels that
+//! work on several buffers in turn, or that borrow a buffer with another purpose.
 
 use std::collections::HashMap;
 
@@ -13,86 +13,96 @@ use super::rows::{Edited, FIRST, PARAMETERS, RowArray, SECOND, WAITING};
 use super::sizes::Sizes;
 use crate::{Accumulation, Kept};
 
-/// What errors are read from: the loss's error per pixel, or its gradient.
-const MAPS: [&str; 2] = ["error", "pixel gradient"];
+/// Sources of the error per pixel: the loss's error, or its gradient.
+const ERROR_MAPS: [&str; 2] = ["error", "pixel gradient"];
 const KEYS: [&str; 2] = ["keys 0", "keys 1"];
 const VALUES: [&str; 2] = ["values 0", "values 1"];
 
-/// A kernel's variable, and the buffer bound to it.
-pub(super) type Instead = (&'static str, &'static str);
+/// A kernel's variable and the buffer bound to it.
+pub(super) type Rebinding = (&'static str, &'static str);
 
-/// A kernel with its buffers.
+/// A kernel with its bound buffers.
 #[derive(Debug)]
 pub(super) struct Launch {
     pub(super) pipeline: ComputePipeline,
     pub(super) bindings: BindGroup,
 }
 
-/// All dispatches.
+/// All kernels of a backend, with their buffers.
 #[derive(Debug)]
 pub(super) struct Launches<L = Launch> {
-    /// By kernel: one, or as many as [`rebound`] has. Of kernels that differ by how a device adds up,
-    /// a device has one, whose name here is without `_atomic`.
+    /// The launches of each kernel: one, or as many as in [`rebound`]. Keys are [base names](base_name).
     by_kernel: HashMap<String, Vec<L>>,
-    /// Numbers of a record, whose sums atomics add to.
+    /// Numbers per record.
     pub(super) record: u32,
-    /// Whether the device adds up in slots: it gathers, and has no sums to clear.
+    /// True if gradients are accumulated in slots: they are gathered, and no sums are cleared.
     pub(super) in_slots: bool,
-    /// Whether pixels are counted for the row that dominates them.
+    /// Count the pixels that each row dominates.
     pub(super) counts_dominant: bool,
-    /// Copies or clears rows, for every array that an edit touches.
+    /// `copy_rows`, which copies or clears rows, for every array that edits change.
     pub(super) copy_rows: Vec<RowLaunch<L>>,
-    /// Exchanges rows, for the same arrays.
+    /// `swap_rows` for the same arrays.
     pub(super) swap_rows: Vec<RowLaunch<L>>,
+    /// `audit` for every audited array.
     pub(super) audits: Vec<Audit<L>>,
 }
 
-/// A kernel for one array of rows: the first row that it has, how many numbers a row has, how far apart rows are,
-/// and a row's numbers.
+/// A kernel bound to an array of rows.
 #[derive(Debug)]
 pub(super) struct RowLaunch<L> {
     pub(super) launch: L,
     pub(super) edited: Edited,
+    /// First row that is stored in the array.
     pub(super) first_row: u32,
-    /// The first of the parameters that the numbers belong to; 0 where they belong to none.
+    /// First parameter that the numbers belong to; 0 if they belong to none.
     pub(super) first_parameter: usize,
+    /// Numbers per row.
     pub(super) numbers: u32,
+    /// Distance between rows, and between the numbers of a row.
     pub(super) pitch: [u32; 2],
 }
 
-/// The audit of one array: the first row that it has, how many numbers a row has, and the place of the first of them.
+/// The audit of one array.
 #[derive(Debug)]
 pub(super) struct Audit<L> {
     pub(super) launch: L,
+    /// First row that is stored in the array.
     pub(super) first_row: u32,
+    /// Numbers per row.
     pub(super) numbers: u32,
-    pub(super) place: u32,
+    /// Mark of a row's first number: the parameter's index, plus [`MOMENTS`] for a moment.
+    pub(super) mark: u32,
 }
 
-/// From a parameter's place to that of its moments; no row has as many parameters.
+/// Offset from a parameter's mark to that of its moments; more than the parameters of a row.
 pub(super) const MOMENTS: u32 = 64;
 
 impl Launches {
-    /// All dispatches on these buffers.
-    pub(super) fn bound(
+    /// Binds all kernels to the buffers.
+    pub(super) fn bind(
         device: &Device,
         pipelines: &Pipelines,
         buffers: &Buffers,
         sizes: &Sizes,
     ) -> Self {
-        let bind = |kernel: &str, instead: &[Instead]| {
-            launch(device, pipelines.get(kernel), buffers, instead)
+        let bind = |kernel: &str, rebindings: &[Rebinding]| {
+            launch(device, pipelines.get(kernel), buffers, rebindings)
         };
         Self::new(pipelines.names(), &bind, sizes)
     }
 }
 
-fn launch(device: &Device, kernel: &Compiled, buffers: &Buffers, instead: &[Instead]) -> Launch {
+fn launch(
+    device: &Device,
+    kernel: &Compiled,
+    buffers: &Buffers,
+    rebindings: &[Rebinding],
+) -> Launch {
     let entries: Vec<_> = kernel
         .bindings
         .iter()
         .map(|binding| {
-            let other = instead.iter().find(|(variable, _)| *variable == binding.name);
+            let other = rebindings.iter().find(|(variable, _)| *variable == binding.name);
             let name = other.map_or(&*binding.name, |(_, buffer)| buffer);
             BindGroupEntry {
                 binding: binding.number,
@@ -108,46 +118,46 @@ fn launch(device: &Device, kernel: &Compiled, buffers: &Buffers, instead: &[Inst
     Launch { pipeline: kernel.pipeline.clone(), bindings }
 }
 
-/// What binds a kernel.
-type Bind<'a, L> = &'a dyn Fn(&str, &[Instead]) -> L;
+/// Binds a kernel, with exceptions to the names of its variables.
+type Bind<'a, L> = &'a dyn Fn(&str, &[Rebinding]) -> L;
 
 impl<L> Launches<L> {
-    /// Binds each kernel by name, and those of [`rebound`] to the buffers that it has for them.
+    /// Binds each kernel by the names of its variables, and those of [`rebound`] once per list of exceptions.
     pub(super) fn new<'k>(
         kernels: impl Iterator<Item = &'k str>,
         bind: Bind<'_, L>,
         sizes: &Sizes,
     ) -> Self {
         let rebound = rebound();
-        let launches = |kernel: &str| match rebound.get(plain(kernel)) {
+        let launches = |kernel: &str| match rebound.get(base_name(kernel)) {
             None => vec![bind(kernel, &[])],
-            Some(several) => several.iter().map(|instead| bind(kernel, instead)).collect(),
+            Some(lists) => lists.iter().map(|rebindings| bind(kernel, rebindings)).collect(),
         };
-        let of_array = |kernel: &&str| !["copy_rows", "swap_rows", "audit"].contains(kernel);
+        let is_single = |kernel: &&str| !["copy_rows", "swap_rows", "audit"].contains(kernel);
         Self {
             by_kernel: kernels
-                .filter(of_array)
-                .map(|k| (plain(k).to_owned(), launches(k)))
+                .filter(is_single)
+                .map(|k| (base_name(k).to_owned(), launches(k)))
                 .collect(),
             record: sizes.records.stride() as u32,
             in_slots: sizes.accumulation == Accumulation::Slots,
-            counts_dominant: sizes.dominant,
-            copy_rows: of_rows("copy_rows", bind, sizes),
-            swap_rows: of_rows("swap_rows", bind, sizes),
+            counts_dominant: sizes.counts_dominant,
+            copy_rows: row_launches("copy_rows", bind, sizes),
+            swap_rows: row_launches("swap_rows", bind, sizes),
             audits: audits(bind, sizes),
         }
     }
 
-    /// The dispatch of a kernel with this number.
+    /// Launch `number` of a kernel.
     ///
     /// # Panics
-    /// When the device does not have it: a bug in the caller.
+    /// When there is none: a bug in the caller.
     pub(super) fn nth(&self, kernel: &str, number: usize) -> &L {
         let found = self.by_kernel.get(kernel).and_then(|launches| launches.get(number));
         found.unwrap_or_else(|| panic!("this device has no launch {number} of `{kernel}`"))
     }
 
-    /// The first dispatch of a kernel.
+    /// The first launch of a kernel.
     ///
     /// # Panics
     /// As [`nth`](Self::nth).
@@ -156,15 +166,16 @@ impl<L> Launches<L> {
     }
 }
 
-/// A kernel's name without the way of adding up.
-pub(super) fn plain(kernel: &str) -> &str {
+/// A kernel's name without `_atomic`: of two kernels that differ in how gradients are accumulated, a device has
+/// one.
+pub(super) fn base_name(kernel: &str) -> &str {
     kernel.strip_suffix("_atomic").unwrap_or(kernel)
 }
 
-/// The dispatches of the kernels whose variables are not all bound to buffers of their names: for each,
-/// the variables that are bound to others. Of pairs, the first reads `keys 0` and `values 0`.
-pub(super) fn rebound() -> HashMap<&'static str, Vec<Vec<Instead>>> {
-    let both = |instead: &dyn Fn(usize) -> Vec<Instead>| vec![instead(0), instead(1)];
+/// The kernels with variables that are bound to buffers of other names, with the exceptions of each launch. Of two
+/// launches, the first reads `keys 0` and `values 0`.
+pub(super) fn rebound() -> HashMap<&'static str, Vec<Vec<Rebinding>>> {
+    let two = |rebindings: &dyn Fn(usize) -> Vec<Rebinding>| vec![rebindings(0), rebindings(1)];
     let list = |i: usize| ("list", VALUES[i]);
     let scatter = |i: usize, values_to| {
         let from = [("keys in", KEYS[i]), ("values in", VALUES[i])];
@@ -174,41 +185,41 @@ pub(super) fn rebound() -> HashMap<&'static str, Vec<Vec<Instead>>> {
         let moments = [("first", FIRST[part]), ("second", SECOND[part])];
         [&[("params", PARAMETERS[part]), ("waiting", WAITING[part])], &moments[..]].concat()
     };
-    let keys_in = both(&|i| vec![("keys in", KEYS[i])]);
+    let keys_in = two(&|i| vec![("keys in", KEYS[i])]);
     HashMap::from([
         ("compact", vec![vec![("keys out", KEYS[0]), ("values out", VALUES[0])]]),
         ("count_digits", keys_in.clone()),
         ("find_tiles", keys_in),
-        // The last writes the order of rows.
+        // The third writes the order of rows.
         ("scatter", vec![scatter(0, VALUES[1]), scatter(1, VALUES[0]), scatter(1, "order")]),
         ("emit_entries", vec![vec![("keys out", KEYS[0])]]),
-        ("rasterize", both(&|i| vec![list(i)])),
-        ("rasterize_bwd", both(&|i| vec![list(i)])),
+        ("rasterize", two(&|i| vec![list(i)])),
+        ("rasterize_bwd", two(&|i| vec![list(i)])),
         ("similarity", vec![vec![("gradient", "pixel gradient")]]),
         ("pixel_gradient", vec![vec![("gradient", "pixel gradient")]]),
         ("expose_bwd", vec![vec![("gradient", "pixel gradient")]]),
         ("adam_band", (0..4).map(|band| adam(1 + band)).collect()),
         ("adam_geometry", vec![adam(0)]),
-        // Borrows the sums of the sorts, which are not needed then and are long enough.
+        // Borrows the sums of the sorts, which are unused then and long enough.
         ("present", vec![vec![("signals", "sums")]]),
-        // Borrows the gradients of the rows, which are not needed between two steps.
-        ("surface", both(&|i| vec![list(i), ("pixels", "ops"), ("points", "gradient")])),
-        ("count_errors", both(&|i| vec![("map", MAPS[i])])),
+        // Borrows the gradients of the rows, which are unused between two steps.
+        ("surface", two(&|i| vec![list(i), ("pixels", "ops"), ("points", "gradient")])),
+        ("count_errors", two(&|i| vec![("map", ERROR_MAPS[i])])),
         ("narrow", vec![vec![("worst", "gradient")]]),
-        ("write_worst", both(&|i| vec![("map", MAPS[i]), ("worst", "gradient")])),
-        ("replay", both(&|i| vec![list(i), ("map", "pixel gradient")])),
+        ("write_worst", two(&|i| vec![("map", ERROR_MAPS[i]), ("worst", "gradient")])),
+        ("replay", two(&|i| vec![list(i), ("map", "pixel gradient")])),
         ("gather", vec![vec![("all records", "records")]]),
         ("gather_columns", vec![vec![("all records", "records")]]),
     ])
 }
 
-/// One dispatch of a kernel for each array that an edit touches.
-fn of_rows<L>(kernel: &str, bind: Bind<'_, L>, sizes: &Sizes) -> Vec<RowLaunch<L>> {
+/// One launch of a kernel for each array that edits change.
+fn row_launches<L>(kernel: &str, bind: Bind<'_, L>, sizes: &Sizes) -> Vec<RowLaunch<L>> {
     let launch = |array: &RowArray| {
         let [first_row, rows] = sizes.places(array);
         RowLaunch {
             launch: bind(kernel, &[("buffer", array.name)]),
-            edited: array.holds.traits().edited,
+            edited: array.content.traits().edited,
             first_row: first_row as u32,
             first_parameter: array.parameters.start,
             numbers: array.numbers as u32,
@@ -216,11 +227,11 @@ fn of_rows<L>(kernel: &str, bind: Bind<'_, L>, sizes: &Sizes) -> Vec<RowLaunch<L
         }
     };
     let arrays = sizes.row_arrays();
-    let edited = arrays.iter().filter(|array| array.holds.traits().edited != Edited::Untouched);
+    let edited = arrays.iter().filter(|array| array.content.traits().edited != Edited::Untouched);
     edited.map(launch).collect()
 }
 
-/// The marks borrow the sums of the sorts, which are not needed between two steps.
+/// The launches of `audit`. The marks borrow the sums of the sorts, which are unused between two steps.
 fn audits<L>(bind: Bind<'_, L>, sizes: &Sizes) -> Vec<Audit<L>> {
     let arrays = sizes.row_arrays();
     let audit = |array: &RowArray| {
@@ -229,7 +240,7 @@ fn audits<L>(bind: Bind<'_, L>, sizes: &Sizes) -> Vec<Audit<L>> {
             launch: bind("audit", &[("marks", "sums"), ("numbers", array.name)]),
             first_row: sizes.places(array)[0] as u32,
             numbers: array.numbers as u32,
-            place: match array.holds.traits().audited? {
+            mark: match array.content.traits().audited? {
                 Kept::Parameter => first,
                 Kept::Moment => MOMENTS + first,
             },

@@ -1,14 +1,13 @@
 //! The GPU backend: the native backend's stages as WGSL, through wgpu, on Vulkan, Metal and DX12.
 //!
-//! Parameters stay on the device. A step is encoded once and submitted once; what differs between
-//! views (rows on screen, entries, bands) is counted there and drives indirect dispatches, and a few
-//! scalars come back with the loss. Where a view has more tile entries than the cap, the image is
-//! processed in bands. As many are encoded as the step before needed; a step that needs more changes
-//! nothing, reports it, and is repeated with enough.
+//! Parameters stay on the device. A step is encoded and submitted once. Numbers that differ between views
+//! (visible rows, tile entries, bands) are counted on the device and drive indirect dispatches; a few scalars
+//! come back with the loss. If a view has more tile entries than the cap, the image is processed in bands. As
+//! many bands are encoded as the previous step needed; a step that needs more changes nothing, reports it, and
+//! is repeated with enough.
 //!
-//! With [`Accumulation::Slots`](super::Accumulation::Slots) every sum has a fixed order, so that runs
-//! on the same device are reproducible byte for byte. Otherwise the order of a row's sums over tiles
-//! varies.
+//! With [`Accumulation::Slots`](super::Accumulation::Slots) every sum has a fixed order, and runs on the same
+//! device are reproducible byte for byte. Otherwise the order of a row's sums over tiles varies.
 
 mod adapter;
 mod audit;
@@ -22,10 +21,10 @@ mod exposure;
 mod frame;
 mod kernels;
 mod launches;
+mod memory_plan;
 mod observe;
 mod passes;
 mod pipelines;
-mod promise;
 mod readback;
 mod rows;
 mod sizes;
@@ -59,15 +58,28 @@ pub use device::GpuDevice;
 pub use device::faults::with_device_lost_after;
 use frame::Frame;
 use launches::Launches;
+use memory_plan::MAX_SIDE;
 use pipelines::Variant;
-use promise::MAX_SIDE;
 use sizes::Sizes;
 
-/// Whether gradients wait for an optimiser step: of bands 1–3, and of all else.
+/// Parameter groups whose gradients wait for an optimiser step.
 #[derive(Debug, Clone, Copy, Default)]
 struct Waiting {
+    /// All parameters but SH bands 1–3.
     main: bool,
+    /// SH bands 1–3.
     rest: bool,
+}
+
+/// A photograph that stays on the device.
+#[derive(Debug, Clone, Copy)]
+struct ResidentPhotograph {
+    /// Place in the buffer of photographs.
+    slot: u64,
+    /// Width and height `[px]`.
+    size: [u32; 2],
+    /// Bits of [`frame::target`].
+    flags: u32,
 }
 
 /// The GPU backend.
@@ -87,19 +99,19 @@ pub struct GpuBackend {
     cadence: Cadence,
     waiting: Waiting,
     candidates: Candidates,
-    /// Photographs on the device, the first ones seen; the others are uploaded at every step. The choice is
-    /// never changed: views come in a new random order in each epoch, so that the newest ones would be gone
-    /// before they are needed again. By view: place among those kept, size, and the bits that say what it
-    /// has.
-    kept: HashMap<usize, (u64, [u32; 2], u32)>,
-    /// Sums of the last step by its exposure, if it had one; see `shaders/exposure.wgsl`.
+    /// Photographs that stay on the device, by view: the first ones used. The others are uploaded at every step.
+    /// None is ever replaced: views come in a new random order in each epoch, so that the most recent ones would
+    /// be evicted before they are used again.
+    photographs: HashMap<usize, ResidentPhotograph>,
+    /// Derivative sums of the last step's exposure, if it had one; see `shaders/exposure.wgsl`.
     exposure_sums: [[f32; 4]; 4],
-    /// Bands that are encoded for the next view.
+    /// Number of bands to encode for the next view.
     bands: u32,
-    laps: Vec<(&'static str, Duration)>,
+    stage_times: Vec<(&'static str, Duration)>,
 }
 
 impl GpuBackend {
+    /// Creates the backend without the [canary](GpuDevice::run_canary).
     fn without_canary(
         model: &Gaussians,
         options: &Setup,
@@ -119,10 +131,10 @@ impl GpuBackend {
             });
         }
         let planes = SignalPlanes::new(&options.needs);
-        let sizes = promise::sizes(&device, model.sh_degree, options);
+        let sizes = memory_plan::sizes(&device, model.sh_degree, options);
         let buffers = Buffers::new(&device, &sizes)?;
         let launches = launches(&device, &sizes, shortcuts, &buffers)?;
-        let ledger = promise::ledger(&sizes, &options.needs);
+        let ledger = memory_plan::ledger(&sizes, &options.needs);
         let gpu = Self {
             ledger,
             device,
@@ -138,10 +150,10 @@ impl GpuBackend {
             cadence: options.needs.cadence,
             waiting: Waiting::default(),
             candidates: Candidates::new(options.needs.candidates),
-            kept: HashMap::new(),
+            photographs: HashMap::new(),
             exposure_sums: [[0.0; 4]; 4],
             bands: 1,
-            laps: Vec::new(),
+            stage_times: Vec::new(),
         };
         gpu.write("bias", bytemuck::cast_slice(&bias_table()));
         gpu.upload(model);
@@ -149,40 +161,40 @@ impl GpuBackend {
         Ok(gpu)
     }
 
-    /// The adapter that was taken.
+    /// The adapter in use.
     #[must_use]
     pub fn adapter(&self) -> &AdapterSummary {
         &self.device.summary
     }
 
-    /// Bytes of the ledger that are on the device.
+    /// Planned size of all buffers on the device `[bytes]`.
     #[must_use]
-    pub fn promised(&self) -> u64 {
+    pub fn planned_bytes(&self) -> u64 {
         self.sizes.planned().iter().map(|planned| planned.bytes).sum()
     }
 
-    /// Bytes allocated on the device now.
+    /// Current size of all buffers on the device `[bytes]`.
     #[must_use]
-    pub fn allocated(&self) -> u64 {
+    pub fn allocated_bytes(&self) -> u64 {
         self.buffers.bytes()
     }
 
-    /// Makes room for images of this size.
+    /// Enlarges the buffers if the image does not fit.
     fn fit_image(&mut self, width: u32, height: u32) -> Result<(), BackendError> {
         if width > MAX_SIDE || height > MAX_SIDE {
             return Err(BackendError::ImageTooLarge { width, height, max: MAX_SIDE });
         }
-        let (most_wide, most_high) = self.sizes.image;
-        if width > most_wide || height > most_high {
-            self.sizes.image = (most_wide.max(width), most_high.max(height));
+        let (max_width, max_height) = self.sizes.image;
+        if width > max_width || height > max_height {
+            self.sizes.image = (max_width.max(width), max_height.max(height));
             // Their places have moved.
-            self.kept.clear();
+            self.photographs.clear();
             self.rebuild()?;
         }
         Ok(())
     }
 
-    /// Allocates buffers whose size has changed, and binds all of them anew.
+    /// Reallocates buffers whose size has changed, and binds all buffers again.
     fn rebuild(&mut self) -> Result<(), BackendError> {
         self.buffers.resize(&self.device, &self.sizes)?;
         self.launches = launches(&self.device, &self.sizes, self.shortcuts, &self.buffers)?;
@@ -192,24 +204,24 @@ impl GpuBackend {
     fn frame(&self, camera: &Camera, background: [f32; 3], sh_degree: u8) -> Frame {
         let degree = u32::from(sh_degree.min(self.sizes.sh_degree));
         let Sizes { cap, frozen, .. } = self.sizes;
-        let of_model = [self.rows as u32, degree, cap as u32, self.sizes.trained() as u32];
-        let mut frame = Frame::of_view(camera, background, self.near, of_model);
+        let model = [self.rows as u32, degree, cap as u32, self.sizes.trained() as u32];
+        let mut frame = Frame::for_view(camera, background, self.near, model);
         frame.frozen[0] = frozen as u32;
         frame
     }
 }
 
-/// The kernels for these sizes, bound to these buffers.
+/// Compiles the kernels for these sizes and binds them to the buffers.
 fn launches(
     device: &Device,
     sizes: &Sizes,
     shortcuts: Shortcuts,
     buffers: &Buffers,
 ) -> Result<Launches, BackendError> {
-    let &Sizes { records, more, accumulation, dominant, .. } = sizes;
-    let variant = Variant { records, more, shortcuts, accumulation, dominant };
+    let &Sizes { records, alpha_and_depth, accumulation, counts_dominant, .. } = sizes;
+    let variant = Variant { records, alpha_and_depth, shortcuts, accumulation, counts_dominant };
     let pipelines = device.pipelines(variant)?;
-    device.guarded("the kernels", 0, |device| Launches::bound(device, &pipelines, buffers, sizes))
+    device.guarded("the kernels", 0, |device| Launches::bind(device, &pipelines, buffers, sizes))
 }
 
 impl Backend for GpuBackend {
@@ -255,10 +267,10 @@ impl Backend for GpuBackend {
                 let planes = self.planes.of(signal);
                 let columns: Result<Vec<_>, _> =
                     planes.map(|plane| self.column(plane, 0..self.rows)).collect();
-                let most =
+                let max =
                     |a: Vec<f32>, b: Vec<f32>| a.iter().zip(&b).map(|(a, b)| a.max(*b)).collect();
                 let mut kept =
-                    columns?.into_iter().reduce(most).unwrap_or_else(|| vec![0.0; self.rows]);
+                    columns?.into_iter().reduce(max).unwrap_or_else(|| vec![0.0; self.rows]);
                 kept.iter_mut().for_each(|value| *value = as_read(signal, *value));
                 kept
             };
@@ -283,7 +295,7 @@ impl Backend for GpuBackend {
     }
 
     fn audit(&mut self) -> Result<Vec<Unsound>, BackendError> {
-        self.unsound()
+        self.find_unsound()
     }
 
     fn render(
@@ -338,7 +350,7 @@ impl Backend for GpuBackend {
     }
 
     fn stage_times(&self) -> &[(&'static str, Duration)] {
-        &self.laps
+        &self.stage_times
     }
 }
 
@@ -350,14 +362,14 @@ impl Inspect for GpuBackend {
         colours: &[[f32; 3]],
     ) -> Result<Rendering, BackendError> {
         assert_eq!(colours.len(), self.rows, "colours of other rows");
-        // The colours take the place of band 0 meanwhile, which costs the device no memory.
+        // The colours temporarily replace band 0, which needs no device memory.
         let (band, rows) = (ModelArray::Sh.parameters(0), 0..self.rows);
         let own = self.parameters_of(&band, rows.clone())?;
         let painted: Vec<f32> = colours.as_flattened().iter().copied().map(rgb_to_dc).collect();
         self.set_parameters(&band, rows.clone(), &painted)?;
-        let made = self.render(camera, background, 0);
-        // If that fails the device has: it takes no step with these colours.
+        let rendering = self.render(camera, background, 0);
+        // If restoring fails, the device has failed: no step is taken with these colours.
         self.set_parameters(&band, rows, &own)?;
-        made
+        rendering
     }
 }

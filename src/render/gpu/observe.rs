@@ -1,7 +1,6 @@
-//! Measures single views for a policy: candidates for new rows while training, and auxiliary views at
-//! its events. The device lists the worst pixels of a view, of which the host takes
-//! those that are spaced; of auxiliary views the host chooses them, from a copy of the image. The
-//! device then finds their surface points, and the sums over each row's pixels.
+//! Measures single views for a policy: candidates for new rows while training, and auxiliary views at its events. In
+//! training the device lists the pixels with the largest errors, of which the host selects; in auxiliary views the host
+//! draws pixels from a copy of the image. The device then finds their surface points, and sums over each row's pixels.
 
 use densify_policies::policy::{
     AuxColumn, AuxRequest, Candidate, CandidateRequest, DepthMode, ErrorMode,
@@ -17,24 +16,24 @@ use crate::pixel_map::{draw_pixels, pixel_map, radius_px};
 use crate::{AuxInput, AuxOutput, BackendError, assert_same_size};
 
 /// √(½·log₂ e): folded into the splats' factors.
-const FOLD: f32 = 0.849_321_8;
+pub(super) const FOLD: f32 = 0.849_321_8;
 
-/// A view whose passes have run, so that its lists and its image are on the device.
-pub(super) struct DrawnView<'a> {
+/// A rendered view, with its lists and its image on the device.
+pub(super) struct RenderedView<'a> {
     pub(super) frame: Frame,
     pub(super) shape: Shape,
     pub(super) photograph: Photograph<'a>,
 }
 
 impl GpuBackend {
-    /// The search for candidates in a view of this size; `None` if the device lacks room for the result.
+    /// The search for candidates in a view of this size; `None` if the result would not fit.
     pub(super) fn search(
         &self,
         request: &CandidateRequest,
         count: usize,
         [width, height, ..]: [u32; 4],
     ) -> Option<Search> {
-        let room = self.found_room();
+        let room = self.search_room();
         let wanted = ranked(count, request.spaced);
         (wanted <= room).then_some(Search {
             pixels: width * height,
@@ -45,40 +44,40 @@ impl GpuBackend {
         })
     }
 
-    /// Pixels of which the gradients of the rows have room, beside their number.
-    fn found_room(&self) -> usize {
+    /// Number of pixels that fit the gradients of the rows, beside their number.
+    fn search_room(&self) -> usize {
         (GRADIENT / 2 * self.sizes.trained() as usize - 1).min(u32::MAX as usize)
     }
 
-    /// Adds the worst pixels of the view to the candidates; `search` is what was looked for, if it was.
+    /// Adds the pixels with the largest errors to the candidates. `search` is the search that the device has done, if any.
     pub(super) fn collect_candidates(
         &mut self,
-        drawn: &DrawnView<'_>,
+        rendered: &RenderedView<'_>,
         request: &CandidateRequest,
         count: usize,
         search: Option<Search>,
     ) -> Result<(), BackendError> {
         let found = match search {
-            Some(search) => self.found(&search)?,
+            Some(search) => self.search_result(&search)?,
             None => None,
         };
         let worst = match found {
             Some(found) => {
-                let [width, height, ..] = drawn.frame.image.map(|n| n as usize);
+                let [width, height, ..] = rendered.frame.image.map(|n| n as usize);
                 self.candidates.worst_of([width, height], count, request.spaced, found)
             }
-            None => self.worst_of_all(drawn, request, count)?,
+            None => self.worst_of_all(rendered, request, count)?,
         };
-        for candidate in self.surface_points(drawn, &worst, request.depth)? {
+        for candidate in self.surface_points(rendered, &worst, request.depth)? {
             self.candidates.push(candidate);
         }
         Ok(())
     }
 
-    /// The pixels that a search has found, with their errors; `None` if there are more than fit, as in an
-    /// image with the same error everywhere.
-    fn found(&self, search: &Search) -> Result<Option<Vec<(f32, u32)>>, BackendError> {
-        // As many as are wanted, and a few that are as bad as the last.
+    /// The pixels that a search has found, with their errors; `None` if there are more than fit, as in an image with the
+    /// same error everywhere.
+    fn search_result(&self, search: &Search) -> Result<Option<Vec<(f32, u32)>>, BackendError> {
+        // The wanted ones, and a few that are as bad as the last.
         let likely = (search.wanted + 63).min(search.room);
         let mut read = self.read("gradient", 0, 8 * (1 + u64::from(likely)))?;
         let count = read[0].to_bits();
@@ -92,14 +91,14 @@ impl GpuBackend {
         Ok(Some(pairs.map(|[error, pixel]| (*error, pixel.to_bits())).collect()))
     }
 
-    /// The worst pixels, chosen on the host from a copy of all errors.
+    /// The pixels with the largest errors, selected on the host from a copy of all errors.
     fn worst_of_all(
         &mut self,
-        drawn: &DrawnView<'_>,
+        rendered: &RenderedView<'_>,
         request: &CandidateRequest,
         count: usize,
     ) -> Result<Vec<(usize, usize, f32)>, BackendError> {
-        let [width, height, ..] = drawn.frame.image.map(|n| n as usize);
+        let [width, height, ..] = rendered.frame.image.map(|n| n as usize);
         let pixels = width * height;
         let finish = self.read("finish", 0, 8 * pixels as u64)?;
         let error: Vec<f32> = match request.error {
@@ -119,27 +118,28 @@ impl GpuBackend {
         Ok(self.candidates.worst(width, height, count, request.spaced, at))
     }
 
-    /// The surface points of some pixels (x, y, error) of the view, in their order; none for a pixel
-    /// that shows no surface.
+    /// The surface points of some pixels (x, y, error) of the view, in order; pixels without a surface are skipped.
     fn surface_points(
         &self,
-        drawn: &DrawnView<'_>,
+        rendered: &RenderedView<'_>,
         pixels: &[(usize, usize, f32)],
         mode: DepthMode,
     ) -> Result<Vec<Candidate>, BackendError> {
-        let DrawnView { frame, shape, photograph } = drawn;
+        let RenderedView { frame, shape, photograph } = rendered;
         let colour = photograph.scene_colours();
         let [width, ..] = frame.image;
         let focal = 0.5 * (frame.lens[0] + frame.lens[1]);
-        let which = u32::from(mode == DepthMode::Median);
+        let is_median = u32::from(mode == DepthMode::Median);
         let mut found = Vec::new();
-        // What fits the upload, and the points, of four numbers each, that come back.
+        // Limited by the upload, and by the buffer of the points, of four numbers each.
         let room = (OPS_BYTES as usize / 4).min(GRADIENT / 4 * self.sizes.trained() as usize);
         for chunk in pixels.chunks(room) {
             let numbers: Vec<u32> =
                 chunk.iter().map(|&(x, y, _)| y as u32 * width + x as u32).collect();
             self.write("ops", bytemuck::cast_slice(&numbers));
-            self.go_on(*shape, |passes, to| passes.surface(to, numbers.len() as u32, which, 0));
+            self.continue_view(*shape, |passes, to| {
+                passes.surface(to, numbers.len() as u32, is_median, 0);
+            });
             let points = self.read("gradient", 0, 16 * chunk.len() as u64)?;
             for (&(x, y, error), &[px, py, pz, depth]) in
                 chunk.iter().zip(points.as_chunks::<4>().0)
@@ -157,14 +157,14 @@ impl GpuBackend {
         Ok(found)
     }
 
-    /// Measures one view.
+    /// Measures an auxiliary view.
     pub(super) fn observe_view(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {
         let AuxInput { camera, target, background, exposure, request, .. } = *input;
         assert_same_size(camera, target);
         self.fit_image(camera.width, camera.height)?;
         let mut frame = self.frame(camera, background, input.sh_degree);
-        frame.draw[3] = self.bring_photograph(input.view, target);
-        self.bring_exposure(&mut frame, exposure);
+        frame.draw[3] = self.load_photograph(input.view, target);
+        self.load_exposure(&mut frame, exposure);
         let (state, shape) = self.run(&frame, |passes, to| {
             passes.forward(to);
             if exposure.is_some() {
@@ -175,19 +175,19 @@ impl GpuBackend {
         let loss = state.output().loss;
         let image = self.rendering(camera.width, camera.height)?;
         let photograph = Photograph { target, background, exposure };
-        let drawn = DrawnView { frame, shape, photograph };
+        let rendered = RenderedView { frame, shape, photograph };
         let points = if request.points == 0 {
             Vec::new()
         } else {
             let pixels = draw_pixels(&image.alpha, camera.width as usize, input);
-            self.surface_points(&drawn, &pixels, DepthMode::MaxWeight)?
+            self.surface_points(&rendered, &pixels, DepthMode::MaxWeight)?
         };
         let columns = if request.columns.is_empty() {
             Vec::new()
         } else {
             let map = pixel_map(image.rgb.as_chunks::<3>().0, target, background, request.map);
             self.write("pixel gradient", bytemuck::cast_slice(&map));
-            self.go_on(shape, |passes, to| {
+            self.continue_view(shape, |passes, to| {
                 passes.columns(to);
             });
             self.columns(request)?
@@ -195,13 +195,13 @@ impl GpuBackend {
         Ok(AuxOutput { loss, columns, points })
     }
 
-    /// The columns that the last passes have left.
+    /// Reads the columns that the last passes have computed.
     fn columns(&self, request: &AuxRequest) -> Result<Vec<(AuxColumn, Vec<f32>)>, BackendError> {
         let n = self.rows as u64;
         let sums = self.read("row sums", 0, 20 * n)?;
         let splats = self.read("splats", 0, 48 * n)?;
         let depths = self.read("depths", 0, 4 * n)?;
-        let counted = if self.sizes.dominant { n } else { 0 };
+        let counted = if self.sizes.counts_dominant { n } else { 0 };
         let dominant = self.read("dominant", 0, 4 * counted)?;
         let value = |column: AuxColumn, row: usize| {
             if depths[row].to_bits() == u32::MAX {
@@ -221,7 +221,7 @@ impl GpuBackend {
                 }
             }
         };
-        let of = |c: AuxColumn| (c, (0..self.rows).map(|row| value(c, row)).collect());
-        Ok(request.columns.iter().map(|&c| of(c)).collect())
+        let values = |c: &AuxColumn| (*c, (0..self.rows).map(|row| value(*c, row)).collect());
+        Ok(request.columns.iter().map(values).collect())
     }
 }

@@ -1,5 +1,5 @@
-//! Encodes the passes of a view: forward, image loss, backward, optimiser. What is encoded depends only
-//! on the image's size and the number of bands; everything else is counted on the device.
+//! Encodes the passes of a view: forward, image loss, backward, optimiser. The commands depend only on the image's size
+//! and the number of bands; everything else is counted on the device.
 
 use densify_policies::policy::MaskTerm;
 use wgpu::ComputePass;
@@ -10,9 +10,9 @@ use super::launches::{Launch, Launches};
 use super::sizes::BLOCK;
 use densify_core::gaussians::logit;
 
-/// Workgroups in the first of two dimensions; see `shaders/shared/view.wgsl`.
+/// Workgroups along the first of two dimensions; see `shaders/shared/view.wgsl`.
 const ACROSS: u32 = 32_768;
-/// Places of indirect dispatches `[bytes]`; see `shaders/tiles.wgsl`.
+/// Offsets of indirect dispatch sizes `[bytes]`; see `shaders/tiles.wgsl`.
 mod args {
     pub(super) const ROWS: u64 = 0;
     pub(super) const ROW_BLOCKS: u64 = 12;
@@ -20,7 +20,7 @@ mod args {
     pub(super) const ENTRY_BLOCKS: u64 = 36;
     pub(super) const ENTRY_DIGITS: u64 = 48;
 }
-/// What is summed; see `shaders/tiles.wgsl`.
+/// Quantities to sum; see `shaders/tiles.wgsl`.
 const FLAGS: u32 = 0;
 const COUNTS_ALL: u32 = 1;
 const COUNTS_BAND: u32 = 2;
@@ -29,39 +29,40 @@ const DIGITS_OF_ROWS: u32 = 4;
 const DIGITS_OF_ENTRIES: u32 = 5;
 /// The launch of `scatter` that writes the order of rows.
 const TO_ORDER: usize = 2;
-/// In place of a band: the whole image.
+/// Band that stands for the whole image.
 const WHOLE: u32 = u32::MAX;
 
 /// Numbers per row of an auxiliary view.
 const COLUMNS: u32 = 5;
 
-/// What decides which commands are encoded.
+/// The sizes that determine the commands.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Shape {
     pub(super) rows: u32,
     pub(super) tiles: u32,
-    /// Bands to encode; more than needed do nothing.
+    /// Number of bands to encode; superfluous ones do nothing.
     pub(super) bands: u32,
 }
 
 impl Shape {
-    /// Passes of four bits that sort the entries by tile.
-    fn tile_passes(&self) -> u32 {
+    /// Number of four-bit digits that sort the entries by tile.
+    fn tile_digits(&self) -> u32 {
         (u32::BITS - (self.tiles - 1).leading_zeros()).div_ceil(4).max(1)
     }
 }
 
-/// Which pixels of a view are looked for.
+/// A search for the pixels of a view with the largest errors.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Search {
-    /// Of the image.
+    /// Number of pixels of the image.
     pub(super) pixels: u32,
+    /// Number of pixels wanted.
     pub(super) wanted: u32,
-    /// Most that can be written down.
+    /// Largest number of pixels that the result can hold.
     pub(super) room: u32,
-    /// Least alpha of a pixel.
+    /// Smallest alpha of a pixel.
     pub(super) min_alpha: f32,
-    /// Whether the error is the length of the loss's gradient.
+    /// Use the length of the loss's gradient as error.
     pub(super) of_gradient: bool,
 }
 
@@ -81,29 +82,35 @@ impl<'e> Recorder<'e> {
         self.stages.begin(&mut self.pass, name);
     }
 
-    /// Ends the pass, and returns its stages, of which the last is the end.
+    /// Ends the pass and returns the names of its stages; the last is the end.
     pub(super) fn end(mut self) -> Vec<&'static str> {
         self.stage("");
         self.stages.names
     }
 
-    fn set(&mut self, launch: &Launch, now: [u32; 4]) {
+    fn set(&mut self, launch: &Launch, immediates: [u32; 4]) {
         self.pass.set_pipeline(&launch.pipeline);
         self.pass.set_bind_group(0, &launch.bindings, &[]);
-        self.pass.set_immediates(0, bytemuck::bytes_of(&now));
+        self.pass.set_immediates(0, bytemuck::bytes_of(&immediates));
     }
 
-    /// Dispatches so many workgroups.
-    pub(super) fn run(&mut self, launch: &Launch, now: [u32; 4], groups: u32) {
+    /// Dispatches this number of workgroups.
+    pub(super) fn run(&mut self, launch: &Launch, immediates: [u32; 4], groups: u32) {
         if groups > 0 {
-            self.set(launch, now);
+            self.set(launch, immediates);
             self.pass.dispatch_workgroups(groups.min(ACROSS), groups.div_ceil(ACROSS), 1);
         }
     }
 
-    /// Dispatches as many workgroups as the device has counted.
-    fn run_counted(&mut self, launch: &Launch, now: [u32; 4], groups: &wgpu::Buffer, at: u64) {
-        self.set(launch, now);
+    /// Dispatches the number of workgroups that the device has counted.
+    fn run_counted(
+        &mut self,
+        launch: &Launch,
+        immediates: [u32; 4],
+        groups: &wgpu::Buffer,
+        at: u64,
+    ) {
+        self.set(launch, immediates);
         self.pass.dispatch_workgroups_indirect(groups, at);
     }
 }
@@ -116,24 +123,23 @@ pub(super) struct Passes<'a> {
 }
 
 impl Passes<'_> {
-    /// One digit of a stable sort. `items` is 1 for entries and 0 for rows.
-    fn sort_digit(&self, to: &mut Recorder<'_>, pass: u32, items: u32, scatter: &Launch) {
+    /// Sorts by one digit, stably. `items` is 1 for entries and 0 for rows.
+    fn sort_digit(&self, to: &mut Recorder<'_>, digit: u32, items: u32, scatter: &Launch) {
         let l = self.launches;
-        let source = (pass % 2) as usize;
-        let (blocks, digits, what) = if items == 1 {
+        let source = (digit % 2) as usize;
+        let (blocks, digits, sum) = if items == 1 {
             (args::ENTRY_BLOCKS, args::ENTRY_DIGITS, DIGITS_OF_ENTRIES)
         } else {
             (args::ROW_BLOCKS, args::ROW_DIGITS, DIGITS_OF_ROWS)
         };
-        let now = [4 * pass, items, u32::from(items == 1 && pass == 0), 0];
-        to.run_counted(l.nth("count_digits", source), now, self.groups, blocks);
-        to.run_counted(l.get("scan_blocks"), [what, 0, 0, 0], self.groups, digits);
-        to.run(l.get("scan_sums"), [what, 0, 0, 0], 1);
-        to.run_counted(scatter, now, self.groups, blocks);
+        let immediates = [4 * digit, items, u32::from(items == 1 && digit == 0), 0];
+        to.run_counted(l.nth("count_digits", source), immediates, self.groups, blocks);
+        to.run_counted(l.get("scan_blocks"), [sum, 0, 0, 0], self.groups, digits);
+        to.run(l.get("scan_sums"), [sum, 0, 0, 0], 1);
+        to.run_counted(scatter, immediates, self.groups, blocks);
     }
 
-    /// Stages 1–3. Afterwards the canvas holds the image and, if there is one band, the lists hold
-    /// its entries.
+    /// Stages 1–3. Afterwards the canvas holds the image, and the lists hold the entries of the last band.
     pub(super) fn forward(&self, to: &mut Recorder<'_>) {
         let l = self.launches;
         let Shape { rows, bands, .. } = self.shape;
@@ -146,9 +152,9 @@ impl Passes<'_> {
         to.run(l.get("scan_sums"), [FLAGS, bands, 0, 0], 1);
         to.run(l.get("compact"), [0; 4], rows.div_ceil(256));
         to.stage("sort by depth");
-        for pass in 0..8 {
-            let number = if pass == 7 { TO_ORDER } else { pass as usize % 2 };
-            self.sort_digit(to, pass, 0, l.nth("scatter", number));
+        for digit in 0..8 {
+            let number = if digit == 7 { TO_ORDER } else { digit as usize % 2 };
+            self.sort_digit(to, digit, 0, l.nth("scatter", number));
         }
         to.stage("tiles");
         self.count(to, WHOLE, COUNTS_ALL);
@@ -163,48 +169,49 @@ impl Passes<'_> {
         }
     }
 
-    fn count(&self, to: &mut Recorder<'_>, band: u32, what: u32) {
+    /// Counts the entries of a band.
+    fn count(&self, to: &mut Recorder<'_>, band: u32, sum: u32) {
         let l = self.launches;
         to.run_counted(l.get("count_entries"), [band, 0, 0, 0], self.groups, args::ROWS);
-        to.run_counted(l.get("scan_blocks"), [what, 0, 0, 0], self.groups, args::ROW_BLOCKS);
-        to.run(l.get("scan_sums"), [what, self.shape.bands, 0, 0], 1);
+        to.run_counted(l.get("scan_blocks"), [sum, 0, 0, 0], self.groups, args::ROW_BLOCKS);
+        to.run(l.get("scan_sums"), [sum, self.shape.bands, 0, 0], 1);
     }
 
-    /// Which of the two key buffers holds the sorted entries.
+    /// Number of the key buffer that holds the sorted entries.
     fn sorted(&self) -> usize {
-        (self.shape.tile_passes() % 2) as usize
+        (self.shape.tile_digits() % 2) as usize
     }
 
-    /// The lists of a band. With one band its entries are counted already.
-    fn lists(&self, to: &mut Recorder<'_>, band: u32, what: u32) {
+    /// Builds the tile lists of a band. If there is only one, its entries are already counted.
+    fn lists(&self, to: &mut Recorder<'_>, band: u32, sum: u32) {
         let l = self.launches;
         to.stage("tiles");
         let several = self.shape.bands > 1;
         if several {
-            self.count(to, band, what);
+            self.count(to, band, sum);
         }
         let tiles = if several { band } else { WHOLE };
         to.run_counted(l.get("emit_entries"), [tiles, 0, 0, 0], self.groups, args::ROWS);
-        for pass in 0..self.shape.tile_passes() {
-            self.sort_digit(to, pass, 1, l.nth("scatter", pass as usize % 2));
+        for digit in 0..self.shape.tile_digits() {
+            self.sort_digit(to, digit, 1, l.nth("scatter", digit as usize % 2));
         }
         let groups = (self.shape.tiles + 1).div_ceil(256);
         to.run(l.nth("find_tiles", self.sorted()), [0; 4], groups);
     }
 
-    /// Gives the rendered image, of so many pixels, the photograph's exposure.
+    /// Applies the photograph's exposure to the rendered image.
     pub(super) fn expose(&self, to: &mut Recorder<'_>, pixels: u32) {
         to.run(self.launches.get("expose"), [0; 4], groups(pixels.into()) as u32);
     }
 
-    /// Takes the gradients of an exposed image back, and adds up those by the exposure.
+    /// Backpropagates the gradients of an exposed image, and sums the derivatives with respect to the exposure.
     pub(super) fn expose_bwd(&self, to: &mut Recorder<'_>, pixels: u32) {
         let l = self.launches;
         to.run(l.get("expose_bwd"), [0; 4], groups(pixels.into()) as u32);
         to.run(l.get("total_exposure"), [0; 4], 1);
     }
 
-    /// Stage 4, with the weights of |e| and 1 − SSIM in the errors per pixel, for candidates and for signals.
+    /// Stage 4. The weights are those of |e| and 1 − SSIM in the errors per pixel, for candidates and for signals.
     pub(super) fn loss(&self, to: &mut Recorder<'_>, error_weights: [[f32; 2]; 2]) {
         let l = self.launches;
         let [[a, b], [c, d]] = error_weights.map(|weights| weights.map(f32::to_bits));
@@ -214,7 +221,7 @@ impl Passes<'_> {
         to.run(l.get("total"), [0; 4], 1);
     }
 
-    /// Stage 5: from the pixels' gradients to one sum per row.
+    /// Stage 5: sums the pixels' gradients per row.
     pub(super) fn backward(&self, to: &mut Recorder<'_>) {
         let l = self.launches;
         let Shape { rows, tiles, bands } = self.shape;
@@ -241,8 +248,8 @@ impl Passes<'_> {
         to.run(self.launches.get("project_bwd"), [0; 4], self.shape.rows.div_ceil(256));
     }
 
-    /// Stages 6 to 8. Colour steps before the geometry, on which its gradient depends. Of `mask` the weight is that
-    /// of one row.
+    /// Stages 6 to 8. Colours step before the geometry, as their gradient depends on it. The weight of `mask` is per
+    /// row.
     pub(super) fn optimise(
         &self,
         to: &mut Recorder<'_>,
@@ -257,48 +264,47 @@ impl Passes<'_> {
             to.run(l.get("accumulate"), [0; 4], groups);
         }
         if let Some(MaskTerm { start, rate, weight, threshold }) = mask {
-            let now = [start, rate, weight, logit(threshold)].map(f32::to_bits);
-            to.run(l.get("step_masks"), now, groups);
+            let immediates = [start, rate, weight, logit(threshold)].map(f32::to_bits);
+            to.run(l.get("step_masks"), immediates, groups);
         }
         to.stage("adam");
         for band in 0..=usize::from(sh_degree) {
             let [first, coefficients] = [(band * band) as u32, (2 * band + 1) as u32];
             let numbers = self.shape.rows * 3 * coefficients;
-            let now = [first, coefficients, 0, 0];
-            to.run(l.nth("adam_band", band), now, numbers.div_ceil(256));
+            let immediates = [first, coefficients, 0, 0];
+            to.run(l.nth("adam_band", band), immediates, numbers.div_ceil(256));
         }
         to.run(l.get("adam_geometry"), [0; 4], groups);
     }
 
-    /// Writes the `wanted` worst pixels, and those as bad as the last of them, to the gradients of the
-    /// rows: their number, then error bits and pixel number of each, as many as fit.
+    /// Writes the pixels with the largest errors to the gradients of the rows: their number, then the error bits and the
+    /// index of each, as many as fit. Pixels as bad as the last wanted one are included.
     pub(super) fn worst(&self, to: &mut Recorder<'_>, search: &Search) {
         let l = self.launches;
         let &Search { pixels, wanted, room, min_alpha, of_gradient } = search;
         let (groups, map) = (pixels.div_ceil(256), usize::from(of_gradient));
-        let of_pixel = [min_alpha.to_bits(), u32::from(of_gradient)];
-        let now = |a, b| [a, b, of_pixel[0], of_pixel[1]];
+        let immediates = |a, b| [a, b, min_alpha.to_bits(), u32::from(of_gradient)];
         to.run(l.get("narrow"), [0, wanted, 0, 0], 1);
         for shift in [24, 16, 8, 0] {
-            to.run(l.nth("count_errors", map), now(shift, u32::from(shift == 24)), groups);
+            to.run(l.nth("count_errors", map), immediates(shift, u32::from(shift == 24)), groups);
             to.run(l.get("narrow"), [1, 0, 0, 0], 1);
         }
-        to.run(l.nth("write_worst", map), now(0, room), groups);
+        to.run(l.nth("write_worst", map), immediates(0, room), groups);
         to.run(l.get("narrow"), [2, 0, 0, 0], 1);
     }
 
-    /// Surface points of the pixels whose numbers are uploaded, from place `first` on.
+    /// Finds the surface points of the pixels whose indices are uploaded, from index `first` on.
     pub(super) fn surface(&self, to: &mut Recorder<'_>, pixels: u32, mode: u32, first: u32) {
         for band in 0..self.shape.bands {
             if self.shape.bands > 1 {
                 self.lists(to, band, COUNTS_AGAIN);
             }
-            let now = [band, pixels, mode, first];
-            to.run(self.launches.nth("surface", self.sorted()), now, pixels.div_ceil(256));
+            let immediates = [band, pixels, mode, first];
+            to.run(self.launches.nth("surface", self.sorted()), immediates, pixels.div_ceil(256));
         }
     }
 
-    /// Each row's sums over the pixels of a view that it is blended into.
+    /// Sums, for each row, over the pixels of a view that it is blended into.
     pub(super) fn columns(&self, to: &mut Recorder<'_>) {
         let l = self.launches;
         let groups = self.shape.rows.div_ceil(256);

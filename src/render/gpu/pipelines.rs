@@ -1,4 +1,4 @@
-//! The compute pipelines of a device. wgpu derives their layouts from the shaders.
+//! Compiles the compute pipelines of a device. wgpu derives their layouts from the shaders.
 
 use std::collections::HashMap;
 
@@ -11,31 +11,31 @@ use crate::Shortcuts;
 use crate::signals::{Field, ParameterSignal, RecordLayout};
 use densify_shaders::STAGES;
 
-/// What kernels are compiled for.
+/// Compile-time options of the kernels.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Variant {
     pub(super) records: RecordLayout,
-    /// Whether alpha and depth have gradients.
-    pub(super) more: bool,
+    /// Gradients of alpha and depth too.
+    pub(super) alpha_and_depth: bool,
     pub(super) shortcuts: Shortcuts,
     pub(super) accumulation: Accumulation,
-    /// Whether pixels are counted for the row that dominates them.
-    pub(super) dominant: bool,
+    /// Count the pixels that each row dominates.
+    pub(super) counts_dominant: bool,
 }
 
 impl Variant {
-    /// The shaders' `override` constants; a module is given those that it declares.
+    /// The values of the shaders' `override` constants.
     pub(super) fn constants(&self) -> Vec<(String, f64)> {
         let mut all = vec![
             ("RECORD".to_owned(), self.records.stride() as f64),
-            ("MORE".to_owned(), f64::from(u8::from(self.more))),
-            ("COUNTS_DOMINANT".to_owned(), f64::from(u8::from(self.dominant))),
+            ("MORE".to_owned(), f64::from(u8::from(self.alpha_and_depth))),
+            ("COUNTS_DOMINANT".to_owned(), f64::from(u8::from(self.counts_dominant))),
             ("ALPHA_MIN".to_owned(), f64::from(self.shortcuts.alpha_min)),
             ("LOG2_REACH".to_owned(), f64::from(self.shortcuts.log2_reach())),
             ("TRANSMITTANCE_MIN".to_owned(), f64::from(self.shortcuts.transmittance_min)),
         ];
-        let place = |field| self.records.at(field).unwrap_or(0) as f64;
-        all.extend(Field::ALL.map(|field| (field.constant().to_owned(), place(field))));
+        let offset = |field| self.records.at(field).unwrap_or(0) as f64;
+        all.extend(Field::ALL.map(|field| (field.constant().to_owned(), offset(field))));
         let is_computed = |signal: &Signal| ParameterSignal::of(*signal).is_none();
         let computed = Signal::ALL.into_iter().filter(is_computed);
         all.extend(computed.map(|signal| (constant(signal), f64::from(signal as u32))));
@@ -43,8 +43,8 @@ impl Variant {
     }
 }
 
-/// The name of a signal's number in shaders: `WEIGHT_MAX`.
-pub(super) fn constant(signal: Signal) -> String {
+/// Name of a signal's constant in the shaders, such as `WEIGHT_MAX`.
+fn constant(signal: Signal) -> String {
     let mut name = String::new();
     for c in format!("{signal:?}").chars() {
         if c.is_uppercase() && !name.is_empty() {
@@ -55,7 +55,7 @@ pub(super) fn constant(signal: Signal) -> String {
     name
 }
 
-/// A compiled kernel and the buffers that it uses.
+/// A compiled kernel and its bindings.
 #[derive(Debug)]
 pub(super) struct Compiled {
     pub(super) pipeline: ComputePipeline,
@@ -69,7 +69,7 @@ pub(super) struct Pipelines {
 }
 
 impl Pipelines {
-    /// Builds every kernel of the variant.
+    /// Compiles every kernel of the variant.
     pub(super) fn new(device: &Device, variant: Variant) -> Self {
         let mut compiled = HashMap::new();
         for stage in STAGES {
@@ -117,7 +117,7 @@ fn compile(
         entry_point: Some(entry),
         compilation_options: wgpu::PipelineCompilationOptions {
             constants,
-            // Every kernel writes what it reads.
+            // Every kernel writes shared memory before it reads it.
             zero_initialize_workgroup_memory: false,
         },
         cache: None,

@@ -1,4 +1,4 @@
-//! Copies from the device to the host, piece by piece through one buffer of fixed size.
+//! Copies from the device to the host, in pieces through one staging buffer of fixed size.
 
 use wgpu::{Buffer, CommandEncoder, MapMode, PollType};
 
@@ -6,7 +6,7 @@ use super::device::Device;
 use super::sizes::READ_BYTES;
 use crate::BackendError;
 
-/// Copies `bytes` bytes from `from` of `buffer` to the host.
+/// Copies `bytes` bytes of `buffer` to the host, from byte `from` on.
 pub(super) fn read(
     device: &Device,
     staging: &Buffer,
@@ -26,7 +26,7 @@ pub(super) fn read(
     Ok(all)
 }
 
-/// Submits what is encoded, waits, and copies the first `bytes` bytes of `staging`.
+/// Submits the encoded commands, waits, and copies the first `bytes` bytes of `staging`.
 pub(super) fn finish(
     device: &Device,
     staging: &Buffer,
@@ -35,7 +35,7 @@ pub(super) fn finish(
 ) -> Result<Vec<u8>, BackendError> {
     device.queue.submit([encoder.finish()]);
     let slice = staging.slice(..bytes);
-    // Whether it can be mapped shows when it is read.
+    // `get_mapped_range` reports failures.
     slice.map_async(MapMode::Read, |_| ());
     device.device.poll(PollType::wait_indefinitely()).map_err(|e| device.failed(e.to_string()))?;
     device.check()?;

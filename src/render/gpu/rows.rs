@@ -1,5 +1,5 @@
-//! The one table of the device's arrays with an entry per row: name, width, line of the ledger, and
-//! what becomes of it when rows are edited, saved and audited.
+//! The table of the device's arrays with an entry per row: name, width, line of the ledger, and how edits, checkpoints and
+//! the audit treat it.
 
 use std::ops::Range;
 
@@ -7,8 +7,8 @@ use crate::Kept;
 use densify_core::gaussians::ModelArray;
 use densify_core::memory::Section;
 
-/// Buffers of the geometry, then of the four colour bands.
-pub(super) type PartNames = [&'static str; 5];
+/// Names of the buffers of the geometry and of the four SH bands.
+type PartNames = [&'static str; 5];
 pub(super) const PARAMETERS: PartNames = ["rows", "sh0", "sh1", "sh2", "sh3"];
 pub(super) const FIRST: PartNames =
     ["first rows", "first sh0", "first sh1", "first sh2", "first sh3"];
@@ -17,51 +17,51 @@ pub(super) const SECOND: PartNames =
 pub(super) const WAITING: PartNames =
     ["waiting rows", "waiting sh0", "waiting sh1", "waiting sh2", "waiting sh3"];
 
-/// Numbers per row of the geometry, the last of which is padding.
+/// Numbers per row of the geometry; the last is padding.
 const GEOMETRY: usize = 12;
 /// Numbers per row of the gradients; see `shaders/project_bwd.wgsl`.
 pub(super) const GRADIENT: usize = 20;
 
-/// What an array holds.
+/// The content of an array.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Holds {
+pub(super) enum Content {
     Geometry,
     Colour,
     FirstMoments,
     SecondMoments,
-    /// Gradients that wait for an optimiser step.
+    /// Gradients waiting for an optimiser step.
     Waiting,
-    /// Steps of the optimiser, as whole numbers.
+    /// Number of optimiser steps, as whole numbers.
     Ages,
     /// Accumulated signals, one plane of rows after another.
     Signals,
-    /// What projection and tile lists know of a row in the view at hand.
+    /// Projection and tile lists of the current view.
     Projected,
-    /// Logits of masks, counted from where they began, so that 0 is a fresh one.
+    /// Logits of masks, relative to the initial one.
     Masks,
     MaskMoments,
-    /// Pixels that a row dominates in the view at hand.
+    /// Number of pixels that a row dominates in the current view.
     Dominated,
-    /// Gradients of splats, summed over the view at hand.
+    /// Gradients of splats, summed over the current view.
     SplatGradients,
-    /// Gradients by parameters in the view at hand.
+    /// Gradients of parameters in the current view.
     RowGradients,
 }
 
-/// What an edit does to an array.
+/// The effect of an edit on an array. Moved rows keep their numbers, except in [untouched](Self::Untouched) arrays.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Edited {
-    /// A newborn row's numbers follow from its parent's and the plan; moved rows take theirs along.
+    /// New rows are computed from their parent's numbers and the plan.
     Computed,
-    /// A newborn row gets a copy of its parent's numbers; moved rows take theirs along.
+    /// New rows copy their parent's numbers.
     Inherited,
-    /// A newborn row starts at 0; moved rows take theirs along.
+    /// New rows start at 0.
     Cleared,
-    /// Nothing: it is written anew for each view.
+    /// None: the array is rewritten for each view.
     Untouched,
 }
 
-/// What follows from what an array holds.
+/// Properties that follow from the content of an array.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Traits {
     pub(super) section: Section,
@@ -72,11 +72,11 @@ pub(super) struct Traits {
     pub(super) is_saved: bool,
     /// Searched for numbers that are not finite.
     pub(super) audited: Option<Kept>,
-    /// Needed by training only, so that frozen rows have no place in it.
+    /// Used by training only, so that frozen rows are not stored.
     pub(super) is_for_training: bool,
 }
 
-impl Holds {
+impl Content {
     pub(super) const fn traits(self) -> Traits {
         use Edited::{Cleared, Computed, Inherited, Untouched};
         let (section, line, edited, is_saved, audited) = match self {
@@ -105,15 +105,15 @@ impl Holds {
     }
 }
 
-/// One array.
+/// An array with an entry per row.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct RowArray {
     /// Name of the buffer.
     pub(super) name: &'static str,
     /// Numbers per row, of four bytes each.
     pub(super) numbers: usize,
-    pub(super) holds: Holds,
-    /// The parameters of a row that the numbers belong to, one by one; empty where they belong to none.
+    pub(super) content: Content,
+    /// The parameters that the numbers belong to; empty if they belong to none.
     pub(super) parameters: Range<usize>,
 }
 
@@ -123,21 +123,20 @@ impl RowArray {
         4 * self.numbers as u64
     }
 
-    /// How far apart rows lie, and the numbers of a row, where the array has so many rows.
+    /// Distance between rows, and between the numbers of a row, in an array of this number of rows.
     pub(super) fn pitch(&self, rows: u64) -> [u32; 2] {
-        match self.holds {
-            Holds::Signals => [1, rows as u32],
+        match self.content {
+            Content::Signals => [1, rows as u32],
             _ => [self.numbers as u32, 1],
         }
     }
 }
 
-/// Every array of a model of this degree; `waits`: whether gradients of the geometry and of band 0,
-/// and those of bands 1–3, may wait for a step; planes of signals, fields of a record, counts of pixels
-/// that a row dominates, and masks.
+/// All arrays for models of this SH degree. `may_wait`: gradients of the geometry and band 0, and those of bands 1–3, may
+/// wait for a step. The last argument has the numbers per row of signals, records, dominated pixels and masks.
 pub(super) fn row_arrays(
     sh_degree: u8,
-    waits: [bool; 2],
+    may_wait: [bool; 2],
     [planes, fields, counts, masks]: [usize; 4],
 ) -> Vec<RowArray> {
     let geometry = 0..ModelArray::Sh.parameters(sh_degree).start;
@@ -146,44 +145,44 @@ pub(super) fn row_arrays(
         coefficient(band)..coefficient(band + 1)
     };
     let mut all = Vec::new();
-    for (of_geometry, of_colour, names) in [
-        (Holds::Geometry, Holds::Colour, PARAMETERS),
-        (Holds::FirstMoments, Holds::FirstMoments, FIRST),
-        (Holds::SecondMoments, Holds::SecondMoments, SECOND),
-        (Holds::Waiting, Holds::Waiting, WAITING),
+    for (geometry_content, colour_content, names) in [
+        (Content::Geometry, Content::Colour, PARAMETERS),
+        (Content::FirstMoments, Content::FirstMoments, FIRST),
+        (Content::SecondMoments, Content::SecondMoments, SECOND),
+        (Content::Waiting, Content::Waiting, WAITING),
     ] {
         for (part, name) in names.into_iter().enumerate().take(usize::from(sh_degree) + 2) {
             let array = match part {
-                0 => (GEOMETRY, of_geometry, geometry.clone()),
-                _ => (band(part - 1).len(), of_colour, band(part - 1)),
+                0 => (GEOMETRY, geometry_content, geometry.clone()),
+                _ => (band(part - 1).len(), colour_content, band(part - 1)),
             };
-            let (numbers, holds, parameters) = array;
-            if holds != Holds::Waiting || waits[usize::from(part > 1)] {
-                all.push(RowArray { name, numbers, holds, parameters });
+            let (numbers, content, parameters) = array;
+            if content != Content::Waiting || may_wait[usize::from(part > 1)] {
+                all.push(RowArray { name, numbers, content, parameters });
             }
         }
     }
     let others = [
-        ("ages", 1, Holds::Ages),
-        ("signals", planes, Holds::Signals),
-        ("splats", 12, Holds::Projected),
-        ("footprints", 4, Holds::Projected),
-        ("depths", 1, Holds::Projected),
-        ("order", 1, Holds::Projected),
-        ("slots of row", 2, Holds::Projected),
-        ("row sums", fields, Holds::SplatGradients),
-        ("gradient", GRADIENT, Holds::RowGradients),
-        ("dominant", counts, Holds::Dominated),
-        ("mask offsets", masks, Holds::Masks),
-        ("mask moments", 2 * masks, Holds::MaskMoments),
+        ("ages", 1, Content::Ages),
+        ("signals", planes, Content::Signals),
+        ("splats", 12, Content::Projected),
+        ("footprints", 4, Content::Projected),
+        ("depths", 1, Content::Projected),
+        ("order", 1, Content::Projected),
+        ("slots of row", 2, Content::Projected),
+        ("row sums", fields, Content::SplatGradients),
+        ("gradient", GRADIENT, Content::RowGradients),
+        ("dominant", counts, Content::Dominated),
+        ("mask offsets", masks, Content::Masks),
+        ("mask moments", 2 * masks, Content::MaskMoments),
     ];
-    let unlike_parameters =
-        |(name, numbers, holds)| RowArray { name, numbers, holds, parameters: 0..0 };
-    all.extend(others.map(unlike_parameters));
+    let without_parameters =
+        |(name, numbers, content)| RowArray { name, numbers, content, parameters: 0..0 };
+    all.extend(others.map(without_parameters));
     all
 }
 
-/// Most bytes per row of any one array of a model of this degree, whatever the policy needs.
+/// Bytes per row of the widest array for models of this SH degree, for any policy.
 pub(super) fn widest_row(sh_degree: u8) -> u64 {
     let arrays = row_arrays(sh_degree, [false; 2], [0; 4]);
     arrays.iter().map(RowArray::row_bytes).max().unwrap_or(0)

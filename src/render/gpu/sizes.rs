@@ -1,11 +1,11 @@
-//! The sizes of all buffers, known before the first is allocated; the ledger is the list of them.
+//! Sizes of all buffers, known before the first is allocated. The ledger lists them.
 
 use densify_policies::policy::{Cadence, ErrorMode, Needs};
 use wgpu::BufferUsages;
 
 use super::exposure;
 use super::frame::{Frame, State, grid};
-use super::rows::{Holds, RowArray, row_arrays};
+use super::rows::{Content, RowArray, row_arrays};
 use crate::Accumulation;
 use crate::KeptPhotographs;
 use crate::signals::{Field, RecordLayout, SignalPlanes, counts_dominant};
@@ -14,42 +14,45 @@ use densify_core::memory::{Ledger, Section};
 
 /// Bytes of an edit's operations that are uploaded at a time.
 pub(super) const OPS_BYTES: u64 = 1 << 18;
-/// Most bytes read back at a time.
+/// Largest number of bytes read back at a time.
 pub(super) const READ_BYTES: u64 = 1 << 20;
 /// Items per group of the sums and sorts; see `shaders/tiles.wgsl`.
 pub(super) const BLOCK: u64 = 2048;
-/// Ages at which the bias correction is tabulated; older rows have none left: ln(2⁻²⁵)/ln(0.999).
+/// Oldest age with a tabulated bias correction; beyond ln(2⁻²⁵)/ln(0.999) there is none.
 pub(super) const MATURE: usize = 17_400;
-/// Most entries at a time: sums saturate beyond it.
-pub(super) const MOST_ENTRIES: u64 = 1 << 28;
+/// Largest number of entries held at a time; sums saturate beyond it.
+pub(super) const MAX_ENTRIES: u64 = 1 << 28;
 
-/// What decides all sizes.
+/// The quantities that determine all sizes.
 #[derive(Debug, Clone)]
 pub(super) struct Sizes {
     pub(super) budget: u64,
-    /// Rows at the front that never change.
+    /// Frozen rows at the front.
     pub(super) frozen: u64,
+    /// Largest number of (row, tile) pairs held at a time.
     pub(super) cap: u64,
     pub(super) sh_degree: u8,
+    /// Largest image, width and height `[px]`.
     pub(super) image: (u32, u32),
     pub(super) photographs: KeptPhotographs,
-    /// Planes of the signals.
+    /// Number of planes of the signals.
     pub(super) planes: usize,
-    /// Of the records and their sums.
+    /// Layout of the records and their sums.
     pub(super) records: RecordLayout,
-    /// How gradients are added up: only slots need records.
+    /// Accumulation of gradients; only slots need records.
     pub(super) accumulation: Accumulation,
-    /// Whether gradients of alpha and depth are given as well.
-    pub(super) more: bool,
+    /// Gradients of alpha and depth too.
+    pub(super) alpha_and_depth: bool,
     pub(super) cadence: Cadence,
-    /// Whether pixels are counted for the row that dominates them.
-    pub(super) dominant: bool,
-    /// Whether rows have masks.
-    pub(super) masks: bool,
-    pub(super) with_error: bool,
-    /// Whether pixels weigh more at edges.
+    /// Count the pixels that each row dominates.
+    pub(super) counts_dominant: bool,
+    /// Rows have masks.
+    pub(super) with_masks: bool,
+    /// The loss writes the error per pixel.
+    with_error: bool,
+    /// Pixels weigh more at edges.
     pub(super) with_edges: bool,
-    /// Whether photographs have exposures.
+    /// Photographs have exposures.
     pub(super) exposures: bool,
 }
 
@@ -58,6 +61,7 @@ pub(super) struct Sizes {
 pub(super) struct Planned {
     pub(super) name: &'static str,
     pub(super) section: Section,
+    /// Line of the ledger.
     pub(super) line: &'static str,
     pub(super) bytes: u64,
     pub(super) usage: BufferUsages,
@@ -83,46 +87,47 @@ impl Sizes {
             planes: SignalPlanes::new(needs).count,
             records,
             accumulation,
-            more: false,
+            alpha_and_depth: false,
             cadence: needs.cadence,
-            dominant: counts_dominant(needs),
-            masks: needs.mask.is_some(),
+            counts_dominant: counts_dominant(needs),
+            with_masks: needs.mask.is_some(),
             with_edges: records.has(Field::Error) && needs.error_score.edge > 0.0,
             with_error: needs.candidates.is_some_and(|r| r.error != ErrorMode::Gradient),
             exposures: false,
         }
     }
 
-    /// Whether the gradients of the geometry and of band 0, and those of bands 1–3, may wait.
-    pub(super) fn waits(&self) -> [bool; 2] {
+    /// True if gradients may wait for an optimiser step: those of the geometry and band 0, and those of bands 1–3.
+    pub(super) fn may_wait(&self) -> [bool; 2] {
         let Cadence { all, sh_rest } = self.cadence;
         [all > 1, all > 1 || sh_rest > 1]
     }
 
-    /// Most rows that are not frozen, >= 1.
+    /// Largest number of rows that are not frozen, >= 1.
     pub(super) fn trained(&self) -> u64 {
         self.budget.saturating_sub(self.frozen).max(1)
     }
 
-    /// The first row that has a place in an array, and how many have one at most.
+    /// First row that is stored in an array, and the largest number of stored rows.
     pub(super) fn places(&self, array: &RowArray) -> [u64; 2] {
-        match array.holds.traits().is_for_training {
-            true => [self.frozen, self.trained()],
-            false => [0, self.budget],
+        if array.content.traits().is_for_training {
+            [self.frozen, self.trained()]
+        } else {
+            [0, self.budget]
         }
     }
 
     /// Every array with an entry per row.
     pub(super) fn row_arrays(&self) -> Vec<RowArray> {
-        let [counts, masks] = [self.dominant, self.masks].map(usize::from);
+        let [counts, masks] = [self.counts_dominant, self.with_masks].map(usize::from);
         let others = [self.planes, self.records.stride(), counts, masks];
-        row_arrays(self.sh_degree, self.waits(), others)
+        row_arrays(self.sh_degree, self.may_wait(), others)
     }
 
     /// The arrays that hold the model.
     pub(super) fn parameters(&self) -> Vec<RowArray> {
         let mut arrays = self.row_arrays();
-        arrays.retain(|array| matches!(array.holds, Holds::Geometry | Holds::Colour));
+        arrays.retain(|array| matches!(array.content, Content::Geometry | Content::Colour));
         arrays
     }
 
@@ -136,11 +141,11 @@ impl Sizes {
         };
         let (b, cap) = (self.budget, self.cap);
         for array in self.row_arrays() {
-            let traits = array.holds.traits();
+            let traits = array.content.traits();
             let [_, rows] = self.places(&array);
             add(traits.section, traits.line, array.name, rows * array.row_bytes());
         }
-        add(Section::Model, Holds::Ages.traits().line, "bias", 8 * (MATURE as u64 + 1));
+        add(Section::Model, Content::Ages.traits().line, "bias", 8 * (MATURE as u64 + 1));
         for name in ["keys 0", "keys 1", "values 0", "values 1", "row of slot"] {
             add(Section::Tiles, "entries", name, 4 * cap);
         }
@@ -160,15 +165,16 @@ impl Sizes {
         add(Section::Renderer, "image and image gradient", "canvas", 16 * pixels);
         add(Section::Renderer, "image and image gradient", "finish", 8 * pixels);
         let errors = u64::from(self.records.has(Field::Error));
-        let channels = if self.more { 5 } else { 3 + errors * (1 + u64::from(self.with_edges)) };
+        let channels =
+            if self.alpha_and_depth { 5 } else { 3 + errors * (1 + u64::from(self.with_edges)) };
         add(Section::Renderer, "image and image gradient", "pixel gradient", 4 * channels * pixels);
         add(Section::Renderer, "loss", "derivatives", 36 * pixels);
         add(Section::Renderer, "loss", "tile sums", 8 * tiles);
         if self.with_error {
             add(Section::Renderer, "loss", "error", 4 * pixels);
         }
-        // Without exposures too: the loss binds it, and one buffer cannot stand for all that are missing where a
-        // kernel writes to some of them.
+        // Allocated without exposures too: the loss binds it, and a kernel cannot bind the placeholder several times
+        // if it writes to it.
         add(Section::Renderer, "small buffers", "exposure", exposure::TRANSFORM);
         if self.exposures {
             let sums = exposure::SUMS * exposure::groups(pixels);
@@ -195,12 +201,12 @@ impl Sizes {
         all
     }
 
-    /// Bytes of each photograph that is kept, and of its mask.
+    /// Size of each resident photograph and of its mask `[bytes]`.
     pub(super) fn photograph_bytes(&self) -> [u64; 2] {
         KeptPhotographs::bytes(self.image, self.photographs.with_masks)
     }
 
-    /// Bytes per purpose.
+    /// The ledger: bytes per purpose.
     pub(super) fn ledger(&self) -> Ledger {
         let mut ledger = Ledger::default();
         for Planned { section, line, bytes, .. } in self.planned() {
@@ -209,7 +215,7 @@ impl Sizes {
         ledger
     }
 
-    /// Numbers per row of all parameters but the geometry.
+    /// SH coefficients per row, of all channels.
     pub(super) fn sh_numbers(&self) -> usize {
         3 * sh_coefficients(self.sh_degree)
     }

@@ -1,32 +1,32 @@
-//! The GPU backend's state as named arrays: its buffers row by row, as the device holds them; zeros of frozen rows that
-//! have no place there.
+//! Saves and restores the GPU backend's state as named arrays: its buffers row by row, with zeros for frozen rows
+//! that are not stored.
 //!
-//! They are named after the device, so that the native backend, whose sums have another order, does
-//! not go on from them unasked.
+//! The names begin with `device`, so that the native backend, whose sums have another order, does not resume from
+//! them by accident.
 
 use std::ops::Range;
 
 use super::GpuBackend;
-use super::rows::{Holds, RowArray};
-use super::transfer::held;
+use super::rows::{Content, RowArray};
+use super::transfer::stored_rows;
 use crate::{BackendError, StateArray, StateError, Tensor};
 
-/// Before the name of a buffer.
+/// Prefix of a buffer's name.
 const BUFFER: &str = "device.";
-/// Before the name of a signal.
+/// Prefix of a signal's name.
 const SIGNAL: &str = "device.signals.";
 const WAITS: &str = "device.waits";
 const CANDIDATES: &str = "candidates";
 
 impl GpuBackend {
-    /// The arrays that outlive a step, beside the model and the signals.
-    fn saved(&self) -> impl Iterator<Item = RowArray> {
-        self.sizes.row_arrays().into_iter().filter(|array| array.holds.traits().is_saved)
+    /// The saved arrays, without the model and the signals.
+    fn saved_arrays(&self) -> impl Iterator<Item = RowArray> {
+        self.sizes.row_arrays().into_iter().filter(|array| array.content.traits().is_saved)
     }
 
     fn array(&self, name: &str) -> Option<RowArray> {
         let name = name.strip_prefix(BUFFER)?;
-        self.saved().find(|array| array.name == name)
+        self.saved_arrays().find(|array| array.name == name)
     }
 
     fn signal(&self, name: &str) -> Option<usize> {
@@ -35,7 +35,7 @@ impl GpuBackend {
     }
 
     pub(super) fn state_arrays(&self) -> Vec<StateArray> {
-        let buffers = self.saved().map(|array| format!("{BUFFER}{}", array.name));
+        let buffers = self.saved_arrays().map(|array| format!("{BUFFER}{}", array.name));
         let signals = self.planes.kept().into_iter().map(|(name, _)| format!("{SIGNAL}{name}"));
         let mut arrays: Vec<StateArray> = buffers.chain(signals).map(StateArray::of_rows).collect();
         arrays.push(StateArray::small(WAITS));
@@ -65,8 +65,8 @@ impl GpuBackend {
         let array = self.array(name);
         let array = array.unwrap_or_else(|| panic!("there is no `{name}` in this backend's state"));
         let values = self.read_rows(&array, rows.clone())?;
-        if array.holds == Holds::Ages {
-            // Whole numbers in the same four bytes.
+        if array.content == Content::Ages {
+            // Whole numbers of four bytes each.
             let bytes = bytemuck::cast_slice(&values).to_vec();
             return Ok(Tensor::u8(name, &[rows.len(), 4], bytes));
         }
@@ -87,19 +87,19 @@ impl GpuBackend {
             self.candidates.restore(tensor)?;
         } else if let Some(plane) = self.signal(&name) {
             let values = tensor.into_f32(&[rows.len()])?;
-            let (first, without) = held(self.sizes.frozen, &rows);
+            let (first, missing) = stored_rows(self.sizes.frozen, &rows);
             let start = plane as u64 * self.sizes.trained() + first;
-            self.write_at("signals", 4 * start, &values[without..]);
+            self.write_at("signals", 4 * start, &values[missing..]);
         } else if let Some(array) = self.array(&name) {
             let [first_row, _] = self.sizes.places(&array);
-            let (first, without) = held(first_row, &rows);
+            let (first, missing) = stored_rows(first_row, &rows);
             let at = array.row_bytes() * first;
-            if array.holds == Holds::Ages {
+            if array.content == Content::Ages {
                 let values = tensor.into_u8(&[rows.len(), 4])?;
-                self.write_at(array.name, at, &values[4 * without..]);
+                self.write_at(array.name, at, &values[4 * missing..]);
             } else {
                 let values = tensor.into_f32(&[rows.len(), array.numbers])?;
-                self.write_at(array.name, at, &values[array.numbers * without..]);
+                self.write_at(array.name, at, &values[array.numbers * missing..]);
             }
         } else {
             return Err(tensor.error("this run keeps nothing of that name"));

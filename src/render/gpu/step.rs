@@ -1,11 +1,11 @@
-//! One training step: fills the uniform buffer and runs the passes.
+//! A training step: fills the uniform buffer and runs the passes.
 
 use std::time::Instant;
 
 use densify_policies::policy::MaskTerm;
 
-use super::frame::{due, target as of_target};
-use super::observe::DrawnView;
+use super::frame::{due, target as target_flags};
+use super::observe::RenderedView;
 use super::passes::{Passes, Recorder};
 use super::{GpuBackend, Waiting};
 use crate::candidates::{Photograph, error_weights};
@@ -14,8 +14,7 @@ use crate::signals::Field;
 use crate::{BackendError, StepInput, StepOutput, assert_same_size};
 
 impl GpuBackend {
-    /// Which parameter groups step now and which have waited, as bits of the frame, and which wait
-    /// afterwards.
+    /// Parameter groups that step and groups that have waited, as bits of the frame; and the groups that wait afterwards.
     fn cadence_bits(&self, input: &StepInput<'_>) -> (u32, Waiting) {
         let (step, cadence) = (input.step, input.cadence);
         assert!(cadence.is_within(self.cadence), "step {step}: {cadence:?} was not declared");
@@ -39,11 +38,11 @@ impl GpuBackend {
         self.fit_image(camera.width, camera.height)?;
         let (due, waiting) = self.cadence_bits(input);
         let mut frame = self.frame(camera, background, input.sh_degree);
-        frame.draw[3] = self.bring_photograph(input.view, target);
-        self.bring_exposure(&mut frame, exposure);
-        frame.for_step(input, due, &self.planes);
+        frame.draw[3] = self.load_photograph(input.view, target);
+        self.load_exposure(&mut frame, exposure);
+        frame.add_step(input, due, &self.planes);
         if self.sizes.records.has(Field::Error) {
-            frame.draw[3] |= of_target::BY_PIXEL;
+            frame.draw[3] |= target_flags::BY_PIXEL;
             let score = &self.planes.score;
             if score.edge > 0.0 {
                 let pixels = u64::from(camera.width) * u64::from(camera.height);
@@ -55,14 +54,14 @@ impl GpuBackend {
         let trained = (self.rows - self.sizes.frozen as usize).max(1) as f32;
         let mask = self.mask.map(|mask| MaskTerm { weight: mask.weight / trained, ..mask });
         let pixels = camera.width * camera.height;
-        let by_map = self.planes.score.map.weights();
-        // Up to dL/dpixel.
+        let signal_weights = self.planes.score.map.weights();
+        // All passes up to dL/dpixel.
         let compare = |passes: &Passes<'_>, to: &mut Recorder<'_>, weights| {
             passes.forward(to);
             if exposure.is_some() {
                 passes.expose(to, pixels);
             }
-            passes.loss(to, [weights, by_map]);
+            passes.loss(to, [weights, signal_weights]);
             if exposure.is_some() {
                 passes.expose_bwd(to, pixels);
             }
@@ -74,7 +73,7 @@ impl GpuBackend {
         let state = if let Some((request, count)) = self.candidates.open(input.step, self.rows) {
             let weights = error_weights(request.error);
             if weights.is_some() {
-                frame.draw[3] |= of_target::WITH_ERROR;
+                frame.draw[3] |= target_flags::WITH_ERROR;
             }
             let search = self.search(&request, count, frame.image);
             let (state, shape) = self.run(&frame, |passes, to| {
@@ -84,9 +83,9 @@ impl GpuBackend {
                 }
             })?;
             let photograph = Photograph { target, background, exposure };
-            let drawn = DrawnView { frame, shape, photograph };
-            self.collect_candidates(&drawn, &request, count, search)?;
-            self.go_on(shape, step);
+            let rendered = RenderedView { frame, shape, photograph };
+            self.collect_candidates(&rendered, &request, count, search)?;
+            self.continue_view(shape, step);
             state
         } else {
             let run = self.run(&frame, |passes, to| {
@@ -97,9 +96,9 @@ impl GpuBackend {
         };
         self.waiting = waiting;
         if self.device.clock.is_none() {
-            self.laps = vec![("device", start.elapsed())];
+            self.stage_times = vec![("device", start.elapsed())];
         }
-        let by_exposure = exposure.map(|exposure| self.exposure_gradient(exposure, background));
-        Ok(StepOutput { exposure: by_exposure, ..state.output() })
+        let exposure = exposure.map(|exposure| self.exposure_gradient(exposure, background));
+        Ok(StepOutput { exposure, ..state.output() })
     }
 }

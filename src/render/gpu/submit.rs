@@ -1,4 +1,4 @@
-//! Submits a view's passes, and again with more bands where there were too few.
+//! Submits a view's passes, and repeats them with more bands if there were too few.
 
 use super::exposure::SUMS;
 use super::frame::{Frame, State};
@@ -7,8 +7,8 @@ use super::{GpuBackend, readback};
 use crate::BackendError;
 
 impl GpuBackend {
-    /// Encodes and submits a view's passes until the bands that were encoded do, and returns the
-    /// state that they left, and how they were encoded. `encode` records everything.
+    /// Encodes and submits a view's passes until the number of bands suffices. Returns the state that they leave and
+    /// the sizes that they were encoded with. `encode` records all passes.
     pub(super) fn run(
         &mut self,
         frame: &Frame,
@@ -31,56 +31,55 @@ impl GpuBackend {
             encode(&passes, &mut to);
             let stages = to.end();
             let staging = self.buffers.get("read");
-            let of_state = size_of::<State>() as u64;
-            encoder.copy_buffer_to_buffer(self.buffers.get("state"), 0, staging, 0, of_state);
-            let of_sums = if self.sizes.exposures { SUMS } else { 0 };
-            if of_sums > 0 {
+            let state_bytes = size_of::<State>() as u64;
+            encoder.copy_buffer_to_buffer(self.buffers.get("state"), 0, staging, 0, state_bytes);
+            let sums_bytes = if self.sizes.exposures { SUMS } else { 0 };
+            if sums_bytes > 0 {
                 let sums = self.buffers.get("exposure total");
-                encoder.copy_buffer_to_buffer(sums, 0, staging, of_state, of_sums);
+                encoder.copy_buffer_to_buffer(sums, 0, staging, state_bytes, sums_bytes);
             }
-            let bytes = readback::finish(&self.device, staging, encoder, of_state + of_sums)?;
+            let bytes = readback::finish(&self.device, staging, encoder, state_bytes + sums_bytes)?;
             let (state, sums) = bytes.split_at(size_of::<State>());
             let state: State = bytemuck::pod_read_unaligned(state);
-            if of_sums > 0 {
+            if sums_bytes > 0 {
                 self.exposure_sums = bytemuck::pod_read_unaligned(sums);
             }
             if state.broken_off != 0 {
-                return Err(self.broken_off());
+                return Err(BackendError::LoopCut {
+                    device: self.device.summary.name.clone(),
+                    accumulation: self.device.accumulation,
+                });
             }
             if state.short == 0 {
                 if let Some(clock) = &self.device.clock {
-                    self.laps = clock.laps(&self.device, &stages)?;
+                    self.stage_times = clock.stage_times(&self.device, &stages)?;
                 }
                 self.bands = state.bands.max(1);
                 return Ok((state, shape));
             }
-            // One band was tried: a guess. Several: now the device has counted how many.
+            // With one band, the number needed is a guess; with several, the device has counted it.
             let guess = (2 * u64::from(state.total)).div_ceil(self.sizes.cap).max(2);
             let needed = if shape.bands == 1 { guess } else { u64::from(state.bands) };
             self.bands = needed.min(u64::from(tiles)) as u32;
         }
     }
 
-    /// Encodes more passes over the view at hand and submits them.
-    pub(super) fn go_on(&self, shape: Shape, encode: impl FnOnce(&Passes<'_>, &mut Recorder<'_>)) {
+    /// Encodes more passes over the current view and submits them.
+    pub(super) fn continue_view(
+        &self,
+        shape: Shape,
+        encode: impl FnOnce(&Passes<'_>, &mut Recorder<'_>),
+    ) {
         let groups = self.buffers.get("groups");
         let passes = Passes { launches: &self.launches, groups, shape };
         self.submit(|to| encode(&passes, to));
     }
 
-    /// Submits what `encode` records.
+    /// Submits the dispatches that `encode` records.
     pub(super) fn submit(&self, encode: impl FnOnce(&mut Recorder<'_>)) {
         let mut encoder = self.device.device.create_command_encoder(&Default::default());
         let pass = encoder.begin_compute_pass(&Default::default());
         encode(&mut Recorder::new(pass));
         self.device.queue.submit([encoder.finish()]);
-    }
-
-    /// That the driver has not gone through all splats of a tile.
-    fn broken_off(&self) -> BackendError {
-        BackendError::LoopCut {
-            device: self.device.summary.name.clone(),
-            accumulation: self.device.accumulation,
-        }
     }
 }

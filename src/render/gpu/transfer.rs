@@ -1,12 +1,12 @@
-//! Transfers between host and device: the model, photographs, rendered images and columns of numbers.
+//! Transfers between host and device: the model, photographs, rendered images and signals.
 
 use std::ops::Range;
 
 use densify_policies::policy::Signal;
 
 use super::frame::target;
-use super::rows::{Holds, RowArray};
-use super::{GpuBackend, readback};
+use super::rows::{Content, RowArray};
+use super::{GpuBackend, ResidentPhotograph, readback};
 use crate::signals::ParameterSignal;
 use crate::{BackendError, Rendering};
 use densify_core::gaussians::{Gaussians, ModelArray};
@@ -30,7 +30,7 @@ impl GpuBackend {
         for array in self.sizes.parameters() {
             let mut values = Vec::with_capacity(array.numbers * model.len());
             for i in 0..model.len() {
-                if array.holds == Holds::Geometry {
+                if array.content == Content::Geometry {
                     values.extend_from_slice(&model.means[i]);
                     values.extend_from_slice(&model.log_scales[i]);
                     values.extend_from_slice(&model.quats[i]);
@@ -51,7 +51,7 @@ impl GpuBackend {
         Ok(bytemuck::pod_collect_to_vec(&bytes))
     }
 
-    /// Packs a photograph and uploads it; returns the bits that say what it has.
+    /// Packs and uploads a photograph; returns its bits of [`target`].
     pub(super) fn upload_target(&self, image: &Image8) -> u32 {
         let pixels = image.width as usize * image.height as usize;
         let mut words = vec![0_u32; pixels];
@@ -73,50 +73,51 @@ impl GpuBackend {
             | (if image.mask.is_some() { target::HAS_MASK } else { 0 })
     }
 
-    /// Brings a view's photograph to where the loss reads it; returns the bits that say what it has.
-    /// Views keep their photographs.
-    pub(super) fn bring_photograph(&mut self, view: usize, image: &Image8) -> u32 {
+    /// Copies a view's photograph to the buffer that the loss reads, and keeps it on the device if there is room. Returns
+    /// its bits of [`target`]. A view always has the same photograph.
+    pub(super) fn load_photograph(&mut self, view: usize, image: &Image8) -> u32 {
         let size = [image.width, image.height];
-        if let Some(&(place, kept, bits)) = self.kept.get(&view)
-            && kept == size
-        {
-            self.copy_photograph(place, size, bits, false);
-            return bits;
+        let resident = self.photographs.get(&view).copied();
+        if let Some(photograph) = resident.filter(|photograph| photograph.size == size) {
+            self.copy_photograph(photograph, false);
+            return photograph.flags;
         }
-        let bits = self.upload_target(image);
+        let flags = self.upload_target(image);
         let room = self.sizes.photographs;
-        // A view whose image has another size now keeps its place.
-        let own = self.kept.get(&view).map(|&(place, ..)| place);
-        let place = own.unwrap_or(self.kept.len() as u64);
-        if place < room.count as u64 && (bits & target::HAS_MASK == 0 || room.with_masks) {
-            self.copy_photograph(place, size, bits, true);
-            self.kept.insert(view, (place, size, bits));
+        // A view whose image has another size now keeps its slot.
+        let slot = resident.map_or(self.photographs.len() as u64, |photograph| photograph.slot);
+        if slot < room.count as u64 && (flags & target::HAS_MASK == 0 || room.with_masks) {
+            let photograph = ResidentPhotograph { slot, size, flags };
+            self.copy_photograph(photograph, true);
+            self.photographs.insert(view, photograph);
         }
-        bits
+        flags
     }
 
-    /// Copies between a place and where the loss reads.
-    fn copy_photograph(&self, place: u64, [width, height]: [u32; 2], bits: u32, keeps: bool) {
+    /// Copies a photograph between its slot and the buffers that the loss reads, to the slot if `keep`.
+    fn copy_photograph(&self, photograph: ResidentPhotograph, keep: bool) {
+        let ResidentPhotograph { slot, size: [width, height], flags } = photograph;
         let pixels = u64::from(width) * u64::from(height);
         let [truth_bytes, mask_bytes] = self.sizes.photograph_bytes();
-        let truth = place * (truth_bytes + mask_bytes);
+        let truth = slot * (truth_bytes + mask_bytes);
         let mut parts = vec![("truth", truth, 4 * pixels)];
-        if bits & target::HAS_MASK != 0 {
+        if flags & target::HAS_MASK != 0 {
             parts.push(("mask", truth + truth_bytes, pixels.next_multiple_of(4)));
         }
         let all = self.buffers.get("photographs");
         let mut encoder = self.device.device.create_command_encoder(&Default::default());
         for (name, at, bytes) in parts {
-            let one = self.buffers.get(name);
-            match keeps {
-                true => encoder.copy_buffer_to_buffer(one, 0, all, at, bytes),
-                false => encoder.copy_buffer_to_buffer(all, at, one, 0, bytes),
+            let current = self.buffers.get(name);
+            if keep {
+                encoder.copy_buffer_to_buffer(current, 0, all, at, bytes);
+            } else {
+                encoder.copy_buffer_to_buffer(all, at, current, 0, bytes);
             }
         }
         self.device.queue.submit([encoder.finish()]);
     }
 
-    /// The image of the last view rendered.
+    /// Reads the last rendered image.
     pub(super) fn rendering(&self, width: u32, height: u32) -> Result<Rendering, BackendError> {
         let pixels = width as usize * height as usize;
         let canvas = self.read("canvas", 0, 16 * pixels as u64)?;
@@ -131,20 +132,20 @@ impl GpuBackend {
         })
     }
 
-    /// Some rows of an array; zeros of those that it does not have.
+    /// Reads rows of an array, with zeros for rows that it does not store.
     pub(super) fn read_rows(
         &self,
         array: &RowArray,
         rows: Range<usize>,
     ) -> Result<Vec<f32>, BackendError> {
-        let (place, without) = held(self.sizes.places(array)[0], &rows);
-        let (bytes, count) = (array.row_bytes(), rows.len() - without);
-        let mut values = vec![0.0; array.numbers * without];
-        values.extend(self.read(array.name, bytes * place, bytes * count as u64)?);
+        let (first, missing) = stored_rows(self.sizes.places(array)[0], &rows);
+        let (bytes, count) = (array.row_bytes(), rows.len() - missing);
+        let mut values = vec![0.0; array.numbers * missing];
+        values.extend(self.read(array.name, bytes * first, bytes * count as u64)?);
         Ok(values)
     }
 
-    /// Some parameters of some rows, row after row.
+    /// Reads parameters of rows, row after row.
     pub(super) fn parameters_of(
         &self,
         wanted: &Range<usize>,
@@ -152,7 +153,7 @@ impl GpuBackend {
     ) -> Result<Vec<f32>, BackendError> {
         let mut all = vec![0.0; wanted.len() * rows.len()];
         for from in self.sizes.parameters() {
-            if let Some((here, there)) = shared(wanted, &from.parameters) {
+            if let Some((here, there)) = overlap(wanted, &from.parameters) {
                 let read = self.read_rows(&from, rows.clone())?;
                 let to = all.chunks_exact_mut(wanted.len());
                 for (to, from) in to.zip(read.chunks_exact(from.numbers)) {
@@ -163,7 +164,7 @@ impl GpuBackend {
         Ok(all)
     }
 
-    /// Reads an attribute of all rows, some at a time.
+    /// Reads an attribute of all rows, in pieces.
     pub(super) fn read_attribute(
         &self,
         attribute: &ParameterSignal,
@@ -179,7 +180,7 @@ impl GpuBackend {
         Ok(())
     }
 
-    /// Writes what [`parameters_of`](Self::parameters_of) returned of one of the model's arrays.
+    /// Writes rows of one of the model's arrays.
     pub(super) fn set_model_array(
         &self,
         array: ModelArray,
@@ -189,7 +190,7 @@ impl GpuBackend {
         self.set_parameters(&array.parameters(self.sizes.sh_degree), rows, values)
     }
 
-    /// Writes what [`parameters_of`](Self::parameters_of) returned.
+    /// Writes parameters of rows, row after row: the inverse of [`parameters_of`](Self::parameters_of).
     pub(super) fn set_parameters(
         &self,
         given: &Range<usize>,
@@ -197,13 +198,14 @@ impl GpuBackend {
         values: &[f32],
     ) -> Result<(), BackendError> {
         for to in self.sizes.parameters() {
-            if let Some((here, there)) = shared(given, &to.parameters) {
-                let mut all = match there.len() == to.numbers {
-                    true => vec![0.0; to.numbers * rows.len()],
-                    false => self.read_rows(&to, rows.clone())?,
+            if let Some((here, there)) = overlap(given, &to.parameters) {
+                let mut all = if there.len() == to.numbers {
+                    vec![0.0; to.numbers * rows.len()]
+                } else {
+                    self.read_rows(&to, rows.clone())?
                 };
-                let of_rows = all.chunks_exact_mut(to.numbers);
-                for (to, from) in of_rows.zip(values.chunks_exact(given.len())) {
+                let by_row = all.chunks_exact_mut(to.numbers);
+                for (to, from) in by_row.zip(values.chunks_exact(given.len())) {
                     to[there.clone()].copy_from_slice(&from[here.clone()]);
                 }
                 self.write_at(to.name, to.row_bytes() * rows.start as u64, &all);
@@ -212,41 +214,41 @@ impl GpuBackend {
         Ok(())
     }
 
-    /// Some rows, zeros of frozen ones, of the column of one plane of numbers.
+    /// Reads rows of a signal plane, with zeros for frozen rows.
     pub(super) fn column(
         &self,
         plane: usize,
         rows: Range<usize>,
     ) -> Result<Vec<f32>, BackendError> {
-        let (place, without) = held(self.sizes.frozen, &rows);
-        let start = plane as u64 * self.sizes.trained() + place;
-        let mut values = vec![0.0; without];
-        values.extend(self.read("signals", 4 * start, 4 * (rows.len() - without) as u64)?);
+        let (first, missing) = stored_rows(self.sizes.frozen, &rows);
+        let start = plane as u64 * self.sizes.trained() + first;
+        let mut values = vec![0.0; missing];
+        values.extend(self.read("signals", 4 * start, 4 * (rows.len() - missing) as u64)?);
         Ok(values)
     }
 
-    /// A column of present values, zeros of frozen rows; see `present` in `shaders/signals.wgsl`.
+    /// Computes and reads a signal of the present, with zeros for frozen rows; see `present` in `shaders/signals.wgsl`.
     pub(super) fn present(&self, signal: Signal) -> Result<Vec<f32>, BackendError> {
         let (rows, launch) = (self.rows as u32, self.launches.get("present"));
         let start = self.mask.map_or(0.0, |mask| mask.start);
         let frozen = self.sizes.frozen as usize;
-        let now = [signal as u32, rows, start.to_bits(), frozen as u32];
-        self.submit(|to| to.run(launch, now, rows.div_ceil(256)));
+        let immediates = [signal as u32, rows, start.to_bits(), frozen as u32];
+        self.submit(|to| to.run(launch, immediates, rows.div_ceil(256)));
         let mut values = vec![0.0; frozen];
         values.extend(self.read("sums", 0, 4 * (self.rows - frozen) as u64)?);
         Ok(values)
     }
 }
 
-/// Where two ranges of parameters have the ones that they share; `None` where they share none.
-fn shared(a: &Range<usize>, b: &Range<usize>) -> Option<(Range<usize>, Range<usize>)> {
+/// The common part of two ranges, relative to the start of each; `None` if they are disjoint.
+fn overlap(a: &Range<usize>, b: &Range<usize>) -> Option<(Range<usize>, Range<usize>)> {
     let (start, end) = (a.start.max(b.start), a.end.min(b.end));
     (start < end).then(|| (start - a.start..end - a.start, start - b.start..end - b.start))
 }
 
-/// Of an array whose first row is `first`: the place of the first of some rows that it has, and how many of them it
-/// does not have.
-pub(super) fn held(first: u64, rows: &Range<usize>) -> (u64, usize) {
-    let held = (first as usize).clamp(rows.start, rows.end);
-    ((held as u64).saturating_sub(first), held - rows.start)
+/// For an array whose first stored row is `first`: the index in the array of the first of `rows` that is stored, and the
+/// number of `rows` that are not.
+pub(super) fn stored_rows(first: u64, rows: &Range<usize>) -> (u64, usize) {
+    let stored = (first as usize).clamp(rows.start, rows.end);
+    ((stored as u64).saturating_sub(first), stored - rows.start)
 }

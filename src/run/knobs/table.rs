@@ -45,7 +45,7 @@ pub static KNOBS: &[Knob] = &[
         class: Bounded,
         effect: "how gradients are added up: slots in one order; cas and atomics in any, so that runs differ slightly",
         levels: &["slots", "cas", "atomics"],
-        set: |knobs, value| knobs.accumulation = Accumulation::of_name(value),
+        set: |knobs, value| knobs.accumulation = Accumulation::from_name(value),
     },
     Knob {
         name: "param_storage",

@@ -1,25 +1,24 @@
-//! Comparing a backend's arrays with the reference's.
+//! Compares a backend's arrays with the reference's.
 //!
-//! A renderer decides: is alpha below 1/255, is transmittance used up, which row is in front.
-//! Next to such a step, `f32` and `f64` may decide differently, and the images then differ by
-//! more than rounding. So images are compared tightly where no decision is close; elsewhere a
-//! pixel may flip, but rarely, by no more than a step, and not always in the same direction,
-//! for a bias is a bug and not rounding. (After gsplat's `assert_close_with_boundary_band`.)
+//! A renderer has thresholds: alpha below 1/255, transmittance used up, depth order. Close to one, `f32` and
+//! `f64` may decide differently, and the images then differ by more than rounding. So the comparison is tight
+//! where no threshold is close. Elsewhere a pixel may flip, but rarely, by a bounded amount, and not always in
+//! the same direction, as a bias would be a bug. (After gsplat's `assert_close_with_boundary_band`.)
 
 use std::fmt::Write as _;
 
 use densify_render::cpu::ModelGradient;
 
-/// How far two images may differ.
+/// Tolerances of a comparison of images.
 #[derive(Debug, Clone, Copy)]
 pub struct Limits {
-    /// Largest difference of a value where no decision is close.
+    /// Largest difference of a value where no threshold is close.
     pub interior: f64,
-    /// Largest difference of a value where one is.
+    /// Largest difference of a value where one is close.
     pub step: f64,
-    /// Largest share of all pixels that may differ by more than `interior`; one always may.
+    /// Largest share of pixels that may differ by more than `interior`; one pixel always may.
     pub flipped: f64,
-    /// Largest |mean sign| of these differences.
+    /// Largest absolute mean of the signs of these differences.
     pub bias: f64,
 }
 
@@ -27,22 +26,22 @@ impl Limits {
     /// For values around 1 computed on a CPU.
     pub const CPU: Self = Self { interior: 2e-5, step: 1.5 / 255.0, flipped: 0.001, bias: 0.5 };
 
-    /// The same for values around `scale`.
+    /// The tolerances for values around `scale`.
     #[must_use]
     pub fn scaled(self, scale: f64) -> Self {
         Self { interior: self.interior * scale, step: self.step * scale, ..self }
     }
 }
 
-/// From this many flipped pixels on, a common direction is no accident (p < 0.01 at bias ½).
-const FLIPS_WITH_DIRECTION: usize = 30;
+/// Flipped pixels from which on the bias is tested: at bias ½, chance is excluded (p < 0.01).
+const MIN_FLIPS_FOR_BIAS: usize = 30;
 
-/// What is wrong with `measured`, or `Ok` with the largest difference away from boundaries.
+/// Compares two images; returns the largest difference away from boundaries.
 ///
 /// Shapes: `measured` and `expected` `[pixels, channels]`, `boundary` `[pixels]`.
 ///
 /// # Errors
-/// The first pixel that differs by more than is allowed, or too many that do.
+/// The first pixel that differs by more than its tolerance, or too many flipped pixels.
 pub fn compare_images(
     measured: &[f32],
     expected: &[f64],
@@ -62,7 +61,7 @@ pub fn compare_images(
     for (p, &on_boundary) in boundary.iter().enumerate() {
         let differences =
             (p * channels..(p + 1) * channels).map(|i| f64::from(measured[i]) - expected[i]);
-        // The channel that differs most speaks for the pixel; a NaN differs most of all.
+        // The channel that differs most represents the pixel; a NaN counts as the largest difference.
         let worst = differences.fold(0.0_f64, |worst, d| {
             if worst.is_nan() || d.abs() <= worst.abs() { worst } else { d }
         });
@@ -70,7 +69,7 @@ pub fn compare_images(
             largest = largest.max(worst.abs());
         } else if !on_boundary || worst.is_nan() {
             return Err(format!(
-                "pixel {p} differs by {worst:e}, {:e} allowed where no decision is close",
+                "pixel {p} differs by {worst:e}, {:e} allowed where no threshold is close",
                 limits.interior
             ));
         } else if worst.abs() > limits.step {
@@ -83,21 +82,23 @@ pub fn compare_images(
             directions += worst.signum();
         }
     }
-    let most = ((limits.flipped * pixels as f64) as usize).max(1);
-    if flips > most {
-        return Err(format!("{flips} of {pixels} pixels flipped at a boundary, {most} allowed"));
+    let max_flips = ((limits.flipped * pixels as f64) as usize).max(1);
+    if flips > max_flips {
+        return Err(format!(
+            "{flips} of {pixels} pixels flipped at a boundary, {max_flips} allowed"
+        ));
     }
     let bias = directions / flips.max(1) as f64;
-    if flips >= FLIPS_WITH_DIRECTION && bias.abs() >= limits.bias {
+    if flips >= MIN_FLIPS_FOR_BIAS && bias.abs() >= limits.bias {
         return Err(format!("{flips} pixels flipped with bias {bias:.2}, {} allowed", limits.bias));
     }
     Ok(largest)
 }
 
-/// max |measured − expected| / max |expected|; 0 where both are all zero, NaN where a NaN is.
+/// max |measured − expected| / max |expected|; 0 if both are all zero, NaN if one holds a NaN.
 ///
 /// # Panics
-/// When they differ in length.
+/// When the arrays differ in length.
 #[must_use]
 pub fn relative_error<M: Copy + Into<f64>>(measured: &[M], expected: &[f64]) -> f64 {
     assert_eq!(measured.len(), expected.len(), "two arrays of one quantity differ in length");
@@ -116,7 +117,7 @@ pub fn relative_error<M: Copy + Into<f64>>(measured: &[M], expected: &[f64]) -> 
 /// All values of a parameter class of a gradient, row after row.
 ///
 /// # Panics
-/// When no class has this name.
+/// When there is no such class.
 #[must_use]
 pub fn class<'a>(gradient: &'a ModelGradient, name: &str) -> &'a [f32] {
     match name {
@@ -129,7 +130,7 @@ pub fn class<'a>(gradient: &'a ModelGradient, name: &str) -> &'a [f32] {
     }
 }
 
-/// Collects comparisons, so that a failing test shows all of them at once.
+/// Collects comparisons, so that a failing test reports all failures at once.
 #[derive(Debug)]
 pub struct Table {
     title: String,
@@ -144,12 +145,12 @@ impl Table {
         Self { title: title.into(), rows: Vec::new(), messages: Vec::new() }
     }
 
-    /// Records that `quantity` of `case` is off by `error`.
+    /// Records the error of `quantity` in `case`.
     pub fn check(&mut self, case: &str, quantity: &str, error: f64, tolerance: f64) {
         self.rows.push((case.into(), quantity.into(), error, tolerance));
     }
 
-    /// Records the outcome of a comparison of images.
+    /// Records the result of a comparison of images.
     pub fn image(
         &mut self,
         case: &str,
@@ -166,12 +167,12 @@ impl Table {
         }
     }
 
-    /// Records a failure that has no error to show.
+    /// Records a failure without a figure.
     pub fn fail(&mut self, message: String) {
         self.messages.push(message);
     }
 
-    /// Everything that failed, or `None`.
+    /// A text with all failures; `None` if there are none.
     fn failures(&self) -> Option<String> {
         let failed: Vec<_> = self.rows().filter(|row| row.2.is_nan() || row.2 > row.3).collect();
         if failed.is_empty() && self.messages.is_empty() {
@@ -199,15 +200,15 @@ impl Table {
         })
     }
 
-    /// All failures that have no error to show.
+    /// All failures without a figure.
     pub fn messages(&self) -> impl Iterator<Item = &str> {
         self.messages.iter().map(String::as_str)
     }
 
-    /// Ends a test.
+    /// Ends a test; fails it if a comparison failed.
     ///
     /// # Panics
-    /// With the table of failures, if there are any, or if nothing was compared.
+    /// With the table of failures; also if nothing was compared.
     pub fn finish(self) {
         assert!(!self.rows.is_empty(), "{}: nothing was compared", self.title);
         if let Some(failures) = self.failures() {

@@ -1,58 +1,59 @@
-//! What was found on a backend: the worst figure of each kind in each case.
+//! Results of the cases on a backend: the worst figure of each kind in each case.
 
 use super::Case;
 use super::compare::Table;
 
-/// The worst figure of a kind that was measured in a case.
+/// The worst figure of one kind in a case.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Finding {
-    /// The number of the case.
-    pub number: u8,
-    /// The kind of figure: image, gradient, or a quantity by name.
+    /// Number of the case.
+    pub case: u8,
+    /// Kind of figure: image, gradient, or the name of a quantity.
     pub kind: String,
-    /// Where it is worst: the scene, and which of its arrays.
+    /// Scene and array in which it was measured.
     pub place: String,
-    /// How far off it is there. NaN where there is no figure, because the case could not be finished.
+    /// Error; NaN if the case could not be finished.
     pub error: f64,
-    /// How far off it may be.
+    /// Largest error allowed.
     pub tolerance: f64,
 }
 
-/// Everything that was found on one backend.
+/// All results of one backend.
 #[derive(Debug, Clone)]
-pub struct Tested {
-    /// Its [name](super::Subject::name).
+pub struct SubjectReport {
+    /// [Name](super::Subject::name) of the backend.
     pub subject: String,
-    /// The cases that were tried, in their order, each with its findings.
+    /// The cases in the order in which they ran, each with its findings.
     pub cases: Vec<(Case, Vec<Finding>)>,
 }
 
-impl Tested {
-    /// All findings.
+impl SubjectReport {
+    /// All findings of all cases.
     pub fn findings(&self) -> impl Iterator<Item = &Finding> {
         self.cases.iter().flat_map(|(_, findings)| findings)
     }
 }
 
 impl Finding {
-    /// Whether it is within its tolerance.
+    /// True if the error is within its tolerance.
     #[must_use]
-    pub fn holds(&self) -> bool {
+    pub fn passes(&self) -> bool {
         self.error <= self.tolerance
     }
 
-    /// The error in units of its tolerance; more than 1 for one that does not hold.
-    fn share(&self) -> f64 {
-        match (self.holds(), self.error > 0.0) {
-            (true, true) => self.error / self.tolerance,
-            (true, false) => 0.0,
-            (false, true) if self.tolerance > 0.0 => self.error / self.tolerance,
-            (false, _) => f64::INFINITY,
+    /// Error in units of the tolerance; more than 1 if it fails.
+    fn relative(&self) -> f64 {
+        if self.error > 0.0 && self.tolerance > 0.0 {
+            self.error / self.tolerance
+        } else if self.passes() {
+            0.0
+        } else {
+            f64::INFINITY
         }
     }
 }
 
-/// The kind of a quantity: arrays of images, and gradients by class, are one kind each.
+/// The kind of a quantity: all arrays of an image are one kind, and so are the gradients of all classes.
 fn kind(quantity: &str) -> &str {
     match quantity {
         "rgb" | "alpha" | "depth" => "image",
@@ -66,25 +67,25 @@ fn kind(quantity: &str) -> &str {
     }
 }
 
-/// What the kind of everything that must be a number begins with.
+/// Beginning of the name of every quantity that counts numbers which are not finite.
 const BROKEN: &str = "NaN or infinity";
 
-/// The worst of each kind, in the order in which kinds first appear; what could not be measured last.
-pub(super) fn worst(number: u8, table: &Table) -> Vec<Finding> {
+/// The worst finding of each kind, in the order in which kinds first appear; then the failures without a figure.
+pub(super) fn worst(case: u8, table: &Table) -> Vec<Finding> {
     let mut found: Vec<Finding> = Vec::new();
     for (place, quantity, error, tolerance) in table.rows() {
         let kind = kind(quantity);
         let place =
             if kind == quantity { place.to_owned() } else { format!("{place}: {quantity}") };
-        let finding = Finding { number, kind: kind.into(), place, error, tolerance };
+        let finding = Finding { case, kind: kind.into(), place, error, tolerance };
         match found.iter_mut().find(|other| other.kind == finding.kind) {
-            Some(other) if finding.share() > other.share() => *other = finding,
+            Some(other) if finding.relative() > other.relative() => *other = finding,
             Some(_) => {}
             None => found.push(finding),
         }
     }
     let failed = table.messages().map(|message| Finding {
-        number,
+        case,
         kind: "failed".into(),
         place: message.into(),
         error: f64::NAN,
@@ -93,7 +94,7 @@ pub(super) fn worst(number: u8, table: &Table) -> Vec<Finding> {
     found.extend(failed);
     if found.is_empty() {
         let (kind, place) = ("failed".into(), "nothing was compared".into());
-        found.push(Finding { number, kind, place, error: f64::NAN, tolerance: 0.0 });
+        found.push(Finding { case, kind, place, error: f64::NAN, tolerance: 0.0 });
     }
     found
 }
@@ -114,7 +115,7 @@ mod tests {
         table.check("d", "loss", 0.5, 1.0);
         table.fail("it broke".into());
         let found = worst(3, &table);
-        let shown: Vec<_> = found.iter().map(|f| (&*f.kind, &*f.place, f.holds())).collect();
+        let shown: Vec<_> = found.iter().map(|f| (&*f.kind, &*f.place, f.passes())).collect();
         let expected = [
             ("image", "b: depth", true),
             ("steps", "b", false),
@@ -122,6 +123,6 @@ mod tests {
             ("failed", "it broke", false),
         ];
         assert_eq!(shown, expected);
-        assert!(!worst(3, &Table::new("t"))[0].holds());
+        assert!(!worst(3, &Table::new("t"))[0].passes());
     }
 }

@@ -1,18 +1,17 @@
-//! Whether a backend computes what it should: a renderer in `f64` that shares no arithmetic with the
-//! backends, comparisons with tolerances, and the cases where numbers are hardest.
+//! Numerical checks of a backend: a [reference] renderer in `f64` that shares no arithmetic with the backends,
+//! comparisons with tolerances, and the numerically hardest [`cases`].
 //!
-//! Needles, thousands of layers, saturated opacities, images of one pixel, rows that hold anything at
-//! all: `densify selftest` holds a user's own machine and driver to the [`cases`], and the tests hold
-//! every backend that they find to them. Their numbers are those of the table at the head of
-//! `tests/it/extremes.rs`, which says where each of them is tested beside here.
+//! `densify selftest` runs the cases on the user's own machine and driver; the tests run them on every
+//! available backend. The table at the head of `tests/it/extremes.rs` has the same case numbers, and lists
+//! the other tests of each case.
 
 mod cases;
 pub mod compare;
+#[cfg(test)]
+mod fault_injection;
 mod findings;
 pub mod reference;
 mod report;
-#[cfg(test)]
-pub(crate) mod sabotage;
 pub mod scenes;
 mod subject;
 mod trial;
@@ -24,30 +23,29 @@ pub use cases::cases;
 use densify_render::BackendError;
 pub use densify_render::Differentiable;
 pub use densify_render::Setup;
-pub use findings::{Finding, Tested};
+pub use findings::{Finding, SubjectReport};
 pub use report::{markdown, table};
 pub use subject::Subject;
 use trial::Trial;
 
-/// Something that must hold on every backend.
+/// A set of checks that every backend must pass.
 #[derive(Debug, Clone, Copy)]
 pub struct Case {
-    /// Its number.
+    /// Number, as the user chooses it.
     pub number: u8,
-    /// What is hard about it, in a few words.
-    pub what: &'static str,
+    /// The numerical difficulty, in a few words.
+    pub title: &'static str,
     run: fn(&mut Trial<'_>) -> Result<(), BackendError>,
 }
 
 impl Case {
-    /// Tries the case: one finding for each kind of figure, the worst of its kind. With `long`, in
-    /// full where that takes minutes.
+    /// Runs the case and returns the worst finding of each kind of figure. `long` includes checks that take
+    /// minutes.
     #[must_use]
     pub fn run(&self, subject: &Subject, long: bool) -> Vec<Finding> {
         let mut trial = Trial::new(subject, long);
-        // A panic is a bug, and the other cases' figures are wanted all the same.
-        let done = catch_unwind(AssertUnwindSafe(|| (self.run)(&mut trial)));
-        match done {
+        // A panic is a bug; the figures of the other cases are still needed.
+        match catch_unwind(AssertUnwindSafe(|| (self.run)(&mut trial))) {
             Ok(Ok(())) => {}
             Ok(Err(error)) => trial.table.fail(error.to_string()),
             Err(_) => trial.table.fail("a panic, which is a bug".into()),
@@ -65,7 +63,7 @@ mod tests {
     }
 
     fn fails(trial: &mut Trial<'_>) -> Result<(), BackendError> {
-        trial.figure("a", "steps", 0.0, 0.0);
+        trial.record("a", "steps", 0.0, 0.0);
         Err(BackendError::NoAdapter("gone".into()))
     }
 
@@ -73,9 +71,9 @@ mod tests {
     fn panics_and_errors_are_failures() {
         let subject = Subject::NATIVE;
         for (run, findings) in [(panics as fn(&mut Trial<'_>) -> _, 1), (fails, 2)] {
-            let found = Case { number: 1, what: "x", run }.run(&subject, false);
+            let found = Case { number: 1, title: "x", run }.run(&subject, false);
             assert_eq!(found.len(), findings);
-            assert!(!found.last().unwrap().holds(), "{found:?}");
+            assert!(!found.last().unwrap().passes(), "{found:?}");
         }
     }
 }

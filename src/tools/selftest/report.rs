@@ -1,10 +1,10 @@
-//! Findings as a table for a terminal and for Markdown.
+//! Tables of findings, for a terminal and as Markdown.
 
 use std::fmt::Write as _;
 
-use super::{Case, Finding, Tested};
+use super::{Case, Finding, SubjectReport};
 
-fn figure(value: f64) -> String {
+fn format_figure(value: f64) -> String {
     if value.is_nan() {
         "-".into()
     } else if value.to_bits() == 0 || (value.fract() == 0.0 && value < 1e6) {
@@ -15,16 +15,16 @@ fn figure(value: f64) -> String {
 }
 
 fn verdict(finding: &Finding) -> &'static str {
-    if finding.holds() { "ok" } else { "FAILED" }
+    if finding.passes() { "ok" } else { "FAILED" }
 }
 
 /// The lines of one case for a terminal.
 #[must_use]
 pub fn table(case: &Case, findings: &[Finding]) -> String {
-    let mut text = format!("{:>2}  {}", case.number, case.what);
+    let mut text = format!("{:>2}  {}", case.number, case.title);
     for finding in findings {
         let Finding { kind, place, error, tolerance, .. } = finding;
-        let (error, tolerance) = (figure(*error), figure(*tolerance));
+        let (error, tolerance) = (format_figure(*error), format_figure(*tolerance));
         let verdict = verdict(finding);
         let _ =
             write!(text, "\n    {verdict:<6} {error:>8} of {tolerance:>8}  {kind:<38}  {place}");
@@ -32,33 +32,33 @@ pub fn table(case: &Case, findings: &[Finding]) -> String {
     text
 }
 
-/// What stands at the head of a Markdown file.
+/// Head of the Markdown file.
 const HEAD: &str = "\
 # Figures of the selftest
 
-Written by `densify selftest --markdown FILE`, with `--all` for every backend; of each case and
-kind of figure the worst that was measured, beside the tolerance. Images are compared with those of a
-renderer in float64 where no decision is close; gradients relative to the largest of their class; what
-must never happen is counted. The numbers of the cases are those of `tests/it/extremes.rs`.
+Written by `densify selftest --markdown FILE`; `--all` includes every backend. The tables show the worst
+figure of each kind in each case, beside its tolerance. Images and gradients are compared with those of a
+float64 renderer: images except where a threshold of the renderer is close, gradients relative to the largest
+of their class. Other figures count what must never happen. `tests/it/extremes.rs` has the same case numbers.
 ";
 
-/// A Markdown file: a section for each backend that was tested, with a table of its findings.
+/// A Markdown file with a section for each backend and a table of its findings.
 #[must_use]
-pub fn markdown(tested: &[Tested]) -> String {
+pub fn markdown(reports: &[SubjectReport]) -> String {
     let mut text = HEAD.to_owned();
-    for Tested { subject, cases } in tested {
+    for SubjectReport { subject, cases } in reports {
         let _ = write!(text, "\n## {subject}\n\n{COLUMNS}");
         for (case, findings) in cases {
             for (i, finding) in findings.iter().enumerate() {
                 let number = case.number.to_string();
-                let (number, what) = if i == 0 { (&*number, case.what) } else { ("", "") };
+                let (number, title) = if i == 0 { (&*number, case.title) } else { ("", "") };
                 let Finding { kind, place, error, tolerance, .. } = finding;
-                let (error, tolerance) = (figure(*error), figure(*tolerance));
+                let (error, tolerance) = (format_figure(*error), format_figure(*tolerance));
                 let verdict = verdict(finding);
                 let place = place.replace('|', "\\|");
                 let _ = writeln!(
                     text,
-                    "| {number} | {what} | {kind} | {error} | {tolerance} | {verdict} | {place} |"
+                    "| {number} | {title} | {kind} | {error} | {tolerance} | {verdict} | {place} |"
                 );
             }
         }
@@ -67,7 +67,7 @@ pub fn markdown(tested: &[Tested]) -> String {
 }
 
 const COLUMNS: &str = "\
-| case | what | figure | measured | tolerance | | worst in |
+| case | title | figure | measured | tolerance | | worst in |
 |---|---|---|---|---|---|---|
 ";
 
@@ -77,18 +77,19 @@ mod tests {
     use crate::cases;
 
     fn finding(error: f64, tolerance: f64) -> Finding {
-        Finding { number: 1, kind: "image".into(), place: "a|b".into(), error, tolerance }
+        Finding { case: 1, kind: "image".into(), place: "a|b".into(), error, tolerance }
     }
 
     #[test]
-    fn what_fails_is_seen() {
+    fn failures_are_marked() {
         let case = cases()[0];
         let findings = vec![finding(1.5e-5, 2e-5), finding(3.0, 0.0), finding(f64::NAN, 1.0)];
         let text = table(&case, &findings);
         assert!(text.contains("ok       1.5e-5 of   2.0e-5"), "{text}");
         assert!(text.contains("FAILED        3 of        0"), "{text}");
         assert!(text.contains("FAILED        - of"), "{text}");
-        let text = markdown(&[Tested { subject: "native".into(), cases: vec![(case, findings)] }]);
+        let text =
+            markdown(&[SubjectReport { subject: "native".into(), cases: vec![(case, findings)] }]);
         assert!(text.contains("\n## native\n\n| case |"), "{text}");
         assert!(text.contains("| 1.5e-5 | 2.0e-5 | ok | a\\|b |"), "{text}");
         assert_eq!(text.matches("FAILED").count(), 2);

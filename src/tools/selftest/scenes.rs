@@ -1,4 +1,4 @@
-//! Small scenes to test with: deterministic, in front of a camera in general position.
+//! Small deterministic test scenes in front of a camera in general position.
 
 use densify_core::camera::Camera;
 use densify_core::gaussians::{Gaussians, sh_coefficients};
@@ -11,7 +11,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::reference::Upstream;
 
-/// A camera with an arbitrary pose and a principal point off the image's middle.
+/// A camera with an arbitrary pose and a principal point off the centre of the image.
 #[must_use]
 pub fn camera(width: u32, height: u32, seed: u64) -> Camera {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
@@ -31,8 +31,7 @@ pub fn camera(width: u32, height: u32, seed: u64) -> Camera {
     rounded(&camera)
 }
 
-/// The camera with every number rounded to `f32`, so that a backend that computes in `f32`
-/// starts from the same values as the reference.
+/// The camera with every number rounded to `f32`, so that backends and reference start from the same values.
 #[must_use]
 pub fn rounded(camera: &Camera) -> Camera {
     let round = |v: f64| f64::from(v as f32);
@@ -47,7 +46,7 @@ pub fn rounded(camera: &Camera) -> Camera {
     }
 }
 
-/// World position of a point given in camera axes.
+/// World position of a point in camera coordinates.
 #[must_use]
 pub fn world(camera: &Camera, local: [f64; 3]) -> [f32; 3] {
     let world = camera.rotation.inverse() * (DVec3::from(local) - camera.translation);
@@ -70,8 +69,8 @@ pub fn push(
     model.sh.extend((0..3 * sh_coefficients(model.sh_degree)).map(sh));
 }
 
-/// `rows` Gaussians over the image and a little beyond, at depths of 2 to 5 that differ by more
-/// than rounding, 2 to 40 % of the image wide, translucent, with quaternions of any length.
+/// `rows` translucent Gaussians over the image and a little beyond, 2 to 40 % of the image wide, with
+/// quaternions of any length. Depths lie between 2 and 5 and differ by more than rounding.
 #[must_use]
 pub fn cloud(rows: usize, sh_degree: u8, camera: &Camera, seed: u64) -> Gaussians {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
@@ -80,8 +79,8 @@ pub fn cloud(rows: usize, sh_degree: u8, camera: &Camera, seed: u64) -> Gaussian
     for i in (1..rows).rev() {
         order.swap(i, rng.random_range(0..=i));
     }
-    for place in order {
-        let z = 2.0 + 3.0 * (place as f64 + rng.random_range(0.2..0.8)) / rows as f64;
+    for rank in order {
+        let z = 2.0 + 3.0 * (rank as f64 + rng.random_range(0.2..0.8)) / rows as f64;
         let u = f64::from(camera.width) * rng.random_range(-0.1..1.1);
         let v = f64::from(camera.height) * rng.random_range(-0.1..1.1);
         let local = [(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z];
@@ -95,7 +94,7 @@ pub fn cloud(rows: usize, sh_degree: u8, camera: &Camera, seed: u64) -> Gaussian
     model
 }
 
-/// One row at a place given in camera axes, with colour that depends on the view (degree 1).
+/// One row at a point in camera coordinates, with a view-dependent colour (degree 1).
 #[must_use]
 pub fn one_at(camera: &Camera, local: [f64; 3], scale: [f32; 3]) -> Gaussians {
     let mut model = Gaussians { sh_degree: 1, ..Gaussians::default() };
@@ -104,7 +103,7 @@ pub fn one_at(camera: &Camera, local: [f64; 3], scale: [f32; 3]) -> Gaussians {
     model
 }
 
-/// A photograph of a camera's size in which neighbouring pixels differ.
+/// A photograph of the camera's size in which neighbouring pixels differ.
 #[must_use]
 pub fn target(camera: &Camera) -> Image8 {
     let n = 3 * camera.width * camera.height;
@@ -112,7 +111,7 @@ pub fn target(camera: &Camera) -> Image8 {
     Image8 { width: camera.width, height: camera.height, rgb, alpha: None, mask: None }
 }
 
-/// A loss that weighs every pixel of every image, with both signs.
+/// dL/d(image) of a loss with random weights of both signs on every pixel.
 #[must_use]
 pub fn upstream(camera: &Camera, seed: u64) -> Upstream {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
@@ -124,7 +123,7 @@ pub fn upstream(camera: &Camera, seed: u64) -> Upstream {
     Upstream { rgb: noise(3 * pixels, 1.0), alpha: noise(pixels, 1.0), depth: noise(pixels, 0.3) }
 }
 
-/// The same, as a backend takes it.
+/// The gradient in `f32`, as backends take it.
 #[must_use]
 pub fn narrowed(upstream: &Upstream) -> ImageGradient {
     let narrow = |values: &[f64]| values.iter().map(|&v| v as f32).collect();
@@ -135,7 +134,7 @@ pub fn narrowed(upstream: &Upstream) -> ImageGradient {
     }
 }
 
-/// A random photograph, and the colours of a rendering of it with noise.
+/// A noisy rendering of a random photograph, and the photograph.
 #[must_use]
 pub fn noisy((width, height): (u32, u32), noise: f32, seed: u64) -> (Vec<f32>, Image8) {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
@@ -148,7 +147,7 @@ pub fn noisy((width, height): (u32, u32), noise: f32, seed: u64) -> (Vec<f32>, I
     (rendered, Image8 { width, height, rgb, alpha: None, mask: None })
 }
 
-/// A rendering with these colours, of a photograph's size: opaque, at depth 1.
+/// A rendering with these colours and the photograph's size: opaque, at depth 1.
 #[must_use]
 pub fn opaque(rgb: &[f32], target: &Image8) -> Rendering {
     let pixels = rgb.len() / 3;

@@ -1,4 +1,4 @@
-//! What is tested: a backend, made the same way whichever it is.
+//! The backend under test, created the same way for every kind.
 
 use super::compare::Limits;
 use densify_core::gaussians::Gaussians;
@@ -6,54 +6,55 @@ use densify_render::cpu::{CpuBackend, InstructionSet};
 use densify_render::gpu::GpuDevice;
 use densify_render::{BackendError, Differentiable, Setup};
 
-/// What is tested.
+/// A backend under test.
 #[derive(Debug, Clone)]
 pub enum Subject {
     /// The native backend.
     Native {
-        /// What its kernels are compiled for.
+        /// Instruction set of the kernels.
         instructions: InstructionSet,
-        /// Worker threads; `None` takes all cores.
+        /// Worker threads; `None` uses all cores.
         threads: Option<usize>,
     },
-    /// A GPU, or what stands for one.
+    /// A GPU, or a software driver.
     Gpu(GpuDevice),
 }
 
 impl Subject {
-    /// The native backend as a run has it by default.
+    /// The native backend with its default options.
     pub const NATIVE: Self = Self::Native { instructions: InstructionSet::Best, threads: None };
 
-    /// What is tested, for people.
+    /// A name for people.
     #[must_use]
     pub fn name(&self) -> String {
         match self {
             Self::Native { instructions: InstructionSet::Best, .. } => "native".into(),
             Self::Native { instructions, .. } => format!("native ({instructions})"),
             Self::Gpu(device) => {
-                let (adapter, way) = (device.adapter(), device.accumulation());
-                let note = match way.is_deterministic() {
-                    true => String::new(),
-                    false => format!(", accumulation={way}"),
+                let (adapter, accumulation) = (device.adapter(), device.accumulation());
+                let note = if accumulation.is_deterministic() {
+                    String::new()
+                } else {
+                    format!(", accumulation={accumulation}")
                 };
                 format!("{} ({}, {}{note})", adapter.name, adapter.interface, adapter.driver)
             }
         }
     }
 
-    /// A backend for a model.
+    /// Creates a backend with room for the model.
     ///
     /// # Errors
     /// See [`BackendError`].
     pub fn backend(&self, model: &Gaussians) -> Result<Box<dyn Differentiable>, BackendError> {
-        self.with(model, Setup::default())
+        self.backend_with(model, Setup::default())
     }
 
-    /// A backend with room for more; it has room for the model whatever the budget.
+    /// Creates a backend with these options; a budget too small for the model is raised.
     ///
     /// # Errors
     /// See [`BackendError`].
-    pub fn with(
+    pub fn backend_with(
         &self,
         model: &Gaussians,
         mut setup: Setup,
@@ -62,13 +63,17 @@ impl Subject {
         match self {
             Self::Native { instructions, threads } => {
                 (setup.instructions, setup.threads) = (*instructions, *threads);
-                Ok(Box::new(CpuBackend::new(model, &setup)?))
+                let backend = CpuBackend::new(model, &setup)?;
+                #[cfg(test)]
+                return Ok(crate::fault_injection::wrap(backend));
+                #[cfg(not(test))]
+                Ok(Box::new(backend))
             }
             Self::Gpu(device) => device.backend(model, &setup),
         }
     }
 
-    /// Whether two runs give the same bits.
+    /// True if two runs give the same bits.
     #[must_use]
     pub fn is_deterministic(&self) -> bool {
         match self {
@@ -77,8 +82,8 @@ impl Subject {
         }
     }
 
-    /// How far an image may be from the reference's. The functions of a GPU are less accurate: an
-    /// exponential of WGSL may be off by 3 + 2·|x| units in the last place.
+    /// Tolerances of an image against the reference. Functions are less accurate on a GPU: WGSL allows `exp(x)`
+    /// an error of 3 + 2·|x| units in the last place.
     #[must_use]
     pub fn limits(&self) -> Limits {
         match self {
@@ -87,11 +92,11 @@ impl Subject {
         }
     }
 
-    /// How far a gradient may be from the reference's, against the largest of its class. Single
-    /// precision loses about 1e-6 in a sum over pixels; a hundred times that leaves room for
-    /// cancellation and none for a wrong term.
+    /// Tolerance of a gradient against the reference, relative to the largest of its class. Single
+    /// precision loses about 1e-6 in a sum over pixels; a hundred times that allows for cancellation, but
+    /// not for a wrong term.
     #[must_use]
-    pub fn gradient(&self) -> f64 {
+    pub fn gradient_tolerance(&self) -> f64 {
         match self {
             Self::Gpu(_) => 1e-3,
             Self::Native { .. } => 1e-4,

@@ -1,11 +1,11 @@
-//! One case on one backend: what is compared, and what was found.
+//! One run of a case on a backend: compares with the reference and records figures.
 
 use densify_policies::adc;
 use densify_policies::plan::EditPlan;
 use densify_policies::policy::{Cadence, LossTerms};
 
 use super::compare::{Limits, Table, class, compare_images, relative_error};
-use super::reference::{CLASSES, Image, Model, Rules, ScreenGradient, View, blend, project};
+use super::reference::{self, CLASSES, Image, Model, Rules, ScreenGradient, View, blend, project};
 use super::scenes;
 use super::subject::Subject;
 use super::values::RATES;
@@ -15,57 +15,57 @@ use densify_core::image::Image8;
 use densify_render::cpu::ModelGradient;
 use densify_render::{BackendError, Differentiable, Rendering, StepInput, StepOutput};
 
-/// Steps after each comparison of a scene, after which nothing may have broken.
+/// Training steps after each comparison of a scene.
 const STEPS: u32 = 5;
-/// What is counted there.
-const NEVER: &str = "NaN or infinity in 5 steps and an edit";
+/// Quantity that counts the numbers broken by these steps.
+const BROKEN_BY_STEPS: &str = "NaN or infinity in 5 steps and an edit";
 
-/// A case that is being tried.
+/// A running case.
 pub(super) struct Trial<'a> {
     pub(super) subject: &'a Subject,
-    /// Whether there is time for the whole of it.
+    /// Include checks that take minutes.
     pub(super) long: bool,
     pub(super) table: Table,
-    /// How far images may be off.
+    /// Tolerances of images.
     pub(super) limits: Limits,
-    /// How far gradients may be off, against the largest of their class.
-    pub(super) gradient: f64,
+    /// Tolerance of gradients, relative to the largest of their class.
+    pub(super) gradient_tolerance: f64,
 }
 
 impl<'a> Trial<'a> {
     pub(super) fn new(subject: &'a Subject, long: bool) -> Self {
-        let (limits, gradient) = (subject.limits(), subject.gradient());
-        Self { subject, long, table: Table::new("selftest"), limits, gradient }
+        let (limits, gradient_tolerance) = (subject.limits(), subject.gradient_tolerance());
+        Self { subject, long, table: Table::new("selftest"), limits, gradient_tolerance }
     }
 
-    /// Whether what the process holds is the native backend's: other tests may run beside a case, but
-    /// not where it is run in full.
-    pub(super) fn is_alone(&self) -> bool {
+    /// True if the native backend's memory can be measured as that of the process: long cases run alone,
+    /// others may run beside other tests.
+    pub(super) fn is_memory_measurable(&self) -> bool {
         self.long && matches!(self.subject, Subject::Native { .. })
     }
 
-    /// Records a figure.
-    pub(super) fn figure(&mut self, what: &str, quantity: &str, error: f64, tolerance: f64) {
-        self.table.check(what, quantity, error, tolerance);
+    /// Records a figure and its tolerance.
+    pub(super) fn record(&mut self, label: &str, quantity: &str, error: f64, tolerance: f64) {
+        self.table.check(label, quantity, error, tolerance);
     }
 
-    /// Records how often something happened that must not.
-    pub(super) fn never(&mut self, what: &str, quantity: &str, count: usize) {
-        self.figure(what, quantity, count as f64, 0.0);
+    /// Records a count that must be zero.
+    pub(super) fn count(&mut self, label: &str, quantity: &str, count: usize) {
+        self.record(label, quantity, count as f64, 0.0);
     }
 
-    /// Compares image, gradients and statistics of one view with the reference's, then trains on it.
-    /// Returns the gradients, and those of the reference.
+    /// Compares the image, gradients and row statistics of a view with the reference's, then trains on it.
+    /// Returns the gradients of the backend and of the reference.
     pub(super) fn check(
         &mut self,
-        what: &str,
+        label: &str,
         model: &Gaussians,
         camera: &Camera,
         background: [f32; 3],
         sh_degree: u8,
     ) -> Result<(ModelGradient, Model), BackendError> {
         let view = View { camera, background: background.map(f64::from), sh_degree };
-        let (exact, rules) = (Model::of(model), Rules::STANDARD);
+        let (exact, rules) = (Model::from(model), Rules::STANDARD);
         let splats = project::project(&exact, view, &rules);
         let order = project::by_depth(&splats);
         let image = blend::render(&splats, &order, view, &rules);
@@ -76,33 +76,33 @@ impl<'a> Trial<'a> {
         let mut backend = self.subject.backend(model)?;
         let upstream = scenes::narrowed(&upstream);
         let (found, measured) = backend.differentiate(camera, background, sh_degree, &upstream)?;
-        self.images(what, &found, &image);
+        self.compare_image(label, &found, &image);
         for name in CLASSES {
             let error = relative_error(class(&measured, name), expected.class(name));
-            self.figure(what, name, error, self.gradient);
+            self.record(label, name, error, self.gradient_tolerance);
         }
-        self.statistics(what, &measured, &screen, &image.boundary);
-        self.train(what, &mut *backend, camera, background, sh_degree)?;
+        self.compare_statistics(label, &measured, &screen, &image.boundary);
+        self.train(label, &mut *backend, camera, background, sh_degree)?;
         Ok((measured, expected))
     }
 
-    /// Compares the image of one view with the reference's.
+    /// Compares the image of a view with the reference's.
     pub(super) fn check_image(
         &mut self,
-        what: &str,
+        label: &str,
         model: &Gaussians,
         camera: &Camera,
         background: [f32; 3],
         sh_degree: u8,
     ) -> Result<(), BackendError> {
         let view = View { camera, background: background.map(f64::from), sh_degree };
-        let image = super::reference::render(&Model::of(model), view, &Rules::STANDARD);
+        let image = reference::render(&Model::from(model), view, &Rules::STANDARD);
         let found = self.subject.backend(model)?.render(camera, background, sh_degree)?;
-        self.images(what, &found, &image);
+        self.compare_image(label, &found, &image);
         Ok(())
     }
 
-    fn images(&mut self, what: &str, found: &Rendering, image: &Image) {
+    fn compare_image(&mut self, label: &str, found: &Rendering, image: &Image) {
         let deepest = image.depth.iter().fold(1.0_f64, |m, d| m.max(*d));
         let limits = self.limits;
         let arrays = [
@@ -112,20 +112,20 @@ impl<'a> Trial<'a> {
         ];
         for (quantity, found, expected, limits) in arrays {
             let outcome = compare_images(found, expected, &image.boundary, limits);
-            self.table.image(what, quantity, outcome, limits);
+            self.table.image(label, quantity, outcome, limits);
         }
     }
 
-    fn statistics(
+    fn compare_statistics(
         &mut self,
-        what: &str,
+        label: &str,
         measured: &ModelGradient,
         rows: &[ScreenGradient],
         boundary: &[bool],
     ) {
-        let tolerance = self.gradient;
+        let tolerance = self.gradient_tolerance;
         let mut on_screen = |quantity: &str, found: &[f32], expected: Vec<f64>| {
-            self.table.check(what, quantity, relative_error(found, &expected), tolerance);
+            self.table.check(label, quantity, relative_error(found, &expected), tolerance);
         };
         let flat = |f: fn(&ScreenGradient) -> Vec<f64>| rows.iter().flat_map(f).collect::<Vec<_>>();
         on_screen("mean2d", measured.mean2d.as_flattened(), flat(|s| s.mean.to_vec()));
@@ -136,20 +136,20 @@ impl<'a> Trial<'a> {
         let mut invisible = 0;
         for (row, expected) in rows.iter().enumerate() {
             let off = f64::from(measured.pixel_count[row].abs_diff(expected.pixels));
-            self.figure(what, "pixel_count", off, close);
+            self.record(label, "pixel_count", off, close);
             let off = f64::from(measured.sum_weight[row]) - expected.sum_weight;
             let flips = close * Limits::CPU.step;
-            self.figure(what, "sum_weight", off.abs(), tolerance * expected.sum_weight + flips);
+            self.record(label, "sum_weight", off.abs(), tolerance * expected.sum_weight + flips);
             invisible += usize::from(expected.pixels > 0 && !measured.visible[row]);
         }
-        self.never(what, "rows blended but not visible", invisible);
+        self.count(label, "rows blended but not visible", invisible);
     }
 
-    /// Some steps and an edit, after which every number of the model, of the optimiser and of an
-    /// image must be one.
+    /// Trains for some steps and applies an edit; then every number of the model, of the optimiser and of an
+    /// image must be finite.
     pub(super) fn train(
         &mut self,
-        what: &str,
+        label: &str,
         backend: &mut dyn Differentiable,
         camera: &Camera,
         background: [f32; 3],
@@ -173,12 +173,12 @@ impl<'a> Trial<'a> {
         broken += backend.audit()?.len();
         let image = backend.render(camera, background, sh_degree)?;
         broken += count_broken(&[&image.rgb, &image.alpha, &image.depth]);
-        self.never(what, NEVER, broken);
+        self.count(label, BROKEN_BY_STEPS, broken);
         Ok(())
     }
 }
 
-/// One training step with the step sizes of the suite.
+/// One training step with the learning rates of the suite.
 pub(super) fn step(
     backend: &mut dyn Differentiable,
     number: u32,
@@ -203,12 +203,12 @@ pub(super) fn step(
     })
 }
 
-/// Values that are none.
+/// Number of values that are not finite.
 pub(super) fn count_broken(arrays: &[&[f32]]) -> usize {
     arrays.iter().flat_map(|values| values.iter()).filter(|v| !v.is_finite()).count()
 }
 
-/// The bits of an image and of every gradient and statistic.
+/// The bits of an image, its gradients and its pixel counts.
 pub(super) fn bits((image, gradient): &(Rendering, ModelGradient)) -> Vec<u32> {
     let classes = CLASSES.map(|name| class(gradient, name));
     let images: [&[f32]; 3] = [&image.rgb, &image.alpha, &image.depth];
@@ -216,7 +216,7 @@ pub(super) fn bits((image, gradient): &(Rendering, ModelGradient)) -> Vec<u32> {
     all.chain(gradient.pixel_count.iter().copied()).collect()
 }
 
-/// Pairs that differ.
+/// Number of positions at which two arrays differ.
 pub(super) fn count_different(a: &[u32], b: &[u32]) -> usize {
     a.len().abs_diff(b.len()) + a.iter().zip(b).filter(|(a, b)| a != b).count()
 }

@@ -1,14 +1,13 @@
-//! The numbers and sizes at which renderers break, for every test that needs some: one table of
-//! numbers that are none, one of numbers at the ends of `f32`, one of awkward image sizes.
+//! Numbers and image sizes at which renderers tend to break, shared by all tests.
 
 use densify_core::gaussians::Gaussians;
 use densify_render::LearningRates;
 
-/// Numbers that are none. What holds one is drawn nowhere and is found by the audit.
+/// Numbers that are not finite. A row that holds one is not rendered, and the audit reports it.
 pub const POISON: [f32; 4] = [f32::NAN, -f32::NAN, f32::INFINITY, f32::NEG_INFINITY];
 
-/// Finite numbers that no row should hold: zeros, subnormal ones, and those whose square is none.
-pub const EXTREMES: [f32; 15] = [
+/// Extreme finite numbers: zeros, subnormal numbers, and numbers whose square overflows.
+pub(crate) const EXTREMES: [f32; 15] = [
     0.0,
     -0.0,
     1e-45,
@@ -26,8 +25,8 @@ pub const EXTREMES: [f32; 15] = [
     f32::MIN,
 ];
 
-/// Width and height `[px]` of images that are no multiple of a tile (16 px), smaller than one, as wide
-/// as one and a pixel more or less, narrower than the window of SSIM (11 px), and as long as can be.
+/// Image sizes, width and height `[px]`: around the size of a tile (16 px), narrower than the SSIM window
+/// (11 px), and the longest side supported.
 pub const SIZES: [(u32, u32); 11] = [
     (1, 1),
     (1, 17),
@@ -42,18 +41,18 @@ pub const SIZES: [(u32, u32); 11] = [
     (1, 16_384),
 ];
 
-/// Width and height `[px]` at which the number of tiles passes 65,535, the most workgroups along one
-/// axis that WebGPU promises: 65,536 tiles, and 66,049.
-pub const LARGE_SIZES: [(u32, u32); 2] = [(4096, 4096), (4097, 4097)];
+/// Image sizes `[px]` of 65,536 and 66,049 tiles: more than 65,535, the workgroups along one axis that every
+/// WebGPU device supports.
+pub(crate) const LARGE_SIZES: [(u32, u32); 2] = [(4096, 4096), (4097, 4097)];
 
-/// Numbers of a row of degree 3.
+/// Parameters of a row of degree 3.
 pub const SLOTS: usize = 59;
 
-/// Number `slot` of a row of degree 3: mean, log-scale, quaternion, opacity logit, coefficients.
+/// Parameter `slot` of a row of degree 3, in the order mean, log-scale, quaternion, opacity logit, coefficients.
 ///
 /// # Panics
 /// When the model has no such row, or another degree.
-pub fn slot_of(model: &mut Gaussians, row: usize, slot: usize) -> &mut f32 {
+pub fn slot_mut(model: &mut Gaussians, row: usize, slot: usize) -> &mut f32 {
     match slot {
         0..3 => &mut model.means[row][slot],
         3..6 => &mut model.log_scales[row][slot - 3],
@@ -63,9 +62,8 @@ pub fn slot_of(model: &mut Gaussians, row: usize, slot: usize) -> &mut f32 {
     }
 }
 
-/// What slot `slot` belongs to.
-#[must_use]
-pub fn name_of_slot(slot: usize) -> &'static str {
+/// The attribute that parameter `slot` belongs to.
+pub(crate) fn slot_name(slot: usize) -> &'static str {
     match slot {
         0..3 => "a mean",
         3..6 => "a log-scale",
@@ -76,9 +74,8 @@ pub fn name_of_slot(slot: usize) -> &'static str {
     }
 }
 
-/// What `values`, of which each row has `per_row`, are without row `row`.
-#[must_use]
-pub fn without<T: Clone>(values: &[T], row: usize, per_row: usize) -> Vec<T> {
+/// `values`, of which each row has `per_row`, without those of row `row`.
+pub(crate) fn without<T: Clone>(values: &[T], row: usize, per_row: usize) -> Vec<T> {
     let (before, rest) = (&values[..row * per_row], &values[(row + 1) * per_row..]);
     [before, rest].concat()
 }
@@ -97,7 +94,7 @@ pub fn remove(model: &Gaussians, row: usize) -> Gaussians {
     }
 }
 
-/// Step sizes of tests that train: those of the schedule, with means in scene units.
+/// Learning rates of tests that train: those of the schedule, with means in scene units.
 pub const RATES: LearningRates = LearningRates {
     mean: 1e-3,
     noise: 2e-3,

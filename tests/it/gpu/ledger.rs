@@ -49,13 +49,13 @@ fn what_is_allocated_is_what_the_ledger_says() {
             ..Setup::new(model.len())
         };
         let mut gpu = GpuBackend::new(&model, &options, device).expect("a small model fits");
-        let promised = gpu.promised();
-        assert_eq!((gpu.allocated(), gpu.ledger().on_device()), (promised, promised));
+        let promised = gpu.planned_bytes();
+        assert_eq!((gpu.allocated_bytes(), gpu.ledger().on_device()), (promised, promised));
         let has_host_parts = needs.aux.is_some() || needs.error_score.edge > 0.0;
         assert_eq!(gpu.ledger().on_host() > 0, has_host_parts, "{needs:?}");
-        assert_eq!(&device.promise(model.sh_degree, &options), gpu.ledger());
+        assert_eq!(&device.memory_plan(model.sh_degree, &options), gpu.ledger());
         gpu.render(&camera, GREY, 1).expect("a rendering");
-        assert_eq!(gpu.allocated(), promised);
+        assert_eq!(gpu.allocated_bytes(), promised);
         // Only slots take records.
         let of_pairs = gpu.ledger().lines.iter().filter(|line| line.what.contains("per entry"));
         let records: u64 = of_pairs.map(|line| line.bytes).sum();

@@ -47,8 +47,8 @@ fn to_keep_photographs_changes_nothing_but_memory() {
                 let images = if number < 6 { &coarse } else { &views };
                 step(&mut backend, number as u32 + 1, view, &images[view]);
             }
-            assert_eq!(backend.allocated(), backend.promised());
-            (backend.download().expect("a model"), backend.allocated())
+            assert_eq!(backend.allocated_bytes(), backend.planned_bytes());
+            (backend.download().expect("a model"), backend.allocated_bytes())
         };
         let (expected, least) = run(0, false);
         for (count, with_masks, bytes) in [

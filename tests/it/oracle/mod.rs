@@ -39,7 +39,7 @@ fn view(case: &Case, camera: usize) -> View<'_> {
 fn by_reference(case: &Case, camera: usize, part: Part) -> Seen {
     let upstream = case.upstream(camera, part);
     let (image, gradient) =
-        differentiate(&Model::of(&case.model), view(case, camera), &Rules::STANDARD, &upstream);
+        differentiate(&Model::from(&case.model), view(case, camera), &Rules::STANDARD, &upstream);
     // It calls a pixel close more rarely than the stored mask, which is wider.
     let close = image.boundary.iter().zip(case.decided(camera));
     assert!(close.into_iter().all(|(close, decided)| !(*close && decided)), "{}", case.name);
@@ -150,7 +150,7 @@ fn check_images(table: &mut Table, case: &Case, camera: usize, seen: &Seen, tole
 /// Stored statistics leave out pixels with a close decision; those that are held to them cannot. So
 /// each lies between the stored value and that value plus what those pixels could add.
 fn check_statistics(table: &mut Table, case: &Case, camera: usize, seen: &Seen, tolerance: f64) {
-    let splats = project(&Model::of(&case.model), view(case, camera), &Rules::STANDARD);
+    let splats = project(&Model::from(&case.model), view(case, camera), &Rules::STANDARD);
     let spare = leeway(&splats, &by_depth(&splats), view(case, camera), &case.decided(camera));
     let beyond = |value: f64, from: f64, to: f64| (from - value).max(value - to).max(0.0);
     let stored = |key: &str, row: usize| case.of_camera(key, camera)[row];

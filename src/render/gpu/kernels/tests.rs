@@ -1,16 +1,18 @@
-//! Shaders and their kernels, offline. What they compute is compared in `tests/it`.
+//! Tests of the shaders that need no device. Tests in `tests/it` compare their results.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::mem::offset_of;
 
-use wgpu::naga::AddressSpace;
 use wgpu::naga::valid::{Capabilities, ValidationFlags, Validator};
+use wgpu::naga::{AddressSpace, StructMember, TypeInner};
 
 use densify_policies::policy::{
     Cadence, CandidateRequest, DepthMode, ErrorMode, Needs, Signal, SignalSet,
 };
 
 use super::super::adapter::features_for;
-use super::super::launches::{Instead, Launches, plain, rebound};
+use super::super::frame::{Frame, State};
+use super::super::launches::{Launches, Rebinding, base_name, rebound};
 use super::super::pipelines::Variant;
 use super::super::sizes::Sizes;
 use super::*;
@@ -19,7 +21,7 @@ use crate::Shortcuts;
 use crate::signals::RecordLayout;
 use densify_shaders::{Accumulation, STAGES};
 
-/// What naga must allow, beside what WebGPU has everywhere.
+/// Capabilities beyond those of every WebGPU device that naga must allow.
 fn capabilities(accumulation: Accumulation) -> Capabilities {
     let needed = features_for(accumulation);
     [
@@ -45,7 +47,7 @@ fn every_shader_is_valid_and_within_the_portable_limits() {
     assert_eq!(seen.len(), STAGES.len(), "stages that no device has");
 }
 
-/// Every device has the portable limits of WebGPU.
+/// Checks the limits that every WebGPU device has.
 fn check_stage(stage: &Stage, text: &str, capabilities: Capabilities) {
     let module = parse(stage, text);
     let info = Validator::new(ValidationFlags::all(), capabilities)
@@ -69,16 +71,15 @@ fn check_stage(stage: &Stage, text: &str, capabilities: Capabilities) {
     }
 }
 
-/// A shader's `override` is given its value by name, and a signal that the shader does not know would
-/// be 0 for good.
+/// Override constants are matched by name; a misspelt one would keep its default.
 #[test]
 fn every_override_has_a_value_and_every_signal_a_number() {
     let variant = Variant {
         records: RecordLayout::ALL,
-        more: true,
+        alpha_and_depth: true,
         shortcuts: Shortcuts::default(),
         accumulation: Accumulation::Slots,
-        dominant: true,
+        counts_dominant: true,
     };
     let constants: BTreeSet<String> =
         variant.constants().into_iter().map(|(name, _)| name).collect();
@@ -93,7 +94,7 @@ fn every_override_has_a_value_and_every_signal_a_number() {
     assert_eq!(declared, constants);
 }
 
-/// The sizes of a backend that has every buffer there is.
+/// The sizes of a backend with every optional buffer.
 fn largest_sizes(accumulation: Accumulation) -> Sizes {
     let candidates = CandidateRequest {
         from: 0,
@@ -117,14 +118,14 @@ fn largest_sizes(accumulation: Accumulation) -> Sizes {
     sizes
 }
 
-/// A kernel that nothing dispatches is a stage that is left out; a name that no shader has ends a run.
+/// A kernel that nothing dispatches would be a missing stage; a dispatched name without a kernel would panic.
 #[test]
 fn every_kernel_is_dispatched_by_its_name() {
     let mut found_kernels = BTreeSet::new();
     for (stage, accumulation) in STAGES.iter().flat_map(|s| Accumulation::ALL.map(|a| (s, a))) {
         let Some(text) = stage.text(accumulation) else { continue };
         let found = kernels(stage, &text, &parse(stage, &text));
-        found_kernels.extend(found.into_iter().map(|kernel| plain(&kernel.entry).to_owned()));
+        found_kernels.extend(found.into_iter().map(|kernel| base_name(&kernel.entry).to_owned()));
     }
     for kernel in rebound().keys() {
         assert!(
@@ -132,9 +133,9 @@ fn every_kernel_is_dispatched_by_its_name() {
             "`rebound` has buffers for `{kernel}`, which is no kernel"
         );
     }
-    // These are bound to each array of rows.
+    // Bound to each array of rows.
     let mut dispatched = BTreeSet::from(["copy_rows", "swap_rows", "audit"].map(str::to_owned));
-    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/src/backend/gpu");
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/gpu");
     for entry in std::fs::read_dir(folder).expect("the sources") {
         let path = entry.expect("a file").path();
         let Ok(text) = std::fs::read_to_string(path) else { continue };
@@ -146,7 +147,7 @@ fn every_kernel_is_dispatched_by_its_name() {
     assert_eq!(dispatched, found_kernels);
 }
 
-/// A variable that no buffer has the name of would be bound to nothing.
+/// A variable without a buffer would be bound to the placeholder.
 #[test]
 fn every_variable_has_a_buffer() {
     for accumulation in Accumulation::ALL {
@@ -162,18 +163,51 @@ fn every_variable_has_a_buffer() {
         }
         let sizes = largest_sizes(accumulation);
         let buffers: BTreeSet<_> = sizes.planned().into_iter().map(|p| p.name).collect();
-        let bind = |kernel: &str, instead: &[Instead]| {
+        let bind = |kernel: &str, rebindings: &[Rebinding]| {
             let bindings = &found_kernels[kernel];
-            for (variable, buffer) in instead {
+            for (variable, buffer) in rebindings {
                 let is_used = bindings.iter().any(|binding| binding.name == *variable);
                 assert!(is_used, "{kernel}: it uses no `{variable}`");
                 assert!(buffers.contains(buffer), "{kernel}: there is no `{buffer}`");
             }
             for Binding { name, .. } in bindings {
-                let is_given = instead.iter().any(|(variable, _)| variable == name);
+                let is_given = rebindings.iter().any(|(variable, _)| variable == name);
                 assert!(is_given || buffers.contains(&**name), "{kernel}: `{name}`");
             }
         };
         let _ = Launches::new(found_kernels.keys().map(|name| &**name), &bind, &sizes);
+    }
+}
+
+/// Lists the fields of a struct with their offsets, and the size of the struct.
+macro_rules! layout {
+    ($type:ident: $($field:ident)*) => {
+        (stringify!($type), vec![$((stringify!($field), offset_of!($type, $field))),*], size_of::<$type>())
+    };
+}
+
+#[test]
+fn layouts_are_those_of_the_shaders() {
+    let project = &STAGES[0];
+    let text = project.text(Accumulation::Slots).expect("every device projects");
+    let module = parse(project, &text);
+    let layouts = [
+        layout!(Frame: rotation centre lens ratio background image model rates more_rates noise score draw frozen planes),
+        layout!(State: visible total bands short entries_low entries_high held broken_off l1 ssim spare_f),
+    ];
+    for (name, mut expected, size) in layouts {
+        let found = module.types.iter().find(|(_, t)| t.name.as_deref() == Some(name));
+        let Some(TypeInner::Struct { members, .. }) = found.map(|(_, t)| &t.inner) else {
+            panic!("no struct `{name}`");
+        };
+        if name == "State" {
+            expected.push(("cuts", size));
+        }
+        let name_and_offset =
+            |m: &StructMember| (m.name.clone().unwrap_or_default(), m.offset as usize);
+        let found: Vec<_> = members.iter().map(name_and_offset).collect();
+        let expected: Vec<_> =
+            expected.iter().map(|(name, at)| ((*name).to_owned(), *at)).collect();
+        assert_eq!(found, expected, "{name}");
     }
 }

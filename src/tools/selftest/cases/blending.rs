@@ -1,4 +1,4 @@
-//! Opacities at the steps of the renderer, faint layers by the thousand, and opaque ones before them.
+//! Opacities at the thresholds of the renderer, thousands of faint layers, and opaque rows in front of them.
 
 use super::{GREY, UPRIGHT, straight};
 use crate::compare::class;
@@ -8,21 +8,30 @@ use crate::trial::{Trial, count_broken};
 use densify_core::gaussians::Gaussians;
 use densify_render::BackendError;
 
-/// The logit of an opacity, in f64, so that opacities next to 1 have one.
+/// The logit of an opacity, computed in f64 for opacities close to 1.
 fn logit(opacity: f64) -> f32 {
     (opacity.ln() - (-opacity).ln_1p()) as f32
 }
 
-/// Colours, alphas and gradients around the least alpha, around its clamp, and at both ends.
+/// Alphas around the minimum, around the clamp, and at both extremes.
 pub(super) fn opacities(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = straight(33, 27);
-    let least = 1.0 / 255.0;
-    let alphas =
-        [1e-30, least - 5e-10, least, least + 5e-10, 0.5, 0.99 - 6e-8, 0.99, 0.99 + 6e-8, 0.9999];
-    // One at a time, so that a row on the other side of the step is a flip and no more.
+    let minimum = 1.0 / 255.0;
+    let alphas = [
+        1e-30,
+        minimum - 5e-10,
+        minimum,
+        minimum + 5e-10,
+        0.5,
+        0.99 - 6e-8,
+        0.99,
+        0.99 + 6e-8,
+        0.9999,
+    ];
+    // One at a time, so that a row on the other side of a threshold is a single flip.
     for alpha in alphas {
         let mut model = Gaussians::default();
-        // The mean lies on a pixel's centre, so that alpha is the opacity there.
+        // The mean lies on a pixel's centre, where alpha equals the opacity.
         let shade = |k: usize| 0.6 - 0.3 * k as f32;
         scenes::push(&mut model, [0.0, 0.0, 2.0], [0.2; 3], UPRIGHT, logit(alpha), shade);
         scenes::push(&mut model, [0.1, 0.0, 3.0], [0.4; 3], UPRIGHT, 0.5, |k| 0.4 * k as f32);
@@ -45,30 +54,31 @@ pub(super) fn layers(trial: &mut Trial<'_>) -> Result<(), BackendError> {
             let shade = |k: usize| ((row * 7 + k * 5) % 11) as f32 * 0.1 - 0.5;
             scenes::push(&mut model, [0.0, 0.0, z], [0.3 * z; 3], UPRIGHT, logit, shade);
         }
-        let what = format!("{rows} layers");
-        trial.check(&what, &model, &camera, GREY, 0)?;
-        // Black rows on white: what is left of white is the transmittance, with all of its digits.
+        let label = format!("{rows} layers");
+        trial.check(&label, &model, &camera, GREY, 0)?;
+        // Black rows on white: the image is the transmittance, with full precision.
         model.sh.fill(-2.0);
         let view = View { camera: &camera, background: [1.0; 3], sh_degree: 0 };
-        let exact = render(&Model::of(&model), view, &Rules::STANDARD);
+        let exact = render(&Model::from(&model), view, &Rules::STANDARD);
         let mut backend = trial.subject.backend(&model)?;
         let upstream = scenes::narrowed(&scenes::upstream(&camera, 4));
         let (found, gradient) = backend.differentiate(&camera, [1.0; 3], 0, &upstream)?;
-        let left = exact.transmittance.iter().zip(found.rgb.chunks_exact(3)).zip(&exact.boundary);
-        let off = left.filter(|(_, close)| !**close).map(|((exact, rgb), _)| {
+        let remaining =
+            exact.transmittance.iter().zip(found.rgb.chunks_exact(3)).zip(&exact.boundary);
+        let errors = remaining.filter(|(_, close)| !**close).map(|((exact, rgb), _)| {
             rgb.iter().map(|v| (f64::from(*v) / exact - 1.0).abs()).fold(0.0, f64::max)
         });
-        trial.figure(&what, "transmittance, relative", off.fold(0.0, f64::max), 2e-4);
-        // (254/255)^n falls to 1e-4 at n = 2,345, and no pixel goes on beyond.
+        trial.record(&label, "transmittance, relative", errors.fold(0.0, f64::max), 2e-4);
+        // (254/255)^n falls to 1e-4 at n = 2,345, where every pixel ends.
         let blended: u32 = gradient.pixel_count.iter().sum();
         let pixels = camera.width * camera.height;
-        trial.figure(&what, "rows in a pixel", f64::from(blended / pixels), 2345.0);
+        trial.record(&label, "Gaussians in a pixel", f64::from(blended / pixels), 2345.0);
     }
-    scattered(trial)
+    side_by_side(trial)
 }
 
-/// Rows of one tile that no pixel has more than a twentieth of, so that the list is read to its end.
-fn scattered(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+/// Rows of one tile, of which each pixel is covered by at most a twentieth, so that the list is read to its end.
+fn side_by_side(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = straight(16, 16);
     let mut model = Gaussians::default();
     for row in 0..100_000 {
@@ -79,13 +89,13 @@ fn scattered(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let scale = 0.4 * z / camera.fx as f32;
         scenes::push(&mut model, [place[0], place[1], z], [scale; 3], UPRIGHT, -5.0, shade);
     }
-    trial.check("100000 rows beside each other", &model, &camera, GREY, 0)?;
+    trial.check("100000 Gaussians side by side", &model, &camera, GREY, 0)?;
     Ok(())
 }
 
-pub(super) fn behind(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+pub(super) fn behind_opaque(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = straight(21, 17);
-    // The last two are clamped to 0.99 where they are thickest.
+    // The last two are clamped to 0.99 at their centre.
     for opacity in [0.98, 0.9895, 0.9995, 0.9999] {
         let mut model = Gaussians::default();
         for row in 0..41_u8 {
@@ -95,7 +105,7 @@ pub(super) fn behind(trial: &mut Trial<'_>) -> Result<(), BackendError> {
             let place = [0.02 * z, -0.01 * z, z];
             scenes::push(&mut model, place, [0.4 * z; 3], UPRIGHT, logit, shade);
         }
-        trial.check(&format!("opacity {opacity} before 40"), &model, &camera, GREY, 0)?;
+        trial.check(&format!("opacity {opacity} in front of 40"), &model, &camera, GREY, 0)?;
     }
     Ok(())
 }
@@ -104,15 +114,15 @@ pub(super) fn logits(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let values = [-104.0, -89.0, -88.0, -50.0, -9.2, -5.6, -5.5, 0.0, 4.4, 4.7, 9.2, 16.6, 17.0];
     let values = values.into_iter().chain([40.0, 90.0]);
     for (seed, logit) in values.enumerate() {
-        let what = format!("logit {logit}");
+        let label = format!("logit {logit}");
         let camera = scenes::camera(40, 30, 17);
         let mut model = scenes::cloud(12, 0, &camera, 30 + seed as u64);
         for opacity in model.opacity_logits.iter_mut().step_by(2) {
             *opacity = logit;
         }
-        trial.check(&what, &model, &camera, GREY, 0)?;
+        trial.check(&label, &model, &camera, GREY, 0)?;
 
-        // Alone on a pixel's centre: alpha is the opacity, and the gradient its derivative.
+        // A single row on a pixel's centre: alpha is the opacity, and the gradient its derivative.
         let camera = straight(17, 17);
         let mut model = Gaussians::default();
         scenes::push(&mut model, [0.0, 0.0, 1.0], [0.05; 3], UPRIGHT, logit, |_| 0.0);
@@ -132,15 +142,15 @@ pub(super) fn logits(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         };
         let off = |found: f32, exact: f64| (f64::from(found) - exact).abs() / exact.max(1e-3);
         // alpha is 1 − T, and T has an error of 2⁻²⁴ at 1.
-        let tolerance = if trial.gradient > 1e-4 { 1e-4 } else { 2e-5 };
-        trial.figure(&what, "opacity, relative", off(image.alpha[middle], alpha), tolerance);
+        let tolerance = if trial.gradient_tolerance > 1e-4 { 1e-4 } else { 2e-5 };
+        trial.record(&label, "opacity, relative", off(image.alpha[middle], alpha), tolerance);
         let found = gradient.opacity_logits[0];
-        trial.figure(&what, "its derivative, relative", off(found, slope), tolerance);
-        trial.train(&what, &mut *backend, &camera, GREY, 0)?;
+        trial.record(&label, "derivative of the opacity, relative", off(found, slope), tolerance);
+        trial.train(&label, &mut *backend, &camera, GREY, 0)?;
         let beyond = backend.download()?.opacity_logits.iter().filter(|x| x.abs() > 9.2).count();
-        trial.never(&what, "logits beyond 9.2 after a step", beyond);
+        trial.count(&label, "logits beyond 9.2 after a step", beyond);
         let broken = CLASSES.iter().map(|name| count_broken(&[class(&gradient, name)])).sum();
-        trial.never(&what, "NaN or infinity", broken);
+        trial.count(&label, "NaN or infinity", broken);
     }
     Ok(())
 }

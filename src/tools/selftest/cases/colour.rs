@@ -1,4 +1,4 @@
-//! Coefficients of any size, and rows that begin black or white.
+//! SH coefficients of any size, and rows that start black or white.
 
 use glam::DVec3;
 
@@ -14,18 +14,18 @@ use densify_render::BackendError;
 use densify_train::init::initialise;
 
 pub(super) fn colours(trial: &mut Trial<'_>) -> Result<(), BackendError> {
-    any_coefficient(trial)?;
+    extreme_coefficients(trial)?;
     black_and_white_learn(trial)
 }
 
-fn any_coefficient(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+fn extreme_coefficients(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = scenes::camera(33, 25, 22);
     for value in [0.0, 1e-30, -1e-30] {
         let mut model = scenes::cloud(16, 3, &camera, 23);
         model.sh[5 * 48..6 * 48].fill(value);
         trial.check(&format!("coefficients {value:e}"), &model, &camera, GREY, 3)?;
     }
-    // Far beyond any colour: finite, and no other row's gradient breaks.
+    // Far beyond any colour: the image and the gradients of other rows stay finite.
     for value in [1e4, -1e4, 1e20, -1e20, 1e38, -1e38] {
         let mut model = scenes::cloud(16, 3, &camera, 23);
         model.sh[5 * 48..6 * 48].fill(value);
@@ -37,20 +37,20 @@ fn any_coefficient(trial: &mut Trial<'_>) -> Result<(), BackendError> {
             let all = class(&gradient, name);
             broken += count_broken(&[&without(all, 5, all.len() / model.len())]);
         }
-        let what = format!("coefficients {value:e}");
-        trial.never(&what, "NaN or infinity", broken);
-        trial.train(&what, &mut *backend, &camera, GREY, 3)?;
+        let label = format!("coefficients {value:e}");
+        trial.count(&label, "NaN or infinity", broken);
+        trial.train(&label, &mut *backend, &camera, GREY, 3)?;
     }
     Ok(())
 }
 
-/// A colour at the end of its range has a gradient all the same.
+/// Colours at the ends of the range have gradients.
 fn black_and_white_learn(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = scenes::camera(24, 24, 24);
     let pixels = (camera.width * camera.height) as usize;
     let (width, height) = (camera.width, camera.height);
     let grey = Image8 { width, height, rgb: vec![128; 3 * pixels], alpha: None, mask: None };
-    for (what, colour) in [("black", 0), ("white", 255)] {
+    for (label, colour) in [("black", 0), ("white", 255)] {
         let positions = (0..12_u8).map(|i| {
             let at = f64::from(i);
             let local = [0.3 * (at * 1.7).sin(), 0.3 * (at * 2.9).cos(), 2.0 + 0.05 * at];
@@ -65,11 +65,11 @@ fn black_and_white_learn(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         }
         let after = backend.download()?;
         let moved = model.sh.iter().zip(&after.sh).filter(|(a, b)| {
-            // Towards grey, which is 0.
+            // Grey is 0.
             b.abs() < a.abs() - 0.05
         });
         let dead = model.sh.len() - moved.count();
-        trial.never(&format!("{what} points"), "colours that did not learn in 200 steps", dead);
+        trial.count(&format!("{label} points"), "colours that did not learn in 200 steps", dead);
     }
     Ok(())
 }

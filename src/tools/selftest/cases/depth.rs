@@ -1,4 +1,4 @@
-//! Rows at the camera, around the near plane, and at depths that are equal or nearly so.
+//! Rows at the camera, around the near plane, and at equal or nearly equal depths.
 
 use super::{GREY, UPRIGHT, flat_colour, straight};
 use crate::compare::class;
@@ -8,17 +8,17 @@ use crate::trial::{Trial, bits, count_broken, count_different};
 use densify_core::gaussians::Gaussians;
 use densify_render::BackendError;
 
-/// The near plane of a backend's default options.
+/// Near plane of the default options.
 const NEAR: f32 = 0.01;
 
-pub(super) fn near(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+pub(super) fn near_plane(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = scenes::camera(30, 26, 6);
     let mut model = Gaussians { sh_degree: 1, ..Gaussians::default() };
-    // Left-out rows first: an index among the visible ones is not a row's index.
+    // Invisible rows come first, so that an index among the visible ones differs from the row's index.
     for z in [-3.0, -0.5, -0.02, 0.0, 0.004, 0.0099, 0.0101, 0.02, 0.3, 1e3] {
         let colour = |k| if k < 3 { 0.5 - 0.2 * k as f32 } else { 0.05 };
         let mean = scenes::world(&camera, [0.1 * z, -0.05 * z, z]);
-        // At most a third of its distance wide, as else a row at 0.01 fills the screen.
+        // At most a third of the distance wide; otherwise a row at 0.01 fills the screen.
         let scale = [0.3, 0.2, 0.1].map(|s: f32| s * (z.abs() as f32).clamp(1e-3, 3.0));
         scenes::push(&mut model, mean, scale, [0.8, 0.2, -0.5, 0.1], 0.3, colour);
     }
@@ -30,7 +30,7 @@ pub(super) fn near(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     model.sh.extend(cloud.sh);
     trial.check("behind and near", &model, &camera, GREY, 1)?;
 
-    // A bit to either side; with no rotation the camera's z is the mean's to the bit.
+    // One bit to either side of the plane; without rotation, camera z equals the mean's z exactly.
     let camera = straight(16, 16);
     for z in [NEAR.next_down(), NEAR, NEAR.next_up()] {
         let mut model = Gaussians::default();
@@ -38,12 +38,12 @@ pub(super) fn near(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let image = trial.subject.backend(&model)?.render(&camera, GREY, 0)?;
         let is_drawn = image.alpha.iter().any(|a| *a > 0.5);
         let wrong = is_drawn != (z > NEAR);
-        trial.never(&format!("z = {z:.9}"), "rows on the wrong side", usize::from(wrong));
+        trial.count(&format!("z = {z:.9}"), "Gaussians on the wrong side", usize::from(wrong));
     }
     Ok(())
 }
 
-pub(super) fn inside(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+pub(super) fn camera_inside(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = straight(40, 30);
     for times in [1.0_f32, 10.0, 100.0] {
         let mut model = Gaussians::default();
@@ -57,14 +57,14 @@ pub(super) fn inside(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         back.quats.extend(&model.quats);
         back.opacity_logits.extend(&model.opacity_logits);
         back.sh.extend(&model.sh);
-        let what = format!("{times} times as wide as far");
-        trial.check(&what, &back, &camera, GREY, 0)?;
+        let label = format!("{times} times as wide as distant");
+        trial.check(&label, &back, &camera, GREY, 0)?;
     }
     Ok(())
 }
 
-pub(super) fn coincident(trial: &mut Trial<'_>) -> Result<(), BackendError> {
-    for (what, offset) in [("0", 0.0), ("1e-20", 1e-20_f32), ("0.001", 1e-3)] {
+pub(super) fn camera_at_mean(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+    for (label, offset) in [("0", 0.0), ("1e-20", 1e-20_f32), ("0.001", 1e-3)] {
         let camera = straight(33, 30);
         let mut model = scenes::cloud(10, 2, &camera, 34);
         for (row, direction) in
@@ -79,21 +79,21 @@ pub(super) fn coincident(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let gradients = CLASSES.map(|name| class(&gradient, name));
         let mut broken = count_broken(&[&image.rgb, &image.alpha, &image.depth]);
         broken += count_broken(&gradients);
-        let what = format!("{what} from the camera");
-        trial.never(&what, "NaN or infinity", broken);
+        let label = format!("{label} from the camera");
+        trial.count(&label, "NaN or infinity", broken);
         let pulled = gradient.sh[..3 * 27].iter().filter(|g| **g != 0.0).count();
-        trial.never(&what, "gradients of colours without a direction", pulled);
-        trial.train(&what, &mut *backend, &camera, GREY, 2)?;
+        trial.count(&label, "gradients of SH without a direction", pulled);
+        trial.train(&label, &mut *backend, &camera, GREY, 2)?;
     }
     Ok(())
 }
 
-pub(super) fn ties(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+pub(super) fn equal_depths(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = scenes::camera(32, 24, 36);
     let mut model = scenes::cloud(1000, 0, &camera, 45);
     let place = scenes::world(&camera, [0.0, 0.0, 3.0]);
     model.means.fill(place);
-    trial.check("1000 rows at one place", &model, &camera, GREY, 0)?;
+    trial.check("1000 Gaussians at one place", &model, &camera, GREY, 0)?;
     let upstream = scenes::narrowed(&scenes::upstream(&camera, 12));
     let run = || trial.subject.backend(&model)?.differentiate(&camera, GREY, 0, &upstream);
     let first = bits(&run()?);
@@ -101,15 +101,15 @@ pub(super) fn ties(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     for _ in 0..3 {
         different += count_different(&bits(&run()?), &first);
     }
-    trial.never("1000 rows at one place", "bits that differ between runs", different);
+    trial.count("1000 Gaussians at one place", "bits that differ between runs", different);
     Ok(())
 }
 
-pub(super) fn order(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+pub(super) fn depth_order(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = straight(16, 16);
-    // Red in front of green; which of them is the first row must not matter.
+    // Red in front of green, in both orders of the rows.
     let (red, green) = ([1.5, -2.0, -2.0], [-2.0, 1.5, -2.0]);
-    let (mut wrong, mut looks) = (0, 0);
+    let (mut wrong, mut pairs) = (0, 0);
     let mut z = NEAR.next_up();
     while z <= 1e6 {
         let pair = [(z, red), (z.next_up(), green)];
@@ -122,12 +122,12 @@ pub(super) fn order(trial: &mut Trial<'_>) -> Result<(), BackendError> {
             let image = trial.subject.backend(&model)?.render(&camera, [0.0; 3], 0)?;
             let middle = 3 * (8 * 16 + 8);
             wrong += usize::from(image.rgb[middle] <= 2.0 * image.rgb[middle + 1]);
-            looks += 1;
+            pairs += 1;
         }
         z *= 7.3;
     }
-    trial.never(&format!("{looks} pairs"), "rows in the wrong order", wrong);
-    // Zero, with either sign, and the smallest numbers lie before the near plane.
+    trial.count(&format!("{pairs} pairs"), "Gaussians in the wrong order", wrong);
+    // Zero of either sign and the smallest numbers are closer than the near plane.
     let mut drawn = 0;
     for z in [0.0, -0.0, 1e-45, -1e-45, 1e-38, f32::MIN_POSITIVE] {
         let mut model = Gaussians::default();
@@ -135,6 +135,6 @@ pub(super) fn order(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let image = trial.subject.backend(&model)?.render(&camera, GREY, 0)?;
         drawn += image.alpha.iter().filter(|a| **a != 0.0).count();
     }
-    trial.never("depths around zero", "pixels of rows that are too near", drawn);
+    trial.count("depths around zero", "pixels of Gaussians that are too near", drawn);
     Ok(())
 }

@@ -1,4 +1,4 @@
-//! Images of one colour, equal ones, nearly equal ones: where the similarity's usual form cancels.
+//! Losses of uniform, equal and nearly equal images, where the usual form of SSIM cancels.
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -13,11 +13,11 @@ use densify_core::gaussians::Gaussians;
 use densify_core::image::Image8;
 use densify_render::{BackendError, Differentiable};
 
-/// The pixels of the images of this file that are not of the table of sizes.
-const SIDES: (u32, u32) = (48, 40);
+/// Size of the images `[px]`, except those of the table of sizes.
+const SIZE: (u32, u32) = (48, 40);
 
-/// How far the loss, L1 and the mean similarity may be off; and the gradient, against its largest
-/// value. Flat images lose most, as C₂ is small beside the rounding of their squares.
+/// Tolerances of the loss, L1 and SSIM, and of the gradient relative to its largest value. Flat images are the
+/// least accurate, as C₂ is small beside the rounding of their squares.
 fn tolerances(subject: &Subject) -> (f64, f64) {
     match subject {
         Subject::Gpu(_) => (2e-6, 1e-4),
@@ -26,28 +26,28 @@ fn tolerances(subject: &Subject) -> (f64, f64) {
 }
 
 fn flat_image(value: u8) -> Image8 {
-    let (width, height) = SIDES;
+    let (width, height) = SIZE;
     let rgb = vec![value; 3 * (width * height) as usize];
     Image8 { width, height, rgb, alpha: None, mask: None }
 }
 
-/// The reference's loss of what the backend sees: target on background, error under the mask.
+/// The reference's loss, of the target on the background and with the error weighted by the mask.
 fn expected(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Loss {
-    let share = |plane: &Option<Vec<u8>>, p: usize| {
+    let weight = |plane: &Option<Vec<u8>>, p: usize| {
         plane.as_ref().map_or(1.0, |plane| f64::from(plane[p]) / 255.0)
     };
     let truth: Vec<f64> = (0..rendered.len())
         .map(|i| {
-            let alpha = share(&target.alpha, i / 3);
+            let alpha = weight(&target.alpha, i / 3);
             alpha * f64::from(target.rgb[i]) / 255.0 + (1.0 - alpha) * f64::from(background[i % 3])
         })
         .collect();
     let masked: Vec<f64> = (0..rendered.len())
-        .map(|i| truth[i] + share(&target.mask, i / 3) * (f64::from(rendered[i]) - truth[i]))
+        .map(|i| truth[i] + weight(&target.mask, i / 3) * (f64::from(rendered[i]) - truth[i]))
         .collect();
     let mut loss = loss(&masked, &truth, target.width as usize, target.height as usize);
     for (i, gradient) in loss.gradient.iter_mut().enumerate() {
-        *gradient *= share(&target.mask, i / 3);
+        *gradient *= weight(&target.mask, i / 3);
     }
     loss
 }
@@ -55,31 +55,31 @@ fn expected(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Loss {
 fn check(
     trial: &mut Trial<'_>,
     backend: &mut dyn Differentiable,
-    what: &str,
+    label: &str,
     rendered: &[f32],
     target: &Image8,
 ) -> Result<(), BackendError> {
     let background = [0.1, 0.5, 0.9];
     let expected = expected(rendered, target, background);
     let (found, gradient) = backend.loss(&scenes::opaque(rendered, target), target, background)?;
-    let (value, slope) = tolerances(trial.subject);
+    let (value_tolerance, gradient_tolerance) = tolerances(trial.subject);
     let scalars = [
         ("loss", found.loss, expected.loss),
         ("L1", found.l1, expected.l1),
         ("SSIM", found.ssim, expected.ssim),
     ];
     for (quantity, found, expected) in scalars {
-        trial.figure(what, quantity, (f64::from(found) - expected).abs(), value);
+        trial.record(label, quantity, (f64::from(found) - expected).abs(), value_tolerance);
     }
     let error = relative_error(&gradient, &expected.gradient);
-    trial.figure(what, "gradient by pixels", error, slope);
-    trial.never(what, "SSIM beyond 1", usize::from(found.ssim.abs() > 1.0));
+    trial.record(label, "pixel gradient", error, gradient_tolerance);
+    trial.count(label, "SSIM beyond 1", usize::from(found.ssim.abs() > 1.0));
     Ok(())
 }
 
-pub(super) fn plain(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+pub(super) fn uniform_photographs(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let mut backend = trial.subject.backend(&Gaussians::default())?;
-    let (noisy, photograph) = scenes::noisy(SIDES, 0.2, 23);
+    let (noisy, photograph) = scenes::noisy(SIZE, 0.2, 23);
     let transparent = Image8 { alpha: Some(vec![0; photograph.rgb.len() / 3]), ..photograph };
     let targets = [
         ("black", flat_image(0)),
@@ -87,24 +87,24 @@ pub(super) fn plain(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         ("grey", flat_image(128)),
         ("transparent", transparent),
     ];
-    for (what, target) in &targets {
-        check(trial, &mut *backend, what, &noisy, target)?;
+    for (label, target) in &targets {
+        check(trial, &mut *backend, label, &noisy, target)?;
     }
     for value in [0, 1, 153, 255] {
-        let (what, target) = (format!("equal to {value}"), flat_image(value));
+        let (label, target) = (format!("equal to {value}"), flat_image(value));
         let rendered = vec![f32::from(value) * (1.0 / 255.0); target.rgb.len()];
         let (found, gradient) =
             backend.loss(&scenes::opaque(&rendered, &target), &target, [0.0; 3])?;
         let off = f64::from(found.loss.abs().max((1.0 - found.ssim).abs()));
-        // The GPU divides by 255 within 2.5 units in the last place.
+        // A GPU divides by 255 within 2.5 units in the last place.
         let tolerance = if matches!(trial.subject, Subject::Gpu(_)) { 3e-7 } else { 0.0 };
-        trial.figure(&what, "loss of equal images", off, tolerance);
+        trial.record(&label, "loss of equal images", off, tolerance);
         if tolerance == 0.0 {
             let pulled = gradient.iter().filter(|g| g.abs() > 1e-12).count();
-            trial.never(&what, "gradients of equal images", pulled);
+            trial.count(&label, "gradients of equal images", pulled);
         }
     }
-    // Nothing is seen and nothing is wrong: no row is moved.
+    // An empty view that equals its photograph moves no row.
     let camera = scenes::camera(48, 40, 25);
     let model = scenes::cloud(10, 0, &camera, 26);
     let away =
@@ -113,21 +113,21 @@ pub(super) fn plain(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let output = step(&mut *backend, 1, &away, &flat_image(255), [1.0; 3], 0)?;
     let mut moved = usize::from(backend.download()?.means != model.means);
     moved += count_broken(&[&[output.loss, output.ssim]]) + output.visible;
-    trial.never("an empty view", "rows moved by it", moved);
+    trial.count("an empty view", "Gaussians moved", moved);
     Ok(())
 }
 
-pub(super) fn flat(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+pub(super) fn flat_and_similar(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let mut backend = trial.subject.backend(&Gaussians::default())?;
     // The reference's loss is too slow for the longest image.
     for (seed, size) in SIZES.into_iter().filter(|size| size.1 < 1000).enumerate() {
         for noise in [0.05, 1.0] {
             let (rendered, target) = scenes::noisy(size, noise, seed as u64);
-            let what = format!("{}x{}, noise {noise}", size.0, size.1);
-            check(trial, &mut *backend, &what, &rendered, &target)?;
+            let label = format!("{}x{}, noise {noise}", size.0, size.1);
+            check(trial, &mut *backend, &label, &rendered, &target)?;
         }
     }
-    let (rendered, target) = scenes::noisy(SIDES, 0.3, 77);
+    let (rendered, target) = scenes::noisy(SIZE, 0.3, 77);
     let (width, pixels) = (target.width as usize, target.rgb.len() / 3);
     let ramp: Vec<u8> = (0..pixels).map(|p| (p % 256) as u8).collect();
     let half: Vec<u8> = (0..pixels).map(|p| if p % width < width / 2 { 255 } else { 0 }).collect();
@@ -137,9 +137,9 @@ pub(super) fn flat(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         ("soft mask", None, Some(&ramp)),
         ("coverage and mask", Some(&ramp), Some(&half)),
     ];
-    for (what, alpha, mask) in planes {
+    for (label, alpha, mask) in planes {
         let target = Image8 { alpha: alpha.cloned(), mask: mask.cloned(), ..target.clone() };
-        check(trial, &mut *backend, what, &rendered, &target)?;
+        check(trial, &mut *backend, label, &rendered, &target)?;
     }
     let n = target.rgb.len();
     let mut rng = ChaCha8Rng::seed_from_u64(24);
@@ -150,14 +150,14 @@ pub(super) fn flat(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         ("black on white", vec![0.0; n], 255),
         ("beyond 1", vec![1.2; n], 255),
     ];
-    for (what, rendered, value) in pairs {
-        check(trial, &mut *backend, what, &rendered, &flat_image(value))?;
+    for (label, rendered, value) in pairs {
+        check(trial, &mut *backend, label, &rendered, &flat_image(value))?;
     }
-    // A hair apart: the sign of the difference is the whole gradient, and SSIM stays at 1.
+    // Almost equal: SSIM stays at 1.
     let target = flat_image(153);
-    let hair = scenes::opaque(&vec![0.600_000_1; n], &target);
-    let (found, _) = backend.loss(&hair, &target, [0.0; 3])?;
-    trial.figure("0.6 + 1e-7", "SSIM below 1", f64::from(1.0 - found.ssim), 1e-6);
-    trial.never("0.6 + 1e-7", "SSIM beyond 1", usize::from(found.ssim > 1.0));
+    let almost = scenes::opaque(&vec![0.600_000_1; n], &target);
+    let (found, _) = backend.loss(&almost, &target, [0.0; 3])?;
+    trial.record("0.6 + 1e-7", "SSIM below 1", f64::from(1.0 - found.ssim), 1e-6);
+    trial.count("0.6 + 1e-7", "SSIM beyond 1", usize::from(found.ssim > 1.0));
     Ok(())
 }

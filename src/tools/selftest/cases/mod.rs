@@ -1,4 +1,4 @@
-//! The cases, by what is hard about them.
+//! The cases, one file per kind of difficulty.
 
 mod blending;
 mod colour;
@@ -19,43 +19,43 @@ const GREY: [f32; 3] = [0.2, 0.5, 0.3];
 /// No rotation.
 const UPRIGHT: [f32; 4] = [1.0, 0.0, 0.0, 0.0];
 
-/// All cases that every backend must hold, in the order of their numbers.
+/// All cases, in the order of their numbers.
 #[must_use]
-#[rustfmt::skip] // A case is a line.
+#[rustfmt::skip] // One case per line.
 pub fn cases() -> &'static [Case] {
     &[
-        Case { number: 0, what: "ordinary scenes, every degree", run: shapes::ordinary },
-        Case { number: 1, what: "no row", run: rows::none },
-        Case { number: 2, what: "one row", run: rows::one },
-        Case { number: 3, what: "rows on top of each other", run: rows::duplicates },
-        Case { number: 5, what: "log-scales at both ends", run: shapes::scales },
-        Case { number: 6, what: "quaternions of any length", run: shapes::quaternions },
-        Case { number: 7, what: "needles in every direction", run: shapes::needles },
-        Case { number: 8, what: "rows behind, at and beyond the near plane", run: depth::near },
-        Case { number: 9, what: "a camera inside of rows", run: depth::inside },
-        Case { number: 10, what: "rows far beside the frustum", run: shapes::beside },
-        Case { number: 11, what: "rows as large as the image, in bands", run: sizes::crowd },
-        Case { number: 12, what: "opacities at the steps of the renderer", run: blending::opacities },
-        Case { number: 13, what: "thousands of faint layers", run: blending::layers },
-        Case { number: 14, what: "faint rows behind an opaque one", run: blending::behind },
-        Case { number: 15, what: "equal depths", run: depth::ties },
-        Case { number: 16, what: "depths one bit apart, from 0.01 to a million", run: depth::order },
-        Case { number: 17, what: "opacity logits at both ends", run: blending::logits },
-        Case { number: 18, what: "colours of any size, and black ones learn", run: colour::colours },
-        Case { number: 19, what: "a camera at the mean of a row", run: depth::coincident },
-        Case { number: 20, what: "scenes far off, tiny and huge", run: world::anywhere },
-        Case { number: 21, what: "awkward image sizes", run: sizes::images },
-        Case { number: 22, what: "lenses from 0.5 to 160 degrees, centres outside", run: sizes::lenses },
-        Case { number: 23, what: "photographs of one colour, or equal to the render", run: loss::plain },
-        Case { number: 24, what: "losses of flat and nearly equal images", run: loss::flat },
-        Case { number: 25, what: "the optimiser after gradients of any size", run: optimiser::moments },
-        Case { number: 26, what: "rows that hold NaN, infinity, or any number", run: poison::poisoned },
-        Case { number: 27, what: "rows all too faint to be seen", run: rows::invisible },
-        Case { number: 30, what: "a run of 64x64 px, looked at every 100 steps", run: training::run },
+        Case { number: 0, title: "ordinary scenes, every SH degree", run: shapes::ordinary },
+        Case { number: 1, title: "no Gaussian", run: rows::no_row },
+        Case { number: 2, title: "one Gaussian", run: rows::one_row },
+        Case { number: 3, title: "Gaussians on top of each other", run: rows::duplicates },
+        Case { number: 5, title: "extreme log-scales", run: shapes::scales },
+        Case { number: 6, title: "quaternions of any length", run: shapes::quaternions },
+        Case { number: 7, title: "needles in every direction", run: shapes::needles },
+        Case { number: 8, title: "Gaussians behind, at and beyond the near plane", run: depth::near_plane },
+        Case { number: 9, title: "a camera inside Gaussians", run: depth::camera_inside },
+        Case { number: 10, title: "Gaussians far outside the frustum", run: shapes::outside_frustum },
+        Case { number: 11, title: "Gaussians as large as the image, in bands", run: sizes::large_rows },
+        Case { number: 12, title: "opacities at the thresholds of the renderer", run: blending::opacities },
+        Case { number: 13, title: "thousands of faint layers", run: blending::layers },
+        Case { number: 14, title: "faint Gaussians behind an opaque one", run: blending::behind_opaque },
+        Case { number: 15, title: "equal depths", run: depth::equal_depths },
+        Case { number: 16, title: "depths one bit apart, from 0.01 to a million", run: depth::depth_order },
+        Case { number: 17, title: "extreme opacity logits", run: blending::logits },
+        Case { number: 18, title: "colours of any size; black and white ones learn", run: colour::colours },
+        Case { number: 19, title: "a camera at the mean of a Gaussian", run: depth::camera_at_mean },
+        Case { number: 20, title: "distant, tiny and huge scenes", run: world::placements },
+        Case { number: 21, title: "awkward image sizes", run: sizes::images },
+        Case { number: 22, title: "lenses from 0.5 to 160 degrees, principal points outside", run: sizes::lenses },
+        Case { number: 23, title: "photographs of one colour, or equal to the rendering", run: loss::uniform_photographs },
+        Case { number: 24, title: "losses of flat and nearly equal images", run: loss::flat_and_similar },
+        Case { number: 25, title: "the optimiser after gradients of any size", run: optimiser::moments },
+        Case { number: 26, title: "Gaussians that hold NaN, infinity or extreme numbers", run: poison::poisoned },
+        Case { number: 27, title: "Gaussians too faint to be visible", run: rows::invisible },
+        Case { number: 30, title: "a training run at 64x64 px, checked every 100 steps", run: training::run },
     ]
 }
 
-/// A camera that looks along z, at the origin, so that sizes can be given in pixels.
+/// A camera at the origin that looks along z, with a focal length of 64 px.
 fn straight(width: u32, height: u32) -> Camera {
     Camera {
         width,
@@ -69,7 +69,7 @@ fn straight(width: u32, height: u32) -> Camera {
     }
 }
 
-/// Coefficients of band 0 that tell the channels apart.
+/// Coefficients of band 0 that differ between channels.
 fn flat_colour(k: usize) -> f32 {
     0.4 - 0.3 * k as f32
 }

@@ -1,4 +1,4 @@
-//! The optimiser's arithmetic after gradients of any size, by way of the moments that they leave.
+//! The optimiser's arithmetic after gradients of any size, which are set as moments.
 
 use densify_policies::plan::EditPlan;
 
@@ -8,14 +8,14 @@ use crate::values::RATES;
 use densify_core::camera::Camera;
 use densify_render::{BackendError, Kept, LearningRates, StateArray, Values};
 
-/// Gradients whose square is nothing, subnormal, ordinary, nearly too large, and too large.
+/// Gradients whose square is zero, subnormal, ordinary, almost overflowing, and overflowing.
 const GRADIENTS: [f32; 8] = [0.0, 1e-45, 1e-23, 1e-15, 1e-6, 1.0, 1e19, 1e30];
-/// The row of the last.
-const OVERFLOWN: u32 = 7;
+/// Row of the gradient whose square overflows.
+const OVERFLOWING: u32 = 7;
 
-/// The length of a first step, in learning rates, after m = g and v = g²: algorithm 1 of Kingma and Ba,
-/// with no gradient in this step.
-fn exact(gradient: f32) -> f64 {
+/// Length of a first step with zero gradient, in learning rates, after moments m = g and v = g² (Kingma and Ba,
+/// algorithm 1).
+fn expected_step(gradient: f32) -> f64 {
     let (m, v) = (0.9 * f64::from(gradient), 0.999 * f64::from(gradient * gradient));
     let (m_hat, v_hat) = (m / (1.0 - 0.9), v / (1.0 - 0.999));
     m_hat / (v_hat.sqrt() + 1e-15)
@@ -23,10 +23,10 @@ fn exact(gradient: f32) -> f64 {
 
 pub(super) fn moments(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = scenes::camera(20, 20, 27);
-    // It sees nothing, so that there is no gradient.
+    // A camera that sees nothing, so that there is no gradient.
     let away = Camera { translation: glam::DVec3::new(0.0, 0.0, -1e3), ..camera };
     let mut model = scenes::cloud(GRADIENTS.len(), 3, &camera, 28);
-    // One size, so that rounding is alike, and far from where parameters are confined.
+    // Equal parameters, so that rounding is the same, and far from the limits of parameters.
     model.means.as_flattened_mut().fill(0.5);
     model.log_scales.as_flattened_mut().fill(-1.0);
     model.opacity_logits.fill(0.5);
@@ -53,8 +53,8 @@ pub(super) fn moments(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let after = backend.download()?;
     let LearningRates { mean, log_scale, opacity, sh_dc, sh_rest, .. } = RATES;
     for (row, &gradient) in GRADIENTS.iter().enumerate() {
-        let what = format!("gradient {gradient:e}");
-        let expected = if row == OVERFLOWN as usize { 0.0 } else { exact(gradient) };
+        let label = format!("gradient {gradient:e}");
+        let expected = if row == OVERFLOWING as usize { 0.0 } else { expected_step(gradient) };
         let sh = after.sh_of(row);
         let moved = [
             (0.5 - after.means[row][1], mean),
@@ -65,17 +65,17 @@ pub(super) fn moments(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         ];
         for (moved, rate) in moved {
             let length = f64::from(moved / rate);
-            trial.figure(&what, "step, in learning rates", (length - expected).abs(), 5e-3);
+            trial.record(&label, "step, in learning rates", (length - expected).abs(), 5e-3);
         }
     }
-    // What cannot be squared is found, by row and as a moment, and nothing else is.
+    // The audit reports exactly the row whose moment overflows.
     let found = backend.audit()?;
-    let is_found = |u: &densify_render::Unsound| u.row == OVERFLOWN && u.kept == Kept::Moment;
-    let wrong = usize::from(found.is_empty()) + found.iter().filter(|u| !is_found(u)).count();
-    trial.never("gradient 1e30", "rows not quarantined, or wrongly", wrong);
+    let is_expected = |u: &densify_render::Unsound| u.row == OVERFLOWING && u.kept == Kept::Moment;
+    let wrong = usize::from(found.is_empty()) + found.iter().filter(|u| !is_expected(u)).count();
+    trial.count("gradient 1e30", "Gaussians missed or wrongly reported by the audit", wrong);
     let mut plan = EditPlan::new(backend.rows(), backend.budget());
-    let _ = plan.prune(OVERFLOWN);
+    let _ = plan.prune(OVERFLOWING);
     backend.apply(&plan.compile(), 1, 1)?;
-    trial.never("gradient 1e30", "rows unsound after it is removed", backend.audit()?.len());
+    trial.count("gradient 1e30", "Gaussians not finite after its removal", backend.audit()?.len());
     Ok(())
 }

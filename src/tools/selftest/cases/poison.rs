@@ -1,19 +1,19 @@
-//! Rows that hold no number, or one that no row should hold, among sound ones.
+//! Rows that hold NaN, infinity or extreme numbers, among sound ones.
 
+use super::GREY;
 use crate::compare::class;
 use crate::reference::CLASSES;
 use crate::scenes;
 use crate::trial::{Trial, count_broken, count_different};
-use crate::values::{EXTREMES, POISON, SLOTS, name_of_slot, remove, slot_of};
+use crate::values::{EXTREMES, POISON, SLOTS, remove, slot_mut, slot_name};
 use densify_core::gaussians::Gaussians;
 use densify_render::{BackendError, Differentiable};
 
-const GREY: [f32; 3] = [0.2, 0.5, 0.3];
-/// Sound rows among which the others lie.
+/// Number of sound rows.
 const SOUND: usize = 1_000;
 
-/// The model with a copy of its row 0 at the end for each number of a row, with `value` there.
-fn with_each_slot(model: &Gaussians, value: f32) -> Gaussians {
+/// Appends a copy of row 0 for each parameter of a row, with `value` in place of that parameter.
+fn with_value_in_each_slot(model: &Gaussians, value: f32) -> Gaussians {
     let mut model = model.clone();
     for slot in 0..SLOTS {
         model.means.push(model.means[0]);
@@ -22,7 +22,7 @@ fn with_each_slot(model: &Gaussians, value: f32) -> Gaussians {
         model.opacity_logits.push(model.opacity_logits[0]);
         model.sh.extend_from_within(..48);
         let row = model.len() - 1;
-        *slot_of(&mut model, row, slot) = value;
+        *slot_mut(&mut model, row, slot) = value;
     }
     model
 }
@@ -32,7 +32,7 @@ pub(super) fn poisoned(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let model = scenes::cloud(SOUND, 3, &camera, 32);
     let upstream = scenes::narrowed(&scenes::upstream(&camera, 5));
     let run = |backend: &mut dyn Differentiable| backend.differentiate(&camera, GREY, 3, &upstream);
-    // Of the image, and of the gradients of the rows that are sound.
+    // The bits of the image and of the gradients of the sound rows.
     let bits = |backend: &mut dyn Differentiable| -> Result<Vec<u32>, BackendError> {
         let (image, gradient) = run(backend)?;
         let rows = gradient.means.len();
@@ -45,35 +45,42 @@ pub(super) fn poisoned(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     };
     let clean = bits(&mut *trial.subject.backend(&model)?)?;
     for value in POISON {
-        let what = format!("{value} in every number");
-        let poisoned = with_each_slot(&model, value);
+        let label = format!("{value} in every parameter");
+        let poisoned = with_value_in_each_slot(&model, value);
         let mut backend = trial.subject.backend(&poisoned)?;
         let different = count_different(&bits(&mut *backend)?, &clean);
-        trial.never(&what, "bits of other rows and pixels changed", different);
+        trial.count(&label, "bits of other Gaussians and of pixels changed", different);
         let found: Vec<usize> = backend.audit()?.iter().map(|u| u.row as usize).collect();
         let expected: Vec<usize> = (SOUND..SOUND + SLOTS).collect();
-        trial.never(&what, "rows not found, or wrongly", usize::from(found != expected));
+        trial.count(
+            &label,
+            "Gaussians missed or wrongly reported by the audit",
+            usize::from(found != expected),
+        );
     }
-    // Finite numbers may be drawn, so that they change the image; they break nothing. The poisoned
-    // rows come first and last, so that no index is another's by accident.
+    // Finite numbers may be rendered, and change the image; all results stay finite.
     for value in EXTREMES {
-        let extreme = with_each_slot(&model, value);
-        let extreme = remove(&extreme, 3);
+        // Without row 3, an index among the visible rows differs from the row's index.
+        let extreme = remove(&with_value_in_each_slot(&model, value), 3);
         let mut backend = trial.subject.backend(&extreme)?;
         let (image, gradient) = run(&mut *backend)?;
-        let what = format!("{value:e} in every number");
+        let label = format!("{value:e} in every parameter");
         let broken = count_broken(&[&image.rgb, &image.alpha, &image.depth]);
-        trial.never(&what, "NaN or infinity in the image", broken);
+        trial.count(&label, "NaN or infinity in the image", broken);
         for name in CLASSES {
             let all = class(&gradient, name);
             let per_row = all.len() / extreme.len();
             let sound = &all[..per_row * (SOUND - 1)];
-            trial.never(&what, "NaN or infinity in gradients of others", count_broken(&[sound]));
+            trial.count(
+                &label,
+                "NaN or infinity in the gradients of others",
+                count_broken(&[sound]),
+            );
             for slot in 0..SLOTS {
                 let row = SOUND - 1 + slot;
-                let mine = &all[row * per_row..(row + 1) * per_row];
-                let what = format!("{value:e} in {}", name_of_slot(slot));
-                trial.never(&what, "NaN or infinity in its own gradient", count_broken(&[mine]));
+                let own = &all[row * per_row..(row + 1) * per_row];
+                let label = format!("{value:e} in {}", slot_name(slot));
+                trial.count(&label, "NaN or infinity in its own gradient", count_broken(&[own]));
             }
         }
     }

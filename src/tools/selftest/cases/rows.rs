@@ -1,4 +1,4 @@
-//! Few rows, rows in one place, and rows that nobody sees.
+//! Few rows, rows at one place, and invisible rows.
 
 use densify_policies::plan::EditPlan;
 
@@ -13,30 +13,35 @@ use densify_render::Setup;
 
 const BACKGROUND: [f32; 3] = [0.25, 0.5, 0.75];
 
-/// Pixels that do not show the bare background, and values of alpha and depth other than zero.
-fn drawn(image: &densify_render::Rendering) -> usize {
+/// Number of pixels that differ from the background, and of nonzero values of alpha and depth.
+fn count_drawn(image: &densify_render::Rendering) -> usize {
     let coloured = image.rgb.chunks_exact(3).filter(|rgb| **rgb != BACKGROUND).count();
     coloured + image.alpha.iter().chain(&image.depth).filter(|v| v.to_bits() != 0).count()
 }
 
-pub(super) fn none(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+pub(super) fn no_row(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = scenes::camera(21, 13, 1);
     let model = Gaussians { sh_degree: 2, ..Gaussians::default() };
-    let mut backend = trial.subject.with(&model, Setup { budget: 3, ..Setup::default() })?;
+    let mut backend =
+        trial.subject.backend_with(&model, Setup { budget: 3, ..Setup::default() })?;
     let upstream = scenes::narrowed(&scenes::upstream(&camera, 1));
     let (image, gradient) = backend.differentiate(&camera, BACKGROUND, 2, &upstream)?;
-    trial.never("0 rows", "pixels other than the background", drawn(&image));
+    trial.count("0 Gaussians", "pixels other than the background", count_drawn(&image));
     let numbers = CLASSES.iter().map(|name| class(&gradient, name).len()).sum();
-    trial.never("0 rows", "gradients of nothing", numbers);
+    trial.count("0 Gaussians", "gradients", numbers);
     let target = scenes::target(&camera);
     let output = step(&mut *backend, 1, &camera, &target, BACKGROUND, 2)?;
     backend.apply(&EditPlan::new(0, 3).compile(), 1, 1)?;
     let unsound = backend.audit()?.len() + count_broken(&[&[output.loss, output.ssim]]);
-    trial.never("0 rows", "rows after a step and an edit", backend.rows() + unsound);
+    trial.count(
+        "0 Gaussians",
+        "Gaussians or broken numbers after a step and an edit",
+        backend.rows() + unsound,
+    );
     Ok(())
 }
 
-pub(super) fn one(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+pub(super) fn one_row(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = straight(64, 64);
     for scale in [0.01, 0.1, 1.0] {
         let mut model = Gaussians::default();
@@ -55,7 +60,7 @@ pub(super) fn duplicates(trial: &mut Trial<'_>) -> Result<(), BackendError> {
             let shade = |k: usize| ((row * 7 + k * 5) % 11) as f32 * 0.1 - 0.5;
             scenes::push(&mut model, place, [0.3, 0.2, 0.4], UPRIGHT, -2.0, shade);
         }
-        trial.check(&format!("{rows} rows"), &model, &camera, GREY, 0)?;
+        trial.check(&format!("{rows} Gaussians"), &model, &camera, GREY, 0)?;
     }
     Ok(())
 }
@@ -68,8 +73,12 @@ pub(super) fn invisible(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let mut backend = trial.subject.backend(&model)?;
     let upstream = scenes::narrowed(&scenes::upstream(&camera, 1));
     let (image, gradient) = backend.differentiate(&camera, BACKGROUND, 1, &upstream)?;
-    trial.never("all rows", "pixels other than the background", drawn(&image));
+    trial.count("all Gaussians", "pixels other than the background", count_drawn(&image));
     let pulled = |name: &&str| class(&gradient, name).iter().filter(|g| **g != 0.0).count();
-    trial.never("all rows", "gradients of what is not seen", CLASSES.iter().map(pulled).sum());
-    trial.train("all rows", &mut *backend, &camera, BACKGROUND, 1)
+    trial.count(
+        "all Gaussians",
+        "gradients of invisible Gaussians",
+        CLASSES.iter().map(pulled).sum(),
+    );
+    trial.train("all Gaussians", &mut *backend, &camera, BACKGROUND, 1)
 }

@@ -1,4 +1,4 @@
-//! Rows of every shape and size, in general position and far beside the image.
+//! Rows of every shape and size, in general position and far outside the frustum.
 
 use super::{GREY, flat_colour, straight};
 use crate::compare::{class, relative_error};
@@ -14,15 +14,15 @@ pub(super) fn ordinary(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let camera = scenes::camera(49, 35, 10 + u64::from(degree));
         let model = scenes::cloud(40, degree, &camera, 20 + u64::from(degree));
         for active in 0..=degree {
-            let what = format!("degree {active} of {degree}");
-            trial.check(&what, &model, &camera, [0.2, 0.7, 0.4], active)?;
+            let label = format!("degree {active} of {degree}");
+            trial.check(&label, &model, &camera, [0.2, 0.7, 0.4], active)?;
         }
     }
     Ok(())
 }
 
-/// A cloud of which every second row has all log-scales `value`.
-fn of_scale(camera: &Camera, value: f32) -> Gaussians {
+/// A cloud in which every second row has log-scales `value`.
+fn cloud_of_scale(camera: &Camera, value: f32) -> Gaussians {
     let mut model = scenes::cloud(12, 0, camera, 30);
     for scales in model.log_scales.iter_mut().step_by(2) {
         *scales = [value; 3];
@@ -34,20 +34,20 @@ pub(super) fn scales(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = scenes::camera(40, 30, 17);
     // exp(−43.7)² is the smallest normal number; from exp(2.3) on, training stops growth.
     for value in [-80.0, -43.7, -30.0, -20.0, 0.0, 2.3] {
-        let what = format!("log-scale {value}");
-        trial.check(&what, &of_scale(&camera, value), &camera, GREY, 0)?;
+        let label = format!("log-scale {value}");
+        trial.check(&label, &cloud_of_scale(&camera, value), &camera, GREY, 0)?;
     }
-    // Squares and determinants leave f32: no standard, but nothing breaks, and no other row.
+    // Squares and determinants exceed f32: no accuracy is required, but all numbers stay finite.
     for value in [12.0, 20.0, 44.0, 60.0, 88.0, 89.0, 120.0] {
-        let model = of_scale(&camera, value);
+        let model = cloud_of_scale(&camera, value);
         let mut backend = trial.subject.backend(&model)?;
         let upstream = scenes::narrowed(&scenes::upstream(&camera, 5));
         let (image, gradient) = backend.differentiate(&camera, GREY, 0, &upstream)?;
         let mut broken = count_broken(&[&image.rgb, &image.alpha, &image.depth]);
         broken += CLASSES.iter().map(|name| count_broken(&[class(&gradient, name)])).sum::<usize>();
-        let what = format!("log-scale {value}");
-        trial.never(&what, "NaN or infinity", broken);
-        trial.train(&what, &mut *backend, &camera, GREY, 0)?;
+        let label = format!("log-scale {value}");
+        trial.count(&label, "NaN or infinity", broken);
+        trial.train(&label, &mut *backend, &camera, GREY, 0)?;
     }
     Ok(())
 }
@@ -62,83 +62,82 @@ pub(super) fn quaternions(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         }
         model
     };
-    // Beyond 1.8e19 the square of the length is none; below 1e-18 those of the components are subnormal,
-    // which devices may take for zero (WGSL, "Differences from IEEE-754"), and SwiftShader does.
+    // Beyond 1.8e19 the square of the length overflows; below 1e-18 those of the components are subnormal,
+    // which devices may flush to zero (WGSL, "Differences from IEEE-754"), as SwiftShader does.
     for length in [1e-15_f32, 1e-8, 1e-5, 1.0, 1e6, 1e18] {
-        let what = format!("length {length:e}");
+        let label = format!("length {length:e}");
         let model = scaled(length);
-        trial.check(&what, &model, &camera, GREY, 0)?;
-        // Turning does not depend on the length, so that nothing pulls along it.
+        trial.check(&label, &model, &camera, GREY, 0)?;
+        // The rotation does not depend on the length, so the gradient along it is zero.
         let upstream = scenes::narrowed(&scenes::upstream(&camera, 5));
         let mut backend = trial.subject.backend(&model)?;
         let (_, gradient) = backend.differentiate(&camera, GREY, 0, &upstream)?;
         let wide = |q: &[f32; 4]| q.map(f64::from);
-        let size = |q: [f64; 4]| q.iter().map(|v| v * v).sum::<f64>().sqrt();
-        let largest = gradient.quats.iter().map(|g| size(wide(g))).fold(0.0, f64::max);
+        let norm = |q: [f64; 4]| q.iter().map(|v| v * v).sum::<f64>().sqrt();
+        let largest = gradient.quats.iter().map(|g| norm(wide(g))).fold(0.0, f64::max);
         let along = model.quats.iter().zip(&gradient.quats).map(|(q, g)| {
             let (q, g) = (wide(q), wide(g));
-            q.iter().zip(g).map(|(q, g)| q * g).sum::<f64>().abs() / size(q)
+            q.iter().zip(g).map(|(q, g)| q * g).sum::<f64>().abs() / norm(q)
         });
         let radial = along.fold(0.0, f64::max) / largest;
-        trial.figure(&what, "gradient along the length", radial, 2e-6);
+        trial.record(&label, "gradient along the length", radial, 2e-6);
     }
-    // Without a direction: not drawn, and without rotation after a step.
+    // Without a direction the row is not rendered; a step resets it to no rotation.
     for length in [0.0, 1e-30] {
-        let what = format!("length {length:e}");
+        let label = format!("length {length:e}");
         let mut model = scaled(1.0);
         model.quats[3] = [0.5 * length; 4];
         let mut backend = trial.subject.backend(&model)?;
         let image = backend.render(&camera, GREY, 0)?;
-        trial.never(&what, "NaN or infinity", count_broken(&[&image.rgb, &image.depth]));
-        trial.train(&what, &mut *backend, &camera, GREY, 0)?;
-        // It is drawn from then on, and turns as others do: by a learning rate a step.
-        // The first row was pruned: it is the third now.
+        trial.count(&label, "NaN or infinity", count_broken(&[&image.rgb, &image.depth]));
+        trial.train(&label, &mut *backend, &camera, GREY, 0)?;
+        // The first row was pruned, so that the row is the third now.
         let upright = backend.download()?.quats[2][0] > 0.99;
-        trial.never(&what, "rows that stay without a rotation", usize::from(!upright));
+        trial.count(&label, "Gaussians that stay without a rotation", usize::from(!upright));
     }
     Ok(())
 }
 
 pub(super) fn needles(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = straight(48, 48);
-    // The gradient of the long axis is what remains when the short axis's share of dL/dΣ, larger by
-    // the squared ratio of the widths, cancels; the usual route over the inverse of Σ leaves nothing
-    // of it at 300 px already.
+    // The gradient of the long axis is the remainder after the short axis's part of dL/dΣ, larger by the
+    // squared ratio of the widths, cancels. By the usual formula with the inverse of Σ, nothing is left of it
+    // at 300 px.
     trial.limits.interior = 1e-3;
     for (sigma_px, tolerance) in [(10.0_f32, 1e-3), (100.0, 5e-3), (1000.0, 1e-1)] {
-        trial.gradient = tolerance;
+        trial.gradient_tolerance = tolerance;
         for turn in 0..16 {
-            let what = format!("{sigma_px} px, turn {turn}");
+            let label = format!("{sigma_px} px, turn {turn}");
             let model = needle(sigma_px, turn);
-            let (measured, expected) = trial.check(&what, &model, &camera, GREY, 0)?;
+            let (measured, expected) = trial.check(&label, &model, &camera, GREY, 0)?;
             let found = by_covariance(
                 &model,
                 measured.log_scales[0].map(f64::from),
                 measured.quats[0].map(f64::from),
             );
             let exact = by_covariance(&model, expected.log_scales[0], expected.quats[0]);
-            trial.figure(&what, "by covariance", relative_error(&found, &exact), 1e-3);
+            trial.record(&label, "by covariance", relative_error(&found, &exact), 1e-3);
         }
     }
     // The exponent may be off by 1e-2 here, and alpha with it.
     trial.limits.interior = 1e-2;
     for turn in 0..16 {
-        let what = format!("10000 px, turn {turn}");
-        trial.check_image(&what, &needle(1e4, turn), &camera, GREY, 0)?;
+        let label = format!("10000 px, turn {turn}");
+        trial.check_image(&label, &needle(1e4, turn), &camera, GREY, 0)?;
     }
     Ok(())
 }
 
-/// dL/dΣ of a row of unit quaternion, in the frame of its axes: xx, yy, zz, xy, xz. What turning about
-/// the long axis would tell, yz, is lost where the others are equally wide.
+/// dL/dΣ of a row with a unit quaternion, in the frame of its axes: xx, yy, zz, xy, xz. The element yz cannot be
+/// recovered, as the other two axes are equally wide.
 ///
-/// Log-scales move the diagonal D of Σ = R D Rᵀ by 2D; a turn δ about an axis of the row, which moves q
-/// by half of q ⊗ (0, δ), moves the element ij beside it by (Dᵢ − Dⱼ) δ, and its mirror image, too.
+/// Log-scales change the diagonal D of Σ = R D Rᵀ by 2D. A rotation δ about an axis of the row changes q by half
+/// of q ⊗ (0, δ), and the elements ij and ji of the other two axes by (Dᵢ − Dⱼ) δ.
 fn by_covariance(model: &Gaussians, log_scales: [f64; 3], quats: [f64; 4]) -> [f64; 5] {
     let variance = model.log_scales[0].map(|log| (2.0 * f64::from(log)).exp());
     let [w, x, y, z] = model.quats[0].map(f64::from);
     let [gw, gx, gy, gz] = quats;
-    // The imaginary part of conj(q) ⊗ g, halved.
+    // Half the imaginary part of conj(q) ⊗ g.
     let turn_y = 0.5 * (w * gy - y * gw - z * gx + x * gz);
     let turn_z = 0.5 * (w * gz - z * gw - x * gy + y * gx);
     let [a, b, c] = variance;
@@ -147,7 +146,7 @@ fn by_covariance(model: &Gaussians, log_scales: [f64; 3], quats: [f64; 4]) -> [f
     [xx, yy, zz, turn_z / (2.0 * (a - b)), turn_y / (2.0 * (c - a))]
 }
 
-/// A row of 0.01 px by `sigma_px` before the blur: at z = 1 a pixel is 1/64 wide.
+/// A row of `sigma_px` by 0.01 px before the blur: at z = 1 a pixel is 1/64 wide.
 fn needle(sigma_px: f32, turn: u8) -> Gaussians {
     let angle = std::f32::consts::PI * (f32::from(turn) + 0.3) / 16.0;
     let scale = [sigma_px / 64.0, 0.01 / 64.0, 0.01 / 64.0];
@@ -157,7 +156,7 @@ fn needle(sigma_px: f32, turn: u8) -> Gaussians {
     model
 }
 
-pub(super) fn beside(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+pub(super) fn outside_frustum(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = scenes::camera(34, 28, 12);
     for times in [1.0, 1.1, 1.2, 1.5, 2.0, 5.0, 20.0] {
         let mut model = Gaussians { sh_degree: 1, ..Gaussians::default() };
@@ -171,8 +170,8 @@ pub(super) fn beside(trial: &mut Trial<'_>) -> Result<(), BackendError> {
             let colour = |k| if k < 3 { 0.5 - 0.2 * k as f32 } else { 0.05 };
             scenes::push(&mut model, mean, scale, [0.9, 0.1 * row as f32, -0.3, 0.2], 0.6, colour);
         }
-        let what = format!("{times} times the half width");
-        trial.check(&what, &model, &camera, [0.2, 0.7, 0.4], 1)?;
+        let label = format!("{times} times the half width");
+        trial.check(&label, &model, &camera, [0.2, 0.7, 0.4], 1)?;
     }
     Ok(())
 }

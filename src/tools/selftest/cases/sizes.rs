@@ -1,4 +1,4 @@
-//! Images of awkward sizes, lenses at their ends, and rows that fill the image.
+//! Awkward image sizes, extreme lenses, and rows that fill the image.
 
 use super::{GREY, UPRIGHT, straight};
 use crate::reference::{Model, Rules, View, blend, project};
@@ -17,8 +17,8 @@ pub(super) fn images(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     for (seed, (width, height)) in SIZES.into_iter().enumerate() {
         let camera = scenes::camera(width, height, seed as u64);
         let model = scenes::cloud(37, 1, &camera, 50 + seed as u64);
-        let what = format!("{width}x{height}");
-        trial.check(&what, &model, &camera, BACKGROUNDS[seed % 3], 1)?;
+        let label = format!("{width}x{height}");
+        trial.check(&label, &model, &camera, BACKGROUNDS[seed % 3], 1)?;
     }
     for (width, height) in LARGE_SIZES {
         large(trial, width, height)?;
@@ -26,25 +26,25 @@ pub(super) fn images(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     Ok(())
 }
 
-/// The reference's pixels at corners, at the seams of tiles, and here and there.
+/// Compares some pixels with the reference: at corners, at the borders of tiles, and spread over the image.
 fn large(trial: &mut Trial<'_>, width: u32, height: u32) -> Result<(), BackendError> {
     let camera = scenes::camera(width, height, 60);
     let model = scenes::cloud(40, 1, &camera, 61);
-    let what = format!("{width}x{height}");
+    let label = format!("{width}x{height}");
     let image = match trial.subject.backend(&model)?.render(&camera, GREY, 1) {
-        // A device with small buffers refuses such an image; there is nothing to compare then.
+        // A device with small buffers does not support such an image; there is nothing to compare.
         Err(BackendError::BufferTooLarge { .. }) => return Ok(()),
         other => other?,
     };
     let view = View { camera: &camera, background: GREY.map(f64::from), sh_degree: 1 };
-    let splats = project::project(&Model::of(&model), view, &Rules::STANDARD);
+    let splats = project::project(&Model::from(&model), view, &Rules::STANDARD);
     let order = project::by_depth(&splats);
     let ends = |size: u32| [0, 15, 16, size / 2, size - 17, size - 16, size - 1];
-    let seams = ends(height).into_iter().flat_map(|y| ends(width).map(|x| [x, y]));
+    let borders = ends(height).into_iter().flat_map(|y| ends(width).map(|x| [x, y]));
     let spread = (0..500_u32).map(|i| [i * 2_654_435 % width, i * 40_503 % height]);
     let mut worst = 0.0_f64;
-    for [x, y] in seams.chain(spread) {
-        let exact = blend::sample(&splats, &order, view, &Rules::STANDARD, [x, y]);
+    for [x, y] in borders.chain(spread) {
+        let exact = blend::render_pixel(&splats, &order, view, &Rules::STANDARD, [x, y]);
         let at = 3 * (y as usize * width as usize + x as usize);
         for (found, exact_value) in image.rgb[at..at + 3].iter().zip(exact.rgb) {
             let off = (f64::from(*found) - exact_value).abs();
@@ -52,9 +52,9 @@ fn large(trial: &mut Trial<'_>, width: u32, height: u32) -> Result<(), BackendEr
         }
     }
     let broken = count_broken(&[&image.rgb, &image.alpha, &image.depth]);
-    trial.never(&what, "NaN or infinity", broken);
+    trial.count(&label, "NaN or infinity", broken);
     let tolerance = trial.limits.interior;
-    trial.figure(&format!("{what}: rgb of 549 pixels"), "image", worst, tolerance);
+    trial.record(&format!("{label}: rgb of 549 pixels"), "image", worst, tolerance);
     Ok(())
 }
 
@@ -70,21 +70,21 @@ pub(super) fn lenses(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         ("fx = 100 fy", Camera { fx: 400.0, fy: 4.0, ..base }),
         ("centre outside", Camera { cx: -30.0, cy: 55.0, ..base }),
     ];
-    for (seed, (what, camera)) in lenses.into_iter().enumerate() {
+    for (seed, (label, camera)) in lenses.into_iter().enumerate() {
         let camera = scenes::rounded(&camera);
         let model = scenes::cloud(30, 1, &camera, 80 + seed as u64);
-        trial.check(what, &model, &camera, BACKGROUNDS[2], 1)?;
+        trial.check(label, &model, &camera, BACKGROUNDS[2], 1)?;
     }
     Ok(())
 }
 
-/// Rows that each touch every tile of a full-HD image. In full it is half a million, whose tile
-/// entries do not fit 32 bits. Light ends after a few hundred of them, so that the image must be that
-/// of the rows in front, to the bit, which has no bands.
-pub(super) fn crowd(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+/// Rows that each touch every tile of a full-HD image; in the long case half a million, whose number of tile
+/// entries exceeds 32 bits. Pixels are opaque after the front rows, so that the image must equal, bit for bit,
+/// that of the front rows alone, which needs no bands.
+pub(super) fn large_rows(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     const TILES: u64 = 120 * 68;
     let (rows, front) = if trial.long { (530_000, 128) } else { (300, 128) };
-    // In full the backend's own choice, which is 16 entries per row.
+    // The long case uses the default, which is 16 entries per row.
     let tile_cap = (!trial.long).then_some(rows * TILES as usize / 6);
     let camera = straight(1920, 1080);
     let model = |rows: usize| {
@@ -96,33 +96,38 @@ pub(super) fn crowd(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         }
         model
     };
-    let what = format!("{rows} rows");
+    let label = format!("{rows} Gaussians");
     let expected = {
         let front = model(front);
         let tile_cap = Some(front.len() * TILES as usize);
-        let mut backend = trial.subject.with(&front, Setup { tile_cap, ..Setup::default() })?;
+        let mut backend =
+            trial.subject.backend_with(&front, Setup { tile_cap, ..Setup::default() })?;
         backend.render(&camera, GREY, 0)?
     };
     let all = model(rows);
     let target = scenes::target(&camera);
     let before = resident();
     let largest_image = (camera.width, camera.height);
-    let room = Setup { largest_image, tile_cap, ..Setup::default() };
-    let mut backend = trial.subject.with(&all, room)?;
+    let setup = Setup { largest_image, tile_cap, ..Setup::default() };
+    let mut backend = trial.subject.backend_with(&all, setup)?;
     let output = step(&mut *backend, 1, &camera, &target, GREY, 0)?;
-    if let (Some(before), Some(after), true) = (before, resident(), trial.is_alone()) {
+    if let (Some(before), Some(after), true) = (before, resident(), trial.is_memory_measurable()) {
         let held = after.saturating_sub(before) as f64 / backend.ledger().total() as f64;
-        trial.figure(&what, "memory held, of that promised", held, 1.1);
+        trial.record(&label, "memory used, relative to the ledger", held, 1.1);
     }
-    trial.never(&what, "entries miscounted", output.entries.abs_diff(rows as u64 * TILES) as usize);
-    trial.never(&what, "images in one band only", usize::from(output.bands < 2));
+    trial.count(
+        &label,
+        "entries miscounted",
+        output.entries.abs_diff(rows as u64 * TILES) as usize,
+    );
+    trial.count(&label, "images in a single band", usize::from(output.bands < 2));
     let broken = backend.audit()?.len() + usize::from(!output.loss.is_finite());
-    trial.never(&what, "NaN or infinity", broken);
+    trial.count(&label, "NaN or infinity", broken);
     drop(backend);
-    let mut backend = trial.subject.with(&all, Setup { tile_cap, ..Setup::default() })?;
+    let mut backend = trial.subject.backend_with(&all, Setup { tile_cap, ..Setup::default() })?;
     let image = backend.render(&camera, GREY, 0)?;
     let pairs = image.rgb.iter().zip(&expected.rgb).chain(image.depth.iter().zip(&expected.depth));
     let different = pairs.filter(|(a, b)| a.to_bits() != b.to_bits()).count();
-    trial.never(&what, "bits that differ from the rows in front", different);
+    trial.count(&label, "bits that differ from the front Gaussians alone", different);
     Ok(())
 }

@@ -1,4 +1,4 @@
-//! A whole run on small images, looked at on the way: nothing drifts, and the budget is kept.
+//! Whole training runs on small images, with checks on the way: no number drifts, and the budget is kept.
 
 use std::sync::Arc;
 
@@ -24,8 +24,7 @@ use densify_train::trainer::{OnNan, TrainOptions, Trainer};
 const SIDE: u32 = 64;
 const VIEWS: u32 = 7;
 const BUDGET: usize = 400;
-/// Policies between which every kind of edit happens: splits, clones, resets, relocation, noise,
-/// compensation.
+/// Policies that together use every kind of edit: splits, clones, resets, relocation, noise, compensation.
 const POLICIES: [&str; 3] = ["vanilla", "mcmc", "diet"];
 
 struct Photographs {
@@ -53,7 +52,7 @@ impl ViewSource for Photographs {
     fn prefetch(&self, _: &[usize]) {}
 }
 
-/// Cameras on a circle around the origin, that look at it.
+/// Cameras on a circle around the origin that look at it.
 fn cameras() -> Vec<Camera> {
     let around = |view: u32| {
         let angle = std::f64::consts::TAU * f64::from(view) / f64::from(VIEWS);
@@ -71,7 +70,7 @@ fn cameras() -> Vec<Camera> {
     (0..VIEWS).map(around).collect()
 }
 
-/// What is photographed: small blobs of all colours in a ball.
+/// The photographed scene: small blobs of all colours in a ball.
 fn blobs() -> Gaussians {
     let mut model = Gaussians::default();
     for i in 0..150_u16 {
@@ -85,7 +84,7 @@ fn blobs() -> Gaussians {
 }
 
 fn photographs() -> Result<Photographs, BackendError> {
-    // The same for every backend.
+    // The native backend, so that every backend trains on the same photographs.
     let mut native = Subject::NATIVE.backend(&blobs())?;
     let cameras = cameras();
     let mut images = Vec::new();
@@ -98,10 +97,10 @@ fn photographs() -> Result<Photographs, BackendError> {
     Ok(Photographs { cameras, images })
 }
 
-/// Numbers of a model outside of where the optimiser keeps them.
-fn out_of_range(model: &Gaussians) -> usize {
+/// Number of parameters outside of the optimiser's limits.
+fn count_out_of_range(model: &Gaussians) -> usize {
     let norm = |q: &[f32; 4]| q.iter().map(|v| v * v).sum::<f32>().sqrt();
-    // A comparison that is false for NaN counts it.
+    // NaN is outside of every range.
     let outside = |x: &f32, from: f32, to: f32| !(from..=to).contains(x);
     let quats = model.quats.iter().filter(|q| outside(&norm(q), 0.5, 2.0)).count();
     let logits = model.opacity_logits.iter().filter(|x| outside(x, -9.2, 9.2)).count();
@@ -147,26 +146,26 @@ fn train(trial: &mut Trial<'_>, name: &str) -> Result<(), Box<dyn std::error::Er
     };
     let policy = find(name)?.build(&toml::Table::new(), &scene)?;
     let needs = policy.needs(&scene);
-    let room = Setup { budget: BUDGET, needs, ..Setup::default() };
-    let backend = trial.subject.with(&model, room)?;
+    let setup = Setup { budget: BUDGET, needs, ..Setup::default() };
+    let backend = trial.subject.backend_with(&model, setup)?;
     let mut trainer = Trainer::new(photographs()?, backend, (name, policy), scene, options)?;
-    let (mut over_budget, mut broken, mut looks) = (0, 0, 0);
+    let (mut over_budget, mut broken, mut checks) = (0, 0, 0);
     let (mut first, mut last) = (0.0, 0.0);
     for step in 1..=iterations {
         let report = trainer.step()?;
         over_budget += usize::from(report.rows > BUDGET || trainer.peak_rows() > BUDGET);
         broken += usize::from(!report.output.loss.is_finite());
-        // Edits may leave what the next step puts in range, so between two of them.
+        // Between two edits: after one, a number may be out of range until the next step.
         if step % 100 == 50 {
-            broken += out_of_range(&trainer.model()?) + trainer.backend().audit()?.len();
-            looks += 1;
+            broken += count_out_of_range(&trainer.model()?) + trainer.backend().audit()?.len();
+            checks += 1;
         }
         first += if step <= 50 { f64::from(report.output.loss) } else { 0.0 };
         last += if step + 50 > iterations { f64::from(report.output.loss) } else { 0.0 };
     }
-    let what = format!("{name}, {iterations} steps, {looks} looks");
-    trial.never(&what, "steps over the budget", over_budget);
-    trial.never(&what, "numbers that have drifted out of range", broken);
-    trial.figure(&what, "loss at the end, of that at the start", last / first, 0.5);
+    let label = format!("{name}, {iterations} steps, {checks} checks");
+    trial.count(&label, "steps over the budget", over_budget);
+    trial.count(&label, "numbers out of range", broken);
+    trial.record(&label, "final loss, relative to the initial loss", last / first, 0.5);
     Ok(())
 }

@@ -1,4 +1,4 @@
-//! The same scene far from the origin, tiny, huge, and with its axes exchanged.
+//! The same scene far from the origin, tiny, huge, and with exchanged axes.
 
 use glam::{DMat3, DVec3};
 
@@ -9,7 +9,7 @@ use densify_data::dataset::normalise::Normalisation;
 use densify_render::BackendError;
 use densify_train::init::initialise;
 
-/// A rig of cameras that look at a cloud, in coordinates of the world.
+/// Cameras that look at a point cloud, in world coordinates.
 fn rig() -> (Vec<Camera>, Vec<DVec3>) {
     let cameras = (0..5_u8).map(|i| {
         let rotation = DMat3::from_rotation_y(1.2566 * f64::from(i)) * DMat3::from_rotation_x(0.2);
@@ -31,8 +31,8 @@ fn rig() -> (Vec<Camera>, Vec<DVec3>) {
     (cameras.collect(), points.collect())
 }
 
-/// The picture of the first camera after `place` has moved the world and `turn` its axes.
-fn picture(
+/// Renders the first camera's view after the world is rotated by `turn` and moved by `place`.
+fn render_placed(
     trial: &Trial<'_>,
     turn: DMat3,
     place: impl Fn(DVec3) -> DVec3,
@@ -63,32 +63,32 @@ fn rms(a: &[f32], b: &[f32]) -> f64 {
     (sum / a.len() as f64).sqrt()
 }
 
-pub(super) fn anywhere(trial: &mut Trial<'_>) -> Result<(), BackendError> {
-    let here = picture(trial, DMat3::IDENTITY, |p| p)?;
+pub(super) fn placements(trial: &mut Trial<'_>) -> Result<(), BackendError> {
+    let here = render_placed(trial, DMat3::IDENTITY, |p| p)?;
     let away = DVec3::new(1.0, -0.7, 0.3);
     for offset in [1e3, 1e5, 1e6, 5e6, 1e8] {
-        let there = picture(trial, DMat3::IDENTITY, |p| p + offset * away)?;
+        let there = render_placed(trial, DMat3::IDENTITY, |p| p + offset * away)?;
         // 90 dB.
-        trial.figure(&format!("offset {offset:e}"), "rms of colours", rms(&there, &here), 3.2e-5);
+        trial.record(&format!("offset {offset:e}"), "rms of colours", rms(&there, &here), 3.2e-5);
     }
     for scale in [1e-4, 1e4] {
-        let there = picture(trial, DMat3::IDENTITY, |p| p * scale)?;
-        trial.figure(&format!("scale {scale:e}"), "rms of colours", rms(&there, &here), 3.2e-5);
+        let there = render_placed(trial, DMat3::IDENTITY, |p| p * scale)?;
+        trial.record(&format!("scale {scale:e}"), "rms of colours", rms(&there, &here), 3.2e-5);
     }
     for power in [-20, -1, 7, 20] {
-        let there = picture(trial, DMat3::IDENTITY, |p| p * 2.0_f64.powi(power))?;
+        let there = render_placed(trial, DMat3::IDENTITY, |p| p * 2.0_f64.powi(power))?;
         let different = there.iter().zip(&here).filter(|(a, b)| a.to_bits() != b.to_bits()).count();
-        trial.never(&format!("scale 2^{power}"), "bits that differ", different);
+        trial.count(&format!("scale 2^{power}"), "bits that differ", different);
     }
     let turns = [
         ("yzx", DMat3::from_cols(DVec3::Y, DVec3::Z, DVec3::X)),
         ("zxy", DMat3::from_cols(DVec3::Z, DVec3::X, DVec3::Y)),
     ];
-    for (what, turn) in turns {
-        let there = picture(trial, turn, |p| p)?;
+    for (label, turn) in turns {
+        let there = render_placed(trial, turn, |p| p)?;
         // 100 dB: sums of three products in another order.
-        let what = format!("axes {what}");
-        trial.figure(&what, "rms of colours, axes exchanged", rms(&there, &here), 1e-5);
+        let label = format!("axes {label}");
+        trial.record(&label, "rms of colours, exchanged axes", rms(&there, &here), 1e-5);
     }
     Ok(())
 }

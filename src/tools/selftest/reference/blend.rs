@@ -1,4 +1,4 @@
-//! Blending front to back, every pixel against every row, and its derivative.
+//! Front-to-back blending of every row into every pixel, and its derivative.
 
 use super::project::Splat;
 use super::{Image, Rules, ScreenGradient, Upstream, View};
@@ -12,21 +12,21 @@ struct Contribution {
     falloff: f64,
     alpha: f64,
     clamped: bool,
-    /// Transmittance in front of it.
+    /// Transmittance in front of the row.
     transmittance: f64,
 }
 
-/// What happens in one pixel.
+/// The rows blended into one pixel, front to back.
 struct Pixel {
     contributions: Vec<Contribution>,
     transmittance: f64,
-    /// Some decision was close.
+    /// A threshold was close.
     boundary: bool,
 }
 
-/// Decisions this close are not held against `f32`: alpha to its least value and to its clamp,
-/// relative; transmittance to its least value, relative; depths of neighbours in the order,
-/// relative. What f32 loses is smaller by two orders of magnitude.
+/// Relative distances within which `f32` may decide differently: of alpha to its minimum and its clamp, of
+/// transmittance to its minimum, and between depths of neighbours. Rounding of `f32` is smaller by two orders
+/// of magnitude.
 const CLOSE_ALPHA: f64 = 1e-3;
 const CLOSE_TRANSMITTANCE: f64 = 1e-2;
 const CLOSE_DEPTH: f64 = 1e-6;
@@ -47,7 +47,7 @@ fn trace(splats: &[Splat], order: &[usize], x: u32, y: u32, rules: &Rules) -> Pi
             continue;
         }
         pixel.boundary |= close(raw, rules.alpha_max, CLOSE_ALPHA);
-        // Equal depths are no close decision: every renderer takes the first row first.
+        // Equal depths are not close: every renderer takes the first row first.
         pixel.boundary |= splat.depth > last_depth && close(splat.depth, last_depth, CLOSE_DEPTH);
         last_depth = splat.depth;
         let alpha = raw.min(rules.alpha_max);
@@ -82,17 +82,17 @@ pub struct Sample {
     pub alpha: f64,
     /// Σ α·T·z.
     pub depth: f64,
-    /// What is left for the background.
+    /// Transmittance left for the background.
     pub transmittance: f64,
-    /// Rows blended.
+    /// Number of rows blended.
     pub blended: u32,
-    /// Some decision was close.
+    /// A threshold was close.
     pub boundary: bool,
 }
 
 /// Renders one pixel of splats in the given order.
 #[must_use]
-pub fn sample(
+pub fn render_pixel(
     splats: &[Splat],
     order: &[usize],
     view: View<'_>,
@@ -125,7 +125,8 @@ pub fn sample(
 pub fn render(splats: &[Splat], order: &[usize], view: View<'_>, rules: &Rules) -> Image {
     let (width, height) = (view.camera.width, view.camera.height);
     let pixels = (0..height).flat_map(|y| (0..width).map(move |x| [x, y]));
-    let samples: Vec<Sample> = pixels.map(|at| sample(splats, order, view, rules, at)).collect();
+    let samples: Vec<Sample> =
+        pixels.map(|at| render_pixel(splats, order, view, rules, at)).collect();
     Image {
         rgb: samples.iter().flat_map(|s| s.rgb).collect(),
         alpha: samples.iter().map(|s| s.alpha).collect(),
@@ -136,8 +137,8 @@ pub fn render(splats: &[Splat], order: &[usize], view: View<'_>, rules: &Rules) 
     }
 }
 
-/// Calls `f(pixel, row, weight, distance of the pixel's centre to the projected mean, in px)` for every
-/// row blended into a pixel.
+/// Calls `f` for every row blended into a pixel, with the pixel, the row, its weight, and the distance of the
+/// pixel's centre to the projected mean `[px]`.
 pub fn each_blended(
     splats: &[Splat],
     order: &[usize],
@@ -172,7 +173,7 @@ pub fn backward(
             let pixel = trace(splats, order, x, y, rules);
             let d_rgb = [0, 1, 2].map(|c| upstream.rgb[3 * p + c]);
             let (d_alpha_out, d_depth) = (upstream.alpha[p], upstream.depth[p]);
-            // What lies behind, as this pixel's loss values it; at first the background.
+            // Loss contribution of everything behind; at first the background.
             let mut behind: f64 =
                 pixel.transmittance * (0..3).map(|c| view.background[c] * d_rgb[c]).sum::<f64>();
             for hit in pixel.contributions.iter().rev() {
@@ -203,7 +204,7 @@ pub fn backward(
     gradient
 }
 
-/// Adds the gradient that arrives at the exponent p of alpha = opacity · exp(−p).
+/// Adds the gradient of the exponent p in alpha = opacity · exp(−p).
 fn add_exponent(sum: &mut ScreenGradient, splat: &Splat, hit: &Contribution, d_exponent: f64) {
     let [dx, dy] = hit.offset;
     let [a, b, c] = splat.conic;
@@ -217,8 +218,8 @@ fn add_exponent(sum: &mut ScreenGradient, splat: &Splat, hit: &Contribution, d_e
     sum.conic[2] += d_exponent * 0.5 * dy * dy;
 }
 
-/// Per row, what pixels outside `counted` may add to its statistics if every close decision in
-/// them fell in the row's favour: largest weight, sum of weights, pixels.
+/// Upper bounds of what the pixels outside `counted` add to a row's statistics, whatever is decided at close
+/// thresholds: largest weight, sum of weights, number of pixels.
 #[must_use]
 pub fn leeway(
     splats: &[Splat],
@@ -226,23 +227,23 @@ pub fn leeway(
     view: View<'_>,
     counted: &[bool],
 ) -> Vec<(f64, f64, u32)> {
-    // Without the two steps nothing is skipped; 10 % below the step nothing can be blended.
+    // Without thresholds nothing is skipped; an alpha 10 % below the minimum is never blended.
     let rules = Rules { alpha_min: 0.9 / 255.0, ..Rules::SMOOTH };
-    let mut most = vec![(0.0, 0.0, 0); splats.len()];
+    let mut bounds = vec![(0.0, 0.0, 0); splats.len()];
     for y in 0..view.camera.height {
         for x in 0..view.camera.width {
             if counted[(y * view.camera.width + x) as usize] {
                 continue;
             }
             for hit in trace(splats, order, x, y, &rules).contributions {
-                // A row in front that is skipped lets 1/255 more through.
+                // A skipped row in front raises the transmittance by up to 1/255.
                 let weight = 1.01 * hit.alpha * hit.transmittance;
-                let (largest, sum, pixels) = &mut most[hit.row];
+                let (largest, sum, pixels) = &mut bounds[hit.row];
                 *largest = weight.max(*largest);
                 *sum += weight;
                 *pixels += 1;
             }
         }
     }
-    most
+    bounds
 }

@@ -1,22 +1,22 @@
-//! The training loss, 0.8 · L1 + 0.2 · (1 − SSIM), from its definition, and its derivative.
+//! The training loss, 0.8 · L1 + 0.2 · (1 − SSIM), and its derivative, straight from the definition.
 
-/// Reach of the 11×11 window `[px]`.
+/// Radius of the 11×11 window `[px]`.
 const REACH: i64 = 5;
 const C1: f64 = 0.0001;
 const C2: f64 = 0.0009;
 
-/// The loss, its two parts, and dL/d(rendered).
+/// The loss, its parts, and dL/d(rendered).
 #[derive(Debug, Clone)]
 pub struct Loss {
     /// 0.8 · L1 + 0.2 · (1 − SSIM).
     pub loss: f64,
-    /// Mean over pixels and channels of the absolute error.
+    /// Mean absolute error over pixels and channels.
     pub l1: f64,
-    /// Mean similarity.
+    /// Mean SSIM.
     pub ssim: f64,
     /// Shape: [height, width, 3].
     pub gradient: Vec<f64>,
-    /// Each pixel's absolute error and its 1 − SSIM, means over channels.
+    /// Absolute error and 1 − SSIM of each pixel, means over channels.
     pub by_pixel: Vec<[f64; 2]>,
 }
 
@@ -32,8 +32,8 @@ fn window() -> Vec<(i64, i64, f64)> {
     taps.into_iter().map(|(dy, dx, weight)| (dy, dx, weight / sum)).collect()
 }
 
-/// Convolves an image of [height, width, 3] with the window; zeros beyond the border. The window
-/// is symmetric, so this is its own transpose.
+/// Convolves an image of [height, width, 3] with the window, with zeros beyond the border. The window is
+/// symmetric, so the convolution is its own transpose.
 fn blur(image: &[f64], width: usize, height: usize) -> Vec<f64> {
     let taps = window();
     let (w, h) = (width as i64, height as i64);
@@ -52,7 +52,7 @@ fn product(a: &[f64], b: &[f64]) -> Vec<f64> {
     a.iter().zip(b).map(|(a, b)| a * b).collect()
 }
 
-/// `rendered` and `target`: [height, width, 3], not clamped.
+/// The loss of `rendered` against `target`: [height, width, 3], not clamped.
 #[must_use]
 pub fn loss(rendered: &[f64], target: &[f64], width: usize, height: usize) -> Loss {
     let n = rendered.len() as f64;

@@ -1,11 +1,10 @@
-//! A renderer in `f64`, dense and slow, with analytic gradients: what the backends are held to.
+//! The reference: a dense, slow renderer in `f64` with analytic gradients.
 //!
 //! It follows the textbook (Zwicker et al., *EWA Splatting*, IEEE TVCG 8(3), 2002; Kerbl et al.,
-//! *3D Gaussian Splatting*, ACM TOG 42(4), 2023): every pixel looks at every row, covariance and
-//! conic are plain matrices, and the spherical harmonics are a table of monomials. The backends
-//! do none of that, which is the point: an error in one is not an error in the other.
-//! `tests/it/central.rs` checks its gradients by central differences, `tests/it/oracle/` checks it
-//! against stored arrays.
+//! *3D Gaussian Splatting*, ACM TOG 42(4), 2023): every pixel visits every row, covariance and conic are plain
+//! matrices, and the spherical harmonics are a table of monomials. The backends do none of that, so that they
+//! and the reference do not share errors. `tests/it/central.rs` checks the gradients by central differences,
+//! `tests/it/oracle/` compares with stored arrays.
 
 pub mod blend;
 pub mod loss;
@@ -17,28 +16,28 @@ use densify_core::gaussians::{Gaussians, sh_coefficients};
 /// The constants at which renderers differ.
 #[derive(Debug, Clone, Copy)]
 pub struct Rules {
-    /// Rows at smaller camera z are not drawn [scene units].
+    /// Near plane `[scene units]`: rows at smaller camera z are not rendered.
     pub near: f64,
-    /// A fainter alpha is skipped.
+    /// Smaller alphas are skipped.
     pub alpha_min: f64,
-    /// A larger alpha is clamped, and passes no gradient.
+    /// Larger alphas are clamped, and have no gradient.
     pub alpha_max: f64,
-    /// A row that would bring transmittance down to this ends the pixel and is not blended.
+    /// A row that would lower the transmittance to this ends the pixel and is not blended.
     pub transmittance_min: f64,
 }
 
 /// Added to the diagonal of the projected covariance `[px²]`.
 const BLUR: f64 = 0.3;
-/// Centres further out than the image widened by this factor about its middle are clamped in
-/// the projection's Jacobian.
+/// Centres outside of the image widened by this factor about its centre are clamped in the Jacobian of the
+/// projection.
 const FRUSTUM_MARGIN: f64 = 1.3;
 
 impl Rules {
     /// The rules of the renderer.
     pub const STANDARD: Self =
         Self { near: 0.01, alpha_min: 1.0 / 255.0, alpha_max: 0.99, transmittance_min: 1e-4 };
-    /// The same without the two steps that make a render discontinuous in its parameters, so
-    /// that differences approximate derivatives.
+    /// The rules without the two thresholds that make a rendering discontinuous in its parameters, so that
+    /// finite differences approximate derivatives.
     pub const SMOOTH: Self =
         Self { alpha_min: 0.0, transmittance_min: f64::NEG_INFINITY, ..Self::STANDARD };
 }
@@ -60,11 +59,24 @@ pub struct Model {
     pub sh: Vec<f64>,
 }
 
-/// The parameter classes, by the names that stored arrays have too.
+/// Names of the parameter classes; stored arrays have the same names.
 pub const CLASSES: [&str; 5] = ["means", "log_scales", "quats", "opacity_logits", "sh"];
 
+impl From<&Gaussians> for Model {
+    fn from(gaussians: &Gaussians) -> Self {
+        Self {
+            coefficients: sh_coefficients(gaussians.sh_degree),
+            means: gaussians.means.iter().map(|v| v.map(f64::from)).collect(),
+            log_scales: gaussians.log_scales.iter().map(|v| v.map(f64::from)).collect(),
+            quats: gaussians.quats.iter().map(|v| v.map(f64::from)).collect(),
+            opacity_logits: gaussians.opacity_logits.iter().copied().map(f64::from).collect(),
+            sh: gaussians.sh.iter().copied().map(f64::from).collect(),
+        }
+    }
+}
+
 impl Model {
-    /// A gradient to add to.
+    /// A gradient of zeros.
     #[must_use]
     pub fn zeros(rows: usize, coefficients: usize) -> Self {
         Self {
@@ -77,19 +89,6 @@ impl Model {
         }
     }
 
-    /// The same model in `f64`.
-    #[must_use]
-    pub fn of(gaussians: &Gaussians) -> Self {
-        Self {
-            coefficients: sh_coefficients(gaussians.sh_degree),
-            means: gaussians.means.iter().map(|v| v.map(f64::from)).collect(),
-            log_scales: gaussians.log_scales.iter().map(|v| v.map(f64::from)).collect(),
-            quats: gaussians.quats.iter().map(|v| v.map(f64::from)).collect(),
-            opacity_logits: gaussians.opacity_logits.iter().copied().map(f64::from).collect(),
-            sh: gaussians.sh.iter().copied().map(f64::from).collect(),
-        }
-    }
-
     /// Number of rows.
     #[must_use]
     pub fn rows(&self) -> usize {
@@ -99,7 +98,7 @@ impl Model {
     /// All values of the parameter class `name`, row after row.
     ///
     /// # Panics
-    /// When it is none of [`CLASSES`].
+    /// When `name` is not in [`CLASSES`].
     #[must_use]
     pub fn class(&self, name: &str) -> &[f64] {
         match name {
@@ -112,10 +111,10 @@ impl Model {
         }
     }
 
-    /// The same, to be changed.
+    /// All values of the parameter class `name`, mutable.
     ///
     /// # Panics
-    /// When it is none of [`CLASSES`].
+    /// When `name` is not in [`CLASSES`].
     pub fn class_mut(&mut self, name: &str) -> &mut [f64] {
         match name {
             "means" => self.means.as_flattened_mut(),
@@ -137,14 +136,14 @@ impl Model {
     }
 }
 
-/// Where from, on what, and with how many harmonics.
+/// A view to render: camera, background and SH degree.
 #[derive(Debug, Clone, Copy)]
 pub struct View<'a> {
-    /// The camera.
+    /// Camera.
     pub camera: &'a Camera,
-    /// Colour behind everything.
+    /// Background colour.
     pub background: [f64; 3],
-    /// Degree that is evaluated, <= the model's.
+    /// SH degree to evaluate, <= the model's.
     pub sh_degree: u8,
 }
 
@@ -160,7 +159,7 @@ pub struct Upstream {
 }
 
 impl Upstream {
-    /// The same where no decision is close, so that a gradient can be compared tightly everywhere.
+    /// Zeros the gradient where a threshold is close, so that gradients can be compared tightly everywhere.
     #[must_use]
     pub fn ignoring(mut self, boundary: &[bool]) -> Self {
         for (p, _) in boundary.iter().enumerate().filter(|(_, close)| **close) {
@@ -172,7 +171,7 @@ impl Upstream {
     }
 }
 
-/// A render, and what a test wants to know besides.
+/// A rendering, with details for tests.
 #[derive(Debug, Clone)]
 pub struct Image {
     /// Background included, not clamped. Shape: [height, width, 3].
@@ -181,11 +180,11 @@ pub struct Image {
     pub alpha: Vec<f64>,
     /// Σ α·T·z.
     pub depth: Vec<f64>,
-    /// What is left for the background.
+    /// Transmittance left for the background.
     pub transmittance: Vec<f64>,
-    /// Rows blended into each pixel.
+    /// Number of rows blended into each pixel.
     pub blended: Vec<u32>,
-    /// Pixels where a decision is so close that `f32` may take the other side.
+    /// Pixels in which a threshold is so close that `f32` may decide differently.
     pub boundary: Vec<bool>,
 }
 
@@ -200,25 +199,25 @@ impl Image {
     }
 }
 
-/// Gradients and per-row statistics of one view.
+/// Gradients and row statistics of a view.
 #[derive(Debug, Clone)]
 pub struct Gradient {
-    /// Of the parameters.
+    /// Gradient of the parameters.
     pub model: Model,
-    /// Of the projected rows. Shape: `[rows]`.
+    /// Gradient of the projected rows. Shape: `[rows]`.
     pub screen: Vec<ScreenGradient>,
 }
 
-/// One row's share, as the pixels see it.
+/// Gradient and statistics of one projected row.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct ScreenGradient {
     /// dL/d(projected mean) [1/px].
     pub mean: [f64; 2],
-    /// Σ over pixels of the absolute values of that.
+    /// Σ over pixels of the absolute values of dL/d(projected mean).
     pub mean_abs: [f64; 2],
     /// dL/d(A, B, C), the conic of exp(−½(A·dx² + C·dy²) − B·dx·dy).
     pub conic: [f64; 3],
-    /// dL/d(colour after its clamp at 0).
+    /// dL/d(colour after the clamp at 0).
     pub colour: [f64; 3],
     /// dL/d(opacity).
     pub opacity: f64,
@@ -228,7 +227,7 @@ pub struct ScreenGradient {
     pub max_weight: f64,
     /// Sum of alpha·T.
     pub sum_weight: f64,
-    /// Pixels blended into.
+    /// Number of pixels that the row is blended into.
     pub pixels: u32,
 }
 

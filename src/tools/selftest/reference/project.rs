@@ -1,13 +1,13 @@
-//! Rows to splats on the screen and back: pose, covariance, spherical harmonics.
+//! Projection of rows to splats, and its derivative: pose, covariance, spherical harmonics.
 
 use glam::{DMat3, DVec3};
 
 use super::{BLUR, FRUSTUM_MARGIN, Model, Rules, ScreenGradient, View};
 
-/// A row as the pixels see it.
+/// A projected row.
 #[derive(Debug, Clone, Copy)]
 pub struct Splat {
-    /// Whether it lies beyond the near plane; else all other fields are meaningless.
+    /// True if the row lies beyond the near plane; otherwise the other fields are meaningless.
     pub in_front: bool,
     /// Projected mean `[px]`.
     pub mean: [f64; 2],
@@ -15,7 +15,7 @@ pub struct Splat {
     pub depth: f64,
     /// Projected covariance (xx, xy, yy) `[px²]`, blur included.
     pub covariance: [f64; 3],
-    /// Its inverse (A, B, C) [1/px²].
+    /// Inverse of the covariance (A, B, C) [1/px²].
     pub conic: [f64; 3],
     /// Colour before the clamp at 0.
     pub colour: [f64; 3],
@@ -23,12 +23,13 @@ pub struct Splat {
     pub opacity: f64,
 }
 
-/// Everything about a row's projection that its derivative needs again.
+/// Intermediate values of a projection that its derivative needs again.
 struct Geometry {
-    /// Mean in camera axes.
+    /// Mean in camera coordinates.
     local: DVec3,
-    /// x/z and y/z as the Jacobian uses them, and whether each is clamped.
+    /// x/z and y/z as the Jacobian uses them.
     slope: [f64; 2],
+    /// True if the slope is clamped.
     clamped: [bool; 2],
     /// Camera rotation.
     rotation: DMat3,
@@ -39,7 +40,7 @@ struct Geometry {
 }
 
 impl Geometry {
-    fn of(model: &Model, row: usize, view: View<'_>) -> Self {
+    fn new(model: &Model, row: usize, view: View<'_>) -> Self {
         let camera = view.camera;
         let local = camera.rotation * DVec3::from(model.means[row]) + camera.translation;
         let limits = |size: u32, focal: f64, centre: f64| {
@@ -70,12 +71,12 @@ impl Geometry {
     }
 }
 
-/// All rows of a model, projected.
+/// Projects all rows of a model.
 #[must_use]
 pub fn project(model: &Model, view: View<'_>, rules: &Rules) -> Vec<Splat> {
     (0..model.rows())
         .map(|row| {
-            let geometry = Geometry::of(model, row, view);
+            let geometry = Geometry::new(model, row, view);
             let local = geometry.local;
             let sigma = geometry.m * geometry.m.transpose();
             // Rows of J·W; covariance = (JW)·Σ·(JW)ᵀ.
@@ -100,7 +101,7 @@ pub fn project(model: &Model, view: View<'_>, rules: &Rules) -> Vec<Splat> {
         .collect()
 }
 
-/// Rows in front of the camera, front to back; ties by row.
+/// Rows in front of the camera, front to back; equal depths by row.
 #[must_use]
 pub fn by_depth(splats: &[Splat]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..splats.len()).filter(|&i| splats[i].in_front).collect();
@@ -108,7 +109,7 @@ pub fn by_depth(splats: &[Splat]) -> Vec<usize> {
     order
 }
 
-/// From gradients on the screen to gradients of the parameters.
+/// Gradients of the parameters from those of the projected rows.
 #[must_use]
 pub fn backward(
     model: &Model,
@@ -139,7 +140,7 @@ fn geometry_backward(
     upstream: &ScreenGradient,
     gradient: &mut Model,
 ) -> DVec3 {
-    let geometry = Geometry::of(model, row, view);
+    let geometry = Geometry::new(model, row, view);
     let (fx, fy) = (view.camera.fx, view.camera.fy);
     let DVec3 { x, y, z } = geometry.local;
     // d(covariance) = −Q·d(Q)·Q with Q the conic; B enters the exponent once, hence the halves.
@@ -152,7 +153,7 @@ fn geometry_backward(
     let jw = jacobian.map(|j| geometry.rotation.transpose() * j);
     let sigma = geometry.m * geometry.m.transpose();
 
-    // covariance = (JW)·Σ·(JW)ᵀ: towards the rows of JW, then of J.
+    // covariance = (JW)·Σ·(JW)ᵀ: gradients of the rows of JW, then of J.
     let d_jw = [
         2.0 * (sigma * (d_cov[0] * jw[0] + d_cov[1] * jw[1])),
         2.0 * (sigma * (d_cov[1] * jw[0] + d_cov[2] * jw[1])),
@@ -176,7 +177,7 @@ fn geometry_backward(
         d_local.z -= d_slope[1] * y / (z * z);
     }
 
-    // Towards Σ = m·mᵀ, then scale and rotation.
+    // Gradient of Σ = m·mᵀ, then of scale and rotation.
     let outer = |u: DVec3, v: DVec3| DMat3::from_cols(u * v.x, u * v.y, u * v.z);
     let d_sigma = d_cov[0] * outer(jw[0], jw[0])
         + d_cov[1] * (outer(jw[0], jw[1]) + outer(jw[1], jw[0]))
@@ -192,7 +193,7 @@ fn geometry_backward(
     geometry.rotation.transpose() * d_local
 }
 
-/// A coefficient and the two components of the quaternion it multiplies.
+/// A coefficient and the two quaternion components that it multiplies.
 type Product = (f64, usize, usize);
 
 /// Entry (i, j) of the rotation matrix of a unit quaternion (w, x, y, z) is
@@ -238,7 +239,7 @@ fn rotation_backward(q: [f64; 4], d_columns: [DVec3; 3]) -> [f64; 4] {
 /// A monomial: coefficient and powers of x, y, z.
 type Monomial = (f64, [i32; 3]);
 
-/// The real spherical harmonics of degrees 0–3 in the order and sign of the original code.
+/// The real spherical harmonics of degrees 0–3, with the order and signs of the original 3DGS code.
 #[rustfmt::skip]
 const HARMONICS: [&[Monomial]; 16] = {
     const D0: f64 = 0.282_094_791_773_878_14;
@@ -289,21 +290,21 @@ fn derivative(harmonic: &[Monomial], d: DVec3) -> DVec3 {
     gradient
 }
 
-fn active(view: View<'_>) -> impl Iterator<Item = (usize, &'static [Monomial])> {
+fn active_harmonics(view: View<'_>) -> impl Iterator<Item = (usize, &'static [Monomial])> {
     let count = (usize::from(view.sh_degree) + 1).pow(2);
     HARMONICS.into_iter().take(count).enumerate()
 }
 
-/// From the camera to the row's mean, not normalised.
-fn from_camera(model: &Model, row: usize, view: View<'_>) -> DVec3 {
+/// Vector from the camera to the row's mean, not normalised.
+fn camera_to_mean(model: &Model, row: usize, view: View<'_>) -> DVec3 {
     let centre = -(view.camera.rotation.transpose() * view.camera.translation);
     DVec3::from(model.means[row]) - centre
 }
 
 fn colour(model: &Model, row: usize, view: View<'_>) -> [f64; 3] {
-    let direction = from_camera(model, row, view).normalize();
+    let direction = camera_to_mean(model, row, view).normalize();
     let mut colour = [0.5; 3];
-    for (k, harmonic) in active(view) {
+    for (k, harmonic) in active_harmonics(view) {
         let value = evaluate(harmonic, direction);
         for (c, channel) in colour.iter_mut().enumerate() {
             *channel += value * model.sh[(row * model.coefficients + k) * 3 + c];
@@ -320,11 +321,11 @@ fn colour_backward(
     upstream: &ScreenGradient,
     gradient: &mut Model,
 ) -> DVec3 {
-    let from_camera = from_camera(model, row, view);
-    let direction = from_camera.normalize();
+    let offset = camera_to_mean(model, row, view);
+    let direction = offset.normalize();
     let d_colour = [0, 1, 2].map(|c| if splat.colour[c] > 0.0 { upstream.colour[c] } else { 0.0 });
     let mut d_direction = DVec3::ZERO;
-    for (k, harmonic) in active(view) {
+    for (k, harmonic) in active_harmonics(view) {
         let value = evaluate(harmonic, direction);
         let slope = derivative(harmonic, direction);
         for (c, d) in d_colour.iter().enumerate() {
@@ -333,5 +334,5 @@ fn colour_backward(
             d_direction += slope * (d * model.sh[index]);
         }
     }
-    (d_direction - direction * direction.dot(d_direction)) / from_camera.length()
+    (d_direction - direction * direction.dot(d_direction)) / offset.length()
 }

@@ -1,50 +1,51 @@
-//! What a backend with given options needs, before anything is allocated.
+//! Memory of a backend, computed from its options before anything is allocated.
 
 use densify_policies::policy::{AuxRequest, Candidate, Needs};
 
 use super::device::Device;
-use super::sizes::{MOST_ENTRIES, Sizes};
+use super::sizes::{MAX_ENTRIES, Sizes};
 use crate::Accumulation;
 use crate::Setup;
 use crate::candidates::Candidates;
 use crate::signals::RecordLayout;
 use densify_core::memory::{Ledger, Section};
 
-/// Largest image side `[px]`; at this size every index of the stages still fits its type.
+/// Longest image side `[px]` at which every index of the stages fits its type.
 pub(super) const MAX_SIDE: u32 = 16_384;
 
-/// Most (row, tile) pairs that this device can hold at a time for such needs.
-pub(super) fn most_pairs(device: &Device, needs: &Needs) -> u64 {
-    // Of the largest buffer that grows with them: records, or lists.
+/// Largest number of (row, tile) pairs that this device can hold at a time, for a policy's needs.
+pub(super) fn max_pairs(device: &Device, needs: &Needs) -> u64 {
+    // Numbers per pair in the largest buffer that grows with them: records, or lists.
     let numbers = match device.accumulation {
         Accumulation::Slots => RecordLayout::new(needs.signals).stride() as u64,
         Accumulation::SubgroupCas | Accumulation::SubgroupAtomics => 1,
     };
-    (device.largest_binding() / (4 * numbers)).min(MOST_ENTRIES)
+    (device.largest_binding() / (4 * numbers)).min(MAX_ENTRIES)
 }
 
+/// Sizes of all buffers.
 pub(super) fn sizes(device: &Device, sh_degree: u8, options: &Setup) -> Sizes {
     let budget = options.budget.max(1);
     let cap = match options.tile_cap {
         Some(cap) => cap as u64,
-        None => (16 * budget as u64).min(most_pairs(device, &options.needs)),
+        None => (16 * budget as u64).min(max_pairs(device, &options.needs)),
     };
     let (width, height) = options.largest_image;
     let image = (width.clamp(1, MAX_SIDE), height.clamp(1, MAX_SIDE));
-    // The adapter takes fewer rows than the sums do entries.
-    let cap = cap.min(MOST_ENTRIES).max(budget as u64);
+    // An adapter supports fewer rows than MAX_ENTRIES.
+    let cap = cap.min(MAX_ENTRIES).max(budget as u64);
     let mut sizes = Sizes::new(budget, cap, sh_degree, image, &options.needs, device.accumulation);
     sizes.frozen = options.frozen as u64;
     sizes.photographs = options.photographs;
     sizes.exposures = options.exposures;
-    // They lie in one buffer, which nothing binds.
-    let one = sizes.photograph_bytes().iter().sum::<u64>();
-    let most = usize::try_from(device.summary.largest_buffer / one).unwrap_or(usize::MAX);
-    sizes.photographs.count = sizes.photographs.count.min(most);
+    // They lie in one buffer, which is only copied from and to.
+    let bytes = sizes.photograph_bytes().iter().sum::<u64>();
+    let max = usize::try_from(device.summary.largest_buffer / bytes).unwrap_or(usize::MAX);
+    sizes.photographs.count = sizes.photographs.count.min(max);
     sizes
 }
 
-/// Bytes on the device, and on the host for it.
+/// Memory on the device, and on the host for the device.
 pub(super) fn ledger(sizes: &Sizes, needs: &Needs) -> Ledger {
     let mut ledger = sizes.ledger();
     let pixels = u64::from(sizes.image.0) * u64::from(sizes.image.1);
@@ -61,9 +62,9 @@ pub(super) fn ledger(sizes: &Sizes, needs: &Needs) -> Ledger {
     ledger
 }
 
-/// Bytes that the host holds while it measures an auxiliary view of so many pixels.
+/// Memory on the host while it measures an auxiliary view of this number of pixels `[bytes]`.
 fn aux_bytes(request: &AuxRequest, pixels: u64) -> u64 {
     let drawing = if request.points > 0 { 20 } else { 0 };
-    // The image as copied, its map, error, edge and luma.
+    // The copied image, its map, error, edges and luma.
     pixels * (20 + 24 + 13 + drawing) + u64::from(request.points) * size_of::<Candidate>() as u64
 }
