@@ -9,6 +9,7 @@ use densify_core::files::OutputError;
 use densify_core::gaussians::Gaussians;
 use densify_core::numbers::{grouped, percent};
 use densify_data::dataset::Dataset;
+use densify_data::models::PLY;
 use densify_data::views::ViewSource;
 use densify_render::Backend;
 use densify_run::RunConfig;
@@ -89,7 +90,7 @@ impl Truth {
 
 /// A line per format.
 pub(super) fn table(lines: &[Line], rows: usize) -> String {
-    let of_ply = lines.iter().find(|line| line.name == "ply").map(|line| line.bytes);
+    let of_ply = lines.iter().find(|line| line.name == PLY.name).map(|line| line.bytes);
     let width = lines.iter().map(|line| line.name.len()).max().unwrap_or(0).max("format".len());
     let mut text = format!("\n{:width$}  {:>15}  {:>12}", "format", "bytes", "per Gaussian");
     let columns =
