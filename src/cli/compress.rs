@@ -12,7 +12,7 @@ use super::train::Follower;
 use densify_compress::{Attempt, Compressed, Options, Target, compress, file};
 use densify_core::numbers;
 use densify_core::numbers::{grouped, percent};
-use densify_data::export::{Format, find};
+use densify_data::models::{Format, compress_formats, find};
 use densify_run::failure::Failure;
 use densify_run::finished::{is_model, model_file};
 use densify_run::{RunConfig, Whole};
@@ -70,8 +70,6 @@ Examples:
 
 /// The name that stands for whichever format holds most.
 const ANY: &str = "any";
-/// What is chosen from, the more exact first.
-const CHOICE: [&str; 4] = ["ply", "sog", "compressed-ply", "spz"];
 
 /// What `--to` may be.
 #[derive(Debug, Clone, Copy)]
@@ -145,7 +143,7 @@ pub(super) fn run(
 /// The formats to choose from.
 fn formats(args: &CompressArgs) -> Result<Vec<&'static Format>, Failure> {
     match args.format.as_deref() {
-        Some(ANY) => Ok(CHOICE.into_iter().filter_map(|name| find(name).ok()).collect()),
+        Some(ANY) => Ok(compress_formats()),
         Some(name) => {
             let wrong = |error| Failure::input(format!("--format: {error}, {ANY}"));
             Ok(vec![find(name).map_err(wrong)?])

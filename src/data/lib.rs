@@ -1,8 +1,15 @@
-//! Everything that opens strangers' files: datasets, and models of Gaussian splats in all formats; and the writers
-//! of those formats. Knows no backend and no run.
+//! Readers of everything that other programs write, datasets and models of Gaussian splats in all formats, and the
+//! writers of model formats. This layer knows no backend and no run.
+//!
+//! Its modules in order, each using only those before it: `error`, `ply`, [`points`], [`models`], [`dataset`],
+//! [`track_colours`] and [`views`].
 
 pub mod dataset;
-pub mod export;
-pub mod import;
+mod error;
+pub mod models;
+mod ply;
+pub mod points;
 pub mod track_colours;
 pub mod views;
+
+pub use error::LoadError;

@@ -7,8 +7,8 @@ use densify_scenegen::Error as SceneError;
 
 use crate::knobs::KnobError;
 use densify_core::files::OutputError;
-use densify_data::dataset::DatasetError;
-use densify_data::export::FormatError;
+use densify_data::LoadError;
+use densify_data::models::FormatError;
 use densify_render::{Accumulation, BackendError, Fit};
 use densify_train::checkpoint::CheckpointError;
 use densify_train::evaluate::EvaluateError;
@@ -58,7 +58,7 @@ impl Failure {
 /// Errors that are always of bad input.
 pub trait BadInput: Display {}
 
-impl BadInput for DatasetError {}
+impl BadInput for LoadError {}
 impl BadInput for FormatError {}
 impl BadInput for InitError {}
 impl BadInput for KnobError {}

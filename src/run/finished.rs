@@ -11,7 +11,7 @@ use densify_core::files;
 use densify_core::gaussians::Gaussians;
 use densify_data::dataset::normalise::{EXTENT, Normalisation};
 use densify_data::dataset::{Dataset, View, builtin, is_archive};
-use densify_data::import;
+use densify_data::models;
 use densify_data::views::DatasetViews;
 use densify_render::{Backend, Device, Setup};
 use densify_render::{BackendError, MomentStorage, Storage};
@@ -103,9 +103,9 @@ pub struct Opened {
     pub backend: Box<dyn Backend>,
 }
 
-/// Whether a path is a model by itself: a file that is no archive of a dataset, or a folder of SOG.
+/// True if a path is a model by itself: a file that is not an archive of a dataset, or a folder in a model format.
 pub fn is_model(path: &Path) -> bool {
-    (path.is_file() && !is_archive(path)) || path.join("meta.json").is_file()
+    (path.is_file() && !is_archive(path)) || models::main_file(path).is_some()
 }
 
 /// The iteration asked for, or the last one saved.
@@ -267,7 +267,7 @@ pub fn load(path: &Path, data: &DataSpec, observer: &dyn Observer) -> Result<Dat
 
 /// Reads a file of Gaussian splats by any program, in its own coordinates; says what was wrong with it.
 pub fn read_model(path: &Path, observer: &dyn Observer) -> Result<Gaussians, Failure> {
-    let file = import::read_model(path)?;
+    let file = models::read_model(path)?;
     for (number, what) in [
         (file.dropped, "left out: a value is not finite"),
         (file.repaired, "with a zero quaternion, read as unrotated"),

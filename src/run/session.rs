@@ -14,7 +14,7 @@ use super::observer::{Between, Interrupt, Observer};
 use super::records::{Logs, Totals};
 use crate::failure::{Failure, INPUT, OTHER};
 use densify_core::files::{OutputError, write_atomically};
-use densify_data::export::{PLY, Shape};
+use densify_data::models::{PLY, Shape};
 use densify_data::views::ViewSource;
 use densify_train::checkpoint::{CheckpointError, Header, checkpoint_path, remove_older, write};
 use densify_train::evaluate::{Comparison, EvaluateError, Split, evaluate};

@@ -1,7 +1,15 @@
-//! The main file of all fuzz targets: the name of the binary is the format that it reads. See
-//! `formats.rs`.
+//! The fuzz target: reads inputs as the format that the variable `FORMAT` names. See `formats.rs`.
 #![no_main]
 
+use std::sync::LazyLock;
+
+use densify_fuzz::Target;
+
+static TARGET: LazyLock<Target> = LazyLock::new(|| {
+    let name = std::env::var("FORMAT").expect("the variable FORMAT with the name of a corpus");
+    Target::named(&name)
+});
+
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    densify_fuzz::read(env!("CARGO_BIN_NAME"), bytes);
+    TARGET.accepts(bytes);
 });

@@ -8,12 +8,12 @@
 //!
 //! | extreme | tested in |
 //! |---|---|
-//! | 1 no row | selftest; `src/init/tests.rs: impossible_requests_are_errors`; `src/import/ply/tests.rs: splats_make_the_round_trip_bit_for_bit`; `policies/src/conformance/tests.rs: every_registered_policy_conforms` |
+//! | 1 no row | selftest; `src/init/tests.rs: impossible_requests_are_errors`; `src/data/models/ply/tests.rs: splats_make_the_round_trip_bit_for_bit`; `policies/src/conformance/tests.rs: every_registered_policy_conforms` |
 //! | 2 one row | selftest; `src/init/tests.rs: few_points` |
 //! | 3 duplicates | selftest; `src/init/tests.rs: duplicates_are_merged_and_counted_and_break_nothing` |
 //! | 4 a budget below the points | `src/init/tests.rs: the_budget_is_kept_by_a_seeded_subsample`; `tests/it/cli/training.rs: more_points_than_the_budget_are_subsampled_and_it_is_said`; `tests/it/cli/training.rs: a_budget_of_one_row_trains`; `tests/it/cli/faults.rs: flags_out_of_range_are_refused` |
-//! | 5 log-scales | selftest; `src/import/ply/tests.rs: damaged_rows_are_dropped_up_to_one_percent` |
-//! | 6 quaternions | selftest; `src/import/ply/tests.rs: damaged_rows_are_dropped_up_to_one_percent` |
+//! | 5 log-scales | selftest; `src/data/models/ply/tests.rs: damaged_rows_are_dropped_up_to_one_percent` |
+//! | 6 quaternions | selftest; `src/data/models/ply/tests.rs: damaged_rows_are_dropped_up_to_one_percent` |
 //! | 7 needles | selftest |
 //! | 8 the near plane | selftest |
 //! | 9 a camera inside of a row | selftest |

@@ -1,26 +1,27 @@
-//! A moment of what `cargo fuzz` does without end: the files of the corpora and damaged copies of
-//! them go through the readers, always the same ones.
+//! A short run of the fuzzer: the files of the corpora and damaged copies of them go through the readers, the same
+//! copies in every run.
 
+use std::collections::BTreeSet;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
+use densify_fixtures::corpus;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 #[path = "../fuzz/formats.rs"]
-#[expect(unreachable_pub, reason = "the fuzz targets reach it")]
+#[expect(unreachable_pub, reason = "the fuzz target uses it")]
 mod formats;
+
+use formats::targets;
 
 /// Damaged copies of each file.
 const COPIES: u64 = 150;
 
-fn folder() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fuzz")
-}
-
-/// The files of a format's corpus, by name.
-fn corpus(format: &str) -> Vec<(String, Vec<u8>)> {
-    let listing = std::fs::read_dir(folder().join("corpus").join(format)).expect("a corpus");
+/// The files of a target's corpus, by name.
+fn files(target: &str) -> Vec<(String, Vec<u8>)> {
+    let listing = std::fs::read_dir(corpus(target))
+        .unwrap_or_else(|error| panic!("tests/fuzz/corpus/{target}: {error}"));
     let mut files: Vec<_> = listing
         .map(|entry| {
             let path = entry.expect("a readable folder").path();
@@ -32,17 +33,17 @@ fn corpus(format: &str) -> Vec<(String, Vec<u8>)> {
     files
 }
 
-/// Draws that depend on nothing but their seed.
+/// A seeded random generator.
 struct Draws(ChaCha8Rng);
 
 impl Draws {
-    /// Below `bound`, and 0 where nothing is.
+    /// A number below `bound`, or 0 if `bound` is 0.
     fn below(&mut self, bound: usize) -> usize {
         self.0.random_range(0..bound.max(1))
     }
 }
 
-/// Numbers that parsers stumble over.
+/// Texts and numbers that break parsers.
 const WORDS: [&[u8]; 12] = [
     b"0",
     b"-1",
@@ -59,7 +60,7 @@ const WORDS: [&[u8]; 12] = [
 ];
 const INTEGERS: [u64; 8] = [0, 1, u64::MAX, 1 << 31, (1 << 31) - 1, 1 << 32, 1 << 62, 0x7ff8 << 48];
 
-/// One wound.
+/// Damages one place.
 fn damage(bytes: &mut Vec<u8>, draws: &mut Draws) {
     let at = draws.below(bytes.len());
     let end = (at + 1 + draws.below(16)).min(bytes.len());
@@ -99,10 +100,10 @@ fn damage(bytes: &mut Vec<u8>, draws: &mut Draws) {
 #[test]
 fn damaged_files_are_refused_or_read() {
     let mut failures = Vec::new();
-    for (format, _) in formats::FORMATS {
+    for target in targets() {
+        let target_name = target.name;
         let mut accepted = 0;
-        let mut copies = 0;
-        for (name, file) in corpus(format) {
+        for (name, file) in files(target_name) {
             for copy in 0..=COPIES {
                 let mut bytes = file.clone();
                 let mut draws = Draws(ChaCha8Rng::seed_from_u64(copy));
@@ -110,36 +111,42 @@ fn damaged_files_are_refused_or_read() {
                 for _ in 0..copy.min(1 + copy % 4) {
                     damage(&mut bytes, &mut draws);
                 }
-                let outcome = catch_unwind(AssertUnwindSafe(|| formats::read(format, &bytes)));
-                copies += u64::from(copy > 0);
-                match outcome {
-                    Ok(read) => accepted += u64::from(read && copy > 0),
+                match catch_unwind(AssertUnwindSafe(|| target.accepts(&bytes))) {
+                    Ok(accepts) if copy > 0 => accepted += u64::from(accepts),
+                    Ok(accepts) => {
+                        let is_fault = name.starts_with("fault");
+                        assert!(accepts || is_fault, "{target_name}/{name} is not accepted whole");
+                    }
                     Err(_) => {
                         let to = Path::new(env!("CARGO_TARGET_TMPDIR"));
-                        let to = to.join(format!("{format}-{name}-{copy}"));
-                        std::fs::write(&to, &bytes).expect("a folder for it");
+                        let to = to.join(format!("{target_name}-{name}-{copy}"));
+                        std::fs::write(&to, &bytes).expect("a folder for the input");
                         failures.push(to);
                     }
                 }
-                if copy == 0 && !name.starts_with("fault") {
-                    assert!(
-                        formats::read(format, &bytes),
-                        "{format}/{name} is not accepted as it is"
-                    );
-                }
             }
         }
-        assert!(copies >= COPIES, "{format} has no corpus");
-        // Always refused, the damage would stop at the first gate.
-        assert!(accepted > 0 || format == "checkpoint", "{format}: none of {copies}");
+        // If every copy were refused, damage would never get past the first check.
+        assert!(
+            accepted > 0 || target_name == "checkpoint",
+            "{target_name} accepts no damaged copy"
+        );
     }
     assert!(failures.is_empty(), "these end in a panic: {failures:#?}");
 }
 
+/// A new format fails here until it has a corpus.
 #[test]
-fn every_format_is_a_target_of_the_fuzzer() {
-    let manifest = std::fs::read_to_string(folder().join("Cargo.toml")).expect("a manifest");
-    for (format, _) in formats::FORMATS {
-        assert!(manifest.contains(&format!("name = \"{format}\"")), "{format}");
+fn every_format_has_a_corpus_and_every_corpus_a_format() {
+    let names: Vec<&str> = targets().iter().map(|target| target.name).collect();
+    let unique: BTreeSet<String> = names.iter().map(|&name| name.to_owned()).collect();
+    assert_eq!(unique.len(), names.len(), "two targets have the same name: {names:?}");
+    for &name in &names {
+        assert!(!files(name).is_empty(), "tests/fuzz/corpus/{name} is empty");
     }
+    let folders = std::fs::read_dir(corpus(".")).expect("the corpora");
+    let folders: BTreeSet<String> = folders
+        .map(|entry| entry.expect("a folder").file_name().to_string_lossy().into_owned())
+        .collect();
+    assert_eq!(folders, unique);
 }

@@ -12,7 +12,7 @@ use super::render::{RenderingArgs, refuse_options_of_a_file};
 use densify_core::files::{OutputError, write_atomically};
 use densify_core::gaussians::Gaussians;
 use densify_core::numbers::gaussians;
-use densify_data::export::{Format, find, find_by_extension, formats, is_unfit};
+use densify_data::models::{Format, export_formats, find, find_by_extension, is_unfit};
 use densify_inspect::Reference;
 use densify_run::RunConfig;
 use densify_run::failure::{Failure, INPUT};
@@ -55,7 +55,7 @@ pub(super) struct ExportArgs {
 
 fn after_help() -> String {
     let mut text = "Formats:\n".to_owned();
-    for Format { name, extension, summary, .. } in formats() {
+    for Format { name, extension, summary, .. } in export_formats() {
         let _ = writeln!(text, "  {name:14}  .{extension:14}  {summary}");
     }
     text + "
@@ -152,7 +152,7 @@ fn files(args: &ExportArgs) -> Result<Vec<(&'static Format, PathBuf)>, Failure> 
             let stem = stem(&args.model);
             let file =
                 |format: &'static Format| args.output.join(format!("{stem}.{}", format.extension));
-            Ok(formats().into_iter().map(|format| (format, file(format))).collect())
+            Ok(export_formats().into_iter().map(|format| (format, file(format))).collect())
         }
         Some(name) => {
             let format =

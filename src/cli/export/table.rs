@@ -5,6 +5,7 @@ use std::path::Path;
 
 use densify_core::files::OutputError;
 use densify_core::numbers::{grouped, percent};
+use densify_data::models::PLY;
 use densify_run::failure::Failure;
 
 /// A format that was written.
@@ -23,7 +24,7 @@ impl Line {
 
 /// A line per format.
 pub(super) fn table(lines: &[Line], rows: usize) -> String {
-    let of_ply = lines.iter().find(|line| line.name == "ply").map(|line| line.bytes);
+    let of_ply = lines.iter().find(|line| line.name == PLY.name).map(|line| line.bytes);
     let width = lines.iter().map(|line| line.name.len()).max().unwrap_or(0).max("format".len());
     let mut text = format!("\n{:width$}  {:>15}  {:>12}", "format", "bytes", "per Gaussian");
     let columns =

@@ -13,7 +13,7 @@ use tempfile::TempDir;
 use zip::ZipArchive;
 use zip::result::ZipError;
 
-use super::error::DatasetError;
+use super::DatasetError;
 use super::paths::{lexical_fault, relative};
 use super::{Dataset, LoadOptions, View};
 use densify_core::files;

@@ -10,7 +10,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
-use super::error::DatasetError;
+use super::DatasetError;
 pub use super::images::{Image8, ImageSource, SharedImage};
 
 /// Decoded images on demand. Caching changes only the time to wait, never a pixel.

@@ -3,7 +3,7 @@
 use std::fs::DirEntry;
 use std::path::PathBuf;
 
-use super::error::DatasetError;
+use super::DatasetError;
 use super::masks;
 use super::paths::{DataPath, Root, is_absolute, relative};
 use super::{LoadOptions, Resolution};

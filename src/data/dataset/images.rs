@@ -9,8 +9,8 @@ use image::error::ImageFormatHint;
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits};
 
+use super::DatasetError;
 pub use super::cache::{ImageCache, ImageDemand};
-use super::error::DatasetError;
 use super::jpeg;
 pub use super::mask::{Hides, Mask};
 use super::options::MaskMode;

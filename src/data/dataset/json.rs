@@ -4,7 +4,7 @@ use std::path::Path;
 
 use serde_json::Value;
 
-use super::error::DatasetError;
+use super::DatasetError;
 
 /// Largest file read `[bytes]`. (serde_json bounds the depth to 128.)
 const MAX: u64 = 64 << 20;

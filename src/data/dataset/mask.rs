@@ -2,7 +2,7 @@
 
 use image::DynamicImage;
 
-use super::error::DatasetError;
+use super::DatasetError;
 use super::images::{SourceFile, decode};
 use super::options::MaskMode;
 use densify_core::image::Image8;

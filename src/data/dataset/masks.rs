@@ -6,7 +6,7 @@
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
-use super::error::DatasetError;
+use super::DatasetError;
 use super::folders::{Folders, ImageFile};
 use super::paths::{DataPath, Root};
 

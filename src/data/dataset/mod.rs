@@ -8,9 +8,9 @@ mod archive;
 pub mod builtin;
 mod cache;
 mod colmap;
-mod error;
 mod exif;
 mod folders;
+mod formats;
 pub mod images;
 mod jpeg;
 mod json;
@@ -44,15 +44,16 @@ use std::sync::Arc;
 
 use glam::{DMat3, DVec3};
 
-pub use crate::import::PointCloud;
+pub use crate::error::LoadError as DatasetError;
+pub use crate::points::PointCloud;
 pub use archive::is_archive;
 pub use builtin::GroundTruth;
 use densify_core::camera::Camera;
 use densify_core::memory::Bytes;
 use densify_core::numbers::grouped;
-pub use error::DatasetError;
 pub use exif::ReportedExposures;
-use folders::Folders;
+use formats::read_scene;
+pub use formats::{DatasetFormat, formats};
 use lens::Lens;
 use masks::MaskFile;
 use normalise::Normalisation;
@@ -207,32 +208,5 @@ impl Dataset {
             self.test.len(),
             grouped(self.points.len()),
         )
-    }
-}
-
-fn read_scene(root: &Root, options: &LoadOptions) -> Result<Scene, DatasetError> {
-    let here = |name: &str| root.path().join(name).is_file();
-    let model = colmap::find(root.path());
-    if transforms::PAIR.iter().all(|name| here(name)) {
-        let mut scene = transforms::read_pair(root, &Folders::new(root, options, false)?)?;
-        if let Some(folder) = model.filter(|_| options.tracks) {
-            colmap::adopt_tracks(root, &folder, &mut scene);
-        }
-        Ok(scene)
-    } else if let Some(folder) = model {
-        colmap::read(root, &folder, &Folders::new(root, options, true)?, options.tracks)
-    } else if here(transforms::SINGLE) {
-        transforms::read(root, &Folders::new(root, options, false)?, transforms::SINGLE, false)
-    } else if let Some(file) = realitycapture::find(root)? {
-        let [inside, beside] = [true, false].map(|within| Folders::new(root, options, within));
-        realitycapture::read(root, &file, &[inside?, beside?])
-    } else {
-        Err(DatasetError(format!(
-            "{} is not a dataset: found neither transforms_train.json with transforms_test.json, nor \
-             sparse/0/cameras.bin or .txt, nor sparse/cameras.bin or .txt, nor transforms.json, nor a .csv of \
-             RealityCapture's camera parameters; name a folder or ZIP archive with a COLMAP model, transforms files or \
-             such a table",
-            root.path().display()
-        )))
     }
 }

@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use unicode_normalization::UnicodeNormalization;
 
-use super::error::DatasetError;
+use super::DatasetError;
 
 /// What separates the parts of a path: both, as paths may come from another system.
 const SEPARATORS: [char; 2] = ['/', '\\'];

@@ -6,7 +6,7 @@ use std::path::Path;
 use glam::{DMat3, DVec2};
 use rayon::prelude::*;
 
-use super::error::DatasetError;
+use super::DatasetError;
 use super::exif;
 use super::images::{self, Hides, ImageHeader, ImageSource, Mask, SourceFile};
 use super::lens::{Cut, CutFault, Lens};

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use glam::{DMat3, DVec3};
 
-use super::error::DatasetError;
+use super::DatasetError;
 use super::lens::{Lens, Plane};
 
 /// Fields of view accepted for a pinhole camera `[degrees]`.

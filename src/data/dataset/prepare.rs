@@ -5,7 +5,7 @@ use std::path::Path;
 
 use glam::DVec3;
 
-use super::error::DatasetError;
+use super::DatasetError;
 use super::masks::unused_masks_note;
 use super::normalise::{self, Normalisation};
 use super::photographs::{Photograph, photographs};

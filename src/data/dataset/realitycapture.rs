@@ -15,15 +15,16 @@ use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DVec2, DVec3};
 
-use super::error::DatasetError;
 use super::folders::Folders;
+use super::formats::DatasetFormat;
 use super::images;
 use super::lens::table::Term;
 use super::lens::{Distortion, Lens, Plane};
 use super::paths::{DataPath, Root, relative};
 use super::pose::{check_lens, checked_pose};
 use super::transforms::usual_points;
-use super::{Frame, Scene};
+use super::{DatasetError, Frame, Scene};
+use crate::points::read_points;
 use densify_core::files;
 
 /// Largest file read `[bytes]`: some 200 per photograph.
@@ -49,11 +50,23 @@ const DISTORTION: [(&str, Term); 6] = [
 const RENAMED: [(&str, &str); 4] =
     [("yaw", "heading"), ("f_35mm", "f"), ("px_norm", "px"), ("py_norm", "py")];
 
+/// The format.
+pub(super) const FORMAT: DatasetFormat = DatasetFormat {
+    name: "realitycapture",
+    file: "cameras.csv",
+    marker: "a .csv of RealityCapture's camera parameters",
+    read: |root, options| {
+        let Some(file) = find(root)? else { return Ok(None) };
+        let [inside, beside] = [true, false].map(|within| Folders::new(root, options, within));
+        read(root, &file, &[inside?, beside?]).map(Some)
+    },
+};
+
 /// The file in the dataset's folder, if there is one, whatever its name.
 ///
 /// # Errors
 /// When there are several: they may be of different scenes.
-pub(super) fn find(root: &Root) -> Result<Option<PathBuf>, DatasetError> {
+fn find(root: &Root) -> Result<Option<PathBuf>, DatasetError> {
     let is_csv = |name: &str| name.to_ascii_lowercase().ends_with(".csv");
     let entries = fs::read_dir(root.path()).into_iter().flatten().flatten();
     let names = entries.filter_map(|entry| entry.file_name().into_string().ok());
@@ -82,11 +95,7 @@ pub(super) fn find(root: &Root) -> Result<Option<PathBuf>, DatasetError> {
 ///
 /// # Errors
 /// When a line is damaged, or a camera is none.
-pub(super) fn read(
-    root: &Root,
-    path: &Path,
-    folders: &[Folders; 2],
-) -> Result<Scene, DatasetError> {
+fn read(root: &Root, path: &Path, folders: &[Folders; 2]) -> Result<Scene, DatasetError> {
     let text = files::read_text(path, MAX_BYTES).map_err(DatasetError::io(path))?;
     let mut lines = (1..).zip(text.lines()).filter(|(_, line)| !line.trim().is_empty());
     let Some(columns) = lines.find_map(|(_, line)| Columns::of(line)) else {
@@ -156,7 +165,7 @@ pub(super) fn read(
         notes.push(folders[0].fell_back_note(fell_back));
     }
     let points_file = usual_points(root, path, &mut notes)?;
-    let points = points_file.as_deref().map(crate::import::ply::read_points).transpose()?;
+    let points = points_file.as_deref().map(read_points).transpose()?;
     let (points, listing) = (points.unwrap_or_default(), path.to_owned());
     Ok(Scene { listing, frames, first_missing, points, points_file, notes, ..Scene::default() })
 }

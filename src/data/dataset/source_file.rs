@@ -4,8 +4,8 @@ use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use super::DatasetError;
 use super::archive::Unpacked;
-use super::error::DatasetError;
 use densify_core::files;
 
 /// An image file that was found within the folder it may not leave.

@@ -11,8 +11,8 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DVec2, DVec3};
 use serde_json::{Map, Value};
 
-use super::error::DatasetError;
 use super::folders::{Folders, ImageFile};
+use super::formats::DatasetFormat;
 use super::images;
 use super::json;
 use super::lens::table::{FISHEYE_FIELDS, OPENCV_FIELDS};
@@ -20,7 +20,8 @@ use super::lens::{Distortion, Lens, Plane};
 use super::masks::MaskFile;
 use super::paths::{DataPath, Root, is_absolute, relative};
 use super::pose::{check_lens, checked_pose};
-use super::{Frame, Scene};
+use super::{DatasetError, Frame, Scene, colmap};
+use crate::points::read_points;
 
 const MAX_FRAMES: usize = 1_000_000;
 const REMEDY: &str = "correct the file or export it again";
@@ -41,12 +42,42 @@ const PINHOLES: [&str; 7] = [
 const FISHEYE: &str = "OPENCV_FISHEYE";
 
 /// The pair of files that defines its own test split.
-pub(super) const PAIR: [&str; 2] = ["transforms_train.json", "transforms_test.json"];
+const PAIR: [&str; 2] = ["transforms_train.json", "transforms_test.json"];
 /// The single file.
-pub(super) const SINGLE: &str = "transforms.json";
+const SINGLE: &str = "transforms.json";
+
+/// The format with the pair of files.
+pub(super) const NERF_SYNTHETIC: DatasetFormat = DatasetFormat {
+    name: "nerf-synthetic",
+    file: PAIR[0],
+    marker: "transforms_train.json with transforms_test.json",
+    read: |root, options| {
+        if !PAIR.iter().all(|name| root.path().join(name).is_file()) {
+            return Ok(None);
+        }
+        let mut scene = read_pair(root, &Folders::new(root, options, false)?)?;
+        if let Some(folder) = colmap::find(root.path()).filter(|_| options.tracks) {
+            colmap::adopt_tracks(root, &folder, &mut scene);
+        }
+        Ok(Some(scene))
+    },
+};
+
+/// The format with the single file.
+pub(super) const NERFSTUDIO: DatasetFormat = DatasetFormat {
+    name: "transforms",
+    file: SINGLE,
+    marker: SINGLE,
+    read: |root, options| {
+        if !root.path().join(SINGLE).is_file() {
+            return Ok(None);
+        }
+        read(root, &Folders::new(root, options, false)?, SINGLE, false).map(Some)
+    },
+};
 
 /// Reads `transforms_train.json` and `transforms_test.json`.
-pub(super) fn read_pair(root: &Root, folders: &Folders) -> Result<Scene, DatasetError> {
+fn read_pair(root: &Root, folders: &Folders) -> Result<Scene, DatasetError> {
     let mut scene = read(root, folders, PAIR[0], false)?;
     let test = read(root, folders, PAIR[1], true)?;
     scene.frames.extend(test.frames);
@@ -57,12 +88,7 @@ pub(super) fn read_pair(root: &Root, folders: &Folders) -> Result<Scene, Dataset
 
 /// Reads the file `name`. Its own test split, if any, is under `test_filenames`, or under `val_filenames`
 /// if there is no other, as in nerfstudio.
-pub(super) fn read(
-    root: &Root,
-    folders: &Folders,
-    name: &str,
-    held_out: bool,
-) -> Result<Scene, DatasetError> {
+fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Scene, DatasetError> {
     let path = root.path().join(name);
     root.existing(DataPath { file: &path, field: "the file", value: name })?;
     let Value::Object(top) = json::read(&path)? else {
@@ -138,7 +164,7 @@ pub(super) fn read(
     let rest = Scene::default();
     let mut scene = Scene { frames, first_missing, notes, points_file, listing, own_split, ..rest };
     if !held_out && let Some(file) = &scene.points_file {
-        scene.points = crate::import::ply::read_points(file)?;
+        scene.points = read_points(file)?;
     }
     Ok(scene)
 }

@@ -15,7 +15,7 @@ use densify_core::memory::{Ledger, Section};
 use densify_core::pieces::ROWS_AT_A_TIME;
 use densify_data::dataset::images::ImageDemand;
 use densify_data::dataset::{Dataset, View};
-use densify_data::export::{PLY, Shape};
+use densify_data::models::{PLY, Shape};
 use densify_render::{KeptPhotographs, MomentStorage, Setup, Shortcuts, Storage};
 use densify_train::exposure::Exposures;
 use densify_train::metrics::{geometry, scratch_bytes};

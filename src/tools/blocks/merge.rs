@@ -8,7 +8,7 @@ use super::{Block, Blocks, Task, run_folder};
 use densify_core::files::{WriteError, write_atomically_from};
 use densify_core::gaussians::{Gaussians, sh_coefficients};
 use densify_core::pieces::ROWS_AT_A_TIME;
-use densify_data::export::{Format, Shape};
+use densify_data::models::{Format, Shape};
 use densify_run::failure::{Failure, OTHER};
 use densify_run::finished::{iteration, read_model};
 use densify_run::{Observer, RunConfig, Silent};
@@ -75,7 +75,7 @@ pub fn merge(
     }
     let shape = Shape { rows, sh_degree: blocks.sh_degree };
     write_atomically_from::<Failure>(output, |out| {
-        let mut writer = (format.writer)();
+        let mut writer = format.open_writer()?;
         writer.begin(shape, out)?;
         for &place in &there {
             let part = part(folder, blocks, place, &Silent).map_err(WriteError::Source)?;

@@ -10,7 +10,7 @@ use densify_core::files::{OutputError, write_atomically};
 use densify_core::gaussians::Gaussians;
 use densify_core::numbers::grouped;
 use densify_data::dataset::Dataset;
-use densify_data::export::PLY;
+use densify_data::models::PLY;
 use densify_launch::utf8;
 use densify_run::failure::Failure;
 use densify_run::finished::{iteration, read_model};

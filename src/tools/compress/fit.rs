@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use super::{Options, Target};
 use densify_core::gaussians::Gaussians;
 use densify_core::numbers::grouped;
-use densify_data::export::{Format, is_unfit};
+use densify_data::models::{Format, is_unfit};
 use densify_run::failure::{Failure, INPUT, OTHER};
 use densify_train::importance::{footprints, largest};
 
@@ -68,7 +68,7 @@ pub(super) struct Packing {
 }
 
 /// In which formats to try this model, and how many of its rows, as it is, then make a file of the target: the format
-/// that holds most, the first of equals; where it has several forms all that hold at least four fifths as many as the one
+/// that holds most, the first of equals; where it has several variants, all that hold at least four fifths as many as the one
 /// that holds most, or, where it holds all as it is, the most accurate if that does too. None where not even one row fits.
 ///
 /// # Errors
@@ -86,20 +86,20 @@ pub(super) fn packings(options: &Options<'_>, model: &Gaussians) -> Result<Vec<P
     }
     let Some((format, rows)) = best else { return unfit.map_or(Ok(Vec::new()), Err) };
     let as_it_is = Packing { format, rows, is_whole: rows == model.len() };
-    let forms = (format.writer)().forms();
-    // Without bands above 0 all forms are the same.
-    let has_one = forms.is_empty() || model.sh_degree == 0;
+    let variants = format.variants();
+    // Without bands above 0 all variants are the same.
+    let has_one = variants.is_empty() || model.sh_degree == 0;
     let Target::Bytes(most) = options.to else { return Ok(vec![as_it_is]) };
     if has_one {
         return Ok(vec![as_it_is]);
     }
     if as_it_is.is_whole {
         // Beside all rows there may be room for the most accurate colour.
-        let format = if bytes(&forms[0], model)? <= most { &forms[0] } else { format };
+        let format = if bytes(&variants[0], model)? <= most { &variants[0] } else { format };
         return Ok(vec![Packing { format, ..as_it_is }]);
     }
     let mut found: Vec<Packing> = Vec::new();
-    for format in forms {
+    for format in variants {
         let Some(rows) = self::rows(options.to, format, model)? else { continue };
         found.push(Packing { format, rows, is_whole: false });
         if rows == model.len() {

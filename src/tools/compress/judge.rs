@@ -5,7 +5,7 @@ use std::path::Path;
 use super::{Attempt, Options};
 use densify_core::gaussians::Gaussians;
 use densify_data::dataset::Dataset;
-use densify_data::export::Format;
+use densify_data::models::Format;
 use densify_data::views::ViewSource;
 use densify_run::Observer;
 use densify_run::failure::Failure;

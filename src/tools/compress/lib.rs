@@ -18,7 +18,7 @@ use tempfile::TempPath;
 use densify_core::files::{OutputError, write_atomically};
 use densify_core::gaussians::Gaussians;
 use densify_core::numbers::grouped;
-use densify_data::export::{Format, PLY};
+use densify_data::models::{Format, PLY};
 use densify_run::failure::Failure;
 use densify_run::finished::read_model;
 use densify_run::{DataSpec, DeviceSpec, Fraction, Observer};

@@ -32,7 +32,7 @@ fn colourful(rows: usize) -> Gaussians {
 }
 
 fn sog() -> &'static Format {
-    densify_data::export::find("sog").expect("a format")
+    densify_data::models::find("sog").expect("a format")
 }
 
 fn options<'a>(to: Target, scene: &'a Path, formats: &'a [&'static Format]) -> Options<'a> {
@@ -64,13 +64,13 @@ fn a_size_that_no_gaussian_fits_is_refused_before_training() {
     assert_eq!(check(one), Ok(()));
 }
 
-/// Less accurate forms take fewer bytes, so that more rows fit; those that hold fewer than four fifths of the most are no
+/// Less accurate variants take fewer bytes, so that more rows fit; those that hold fewer than four fifths of the most are no
 /// attempt; and where the format holds all as it usually is, the most accurate form is tried if it does too.
 #[test]
-fn forms_of_a_format_are_tried_that_hold_enough_rows() {
+fn variants_of_a_format_are_tried_that_hold_enough_rows() {
     let model = colourful(2_000);
-    let sizes: Vec<u64> = (sog().writer)()
-        .forms()
+    let sizes: Vec<u64> = sog()
+        .variants()
         .iter()
         .map(|form| fit::bytes(form, &model).expect("it is written"))
         .collect();
@@ -104,7 +104,7 @@ fn colours_end_as_a_file_has_them() {
     let made = Made::colmap_txt();
     let formats = [sog()];
     let options = options(Target::Rows(256), made.path(), &formats);
-    let form = &(sog().writer)().forms()[2];
+    let form = &sog().variants()[2];
     let scratch = scratch(&made.path().join("small.sog")).expect("a file");
     let start = colourful(256);
     let tuned =

@@ -6,7 +6,7 @@ use super::colour::reduced;
 use super::{Options, Target, fit};
 use densify_core::files::write_atomically;
 use densify_core::gaussians::Gaussians;
-use densify_data::export::{Format, PLY};
+use densify_data::models::{Format, PLY};
 use densify_run::failure::Failure;
 use densify_run::finished::read_model;
 use densify_run::{
@@ -35,7 +35,7 @@ pub(super) fn tune(
     after_stage: &mut dyn FnMut(&Gaussians) -> Result<(), Failure>,
 ) -> Result<Gaussians, Failure> {
     let least = if matches!(options.to, Target::Bytes(_)) { 2 } else { 1 };
-    let rounds = (format.writer)().rounds();
+    let rounds = format.is_lossy();
     let stages = stages((model.len(), rows), options.iterations, least);
     for (stage, &(mut budget, iterations)) in stages.iter().enumerate() {
         if stage > 0 {

@@ -1,7 +1,7 @@
 //! A disk that fills while a model is written: exit code 1, one message with the remedy, and nothing of the file.
 
 use assert_cmd::Command;
-use densify::data::export::formats;
+use densify::data::models::export_formats;
 use densify::train::output::model_path;
 
 use super::{Outcome, files, outcome_of, read, scratch, text, train};
@@ -35,7 +35,7 @@ fn nothing_is_left_in_any_format() {
     let (root, run) = scratch();
     train(scene.path(), &run, 20, "--budget 320 --quiet").ok();
     let before = files(root.path());
-    for format in formats() {
+    for format in export_formats() {
         let name = format!("full.{}", format.extension);
         let to = root.path().join(&name);
         let words = format!("export {} -o {} --format {}", text(&run), text(&to), format.name);

@@ -174,13 +174,13 @@ fn read(path: &Path) -> Vec<u8> {
 
 /// The Gaussians of a file.
 fn gaussians(file: &Path) -> densify::core::gaussians::Gaussians {
-    densify::data::import::read_model(file).expect("a model").gaussians
+    densify::data::models::read_model(file).expect("a model").gaussians
 }
 
 /// Writes a model as PLY.
 fn write_ply(model: &densify::core::gaussians::Gaussians, file: &Path) {
     let mut bytes = Vec::new();
-    densify::data::export::PLY.write(model, &mut bytes).expect("it is written");
+    densify::data::models::PLY.write(model, &mut bytes).expect("it is written");
     std::fs::write(file, bytes).expect("it is written");
 }
 

@@ -10,8 +10,8 @@ use std::path::Path;
 
 use glam::DVec3;
 
+use super::super::DatasetError;
 use super::super::PointCloud;
-use super::super::error::DatasetError;
 use super::super::lens::Lens;
 use super::super::lens::table::LensModel;
 use super::super::paths::MAX_NAME;

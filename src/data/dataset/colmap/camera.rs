@@ -4,7 +4,7 @@ use std::path::Path;
 
 use glam::DVec2;
 
-use super::super::error::DatasetError;
+use super::super::DatasetError;
 use super::super::lens::table::LensModel;
 use super::super::lens::{Distortion, Lens};
 use super::super::pose::check_lens;

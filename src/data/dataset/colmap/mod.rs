@@ -11,17 +11,28 @@ use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DVec3};
 
-use super::error::DatasetError;
 use super::folders::Folders;
+use super::formats::DatasetFormat;
 use super::lens::Lens;
 use super::paths::{DataPath, Root, relative};
 use super::pose::{checked_pose, checked_quaternion};
 use super::tracks::{TrackSampler, Tracks};
-use super::{Frame, PointCloud, Scene};
+use super::{DatasetError, Frame, PointCloud, Scene};
 
 const REMEDY: &str = "export the model again with COLMAP";
 /// The remedy for names of images that are not UTF-8.
 const RENAME: &str = "rename the image, and make the model again";
+
+/// The format.
+pub(super) const FORMAT: DatasetFormat = DatasetFormat {
+    name: "colmap",
+    file: "sparse/0/cameras.bin",
+    marker: "sparse/0/cameras.bin or .txt, nor sparse/cameras.bin or .txt",
+    read: |root, options| {
+        let Some(folder) = find(root.path()) else { return Ok(None) };
+        read(root, &folder, &Folders::new(root, options, true)?, options.tracks).map(Some)
+    },
+};
 
 /// Most records accepted.
 const MAX_IMAGES: u64 = 1_000_000;
@@ -77,7 +88,7 @@ pub(super) fn find(root: &Path) -> Option<PathBuf> {
 ///
 /// # Errors
 /// When a file is missing, damaged, or contradicts another.
-pub(super) fn read(
+fn read(
     root: &Root,
     folder: &Path,
     folders: &Folders,

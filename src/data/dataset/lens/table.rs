@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::{Distortion, Plane};
-use crate::dataset::error::DatasetError;
+use crate::dataset::DatasetError;
 
 /// A parameter after focal lengths and principal point.
 #[derive(Debug, Clone, Copy)]

@@ -1,0 +1,104 @@
+//! Accessors of a glTF document: arrays of numbers in its buffers, with their bounds checked.
+
+use std::path::Path;
+
+use serde::Deserialize;
+
+use super::layout::SHAPES;
+use crate::error::LoadError;
+
+/// Decodes a number from its bytes.
+type ReadNumber<'a> = Box<dyn Fn(&[u8]) -> f32 + 'a>;
+
+/// An array of numbers.
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub(super) struct Accessor {
+    buffer_view: Option<usize>,
+    #[serde(default)]
+    byte_offset: usize,
+    component_type: u32,
+    #[serde(default)]
+    normalized: bool,
+    count: usize,
+    #[serde(rename = "type")]
+    shape: String,
+    sparse: Option<serde::de::IgnoredAny>,
+}
+
+/// A part of a buffer.
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub(super) struct View {
+    buffer: usize,
+    #[serde(default)]
+    byte_offset: usize,
+    byte_length: usize,
+    byte_stride: Option<usize>,
+}
+
+/// The binary data of a document.
+pub(super) struct Buffers<'a> {
+    pub(super) path: &'a Path,
+    pub(super) accessors: &'a [Accessor],
+    pub(super) views: &'a [View],
+    pub(super) buffers: Vec<Vec<u8>>,
+}
+
+impl Buffers<'_> {
+    /// The bytes of a view.
+    pub(super) fn view(&self, index: usize) -> Result<&[u8], LoadError> {
+        let bytes = self.views.get(index).and_then(|view| {
+            let end = view.byte_offset.checked_add(view.byte_length)?;
+            self.buffers.get(view.buffer)?.get(view.byte_offset..end)
+        });
+        let problem = "it does not exist, or reaches beyond its buffer (truncated?)";
+        bytes.ok_or_else(|| LoadError::damaged(self.path, format!("bufferViews {index}"), problem))
+    }
+
+    /// The numbers of an accessor for the attribute `name`, with `width` numbers per element.
+    pub(super) fn numbers(
+        &self,
+        name: &str,
+        index: usize,
+        width: usize,
+    ) -> Result<Vec<f32>, LoadError> {
+        let wrong = |problem: &str| LoadError::damaged(self.path, name, problem);
+        let accessor =
+            self.accessors.get(index).ok_or_else(|| wrong("there is no such accessor"))?;
+        let shape = SHAPES[width];
+        if accessor.shape != shape {
+            return Err(wrong(&format!("it is not {shape}")));
+        }
+        let Some(view) = accessor.buffer_view.filter(|_| accessor.sparse.is_none()) else {
+            return Err(wrong("sparse accessors, and those without data, are not read"));
+        };
+        let bytes = self.view(view)?.get(accessor.byte_offset..).unwrap_or_default();
+        let scale = |most: f32| if accessor.normalized { 1.0 / most } else { 1.0 };
+        let (size, number): (usize, ReadNumber<'_>) = match accessor.component_type {
+            5120 => (1, Box::new(move |b| (f32::from(b[0] as i8) * scale(127.0)).max(-127.0))),
+            5121 => (1, Box::new(move |b| f32::from(b[0]) * scale(255.0))),
+            5122 => (
+                2,
+                Box::new(move |b| f32::from(i16::from_le_bytes([b[0], b[1]])) * scale(32_767.0)),
+            ),
+            5123 => (
+                2,
+                Box::new(move |b| f32::from(u16::from_le_bytes([b[0], b[1]])) * scale(65_535.0)),
+            ),
+            5126 => (4, Box::new(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]))),
+            _ => return Err(wrong("its numbers are neither floats nor bytes or shorts")),
+        };
+        let stride = self.views[view].byte_stride.unwrap_or(size * width);
+        let needed = accessor
+            .count
+            .checked_sub(1)
+            .map_or(Some(0), |others| others.checked_mul(stride)?.checked_add(size * width));
+        if stride < size * width || needed.is_none_or(|needed| needed > bytes.len()) {
+            return Err(wrong("it reaches beyond its view (truncated?)"));
+        }
+        let element = |row: usize| &bytes[row * stride..row * stride + size * width];
+        let rows = (0..accessor.count).flat_map(|row| element(row).chunks_exact(size));
+        Ok(rows.map(number).collect())
+    }
+}

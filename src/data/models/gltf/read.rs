@@ -1,0 +1,280 @@
+//! Reads glTF 2.0 with splats; every node that shows splats is placed as the scene says.
+
+use std::collections::BTreeMap;
+use std::io::Read;
+use std::path::Path;
+
+use base64::Engine as _;
+use base64::alphabet::STANDARD;
+use base64::engine::{DecodePaddingMode, GeneralPurpose, GeneralPurposeConfig};
+use serde::Deserialize;
+use serde_json::Value;
+
+use super::accessors::{Accessor, Buffers, View};
+use super::layout::{LOG_SCALE, OPACITY_LOGIT, SPLATS, coefficient};
+use super::nodes;
+use crate::error::LoadError;
+use crate::models::quantise::{log_of_scale, quantised_logit};
+use crate::models::rows::{Row, Rows, SplatFile};
+use crate::models::unpack::read_exactly;
+use crate::models::{siblings, spz};
+use densify_core::files::most_unpacked;
+use densify_core::gaussians::{Gaussians, MAX_SH_DEGREE, sh_coefficients, sigmoid};
+
+/// Base64 (RFC 4648, section 4), with or without padding.
+const BASE64: GeneralPurpose = GeneralPurpose::new(
+    &STANDARD,
+    GeneralPurposeConfig::new().with_decode_padding_mode(DecodePaddingMode::Indifferent),
+);
+
+/// The extension of splats in SPZ.
+const SPZ: &str = "KHR_gaussian_splatting_compression_spz_2";
+/// Extensions that a file may require: those of splats, and those without effect on them.
+const KNOWN: [&str; 4] = [SPLATS, SPZ, "KHR_materials_unlit", "KHR_mesh_quantization"];
+
+/// The parts of a document that splats need.
+#[derive(Default, Deserialize)]
+#[serde(rename_all = "camelCase", default)]
+struct Document {
+    extensions_required: Vec<String>,
+    buffers: Vec<BufferSource>,
+    buffer_views: Vec<View>,
+    accessors: Vec<Accessor>,
+    meshes: Vec<Mesh>,
+    nodes: Vec<nodes::Node>,
+    scenes: Vec<Scene>,
+    scene: usize,
+}
+
+#[derive(Deserialize)]
+struct BufferSource {
+    uri: Option<String>,
+}
+
+#[derive(Deserialize)]
+struct Mesh {
+    primitives: Vec<Primitive>,
+}
+
+#[derive(Deserialize)]
+struct Primitive {
+    attributes: BTreeMap<String, usize>,
+    #[serde(default)]
+    extensions: BTreeMap<String, Value>,
+}
+
+#[derive(Deserialize)]
+struct Scene {
+    #[serde(default)]
+    nodes: Vec<usize>,
+}
+
+/// Reads a `.glb` of `length` bytes.
+///
+/// # Errors
+/// When the file is unreadable or contradicts itself, requires what is not supported, or holds no splats.
+pub(super) fn read_binary(
+    path: &Path,
+    mut input: impl Read,
+    length: u64,
+) -> Result<SplatFile, LoadError> {
+    let mut words = |field: &str, count: u64| {
+        let bytes = read_exactly(path, field, &mut input, 4 * count)?;
+        Ok::<Vec<u32>, LoadError>(
+            bytes.as_chunks().0.iter().map(|&word| u32::from_le_bytes(word)).collect(),
+        )
+    };
+    let header = words("header", 5)?;
+    if header[1] != 2 || header[4] != u32::from_le_bytes(*b"JSON") {
+        return Err(LoadError::damaged(
+            path,
+            "header",
+            "it is not glTF 2.0 that begins with its JSON",
+        ));
+    }
+    let text = read_exactly(path, "JSON", &mut input, u64::from(header[3]))?;
+    let text = String::from_utf8_lossy(&text).into_owned();
+    let mut start = Vec::new();
+    (&mut input).take(8).read_to_end(&mut start).map_err(LoadError::io(path))?;
+    let inside = match start[..] {
+        [a, b, c, d, b'B', b'I', b'N', 0] => {
+            let bytes = u64::from(u32::from_le_bytes([a, b, c, d]));
+            Some(read_exactly(path, "BIN", &mut input, bytes)?)
+        }
+        _ => None,
+    };
+    read(path, &text, inside, length)
+}
+
+/// Reads a `.gltf`.
+///
+/// # Errors
+/// As [`read_binary`].
+pub(super) fn read_text(path: &Path, text: &str) -> Result<SplatFile, LoadError> {
+    read(path, text, None, text.len() as u64)
+}
+
+fn read(
+    path: &Path,
+    text: &str,
+    mut inside: Option<Vec<u8>>,
+    length: u64,
+) -> Result<SplatFile, LoadError> {
+    let document: Document =
+        serde_json::from_str(text).map_err(|error| LoadError::damaged(path, "JSON", error))?;
+    let is_unknown = |name: &&String| !KNOWN.contains(&name.as_str());
+    if let Some(name) = document.extensions_required.iter().find(is_unknown) {
+        let problem = format!("it requires {name}, which densify does not read");
+        return Err(LoadError::damaged(path, "extensionsRequired", problem));
+    }
+    let mut total = length;
+    let mut contents = Vec::new();
+    for (index, BufferSource { uri }) in document.buffers.iter().enumerate() {
+        let bytes = match uri {
+            None => inside.take().filter(|_| index == 0).unwrap_or_default(),
+            Some(uri) => buffer(path, uri)?,
+        };
+        total += bytes.len() as u64;
+        contents.push(bytes);
+    }
+    let buffers = Buffers {
+        path,
+        accessors: &document.accessors,
+        views: &document.buffer_views,
+        buffers: contents,
+    };
+    let mut found = SplatFile { gaussians: Gaussians::default(), dropped: 0, repaired: 0 };
+    let mut primitives = 0;
+    let roots = document.scenes.get(document.scene).map(|scene| scene.nodes.as_slice());
+    for (mesh, transform) in nodes::placed_meshes(path, &document.nodes, roots)? {
+        let mesh = document.meshes.get(mesh);
+        for primitive in &mesh
+            .ok_or_else(|| LoadError::damaged(path, "nodes", "there is no such mesh"))?
+            .primitives
+        {
+            let Some(extension) = primitive.extensions.get(SPLATS) else { continue };
+            primitives += 1;
+            let mut part = splats(&buffers, primitive, extension)?;
+            transform.apply(&mut part.gaussians);
+            join(&mut found, part);
+            // Many nodes may show the same data.
+            let bytes =
+                4 * (11 + found.gaussians.sh.len() as u64 + 11 * found.gaussians.len() as u64);
+            if bytes > most_unpacked(total) {
+                let problem = "they show more splats than a file of this size can hold";
+                return Err(LoadError::damaged(path, "nodes", problem));
+            }
+        }
+    }
+    if primitives == 0 {
+        return Err(LoadError(format!(
+            "{} holds no Gaussian splats ({SPLATS}); a mesh is rendered by `densify scenegen`",
+            path.display()
+        )));
+    }
+    Ok(found)
+}
+
+/// The bytes of a buffer outside the binary chunk.
+fn buffer(path: &Path, uri: &str) -> Result<Vec<u8>, LoadError> {
+    if let Some(data) = uri.strip_prefix("data:") {
+        let bytes = data.split_once(";base64,").and_then(|(_, text)| BASE64.decode(text).ok());
+        return bytes.ok_or_else(|| LoadError::damaged(path, "buffers", "data that is not base64"));
+    }
+    let mut bytes = Vec::new();
+    let mut file = siblings::open(path, "buffers", uri)?;
+    file.read_to_end(&mut bytes).map_err(LoadError::io(path))?;
+    Ok(bytes)
+}
+
+/// The splats of a primitive, before the transform of its node.
+fn splats(
+    buffers: &Buffers<'_>,
+    primitive: &Primitive,
+    extension: &Value,
+) -> Result<SplatFile, LoadError> {
+    let path = buffers.path;
+    if let Some(view) = extension.pointer(&format!("/extensions/{SPZ}/bufferView")) {
+        let view = view.as_u64().and_then(|view| usize::try_from(view).ok());
+        let bytes = buffers.view(view.unwrap_or(usize::MAX))?;
+        return spz::read::read(path, bytes, bytes.len() as u64);
+    }
+    let stated = |key: &str| extension.get(key).and_then(Value::as_str).unwrap_or_default();
+    if !matches!(stated("kernel"), "ellipse" | "") || stated("colorSpace") == "lin_rec709_display" {
+        let problem = format!(
+            "the kernel {:?} with colours in {:?}; only ellipses with sRGB colours are read",
+            stated("kernel"),
+            stated("colorSpace")
+        );
+        return Err(LoadError::damaged(path, SPLATS, problem));
+    }
+    let attribute = |name: &str, width: usize| match primitive.attributes.get(name) {
+        None => Ok(None),
+        Some(&accessor) => buffers.numbers(name, accessor, width).map(Some),
+    };
+    let needed = |name: &str, width: usize| {
+        let name = if name == "POSITION" { name.to_owned() } else { format!("{SPLATS}:{name}") };
+        let missing = || LoadError::damaged(path, "attributes", format!("there is no {name}"));
+        attribute(&name, width)?.ok_or_else(missing)
+    };
+    let (means, quats) = (needed("POSITION", 3)?, needed("ROTATION", 4)?);
+    let (scales, opacities) = (needed("SCALE", 3)?, needed("OPACITY", 1)?);
+    let (log_scales, logits) = (attribute(LOG_SCALE, 3)?, attribute(OPACITY_LOGIT, 1)?);
+    let has = |degree: &u8| primitive.attributes.contains_key(&coefficient(*degree, 0));
+    let sh_degree = (0..=MAX_SH_DEGREE).take_while(|degree| *degree == 0 || has(degree)).last();
+    let sh_degree = sh_degree.unwrap_or(0);
+    let mut bands = Vec::new();
+    for degree in 0..=sh_degree {
+        for n in 0..=2 * degree {
+            let name = coefficient(degree, n);
+            let found = attribute(&name, 3)?;
+            bands.push(found.ok_or_else(|| {
+                LoadError::damaged(path, "attributes", format!("there is no {name}"))
+            })?);
+        }
+    }
+    let count = opacities.len();
+    let others = [&means, &scales].into_iter().chain(&bands).chain(&log_scales);
+    if quats.len() != 4 * count
+        || logits.as_ref().is_some_and(|logits| logits.len() != count)
+        || others.into_iter().any(|values| values.len() != 3 * count)
+    {
+        return Err(LoadError::damaged(path, "attributes", "they have different counts"));
+    }
+    let mut rows = Rows::new(sh_degree);
+    let mut sh = Vec::with_capacity(3 * sh_coefficients(sh_degree));
+    for row in 0..count {
+        let three = |values: &[f32]| [values[3 * row], values[3 * row + 1], values[3 * row + 2]];
+        sh.clear();
+        sh.extend(bands.iter().flat_map(|band| three(band)));
+        let (scale, opacity) = (three(&scales), opacities[row]);
+        // If another program has changed the standard's values, densify's own are stale.
+        let log_scale = log_scales.as_ref().map(|logs| three(logs));
+        let logit = logits.as_ref().map(|logits| logits[row]);
+        let fits = |log: &[f32; 3]| log.map(|x| x.exp().to_bits()) == scale.map(f32::to_bits);
+        rows.push(Row {
+            mean: three(&means),
+            log_scale: log_scale.filter(fits).unwrap_or_else(|| scale.map(log_of_scale)),
+            quat: [quats[4 * row + 3], quats[4 * row], quats[4 * row + 1], quats[4 * row + 2]],
+            opacity_logit: match logit
+                .filter(|&logit| sigmoid(logit).to_bits() == opacity.to_bits())
+            {
+                Some(logit) => logit,
+                None => quantised_logit(opacity),
+            },
+            sh: &sh,
+        });
+    }
+    rows.finish(path)
+}
+
+/// Appends a part; the result has the higher of both degrees.
+fn join(whole: &mut SplatFile, part: SplatFile) {
+    let degree = whole.gaussians.sh_degree.max(part.gaussians.sh_degree);
+    let more = part.gaussians.with_degree(degree);
+    let all = std::mem::take(&mut whole.gaussians).with_degree(degree);
+    whole.gaussians = all;
+    whole.gaussians.append(more);
+    whole.dropped += part.dropped;
+    whole.repaired += part.repaired;
+}

@@ -1,0 +1,63 @@
+//! Reads a splat PLY by any program that keeps the original property names.
+
+use std::path::Path;
+
+use super::layout::{properties, sh_degree};
+use crate::error::LoadError;
+use crate::models::rows::{Row, Rows, SplatFile};
+use crate::ply::Ply;
+use densify_core::gaussians::sh_coefficients;
+
+const REMEDY: &str = "a splat PLY needs x y z, f_dc_0..2, opacity, scale_0..2 and rot_0..3 \
+                      (a point cloud is not a splat file)";
+
+/// Reads a splat PLY.
+///
+/// # Errors
+/// When the file is unreadable or contradicts itself, a property is missing (as in the compressed
+/// layout), or more than 1 % of the Gaussians are not finite.
+pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
+    let mut ply = Ply::open(path)?;
+    let vertices = ply.element("vertex")?;
+    let sh_degree = sh_degree(&vertices).map_err(|rest| {
+        let problem = format!("there are {rest} of them, but degrees 0 to 3 have 0, 9, 24 or 45");
+        LoadError::damaged(path, "f_rest_*", problem)
+    })?;
+    let rest = 3 * (sh_coefficients(sh_degree) - 1);
+    let columns = properties(sh_degree)
+        .map(|name| vertices.column(path, &name, REMEDY))
+        .collect::<Result<Vec<_>, _>>()?;
+
+    let mut rows = Rows::new(sh_degree);
+    let mut values = vec![0f32; columns.len()];
+    let mut sh = Vec::with_capacity(3 + rest);
+    ply.each_row(&vertices, &columns, |row| {
+        for (value, &wide) in values.iter_mut().zip(row) {
+            *value = wide as f32;
+        }
+        push(&mut rows, &values, &mut sh, rest);
+    })?;
+    rows.finish(path)
+}
+
+/// Adds a Gaussian with these [`properties`]. `sh` is scratch.
+fn push(rows: &mut Rows, values: &[f32], sh: &mut Vec<f32>, rest: usize) {
+    let (position, values) = values.split_at(3);
+    let (dc, values) = values.split_at(3);
+    let (bands, values) = values.split_at(rest);
+    let &[opacity_logit, s0, s1, s2, w, x, y, z] = values else {
+        unreachable!("a row of the layout ends with 8 values, not {}", values.len())
+    };
+    sh.clear();
+    sh.extend_from_slice(dc);
+    for k in 0..rest / 3 {
+        sh.extend([0, 1, 2].map(|channel| bands[channel * (rest / 3) + k]));
+    }
+    rows.push(Row {
+        mean: [position[0], position[1], position[2]],
+        log_scale: [s0, s1, s2],
+        quat: [w, x, y, z],
+        opacity_logit,
+        sh,
+    });
+}

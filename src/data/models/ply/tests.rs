@@ -1,0 +1,184 @@
+//! Round trips, layouts of other programs, damaged files.
+
+use std::path::{Path, PathBuf};
+
+use super::read::read;
+use crate::models::PLY;
+use crate::models::tests::model;
+use crate::points::read_points;
+use densify_core::gaussians::Gaussians;
+
+fn saved(contents: impl AsRef<[u8]>) -> (tempfile::TempDir, PathBuf) {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("file.ply");
+    std::fs::write(&path, contents).unwrap();
+    (folder, path)
+}
+
+fn written(model: &Gaussians) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    PLY.write(model, &mut bytes).unwrap();
+    bytes
+}
+
+#[test]
+fn splats_make_the_round_trip_bit_for_bit() {
+    for degree in 0..=3 {
+        for rows in [0, 1, 255, 256, 700] {
+            let mut model = model(rows, degree);
+            if rows > 0 {
+                model.means[0] = [-0.0, f32::MIN_POSITIVE / 4.0, f32::MAX];
+            }
+            let bytes = written(&model);
+            let (_folder, path) = saved(&bytes);
+            let found = read(&path).unwrap();
+            assert_eq!((found.dropped, found.repaired), (0, 0));
+            assert_eq!(found.gaussians, model, "degree {degree}, {rows} rows");
+            // Bits too: −0 equals 0.
+            assert_eq!(written(&found.gaussians), bytes);
+        }
+    }
+}
+
+/// The same splat in ascii and big endian, properties shuffled, of other types, with others
+/// and a list between, behind another element.
+#[test]
+fn other_layouts_read_the_same() {
+    let properties = "property double rot_3\nproperty double rot_0\nproperty list uchar short extra\nproperty double rot_1\n\
+        property double rot_2\nproperty int x\nproperty float label\nproperty double y\nproperty double z\nproperty double opacity\n\
+        property double scale_2\nproperty double scale_1\nproperty double scale_0\nproperty double f_dc_2\n\
+        property double f_dc_1\nproperty double f_dc_0\nend_header\n";
+    let head = |format| {
+        format!(
+            "ply\nformat {format} 1.0\ncomment x\nelement other 2\nproperty list int float l\nelement vertex 1\n{properties}"
+        )
+    };
+    let row =
+        [0.5, 1.0, 0.25, 0.125, 7.0, 9.0, 2.5, 3.5, -1.5, 0.3125, 0.75, 0.625, -2.0, -3.0, -4.0];
+    let ascii = head("ascii")
+        + "2 1 2\n0\n0.5 1 3 5 6 7 0.25\n0.125 7 9 2.5 3.5 -1.5 0.3125 .75 6.25e-1 -2 -3 -4";
+    let mut binary = head("binary_big_endian").into_bytes();
+    binary.extend(2i32.to_be_bytes());
+    binary.extend([0; 8]);
+    binary.extend(0i32.to_be_bytes());
+    for (index, value) in row.iter().enumerate() {
+        match index {
+            4 => binary.extend(7i32.to_be_bytes()),
+            5 => binary.extend(9f32.to_be_bytes()),
+            _ => binary.extend(f64::to_be_bytes(*value)),
+        }
+        if index == 1 {
+            binary.extend([3, 0, 5, 0, 6, 0, 7]);
+        }
+    }
+    for bytes in [ascii.into_bytes(), binary] {
+        let (_folder, path) = saved(bytes);
+        let found = read(&path).unwrap().gaussians;
+        assert_eq!(found.means, [[7.0, 2.5, 3.5]]);
+        assert_eq!(found.quats, [[1.0, 0.25, 0.125, 0.5]]);
+        assert_eq!(found.opacity_logits, [-1.5]);
+        assert_eq!(found.log_scales, [[0.625, 0.75, 0.3125]]);
+        assert_eq!((found.sh_degree, found.sh), (0, vec![-4.0, -3.0, -2.0]));
+    }
+}
+
+#[test]
+fn damaged_rows_are_dropped_up_to_one_percent() {
+    let mut few = model(200, 1);
+    few.means[3][1] = f32::NAN;
+    few.sh[5 * 12 + 4] = f32::INFINITY;
+    few.quats[9] = [0.0; 4];
+    let (_folder, path) = saved(written(&few));
+    let found = read(&path).unwrap();
+    assert_eq!((found.dropped, found.repaired, found.gaussians.len()), (2, 1, 198));
+    assert_eq!(found.gaussians.sh_of(3), few.sh_of(4));
+    assert_eq!(found.gaussians.quats[7], [1.0, 0.0, 0.0, 0.0]);
+    few.opacity_logits[20] = f32::NAN;
+    let (_folder, path) = saved(written(&few));
+    let message = read(&path).unwrap_err().to_string();
+    assert!(message.contains("3 of 200") && message.contains("file.ply"), "{message}");
+}
+
+/// Some programs write the logarithm of 0, and the logits of 0 and 1.
+#[test]
+fn infinite_opacities_and_flat_gaussians_are_read() {
+    let mut model = model(10, 0);
+    (model.opacity_logits[0], model.opacity_logits[1]) = (f32::INFINITY, f32::NEG_INFINITY);
+    model.log_scales[2][1] = f32::NEG_INFINITY;
+    let (_folder, path) = saved(written(&model));
+    let found = read(&path).unwrap();
+    assert_eq!((found.dropped, found.gaussians.len()), (0, 10));
+    let [opaque, transparent, other, ..] = found.gaussians.opacity_logits[..] else {
+        panic!("ten")
+    };
+    assert!((13.0..20.0).contains(&opaque) && (-20.0..-13.0).contains(&transparent));
+    assert!(other.to_bits() == model.opacity_logits[2].to_bits());
+    assert!(found.gaussians.log_scales[2][1].to_bits() == (-20f32).to_bits());
+}
+
+#[test]
+fn other_ply_files_are_refused_with_the_reason() {
+    let good = String::from_utf8_lossy(&written(&model(1, 0))).into_owned();
+    let header = |from: &str, to: &str| {
+        assert!(good.contains(from));
+        good.replacen(from, to, 1)
+    };
+    for (case, contents, words) in [
+        ("points", header("property float opacity\n", ""), &["opacity", "point cloud"][..]),
+        ("2-D splats", header("property float scale_2\n", ""), &["scale_2"]),
+        (
+            "degree",
+            header("property float opacity\n", "property float f_rest_0\nproperty float opacity\n"),
+            &["f_rest_*", "9, 24 or 45"],
+        ),
+        ("count", header("vertex 1\n", "vertex 2\n"), &["element vertex", "2 rows"]),
+        ("absurd count", header("vertex 1\n", "vertex 99999999999999999999\n"), &["line 3"]),
+        ("large count", header("vertex 1\n", "vertex 4000000000\n"), &["element vertex"]),
+        ("negative count", header("vertex 1\n", "vertex -1\n"), &["line 3"]),
+        ("no vertices", header("element vertex", "element face"), &["no element \"vertex\""]),
+        ("not PLY", "obj\n".into(), &["not a PLY file"]),
+        ("empty", String::new(), &["header"]),
+        ("endless", "ply\n".to_owned() + &"comment\n".repeat(200_000), &["1 MiB"]),
+    ] {
+        let (_folder, path) = saved(contents);
+        let message = read(&path).unwrap_err().to_string();
+        for word in words.iter().chain(&["file.ply"]) {
+            assert!(message.contains(word), "{case}: {word:?} is not in: {message}");
+        }
+    }
+    let message = read(Path::new("/none/x.ply")).unwrap_err().to_string();
+    assert!(message.contains("cannot read /none/x.ply"), "{message}");
+}
+
+/// Cut or damaged anywhere: an error or a model, never a panic or a huge allocation.
+#[test]
+fn damaged_files_never_panic() {
+    let whole = written(&model(3, 1));
+    for at in 0..whole.len() {
+        let (_folder, path) = saved(&whole[..at]);
+        assert!(read(&path).is_err(), "cut at {at}");
+        let mut damaged = whole.clone();
+        damaged[at] ^= 0x95;
+        let (_folder, path) = saved(damaged);
+        let _ = (read(&path), read_points(&path));
+    }
+}
+
+#[test]
+#[ignore = "needs files of other programs: set DENSIFY_SHARED"]
+fn shared_splats_of_other_programs_load() {
+    for path in densify_fixtures::shared_files("splats", "ply") {
+        if path.to_string_lossy().contains("compressed") {
+            let message = read(&path).unwrap_err().to_string();
+            assert!(message.contains("no property x"), "{message}");
+            continue;
+        }
+        let file = read(&path).unwrap_or_else(|e| panic!("{e}"));
+        assert!(file.gaussians.len() >= 3 && file.dropped == 0, "{}", path.display());
+        if path.ends_with("train-1000.ply") {
+            assert_eq!((file.gaussians.len(), file.gaussians.sh_degree), (1000, 3));
+            // The original's layout: ours, byte for byte.
+            assert!(written(&file.gaussians) == std::fs::read(&path).unwrap());
+        }
+    }
+}

@@ -1,0 +1,68 @@
+//! Writes the layout of the original trainer; values are copied bit for bit.
+
+use std::io::{self, Write};
+
+use super::layout::{NORMALS_AT, properties};
+use crate::models::{ModelWriter, Shape};
+use densify_core::gaussians::{Gaussians, sh_coefficients};
+
+/// Gaussians per write.
+const CHUNK: usize = 256;
+
+/// Holds one chunk at a time.
+pub(super) struct PlyWriter;
+
+/// Size of a Gaussian: position, normal, opacity, scales, rotation and colours `[bytes]`.
+const fn row_bytes(sh_degree: u8) -> usize {
+    size_of::<f32>() * (14 + 3 * sh_coefficients(sh_degree))
+}
+
+impl ModelWriter for PlyWriter {
+    fn held_bytes(&self, Shape { rows, sh_degree }: Shape) -> u64 {
+        (rows.min(CHUNK) * row_bytes(sh_degree)) as u64
+    }
+
+    fn is_lossy(&self) -> bool {
+        false
+    }
+
+    fn begin(&mut self, Shape { rows, sh_degree }: Shape, out: &mut dyn Write) -> io::Result<()> {
+        let mut header = format!("ply\nformat binary_little_endian 1.0\nelement vertex {rows}\n");
+        for (index, name) in properties(sh_degree).enumerate() {
+            if index == NORMALS_AT {
+                for normal in ["nx", "ny", "nz"] {
+                    header += &format!("property float {normal}\n");
+                }
+            }
+            header += &format!("property float {name}\n");
+        }
+        header += "end_header\n";
+        out.write_all(header.as_bytes())
+    }
+
+    fn rows(&mut self, rows: &Gaussians, out: &mut dyn Write) -> io::Result<()> {
+        let mut chunk = Vec::with_capacity(rows.len().min(CHUNK) * row_bytes(rows.sh_degree));
+        for row in 0..rows.len() {
+            let mut put = |value: f32| chunk.extend_from_slice(&value.to_le_bytes());
+            let sh = rows.sh_of(row);
+            rows.means[row].into_iter().for_each(&mut put);
+            [0.0; 3].into_iter().for_each(&mut put);
+            sh[..3].iter().copied().for_each(&mut put);
+            for channel in 0..3 {
+                sh[3..].iter().skip(channel).step_by(3).copied().for_each(&mut put);
+            }
+            put(rows.opacity_logits[row]);
+            rows.log_scales[row].into_iter().for_each(&mut put);
+            rows.quats[row].into_iter().for_each(&mut put);
+            if row % CHUNK == CHUNK - 1 {
+                out.write_all(&chunk)?;
+                chunk.clear();
+            }
+        }
+        out.write_all(&chunk)
+    }
+
+    fn finish(&mut self, _out: &mut dyn Write) -> io::Result<()> {
+        Ok(())
+    }
+}

@@ -1,0 +1,13 @@
+//! `meta.json` lists the images. Positions are 16 bits between bounds of sign(x)·ln(1 + |x|), in two images. Scales,
+//! colours and coefficients are bytes that index codebooks of 256 numbers each. The bands above 0 are an index into a
+//! palette, whose image has 64 entries in a row. A quaternion is its three smaller components, and the index of the
+//! largest in the alpha channel.
+
+/// The file that describes the images.
+pub(super) const META: &str = "meta.json";
+/// Entries of the palette in a row of its image.
+pub(super) const PALETTE_WIDTH: usize = 64;
+/// Numbers in a codebook.
+pub(super) const CODEBOOK: usize = 256;
+/// Alpha of a quaternion whose first component is the largest; the next values name the other components.
+pub(super) const FIRST_LARGEST: u8 = 252;

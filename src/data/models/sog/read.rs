@@ -1,0 +1,213 @@
+//! Reads SOG from an archive or a folder.
+
+use std::io::{Cursor, Read};
+use std::path::Path;
+
+use image::{ImageDecoder, ImageFormat, ImageReader};
+use serde::Deserialize;
+
+use super::layout::{CODEBOOK, FIRST_LARGEST, META, PALETTE_WIDTH};
+use crate::error::LoadError;
+use crate::models::quantise::{from_smallest_three, quantised_logit};
+use crate::models::rows::{Row, Rows, SplatFile};
+use crate::models::zip::ZipReader;
+use crate::models::{ModelFile, siblings};
+use densify_core::files::most_unpacked;
+use densify_core::gaussians::sh_coefficients;
+
+/// The parts of `meta.json` that are needed.
+#[derive(Deserialize)]
+struct Meta {
+    version: Option<u32>,
+    #[serde(default)]
+    count: u64,
+    means: Quantity,
+    scales: Quantity,
+    quats: Quantity,
+    sh0: Quantity,
+    #[serde(rename = "shN")]
+    bands: Option<Quantity>,
+}
+
+/// One quantity: its images, and the meaning of their bytes.
+#[derive(Deserialize)]
+struct Quantity {
+    files: Vec<String>,
+    #[serde(default)]
+    mins: Vec<f32>,
+    #[serde(default)]
+    maxs: Vec<f32>,
+    #[serde(default)]
+    codebook: Vec<f32>,
+    #[serde(default)]
+    bands: u8,
+    #[serde(default)]
+    count: usize,
+}
+
+/// A decoded image. Shape of `rgba`: `[height, width, 4]`.
+struct Picture {
+    width: usize,
+    rgba: Vec<u8>,
+}
+
+/// Returns the bytes of an image by its name.
+type OpenImage<'a> = &'a mut dyn FnMut(&str) -> Result<Vec<u8>, LoadError>;
+
+/// True if a JSON text describes a model in this format, of any version.
+pub(super) fn is_meta(text: &str) -> bool {
+    let found: Option<serde_json::Map<String, serde_json::Value>> = serde_json::from_str(text).ok();
+    found.is_some_and(|keys| ["means", "quats"].iter().all(|key| keys.contains_key(*key)))
+}
+
+/// Reads an archive, or the images beside `meta.json`.
+///
+/// # Errors
+/// When the archive or an image is unreadable or damaged, contradicts `meta.json`, or its name leads out of the folder.
+pub(super) fn read(file: ModelFile<'_>) -> Result<SplatFile, LoadError> {
+    let path = file.path;
+    if let Some(text) = file.json()? {
+        return read_images(path, text, 0, &mut |name| {
+            let mut bytes = Vec::new();
+            let image = siblings::open(path, "files", name)?;
+            // No image within the limits is larger.
+            image.take(most_unpacked(0)).read_to_end(&mut bytes).map_err(LoadError::io(path))?;
+            Ok(bytes)
+        });
+    }
+    let mut archive = ZipReader::open(path, file.input, file.length)?;
+    let text = archive.read(META)?;
+    let text = String::from_utf8_lossy(&text).into_owned();
+    read_images(path, &text, file.length, &mut |name| archive.read(name))
+}
+
+fn read_images(
+    path: &Path,
+    text: &str,
+    length: u64,
+    open: OpenImage<'_>,
+) -> Result<SplatFile, LoadError> {
+    let meta: Meta =
+        serde_json::from_str(text).map_err(|error| LoadError::damaged(path, META, error))?;
+    if meta.version != Some(2) {
+        let version = meta.version.map_or_else(|| "1 (it names none)".into(), |v| v.to_string());
+        let problem = format!("version {version}, but densify reads 2");
+        return Err(LoadError::damaged(path, META, problem));
+    }
+    let mut picture = |quantity: &Quantity, index: usize, field: &str| {
+        let name = quantity.files.get(index);
+        let name = name.ok_or_else(|| LoadError::damaged(path, field, "it names too few files"))?;
+        decode(path, name, &open(name)?, length)
+    };
+    let mut image_of = |quantity: &Quantity, index: usize, field: &str| {
+        let found = picture(quantity, index, field)?;
+        if (found.rgba.len() as u64) / 4 < meta.count {
+            let problem = format!("{} pixels for {} Gaussians", found.rgba.len() / 4, meta.count);
+            return Err(LoadError::damaged(path, field, problem));
+        }
+        Ok(found.rgba)
+    };
+    let (low, high) = (image_of(&meta.means, 0, "means")?, image_of(&meta.means, 1, "means")?);
+    let quats = image_of(&meta.quats, 0, "quats")?;
+    let scales = image_of(&meta.scales, 0, "scales")?;
+    let colours = image_of(&meta.sh0, 0, "sh0")?;
+    let labels = match &meta.bands {
+        None => Vec::new(),
+        Some(bands) => image_of(bands, 1, "shN")?,
+    };
+    let palette = meta.bands.as_ref().map(|bands| picture(bands, 0, "shN")).transpose()?;
+    let sh_degree = meta.bands.as_ref().map_or(0, |bands| bands.bands);
+    if sh_degree > 3 || (meta.bands.is_some() && sh_degree == 0) {
+        return Err(LoadError::damaged(
+            path,
+            "shN",
+            format!("{sh_degree} bands, but 1 to 3 are possible"),
+        ));
+    }
+    let coefficients = sh_coefficients(sh_degree) - 1;
+    if palette.as_ref().is_some_and(|p| p.width < PALETTE_WIDTH * coefficients) {
+        return Err(LoadError::damaged(
+            path,
+            "shN",
+            "the image of the palette is too narrow for its degree",
+        ));
+    }
+    let ([Some(mins), Some(maxs)], [scale_book, colour_book]) = (
+        [&meta.means.mins, &meta.means.maxs].map(|all| all.first_chunk::<3>()),
+        [&meta.scales, &meta.sh0].map(|all| book(&all.codebook)),
+    ) else {
+        return Err(LoadError::damaged(path, "means", "mins and maxs have fewer than 3 numbers"));
+    };
+    let band_book = book(meta.bands.as_ref().map_or(&[], |bands| &bands.codebook));
+
+    let mut rows = Rows::new(sh_degree);
+    let mut sh = vec![0.0; 3 * (coefficients + 1)];
+    for pixel in (0..meta.count as usize).map(|row| 4 * row) {
+        let three =
+            |bytes: &[u8]| [bytes[pixel], bytes[pixel + 1], bytes[pixel + 2]].map(usize::from);
+        let (low, high) = (three(&low), three(&high));
+        sh[..3].copy_from_slice(&three(&colours).map(|byte| colour_book[byte]));
+        if let (Some(palette), Some(bands)) = (&palette, &meta.bands) {
+            let label = usize::from(labels[pixel]) | usize::from(labels[pixel + 1]) << 8;
+            let start =
+                label / PALETTE_WIDTH * palette.width + label % PALETTE_WIDTH * coefficients;
+            let entry = palette.rgba.get(4 * start..4 * (start + coefficients));
+            match entry.filter(|_| bands.count == 0 || label < bands.count) {
+                // Without an entry the colour is the same from every direction.
+                None => sh[3..].fill(0.0),
+                Some(entry) => {
+                    let bytes = entry.as_chunks::<4>().0.iter().flat_map(|rgba| &rgba[..3]);
+                    for (value, &byte) in sh[3..].iter_mut().zip(bytes) {
+                        *value = band_book[usize::from(byte)];
+                    }
+                }
+            }
+        }
+        rows.push(Row {
+            mean: std::array::from_fn(|i| {
+                let share = (low[i] | high[i] << 8) as f32 / 65_535.0;
+                let log = mins[i] + (maxs[i] - mins[i]) * share;
+                log.abs().exp_m1().copysign(log)
+            }),
+            log_scale: three(&scales).map(|byte| scale_book[byte]),
+            quat: quaternion(three(&quats), quats[pixel + 3]),
+            opacity_logit: quantised_logit(f32::from(colours[pixel + 3]) / 255.0),
+            sh: &sh,
+        });
+    }
+    rows.finish(path)
+}
+
+/// A full codebook; bytes beyond the file's own numbers decode to NaN.
+fn book(numbers: &[f32]) -> Vec<f32> {
+    let mut book = numbers.to_vec();
+    book.resize(CODEBOOK, f32::NAN);
+    book
+}
+
+/// Decodes three components from −1/√2 to 1/√2 in the order (w, x, y, z), without the largest, which `alpha` names.
+fn quaternion(bytes: [usize; 3], alpha: u8) -> [f32; 4] {
+    let Some(largest) = alpha.checked_sub(FIRST_LARGEST).map(usize::from) else {
+        return [1.0, 0.0, 0.0, 0.0];
+    };
+    let small = bytes.map(|v| (v as f32 / 127.5 - 1.0) * std::f32::consts::FRAC_1_SQRT_2);
+    from_smallest_three(largest, small)
+}
+
+/// Decodes a WebP or PNG after checking its size.
+fn decode(path: &Path, name: &str, bytes: &[u8], length: u64) -> Result<Picture, LoadError> {
+    let bad = |problem: String| LoadError::damaged(path, name, problem);
+    let reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format();
+    let reader = reader.map_err(|error| bad(error.to_string()))?;
+    if !matches!(reader.format(), Some(ImageFormat::WebP | ImageFormat::Png)) {
+        return Err(bad("it is neither WebP nor PNG".into()));
+    }
+    let decoder = reader.into_decoder().map_err(|error| bad(error.to_string()))?;
+    let (width, height) = decoder.dimensions();
+    let limit = most_unpacked(length.max(bytes.len() as u64));
+    if 4 * u64::from(width) * u64::from(height) > limit || decoder.total_bytes() > limit {
+        return Err(bad(format!("{width}×{height} pixels are too many for a file of its size")));
+    }
+    let decoded = image::DynamicImage::from_decoder(decoder).map_err(|e| bad(e.to_string()))?;
+    Ok(Picture { width: width as usize, rgba: decoded.into_rgba8().into_raw() })
+}

@@ -1,0 +1,195 @@
+//! The registry, the calls to a writer, the PLY layout, round trips through every format, and files of other programs.
+
+#![allow(clippy::float_cmp, reason = "results are exact")]
+
+mod reading;
+mod round_trips;
+
+use std::io::{self, Write};
+use std::ops::Range;
+
+use super::*;
+use densify_core::files::OutputError;
+use densify_core::gaussians::Gaussians;
+use densify_core::gaussians::sh_coefficients;
+
+/// A model whose values all differ, so that a swapped column shows, with odd bits, so that a
+/// conversion shows.
+pub(crate) fn model(rows: usize, sh_degree: u8) -> Gaussians {
+    let mut next = 0u32;
+    let mut value = || {
+        next += 1;
+        f32::from_bits(0x3e80_0001 ^ ((next * 7919) & 0x007f_ffff) ^ ((next % 2) << 31))
+    };
+    let mut model = Gaussians { sh_degree, ..Gaussians::default() };
+    for _ in 0..rows {
+        model.means.push([value(), value(), value()]);
+        model.log_scales.push([value(), value(), value()]);
+        model.quats.push([value(), value(), value(), value()]);
+        model.opacity_logits.push(value());
+        model.sh.extend((0..3 * sh_coefficients(sh_degree)).map(|_| value()));
+    }
+    model
+}
+
+fn piece(whole: &Gaussians, rows: Range<usize>) -> Gaussians {
+    let sh = 3 * sh_coefficients(whole.sh_degree);
+    Gaussians {
+        sh_degree: whole.sh_degree,
+        means: whole.means[rows.clone()].to_vec(),
+        log_scales: whole.log_scales[rows.clone()].to_vec(),
+        quats: whole.quats[rows.clone()].to_vec(),
+        opacity_logits: whole.opacity_logits[rows.clone()].to_vec(),
+        sh: whole.sh[sh * rows.start..sh * rows.end].to_vec(),
+    }
+}
+
+/// A format that any crate could add; it writes how it was called.
+struct CallLog;
+
+inventory::submit! {
+    Format {
+        name: "call-log",
+        extension: "log.txt",
+        summary: "for tests",
+        reader: None,
+        writer: Some(|| Box::new(CallLog)),
+        compress_rank: None,
+    }
+}
+
+impl ModelWriter for CallLog {
+    fn held_bytes(&self, shape: Shape) -> u64 {
+        shape.rows as u64
+    }
+
+    fn begin(&mut self, Shape { rows, sh_degree }: Shape, out: &mut dyn Write) -> io::Result<()> {
+        write!(out, "begin {rows} {sh_degree};")
+    }
+
+    fn rows(&mut self, rows: &Gaussians, out: &mut dyn Write) -> io::Result<()> {
+        write!(out, "{};", rows.len())
+    }
+
+    fn finish(&mut self, out: &mut dyn Write) -> io::Result<()> {
+        write!(out, "finish")
+    }
+}
+
+#[test]
+fn a_registered_format_is_found_and_given_every_row_once() {
+    let format = find("call-log").unwrap();
+    assert_eq!(find_by_extension(Path::new("a/model.LOG.txt")).unwrap().name, format.name);
+    assert_eq!(format.held_bytes(Shape { rows: 7, sh_degree: 0 }), 7);
+    let (folder, whole) = (tempfile::tempdir().unwrap(), model(100, 1));
+    let path = folder.path().join("new/model.log.txt");
+    let shape = Shape { rows: 100, sh_degree: 1 };
+    format.write_file(&path, shape, |rows| Ok::<_, OutputError>(piece(&whole, rows))).unwrap();
+    // Pieces have 48 rows in tests.
+    assert_eq!(std::fs::read_to_string(&path).unwrap(), "begin 100 1;48;48;4;finish");
+}
+
+/// `find` and `find_by_extension` offer only formats that can be written.
+#[test]
+fn a_format_that_is_only_read_is_not_exported() {
+    let names: Vec<&str> = formats().iter().map(|format| format.name).collect();
+    assert!(["splat", "gltf"].iter().all(|name| names.contains(name)), "{names:?}");
+    for name in ["splat", "gltf"] {
+        let message = find(name).unwrap_err().to_string();
+        assert!(!message.contains(&format!("{name},")), "{message}");
+        assert!(find_by_extension(Path::new(&format!("model.{name}"))).is_err());
+    }
+    let splat = formats().into_iter().find(|format| format.name == "splat").unwrap();
+    let refused = splat.write(&model(1, 0), &mut Vec::new()).unwrap_err();
+    assert!(is_unfit(&refused) && refused.to_string().contains("splat"), "{refused}");
+}
+
+#[test]
+fn compressing_tries_the_most_exact_format_first() {
+    let names: Vec<&str> = compress_formats().iter().map(|format| format.name).collect();
+    assert_eq!(names, ["ply", "sog", "compressed-ply", "spz"]);
+}
+
+#[test]
+fn a_failed_source_leaves_the_old_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("model.ply");
+    std::fs::write(&path, "old").unwrap();
+    let shape = Shape { rows: 100, sh_degree: 0 };
+    let lost = || OutputError::Lost { path: "lost".into() };
+    let written = PLY.write_file(&path, shape, |rows| match rows.start {
+        0 => Ok(model(rows.len(), 0)),
+        _ => Err(lost()),
+    });
+    assert_eq!(written.unwrap_err().to_string(), lost().to_string());
+    assert_eq!(std::fs::read_to_string(&path).unwrap(), "old");
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+}
+
+#[test]
+fn an_unknown_format_names_the_nearest_and_the_list() {
+    let message = find("plz").unwrap_err().to_string();
+    assert!(message.contains("did you mean `ply`?") && message.contains("call-log, "), "{message}");
+    assert!(!find("zzz").unwrap_err().to_string().contains("did you mean"));
+    for path in ["model", "model.zip", "ply", ""] {
+        let message = find_by_extension(Path::new(path)).unwrap_err().to_string();
+        assert!(message.contains("call-log, ") && message.contains("ply"), "{message}");
+    }
+}
+
+#[test]
+fn a_ply_written_in_pieces_is_the_same_and_its_writer_holds_what_it_promises() {
+    let whole = model(300, 2);
+    let mut expected = Vec::new();
+    PLY.write(&whole, &mut expected).unwrap();
+    let mut bytes = Vec::new();
+    let mut writer = PLY.open_writer().unwrap();
+    writer.begin(Shape { rows: 300, sh_degree: 2 }, &mut bytes).unwrap();
+    for rows in [0..0, 0..7, 7..270, 270..300] {
+        writer.rows(&piece(&whole, rows), &mut bytes).unwrap();
+    }
+    writer.finish(&mut bytes).unwrap();
+    assert!(bytes == expected);
+
+    /// The largest write.
+    struct Largest(usize);
+    impl Write for Largest {
+        fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+            self.0 = self.0.max(bytes.len());
+            Ok(bytes.len())
+        }
+        fn flush(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+    for rows in [20, 300] {
+        let mut largest = Largest(0);
+        writer.rows(&piece(&whole, 0..rows), &mut largest).unwrap();
+        assert_eq!(writer.held_bytes(Shape { rows, sh_degree: 2 }), largest.0 as u64);
+    }
+}
+
+#[test]
+fn the_ply_layout_is_that_of_the_original_trainer() {
+    let mut one = model(1, 1);
+    one.sh = (0..12u8).map(f32::from).collect();
+    let mut bytes = Vec::new();
+    PLY.write(&one, &mut bytes).unwrap();
+    let header_end = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
+    let header = std::str::from_utf8(&bytes[..header_end]).unwrap();
+    let names: Vec<&str> =
+        header.lines().filter_map(|line| line.strip_prefix("property float ")).collect();
+    let rest: Vec<String> = (0..9).map(|i| format!("f_rest_{i}")).collect();
+    let mut expected = vec!["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"];
+    expected.extend(rest.iter().map(String::as_str));
+    expected
+        .extend(["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]);
+    assert_eq!(names, expected);
+    let values: Vec<f32> = bytes[header_end..]
+        .chunks_exact(4)
+        .map(|b| f32::from_le_bytes(b.try_into().unwrap()))
+        .collect();
+    assert_eq!(values.len(), expected.len());
+    // Coefficient k of channel c is 3 + 3k + c here; the file goes channel by channel.
+    assert_eq!(values[3..18], [0., 0., 0., 0., 1., 2., 3., 6., 9., 4., 7., 10., 5., 8., 11.]);
+}

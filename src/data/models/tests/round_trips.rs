@@ -1,0 +1,192 @@
+//! Round trips: exact in formats with f32, within half a step in quantised ones.
+
+use std::io;
+use std::path::Path;
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use super::piece;
+use crate::models::{Format, Shape, export_formats, find, find_by_extension, read_model};
+use densify_core::gaussians::{Gaussians, sh_coefficients, sigmoid};
+
+/// A model as training makes them: in a few units, most Gaussians small, colours that depend little on direction.
+fn plausible(rows: usize, sh_degree: u8) -> Gaussians {
+    let mut random = ChaCha8Rng::seed_from_u64(rows as u64);
+    let mut value = |reach: f32| random.random_range(-reach..reach);
+    let mut model = Gaussians { sh_degree, ..Gaussians::default() };
+    for row in 0..rows {
+        // On a curve, so that a row is known by its place.
+        let t = row as f32 / rows as f32;
+        model.means.push([4.0 * t - 2.0, (9.0 * t).sin(), (7.0 * t).cos()]);
+        model.log_scales.push([value(1.5) - 4.0, value(1.5) - 4.0, value(1.5) - 5.0]);
+        model.quats.push([value(1.0), value(1.0), value(1.0), value(1.0)]);
+        model.opacity_logits.push(value(4.0));
+        model.sh.extend((0..3).map(|_| value(1.5)));
+        model.sh.extend((3..3 * sh_coefficients(sh_degree)).map(|_| value(0.3)));
+    }
+    model
+}
+
+fn written(format: &Format, model: &Gaussians) -> io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    format.write(model, &mut bytes).map(|()| bytes)
+}
+
+fn read(bytes: &[u8]) -> Gaussians {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("model");
+    std::fs::write(&path, bytes).unwrap();
+    let file = read_model(&path).unwrap_or_else(|error| panic!("{error}"));
+    assert_eq!((file.dropped, file.repaired), (0, 0));
+    file.gaussians
+}
+
+/// By the first coordinate, in which [`plausible`] models ascend.
+fn in_order(model: &Gaussians) -> Gaussians {
+    let mut rows: Vec<usize> = (0..model.len()).collect();
+    rows.sort_by(|&a, &b| model.means[a][0].total_cmp(&model.means[b][0]));
+    model.gather(&rows)
+}
+
+/// Largest errors of position, logarithm of scale, opacity, colour, and of a quaternion's component.
+fn errors(a: &Gaussians, b: &Gaussians) -> [f32; 5] {
+    assert_eq!((a.len(), a.sh_degree), (b.len(), b.sh_degree));
+    let most =
+        |x: &[f32], y: &[f32]| x.iter().zip(y).map(|(x, y)| (x - y).abs()).fold(0.0, f32::max);
+    let opacities =
+        |m: &Gaussians| m.opacity_logits.iter().map(|&x| sigmoid(x)).collect::<Vec<_>>();
+    let quats = a.quats.iter().zip(&b.quats).flat_map(|(p, q)| {
+        let length = |q: &[f32; 4]| q.iter().map(|v| v * v).sum::<f32>().sqrt();
+        let same = p.iter().zip(q).map(|(p, q)| p * q).sum::<f32>();
+        let sign = 1f32.copysign(same);
+        [0, 1, 2, 3].map(|i| (p[i] / length(p) - sign * q[i] / length(q)).abs())
+    });
+    [
+        most(a.means.as_flattened(), b.means.as_flattened()),
+        most(a.log_scales.as_flattened(), b.log_scales.as_flattened()),
+        most(&opacities(a), &opacities(b)),
+        most(&a.sh, &b.sh),
+        quats.fold(0.0, f32::max),
+    ]
+}
+
+#[test]
+fn formats_in_f32_keep_every_bit() {
+    for name in ["ply", "glb"] {
+        for degree in 0..=3 {
+            let mut model = plausible(100, degree);
+            model.means[3] = [-0.0, f32::MIN_POSITIVE / 4.0, f32::MAX];
+            (model.opacity_logits[4], model.opacity_logits[5]) = (17.5, -40.0);
+            model.log_scales[6] = [-30.0, 3e-5, 12.0];
+            let again = read(&written(find(name).unwrap(), &model).unwrap());
+            assert_eq!(again, model, "{name}, degree {degree}");
+        }
+    }
+}
+
+#[test]
+fn lossy_formats_say_so() {
+    let model = plausible(100, 3);
+    for format in export_formats().into_iter().filter(|format| format.name != "call-log") {
+        let changes = in_order(&read(&written(format, &model).unwrap())) != model;
+        assert_eq!(format.is_lossy(), changes, "{}", format.name);
+    }
+}
+
+#[test]
+fn quantised_formats_are_off_by_half_a_step() {
+    // Positions: 11 bits of a chunk, 10 of them for y, 12 fractional bits, 16 bits of a logarithm. Scales: 10 bits
+    // of 3, sixteenths, a codebook, whose entries are far apart where few values are. Opacity: a byte. Colour: compressed PLY has steps of 1/32; SPZ has steps of 1/38 and, by the
+    // error that is allowed, eighths of bands; a codebook and a palette of half as many entries. Quaternions: ten bits
+    // of √2, nine of 1/√2, a byte of √2; the largest component is what the others leave.
+    for (name, limits) in [
+        ("compressed-ply", [1.1e-3, 1.6e-3, 2e-3, 0.017, 2e-3]),
+        ("spz", [1.3e-4, 0.032, 2e-3, 0.07, 3e-3]),
+        ("spz-v4", [1.3e-4, 0.032, 2e-3, 0.07, 3e-3]),
+        ("sog", [6e-5, 0.08, 2e-3, 0.7, 9e-3]),
+    ] {
+        for degree in 0..=3 {
+            let model = plausible(500, degree);
+            let found = in_order(&read(&written(find(name).unwrap(), &model).unwrap()));
+            let errors = errors(&model, &found);
+            let fits = errors.iter().zip(limits).all(|(error, limit)| *error <= limit);
+            assert!(fits, "{name}, degree {degree}: {errors:?}");
+        }
+    }
+}
+
+#[test]
+fn coefficients_of_zero_are_zero_on_average() {
+    for degree in 1..=3 {
+        let mut model = plausible(256, degree);
+        let width = 3 * sh_coefficients(degree);
+        for row in model.sh.chunks_exact_mut(width) {
+            row[3..].fill(0.0);
+        }
+        let found = read(&written(find("compressed-ply").unwrap(), &model).unwrap());
+        for k in 3..width {
+            let mean = found.sh.iter().skip(k).step_by(width).sum::<f32>() / 256.0;
+            assert!(mean.abs() < 1e-6, "degree {degree}, coefficient {k}: {mean}");
+        }
+    }
+}
+
+#[test]
+fn pieces_do_not_matter_and_equal_models_are_equal_files() {
+    let model = plausible(300, 2);
+    for format in export_formats().into_iter().filter(|format| format.name != "call-log") {
+        let whole = {
+            let (mut bytes, mut writer) = (Vec::new(), format.open_writer().unwrap());
+            writer.begin(Shape { rows: 300, sh_degree: 2 }, &mut bytes).unwrap();
+            writer.rows(&model, &mut bytes).unwrap();
+            writer.finish(&mut bytes).unwrap();
+            bytes
+        };
+        let (mut bytes, mut writer) = (Vec::new(), format.open_writer().unwrap());
+        writer.begin(Shape { rows: 300, sh_degree: 2 }, &mut bytes).unwrap();
+        for rows in [0..0, 0..7, 7..270, 270..300] {
+            writer.rows(&piece(&model, rows), &mut bytes).unwrap();
+        }
+        writer.finish(&mut bytes).unwrap();
+        assert!(bytes == whole, "{}", format.name);
+        assert!(written(format, &model).unwrap() == written(format, &model).unwrap());
+    }
+}
+
+/// The extension of the default ends the other's.
+#[test]
+fn the_version_of_spz_is_chosen_by_the_name() {
+    let version = |path: &str| {
+        let bytes =
+            written(find_by_extension(Path::new(path)).unwrap(), &plausible(40, 1)).unwrap();
+        let is_gzip = bytes.starts_with(&[0x1f, 0x8b]);
+        if is_gzip { 3 } else { bytes[4] }
+    };
+    assert_eq!(["a.spz", "a.v4.spz", "v4.spz", "av4.spz"].map(version), [3, 4, 3, 3]);
+}
+
+#[test]
+fn extreme_models_are_written_or_refused() {
+    let mut one = plausible(1, 3);
+    one.quats[0] = [0.0, 0.0, 0.0, -2.0];
+    one.log_scales[0] = [-90.0, 40.0, 0.0];
+    one.opacity_logits[0] = 88.0;
+    let mut remote = plausible(9, 1);
+    remote.means[2][1] = 1e9;
+    for format in export_formats().into_iter().filter(|format| format.name != "call-log") {
+        let name = format.name;
+        assert_eq!(read(&written(format, &one).unwrap()).len(), 1, "{name}");
+        let empty = Gaussians::zeros(0, 2);
+        for (model, refusing) in [(&remote, &["spz", "spz-v4"][..]), (&empty, &["sog"])] {
+            match written(format, model) {
+                Ok(bytes) => assert_eq!(read(&bytes).len(), model.len(), "{name}"),
+                Err(error) => {
+                    assert_eq!(error.kind(), io::ErrorKind::InvalidInput);
+                    assert!(refusing.contains(&name), "{name}: {error}");
+                    assert!(error.to_string().contains("choose another format"), "{error}");
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,139 @@
+//! The interface of writers, which take a model in pieces, and the functions that drive them.
+
+use std::io::{self, Write};
+use std::ops::Range;
+use std::path::Path;
+
+use super::Format;
+use super::spatial_order::spatial_order;
+use densify_core::files::{OutputError, WriteError, write_atomically_from};
+use densify_core::gaussians::Gaussians;
+use densify_core::pieces::pieces;
+
+/// Size of a model.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Shape {
+    /// Number of Gaussians.
+    pub rows: usize,
+    /// Spherical-harmonic degree, 0..=3.
+    pub sh_degree: u8,
+}
+
+/// Writes one model to one file: [`begin`](Self::begin), then [`rows`](Self::rows) for each piece
+/// in order, then [`finish`](Self::finish).
+pub trait ModelWriter {
+    /// Upper bound on the memory that the writer takes beside the piece it is given `[bytes]`. It is part
+    /// of a run's memory promise, so it must hold for every model of this shape.
+    fn held_bytes(&self, shape: Shape) -> u64;
+
+    /// True if the format packs consecutive Gaussians together, so that they should be neighbours in space. The file
+    /// then has them in that order.
+    fn wants_spatial_order(&self) -> bool {
+        false
+    }
+
+    /// True if the format stores values with less precision than `f32`, so that what is read back differs.
+    fn is_lossy(&self) -> bool {
+        true
+    }
+
+    /// The same format with other trade-offs between size and accuracy, the most accurate first.
+    fn variants(&self) -> &'static [Format] {
+        &[]
+    }
+
+    /// Writes what precedes the Gaussians.
+    ///
+    /// # Errors
+    /// Those of `out`, and [`io::ErrorKind::InvalidInput`] where the format cannot hold the model.
+    fn begin(&mut self, shape: Shape, out: &mut dyn Write) -> io::Result<()>;
+
+    /// Takes the next Gaussians, some thousand at a time, in the dataset's own coordinates.
+    ///
+    /// # Errors
+    /// As [`begin`](Self::begin).
+    fn rows(&mut self, rows: &Gaussians, out: &mut dyn Write) -> io::Result<()>;
+
+    /// Writes what is still held and what follows the Gaussians.
+    ///
+    /// # Errors
+    /// As [`begin`](Self::begin).
+    fn finish(&mut self, out: &mut dyn Write) -> io::Result<()>;
+}
+
+/// True if a writer failed because its format cannot hold the model, and not because of the disk.
+#[must_use]
+pub fn is_unfit(error: &io::Error) -> bool {
+    error.raw_os_error().is_none() && error.kind() == io::ErrorKind::InvalidInput
+}
+
+impl Format {
+    /// A writer of one file.
+    ///
+    /// # Errors
+    /// When densify does not write the format.
+    pub fn open_writer(&self) -> io::Result<Box<dyn ModelWriter>> {
+        let unfit = || {
+            let problem = format!("densify does not write {}; choose another format", self.name);
+            io::Error::new(io::ErrorKind::InvalidInput, problem)
+        };
+        self.writer.map(|make| make()).ok_or_else(unfit)
+    }
+
+    /// [`ModelWriter::held_bytes`] of this format; 0 if densify does not write it.
+    #[must_use]
+    pub fn held_bytes(&self, shape: Shape) -> u64 {
+        self.writer.map_or(0, |make| make().held_bytes(shape))
+    }
+
+    /// [`ModelWriter::is_lossy`] of this format; false if densify does not write it.
+    #[must_use]
+    pub fn is_lossy(&self) -> bool {
+        self.writer.is_some_and(|make| make().is_lossy())
+    }
+
+    /// [`ModelWriter::variants`] of this format; none if densify does not write it.
+    #[must_use]
+    pub fn variants(&self) -> &'static [Self] {
+        self.writer.map_or(&[], |make| make().variants())
+    }
+
+    /// Writes a model that is in memory as a whole, in the order that suits the format.
+    ///
+    /// # Errors
+    /// Those of [`ModelWriter`].
+    pub fn write(&self, model: &Gaussians, out: &mut dyn Write) -> io::Result<()> {
+        let mut writer = self.open_writer()?;
+        writer.begin(Shape { rows: model.len(), sh_degree: model.sh_degree }, out)?;
+        if writer.wants_spatial_order() {
+            let order = spatial_order(model);
+            for piece in pieces(model.len()) {
+                writer.rows(&model.gather(&order[piece]), out)?;
+            }
+        } else {
+            writer.rows(model, out)?;
+        }
+        writer.finish(out)
+    }
+
+    /// Writes a model to a file that appears only when it is complete. `rows` is asked for one
+    /// piece after the other, as a second copy of the model may not fit into memory.
+    ///
+    /// # Errors
+    /// Those of `rows`, [`ModelWriter`] and [`write_atomically_from`].
+    pub fn write_file<E: From<OutputError>>(
+        &self,
+        path: &Path,
+        shape: Shape,
+        mut rows: impl FnMut(Range<usize>) -> Result<Gaussians, E>,
+    ) -> Result<(), E> {
+        write_atomically_from(path, |out| {
+            let mut writer = self.open_writer()?;
+            writer.begin(shape, out)?;
+            for piece in pieces(shape.rows) {
+                writer.rows(&rows(piece).map_err(WriteError::Source)?, out)?;
+            }
+            Ok(writer.finish(out)?)
+        })
+    }
+}
