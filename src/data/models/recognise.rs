@@ -68,7 +68,7 @@ impl<'a> ModelFile<'a> {
         let mut start = Vec::new();
         (&mut file).take(START).read_to_end(&mut start).map_err(LoadError::io(path))?;
         file.rewind().map_err(LoadError::io(path))?;
-        if let Some(problem) = files::mistaken(&start) {
+        if let Some(problem) = files::wrong_kind(&start) {
             return Err(LoadError(format!("{}: the file: {problem}", path.display())));
         }
         let length = file.metadata().map_err(LoadError::io(path))?.len();
