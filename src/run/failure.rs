@@ -190,3 +190,61 @@ impl From<SceneError> for Failure {
         Self { code, message: error.to_string() }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The error's own words first, then the remedy; also when the error is the source of another.
+    #[test]
+    fn errors_of_backends_end_with_their_remedy() {
+        let device = || "Card".to_owned();
+        let too_large = |fit| BackendError::BufferTooLarge {
+            buffer: "loss",
+            bytes: 3 << 30,
+            device: device(),
+            most: 1 << 30,
+            fit,
+        };
+        let cut = |accumulation| BackendError::LoopCut { device: device(), accumulation };
+        let lost = BackendError::DeviceLost { device: device(), why: "reset".into() };
+        for (error, code, message) in [
+            (
+                BackendError::OutOfMemory { what: "the training buffers", bytes: 7 },
+                DEVICE,
+                "cannot allocate 7 bytes for the training buffers; lower --budget, --sh-degree or --tile-cap",
+            ),
+            (
+                too_large(Fit::TileCap(5)),
+                INPUT,
+                "loss: 3.0 GiB in one buffer, but Card supports at most 1.0 GiB; use --tile-cap 5",
+            ),
+            (too_large(Fit::ImageSize), INPUT, "1.0 GiB; shrink the images with --resolution"),
+            (
+                lost,
+                DEVICE,
+                "Card was lost (reset); start again from what was saved, or use --backend cpu",
+            ),
+            (cut(Accumulation::Slots), DEVICE, "a tile); try another driver, or --backend cpu"),
+            (
+                cut(Accumulation::SubgroupCas),
+                DEVICE,
+                "a tile); --knob accumulation=slots goes through",
+            ),
+        ] {
+            let wrapped = TrainError::Backend { step: 3, source: error };
+            let failure = Failure::from(wrapped);
+            assert_eq!(failure.code, code, "{failure}");
+            assert!(failure.message.starts_with("step 3: "), "{failure}");
+            assert!(failure.message.contains(message), "{failure}");
+        }
+    }
+
+    #[test]
+    fn an_occupied_folder_names_the_options_that_help() {
+        let failure = Failure::from(OutputError::occupied("out".as_ref()));
+        let expected =
+            "out holds another run; choose another folder with -o, or replace it with --overwrite";
+        assert_eq!((failure.code, &*failure.message), (INPUT, expected));
+    }
+}

@@ -8,9 +8,9 @@ use super::OutputError;
 use super::disk::{Operation, WatchedFile, attempt};
 
 /// Prefix of the names of temporary files and folders.
-pub const TEMPORARY: &str = ".densify-";
+const TEMPORARY: &str = ".densify-";
 
-/// Whether this is the name of a temporary file or folder.
+/// Returns whether this is the name of a temporary file or folder.
 #[must_use]
 pub fn is_temporary(name: &OsStr) -> bool {
     name.to_string_lossy().starts_with(TEMPORARY)

@@ -6,7 +6,7 @@ mod error;
 mod read;
 
 pub use atomic::{
-    RUN_FOLDER_DEPTH, TEMPORARY, WriteError, is_temporary, remove_incomplete, write_atomically,
+    RUN_FOLDER_DEPTH, WriteError, is_temporary, remove_incomplete, write_atomically,
     write_atomically_from,
 };
 pub use error::OutputError;

@@ -47,7 +47,7 @@ impl CpuBackend {
     }
 }
 
-/// Whether all numbers are finite.
+/// Returns whether all numbers are finite.
 fn is_sound(numbers: &[f32]) -> bool {
     // 0 · x is 0 unless x is NaN or infinite; sixteen sums run side by side.
     let mut sums = [0.0_f32; WIDTH];

@@ -218,7 +218,7 @@ impl CpuBackend {
         if let Some(exposure) = exposure {
             self.expose(&frame.grid, exposure);
         }
-        let picks = self.candidates.open(input.step, self.rows);
+        let picks = self.candidates.to_take(input.step, self.rows);
         let weights = picks.and_then(|(request, _)| error_weights(request.error));
         let by_pixel =
             self.signals.layout().has(Field::Error).then_some(self.signals.planes().score);

@@ -245,14 +245,14 @@ impl Backend for GpuBackend {
     fn take_signals(&mut self, wanted: SignalSet) -> Result<Signals, BackendError> {
         let mut signals = Signals::zeros(self.rows, wanted);
         for signal in wanted.iter() {
-            if let Some(attribute) = ParameterSignal::of(signal) {
+            if let Some(attribute) = ParameterSignal::new(signal) {
                 self.read_attribute(&attribute, signals.get_mut(signal).unwrap_or_default())?;
                 continue;
             }
             let values = if signal.kind() == SignalKind::Present {
                 self.present(signal)?
             } else {
-                let planes = self.planes.of(signal);
+                let planes = self.planes.of_signal(signal);
                 let columns: Result<Vec<_>, _> =
                     planes.map(|plane| self.column(plane, 0..self.rows)).collect();
                 let most =
