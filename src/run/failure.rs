@@ -6,7 +6,7 @@ use densify_policies::policy::PolicyError;
 use densify_scenegen::Error as SceneError;
 
 use crate::knobs::KnobError;
-use densify_core::files::OutputError;
+use densify_core::files::FileError;
 use densify_data::dataset::DatasetError;
 use densify_data::export::FormatError;
 use densify_render::{Accumulation, BackendError, Fit};
@@ -134,13 +134,13 @@ fn remedy(error: &BackendError) -> String {
     remedy.to_owned()
 }
 
-impl From<OutputError> for Failure {
-    fn from(error: OutputError) -> Self {
+impl From<FileError> for Failure {
+    fn from(error: FileError) -> Self {
         match error {
-            OutputError::Occupied { .. } => Self::input(format!(
+            FileError::Occupied { .. } => Self::input(format!(
                 "{error}; choose another folder with -o, or replace it with --overwrite"
             )),
-            OutputError::Unfit(_) => Self::input(error),
+            FileError::Unfit(_) => Self::input(error),
             _ => Self { code: OTHER, message: error.to_string() },
         }
     }
@@ -242,7 +242,7 @@ mod tests {
 
     #[test]
     fn an_occupied_folder_names_the_options_that_help() {
-        let failure = Failure::from(OutputError::occupied("out".as_ref()));
+        let failure = Failure::from(FileError::occupied("out".as_ref()));
         let expected =
             "out holds another run; choose another folder with -o, or replace it with --overwrite";
         assert_eq!((failure.code, &*failure.message), (INPUT, expected));

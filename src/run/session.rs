@@ -13,7 +13,7 @@ use super::measuring::measure;
 use super::observer::{Between, Interrupt, Observer};
 use super::records::{Logs, Totals};
 use crate::failure::{Failure, INPUT, OTHER};
-use densify_core::files::{OutputError, write_atomically};
+use densify_core::files::{FileError, write_atomically};
 use densify_data::export::{PLY, Shape};
 use densify_data::views::ViewSource;
 use densify_train::checkpoint::{CheckpointError, Header, checkpoint_path, remove_older, write};
@@ -336,7 +336,7 @@ impl<'a> Session<'a> {
         }
     }
 
-    fn record(&mut self, report: &StepReport) -> Result<(), OutputError> {
+    fn record(&mut self, report: &StepReport) -> Result<(), FileError> {
         let Self { logs, totals, run, observer, .. } = self;
         for event in &report.events {
             observer.edited(event);

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use super::ExportArgs;
 use crate::console::Console;
-use densify_core::files::OutputError;
+use densify_core::files::FileError;
 use densify_core::gaussians::Gaussians;
 use densify_core::numbers::{grouped, percent};
 use densify_data::dataset::Dataset;
@@ -27,7 +27,7 @@ pub(super) struct Line {
 
 impl Line {
     pub(super) fn of(name: &'static str, path: &Path, psnr: Option<f64>) -> Result<Self, Failure> {
-        let bytes = path.metadata().map_err(OutputError::io("read", path))?.len();
+        let bytes = path.metadata().map_err(FileError::io("read", path))?.len();
         Ok(Self { name, bytes, psnr })
     }
 }

@@ -19,7 +19,7 @@ use densify_policies::parameters::nearest;
 #[doc(hidden)]
 pub use inventory;
 
-use densify_core::files::{OutputError, WriteError, write_atomically_from};
+use densify_core::files::{FileError, WriteError, write_atomically_from};
 use densify_core::gaussians::Gaussians;
 use densify_core::pieces::pieces;
 
@@ -173,7 +173,7 @@ impl Format {
     ///
     /// # Errors
     /// Those of `rows`, [`ModelWriter`] and [`write_atomically_from`].
-    pub fn write_file<E: From<OutputError>>(
+    pub fn write_file<E: From<FileError>>(
         &self,
         path: &Path,
         shape: Shape,
