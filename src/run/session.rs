@@ -325,7 +325,7 @@ impl<'a> Session<'a> {
                 };
                 Err(Failure::from(error).and(&saved))
             }
-            Err(error @ TrainError::Unsound { .. }) => Err(self.kept(error.into())),
+            Err(error @ TrainError::NonFinite { .. }) => Err(self.kept(error.into())),
             // A photograph that could be read before. In the first epoch little is lost.
             Err(error @ TrainError::View { step, .. })
                 if step > self.run.trainer.steps_done() && step as usize > train_views =>

@@ -52,8 +52,8 @@ use pulp::Arch;
 use super::candidates::{Candidates, Photograph, error_weights};
 use super::signals::{Field, counts_dominant};
 use super::{
-    AuxInput, AuxOutput, Backend, BackendError, Inspect, Rendering, Setup, Shortcuts, StateArray,
-    StateError, StepInput, StepOutput, Tensor, Unsound, assert_fits, assert_same_size,
+    AuxInput, AuxOutput, Backend, BackendError, Inspect, NonFinite, Rendering, Setup, Shortcuts,
+    StateArray, StateError, StepInput, StepOutput, Tensor, assert_fits, assert_same_size,
 };
 use adam::BiasCorrection;
 use blocks::{Blocks, planes};
@@ -312,7 +312,7 @@ impl Backend for CpuBackend {
         Ok(())
     }
 
-    fn audit(&mut self) -> Result<Vec<Unsound>, BackendError> {
+    fn audit(&mut self) -> Result<Vec<NonFinite>, BackendError> {
         Ok(self.unsound())
     }
 

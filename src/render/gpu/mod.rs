@@ -45,8 +45,8 @@ use densify_policies::policy::{Cadence, Candidate, MaskTerm, SignalKind, SignalS
 use super::candidates::Candidates;
 use super::signals::{ParameterSignal, SignalPlanes, as_read};
 use super::{
-    AdapterSummary, AuxInput, AuxOutput, Backend, BackendError, Inspect, Rendering, Setup,
-    Shortcuts, StateArray, StateError, StepInput, StepOutput, Tensor, Unsound, assert_fits,
+    AdapterSummary, AuxInput, AuxOutput, Backend, BackendError, Inspect, NonFinite, Rendering,
+    Setup, Shortcuts, StateArray, StateError, StepInput, StepOutput, Tensor, assert_fits,
 };
 use densify_core::camera::Camera;
 use densify_core::gaussians::{Gaussians, ModelArray, rgb_to_dc};
@@ -282,7 +282,7 @@ impl Backend for GpuBackend {
         self.device.check()
     }
 
-    fn audit(&mut self) -> Result<Vec<Unsound>, BackendError> {
+    fn audit(&mut self) -> Result<Vec<NonFinite>, BackendError> {
         self.unsound()
     }
 

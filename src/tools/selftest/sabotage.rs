@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 use super::{Subject, cases};
 use densify_core::gaussians::ModelArray;
 use densify_render::cpu::ModelGradient;
-use densify_render::{Attribute, Kept, Rendering, StepOutput, Unsound};
+use densify_render::{Attribute, NonFinite, NumberKind, Rendering, StepOutput};
 
 /// In what the native backend errs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -89,10 +89,10 @@ pub(crate) fn spoilt_output(output: StepOutput) -> StepOutput {
     }
 }
 
-pub(crate) fn spoilt_audit(mut found: Vec<Unsound>) -> Vec<Unsound> {
+pub(crate) fn spoilt_audit(mut found: Vec<NonFinite>) -> Vec<NonFinite> {
     if HOW.get() == Some(Sabotage::Audit) {
-        let (attribute, kept) = (Attribute::Mean, Kept::Parameter);
-        found.insert(0, Unsound { row: 0, attribute, kept });
+        let (attribute, kind) = (Attribute::Mean, NumberKind::Parameter);
+        found.insert(0, NonFinite { row: 0, attribute, kind });
     }
     found
 }

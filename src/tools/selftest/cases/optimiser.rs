@@ -6,7 +6,7 @@ use crate::scenes;
 use crate::trial::{Trial, step};
 use crate::values::RATES;
 use densify_core::camera::Camera;
-use densify_render::{BackendError, Kept, LearningRates, StateArray, Values};
+use densify_render::{BackendError, LearningRates, NumberKind, StateArray, Values};
 
 /// Gradients whose square is nothing, subnormal, ordinary, nearly too large, and too large.
 const GRADIENTS: [f32; 8] = [0.0, 1e-45, 1e-23, 1e-15, 1e-6, 1.0, 1e19, 1e30];
@@ -70,7 +70,8 @@ pub(super) fn moments(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     }
     // What cannot be squared is found, by row and as a moment, and nothing else is.
     let found = backend.audit()?;
-    let is_found = |u: &densify_render::Unsound| u.row == OVERFLOWN && u.kept == Kept::Moment;
+    let is_found =
+        |u: &densify_render::NonFinite| u.row == OVERFLOWN && u.kind == NumberKind::Moment;
     let wrong = usize::from(found.is_empty()) + found.iter().filter(|u| !is_found(u)).count();
     trial.never("gradient 1e30", "rows not quarantined, or wrongly", wrong);
     let mut plan = EditPlan::new(backend.rows(), backend.budget());
