@@ -11,7 +11,7 @@ use super::buffers::Buffers;
 use super::pipelines::{Compiled, Pipelines};
 use super::rows::{Edited, FIRST, PARAMETERS, RowArray, SECOND, WAITING};
 use super::sizes::Sizes;
-use crate::{Accumulation, Kept};
+use crate::{Accumulation, NumberKind};
 
 /// What errors are read from: the loss's error per pixel, or its gradient.
 const MAPS: [&str; 2] = ["error", "pixel gradient"];
@@ -230,8 +230,8 @@ fn audits<L>(bind: Bind<'_, L>, sizes: &Sizes) -> Vec<Audit<L>> {
             first_row: sizes.places(array)[0] as u32,
             numbers: array.numbers as u32,
             place: match array.holds.traits().audited? {
-                Kept::Parameter => first,
-                Kept::Moment => MOMENTS + first,
+                NumberKind::Parameter => first,
+                NumberKind::Moment => MOMENTS + first,
             },
         })
     };
