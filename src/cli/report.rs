@@ -6,7 +6,7 @@ use clap::Args;
 
 use super::console::Console;
 use super::export::check_output;
-use densify_core::files::OutputError;
+use densify_core::files::FileError;
 use densify_core::memory::Bytes;
 use densify_report as report;
 use densify_report::Wanted;
@@ -70,7 +70,7 @@ pub(super) fn run(args: &ReportArgs, console: &Console) -> Result<(), Failure> {
         device: &args.device,
     };
     report::write(&wanted, file, console)?;
-    let size = file.metadata().map_err(OutputError::io("read", file))?.len();
+    let size = file.metadata().map_err(FileError::io("read", file))?.len();
     console.result(format_args!("report   {} ({})", file.display(), Bytes(size)));
     Ok(())
 }

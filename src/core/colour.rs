@@ -65,7 +65,7 @@ impl ColourTransform {
         self.inverse().apply(background)
     }
 
-    /// Whether all coefficients are finite.
+    /// Returns whether all coefficients are finite.
     #[must_use]
     pub fn is_finite(&self) -> bool {
         self.matrix.as_flattened().iter().chain(&self.offset).all(|x| x.is_finite())

@@ -144,7 +144,7 @@ impl Gaussians {
         self.means.len()
     }
 
-    /// Whether the model has no rows.
+    /// Returns whether the model has no rows.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.means.is_empty()

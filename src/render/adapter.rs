@@ -45,7 +45,7 @@ impl AdapterSummary {
         self.accumulations.last().copied().unwrap_or(Accumulation::Slots)
     }
 
-    /// Whether the automatic choice may take it: a usable GPU that is not a software driver.
+    /// Returns whether the automatic choice may take it: a usable GPU that is not a software driver.
     #[must_use]
     pub fn is_gpu(&self) -> bool {
         self.kind != AdapterKind::Software && self.missing.is_empty()

@@ -46,32 +46,34 @@ impl fmt::Display for Attribute {
     }
 }
 
-/// The array in which a non-finite number was found.
+/// The kind of a non-finite number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Kept {
-    /// The parameters.
+pub enum NumberKind {
+    /// A parameter.
     Parameter,
-    /// The optimiser's first or second moments: the gradient was NaN, or too large to be squared.
+    /// A first or second moment of the optimiser: the gradient was NaN, or too large to be squared.
     Moment,
 }
 
 /// A row with a non-finite number, and the first such number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Unsound {
+pub struct NonFinite {
     /// The row.
     pub row: u32,
     /// The class of the parameter.
     pub attribute: Attribute,
-    /// The array that holds the number.
-    pub kept: Kept,
+    /// The kind of number.
+    pub kind: NumberKind,
 }
 
-impl fmt::Display for Unsound {
+impl fmt::Display for NonFinite {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { row, attribute, kept } = self;
-        match kept {
-            Kept::Parameter => write!(f, "the {attribute} of row {row}"),
-            Kept::Moment => write!(f, "the optimiser's moment of the {attribute} of row {row}"),
+        let Self { row, attribute, kind } = self;
+        match kind {
+            NumberKind::Parameter => write!(f, "the {attribute} of row {row}"),
+            NumberKind::Moment => {
+                write!(f, "the optimiser's moment of the {attribute} of row {row}")
+            }
         }
     }
 }

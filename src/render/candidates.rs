@@ -70,7 +70,7 @@ impl Candidates {
         self.list.clear();
     }
 
-    /// Whether the policy requests candidates.
+    /// Returns whether the policy requests candidates.
     pub(super) fn is_requested(&self) -> bool {
         self.request.is_some()
     }
@@ -107,7 +107,7 @@ impl Candidates {
     }
 
     /// The request and the number of candidates to take in the view of `step`, if any.
-    pub(super) fn open(&self, step: u32, rows: usize) -> Option<(CandidateRequest, usize)> {
+    pub(super) fn to_take(&self, step: u32, rows: usize) -> Option<(CandidateRequest, usize)> {
         let r = self.request.filter(|r| r.from < step && step < r.until)?;
         let count = rows / r.rows_per_candidate.max(1) as usize;
         let room = r.capacity.saturating_sub(self.list.len());

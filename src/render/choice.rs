@@ -68,7 +68,7 @@ impl BackendKind {
         }
     }
 
-    /// Whether this program was built with the backend.
+    /// Returns whether this program was built with the backend.
     #[must_use]
     pub const fn is_built(self) -> bool {
         matches!(self, Self::Cpu) || cfg!(feature = "gpu")

@@ -21,7 +21,7 @@ pub trait Inspect {
         colours: &[[f32; 3]],
     ) -> Result<Rendering, BackendError>;
 
-    /// Whether [`render_counts`](Self::render_counts) is supported.
+    /// Returns whether the backend supports [`render_counts`](Self::render_counts).
     fn counts_rows(&self) -> bool {
         false
     }

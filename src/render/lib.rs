@@ -30,7 +30,7 @@ use densify_policies::policy::{
 };
 
 pub use adapter::{AdapterChoice, AdapterKind, AdapterSummary};
-pub use audit::{Attribute, Kept, Unsound};
+pub use audit::{Attribute, NonFinite, NumberKind};
 pub use choice::{BackendChoice, BackendKind, Device};
 use densify_core::camera::Camera;
 use densify_core::colour::{ColourGradient, ColourTransform};
@@ -250,7 +250,7 @@ pub trait Backend: Send {
     ///
     /// # Errors
     /// See [`BackendError`].
-    fn audit(&mut self) -> Result<Vec<Unsound>, BackendError>;
+    fn audit(&mut self) -> Result<Vec<NonFinite>, BackendError>;
 
     /// Renders a view.
     ///

@@ -35,9 +35,9 @@ pub struct Setup {
     pub shortcuts: Shortcuts,
     /// Signals and candidates to collect.
     pub needs: Needs,
-    /// Whether steps and measured views may have exposures.
+    /// True if steps and measured views may have exposures.
     pub exposures: bool,
-    /// Whether the backend only renders, and so needs no memory for training (native backend).
+    /// True if the backend only renders, and so needs no memory for training (native backend).
     pub only_renders: bool,
 }
 
@@ -75,7 +75,7 @@ impl Default for Setup {
 pub struct KeptPhotographs {
     /// Number of photographs.
     pub count: usize,
-    /// Whether any of them has a mask.
+    /// True if any of them has a mask.
     pub with_masks: bool,
 }
 

@@ -133,7 +133,7 @@ impl RecordLayout {
     }
 }
 
-/// Whether pixels are counted for the row with the largest blend weight.
+/// Returns whether pixels are counted for the row with the largest blend weight.
 pub(super) fn counts_dominant(needs: &Needs) -> bool {
     let in_views = |aux: &AuxRequest| aux.columns.contains(&AuxColumn::DominantPixels);
     needs.signals.contains(Signal::DominantPixels) || needs.aux.as_ref().is_some_and(in_views)
@@ -156,7 +156,7 @@ pub(super) struct SignalPlanes {
     pub(super) full_depth: f32,
     /// See [`Needs::error_score`].
     pub(super) score: ErrorScore,
-    /// Whether the first of an epoch signal's two planes belongs to the current epoch, not the second.
+    /// True if the first of an epoch signal's two planes belongs to the current epoch, not the second.
     swapped: bool,
 }
 
@@ -184,7 +184,7 @@ impl SignalPlanes {
     }
 
     /// The planes of a signal, whose value is their maximum.
-    pub(super) fn of(&self, signal: Signal) -> Range<usize> {
+    pub(super) fn of_signal(&self, signal: Signal) -> Range<usize> {
         self.first[signal as usize].map_or(0..0, |first| first..first + planes(signal.kind()))
     }
 
@@ -196,8 +196,8 @@ impl SignalPlanes {
     }
 
     /// The planes of several signals.
-    pub(super) fn of_all(&self, signals: SignalSet) -> Vec<usize> {
-        signals.iter().flat_map(|signal| self.of(signal)).collect()
+    pub(super) fn of_signals(&self, signals: SignalSet) -> Vec<usize> {
+        signals.iter().flat_map(|signal| self.of_signal(signal)).collect()
     }
 
     /// Swaps the planes of the current and the previous epoch. Returns the planes to clear.
@@ -217,7 +217,7 @@ impl SignalPlanes {
                     kept.push((format!("{signal:?}"), current));
                 }
                 SignalKind::EpochMaximum => {
-                    let both = self.of(signal);
+                    let both = self.of_signal(signal);
                     let previous = both.start + both.end - 1 - current;
                     kept.push((format!("{signal:?}.previous"), previous));
                     kept.push((format!("{signal:?}.current"), current));
@@ -239,7 +239,7 @@ pub(super) struct ParameterSignal {
 
 impl ParameterSignal {
     /// `None` for signals that are not parameters.
-    pub(super) fn of(signal: Signal) -> Option<Self> {
+    pub(super) fn new(signal: Signal) -> Option<Self> {
         let as_stored = |x| x;
         let (array, convert): (_, fn(f32) -> f32) = match signal {
             Signal::Position => (ModelArray::Means, as_stored),
@@ -282,7 +282,7 @@ mod tests {
     #[test]
     fn attributes_and_no_others_are_parameters_as_many_as_they_are_wide() {
         for signal in Signal::ALL {
-            let found = ParameterSignal::of(signal).map(|found| found.parameters.len());
+            let found = ParameterSignal::new(signal).map(|found| found.parameters.len());
             let width = match signal.kind() {
                 SignalKind::Attribute(width) => Some(width),
                 _ => None,

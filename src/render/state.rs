@@ -14,7 +14,7 @@ const CHUNK: usize = 1 << 14;
 pub struct StateArray {
     /// The name, unique within a backend.
     pub name: String,
-    /// Whether its first dimension is the rows, so that it can be copied in pieces. All other arrays are small.
+    /// True if its first dimension is the rows, so that it can be copied in pieces. All other arrays are small.
     pub by_rows: bool,
 }
 
@@ -42,7 +42,7 @@ pub struct Tensor {
 }
 
 impl Tensor {
-    /// Whether the array of this name holds the optimiser's [ages](Self::ages).
+    /// Returns whether the array of this name holds the optimiser's [ages](Self::ages).
     pub fn has_ages(name: &str) -> bool {
         // Of the native and the GPU backend.
         matches!(name, "ages" | "device.ages")
@@ -96,7 +96,7 @@ impl Values {
         }
     }
 
-    /// Whether there are no values.
+    /// Returns whether there are no values.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len() == 0
@@ -174,7 +174,7 @@ impl Tensor {
     ///
     /// # Errors
     /// [`StateError`] when shape or type differ.
-    pub fn into_u16(self, shape: &[usize]) -> Result<Vec<u16>, StateError> {
+    pub(crate) fn into_u16(self, shape: &[usize]) -> Result<Vec<u16>, StateError> {
         self.check(shape)?;
         match self.values {
             Values::U16(values) => Ok(values),
@@ -186,7 +186,7 @@ impl Tensor {
     ///
     /// # Errors
     /// [`StateError`] when shape or type differ.
-    pub fn into_u8(self, shape: &[usize]) -> Result<Vec<u8>, StateError> {
+    pub(crate) fn into_u8(self, shape: &[usize]) -> Result<Vec<u8>, StateError> {
         self.check(shape)?;
         match self.values {
             Values::U8(values) => Ok(values),

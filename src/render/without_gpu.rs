@@ -57,7 +57,7 @@ pub fn adapters() -> Vec<AdapterSummary> {
     Vec::new()
 }
 
-/// Whether there may be a GPU: never.
+/// Never true: without the backend no GPU can be used.
 pub(super) fn may_be_present() -> bool {
     false
 }

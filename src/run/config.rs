@@ -9,7 +9,7 @@ use super::overlay::{FOUND_OUT, Partial};
 use super::spec::RunSpec;
 use super::values::ShDegree;
 use crate::failure::Failure;
-use densify_core::files::{OutputError, write_atomically};
+use densify_core::files::{FileError, write_atomically};
 use densify_data::track_colours::Spread;
 use densify_data::track_colours::exposures::ExposureSpread;
 use densify_train::output::CONFIG_FILE;
@@ -135,10 +135,10 @@ impl RunConfig {
         let path = run.join(CONFIG_FILE);
         let text = densify_core::files::read_text(&path, densify_core::files::MAX_OPTIONS)
             .map_err(|error| match error.kind() {
-                std::io::ErrorKind::NotFound => OutputError::no_run(run, CONFIG_FILE).into(),
+                std::io::ErrorKind::NotFound => FileError::no_run(run, CONFIG_FILE).into(),
                 _ => Failure::input(format!("cannot read {}: {error}", path.display())),
             })?;
-        let malformed = |problem: String| Failure::from(OutputError::malformed(&path, problem));
+        let malformed = |problem: String| Failure::from(FileError::malformed(&path, problem));
         let table: Table = text
             .parse()
             .map_err(|error: toml::de::Error| malformed(error.to_string().trim().into()))?;

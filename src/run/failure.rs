@@ -6,7 +6,7 @@ use densify_policies::policy::PolicyError;
 use densify_scenegen::Error as SceneError;
 
 use crate::knobs::KnobError;
-use densify_core::files::OutputError;
+use densify_core::files::FileError;
 use densify_data::LoadError;
 use densify_data::models::FormatError;
 use densify_render::{Accumulation, BackendError, Fit};
@@ -134,13 +134,13 @@ fn remedy(error: &BackendError) -> String {
     remedy.to_owned()
 }
 
-impl From<OutputError> for Failure {
-    fn from(error: OutputError) -> Self {
+impl From<FileError> for Failure {
+    fn from(error: FileError) -> Self {
         match error {
-            OutputError::Occupied { .. } => Self::input(format!(
+            FileError::Occupied { .. } => Self::input(format!(
                 "{error}; choose another folder with -o, or replace it with --overwrite"
             )),
-            OutputError::Unfit(_) => Self::input(error),
+            FileError::Unfit(_) => Self::input(error),
             _ => Self { code: OTHER, message: error.to_string() },
         }
     }
@@ -188,5 +188,63 @@ impl From<SceneError> for Failure {
             _ => INPUT,
         };
         Self { code, message: error.to_string() }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The error's own words first, then the remedy; also when the error is the source of another.
+    #[test]
+    fn errors_of_backends_end_with_their_remedy() {
+        let device = || "Card".to_owned();
+        let too_large = |fit| BackendError::BufferTooLarge {
+            buffer: "loss",
+            bytes: 3 << 30,
+            device: device(),
+            most: 1 << 30,
+            fit,
+        };
+        let cut = |accumulation| BackendError::LoopCut { device: device(), accumulation };
+        let lost = BackendError::DeviceLost { device: device(), why: "reset".into() };
+        for (error, code, message) in [
+            (
+                BackendError::OutOfMemory { what: "the training buffers", bytes: 7 },
+                DEVICE,
+                "cannot allocate 7 bytes for the training buffers; lower --budget, --sh-degree or --tile-cap",
+            ),
+            (
+                too_large(Fit::TileCap(5)),
+                INPUT,
+                "loss: 3.0 GiB in one buffer, but Card supports at most 1.0 GiB; use --tile-cap 5",
+            ),
+            (too_large(Fit::ImageSize), INPUT, "1.0 GiB; shrink the images with --resolution"),
+            (
+                lost,
+                DEVICE,
+                "Card was lost (reset); start again from what was saved, or use --backend cpu",
+            ),
+            (cut(Accumulation::Slots), DEVICE, "a tile); try another driver, or --backend cpu"),
+            (
+                cut(Accumulation::SubgroupCas),
+                DEVICE,
+                "a tile); --knob accumulation=slots goes through",
+            ),
+        ] {
+            let wrapped = TrainError::Backend { step: 3, source: error };
+            let failure = Failure::from(wrapped);
+            assert_eq!(failure.code, code, "{failure}");
+            assert!(failure.message.starts_with("step 3: "), "{failure}");
+            assert!(failure.message.contains(message), "{failure}");
+        }
+    }
+
+    #[test]
+    fn an_occupied_folder_names_the_options_that_help() {
+        let failure = Failure::from(FileError::occupied("out".as_ref()));
+        let expected =
+            "out holds another run; choose another folder with -o, or replace it with --overwrite";
+        assert_eq!((failure.code, &*failure.message), (INPUT, expected));
     }
 }

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use cpu_time::ProcessTime;
 use serde::{Deserialize, Serialize};
 
-use densify_core::files::OutputError;
+use densify_core::files::FileError;
 use densify_core::memory::{peak_resident, resident};
 use densify_render::StepOutput;
 use densify_train::output::{Mean, RecordLog, StepRecord, TensorBoard};
@@ -124,7 +124,7 @@ const STEPS: &str = "stats/train.jsonl";
 const EVENTS: &str = "stats/events.jsonl";
 
 impl Logs {
-    pub(super) fn create(folder: &Path) -> Result<Self, OutputError> {
+    pub(super) fn create(folder: &Path) -> Result<Self, FileError> {
         Ok(Self {
             steps: RecordLog::create(&folder.join(STEPS))?,
             events: RecordLog::create(&folder.join(EVENTS))?,
@@ -133,7 +133,7 @@ impl Logs {
     }
 
     /// The session as it is now, as JSON; all that the logs hold is on disk then.
-    pub(super) fn keep(&self, totals: &Totals) -> Result<serde_json::Value, OutputError> {
+    pub(super) fn keep(&self, totals: &Totals) -> Result<serde_json::Value, FileError> {
         let lengths = Lengths {
             steps: self.steps.synced()?,
             events: self.events.synced()?,
@@ -149,7 +149,7 @@ impl Logs {
     pub(super) fn resume(
         folder: &Path,
         kept: SavedSession,
-    ) -> Result<(Self, Totals, Vec<&'static str>), OutputError> {
+    ) -> Result<(Self, Totals, Vec<&'static str>), FileError> {
         let SavedSession { totals, logs } = kept;
         let (steps, steps_whole) = RecordLog::resume(&folder.join(STEPS), logs.steps)?;
         let (events, events_whole) = RecordLog::resume(&folder.join(EVENTS), logs.events)?;

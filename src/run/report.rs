@@ -5,7 +5,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use super::config::{DegreeSource, ExposureSource, RunConfig};
-use densify_core::files::OutputError;
+use densify_core::files::FileError;
 use densify_core::gaussians::MAX_SH_DEGREE;
 use densify_train::output::read_stats;
 use densify_train::trainer::{AutoBudget, MIN_GAIN};
@@ -44,7 +44,7 @@ pub struct Reductions {
 
 impl Reductions {
     /// Of a run; `None` where the file does not exist.
-    pub fn read(run: &Path) -> Result<Option<Self>, OutputError> {
+    pub fn read(run: &Path) -> Result<Option<Self>, FileError> {
         read_stats(&run.join(REQUIREMENTS))
     }
 }

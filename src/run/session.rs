@@ -13,7 +13,7 @@ use super::measuring::measure;
 use super::observer::{Between, Interrupt, Observer};
 use super::records::{Logs, Totals};
 use crate::failure::{Failure, INPUT, OTHER};
-use densify_core::files::{OutputError, write_atomically};
+use densify_core::files::{FileError, write_atomically};
 use densify_data::models::{PLY, Shape};
 use densify_data::views::ViewSource;
 use densify_train::checkpoint::{CheckpointError, Header, checkpoint_path, remove_older, write};
@@ -325,7 +325,7 @@ impl<'a> Session<'a> {
                 };
                 Err(Failure::from(error).and(&saved))
             }
-            Err(error @ TrainError::Unsound { .. }) => Err(self.kept(error.into())),
+            Err(error @ TrainError::NonFinite { .. }) => Err(self.kept(error.into())),
             // A photograph that could be read before. In the first epoch little is lost.
             Err(error @ TrainError::View { step, .. })
                 if step > self.run.trainer.steps_done() && step as usize > train_views =>
@@ -336,7 +336,7 @@ impl<'a> Session<'a> {
         }
     }
 
-    fn record(&mut self, report: &StepReport) -> Result<(), OutputError> {
+    fn record(&mut self, report: &StepReport) -> Result<(), FileError> {
         let Self { logs, totals, run, observer, .. } = self;
         for event in &report.events {
             observer.edited(event);

@@ -5,7 +5,7 @@ use std::path::Path;
 use super::Run;
 use super::report::{REQUIREMENTS, Requirements};
 use super::session::Session;
-use densify_core::files::OutputError;
+use densify_core::files::FileError;
 use densify_core::memory::Bytes;
 use densify_core::numbers::{duration, grouped};
 use densify_data::views::ViewSource;
@@ -13,7 +13,7 @@ use densify_train::evaluate::FittedScore;
 use densify_train::output::{Mean, Summary, model_path, write_json};
 
 impl Session<'_> {
-    pub(super) fn write_summary(&self, finished: bool) -> Result<(), OutputError> {
+    pub(super) fn write_summary(&self, finished: bool) -> Result<(), FileError> {
         let Run { config, trainer, test, ledger, .. } = &self.run;
         let (events, views) = trainer.policy_times();
         let images = trainer.images_time();

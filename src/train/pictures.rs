@@ -6,7 +6,7 @@ use std::path::Path;
 use image::{DynamicImage, ImageFormat, Rgb, RgbImage, imageops};
 use rayon::prelude::*;
 
-use densify_core::files::{OutputError, write_atomically};
+use densify_core::files::{FileError, write_atomically};
 use densify_core::image::Image8;
 use densify_render::Rendering;
 
@@ -44,7 +44,7 @@ pub fn side_by_side(pictures: &[RgbImage], gap: u32) -> RgbImage {
     all
 }
 
-pub fn write_png(path: &Path, image: &DynamicImage) -> Result<(), OutputError> {
+pub fn write_png(path: &Path, image: &DynamicImage) -> Result<(), FileError> {
     write_atomically(path, |out| {
         let mut encoded = Cursor::new(Vec::new());
         image.write_to(&mut encoded, ImageFormat::Png).map_err(std::io::Error::other)?;

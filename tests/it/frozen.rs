@@ -3,7 +3,7 @@
 
 use densify::core::camera::Camera;
 use densify::core::gaussians::Gaussians;
-use densify::render::{Attribute, Backend, Kept, StepInput, Storage, Unsound, Values};
+use densify::render::{Attribute, Backend, NonFinite, NumberKind, StepInput, Storage, Values};
 use densify::selftest::{Setup, Subject, scenes};
 use densify_policies::adc::split_by;
 use densify_policies::plan::{Decay, EditPlan};
@@ -199,13 +199,13 @@ fn what_is_unsound_behind_them_is_found() {
         let Values::F32(values) = &mut moments.values else { panic!("{first} has no numbers") };
         values[(FROZEN + 7) * width] = f32::NAN;
         backend.restore(moments).expect("they are taken back");
-        let unsound = |row: usize, attribute, kept| Unsound { row: row as u32, attribute, kept };
+        let unsound = |row: usize, attribute, kind| NonFinite { row: row as u32, attribute, kind };
         assert_eq!(
             backend.audit().expect("an audit"),
             [
-                unsound(5, Attribute::Opacity, Kept::Parameter),
-                unsound(FROZEN + 2, Attribute::Mean, Kept::Parameter),
-                unsound(FROZEN + 7, Attribute::Mean, Kept::Moment),
+                unsound(5, Attribute::Opacity, NumberKind::Parameter),
+                unsound(FROZEN + 2, Attribute::Mean, NumberKind::Parameter),
+                unsound(FROZEN + 7, Attribute::Mean, NumberKind::Moment),
             ]
         );
     });

@@ -3,7 +3,7 @@
 //! [selftest](densify::selftest).
 
 use densify::core::gaussians::Gaussians;
-use densify::render::{Attribute, Backend, Kept, Storage, Unsound, Values};
+use densify::render::{Attribute, Backend, NumberKind, Storage, NonFinite, Values};
 use densify::selftest::values::{POISON, SLOTS, remove, slot_mut};
 use densify::selftest::{Setup, Subject, scenes};
 use densify_policies::plan::EditPlan;
@@ -14,7 +14,7 @@ use crate::subject::{make, make_with, on_each, repeatable, step_input, storages}
 const POISONED: usize = 11;
 
 /// What slot `slot` of a row is.
-fn unsound(row: usize, slot: usize) -> Unsound {
+fn unsound(row: usize, slot: usize) -> NonFinite {
     let attribute = match slot {
         0..3 => Attribute::Mean,
         3..6 => Attribute::LogScale,
@@ -22,7 +22,7 @@ fn unsound(row: usize, slot: usize) -> Unsound {
         10 => Attribute::Opacity,
         _ => Attribute::Sh,
     };
-    Unsound { row: row as u32, attribute, kept: Kept::Parameter }
+    NonFinite { row: row as u32, attribute, kind: NumberKind::Parameter }
 }
 
 /// Row i has its number i poisoned.
@@ -38,7 +38,7 @@ fn every_parameter_that_is_none_is_found(subject: &Subject, storage: Storage) {
         // Beyond f16, and no reason to be removed.
         *slot_mut(&mut poisoned, SLOTS + 1, 20) = -1e30;
         (0..SLOTS).for_each(|slot| *slot_mut(&mut poisoned, slot, slot) = value);
-        let expected: Vec<Unsound> = (0..SLOTS).map(|slot| unsound(slot, slot)).collect();
+        let expected: Vec<NonFinite> = (0..SLOTS).map(|slot| unsound(slot, slot)).collect();
         assert_eq!(audit(&poisoned), expected, "{value}, {storage:?}");
     }
 }
@@ -59,7 +59,7 @@ fn every_moment_that_is_none_is_found(subject: &Subject) {
         let found = backend.audit().expect("an audit");
         let rows: Vec<usize> = found.iter().map(|u| u.row as usize).collect();
         assert_eq!(rows, (0..numbers).collect::<Vec<_>>(), "{name}");
-        assert!(found.iter().all(|u| u.kept == Kept::Moment), "{name}");
+        assert!(found.iter().all(|u| u.kind == NumberKind::Moment), "{name}");
         backend.restore(sound).expect("they are taken back");
         assert!(backend.audit().expect("an audit").is_empty(), "{name}");
         seen += numbers;

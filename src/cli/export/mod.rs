@@ -9,7 +9,7 @@ use clap::{ArgMatches, Args};
 
 use super::console::Console;
 use super::render::{RenderingArgs, refuse_options_of_a_file};
-use densify_core::files::{OutputError, write_atomically};
+use densify_core::files::{FileError, write_atomically};
 use densify_core::gaussians::Gaussians;
 use densify_core::numbers::gaussians;
 use densify_data::models::{Format, export_formats, find, find_by_extension, is_unfit};
@@ -189,7 +189,7 @@ pub(super) fn format_of(output: &Path) -> Result<&'static Format, Failure> {
 fn write(format: &Format, path: &Path, model: &Gaussians) -> Result<(), Failure> {
     write_atomically(path, |out| format.write(model, out)).map_err(|error| match error {
         // What the format has no room for, not what the disk has none for.
-        OutputError::Io { source, .. } if is_unfit(&source) => {
+        FileError::Io { source, .. } if is_unfit(&source) => {
             Failure::input(format!("{}: {source}", path.display()))
         }
         error => error.into(),

@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 use std::path::Path;
 
-use densify_core::files::OutputError;
+use densify_core::files::FileError;
 use densify_core::numbers::{grouped, percent};
 use densify_data::models::PLY;
 use densify_run::failure::Failure;
@@ -17,7 +17,7 @@ pub(super) struct Line {
 
 impl Line {
     pub(super) fn of(name: &'static str, path: &Path, psnr: Option<f64>) -> Result<Self, Failure> {
-        let bytes = path.metadata().map_err(OutputError::io("read", path))?.len();
+        let bytes = path.metadata().map_err(FileError::io("read", path))?.len();
         Ok(Self { name, bytes, psnr })
     }
 }

@@ -26,7 +26,7 @@ struct Rig {
     up: DVec3,
     /// The point nearest to all lines of sight.
     focus: DVec3,
-    /// Whether most cameras have the focus in front of them.
+    /// True if most cameras have the focus in front of them.
     looks_inward: bool,
     /// Median vertical field of view `[rad]`.
     fov_y: f64,
@@ -78,7 +78,7 @@ pub struct Orientation {
     pub up: DVec3,
     /// The point nearest to all lines of sight.
     pub focus: DVec3,
-    /// Whether most cameras have the focus in front of them.
+    /// True if most cameras have the focus in front of them.
     pub looks_inward: bool,
 }
 

@@ -26,7 +26,7 @@ pub struct Keyframe {
 pub struct CameraPath {
     /// The keyframes, at equal intervals; at least one.
     pub keyframes: Vec<Keyframe>,
-    /// Whether the path returns from the last keyframe to the first.
+    /// True if the path returns from the last keyframe to the first.
     pub is_loop: bool,
 }
 

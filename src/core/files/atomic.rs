@@ -4,13 +4,13 @@ use std::ffi::OsStr;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
-use super::OutputError;
+use super::FileError;
 use super::disk::{Operation, WatchedFile, attempt};
 
 /// Prefix of the names of temporary files and folders.
-pub const TEMPORARY: &str = ".densify-";
+const TEMPORARY: &str = ".densify-";
 
-/// Whether this is the name of a temporary file or folder.
+/// Returns whether this is the name of a temporary file or folder.
 #[must_use]
 pub fn is_temporary(name: &OsStr) -> bool {
     name.to_string_lossy().starts_with(TEMPORARY)
@@ -20,13 +20,13 @@ pub fn is_temporary(name: &OsStr) -> bool {
 /// the old or the new content, even after a crash. Creates missing folders.
 ///
 /// # Errors
-/// [`OutputError::Io`], also for an error that `write` returns. An existing file then stays unchanged, and no
+/// [`FileError::Io`], also for an error that `write` returns. An existing file then stays unchanged, and no
 /// temporary file remains.
 pub fn write_atomically(
     path: &Path,
     write: impl FnOnce(&mut dyn Write) -> io::Result<()>,
-) -> Result<(), OutputError> {
-    write_atomically_from(path, |out| Ok::<_, WriteError<OutputError>>(write(out)?))
+) -> Result<(), FileError> {
+    write_atomically_from(path, |out| Ok::<_, WriteError<FileError>>(write(out)?))
 }
 
 /// An error while a file was being written.
@@ -47,9 +47,9 @@ impl<E> From<io::Error> for WriteError<E> {
 /// Does the same as [`write_atomically`], for contents whose production may fail.
 ///
 /// # Errors
-/// [`OutputError::Io`], and the error in a [`WriteError::Source`]. An existing file then stays unchanged, and no
+/// [`FileError::Io`], and the error in a [`WriteError::Source`]. An existing file then stays unchanged, and no
 /// temporary file remains.
-pub fn write_atomically_from<E: From<OutputError>>(
+pub fn write_atomically_from<E: From<FileError>>(
     path: &Path,
     write: impl FnOnce(&mut dyn Write) -> Result<(), WriteError<E>>,
 ) -> Result<(), E> {
@@ -57,9 +57,9 @@ pub fn write_atomically_from<E: From<OutputError>>(
         Some(parent) if !parent.as_os_str().is_empty() => parent,
         _ => Path::new("."),
     };
-    std::fs::create_dir_all(folder).map_err(OutputError::io("create the folder", folder))?;
+    std::fs::create_dir_all(folder).map_err(FileError::io("create the folder", folder))?;
     replace(folder, path, write).map_err(|error| match error {
-        WriteError::Io(error) => OutputError::io("write", path)(error).into(),
+        WriteError::Io(error) => FileError::io("write", path)(error).into(),
         WriteError::Source(error) => error,
     })
 }

@@ -66,7 +66,7 @@ mod faults {
     struct Plan {
         fault: Option<Fault>,
         met: u32,
-        /// Whether every write accepts one byte at most.
+        /// True if every write accepts one byte at most.
         short: bool,
     }
 

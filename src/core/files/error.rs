@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 /// Errors of writing and reading files.
 #[derive(Debug, thiserror::Error)]
-pub enum OutputError {
+pub enum FileError {
     /// The folder holds another run.
     #[error("{} holds another run", folder.display())]
     Occupied {
@@ -47,7 +47,7 @@ pub enum OutputError {
         /// The folder with files of the old run, if they could not be moved back.
         aside: Option<PathBuf>,
         /// The error of the file that could not be moved.
-        source: Box<OutputError>,
+        source: Box<FileError>,
     },
     /// Reading or writing failed.
     #[error("cannot {action} {path}: {source}{}", remedy(source))]
@@ -70,7 +70,7 @@ fn remedy(source: &std::io::Error) -> &'static str {
     }
 }
 
-impl OutputError {
+impl FileError {
     /// An error about a folder that holds another run.
     #[must_use]
     pub fn occupied(folder: &Path) -> Self {

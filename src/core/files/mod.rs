@@ -6,8 +6,8 @@ mod error;
 mod read;
 
 pub use atomic::{
-    RUN_FOLDER_DEPTH, TEMPORARY, WriteError, is_temporary, remove_incomplete, write_atomically,
+    RUN_FOLDER_DEPTH, WriteError, is_temporary, remove_incomplete, write_atomically,
     write_atomically_from,
 };
-pub use error::OutputError;
+pub use error::FileError;
 pub use read::{MAX_OPTIONS, lines, most_unpacked, one_line, open, read_text, wrong_kind};

@@ -25,7 +25,7 @@ pub struct LedgerLine {
     pub what: String,
     /// Its size `[bytes]`.
     pub bytes: u64,
-    /// Whether it is in GPU memory.
+    /// True if it is in GPU memory.
     #[serde(default, skip_serializing_if = "is_false")]
     pub on_device: bool,
 }
@@ -132,8 +132,8 @@ fn peak(lines: &[&LedgerLine]) -> u64 {
 
 /// Finds the lines that are held at the peak: those of the process, and of the largest phase.
 ///
-/// Of [`Section::Passing`], [`Section::Before`] and [`Section::After`] only the largest line counts, as these are
-/// never held together. GPU memory is held together with [`Section::After`], not with [`Section::Before`].
+/// Only the largest line counts in each of [`Section::Passing`], [`Section::Before`] and [`Section::After`], as these
+/// are never held together. GPU memory is held together with [`Section::After`], not with [`Section::Before`].
 fn held_at_peak(lines: &[&LedgerLine]) -> Vec<bool> {
     let largest = |section| {
         let indices = (0..lines.len()).filter(|&i| lines[i].section == section);

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use super::Format;
 use super::spatial_order::spatial_order;
-use densify_core::files::{OutputError, WriteError, write_atomically_from};
+use densify_core::files::{FileError, WriteError, write_atomically_from};
 use densify_core::gaussians::Gaussians;
 use densify_core::pieces::pieces;
 
@@ -121,7 +121,7 @@ impl Format {
     ///
     /// # Errors
     /// Those of `rows`, [`ModelWriter`] and [`write_atomically_from`].
-    pub fn write_file<E: From<OutputError>>(
+    pub fn write_file<E: From<FileError>>(
         &self,
         path: &Path,
         shape: Shape,

@@ -3,25 +3,29 @@
 use super::blocks::{Scratch, planes};
 use super::simd::WIDTH;
 use super::{BLOCKS_PER_TASK, CpuBackend};
-use crate::{Attribute, Kept, Unsound};
+use crate::{Attribute, NonFinite, NumberKind};
 
 impl CpuBackend {
     /// The rows with a non-finite number, in order.
-    pub(super) fn unsound(&self) -> Vec<Unsound> {
+    pub(super) fn unsound(&self) -> Vec<NonFinite> {
         let rows = self.rows;
         let first_block = self.moments.first() / WIDTH;
         let (params, moments) = (self.params.view(rows), self.moments.view(rows));
         let planes = planes(self.sh_degree);
         let find = |row: usize| {
-            let first = |get: &dyn Fn(usize) -> f32, kept| {
+            let first = |get: &dyn Fn(usize) -> f32, kind| {
                 let number = (0..planes).position(|plane| !get(plane).is_finite())?;
-                Some(Unsound { row: row as u32, attribute: Attribute::of_parameter(number), kept })
+                Some(NonFinite {
+                    row: row as u32,
+                    attribute: Attribute::of_parameter(number),
+                    kind,
+                })
             };
             let moment = |which: usize| {
                 let of_row = |plane| self.moments.get(row, plane)[which];
-                (row >= self.moments.first()).then(|| first(&of_row, Kept::Moment))?
+                (row >= self.moments.first()).then(|| first(&of_row, NumberKind::Moment))?
             };
-            first(&|plane| self.params.get(row, plane), Kept::Parameter)
+            first(&|plane| self.params.get(row, plane), NumberKind::Parameter)
                 .or_else(|| moment(0))
                 .or_else(|| moment(1))
         };
@@ -36,7 +40,7 @@ impl CpuBackend {
                     .checked_sub(first_block)
                     .is_some_and(|at| moments_are_unsound(at, &mut scratch))
         };
-        let of_task = |task: usize| -> Vec<Unsound> {
+        let of_task = |task: usize| -> Vec<NonFinite> {
             let blocks = task * BLOCKS_PER_TASK..blocks.min((task + 1) * BLOCKS_PER_TASK);
             let suspects = blocks.filter(|&block| is_suspect(block));
             suspects.flat_map(|b| b * WIDTH..rows.min((b + 1) * WIDTH)).filter_map(find).collect()
@@ -47,7 +51,7 @@ impl CpuBackend {
     }
 }
 
-/// Whether all numbers are finite.
+/// Returns whether all numbers are finite.
 fn is_sound(numbers: &[f32]) -> bool {
     // 0 · x is 0 unless x is NaN or infinite; sixteen sums run side by side.
     let mut sums = [0.0_f32; WIDTH];

@@ -115,7 +115,7 @@ pub(super) struct Ellipse<S: Simd> {
 struct Bounds<S: Simd> {
     /// First and last column, first and last row: whole numbers.
     sides: [[V<S>; 2]; 2],
-    /// Whether the rectangle is more than one tile wide and high, so that its corners may be outside the ellipse.
+    /// True if the rectangle is more than one tile wide and high, so that its corners may be outside the ellipse.
     wide: Mask<S>,
 }
 
@@ -243,24 +243,24 @@ mod tests {
         #[inline(always)]
         fn with_simd<S: Simd>(self, s: S) -> [u32; WIDTH] {
             let Self(splats, grid) = self;
-            let of = |at: usize, field: fn(&Splat) -> f32| {
-                let lanes: Vec<f32> = splats.iter().map(field).collect();
-                V::load(s, &lanes[at..])
+            let lanes = |at: usize, field: fn(&Splat) -> f32| {
+                let values: Vec<f32> = splats.iter().map(field).collect();
+                V::load(s, &values[at..])
             };
             let mut bits = [0.0; WIDTH];
             for at in (0..WIDTH).step_by(S::F32_LANES) {
                 let ellipse = Ellipse {
                     s,
-                    mean: [of(at, |splat| splat.mean[0]), of(at, |splat| splat.mean[1])],
+                    mean: [lanes(at, |splat| splat.mean[0]), lanes(at, |splat| splat.mean[1])],
                     half_sides: [
-                        of(at, |splat| splat.half_width),
-                        of(at, |splat| splat.half_height),
+                        lanes(at, |splat| splat.half_width),
+                        lanes(at, |splat| splat.half_height),
                     ],
-                    shear: of(at, |splat| splat.shear),
-                    l3: of(at, |splat| splat.l3),
-                    inv_l1: of(at, |splat| splat.inv_l1),
-                    peak: of(at, |splat| splat.peak),
-                    reach: of(at, |splat| splat.reach),
+                    shear: lanes(at, |splat| splat.shear),
+                    l3: lanes(at, |splat| splat.l3),
+                    inv_l1: lanes(at, |splat| splat.inv_l1),
+                    peak: lanes(at, |splat| splat.peak),
+                    reach: lanes(at, |splat| splat.reach),
                 };
                 V::of_bits(s, ellipse.tiles(grid)).store(&mut bits[at..]);
             }

@@ -52,8 +52,8 @@ use pulp::Arch;
 use super::candidates::{Candidates, Photograph, error_weights};
 use super::signals::{Field, counts_dominant};
 use super::{
-    AuxInput, AuxOutput, Backend, BackendError, Inspect, Rendering, Setup, Shortcuts, StateArray,
-    StateError, StepInput, StepOutput, Tensor, Unsound, assert_fits, assert_same_size,
+    AuxInput, AuxOutput, Backend, BackendError, Inspect, NonFinite, Rendering, Setup, Shortcuts,
+    StateArray, StateError, StepInput, StepOutput, Tensor, assert_fits, assert_same_size,
 };
 use adam::BiasCorrection;
 use blocks::{Blocks, planes};
@@ -218,7 +218,7 @@ impl CpuBackend {
         if let Some(exposure) = exposure {
             self.expose(&frame.grid, exposure);
         }
-        let picks = self.candidates.open(input.step, self.rows);
+        let picks = self.candidates.to_take(input.step, self.rows);
         let weights = picks.and_then(|(request, _)| error_weights(request.error));
         let by_pixel =
             self.signals.layout().has(Field::Error).then_some(self.signals.planes().score);
@@ -312,7 +312,7 @@ impl Backend for CpuBackend {
         Ok(())
     }
 
-    fn audit(&mut self) -> Result<Vec<Unsound>, BackendError> {
+    fn audit(&mut self) -> Result<Vec<NonFinite>, BackendError> {
         Ok(self.unsound())
     }
 

@@ -249,7 +249,7 @@ impl MomentTask<'_> {
         ratios(&m.0[..used], second, &mut self.ratios.block(block)[..used], of_m);
     }
 
-    /// Whether the stored format is not f32.
+    /// Returns whether the stored format is not f32.
     #[inline(always)]
     pub(super) fn is_narrow(&self) -> bool {
         self.is_narrow

@@ -233,7 +233,7 @@ impl WithSimd for Replay<'_> {
                         alive &= !(1 << p);
                     }
                 }
-                let record = records.of(Entry::load(entry), n * BATCH + i);
+                let record = records.record(Entry::load(entry), n * BATCH + i);
                 for (i, (to, sum)) in record.into_iter().flatten().zip(sums).enumerate() {
                     let total = if i == MAXIMUM { sum.max_lane() } else { sum.sum() };
                     to.store(total.to_bits(), Relaxed);

@@ -188,7 +188,7 @@ pub struct ModelGradient {
     pub sum_weight: Vec<f32>,
     /// Pixels that the row is blended into. Shape: `[rows]`.
     pub pixel_count: Vec<u32>,
-    /// Whether the row's projection is on screen. Shape: `[rows]`.
+    /// True if the row's projection is on screen. Shape: `[rows]`.
     pub visible: Vec<bool>,
 }
 

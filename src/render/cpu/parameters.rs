@@ -252,7 +252,7 @@ pub(super) struct ParameterTask<'a> {
 }
 
 impl ParameterTask<'_> {
-    /// Whether the stored format is not f32.
+    /// Returns whether the stored format is not f32.
     #[inline(always)]
     pub(super) fn is_narrow(&self) -> bool {
         self.is_narrow

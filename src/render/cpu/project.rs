@@ -268,13 +268,13 @@ fn log2_sigmoid<S: Simd>(s: S, x: V<S>) -> V<S> {
     x.min(V::zero(s)) * std::f32::consts::LOG2_E - tail
 }
 
-/// Whether |x| <= most; false for NaN.
+/// Returns whether |x| <= most; false for NaN.
 #[inline(always)]
 fn below<S: Simd>(x: V<S>, most: f32) -> Mask<S> {
     x.abs().le(V::splat_like(x, most))
 }
 
-/// Whether a splat reaches any pixel centre, from ½ to size − ½. False for NaN, so that rows with NaN are not
+/// Returns whether a splat reaches any pixel centre, from ½ to size − ½. False for NaN, so that rows with NaN are not
 /// drawn.
 #[inline(always)]
 fn reaches<S: Simd>(s: S, centre: V<S>, half: V<S>, size: u32) -> Mask<S> {

@@ -93,11 +93,12 @@ impl WithSimd for RasterizeBwd<'_> {
         // Without vectors there are only two kernels: eleven, unrolled lane by lane, would be a tenth of the
         // program. Values that are not requested are not written.
         if const { S::F32_LANES == 1 } {
-            return if has(Field::Depth) {
-                self.run::<S, { extra::ALL }>(s)
+            if has(Field::Depth) {
+                self.run::<S, { extra::ALL }>(s);
             } else {
-                self.run::<S, { extra::ERROR_ABS }>(s)
-            };
+                self.run::<S, { extra::ERROR_ABS }>(s);
+            }
+            return;
         }
         let mut extras = 0;
         if has(Field::AbsX) {
@@ -234,7 +235,7 @@ impl RasterizeBwd<'_> {
         }
         let list_end = patch_end.iter().copied().max().unwrap_or(0) as usize;
         for (i, entry) in list[list_end..].iter().enumerate() {
-            let record = records.of(Entry::load(entry), list_end + i);
+            let record = records.record(Entry::load(entry), list_end + i);
             write(record, &[0.0; RecordLayout::MOST], layout);
         }
 
@@ -336,7 +337,7 @@ impl RasterizeBwd<'_> {
                 if EXTRAS & extra::LARGEST != 0 {
                     record[Field::WeightMax.number()] = sums.weight_max.max_lane();
                 }
-                write(records.of(Entry::load(&chunk[i]), first + i), &record, layout);
+                write(records.record(Entry::load(&chunk[i]), first + i), &record, layout);
             }
         }
     }

@@ -39,7 +39,7 @@ pub(super) struct TileRecords<'a> {
 impl<'a> TileRecords<'a> {
     /// The record of the entry at index `at` of the tile's list, if it belongs to this part.
     #[inline(always)]
-    pub(super) fn of(&self, entry: Entry, at: usize) -> Option<&'a [AtomicU32]> {
+    pub(super) fn record(&self, entry: Entry, at: usize) -> Option<&'a [AtomicU32]> {
         let record = match self.first {
             None => entry.slot,
             Some(first) => first.wrapping_add(at),
@@ -54,7 +54,7 @@ pub(super) struct Sums<'a> {
     /// Shape: `[rows, stride]`, or more rows.
     pub(super) sums: &'a mut [f32],
     pub(super) stride: usize,
-    /// Whether the sums start at 0.
+    /// True if the sums start at 0.
     pub(super) fresh: bool,
     /// Bit per lane of each block: whether the row has records. Shape: `[blocks]`.
     pub(super) visible: &'a [u16],

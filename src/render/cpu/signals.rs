@@ -160,7 +160,7 @@ impl Accumulators {
 
     /// Resets signals to 0.
     pub(super) fn reset(&mut self, signals: SignalSet, threads: &Threads, rows: usize) {
-        self.clear(threads, &self.planes.of_all(signals), rows);
+        self.clear(threads, &self.planes.of_signals(signals), rows);
     }
 
     fn clear(&mut self, threads: &Threads, planes: &[usize], rows: usize) {
@@ -189,8 +189,8 @@ impl Accumulators {
     ) {
         for signal in wanted.iter() {
             let Some(column) = signals.get_mut(signal) else { continue };
-            let attribute = ParameterSignal::of(signal);
-            let planes = self.planes.of(signal);
+            let attribute = ParameterSignal::new(signal);
+            let planes = self.planes.of_signal(signal);
             let value = |row: usize| -> f32 {
                 if signal.kind() == SignalKind::Present {
                     return present(signal, row, params, masks, ages);

@@ -35,7 +35,7 @@ pub(super) struct Due {
     pub(super) main: bool,
     /// Bands 1–3.
     pub(super) rest: bool,
-    /// Whether sums were waiting before this step: main parameters, bands 1–3.
+    /// True if sums were waiting before this step: main parameters, bands 1–3.
     waited: [bool; 2],
 }
 
@@ -117,7 +117,7 @@ impl Summed {
         }
     }
 
-    /// Whether a state array is by rows.
+    /// Returns whether a state array is by rows.
     pub(super) fn is_by_rows(part: &str) -> bool {
         part != WAITING
     }
@@ -197,7 +197,7 @@ impl Summed {
 }
 
 impl Due {
-    /// Whether gradients are added to the sums or taken from them.
+    /// Returns whether gradients are added to the sums or taken from them.
     pub(super) fn uses_sums(self) -> bool {
         !self.main || !self.rest || self.waited != [false; 2]
     }

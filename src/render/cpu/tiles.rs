@@ -414,7 +414,7 @@ mod tests {
         }
     }
 
-    /// Of fewer tiles than a run has, of whole runs, and of more.
+    /// Fewer tiles than a run has, whole runs, and more.
     #[test]
     fn places_are_sums_of_all_that_comes_before() {
         const RUN: usize = MIN_TILES_PER_RUN;

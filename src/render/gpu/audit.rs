@@ -3,11 +3,11 @@
 use super::GpuBackend;
 use super::launches::{Audit, MOMENTS};
 use super::passes::Recorder;
-use crate::{Attribute, BackendError, Kept, Unsound};
+use crate::{Attribute, BackendError, NonFinite, NumberKind};
 
 impl GpuBackend {
     /// The rows with a number that is not finite, in order.
-    pub(super) fn find_unsound(&self) -> Result<Vec<Unsound>, BackendError> {
+    pub(super) fn find_unsound(&self) -> Result<Vec<NonFinite>, BackendError> {
         let rows = self.rows as u32;
         let bytes = 4 * u64::from(rows);
         let mut encoder = self.device.device.create_command_encoder(&Default::default());
@@ -23,9 +23,9 @@ impl GpuBackend {
         let marks = self.read("sums", 0, bytes)?;
         let marked = (0..).zip(&marks).filter_map(|(row, mark)| {
             let place = mark.to_bits().checked_sub(1)?;
-            let kept = if place < MOMENTS { Kept::Parameter } else { Kept::Moment };
+            let kind = if place < MOMENTS { NumberKind::Parameter } else { NumberKind::Moment };
             let attribute = Attribute::of_parameter((place % MOMENTS) as usize);
-            Some(Unsound { row, attribute, kept })
+            Some(NonFinite { row, attribute, kind })
         });
         Ok(marked.collect())
     }

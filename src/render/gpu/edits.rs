@@ -299,7 +299,7 @@ impl GpuBackend {
                 to.run(launches.get("clamp_opacity"), immediates, rows.div_ceil(256));
             });
         }
-        self.clear_planes(&self.planes.of_all(ops.reset_signals));
+        self.clear_planes(&self.planes.of_signals(ops.reset_signals));
         self.rows = ops.rows_after;
     }
 

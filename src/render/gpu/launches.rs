@@ -11,7 +11,7 @@ use super::buffers::Buffers;
 use super::pipelines::{Compiled, Pipelines};
 use super::rows::{Edited, FIRST, PARAMETERS, RowArray, SECOND, WAITING};
 use super::sizes::Sizes;
-use crate::{Accumulation, Kept};
+use crate::{Accumulation, NumberKind};
 
 /// Sources of the error per pixel: the loss's error, or its gradient.
 const ERROR_MAPS: [&str; 2] = ["error", "pixel gradient"];
@@ -241,8 +241,8 @@ fn audits<L>(bind: Bind<'_, L>, sizes: &Sizes) -> Vec<Audit<L>> {
             first_row: sizes.places(array)[0] as u32,
             numbers: array.numbers as u32,
             mark: match array.content.traits().audited? {
-                Kept::Parameter => first,
-                Kept::Moment => MOMENTS + first,
+                NumberKind::Parameter => first,
+                NumberKind::Moment => MOMENTS + first,
             },
         })
     };

@@ -44,8 +44,8 @@ use densify_policies::policy::{Cadence, Candidate, MaskTerm, SignalKind, SignalS
 use super::candidates::Candidates;
 use super::signals::{ParameterSignal, SignalPlanes, as_read};
 use super::{
-    AdapterSummary, AuxInput, AuxOutput, Backend, BackendError, Inspect, Rendering, Setup,
-    Shortcuts, StateArray, StateError, StepInput, StepOutput, Tensor, Unsound, assert_fits,
+    AdapterSummary, AuxInput, AuxOutput, Backend, BackendError, Inspect, NonFinite, Rendering,
+    Setup, Shortcuts, StateArray, StateError, StepInput, StepOutput, Tensor, assert_fits,
 };
 use densify_core::camera::Camera;
 use densify_core::gaussians::{Gaussians, ModelArray, rgb_to_dc};
@@ -257,14 +257,14 @@ impl Backend for GpuBackend {
     fn take_signals(&mut self, wanted: SignalSet) -> Result<Signals, BackendError> {
         let mut signals = Signals::zeros(self.rows, wanted);
         for signal in wanted.iter() {
-            if let Some(attribute) = ParameterSignal::of(signal) {
+            if let Some(attribute) = ParameterSignal::new(signal) {
                 self.read_attribute(&attribute, signals.get_mut(signal).unwrap_or_default())?;
                 continue;
             }
             let values = if signal.kind() == SignalKind::Present {
                 self.present(signal)?
             } else {
-                let planes = self.planes.of(signal);
+                let planes = self.planes.of_signal(signal);
                 let columns: Result<Vec<_>, _> =
                     planes.map(|plane| self.column(plane, 0..self.rows)).collect();
                 let max =
@@ -294,7 +294,7 @@ impl Backend for GpuBackend {
         self.device.check()
     }
 
-    fn audit(&mut self) -> Result<Vec<Unsound>, BackendError> {
+    fn audit(&mut self) -> Result<Vec<NonFinite>, BackendError> {
         self.find_unsound()
     }
 

@@ -36,7 +36,7 @@ impl Variant {
         ];
         let offset = |field| self.records.at(field).unwrap_or(0) as f64;
         all.extend(Field::ALL.map(|field| (field.constant().to_owned(), offset(field))));
-        let is_computed = |signal: &Signal| ParameterSignal::of(*signal).is_none();
+        let is_computed = |signal: &Signal| ParameterSignal::new(*signal).is_none();
         let computed = Signal::ALL.into_iter().filter(is_computed);
         all.extend(computed.map(|signal| (constant(signal), f64::from(signal as u32))));
         all

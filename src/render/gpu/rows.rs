@@ -3,7 +3,7 @@
 
 use std::ops::Range;
 
-use crate::Kept;
+use crate::NumberKind;
 use densify_core::gaussians::ModelArray;
 use densify_core::memory::Section;
 
@@ -71,7 +71,7 @@ pub(super) struct Traits {
     /// Saved in checkpoints as this array; parameters are saved as the model, signals one by one.
     pub(super) is_saved: bool,
     /// Searched for numbers that are not finite.
-    pub(super) audited: Option<Kept>,
+    pub(super) audited: Option<NumberKind>,
     /// Used by training only, so that frozen rows are not stored.
     pub(super) is_for_training: bool,
 }
@@ -81,11 +81,13 @@ impl Content {
         use Edited::{Cleared, Computed, Inherited, Untouched};
         let (section, line, edited, is_saved, audited) = match self {
             Self::Geometry => {
-                (Section::Model, "parameters", Computed, false, Some(Kept::Parameter))
+                (Section::Model, "parameters", Computed, false, Some(NumberKind::Parameter))
             }
-            Self::Colour => (Section::Model, "parameters", Inherited, false, Some(Kept::Parameter)),
+            Self::Colour => {
+                (Section::Model, "parameters", Inherited, false, Some(NumberKind::Parameter))
+            }
             Self::FirstMoments | Self::SecondMoments => {
-                (Section::Model, "optimiser moments", Cleared, true, Some(Kept::Moment))
+                (Section::Model, "optimiser moments", Cleared, true, Some(NumberKind::Moment))
             }
             Self::Waiting => {
                 (Section::Gradients, "gradients summed between steps", Cleared, true, None)

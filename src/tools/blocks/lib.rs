@@ -25,7 +25,7 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use densify_core::files;
-use densify_core::files::OutputError;
+use densify_core::files::FileError;
 use densify_run::failure::Failure;
 pub use divide::Cell;
 pub use ground::Ground;
@@ -130,7 +130,7 @@ impl Blocks {
             Failure::input(format!("{}: {error}; {remedy}", path.display()))
         })?;
         let malformed =
-            |problem: String| Failure::from(OutputError::malformed(&path, problem.trim()));
+            |problem: String| Failure::from(FileError::malformed(&path, problem.trim()));
         let plan: Self = toml::from_str(&text).map_err(|error| malformed(error.to_string()))?;
         match plan.block.iter().find(|block| !is_plain(&block.name)) {
             Some(block) => Err(malformed(format!("`{}` is no name of a block", block.name))),

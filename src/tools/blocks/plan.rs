@@ -13,7 +13,7 @@ use super::{
     BLOCK_FILE, Block, Blocks, COARSE_FILE, Cell, Coarse, Ground, PLAN_FILE, block_folder,
 };
 use densify_core::camera::Camera;
-use densify_core::files::{OutputError, write_atomically};
+use densify_core::files::{FileError, write_atomically};
 use densify_core::gaussians::{MAX_SH_DEGREE, sh_coefficients};
 use densify_core::memory::Bytes;
 use densify_core::numbers::grouped;
@@ -61,7 +61,7 @@ pub fn plan(options: &PlanOptions, observer: &dyn Observer) -> Result<Blocks, Fa
     planner.write(&blocks, staged.path())?;
     let target = &options.output;
     fs::rename(staged.path(), target)
-        .map_err(OutputError::io("move the plan to the folder", target))?;
+        .map_err(FileError::io("move the plan to the folder", target))?;
     Ok(blocks)
 }
 
@@ -84,7 +84,7 @@ fn stage(output: &Path) -> Result<TempDir, Failure> {
     };
     let made = fs::create_dir_all(parent)
         .and_then(|()| tempfile::Builder::new().prefix(".densify-").tempdir_in(parent));
-    Ok(made.map_err(OutputError::io("write to the folder", parent))?)
+    Ok(made.map_err(FileError::io("write to the folder", parent))?)
 }
 
 struct Planner<'a> {
@@ -234,7 +234,7 @@ impl<'a> Planner<'a> {
             }
             let folder = block_folder(staged, &name);
             let written = fs::create_dir_all(&folder);
-            written.map_err(OutputError::io("create the folder", &folder))?;
+            written.map_err(FileError::io("create the folder", &folder))?;
             let lines: String = views.iter().map(|(name, part)| view_line(name, *part)).collect();
             write_atomically(&folder.join(super::task::VIEWS_FILE), |out| {
                 out.write_all(lines.as_bytes())
@@ -355,7 +355,7 @@ impl<'a> Planner<'a> {
         for entry in fs::read_dir(&all).into_iter().flatten().flatten() {
             if !names.iter().any(|name| entry.file_name() == *name) {
                 let path = entry.path();
-                fs::remove_dir_all(&path).map_err(OutputError::io("remove", &path))?;
+                fs::remove_dir_all(&path).map_err(FileError::io("remove", &path))?;
             }
         }
         put(staged.join(COARSE_FILE), text(self.of_coarse())?)?;

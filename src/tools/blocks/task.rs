@@ -6,7 +6,7 @@ use std::path::Path;
 use super::crop::{beyond, inside};
 use super::{BLOCK_FILE, Blocks, COARSE_FILE, MERGED_FILE, Task, block_folder, merge, run_folder};
 use densify_core::camera::Camera;
-use densify_core::files::{OutputError, write_atomically};
+use densify_core::files::{FileError, write_atomically};
 use densify_core::gaussians::Gaussians;
 use densify_core::numbers::grouped;
 use densify_data::dataset::Dataset;
@@ -121,7 +121,7 @@ fn block(
         let path = own.join(FROZEN_FILE);
         match fs::remove_file(&path) {
             Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-                return Err(OutputError::io("remove", &path)(error).into());
+                return Err(FileError::io("remove", &path)(error).into());
             }
             _ => {}
         }

@@ -15,7 +15,7 @@ use std::path::{Path, PathBuf};
 
 use tempfile::TempPath;
 
-use densify_core::files::{OutputError, write_atomically};
+use densify_core::files::{FileError, write_atomically};
 use densify_core::gaussians::Gaussians;
 use densify_core::numbers::grouped;
 use densify_data::models::{Format, PLY};
@@ -220,7 +220,7 @@ fn scratch(output: &Path) -> Result<TempPath, Failure> {
     };
     let made = std::fs::create_dir_all(folder)
         .and_then(|()| tempfile::NamedTempFile::with_prefix_in(".densify-", folder));
-    Ok(made.map_err(OutputError::io("write to the folder", folder))?.into_temp_path())
+    Ok(made.map_err(FileError::io("write to the folder", folder))?.into_temp_path())
 }
 
 /// Degrees of colour that are tried, the model's own first.

@@ -7,7 +7,7 @@ use std::path::Path;
 use image::codecs::webp::WebPEncoder;
 use image::{ExtendedColorType, RgbImage};
 
-use densify_core::files::{OutputError, write_atomically};
+use densify_core::files::{FileError, write_atomically};
 
 /// Longest side `[px]`.
 pub(crate) const MAX_SIDE: u32 = 16_383;
@@ -52,7 +52,7 @@ impl Animation {
     }
 
     /// Writes the file.
-    pub(crate) fn write(mut self, path: &Path) -> Result<(), OutputError> {
+    pub(crate) fn write(mut self, path: &Path) -> Result<(), FileError> {
         write_atomically(path, |out| {
             let frames = self.frames.stream_position()?;
             let mut head = Vec::new();

@@ -7,7 +7,7 @@ use std::str::FromStr;
 
 use densify_core::camera::Camera;
 use densify_core::camera_path::{self, CameraPathError, SavedCameraPath};
-use densify_core::files::{OutputError, one_line, write_atomically};
+use densify_core::files::{FileError, one_line, write_atomically};
 use densify_core::memory::Bytes;
 use densify_data::dataset::normalise::Normalisation;
 use densify_render::{Backend, BackendError};
@@ -144,7 +144,7 @@ pub enum FilmError {
     },
     /// A picture or the video could not be written.
     #[error("{0}")]
-    File(#[from] OutputError),
+    File(#[from] FileError),
     /// Rendering failed.
     #[error("{0}")]
     Backend(#[from] BackendError),

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use image::{DynamicImage, ImageBuffer, Luma};
 
-use densify_core::files::OutputError;
+use densify_core::files::FileError;
 use densify_core::image::Image8;
 use densify_data::dataset::normalise::Normalisation;
 use densify_render::Rendering;
@@ -51,7 +51,7 @@ impl PictureFolder {
     ///
     /// # Errors
     /// When a file cannot be written.
-    pub fn write(&mut self, name: &str, rendering: &Rendering) -> Result<(), OutputError> {
+    pub fn write(&mut self, name: &str, rendering: &Rendering) -> Result<(), FileError> {
         let file = |ending: &str| self.folder.join(format!("{name}{ending}"));
         write_png(&file(".png"), &picture(rendering).into())?;
         if self.channels.alpha {
@@ -76,7 +76,7 @@ impl PictureFolder {
         image: &Image8,
         background: [f32; 3],
         rendering: &Rendering,
-    ) -> Result<(), OutputError> {
+    ) -> Result<(), FileError> {
         let path = self.folder.join(format!("{name}.pair.png"));
         write_png(&path, &pair(image, background, rendering))
     }
@@ -85,7 +85,7 @@ impl PictureFolder {
     ///
     /// # Errors
     /// When the file cannot be written.
-    pub fn finish(&self) -> Result<(), OutputError> {
+    pub fn finish(&self) -> Result<(), FileError> {
         if self.largest_depth.is_empty() {
             return Ok(());
         }

@@ -13,7 +13,7 @@ use clap::Args;
 use serde::{Deserialize, Serialize};
 
 use densify_core::files;
-use densify_core::files::{OutputError, write_atomically};
+use densify_core::files::{FileError, write_atomically};
 use densify_run::Observer;
 use densify_run::failure::{Failure, OTHER};
 
@@ -197,7 +197,7 @@ pub fn submit(
         )));
     }
     let logs = batch.logs();
-    fs::create_dir_all(&logs).map_err(OutputError::io("create the folder", &logs))?;
+    fs::create_dir_all(&logs).map_err(FileError::io("create the folder", &logs))?;
     for EngineFile { path, text } in &files {
         write_atomically(path, |out| out.write_all(text.as_bytes()))?;
     }

@@ -7,7 +7,7 @@ use std::thread::sleep;
 use std::time::Duration;
 
 use super::{Batch, Job, Stage};
-use densify_core::files::OutputError;
+use densify_core::files::FileError;
 use densify_core::memory::Bytes;
 use densify_run::Observer;
 use densify_run::failure::{Failure, OTHER};
@@ -51,7 +51,7 @@ pub(super) fn show(batch: &Batch, observer: &dyn Observer) -> Result<(), Failure
 pub(super) fn run(batch: &Batch, observer: &dyn Observer) -> Result<(), Failure> {
     let _lock = lock(batch)?;
     let logs = batch.logs();
-    fs::create_dir_all(&logs).map_err(OutputError::io("create the folder", &logs))?;
+    fs::create_dir_all(&logs).map_err(FileError::io("create the folder", &logs))?;
     batch.stages.iter().try_for_each(|stage| run_stage(batch, &stage.jobs, &logs, observer))
 }
 
@@ -112,8 +112,8 @@ fn started(batch: &Batch, job: &Job, threads: u32, logs: &Path) -> Result<Child,
     let words = batch.words()?;
     let path = log_of(logs, &job.name);
     let log = File::options().create(true).append(true).open(&path);
-    let log = log.map_err(OutputError::io("write", &path))?;
-    let copy = log.try_clone().map_err(OutputError::io("write", &path))?;
+    let log = log.map_err(FileError::io("write", &path))?;
+    let copy = log.try_clone().map_err(FileError::io("write", &path))?;
     let mut command = Command::new(&words[0]);
     command.args(&words[1..]).arg(&job.name);
     if job.may_have_fewer_threads {
@@ -131,7 +131,7 @@ fn started(batch: &Batch, job: &Job, threads: u32, logs: &Path) -> Result<Child,
 fn lock(batch: &Batch) -> Result<File, Failure> {
     let path = batch.folder.join(LOCK_FILE);
     let file = File::options().create(true).append(true).open(&path);
-    let file = file.map_err(OutputError::io("write", &path))?;
+    let file = file.map_err(FileError::io("write", &path))?;
     match file.try_lock() {
         Ok(()) => Ok(file),
         Err(TryLockError::WouldBlock) => Err(Failure::input(format!(
@@ -139,7 +139,7 @@ fn lock(batch: &Batch) -> Result<File, Failure> {
             batch.folder.display(),
             batch.status
         ))),
-        Err(TryLockError::Error(error)) => Err(OutputError::io("lock", &path)(error).into()),
+        Err(TryLockError::Error(error)) => Err(FileError::io("lock", &path)(error).into()),
     }
 }
 

@@ -17,8 +17,8 @@ use densify_policies::plan::RowOps;
 use densify_policies::policy::{Candidate, SignalSet, Signals};
 use densify_render::cpu::{CpuBackend, ModelGradient};
 use densify_render::{
-    Attribute, AuxInput, AuxOutput, Backend, BackendError, Differentiable, ImageGradient, Kept,
-    Rendering, StateArray, StateError, StepInput, StepOutput, Tensor, Unsound,
+    Attribute, AuxInput, AuxOutput, Backend, BackendError, Differentiable, ImageGradient, NumberKind,
+    Rendering, StateArray, StateError, StepInput, StepOutput, Tensor, NonFinite,
 };
 
 use super::{Subject, cases};
@@ -164,11 +164,11 @@ impl Backend for FaultyBackend {
         self.inner.apply(ops, seed, step)
     }
 
-    fn audit(&mut self) -> Result<Vec<Unsound>, BackendError> {
+    fn audit(&mut self) -> Result<Vec<NonFinite>, BackendError> {
         let mut found = self.inner.audit()?;
         if self.fault == Fault::Audit {
-            let (attribute, kept) = (Attribute::Mean, Kept::Parameter);
-            found.insert(0, Unsound { row: 0, attribute, kept });
+            let (attribute, kept) = (Attribute::Mean, NumberKind::Parameter);
+            found.insert(0, NonFinite { row: 0, attribute, kept });
         }
         Ok(found)
     }

@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::record::Outcome;
-use densify_core::files::{OutputError, write_atomically};
+use densify_core::files::{FileError, write_atomically};
 use densify_run::Partial;
 use densify_run::failure::Failure;
 
@@ -42,7 +42,7 @@ impl Journal {
     }
 
     /// Adds a record and writes them all.
-    pub(super) fn add(&mut self, record: Outcome) -> Result<(), OutputError> {
+    pub(super) fn add(&mut self, record: Outcome) -> Result<(), FileError> {
         self.records.push(record);
         let lines = self.records.iter().map(|r| serde_json::to_string(r).map(|line| line + "\n"));
         write_atomically(&self.path, |out| {

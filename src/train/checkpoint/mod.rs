@@ -35,7 +35,7 @@ use densify_policies::policy::PolicyError;
 use serde::{Deserialize, Serialize};
 
 use crate::trainer::TrainerState;
-use densify_core::files::OutputError;
+use densify_core::files::FileError;
 use densify_render::{BackendError, StateError};
 
 /// A checkpoint without its arrays.
@@ -71,7 +71,7 @@ pub enum CheckpointError {
     },
     /// The file cannot be read or written.
     #[error(transparent)]
-    File(#[from] OutputError),
+    File(#[from] FileError),
     /// The policy cannot save its state.
     #[error("the policy's state: {source}")]
     Policy {

@@ -10,7 +10,7 @@ use super::format::{
     CHECKSUM_KEY, Contents, HEADER_KEY, LENGTH, Record, VERSION, VERSION_KEY, name_of, shape_of,
 };
 use super::{CheckpointError, Header};
-use densify_core::files::OutputError;
+use densify_core::files::FileError;
 use densify_core::gaussians::{Gaussians, MAX_SH_DEGREE, ModelArray};
 use densify_core::pieces::pieces;
 use densify_render::{Backend, BackendError, StateArray, Tensor, Values};
@@ -37,7 +37,7 @@ impl Checkpoint {
     /// [`CheckpointError::File`], [`CheckpointError::Invalid`].
     pub fn open(path: &Path) -> Result<Self, CheckpointError> {
         let invalid = |problem: String| CheckpointError::invalid(path, problem);
-        let failed = |source| OutputError::io("read", path)(source);
+        let failed = |source| FileError::io("read", path)(source);
         let mut file = densify_core::files::open(path).map_err(failed)?;
         let size = file.metadata().map_err(failed)?.len();
         let mut length = [0; LENGTH as usize];
@@ -215,7 +215,7 @@ impl<'a> ArrayReader<'a> {
     }
 
     fn failed(&self, source: io::Error) -> CheckpointError {
-        OutputError::io("read", self.path)(source).into()
+        FileError::io("read", self.path)(source).into()
     }
 
     /// The next `entries` along the first dimension.

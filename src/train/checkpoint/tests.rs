@@ -249,7 +249,7 @@ fn a_state_of_another_run_is_refused_by_name() {
     refused(less, "`summed.gradients`: its shape is [48, 23]; this run needs [48, 9]");
     let mut fewer = options();
     fewer.needs.candidates = fewer.needs.candidates.map(|c| CandidateRequest { capacity: 3, ..c });
-    refused(fewer, "`candidates`: 4 of them; this run holds 3");
+    refused(fewer, "`candidates`: it has 4 candidates; this run holds at most 3");
     let mut small = CpuBackend::new(&Gaussians::zeros(3, 1), &options()).unwrap();
     let problem = Checkpoint::open(&path).unwrap().restore(&mut small).unwrap_err().to_string();
     assert!(problem.contains("`model.means`: it is F32 of shape [61, 3]"), "{problem}");

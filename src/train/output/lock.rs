@@ -5,7 +5,7 @@ use std::io::{Read, Seek, Write};
 use std::path::{Path, PathBuf};
 
 use densify_core::files;
-use densify_core::files::OutputError;
+use densify_core::files::FileError;
 
 /// Name of the locked file. It holds the number of the process that trains.
 pub(super) const LOCK: &str = "densify.lock";
@@ -27,8 +27,8 @@ impl FolderLock {
     /// Locks a folder.
     ///
     /// # Errors
-    /// [`OutputError::Unfit`] while another process has the lock; [`OutputError::Io`].
-    pub(super) fn take(folder: &Path) -> Result<Self, OutputError> {
+    /// [`FileError::Unfit`] while another process has the lock; [`FileError::Io`].
+    pub(super) fn take(folder: &Path) -> Result<Self, FileError> {
         let path = folder.join(LOCK);
         if !cfg!(unix) {
             return Ok(Self { path, file: None });
@@ -36,7 +36,7 @@ impl FolderLock {
         for _ in 0..TRIES {
             let mut options = OpenOptions::new();
             let options = options.read(true).write(true).create(true).truncate(false);
-            let mut file = options.open(&path).map_err(OutputError::io("create", &path))?;
+            let mut file = options.open(&path).map_err(FileError::io("create", &path))?;
             match file.try_lock() {
                 Ok(()) => {}
                 Err(TryLockError::WouldBlock) => return Err(in_use(folder, file)),
@@ -58,8 +58,8 @@ impl FolderLock {
     /// Fails while a process has the lock on a folder. Writes nothing.
     ///
     /// # Errors
-    /// [`OutputError::Unfit`].
-    pub(super) fn check(folder: &Path) -> Result<(), OutputError> {
+    /// [`FileError::Unfit`].
+    pub(super) fn check(folder: &Path) -> Result<(), FileError> {
         if cfg!(unix)
             && let Ok(file) = files::open(&folder.join(LOCK))
             && matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock))
@@ -73,12 +73,12 @@ impl FolderLock {
     /// moved or replaced meanwhile.
     ///
     /// # Errors
-    /// [`OutputError::Lost`].
-    pub(super) fn confirm(&self) -> Result<(), OutputError> {
+    /// [`FileError::Lost`].
+    pub(super) fn confirm(&self) -> Result<(), FileError> {
         if self.file.as_ref().is_none_or(|file| is_at(file, &self.path)) {
             return Ok(());
         }
-        Err(OutputError::Lost { path: self.path.parent().unwrap_or(&self.path).to_owned() })
+        Err(FileError::Lost { path: self.path.parent().unwrap_or(&self.path).to_owned() })
     }
 }
 
@@ -90,13 +90,13 @@ impl Drop for FolderLock {
     }
 }
 
-fn in_use(folder: &Path, mut file: File) -> OutputError {
+fn in_use(folder: &Path, mut file: File) -> FileError {
     let mut number = String::new();
     let read = file.rewind().and_then(|()| Read::take(&mut file, 32).read_to_string(&mut number));
     let process = read.ok().and_then(|_| number.parse::<u32>().ok());
     let who = process.map_or("another process".to_owned(), |number| format!("process {number}"));
     let folder = folder.display();
-    OutputError::Unfit(format!(
+    FileError::Unfit(format!(
         "{folder} is in use: {who} is training there; wait for it, stop it, or choose another folder with -o"
     ))
 }

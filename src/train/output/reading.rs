@@ -12,29 +12,29 @@ use crate::evaluate::Split;
 use crate::metrics::geometry::Geometry;
 use crate::trainer::EditEvent;
 use densify_core::files;
-use densify_core::files::OutputError;
+use densify_core::files::FileError;
 
 /// Most bytes of a file of numbers that is read.
 const MOST_BYTES: u64 = 256 << 20;
 
 /// The mean scores of an iteration on the test views, if there are any.
-pub fn scores_of(run: &Path, iteration: u32) -> Result<Option<Mean>, OutputError> {
+pub fn scores_of(run: &Path, iteration: u32) -> Result<Option<Mean>, FileError> {
     entry_of(&run.join("results.json"), iteration)
 }
 
 /// The geometric measurements of an iteration on the test views, if there are any.
-pub fn geometry_of(run: &Path, iteration: u32) -> Result<Option<Geometry>, OutputError> {
+pub fn geometry_of(run: &Path, iteration: u32) -> Result<Option<Geometry>, FileError> {
     entry_of(&run.join(geometry_file(Split::Test)), iteration)
 }
 
 /// The mean scores of all measured iterations on the test views.
-pub fn all_scores(run: &Path) -> Result<BTreeMap<u32, Mean>, OutputError> {
+pub fn all_scores(run: &Path) -> Result<BTreeMap<u32, Mean>, FileError> {
     let path = run.join("results.json");
     let score = |(name, entry): (String, Value)| {
         let iteration = name.strip_prefix("ours_").and_then(|number| number.parse().ok());
         let iteration = iteration
-            .ok_or_else(|| OutputError::malformed(&path, format!("{name:?} is no iteration")))?;
-        let mean = serde_json::from_value(entry).map_err(|e| OutputError::malformed(&path, e))?;
+            .ok_or_else(|| FileError::malformed(&path, format!("{name:?} is no iteration")))?;
+        let mean = serde_json::from_value(entry).map_err(|e| FileError::malformed(&path, e))?;
         Ok((iteration, mean))
     };
     read_entries(&path)?.into_iter().map(score).collect()
@@ -42,7 +42,7 @@ pub fn all_scores(run: &Path) -> Result<BTreeMap<u32, Mean>, OutputError> {
 
 /// The PSNR of each test view with the model of an iteration `[dB]`, by the view's name; none where it was not
 /// measured.
-pub fn psnr_by_view(run: &Path, iteration: u32) -> Result<BTreeMap<String, f64>, OutputError> {
+pub fn psnr_by_view(run: &Path, iteration: u32) -> Result<BTreeMap<String, f64>, FileError> {
     let path = run.join("per_view.json");
     let columns: Option<BTreeMap<String, BTreeMap<String, Option<f64>>>> =
         entry_of(&path, iteration)?;
@@ -52,34 +52,34 @@ pub fn psnr_by_view(run: &Path, iteration: u32) -> Result<BTreeMap<String, f64>,
 }
 
 /// The records of `stats/train.jsonl`; none without the file.
-pub fn steps_of(run: &Path) -> Result<Vec<StepRecord>, OutputError> {
+pub fn steps_of(run: &Path) -> Result<Vec<StepRecord>, FileError> {
     read_log(&run.join("stats/train.jsonl"))
 }
 
 /// The records of `stats/events.jsonl`; none without the file.
-pub fn events_of(run: &Path) -> Result<Vec<EditEvent>, OutputError> {
+pub fn events_of(run: &Path) -> Result<Vec<EditEvent>, FileError> {
     read_log(&run.join("stats/events.jsonl"))
 }
 
 /// `stats/summary.json`; `None` without the file, as while the run trains.
-pub fn summary_of(run: &Path) -> Result<Option<Summary>, OutputError> {
+pub fn summary_of(run: &Path) -> Result<Option<Summary>, FileError> {
     read_stats(&run.join("stats/summary.json"))
 }
 
 /// A JSON file of a run; `None` where it does not exist.
-pub fn read_stats<T: DeserializeOwned>(path: &Path) -> Result<Option<T>, OutputError> {
+pub fn read_stats<T: DeserializeOwned>(path: &Path) -> Result<Option<T>, FileError> {
     let parsed = text_of(path)?.map(|text| serde_json::from_str(&text));
-    parsed.transpose().map_err(|e| OutputError::malformed(path, e))
+    parsed.transpose().map_err(|e| FileError::malformed(path, e))
 }
 
 /// The records of a log.
-fn read_log<T: DeserializeOwned>(path: &Path) -> Result<Vec<T>, OutputError> {
+fn read_log<T: DeserializeOwned>(path: &Path) -> Result<Vec<T>, FileError> {
     let text = text_of(path)?.unwrap_or_default();
     // What a process writes just now may not be whole yet.
     let whole = text.rfind('\n').map_or("", |end| &text[..end]);
     let record = |(at, line): (usize, &str)| {
         let record = serde_json::from_str(line);
-        record.map_err(|e| OutputError::malformed(path, format!("line {}: {e}", at + 1)))
+        record.map_err(|e| FileError::malformed(path, format!("line {}: {e}", at + 1)))
     };
     whole.lines().enumerate().map(record).collect()
 }
@@ -96,21 +96,21 @@ pub(super) fn entry_name(iteration: u32) -> String {
 }
 
 /// The entry of an iteration, if there is any.
-fn entry_of<T: DeserializeOwned>(path: &Path, iteration: u32) -> Result<Option<T>, OutputError> {
+fn entry_of<T: DeserializeOwned>(path: &Path, iteration: u32) -> Result<Option<T>, FileError> {
     let entry = read_entries(path)?.remove(&entry_name(iteration));
-    entry.map(serde_json::from_value).transpose().map_err(|e| OutputError::malformed(path, e))
+    entry.map(serde_json::from_value).transpose().map_err(|e| FileError::malformed(path, e))
 }
 
 /// The entries of a file; none if it does not exist.
-pub(super) fn read_entries(path: &Path) -> Result<Map<String, Value>, OutputError> {
+pub(super) fn read_entries(path: &Path) -> Result<Map<String, Value>, FileError> {
     Ok(read_stats(path)?.unwrap_or_default())
 }
 
 /// The text of a file; `None` where it does not exist.
-fn text_of(path: &Path) -> Result<Option<String>, OutputError> {
+fn text_of(path: &Path) -> Result<Option<String>, FileError> {
     match files::read_text(path, MOST_BYTES) {
         Ok(text) => Ok(Some(text)),
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(None),
-        Err(e) => Err(OutputError::io("read", path)(e)),
+        Err(e) => Err(FileError::io("read", path)(e)),
     }
 }

@@ -12,7 +12,7 @@ use super::reading::{entry_name, geometry_file, read_entries};
 use crate::evaluate::{Mean, Split, ViewScore};
 use crate::metrics::geometry::Geometry;
 use densify_core::files::disk::{Operation, WatchedFile, attempt};
-use densify_core::files::{OutputError, write_atomically};
+use densify_core::files::{FileError, write_atomically};
 use densify_core::memory::Ledger;
 
 /// A log of JSON records, one per line.
@@ -24,21 +24,20 @@ pub struct RecordLog {
 
 impl RecordLog {
     /// Starts an empty log; creates the folder.
-    pub fn create(path: &Path) -> Result<Self, OutputError> {
+    pub fn create(path: &Path) -> Result<Self, FileError> {
         if let Some(folder) = path.parent() {
-            std::fs::create_dir_all(folder)
-                .map_err(OutputError::io("create the folder", folder))?;
+            std::fs::create_dir_all(folder).map_err(FileError::io("create the folder", folder))?;
         }
         let mut options = OpenOptions::new();
         let file = attempt(Operation::Create, path)
             .and_then(|()| options.create(true).write(true).truncate(true).open(path));
-        let file = file.map_err(OutputError::io("create", path))?;
+        let file = file.map_err(FileError::io("create", path))?;
         Ok(Self { file, path: path.to_owned() })
     }
 
     /// Continues a log, cut to the `bytes` that it had at the checkpoint. Also returns whether it still
     /// had them; missing records stay missing.
-    pub fn resume(path: &Path, bytes: u64) -> Result<(Self, bool), OutputError> {
+    pub fn resume(path: &Path, bytes: u64) -> Result<(Self, bool), FileError> {
         let Ok(mut file) = OpenOptions::new().read(true).write(true).open(path) else {
             return Ok((Self::create(path)?, bytes == 0));
         };
@@ -56,25 +55,25 @@ impl RecordLog {
             file.seek(SeekFrom::End(0))?;
             Ok(there >= bytes)
         };
-        let whole = cut().map_err(OutputError::io("cut", path))?;
+        let whole = cut().map_err(FileError::io("cut", path))?;
         Ok((Self { file, path: path.to_owned() }, whole))
     }
 
     /// Syncs the file; returns its length `[bytes]`.
-    pub fn synced(&self) -> Result<u64, OutputError> {
+    pub fn synced(&self) -> Result<u64, FileError> {
         let length = attempt(Operation::Sync, &self.path)
             .and_then(|()| self.file.sync_all())
             .and_then(|()| self.file.metadata());
-        Ok(length.map_err(OutputError::io("write", &self.path))?.len())
+        Ok(length.map_err(FileError::io("write", &self.path))?.len())
     }
 
     /// Adds a line.
-    pub fn append(&mut self, record: &impl Serialize) -> Result<(), OutputError> {
+    pub fn append(&mut self, record: &impl Serialize) -> Result<(), FileError> {
         let line = serde_json::to_string(record).map_err(std::io::Error::other);
         // One write per line: readers, and a killed process, leave whole lines.
         let Self { file, path } = self;
         line.and_then(|line| WatchedFile { file, path }.write_all((line + "\n").as_bytes()))
-            .map_err(OutputError::io("write", path))
+            .map_err(FileError::io("write", path))
     }
 }
 
@@ -140,7 +139,7 @@ pub struct Summary {
 }
 
 /// Writes a value as indented JSON.
-pub fn write_json(path: &Path, value: &impl Serialize) -> Result<(), OutputError> {
+pub fn write_json(path: &Path, value: &impl Serialize) -> Result<(), FileError> {
     write_atomically(path, |out| {
         serde_json::to_writer_pretty(&mut *out, value)?;
         out.write_all(b"\n")
@@ -155,7 +154,7 @@ pub fn write_scores(
     split: Split,
     iteration: u32,
     scores: &[ViewScore],
-) -> Result<(), OutputError> {
+) -> Result<(), FileError> {
     let (results, per_view) = match split {
         Split::Test => ("results.json", "per_view.json"),
         Split::Train => ("results_train.json", "per_view_train.json"),
@@ -191,12 +190,12 @@ pub fn write_geometry(
     split: Split,
     iteration: u32,
     geometry: &Geometry,
-) -> Result<(), OutputError> {
+) -> Result<(), FileError> {
     let entry = serde_json::to_value(geometry).unwrap_or_default();
     insert_entry(&run.join(geometry_file(split)), iteration, entry)
 }
 
-fn insert_entry(path: &Path, iteration: u32, entry: Value) -> Result<(), OutputError> {
+fn insert_entry(path: &Path, iteration: u32, entry: Value) -> Result<(), FileError> {
     let mut all = read_entries(path)?;
     all.insert(entry_name(iteration), entry);
     write_json(path, &all)

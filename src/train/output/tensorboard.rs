@@ -9,7 +9,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use densify_core::files::OutputError;
+use densify_core::files::FileError;
 use densify_core::files::disk::{Operation, WatchedFile, attempt};
 
 /// Prefix of the names of event files.
@@ -24,13 +24,13 @@ pub struct TensorBoard {
 
 impl TensorBoard {
     /// Starts an event file in `folder`.
-    pub fn create(folder: &Path) -> Result<Self, OutputError> {
+    pub fn create(folder: &Path) -> Result<Self, FileError> {
         let now = wall_time();
         // TensorBoard reads any file whose name contains "tfevents", in the order of their names.
         let path = folder.join(format!("{PREFIX}{:010}.densify", now as u64));
         let file = attempt(Operation::Create, &path)
             .and_then(|()| OpenOptions::new().create(true).append(true).open(&path))
-            .map_err(OutputError::io("create", &path))?;
+            .map_err(FileError::io("create", &path))?;
         let mut board = Self { file, path };
         board.append(&version_event(now))?;
         Ok(board)
@@ -38,7 +38,7 @@ impl TensorBoard {
 
     /// Continues the event file `name` in `folder`, cut to the `bytes` that it had at the checkpoint.
     /// Starts another file if it is missing or shorter, or if `name` is not the name of an event file.
-    pub fn resume(folder: &Path, name: &str, bytes: u64) -> Result<Self, OutputError> {
+    pub fn resume(folder: &Path, name: &str, bytes: u64) -> Result<Self, FileError> {
         let path = folder.join(name);
         let ours = name.starts_with(PREFIX) && !name.contains(['/', '\\']);
         let there = || path.symlink_metadata().is_ok_and(|m| m.is_file() && m.len() >= bytes);
@@ -47,28 +47,28 @@ impl TensorBoard {
         }
         let file = OpenOptions::new().append(true).open(&path);
         let cut = file.and_then(|file| file.set_len(bytes).map(|()| file));
-        Ok(Self { file: cut.map_err(OutputError::io("cut", &path))?, path })
+        Ok(Self { file: cut.map_err(FileError::io("cut", &path))?, path })
     }
 
     /// Syncs the file; returns its name and length `[bytes]`.
-    pub fn synced(&self) -> Result<(String, u64), OutputError> {
+    pub fn synced(&self) -> Result<(String, u64), FileError> {
         let length = attempt(Operation::Sync, &self.path)
             .and_then(|()| self.file.sync_all())
             .and_then(|()| self.file.metadata());
-        let length = length.map_err(OutputError::io("write", &self.path))?.len();
+        let length = length.map_err(FileError::io("write", &self.path))?.len();
         let name = self.path.file_name().map(|name| name.to_string_lossy().into_owned());
         Ok((name.unwrap_or_default(), length))
     }
 
     /// Adds the value of each tag at `step`.
-    pub fn scalars(&mut self, step: u32, values: &[(&str, f32)]) -> Result<(), OutputError> {
+    pub fn scalars(&mut self, step: u32, values: &[(&str, f32)]) -> Result<(), FileError> {
         self.append(&scalar_event(wall_time(), step, values))
     }
 
-    fn append(&mut self, event: &[u8]) -> Result<(), OutputError> {
+    fn append(&mut self, event: &[u8]) -> Result<(), FileError> {
         // One write per record: readers, and a killed process, leave whole records.
         let Self { file, path } = self;
-        WatchedFile { file, path }.write_all(&record(event)).map_err(OutputError::io("write", path))
+        WatchedFile { file, path }.write_all(&record(event)).map_err(FileError::io("write", path))
     }
 }
 

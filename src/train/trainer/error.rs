@@ -40,7 +40,7 @@ pub enum TrainError {
         "step {step}: {count} of {rows} rows hold numbers that are not finite, first {first}; \
          lower the learning rates, and check the scene's scale and cameras"
     )]
-    Unsound {
+    NonFinite {
         /// Iteration.
         step: u32,
         /// How many rows hold them.

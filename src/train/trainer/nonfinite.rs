@@ -27,7 +27,7 @@ impl<V: ViewSource> Trainer<V> {
         let frozen = self.options.frozen as u32;
         let is_frozen = unsound.iter().any(|row| row.row < frozen);
         if self.options.on_nan == OnNan::Stop || !few || is_frozen {
-            return Err(TrainError::Unsound { step, count, rows, first: first.to_string() });
+            return Err(TrainError::NonFinite { step, count, rows, first: first.to_string() });
         }
         let mut plan = self.new_plan();
         plan.cause("not finite");

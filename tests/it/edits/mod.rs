@@ -214,7 +214,7 @@ fn a_corrupted_plan_stops_the_run() {
         ("another number of rows", |ops| ops.rows_before -= 1),
         ("another budget", |ops| ops.budget += 100),
         ("over the budget", |ops| ops.rows_after = ROWS + 3),
-        ("breaks its own rules", |ops| ops.seeds[0].0 = 1),
+        ("an inconsistent plan", |ops| ops.seeds[0].0 = 1),
     ];
     for (words, corrupt) in corruptions {
         let mut backend = trained(&Subject::NATIVE, ROWS + 2);

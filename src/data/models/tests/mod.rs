@@ -9,7 +9,7 @@ use std::io::{self, Write};
 use std::ops::Range;
 
 use super::*;
-use densify_core::files::OutputError;
+use densify_core::files::FileError;
 use densify_core::gaussians::Gaussians;
 use densify_core::gaussians::sh_coefficients;
 
@@ -84,7 +84,7 @@ fn a_registered_format_is_found_and_given_every_row_once() {
     let (folder, whole) = (tempfile::tempdir().unwrap(), model(100, 1));
     let path = folder.path().join("new/model.log.txt");
     let shape = Shape { rows: 100, sh_degree: 1 };
-    format.write_file(&path, shape, |rows| Ok::<_, OutputError>(piece(&whole, rows))).unwrap();
+    format.write_file(&path, shape, |rows| Ok::<_, FileError>(piece(&whole, rows))).unwrap();
     // Pieces have 48 rows in tests.
     assert_eq!(std::fs::read_to_string(&path).unwrap(), "begin 100 1;48;48;4;finish");
 }
@@ -116,7 +116,7 @@ fn a_failed_source_leaves_the_old_file() {
     let path = folder.path().join("model.ply");
     std::fs::write(&path, "old").unwrap();
     let shape = Shape { rows: 100, sh_degree: 0 };
-    let lost = || OutputError::Lost { path: "lost".into() };
+    let lost = || FileError::Lost { path: "lost".into() };
     let written = PLY.write_file(&path, shape, |rows| match rows.start {
         0 => Ok(model(rows.len(), 0)),
         _ => Err(lost()),

@@ -93,7 +93,7 @@ impl LossBuffers {
         threads: usize,
         by_pixel: Option<ErrorScore>,
     ) -> u64 {
-        let segments = Segments::of(width);
+        let segments = Segments::new(width);
         let weights = by_pixel.map_or(0, |score| PixelWeights::bytes(width * height, &score));
         let planes = (6 + usize::from(by_pixel.is_some())) * segments.pitch() * WIDTH * height;
         let lines = threads * MAX_LINES * segments.padded() * WIDTH;
@@ -104,7 +104,7 @@ impl LossBuffers {
         Self {
             planes: Default::default(),
             errors: Default::default(),
-            segments: Segments::of(0),
+            segments: Segments::new(0),
             weights: PixelWeights::default(),
         }
     }
@@ -112,7 +112,7 @@ impl LossBuffers {
     /// Makes room for an image and returns the number of vectors per plane. Only a larger image allocates. Old contents
     /// are not cleared, which would be serial work; everything is written before it is read.
     fn resize(&mut self, grid: &Grid, requested: [bool; 2]) -> usize {
-        self.segments = Segments::of(grid.width);
+        self.segments = Segments::new(grid.width);
         let vectors = self.segments.pitch() * grid.height;
         let errors = self
             .errors
@@ -356,7 +356,7 @@ struct Similarity<'a> {
     errors: [&'a mut Line; 2],
     /// Weights of |e| and 1 − SSIM in each error.
     error_weights: [[f32; 2]; 2],
-    /// Whether errors are written instead of added.
+    /// True if errors are written instead of added.
     first_channel: bool,
 }
 

@@ -37,11 +37,11 @@ fn run_in(
     let threads = Threads::new(Some(2)).expect("threads");
     let (arch, gradients) = (Arch::new(), &mut gradient);
     let value = buffers.run(&threads, arch, &grid, &canvas, &target, [0.0; 3], gradients, terms);
-    let of = |planes: Range<usize>| -> Vec<f32> {
+    let values = |planes: Range<usize>| -> Vec<f32> {
         let planes = gradient.iter().flat_map(|tile| &tile.planes[planes.clone()]);
         planes.flat_map(|plane| plane.as_flattened().iter().copied()).collect()
     };
-    (value, of(0..3), of(4..5))
+    (value, values(0..3), values(4..5))
 }
 
 /// Optional results change neither the loss nor its gradient, and the pixels' parts add up to the loss.

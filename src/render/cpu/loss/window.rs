@@ -43,7 +43,7 @@ pub(super) struct Segments {
 impl Segments {
     /// The segments of lines of `width` pixels. They are whole runs and longer than half the window, so that it never
     /// reaches beyond the next lane.
-    pub(super) const fn of(width: usize) -> Self {
+    pub(super) const fn new(width: usize) -> Self {
         let length = width.div_ceil(WIDTH).next_multiple_of(RUN);
         Self { length: if length < 2 * RUN { 2 * RUN } else { length } }
     }
@@ -298,7 +298,7 @@ mod tests {
     #[test]
     fn pixels_are_arranged_and_restored() {
         for width in [1, 17, 64, 100, 128, 200, 256, 257, 1000] {
-            let segments = Segments::of(width);
+            let segments = Segments::new(width);
             let stride = segments.stride();
             assert!(stride >= width.next_multiple_of(WIDTH) && segments.length() > REACH);
             let pixels: Vec<f32> = (0..stride).map(|i| i as f32).collect();

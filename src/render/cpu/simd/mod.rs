@@ -360,7 +360,7 @@ impl<S: Simd> Mask<S> {
     }
 }
 
-/// Whether `a < b`, lane by lane, as unsigned integers.
+/// Returns whether `a < b`, lane by lane, as unsigned integers.
 #[inline(always)]
 pub(super) fn before<S: Simd>(s: S, a: S::u32s, b: S::u32s) -> Mask<S> {
     Mask { s, m: s.less_than_u32s(a, b) }

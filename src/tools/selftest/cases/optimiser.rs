@@ -6,7 +6,7 @@ use crate::scenes;
 use crate::trial::{Trial, step};
 use crate::values::RATES;
 use densify_core::camera::Camera;
-use densify_render::{BackendError, Kept, LearningRates, StateArray, Values};
+use densify_render::{BackendError, LearningRates, NumberKind, StateArray, Values};
 
 /// Gradients whose square is zero, subnormal, ordinary, almost overflowing, and overflowing.
 const GRADIENTS: [f32; 8] = [0.0, 1e-45, 1e-23, 1e-15, 1e-6, 1.0, 1e19, 1e30];
@@ -70,7 +70,7 @@ pub(super) fn moments(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     }
     // The audit reports exactly the row whose moment overflows.
     let found = backend.audit()?;
-    let is_expected = |u: &densify_render::Unsound| u.row == OVERFLOWING && u.kept == Kept::Moment;
+    let is_expected = |u: &densify_render::NonFinite| u.row == OVERFLOWING && u.kept == NumberKind::Moment;
     let wrong = usize::from(found.is_empty()) + found.iter().filter(|u| !is_expected(u)).count();
     trial.count("gradient 1e30", "Gaussians missed or wrongly reported by the audit", wrong);
     let mut plan = EditPlan::new(backend.rows(), backend.budget());

@@ -10,7 +10,7 @@ use std::rc::Rc;
 use super::CONFIG_FILE;
 use super::lock::FolderLock;
 use super::tensorboard::PREFIX as EVENTS_PREFIX;
-use densify_core::files::OutputError;
+use densify_core::files::FileError;
 use densify_core::files::disk::{Operation, attempt};
 use densify_core::files::{RUN_FOLDER_DEPTH, is_temporary, remove_incomplete};
 use replacement::{NEW, OLD, REPLACED, Stuck, hidden, recover, replace, suffix};
@@ -42,8 +42,8 @@ pub fn model_path(run: &Path, iteration: u32) -> PathBuf {
 /// The iterations whose model a run has saved, in order.
 ///
 /// # Errors
-/// [`OutputError::Unfit`] when there is none.
-pub fn saved_iterations(run: &Path) -> Result<Vec<u32>, OutputError> {
+/// [`FileError::Unfit`] when there is none.
+pub fn saved_iterations(run: &Path) -> Result<Vec<u32>, FileError> {
     let iteration = |name: &OsStr| name.to_str()?.strip_prefix("iteration_")?.parse().ok();
     let entries = fs::read_dir(run.join(MODELS)).into_iter().flatten().flatten();
     let mut saved: Vec<u32> = entries
@@ -52,7 +52,7 @@ pub fn saved_iterations(run: &Path) -> Result<Vec<u32>, OutputError> {
         .collect();
     saved.sort_unstable();
     if saved.is_empty() {
-        return Err(OutputError::no_run(run, "saved model"));
+        return Err(FileError::no_run(run, "saved model"));
     }
     Ok(saved)
 }
@@ -85,8 +85,8 @@ impl Guard {
     /// Fails when the folder was moved or removed, or another process has it.
     ///
     /// # Errors
-    /// [`OutputError::Lost`].
-    pub fn check(&self) -> Result<(), OutputError> {
+    /// [`FileError::Lost`].
+    pub fn check(&self) -> Result<(), FileError> {
         self.0.confirm()
     }
 }
@@ -95,23 +95,23 @@ impl RunFolder {
     /// Checks, without writing anything, that a run may go to `target`.
     ///
     /// # Errors
-    /// [`OutputError::Unfit`] while a process trains there, when it is no folder, and when it holds
-    /// another run and `overwrite` is not set; [`OutputError::Io`].
-    pub fn check(target: &Path, overwrite: bool) -> Result<(), OutputError> {
+    /// [`FileError::Unfit`] while a process trains there, when it is no folder, and when it holds
+    /// another run and `overwrite` is not set; [`FileError::Io`].
+    pub fn check(target: &Path, overwrite: bool) -> Result<(), FileError> {
         if !target.is_dir() {
             // A dangling link is in the way, too.
             return match target.symlink_metadata() {
                 Ok(_) => {
                     let target = target.display();
                     let problem = format!("{target} is not a folder; choose another one with -o");
-                    Err(OutputError::Unfit(problem))
+                    Err(FileError::Unfit(problem))
                 }
                 Err(_) => Ok(()),
             };
         }
         FolderLock::check(target)?;
         if !overwrite && !owned_entries(target)?.is_empty() {
-            return Err(OutputError::occupied(target));
+            return Err(FileError::occupied(target));
         }
         Ok(())
     }
@@ -120,17 +120,17 @@ impl RunFolder {
     ///
     /// # Errors
     /// As [`check`](Self::check).
-    pub fn create(target: &Path, overwrite: bool) -> Result<Self, OutputError> {
+    pub fn create(target: &Path, overwrite: bool) -> Result<Self, FileError> {
         Self::check(target, overwrite)?;
         let mut folder = Self::lock(target)?;
         // Another process may have trained there since.
         let occupied = !owned_entries(target)?.is_empty();
         if occupied && !overwrite {
-            return Err(OutputError::occupied(target));
+            return Err(FileError::occupied(target));
         }
         if occupied {
             let staging = tempfile::Builder::new().prefix(NEW).tempdir_in(target);
-            let staging = staging.map_err(OutputError::io("create a folder in", target))?.keep();
+            let staging = staging.map_err(FileError::io("create a folder in", target))?.keep();
             folder.staged = suffix(&staging, NEW);
         }
         Ok(folder)
@@ -140,10 +140,10 @@ impl RunFolder {
     /// then its files are removed. Incomplete files of a killed process are removed in any case.
     ///
     /// # Errors
-    /// [`OutputError::Io`]; [`OutputError::Unfit`] where there is no run, while a process trains there, and
+    /// [`FileError::Io`]; [`FileError::Unfit`] where there is no run, while a process trains there, and
     /// when a run that starts again would remove models or checkpoints, or
     /// files of something that is no run.
-    pub fn resume(target: &Path, anew: bool) -> Result<Self, OutputError> {
+    pub fn resume(target: &Path, anew: bool) -> Result<Self, FileError> {
         Self::check(target, true)?;
         let folder = Self::lock(target)?;
         if anew {
@@ -154,7 +154,7 @@ impl RunFolder {
             let is_foreign =
                 !target.join(CONFIG_FILE).exists() && !owned_entries(target)?.is_empty();
             if is_foreign || has_checkpoint || saved_iterations(target).is_ok() {
-                return Err(OutputError::occupied(target));
+                return Err(FileError::occupied(target));
             }
             // Its description stays until it is replaced: a kill must not lose it.
             remove_owned(target, |name| name != CONFIG_FILE);
@@ -164,9 +164,9 @@ impl RunFolder {
     }
 
     /// Creates and locks a folder, and ends a replacement in it that was interrupted.
-    fn lock(target: &Path) -> Result<Self, OutputError> {
+    fn lock(target: &Path) -> Result<Self, FileError> {
         let is_new = !target.exists();
-        let fail = |e| OutputError::io("create the folder", target)(e);
+        let fail = |e| FileError::io("create the folder", target)(e);
         attempt(Operation::Create, target).map_err(fail)?;
         fs::create_dir_all(target).map_err(fail)?;
         let lock = Rc::new(FolderLock::take(target)?);
@@ -181,8 +181,8 @@ impl RunFolder {
     /// be looked at.
     ///
     /// # Errors
-    /// [`OutputError::Unfit`], [`OutputError::Io`].
-    pub fn settle(target: &Path) -> Result<(), OutputError> {
+    /// [`FileError::Unfit`], [`FileError::Io`].
+    pub fn settle(target: &Path) -> Result<(), FileError> {
         if hidden(target, OLD).is_empty() && hidden(target, REPLACED).is_empty() {
             return Ok(());
         }
@@ -215,8 +215,8 @@ impl RunFolder {
     /// were interrupted; returns the folder.
     ///
     /// # Errors
-    /// [`OutputError::NotReplaced`] with the hidden folder of the new run; the old run stays.
-    pub fn finish(self) -> Result<PathBuf, OutputError> {
+    /// [`FileError::NotReplaced`] with the hidden folder of the new run; the old run stays.
+    pub fn finish(self) -> Result<PathBuf, FileError> {
         let Some(suffix) = &self.staged else {
             return Ok(self.target.clone());
         };
@@ -228,7 +228,7 @@ impl RunFolder {
             }
             Err(Stuck { source, aside }) => {
                 let source = Box::new(source);
-                Err(OutputError::NotReplaced { staging: self.path(), aside, source })
+                Err(FileError::NotReplaced { staging: self.path(), aside, source })
             }
         }
     }
@@ -263,12 +263,12 @@ fn remove_all(folders: impl IntoIterator<Item = PathBuf>) {
 }
 
 /// Moves the files of a run to another folder.
-fn move_run(from: &Path, to: &Path) -> Result<(), OutputError> {
+fn move_run(from: &Path, to: &Path) -> Result<(), FileError> {
     for name in owned_entries(from)? {
         let path = from.join(&name);
         attempt(Operation::Rename, &path)
             .and_then(|()| fs::rename(&path, to.join(&name)))
-            .map_err(OutputError::io("move", &path))?;
+            .map_err(FileError::io("move", &path))?;
     }
     Ok(())
 }
@@ -283,10 +283,10 @@ fn remove_owned(folder: &Path, is_meant: impl Fn(&OsStr) -> bool) {
 }
 
 /// Names of the files of a run in `folder`.
-fn owned_entries(folder: &Path) -> Result<Vec<std::ffi::OsString>, OutputError> {
+fn owned_entries(folder: &Path) -> Result<Vec<std::ffi::OsString>, FileError> {
     let mut owned = Vec::new();
-    for entry in fs::read_dir(folder).map_err(OutputError::io("read the folder", folder))? {
-        let name = entry.map_err(OutputError::io("read the folder", folder))?.file_name();
+    for entry in fs::read_dir(folder).map_err(FileError::io("read the folder", folder))? {
+        let name = entry.map_err(FileError::io("read the folder", folder))?.file_name();
         if is_owned(&name) {
             owned.push(name);
         }

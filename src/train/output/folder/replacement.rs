@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::{attempt, move_run, remove_all};
-use densify_core::files::OutputError;
+use densify_core::files::FileError;
 use densify_core::files::disk::Operation;
 
 /// Hidden folder of a run that is to replace another, with a suffix of its own.
@@ -18,7 +18,7 @@ pub(super) const REPLACED: &str = ".densify-replaced-";
 
 /// Why a run could not take the place of another.
 pub(super) struct Stuck {
-    pub(super) source: OutputError,
+    pub(super) source: FileError,
     /// Where (part of) the old run lies, if it could not be moved back either.
     pub(super) aside: Option<PathBuf>,
 }
@@ -29,7 +29,7 @@ pub(super) fn replace(target: &Path, suffix: &str) -> Result<(), Stuck> {
     let [new, old, replaced] =
         [NEW, OLD, REPLACED].map(|prefix| target.join(format!("{prefix}{suffix}")));
     // What cannot be moved back stays where it is, for `recover`.
-    let stuck = |source, aside: &Path, moved_back: Result<(), OutputError>| {
+    let stuck = |source, aside: &Path, moved_back: Result<(), FileError>| {
         if moved_back.is_ok() {
             let _ = fs::remove_dir(aside);
         }
@@ -37,11 +37,11 @@ pub(super) fn replace(target: &Path, suffix: &str) -> Result<(), Stuck> {
     };
     let created = attempt(Operation::Create, &old).and_then(|()| fs::create_dir(&old));
     created
-        .map_err(OutputError::io("create the folder", &old))
+        .map_err(FileError::io("create the folder", &old))
         .map_err(|source| Stuck { source, aside: None })?;
     let rename = || attempt(Operation::Rename, &old).and_then(|()| fs::rename(&old, &replaced));
     move_run(target, &old)
-        .and_then(|()| rename().map_err(OutputError::io("rename", &old)))
+        .and_then(|()| rename().map_err(FileError::io("rename", &old)))
         .map_err(|source| stuck(source, &old, move_run(&old, target)))?;
     move_run(&new, target).map_err(|source| {
         let back = move_run(target, &new).and_then(|()| move_run(&replaced, target));
@@ -53,7 +53,7 @@ pub(super) fn replace(target: &Path, suffix: &str) -> Result<(), Stuck> {
 
 /// Ends replacements that a kill has interrupted: one whose old run was still moving out is undone,
 /// one whose new run was moving in is completed.
-pub(super) fn recover(target: &Path) -> Result<(), OutputError> {
+pub(super) fn recover(target: &Path) -> Result<(), FileError> {
     for old in hidden(target, OLD) {
         move_run(&old, target)?;
         remove_all([old]);

@@ -32,7 +32,7 @@ fn frozen_rows_count_for_the_budget_and_policies_know_nothing_of_them() {
     let info = SceneInfo { budget: 7, initial_rows: 2, ..scene(&case, 3) };
     let (mut trainer, ..) = build(&case, 3, info, options).unwrap();
     let error = (0..9).find_map(|_| trainer.step().err()).expect("it ends");
-    assert!(matches!(error, TrainError::Unsound { .. }), "{error}");
+    assert!(matches!(error, TrainError::NonFinite { .. }), "{error}");
 }
 
 #[test]

@@ -19,8 +19,8 @@ use densify_core::image::{Image8, SharedImage};
 use densify_core::memory::Ledger;
 use densify_data::views::ViewError;
 use densify_render::{
-    Attribute, AuxInput, AuxOutput, Kept, Rendering, StateArray, StateError, StepOutput, Tensor,
-    Unsound,
+    Attribute, AuxInput, AuxOutput, NonFinite, NumberKind, Rendering, StateArray, StateError,
+    StepOutput, Tensor,
 };
 
 mod edits;
@@ -103,8 +103,9 @@ impl Backend for CountingBackend {
         self.unsound = 0;
         Ok(())
     }
-    fn audit(&mut self) -> Result<Vec<Unsound>, BackendError> {
-        let unsound = |row| Unsound { row, attribute: Attribute::Opacity, kept: Kept::Moment };
+    fn audit(&mut self) -> Result<Vec<NonFinite>, BackendError> {
+        let unsound =
+            |row| NonFinite { row, attribute: Attribute::Opacity, kind: NumberKind::Moment };
         Ok((0..self.unsound).map(unsound).collect())
     }
     fn render(
