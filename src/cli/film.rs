@@ -129,9 +129,8 @@ impl<'a> Film<'a> {
             ))),
             "webp" => {
                 let milliseconds = (1000.0 / f64::from(fps)).round() as u32;
-                let animation = Animation::new(size, milliseconds).map_err(|e| Failure {
-                    code: OTHER,
-                    message: format!("a temporary file for the film: {e}"),
+                let animation = Animation::new(size, milliseconds).map_err(|e| {
+                    Failure::new(OTHER, format!("a temporary file for the film: {e}"))
                 })?;
                 Ok(Self::WebP(path, animation))
             }
@@ -206,10 +205,9 @@ pub(super) fn run(
         let name = format!("frame_{frame:05}");
         write_pictures(output, &name, &rendering, extras, &mut depths)?;
         if let Some(Film::WebP(path, animation)) = &mut film {
-            animation.add(&picture(&rendering)).map_err(|e| Failure {
-                code: OTHER,
-                message: format!("{}: {e}", path.display()),
-            })?;
+            animation
+                .add(&picture(&rendering))
+                .map_err(|e| Failure::new(OTHER, format!("{}: {e}", path.display())))?;
         }
     }
     depths.write(output)?;
@@ -228,13 +226,10 @@ pub(super) fn run(
 fn has_room((width, height): (u32, u32)) -> Result<(), Failure> {
     let bytes = PIXEL * u64::from(width) * u64::from(height);
     let size = usize::try_from(bytes).unwrap_or(usize::MAX);
-    Vec::<u8>::new().try_reserve_exact(size).map_err(|_| Failure {
-        code: DEVICE,
-        message: format!(
+    Vec::<u8>::new().try_reserve_exact(size).map_err(|_| Failure::new(DEVICE, format!(
             "a frame of {width}x{height} px takes {}, which cannot be allocated; give a smaller --size",
             Bytes(bytes)
-        ),
-    })
+        )))
 }
 
 fn ffmpeg(folder: &Path, arguments: &[&OsStr]) -> std::io::Result<Output> {
@@ -244,13 +239,11 @@ fn ffmpeg(folder: &Path, arguments: &[&OsStr]) -> std::io::Result<Output> {
 
 /// Makes a film of the first pictures. It has its name only when it is whole.
 fn encode(pictures: &Path, path: &Path, frames: u32, fps: u32) -> Result<(), Failure> {
-    let failed = |problem: String| Failure {
-        code: OTHER,
-        message: format!(
-            "{}: {problem}; the pictures are in {}",
-            path.display(),
-            pictures.display()
-        ),
+    let failed = |problem: String| {
+        Failure::new(
+            OTHER,
+            format!("{}: {problem}; the pictures are in {}", path.display(), pictures.display()),
+        )
     };
     let film = tempfile::Builder::new().suffix(".mp4").tempfile();
     let mut film = film.map_err(|e| failed(format!("a temporary file for the film: {e}")))?;

@@ -38,6 +38,7 @@ mod scenegen;
 mod selftest;
 #[cfg(feature = "study")]
 mod study;
+mod threads;
 mod train;
 #[cfg(feature = "view")]
 mod view;

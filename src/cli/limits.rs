@@ -128,7 +128,7 @@ pub(super) fn check(
     }
     match beyond.is_empty() {
         true => Ok(()),
-        false => Err(Failure { code: LIMIT, message: beyond.join("\n") }),
+        false => Err(Failure::new(LIMIT, beyond.join("\n"))),
     }
 }
 
@@ -147,22 +147,22 @@ mod tests {
         let failure = check("psnr=25", "depth.rmse=0.01").unwrap_err();
         assert_eq!(failure.code, LIMIT);
         for words in ["psnr is 24.5", "--fail-below psnr=25", "depth.rmse is 0.02"] {
-            assert!(failure.message.contains(words), "{failure}");
+            assert!(failure.to_string().contains(words), "{failure}");
         }
         assert_eq!(check("thin.0=0", "flip=1").unwrap_err().code, LIMIT);
         let unknown = check("PSNR=1", "flip=1").unwrap_err();
-        assert!(unknown.code == 2 && unknown.message.contains("psnr, ssim"), "{unknown}");
+        assert!(unknown.code == 2 && unknown.to_string().contains("psnr, ssim"), "{unknown}");
         let early = |knows, key: &str| check_keys(knows, false, &limit(&format!("{key}=1")), &[]);
         for key in ["flip", "centres.f_score_one_percent", "thin.3.recall", "normal_error"] {
             assert_eq!(early(true, key), Ok(()), "{key}");
-            let failure = early(false, key).err().map(|failure| failure.message);
+            let failure = early(false, key).err().map(|failure| failure.to_string());
             let told = failure.is_some_and(|it| it.contains("flip") && it.contains("scenegen"));
             assert_eq!(told, key != "flip", "{key}");
         }
         assert_eq!(check_keys(false, true, &limit("lpips=1"), &[]), Ok(()));
-        assert!(early(true, "lpips").unwrap_err().message.contains("--lpips"));
+        assert!(early(true, "lpips").unwrap_err().to_string().contains("--lpips"));
         let typo = early(true, "depth.rsme").unwrap_err();
-        assert!(typo.code == 2 && typo.message.contains("depth.rmse"), "{typo}");
+        assert!(typo.code == 2 && typo.to_string().contains("depth.rmse"), "{typo}");
         for bad in ["psnr", "psnr=", "psnr=nan", "=x"] {
             assert!(bad.parse::<Limit>().is_err(), "{bad}");
         }

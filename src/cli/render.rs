@@ -9,15 +9,14 @@ use image::{DynamicImage, ImageBuffer, Luma};
 
 use super::console::Console;
 use super::film::{self, FilmArgs, Filmed, Route};
+use super::threads::open_machine;
 use densify_render::Rendering;
 
 use densify_core::image::Image8;
 use densify_data::dataset::normalise::Normalisation;
 use densify_data::views::ViewSource;
 use densify_run::failure::Failure;
-use densify_run::finished::{
-    Machine, Opened, is_model, iteration, model_file, open, open_alone, open_run,
-};
+use densify_run::finished::{Opened, is_model, iteration, model_file, open, open_alone, open_run};
 use densify_run::{DataSpec, DeviceSpec, Fraction, RunConfig};
 use densify_train::evaluate::Split;
 use densify_train::output::write_json;
@@ -222,7 +221,7 @@ impl Named<'_> {
         if is_run {
             refuse_options_of_a_file(matches)?;
         }
-        let machine = Machine::open(&rendering.device, console)?;
+        let machine = open_machine(&rendering.device, console)?;
         if is_run {
             RunConfig::read(self.model)?;
             let iteration = iteration(self.model, self.iteration)?;
@@ -242,7 +241,7 @@ impl Named<'_> {
 
     /// Opens a model without a dataset.
     fn alone(&self, rendering: &RenderingArgs, console: &Console) -> Result<Filmed, Failure> {
-        let machine = Machine::open(&rendering.device, console)?;
+        let machine = open_machine(&rendering.device, console)?;
         let model = model_file(self.model, self.iteration)?;
         let (backend, normalisation, sh_degree) =
             open_alone(&model, (rendering.near.0, machine), console)?;

@@ -47,21 +47,7 @@ pub enum BackendKind {
     Gpu,
 }
 
-/// Knobs that only one backend has; all others work on both.
-const KNOBS_OF_ONE: [(&str, BackendKind); 4] = [
-    ("pairs_per_row", BackendKind::Cpu),
-    ("param_storage", BackendKind::Cpu),
-    ("moment_storage", BackendKind::Cpu),
-    ("accumulation", BackendKind::Gpu),
-];
-
 impl BackendKind {
-    /// The kind that alone has a knob; `None` where both have it.
-    #[must_use]
-    pub fn only_one_with(knob: &str) -> Option<Self> {
-        KNOBS_OF_ONE.iter().find(|(name, _)| *name == knob).map(|(_, kind)| *kind)
-    }
-
     /// As it is called in messages.
     #[must_use]
     pub const fn name(self) -> &'static str {

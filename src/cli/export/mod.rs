@@ -92,7 +92,7 @@ pub(super) fn run(
             Ok(()) => {}
             // The other formats may hold it.
             Err(failure) if failure.code == INPUT && files.len() > 1 => {
-                console.say(format_args!("note: not written: {}", failure.message));
+                console.say(format_args!("note: not written: {failure}"));
                 unfit = unfit.or(Some(failure));
                 continue;
             }

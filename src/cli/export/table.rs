@@ -5,6 +5,7 @@ use std::path::Path;
 
 use super::ExportArgs;
 use crate::console::Console;
+use crate::threads::open_machine;
 use densify_core::files::OutputError;
 use densify_core::gaussians::Gaussians;
 use densify_core::numbers::{grouped, percent};
@@ -12,9 +13,9 @@ use densify_data::dataset::Dataset;
 use densify_data::views::ViewSource;
 use densify_render::Backend;
 use densify_run::RunConfig;
+use densify_run::coordinate_check::CoordinateCheck;
 use densify_run::failure::Failure;
 use densify_run::finished::{Machine, load, views_of};
-use densify_run::likeness::Likeness;
 use densify_train::evaluate::Split;
 use densify_train::metrics::psnr_between;
 
@@ -59,15 +60,18 @@ impl Truth {
             false => (args.rendering.data.clone(), args.rendering.near.0),
         };
         data.eval = data.test_every.is_none();
-        let machine = Machine::open(&args.rendering.device, console)?;
+        let machine = open_machine(&args.rendering.device, console)?;
         let dataset = load(scene, &data, console)?;
         let near = (near * dataset.extent()) as f32;
         let mut backend = machine.backend(&dataset, model.clone(), near)?;
         let (background, sh_degree) = (data.background.fixed(), model.sh_degree);
         let views = views_of(&dataset, Split::Test)?;
         // Pictures without the model are alike in every format.
-        Likeness::of(backend.as_mut(), &views, (background, sh_degree))?
-            .note(args.model.display(), console);
+        CoordinateCheck::of(backend.as_mut(), &views, (background, sh_degree))?.note(
+            None,
+            &args.model,
+            console,
+        );
         Ok(Self { dataset, machine, near, background, sh_degree, backend })
     }
 

@@ -1,0 +1,244 @@
+//! Errors of runs: an exit code with what went wrong. [Problems](Problem) are data; their words are in one place, and
+//! whoever shows them says how options are spelled.
+
+pub(crate) mod notes;
+mod problem;
+mod words;
+
+use std::fmt::Display;
+use std::path::Path;
+
+pub use problem::{
+    Difference, ModelProblem, OptionProblem, Problem, Remedy, ResumeProblem, SizeProblem,
+    TrainingProblem,
+};
+
+use densify_policies::policy::PolicyError;
+use densify_scenegen::Error as SceneError;
+
+use densify_core::files::OutputError;
+use densify_core::spelling::Spelling;
+use densify_data::dataset::DatasetError;
+use densify_data::export::FormatError;
+use densify_render::BackendError;
+use densify_train::checkpoint::CheckpointError;
+use densify_train::evaluate::EvaluateError;
+use densify_train::init::InitError;
+use densify_train::trainer::TrainError;
+
+/// Exit code of anything that has no code of its own.
+pub const OTHER: u8 = 1;
+/// Exit code of bad input and usage.
+pub const INPUT: u8 = 2;
+/// Exit code where a measured value is beyond the limit that was given for it.
+pub const LIMIT: u8 = 4;
+/// Exit code where device or memory do not suffice.
+pub const DEVICE: u8 = 3;
+
+/// The failure of a run or a command. Displayed with options as on a terminal.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("{}", self.words(Spelling::Terminal))]
+pub struct Failure {
+    /// Exit code.
+    pub code: u8,
+    parts: Vec<Part>,
+}
+
+/// A part of what a failure says.
+#[derive(Debug, Clone, PartialEq)]
+enum Part {
+    /// Words, such as those of another library.
+    Text(String),
+    Problem(Box<Problem>),
+    /// An option that what follows is about, perhaps with its value.
+    Option(&'static str, Option<String>),
+}
+
+impl Failure {
+    /// A failure in words that name no option, or of a command.
+    #[must_use]
+    #[expect(clippy::needless_pass_by_value, reason = "errors are passed as they come")]
+    pub fn new(code: u8, message: impl ToString) -> Self {
+        Self { code, parts: vec![Part::Text(message.to_string())] }
+    }
+
+    /// Bad input: a file, an option, a field.
+    #[must_use]
+    pub fn input(message: impl ToString) -> Self {
+        Self::new(INPUT, message)
+    }
+
+    /// The failure of a problem with this exit code.
+    #[must_use]
+    pub fn of(code: u8, problem: impl Into<Problem>) -> Self {
+        Self { code, parts: vec![Part::Problem(Box::new(problem.into()))] }
+    }
+
+    /// The same failure, of `origin`.
+    #[must_use]
+    pub fn within(self, origin: &str) -> Self {
+        self.after([Part::Text(format!("{origin}: "))])
+    }
+
+    /// The same failure, of an option, or of the value that it has.
+    #[must_use]
+    pub fn within_option(self, option: &'static str, value: Option<String>) -> Self {
+        self.after([Part::Option(option, value), Part::Text(": ".to_owned())])
+    }
+
+    /// The same failure, in the file of options.
+    #[must_use]
+    pub(crate) fn within_config_file(self, path: &Path) -> Self {
+        self.within_option("config", Some(path.display().to_string()))
+    }
+
+    fn after<const COUNT: usize>(mut self, parts: [Part; COUNT]) -> Self {
+        self.parts.splice(0..0, parts);
+        self
+    }
+
+    /// The same failure with another line.
+    #[must_use]
+    pub fn and(mut self, more: &str) -> Self {
+        self.parts.push(Part::Text(format!("\n{more}")));
+        self
+    }
+
+    /// The same failure, with another problem.
+    #[must_use]
+    pub fn with(mut self, more: impl Into<Problem>) -> Self {
+        self.parts.push(Part::Text("\n".to_owned()));
+        self.parts.push(Part::Problem(Box::new(more.into())));
+        self
+    }
+
+    /// The whole message, with options as its reader spells them.
+    #[must_use]
+    pub fn words(&self, spelling: Spelling) -> String {
+        let words = |part: &Part| match part {
+            Part::Text(text) => text.clone(),
+            Part::Problem(problem) => problem.words(spelling),
+            Part::Option(name, None) => spelling.option(name),
+            Part::Option(name, Some(value)) => spelling.text(name, value),
+        };
+        self.parts.iter().map(words).collect()
+    }
+}
+
+macro_rules! bad_input {
+    ($($problem:ident: $kind:ident),*) => {$(
+        impl From<$problem> for Problem {
+            fn from(problem: $problem) -> Self {
+                Self::$kind(problem)
+            }
+        }
+
+        impl From<$problem> for Failure {
+            fn from(problem: $problem) -> Self {
+                Self::of(INPUT, problem)
+            }
+        }
+    )*};
+}
+
+bad_input!(OptionProblem: Options, SizeProblem: Size, ModelProblem: Model, ResumeProblem: Resume);
+
+impl OptionProblem {
+    /// A wrong value of an option.
+    pub(crate) fn value(option: &'static str, problem: impl Display) -> Self {
+        Self::Value { option, problem: problem.to_string() }
+    }
+}
+
+impl From<TrainingProblem> for Problem {
+    fn from(problem: TrainingProblem) -> Self {
+        Self::Training(problem)
+    }
+}
+
+/// Errors that are always of bad input.
+pub trait BadInput: Display {}
+
+impl BadInput for DatasetError {}
+impl BadInput for FormatError {}
+impl BadInput for InitError {}
+/// Before training: the policy's name or parameters are wrong.
+impl BadInput for PolicyError {}
+
+impl<E: BadInput> From<E> for Failure {
+    fn from(error: E) -> Self {
+        Self::input(error)
+    }
+}
+
+impl From<BackendError> for Failure {
+    fn from(error: BackendError) -> Self {
+        let code = if is_input(&error) { INPUT } else { DEVICE };
+        Self::new(code, error)
+    }
+}
+
+/// Whether other arguments would do.
+fn is_input(error: &BackendError) -> bool {
+    matches!(
+        error,
+        BackendError::ImageTooLarge { .. }
+            | BackendError::NoAdapter(_)
+            | BackendError::OverLimit(_)
+    )
+}
+
+impl From<OutputError> for Failure {
+    fn from(error: OutputError) -> Self {
+        let code = if matches!(error, OutputError::Unfit(_)) { INPUT } else { OTHER };
+        Self::new(code, error)
+    }
+}
+
+impl From<TrainError> for Failure {
+    fn from(error: TrainError) -> Self {
+        let code = match &error {
+            TrainError::BadOption(_) | TrainError::View { .. } => INPUT,
+            TrainError::Backend { source, .. } if is_input(source) => INPUT,
+            TrainError::Backend { .. } => DEVICE,
+            _ => OTHER,
+        };
+        Self::new(code, error)
+    }
+}
+
+impl From<CheckpointError> for Failure {
+    fn from(error: CheckpointError) -> Self {
+        match error {
+            CheckpointError::File(error) => error.into(),
+            CheckpointError::Backend(error) => error.into(),
+            CheckpointError::Policy { .. } => Self::new(OTHER, error),
+            CheckpointError::Invalid { .. } => Self::input(error),
+        }
+    }
+}
+
+impl From<EvaluateError> for Failure {
+    fn from(error: EvaluateError) -> Self {
+        let code = match &error {
+            EvaluateError::Stopped => OTHER,
+            EvaluateError::Backend { source, .. } | EvaluateError::Model(source)
+                if !is_input(source) =>
+            {
+                DEVICE
+            }
+            _ => INPUT,
+        };
+        Self::new(code, error)
+    }
+}
+
+impl From<SceneError> for Failure {
+    fn from(error: SceneError) -> Self {
+        let code = match error {
+            SceneError::Write { .. } => OTHER,
+            _ => INPUT,
+        };
+        Self::new(code, error)
+    }
+}
