@@ -97,7 +97,7 @@ pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> R
         console.result(format_args!("{name:width$}  {psnr:9.3}  {ssim:.4}  {flip:.4}{lpips}"));
     };
     let (backend, degree) = (opened.backend.as_mut(), opened.sh_degree);
-    CoordinateCheck::of(backend, &views, (background, degree))?.note(None, model, console);
+    CoordinateCheck::measure(backend, &views, (background, degree))?.note(None, model, console);
     let has_exposures = run.as_ref().is_some_and(|(config, _)| config.resolved.has_exposures);
     let fits_exposure = args.fit_exposure || has_exposures;
     let comparison = Comparison { lpips: lpips.as_ref(), fits_exposure };

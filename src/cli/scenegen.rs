@@ -13,7 +13,7 @@ use super::console::Console;
 use super::threads;
 use densify_core::numbers;
 use densify_run::Threads;
-use densify_run::failure::{Failure, INPUT, OTHER};
+use densify_run::failure::Failure;
 use densify_train::pictures::write_png;
 
 /// Ray-traces a mesh into posed images of known geometry.

@@ -33,7 +33,7 @@ impl CoordinateCheck {
     ///
     /// # Errors
     /// When a view cannot be read or rendered.
-    pub fn of(
+    pub fn measure(
         backend: &mut dyn Backend,
         views: &impl ViewSource,
         (background, sh_degree): ([f32; 3], u8),
@@ -151,7 +151,7 @@ mod tests {
         (pixel * 7919 % 4093) as f32 / 4093.0
     }
 
-    fn of(rendering: &Rendering, image: &Image8) -> Option<f64> {
+    fn compared(rendering: &Rendering, image: &Image8) -> Option<f64> {
         compare(rendering, image, [0.0; 3])
     }
 
@@ -159,10 +159,17 @@ mod tests {
     fn the_check_compares_contrast_not_exposure() {
         let photograph = image(|pixel| (pixel % SIZE * 15) as u8);
         let shown = |pixel: usize| 0.3 + 0.4 * (pixel % SIZE) as f32 / SIZE as f32;
-        assert!(of(&rendering(shown, |_| 1.0), &photograph).is_some_and(|it| it > 0.99));
+        assert!(
+            compared(&rendering(shown, |_| 1.0), &photograph).is_some_and(|value| value > 0.99)
+        );
         let mirrored = |pixel: usize| shown(SIZE - 1 - pixel % SIZE);
-        assert!(of(&rendering(mirrored, |_| 1.0), &photograph).is_some_and(|it| it < -0.99));
-        assert!(of(&rendering(noise, |_| 1.0), &photograph).is_some_and(|it| it.abs() < 0.1));
+        assert!(
+            compared(&rendering(mirrored, |_| 1.0), &photograph).is_some_and(|value| value < -0.99)
+        );
+        assert!(
+            compared(&rendering(noise, |_| 1.0), &photograph)
+                .is_some_and(|value| value.abs() < 0.1)
+        );
     }
 
     #[test]
@@ -171,11 +178,11 @@ mod tests {
         let is_part = |pixel: usize| pixel < 2 * SIZE;
         let part =
             rendering(|p| if is_part(p) { noise(p) } else { 0.0 }, |p| f32::from(is_part(p)));
-        assert!(of(&part, &photograph).is_some_and(|it| it > 0.99));
-        assert_eq!(of(&rendering(|_| 0.0, |_| 0.0), &photograph), Some(0.0));
+        assert!(compared(&part, &photograph).is_some_and(|value| value > 0.99));
+        assert_eq!(compared(&rendering(|_| 0.0, |_| 0.0), &photograph), Some(0.0));
         // One colour, in either, is no evidence.
-        assert_eq!(of(&rendering(|_| 0.5, |_| 1.0), &photograph), None);
-        assert_eq!(of(&rendering(noise, |_| 1.0), &image(|_| 99)), None);
+        assert_eq!(compared(&rendering(|_| 0.5, |_| 1.0), &photograph), None);
+        assert_eq!(compared(&rendering(noise, |_| 1.0), &image(|_| 99)), None);
     }
 
     #[test]

@@ -97,7 +97,7 @@ impl Machine {
 pub struct Opened {
     /// The dataset.
     pub dataset: Dataset,
-    /// How the dataset was read.
+    /// Options with which the dataset was read.
     pub data: DataSpec,
     /// Spherical-harmonic degree of the model.
     pub sh_degree: u8,

@@ -1,15 +1,15 @@
-//! What the caller of a run provides.
+//! The caller's side of a run: who observes it, and how it may measure its process.
 
 use crate::companion::Companion;
 use crate::observer::{Observer, Silent};
 use crate::process::ProcessMemory;
 
-/// What a run is given besides its description.
+/// The surroundings of a run, which its caller provides.
 #[derive(Clone, Copy)]
 pub struct Host<'a> {
-    /// Follows the run.
+    /// Is told everything, and may stop the run.
     pub observer: &'a dyn Observer,
-    /// How the process's memory is measured.
+    /// Measures the memory of the process.
     pub process: ProcessMemory,
     /// The part of the program that stays beside the run while it trains.
     pub companion: Option<Companion>,

@@ -123,13 +123,13 @@ mod tests {
 
     #[test]
     fn paths_are_called_by_as_little_as_tells_them_apart() {
-        let of = |paths: &[&str]| names_of(&paths.iter().map(Path::new).collect::<Vec<_>>());
-        assert_eq!(of(&["/home/me/out/a", "/home/me/out/b"]), ["a", "b"]);
-        assert_eq!(of(&["/x/one/run", "/x/two/run", "/x/b"]), ["one/run", "two/run", "b"]);
-        assert_eq!(of(&["/x/one/run", "/y/one/run"]), ["x/one/run", "y/one/run"]);
-        assert_eq!(of(&["/run", "/x/run"]), ["/run", "x/run"]);
+        let names = |paths: &[&str]| names_of(&paths.iter().map(Path::new).collect::<Vec<_>>());
+        assert_eq!(names(&["/home/me/out/a", "/home/me/out/b"]), ["a", "b"]);
+        assert_eq!(names(&["/x/one/run", "/x/two/run", "/x/b"]), ["one/run", "two/run", "b"]);
+        assert_eq!(names(&["/x/one/run", "/y/one/run"]), ["x/one/run", "y/one/run"]);
+        assert_eq!(names(&["/run", "/x/run"]), ["/run", "x/run"]);
         // The same path twice has the same name.
-        assert_eq!(of(&["/x/run", "/x/run"]), ["run", "run"]);
-        assert_eq!(of(&["/x/a\u{1b}[1m"]), ["a\\u{1b}[1m"]);
+        assert_eq!(names(&["/x/run", "/x/run"]), ["run", "run"]);
+        assert_eq!(names(&["/x/a\u{1b}[1m"]), ["a\\u{1b}[1m"]);
     }
 }

@@ -67,7 +67,7 @@ impl Truth {
         let (background, sh_degree) = (data.background.fixed(), model.sh_degree);
         let views = views_of(&dataset, Split::Test)?;
         // Pictures without the model are alike in every format.
-        CoordinateCheck::of(backend.as_mut(), &views, (background, sh_degree))?.note(
+        CoordinateCheck::measure(backend.as_mut(), &views, (background, sh_degree))?.note(
             None,
             &args.model,
             console,

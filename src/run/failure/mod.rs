@@ -30,9 +30,9 @@ use densify_train::trainer::TrainError;
 pub const OTHER: u8 = 1;
 /// Exit code of bad input and usage.
 pub const INPUT: u8 = 2;
-/// Exit code where a measured value is beyond the limit that was given for it.
+/// Exit code if a measured value is beyond the limit that was given for it.
 pub const LIMIT: u8 = 4;
-/// Exit code where device or memory do not suffice.
+/// Exit code if device or memory do not suffice.
 pub const DEVICE: u8 = 3;
 
 /// The failure of a run or a command. Displayed with options as on a terminal.
@@ -70,7 +70,7 @@ impl Failure {
 
     /// The failure of a problem with this exit code.
     #[must_use]
-    pub fn of(code: u8, problem: impl Into<Problem>) -> Self {
+    pub fn with_code(code: u8, problem: impl Into<Problem>) -> Self {
         Self { code, parts: vec![Part::Problem(Box::new(problem.into()))] }
     }
 
@@ -135,7 +135,7 @@ macro_rules! bad_input {
 
         impl From<$problem> for Failure {
             fn from(problem: $problem) -> Self {
-                Self::of(INPUT, problem)
+                Self::with_code(INPUT, problem)
             }
         }
     )*};
@@ -178,7 +178,7 @@ impl From<BackendError> for Failure {
     }
 }
 
-/// Whether other arguments would do.
+/// True if other arguments would do.
 fn is_input(error: &BackendError) -> bool {
     matches!(
         error,

@@ -1,4 +1,4 @@
-//! The words of every [`Problem`], with options as their reader spells them.
+//! The words of every [`Problem`], with options as their reader spells them. One piece, so that all can be compared.
 
 use densify_core::memory::Bytes;
 use densify_core::numbers::grouped;
@@ -369,5 +369,33 @@ fn scene_of_run(s: Spelling) -> String {
     match s {
         Spelling::Terminal => "--scene".to_owned(),
         Spelling::Keyword => s.option("scene"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::failure::{Failure, INPUT};
+
+    #[test]
+    fn options_are_spelled_as_their_reader_writes_them() {
+        let remedies = vec![vec![Remedy::NoImages, Remedy::Shrink(4)], vec![Remedy::Memory(96)]];
+        let (memory, rows, sh_degree, needed) = (64 << 20, 1_000, 0, 96);
+        let fits = SizeProblem::NoModelFits { memory, rows, sh_degree, needed, remedies };
+        let failure = Failure::from(fits).within_option("config", Some("a.toml".to_owned()));
+        assert_eq!(failure.code, INPUT);
+        assert_eq!(
+            failure.to_string(),
+            "--config a.toml: --memory 64.0 MiB holds no model of this scene: 1,000 rows at degree 0 take 96 MiB; \
+             give --image-cache 0 -r 4, or --memory 96MiB"
+        );
+        assert_eq!(
+            failure.words(Spelling::Keyword),
+            "config=\"a.toml\": memory=\"64.0 MiB\" holds no model of this scene: 1,000 rows at degree 0 take 96 \
+             MiB; give image_cache=0 resolution=4, or memory=\"96MiB\""
+        );
+        let given = OptionProblem::AutomaticWithFull { option: "sh_degree" };
+        let words = Failure::from(given).words(Spelling::Keyword);
+        assert!(words.ends_with("or full=True with sh_degree=3"), "{words}");
     }
 }

@@ -23,8 +23,8 @@ use densify_train::trainer::{AutoChoices, growth_signals};
 
 /// Most points of a random initialisation without `--init-points` (Kerbl et al. 2023 use 100,000).
 const RANDOM_POINTS: usize = 100_000;
-/// How much more memory a process that resumes a run may be found to take than the one that began it. The room that the
-/// ledger keeps for the allocator is larger.
+/// Resident memory by which a process that resumes a run may exceed the one that began it `[bytes]`. The ledger keeps more
+/// room than this for the allocator.
 const RESUME_TOLERANCE: u64 = 1 << 20;
 /// Threads that decode training views ahead of the trainer.
 pub(crate) const DECODERS: usize = 2;
@@ -48,7 +48,7 @@ pub(crate) struct Choices {
     pub(crate) knobs: Knobs,
     pub(crate) degree: Degree,
     pub(crate) exposure: Exposure,
-    /// What the run finds out by itself while it trains.
+    /// Choices that the run makes while it trains.
     pub(crate) automatic: AutoChoices,
     /// Threads that train and measure.
     pub(crate) threads: usize,
@@ -61,7 +61,7 @@ pub(crate) enum Init {
     Points,
     /// At this many random points.
     Random(usize),
-    /// Those of a file.
+    /// The model of a file.
     Model(AbsolutePath),
 }
 
@@ -90,7 +90,7 @@ impl Choices {
         }
     }
 
-    /// What the colours of the scene decided: lines for the user.
+    /// Choices that the colours of the scene decided, for the user.
     pub(super) fn lines(&self, spelling: Spelling) -> impl Iterator<Item = String> {
         self.degree.line().into_iter().chain(self.exposure.line(spelling))
     }
@@ -241,7 +241,7 @@ impl<'a> Case<'a> {
         }
     }
 
-    /// Rows that the scene starts with if nothing limits them; `None` where the limit decides.
+    /// Rows that the scene starts with if nothing limits them; `None` if the limit decides.
     pub(super) fn start(&self) -> Option<usize> {
         match self.init() {
             InitChoice::Model(_) => self.inputs.init_model.map(|model| model.rows),
@@ -284,7 +284,7 @@ impl<'a> Case<'a> {
         })
     }
 
-    /// What a run with this budget needs of its backend.
+    /// The needs of a run with this budget: the signals and terms that its backend computes.
     pub(crate) fn needs(&self, rows: usize) -> Result<Needs, Failure> {
         let scene = self.scene(rows, self.initial_rows(rows))?;
         let policy = self.choices.entry.build(&self.choices.parameters, &scene)?;
@@ -302,12 +302,12 @@ impl<'a> Case<'a> {
     }
 }
 
-/// Random points to start from where no number is given.
+/// Random points to start from if no number is given.
 fn random_points(trainable: usize) -> usize {
     (trainable / 2).clamp(1, RANDOM_POINTS)
 }
 
-/// Fails where an automatic choice contradicts `--full` or `--freeze`.
+/// Fails if an automatic choice contradicts `--full` or `--freeze`.
 fn check_automatic(spec: &RunSpec) -> Result<(), Failure> {
     let is_auto_budget = spec.size.budget.is_some_and(Budget::is_auto);
     let is_auto_degree = matches!(spec.size.sh_degree, Some(ShDegree::Auto(_)));

@@ -25,13 +25,13 @@ pub struct RunConfig {
     pub densify: String,
     /// A description that makes the same run: it asks for everything that was decided.
     pub spec: RunSpec,
-    /// What was found out when the run was prepared.
+    /// The findings that decided them.
     pub resolved: Findings,
     pub(crate) budget: usize,
     pub(crate) sh_degree: u8,
 }
 
-/// What was found out when a run was prepared.
+/// Facts that were found when a run was prepared.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Findings {

@@ -1,4 +1,4 @@
-//! What a run reads and runs on: device, dataset and the sizes of the models it starts from, opened once.
+//! The inputs of a run, opened once: device, dataset, and the sizes of the models that it starts from.
 
 use std::path::Path;
 
@@ -21,7 +21,7 @@ use super::models::size_of_model;
 #[derive(Clone)]
 pub(crate) struct Inputs {
     pub(crate) device: Device,
-    /// Without its tracks, which [`Evidence`] holds until they have decided what they decide.
+    /// The dataset without its tracks, which are part of the [`Evidence`].
     pub(crate) dataset: Dataset,
     /// The memory that training and test images take.
     pub(crate) images: [ImageDemand; 2],
@@ -33,24 +33,24 @@ pub(crate) struct Inputs {
     pub(super) usable_points: usize,
     /// Bytes that reading the colours of tracks takes, besides an image; 0 where they decide nothing.
     pub(super) track_bytes: u64,
-    /// Resident memory with the dataset and the device's driver, where it is known `[bytes]`.
+    /// Resident memory with the dataset and the device's driver, if it is known `[bytes]`.
     pub(super) resident: Option<u64>,
-    /// The most resident memory before the driver had its kernels, where it is known `[bytes]`.
+    /// The most resident memory before the driver had its kernels, if it is known `[bytes]`.
     pub(super) peak: Option<u64>,
     pub(super) companion: Option<Companion>,
 }
 
-/// The part of the dataset that only decides something: it is freed before training.
+/// Evidence for automatic choices. It is freed before training.
 #[derive(Default)]
 pub(super) struct Evidence {
     pub(super) tracks: Tracks,
-    /// The colours of the tracks; `None` where they are too few, or were not read.
+    /// The colours of the tracks; `None` if they are too few, or were not read.
     pub(super) colours: Option<TrackColours>,
     /// Exposures in EXIF.
     pub(super) reported: ReportedExposures,
 }
 
-/// Which evidence is read besides the dataset, and where the sizes of models come from.
+/// The evidence that is read besides the dataset, and the source of the sizes of models.
 pub(super) struct Reading {
     /// Sizes of the models of `--init` and `--freeze`; `None`: their files are read.
     pub(super) models: Option<[Option<ModelSize>; 2]>,
@@ -66,7 +66,7 @@ pub(super) struct Reading {
 }
 
 impl Inputs {
-    /// Loads the dataset and what `reading` says.
+    /// Loads the dataset, and the evidence that `reading` names.
     pub(super) fn open(
         spec: &RunSpec,
         device: Device,
@@ -162,7 +162,7 @@ pub(super) fn open_device(
     Ok(device)
 }
 
-/// Fails where a knob is set that this backend does not have.
+/// Fails if a knob is set that this backend does not have.
 fn check_knobs(knobs: &Knobs, kind: BackendKind) -> Result<(), Failure> {
     for (knob, value) in knobs.changed() {
         if let Some(only_on) = knob.only_on.filter(|only| *only != kind) {

@@ -149,7 +149,7 @@ impl Case<'_> {
             || self.inputs.init_model.is_some()
         {
             let (width, height) = self.inputs.dataset.largest_image();
-            // One more of its colours, with the exposure that fits best.
+            // Exposures need another copy of the colours, with the exposure that fits best.
             let planes = if self.choices.exposure.is_on { 8 } else { 5 };
             let rendering = u64::from(width) * u64::from(height) * planes * float;
             let one = |images: &ImageDemand| images.held(0) + images.decoding(1);
@@ -197,13 +197,13 @@ impl Case<'_> {
         let float = size_of::<f32>() as u64;
         let candidate = size_of::<densify_policies::policy::Candidate>() as u64;
         let seed = size_of::<densify_policies::plan::Seed>() as u64;
-        // The native backend has room for them.
+        // The native backend lends its own memory for signals.
         let signals = self.inputs.device.columns_on_host(needs.signals.width()) as u64;
         // One auxiliary view's columns, and as many that a policy derives from them; all views' points.
         let aux = needs.aux.as_ref();
         let columns = aux.map_or(0, |request| 2 * request.columns.len()) as u64;
         let points = aux.map_or(0, |request| u64::from(request.points));
-        // A point is kept by the policy, becomes a seed, and is compiled.
+        // The policy keeps a point, makes a seed of it, and compiles the seed.
         let plan = bytes_per_row(needs) as u64;
         size.rows as u64 * ((signals + columns) * float + plan + PLANNING)
             + points * self.inputs.dataset.train.len() as u64 * (candidate + 3 * seed)
@@ -215,7 +215,7 @@ impl Case<'_> {
         let Dataset { train, test, points, .. } = &self.inputs.dataset;
         let views = train.iter().chain(test);
         let rendered = |view: &View| view.source.rendered.as_ref().map_or(0, |image| image.bytes());
-        // A view's name and path; it is there once more for its images.
+        // A view's name and path, in the dataset and again for its images.
         let view = |view: &View| (3 * size_of::<View>() + 512) as u64 + rendered(view);
         let expected = PROGRAM + views.map(view).sum::<u64>() + points.len() as u64 * POINT;
         let program = match self.inputs.resident {

@@ -43,7 +43,7 @@ pub(crate) struct ResolvedRun<'a> {
     pub(crate) size: RunSize,
     /// The first Gaussians.
     pub(crate) init: Init,
-    /// Whether `--memory` made the degree lower than was wanted.
+    /// `--memory` made the degree lower than was wanted.
     pub(crate) degree_lowered: bool,
     /// Why the run has this size, and what the colours of the scene decided: lines for the user.
     pub(crate) reasons: Vec<String>,

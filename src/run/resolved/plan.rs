@@ -31,7 +31,7 @@ pub struct Alternatives {
     pub memory: u64,
     /// `--resolution`, and width and height of the largest image `[px]`.
     pub images: Vec<(u32, (u32, u32))>,
-    /// Rows at each degree and each size of the images; `None` where none fit.
+    /// Rows at each degree and each size of the images; `None` if none fit.
     pub rows: Vec<Vec<Option<usize>>>,
 }
 
@@ -87,7 +87,7 @@ fn alternatives(case: &Case<'_>, memory: u64, planned: usize) -> Result<Alternat
 impl fmt::Display for Alternatives {
     /// A table for a terminal.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        // As it can be typed, and nothing rounded.
+        // In a form that can be typed, without rounding.
         let memory = match self.memory % MIB {
             0 => format!("{}MiB", self.memory / MIB),
             _ => self.memory.to_string(),

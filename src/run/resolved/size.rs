@@ -53,7 +53,7 @@ impl Size {
         setting.image_cache = match case.spec.size.image_cache {
             None => DEFAULT_IMAGE_CACHE,
             Some(ImageCache::Bytes(bytes)) => bytes,
-            // With the rest these are an eighth.
+            // An eighth of the total, which includes the images.
             Some(ImageCache::Auto) => {
                 let rest = case.ledger(&setting, &case.needs(rows)?).on_host();
                 (rest / (IMAGES - 1)).min(DEFAULT_IMAGE_CACHE).min(case.all_images())
@@ -80,7 +80,7 @@ impl Size {
         }
     }
 
-    /// Whether memory made the degree lower than was wanted.
+    /// True if memory made the degree lower than was wanted.
     pub(super) fn is_lowered(&self, case: &Case<'_>) -> bool {
         self.setting.sh_degree < case.choices.degree.highest()
     }
@@ -130,8 +130,9 @@ impl Size {
 impl Case<'_> {
     /// The ledger, and the rest of `--memory`, for the user.
     pub(crate) fn promise(&self, ledger: &Ledger, spelling: Spelling) -> String {
-        let left =
-            self.memory().map(|it| it.saturating_sub(self.inputs.device.limited_bytes(ledger)));
+        let left = self
+            .memory()
+            .map(|memory| memory.saturating_sub(self.inputs.device.limited_bytes(ledger)));
         let left = left.map_or_else(String::new, |left| notes::memory_left(spelling, left));
         format!("memory promised\n{ledger}{left}")
     }
@@ -225,7 +226,7 @@ impl ResolvedRun<'_> {
         let needed = ledger.on_host();
         let problem =
             SizeProblem::OverGrant { needed, resident: now, limit: by, left, remedies: found };
-        Err(Failure::of(DEVICE, problem))
+        Err(Failure::with_code(DEVICE, problem))
     }
 }
 

@@ -33,13 +33,13 @@ fn sized(case: &Case<'_>) -> (usize, u64) {
 
 fn check(case: &Case<'_>, rows: usize) -> Result<(), TestCaseError> {
     let rows = rows.min(case.inputs.device.largest_budget(case.choices.degree.highest()));
-    let of = |budget, memory| {
+    let sized_for = |budget, memory| {
         let mut spec = case.spec.clone();
         spec.size.budget = Some(Budget::Rows(budget));
         spec.size.memory = memory;
         sized(&case.with(&spec).expect("a scene"))
     };
-    let (_, bytes) = of(rows, None);
+    let (_, bytes) = sized_for(rows, None);
     for degree in 0..=case.choices.degree.highest() {
         let held = size::rows_at(case, bytes, degree, rows).expect("it is solved");
         prop_assert!(held >= Some(rows), "{rows} rows take {bytes}, which hold {held:?}");
@@ -47,7 +47,7 @@ fn check(case: &Case<'_>, rows: usize) -> Result<(), TestCaseError> {
     for memory in [bytes, bytes + bytes / 3] {
         let open = size::rows_at(case, memory, 3, rows).expect("it is solved").expect("it fits");
         for asked in [rows, open] {
-            let (found, taken) = of(asked, Some(ByteCount(memory)));
+            let (found, taken) = sized_for(asked, Some(ByteCount(memory)));
             prop_assert!(taken <= memory, "{found} rows take {taken} of {memory}");
             prop_assert_eq!(found, asked, "{} bytes", memory);
         }
@@ -97,7 +97,7 @@ fn plain_ledger(made: &Made, exposure: &str) -> (Vec<(Section, String, u64)>, u6
     (ledger.lines.into_iter().map(|line| (line.section, line.what, line.bytes)).collect(), total)
 }
 
-/// What a run takes that needs neither exposures nor masks nor lenses is a number: nothing that these need is
+/// The memory of a run without exposures, masks and lenses is a fixed number: nothing that these need is
 /// paid for without them, not a byte of a view.
 #[cfg(all(unix, target_pointer_width = "64"))]
 #[test]
@@ -130,7 +130,7 @@ fn what_is_not_used_of_photographs_takes_no_byte() {
     );
 }
 
-/// Whether a case of the test below was already taken to a GPU.
+/// True after a case of the test below has run on a GPU.
 static ON_GPU: AtomicBool = AtomicBool::new(false);
 
 proptest! {

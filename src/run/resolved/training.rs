@@ -12,7 +12,7 @@ pub(crate) struct ResolvedTraining {
     pub(crate) policy: Box<dyn DensityPolicy>,
     /// The scene as the policy sees it.
     pub(crate) scene: SceneInfo,
-    /// What the policy declared.
+    /// The needs that the policy declares.
     pub(crate) declared: Needs,
     /// Every parameter of the policy, with its value.
     pub(crate) parameters: Table,

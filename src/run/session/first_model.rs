@@ -168,7 +168,7 @@ pub(super) fn check_coordinates(
     let ResolvedRun { case, size, .. } = run;
     let views = views_of(&case.inputs.dataset, Split::Train)?;
     let shown = (case.spec.data.background.fixed(), size.sh_degree);
-    let check = CoordinateCheck::of(backend, &views, shown)?;
+    let check = CoordinateCheck::measure(backend, &views, shown)?;
     if case.inputs.frozen_model.is_some() {
         check.note(Some("init"), file, observer);
         return Ok(());

@@ -232,7 +232,7 @@ impl<'a> Session<'a> {
         if 2 * empty <= views {
             return Ok(());
         }
-        Err(Failure::of(OTHER, TrainingProblem::DrawsNothing { empty, views }))
+        Err(Failure::with_code(OTHER, TrainingProblem::DrawsNothing { empty, views }))
     }
 
     /// Saves and measures the model and writes a checkpoint if they are due after `step`; in a resumed run, only those
@@ -283,7 +283,7 @@ impl<'a> Session<'a> {
     fn interrupted(&mut self, Interrupt { name, exit_code }: Interrupt) -> Failure {
         let step = self.run.trainer.steps_done();
         let stopped = TrainingProblem::Stopped { by: name, step: Some(step) };
-        self.kept(Failure::of(exit_code, stopped))
+        self.kept(Failure::with_code(exit_code, stopped))
     }
 
     /// Writes a checkpoint of a run that ends with `failure`.

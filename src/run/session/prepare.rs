@@ -85,7 +85,7 @@ pub(super) fn prepare(
     let mut dataset = case.inputs.into_owned().dataset;
     let views = DatasetViews::new(dataset.train.clone(), size.image_cache, DECODERS);
     let test = DatasetViews::new(dataset.test.clone(), 0, TEST_DECODERS);
-    // Training has made its rows of them.
+    // Once the first rows are made, training needs no points.
     dataset.points = companion
         .map_or_else(PointCloud::default, |companion| dataset.points.thinned(companion.points));
     let ResolvedTraining { policy, scene, .. } = training;

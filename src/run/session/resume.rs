@@ -130,7 +130,8 @@ fn overlay(mut given: Partial, saved: &RunConfig, origin: &str) -> Result<RunSpe
         given = given.clone().over(Partial::preset(name)?);
     }
     // Parameters of one policy mean nothing to another; a change of policy is refused later.
-    if given.get("policy").is_some_and(|it| it.as_str() != Some(&saved.spec.density.policy)) {
+    if given.get("policy").is_some_and(|policy| policy.as_str() != Some(&saved.spec.density.policy))
+    {
         lower.remove("policy_set");
     }
     given.over(lower).spec()

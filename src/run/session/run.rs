@@ -99,7 +99,7 @@ impl Run {
         while self.trainer.steps_done() < self.last {
             if let Some(Interrupt { name, exit_code }) = observer.interrupt() {
                 let stopped = TrainingProblem::Stopped { by: name, step: None };
-                return Err(Failure::of(exit_code, stopped));
+                return Err(Failure::with_code(exit_code, stopped));
             }
             self.trainer.step()?;
         }

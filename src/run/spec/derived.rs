@@ -157,7 +157,7 @@ mod tests {
     use densify_policies::policy::{Fade, Rate};
 
     use super::*;
-    use crate::Partial;
+    use crate::spec::Partial;
 
     fn spec(option: &str, value: &str) -> Result<RunSpec, Failure> {
         let file: Table = format!("{option} = {value}").parse().unwrap();

@@ -24,6 +24,7 @@ use std::path::PathBuf;
 use clap::{ArgAction, Args};
 use serde::{Deserialize, Serialize};
 
+use densify_core::spelling::Spelling;
 use densify_data::dataset::{FarCameras, MaskMode, Resolution};
 use densify_render::BackendChoice;
 use densify_train::exposure::{ExposureChoice, ExposureModel};
@@ -31,23 +32,23 @@ use densify_train::schedule::{Background, InitRates, REFERENCE_ITERATIONS};
 use densify_train::trainer::OnNan;
 use values::as_table;
 
-/// What `--resume` may do with an option.
+/// The rule for an option of a resumed run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum OnResume {
-    /// It stays as it was: another value is refused.
+    /// Another value is refused.
     Fixed,
-    /// It may have any value; the result does not depend on it.
+    /// Any value is allowed; the result does not depend on it.
     Free,
-    /// It may be larger than it was.
+    /// A larger value is allowed.
     Longer,
 }
 
 /// An option of a run, as the list below declares it.
 #[derive(Debug, Clone, Copy)]
 pub struct RunOption {
-    /// Its name in files.
+    /// Name in files, such as `tile_cap`.
     pub name: &'static str,
-    /// What a resumed run may do with it.
+    /// The rule for a resumed run.
     pub on_resume: OnResume,
 }
 
@@ -58,13 +59,10 @@ impl RunOption {
         OPTIONS.iter().find(|option| option.name == name)
     }
 
-    /// Its flag, such as `--tile-cap`; `SCENE`, which has none.
+    /// The flag, such as `--tile-cap`; `SCENE`, which has none.
     #[must_use]
     pub fn flag(&self) -> String {
-        match self.name {
-            "scene" => "SCENE".to_owned(),
-            name => format!("--{}", name.replace('_', "-")),
-        }
+        Spelling::Terminal.option(self.name)
     }
 }
 
@@ -105,7 +103,7 @@ macro_rules! run_spec {
 }
 
 run_spec! {
-    /// How a dataset is read.
+    /// Reading of the dataset.
     data: DataSpec, "Scene" {
         /// Hold out the dataset's own test views, or every 8th photograph by sorted name, for
         /// measuring
@@ -120,24 +118,24 @@ run_spec! {
         #[arg(long, value_name = "K")]
         test_every: Option<NonZeroU32> = None, Fixed;
 
-        /// Folder of the photographs, where it is not the dataset's own (relative to the dataset)
+        /// Folder of the photographs, if it is not the dataset's own (relative to the dataset)
         #[arg(long, value_name = "DIR")]
         images: Option<PathBuf> = None, Free;
 
-        /// Use only the views that this file names, one in each line, and of one that a tab and four numbers follow
-        /// only that part: left, top, right, bottom, from 0 to 1. The others are split into training and test views
-        /// all the same, and then left out
+        /// Use only the views that this file names, one per line. A tab and four numbers from 0 to 1 after a name
+        /// (left, top, right, bottom) select a part of the view. Views are split into training and test views before
+        /// the others are left out
         #[arg(long, value_name = "FILE")]
         views: Option<AbsolutePath> = None, Fixed;
 
-        /// What happens to views whose camera is more than 10 times as far from the others as usual, if
-        /// they are no more than one in 20: structure from motion places some by mistake
+        /// Treatment of views whose camera is more than 10 times as far from the others as usual, if they are at most
+        /// one in 20: structure from motion misplaces some
         #[arg(long, value_name = "WHAT")]
         far_cameras: FarCameras = FarCameras::LeaveOut, Fixed;
 
-        /// Keep all that a distorted lens saw, and mask what it did not see; by default photographs are cropped
-        /// to the largest rectangle without such pixels. Where the distortion folds over, what can be inverted
-        /// is kept
+        /// Keep the full field of view of a distorted lens, and mask pixels that it did not see; by default photographs
+        /// are cropped to the largest rectangle without such pixels. Where the distortion folds over, the invertible
+        /// part is kept
         #[arg(
             long, value_name = "true|false", action = ArgAction::Set, num_args = 0..=1,
             require_equals = true, default_missing_value = "true", hide_possible_values = true
@@ -151,51 +149,50 @@ run_spec! {
         )]
         invert_masks: bool = false, Fixed;
 
-        /// What the pixels are that masks hide. To carve an object out, background needs a colour behind it that the
-        /// object does not have, or --background random
+        /// Meaning of masked pixels. To carve out an object, background needs a background colour that the object does
+        /// not have, or --background random
         #[arg(long, value_name = "MODE")]
         mask_mode: MaskMode = MaskMode::Ignore, Fixed;
 
-        /// Render a built-in scene anew, and do not keep it in the user's cache folder
+        /// Render a built-in scene again, and do not keep it in the user's cache folder
         #[arg(
             long, value_name = "true|false", action = ArgAction::Set, num_args = 0..=1,
             require_equals = true, default_missing_value = "true", hide_possible_values = true
         )]
         no_cache: bool = false, Free;
 
-        /// 1, 2, 4 or 8: photographs that many times smaller (uses images_2, images_4, images_8 where
-        /// they exist); any larger number: their width in pixels
+        /// 1, 2, 4 or 8: photographs this many times smaller (uses images_2, images_4, images_8 if they exist); any
+        /// larger number: their width in pixels
         #[arg(short, long, value_name = "N")]
         resolution: Option<Resolution> = None, Fixed;
 
-        /// What lies behind the scene, and behind transparent images: black, white, random (another
-        /// colour at every step) or #rrggbb
+        /// Background of the scene, and of transparent images: black, white, random (another colour at every step) or
+        /// #rrggbb
         #[arg(long, value_name = "COLOUR")]
         background: Background = Background::Black, Fixed;
     }
 
-    /// What a run starts from.
+    /// The dataset, and the first Gaussians.
     start: StartSpec, "Scene" {
         /// Folder or ZIP archive of the dataset, or scene:NAME for a built-in scene
         #[arg(value_name = "SCENE")]
         scene: Option<PathBuf> = None, Free;
 
-        /// What the first Gaussians are: one on each of the dataset's points, at random places, or those of a
-        /// model in the dataset's coordinates, by any program (default: points where the dataset has any, else
-        /// random)
+        /// Source of the first Gaussians: one on each of the dataset's points, random places, or a model in the
+        /// dataset's coordinates, by any program (default: points if the dataset has any, else random)
         ///
-        /// Of a model with more Gaussians than the budget, those stay that show most in the training views. Its
-        /// colours are cut to --sh-degree, or given room to it
+        /// Of a model with more Gaussians than the budget, those that contribute most to the training views are kept.
+        /// Its colours are cut or extended to --sh-degree
         #[arg(long, value_name = "points|random|MODEL")]
         init: Option<InitChoice> = None, Fixed;
 
-        /// Step sizes of a run from a model; --lr changes single ones
+        /// Learning rates of a run from a model; --lr changes single ones
         #[arg(long, value_name = "WHICH")]
         init_rates: InitRates = InitRates::Fine, Fixed;
 
-        /// A model in the dataset's coordinates, by any program, whose Gaussians are rendered but never change: no
-        /// policy removes or moves them, and no step trains them. What --init gives is trained beside them; the
-        /// budget counts both
+        /// A model in the dataset's coordinates, by any program, whose Gaussians are rendered but never change: they
+        /// are neither trained, moved nor removed. The Gaussians of --init are trained beside them; the budget counts
+        /// both
         #[arg(long, value_name = "MODEL")]
         freeze: Option<AbsolutePath> = None, Fixed;
 
@@ -211,10 +208,10 @@ run_spec! {
         near: Fraction = Fraction(0.04), Fixed;
     }
 
-    /// How large a run is.
+    /// Limits of memory and quality.
     size: SizeSpec, "Size" {
-        /// Most Gaussians the model may ever have, at any instant: 200000, 28k, 1.5M
-        /// (default: 200k, or as many as --memory holds)
+        /// Most Gaussians that the model may have at any time: 200000, 28k, 1.5M (default: 200k, or as many as --memory
+        /// holds)
         ///
         /// auto: growth stops where twice as many Gaussians gain less than 0.10 dB on training
         /// views, and those with the least effect are then pruned. The default stays the limit;
@@ -222,8 +219,8 @@ run_spec! {
         #[arg(short, long, value_name = "ROWS")]
         budget: Option<Budget> = None, Fixed;
 
-        /// Memory that the run may take, everything included: 512MiB, 1.5GiB, 800MB. On a GPU it is the
-        /// device's, else the process's
+        /// Limit of all memory of the run: 512MiB, 1.5GiB, 800MB. On a GPU it limits the device's memory, else that of
+        /// the process
         ///
         /// Options that are given are kept: --budget (the smaller of the two limits holds), --sh-degree,
         /// --tile-cap, --image-cache. The others are chosen: as many Gaussians as fit; degree 3
@@ -238,17 +235,17 @@ run_spec! {
         #[arg(long, value_name = "PAIRS")]
         tile_cap: Option<Rows> = None, Free;
 
-        /// Memory for decoded photographs, and on a GPU as much of its own; those beyond it are decoded,
-        /// and uploaded, again when their turn comes. auto: an eighth of all that the run takes, and what
-        /// --memory leaves free; 1GiB if --memory limits a GPU (default: 1GiB, or as auto for --memory)
+        /// Memory for decoded photographs, and as much of a GPU's own; others are decoded and uploaded again when they
+        /// are needed. auto: an eighth of the memory of the run, and the rest of --memory; 1GiB if --memory limits a
+        /// GPU (default: 1GiB, or as auto with --memory)
         #[arg(long, value_name = "BYTES")]
         image_cache: Option<ImageCache> = None, Free;
 
-        /// How colours may depend on the viewing direction: 0 not at all, 3 most; auto: as much as the
-        /// scene requires (default: 3, or lower where --memory requires it)
+        /// Dependence of colours on the viewing direction: 0 none, 3 most; auto: as much as the scene requires
+        /// (default: 3, or lower if --memory requires it)
         ///
-        /// With auto it is decided before training, by how much the photographs disagree about the
-        /// colours of the reconstruction's points. Where there are too few of them, it is 3
+        /// auto is decided before training, by how much the photographs disagree about the colours of the
+        /// reconstruction's points. With too few points, it is 3
         #[arg(long, value_name = "DEGREE")]
         sh_degree: Option<ShDegree> = None, Fixed;
 
@@ -261,9 +258,9 @@ run_spec! {
         full: bool = false, Fixed;
     }
 
-    /// What decides where Gaussians are born and die.
+    /// The policy of density control.
     density: PolicySpec, "Policy" {
-        /// What decides where Gaussians are born and die; `densify policies` lists the choices
+        /// Policy that decides where Gaussians are added and removed; `densify policies` lists the choices
         #[arg(short, long, value_name = "NAME")]
         policy: String = "diet".to_owned(), Fixed;
 
@@ -273,14 +270,14 @@ run_spec! {
         policy_set: Vec<Assignment> = Vec::new(), Fixed;
     }
 
-    /// How the model is trained.
+    /// Training.
     schedule: ScheduleSpec, "Schedule" {
         /// Length of the run; every schedule scales with it
         // The default of a run that names no preset is that preset's.
         #[arg(short, long, value_name = "N")]
         iterations: Whole<1, { u32::MAX }> = Whole(REFERENCE_ITERATIONS), Longer;
 
-        /// Everything random follows from this number
+        /// Seed of everything random
         #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
         seed: u64 = 0, Fixed;
 
@@ -303,23 +300,21 @@ run_spec! {
         #[serde(with = "as_table")]
         knob: Vec<Assignment> = Vec::new(), Fixed;
 
-        /// Whether each training photograph has an exposure of its own, which is learned beside the model: a factor
-        /// and an offset per colour channel. Test views are then measured as they are, and again after the best
-        /// such fit. auto needs the tracks of a reconstruction
+        /// Learn an exposure for each training photograph: a factor and an offset per colour channel. Test views are
+        /// then measured as they are, and again after the best such fit. auto needs the tracks of a reconstruction
         #[arg(long, value_name = "WHEN")]
         exposure: ExposureChoice = ExposureChoice::Off, Fixed;
 
-        /// What an exposure may do to colours
+        /// Form of an exposure
         #[arg(long, value_name = "MODEL")]
         exposure_model: ExposureModel = ExposureModel::Channels, Fixed;
 
-        /// What happens to Gaussians with a non-finite value; they are looked for every 100 iterations
-        /// at least
+        /// Treatment of Gaussians with a non-finite value; the model is checked at least every 100 iterations
         #[arg(long, value_name = "ACTION")]
         on_nan: OnNan = OnNan::Prune, Free;
 
-        /// Give the same bytes every time. The processor always does; a GPU then adds up gradients in one
-        /// order, which is slower than its atomics (`densify devices`)
+        /// Make runs reproducible byte for byte. On the processor they always are; a GPU then adds up gradients in a
+        /// fixed order, which is slower than its atomics (`densify devices`)
         #[arg(
             help_heading = "Backend", long, value_name = "true|false", action = ArgAction::Set, num_args = 0..=1,
             require_equals = true, default_missing_value = "true", hide_possible_values = true
@@ -327,7 +322,7 @@ run_spec! {
         deterministic: bool = false, Free;
     }
 
-    /// Where to compute.
+    /// The device.
     device: DeviceSpec, "Backend" {
         /// Where to compute
         #[arg(long, value_name = "WHERE")]
@@ -343,7 +338,7 @@ run_spec! {
         threads: Option<Threads> = None, Free;
     }
 
-    /// What is written, and when.
+    /// Output files.
     output: OutputSpec, "Output" {
         /// Folder to write to (default: output/SCENE-POLICY)
         #[arg(short, long, value_name = "DIR")]

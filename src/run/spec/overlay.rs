@@ -111,7 +111,7 @@ impl Partial {
     /// Overlays other options with these, which win; tables are joined key by key.
     #[must_use]
     pub fn over(self, mut lower: Self) -> Self {
-        lay(self.0, &mut lower.0);
+        join(self.0, &mut lower.0);
         lower
     }
 
@@ -159,10 +159,10 @@ impl Partial {
     }
 }
 
-fn lay(upper: Table, lower: &mut Table) {
+fn join(upper: Table, lower: &mut Table) {
     for (key, value) in upper {
         match (value, lower.get_mut(&key)) {
-            (Value::Table(upper), Some(Value::Table(lower))) => lay(upper, lower),
+            (Value::Table(upper), Some(Value::Table(lower))) => join(upper, lower),
             (value, _) => _ = lower.insert(key, value),
         }
     }

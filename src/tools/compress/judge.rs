@@ -46,7 +46,7 @@ impl Judge {
         let degree = model.sh_degree;
         let mut backend = self.machine.backend(&self.dataset, model.clone(), self.near)?;
         let views = views_of(&self.dataset, Split::Train)?;
-        let check = CoordinateCheck::of(backend.as_mut(), &views, (self.background, degree))?;
+        let check = CoordinateCheck::measure(backend.as_mut(), &views, (self.background, degree))?;
         check.require(None, file, observer)
     }
 

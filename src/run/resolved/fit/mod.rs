@@ -114,9 +114,10 @@ pub(super) fn fit<E>(
             let all = RunSize { image_cache: request.all_images, ..setting };
             let left = request.memory.saturating_sub(bytes(&setting)?);
             // Images in use are counted even if the cache is smaller.
-            setting.image_cache = match bytes(&all)? <= request.memory {
-                true => request.all_images,
-                false => setting.image_cache.saturating_add(left).min(request.all_images),
+            setting.image_cache = if bytes(&all)? <= request.memory {
+                request.all_images
+            } else {
+                setting.image_cache.saturating_add(left).min(request.all_images)
             };
         }
     }

@@ -31,7 +31,7 @@ pub struct Knob {
     pub only_on: Option<BackendKind>,
     /// The worst effect on the result.
     pub class: Class,
-    /// Its effect and the gain, in a line.
+    /// Effect and gain, in a line.
     pub effect: &'static str,
     /// Values that `densify trade` measures, besides the default.
     pub levels: &'static [&'static str],

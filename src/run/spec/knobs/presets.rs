@@ -10,11 +10,11 @@ use super::KnobError;
 pub struct Preset {
     /// Such as `fast`.
     pub name: &'static str,
-    /// Its promise, in a line.
+    /// The promise, in a line.
     pub promise: &'static str,
     /// Knobs and options by name, each with its value.
     pub levels: &'static [(&'static str, &'static str)],
-    /// Its measured cost and gain; `None` for the reference.
+    /// Measured cost and gain; `None` for the reference.
     pub measured: Option<Measured>,
 }
 
@@ -23,7 +23,7 @@ pub struct Preset {
 pub struct Measured {
     /// Mean difference of PSNR on views held out `[dB]`.
     pub psnr: f64,
-    /// Its 95 % interval.
+    /// 95 % interval of this difference `[dB]`.
     pub interval: [f64; 2],
     /// Processor time of training, as a ratio.
     pub seconds: f64,

@@ -70,7 +70,9 @@ impl Knobs {
 
     /// Each knob with its value.
     pub fn iter(&self) -> impl Iterator<Item = (&'static Knob, &str)> {
-        KNOBS.iter().map(|knob| (knob, self.values.get(knob.name).map_or(knob.default, |it| it)))
+        KNOBS
+            .iter()
+            .map(|knob| (knob, self.values.get(knob.name).map_or(knob.default, String::as_str)))
     }
 
     /// Each knob whose value is not the default.
