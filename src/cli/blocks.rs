@@ -8,6 +8,7 @@ use clap::{Args, Subcommand};
 use super::console::Console;
 use super::export::{check_output, format_of};
 use super::flags::words;
+use super::threads;
 use super::train::Follower;
 use densify_blocks as blocks;
 use densify_blocks::{
@@ -18,7 +19,7 @@ use densify_core::numbers;
 use densify_core::numbers::grouped;
 use densify_launch::{Engine, SubmissionArgs};
 use densify_run::failure::Failure;
-use densify_run::{ByteCount, Fraction, Rows, Threads};
+use densify_run::{ByteCount, Fraction, Rows, Threads, Whole};
 
 /// Trains a large scene in blocks, on one machine or on a cluster, and merges them.
 ///
@@ -163,6 +164,7 @@ fn run_plan(args: &PlanArgs, console: &Console) -> Result<(), Failure> {
         margin: args.margin.0,
         given: words(&args.train, "densify blocks plan ... --")?,
     };
+    threads::limit(options.given.clone().describe().ok().and_then(|spec| spec.device.threads));
     let blocks = plan(&options, console)?;
     console.result(table(&blocks));
     console.result(format_args!("everything in {}", args.output.display()));
@@ -225,6 +227,7 @@ fn run_task(args: &RunArgs, console: &Console) -> Result<(), Failure> {
     let task = blocks.task(&args.task)?;
     let follower = Follower::new(console);
     follower.listen();
+    threads::limit(Some(args.threads.unwrap_or(Whole(blocks.threads))));
     blocks::run(&args.folder, &blocks, task, args.threads.map(|threads| threads.0), &follower)
 }
 

@@ -8,6 +8,7 @@ use clap::{ArgMatches, Args};
 use super::console::Console;
 use super::export::{check_output, format_of};
 use super::render::{RenderingArgs, refuse_options_of_a_file};
+use super::threads;
 use super::train::Follower;
 use densify_compress::{Attempt, Compressed, Options, Target, compress, file};
 use densify_core::numbers;
@@ -133,6 +134,7 @@ pub(super) fn run(
     };
     let follower = Follower::new(console);
     follower.listen();
+    threads::limit(device.threads);
     let compressed = compress(&options, &follower)?;
     console.result(table(&compressed));
     let format = compressed.attempts[compressed.best].format;

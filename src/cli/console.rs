@@ -10,6 +10,7 @@ use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 
 use densify_core::files;
+use densify_core::spelling::Spelling;
 use densify_run::Observer;
 use densify_run::failure::{Failure, OTHER};
 
@@ -86,10 +87,9 @@ impl Console {
     pub(super) fn finish(&self) -> Result<(), Failure> {
         match self.broken.take() {
             None => Ok(()),
-            Some(error) => Err(Failure {
-                code: OTHER,
-                message: format!("cannot write to standard output: {error}"),
-            }),
+            Some(error) => {
+                Err(Failure::new(OTHER, format!("cannot write to standard output: {error}")))
+            }
         }
     }
 
@@ -102,7 +102,7 @@ impl Console {
 
     /// What goes wrong, on standard error.
     pub(super) fn error(&self, failure: &Failure) {
-        let message = files::lines(&failure.message);
+        let message = files::lines(&failure.words(Spelling::Terminal));
         self.bars.suspend(|| {
             let _ = writeln!(io::stderr().lock(), "error: {message}");
         });

@@ -11,9 +11,9 @@ use super::render::{Named, RenderingArgs};
 use densify_core::numbers::{grouped, percent};
 use densify_inspect::{Bound, Limit, LimitError, Limits, measured_values};
 use densify_run::RunConfig;
+use densify_run::coordinate_check::CoordinateCheck;
 use densify_run::failure::{Failure, INPUT, LIMIT};
 use densify_run::finished::{is_model, iteration};
-use densify_run::likeness::Likeness;
 use densify_train::evaluate::{Comparison, FittedScore, Mean, Split, evaluate};
 use densify_train::metrics::Lpips;
 use densify_train::metrics::geometry::{self, Geometry};
@@ -98,7 +98,7 @@ pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> R
         console.result(format_args!("{name:width$}  {psnr:9.3}  {ssim:.4}  {flip:.4}{lpips}"));
     };
     let (backend, degree) = (opened.backend.as_mut(), opened.sh_degree);
-    Likeness::of(backend, &views, (background, degree))?.note(model.display(), console);
+    CoordinateCheck::measure(backend, &views, (background, degree))?.note(None, model, console);
     let has_exposures = run.as_ref().is_some_and(|(config, _)| config.resolved.has_exposures);
     let fits_exposure = args.fit_exposure || has_exposures;
     let comparison = Comparison { lpips: lpips.as_ref(), fits_exposure };
@@ -134,7 +134,7 @@ fn in_options(error: LimitError) -> Failure {
         Bound::Lowest => "--fail-below",
         Bound::Highest => "--fail-above",
     });
-    Failure { code, message }
+    Failure::new(code, message)
 }
 
 /// The geometric measurements as lines; lengths as percentages of the diagonal.

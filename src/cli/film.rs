@@ -82,20 +82,19 @@ pub(super) fn run(
 
 /// The error in the words of the options.
 fn in_options(error: FilmError) -> Failure {
-    let other = |code, message| Failure { code, message };
     match error {
         FilmError::Path(error) => Failure::input(format!("--path: {error}")),
         FilmError::NoSize => {
             Failure::input(format!("--path: {error}; say it with --size WIDTHxHEIGHT"))
         }
-        FilmError::OutOfMemory { .. } => other(DEVICE, format!("{error}; give a smaller --size")),
+        FilmError::OutOfMemory { .. } => Failure::new(DEVICE, format!("{error}; give a smaller --size")),
         FilmError::TooLargeForWebP { .. } => {
             Failure::input(format!("--video {error}; give a smaller --size"))
         }
         FilmError::UnknownFormat { .. } | FilmError::NoFfmpeg { .. } => {
             Failure::input(format!("--video {error}"))
         }
-        FilmError::Encoding { .. } | FilmError::Temporary { .. } => other(OTHER, error.to_string()),
+        FilmError::Encoding { .. } | FilmError::Temporary { .. } => Failure::new(OTHER, error),
         FilmError::File(error) => error.into(),
         FilmError::Backend(error) => error.into(),
     }

@@ -3,7 +3,6 @@
 use clap::Args;
 
 use super::console::Console;
-use densify_render::BackendKind;
 use densify_run::failure::Failure;
 use densify_run::knobs::{Class, KNOBS, Knob, Measured, PRESETS};
 
@@ -39,7 +38,7 @@ pub(super) fn run(_: &KnobsArgs, console: &Console) -> Result<(), Failure> {
 /// Default, domain, and which backend has it.
 fn facts(knob: &Knob) -> String {
     let unit = if knob.unit.is_empty() { String::new() } else { format!(" {}", knob.unit) };
-    let on = BackendKind::only_one_with(knob.name)
-        .map_or_else(String::new, |only| format!("; {} backend only", only.name()));
+    let on =
+        knob.only_on.map_or_else(String::new, |only| format!("; {} backend only", only.name()));
     format!("{}{unit}, of {}{on}", knob.default, knob.domain)
 }

@@ -36,6 +36,7 @@ mod scenegen;
 mod selftest;
 #[cfg(feature = "study")]
 mod study;
+mod threads;
 mod train;
 #[cfg(feature = "view")]
 mod view;

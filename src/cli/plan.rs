@@ -3,6 +3,7 @@
 use clap::ArgMatches;
 
 use super::console::Console;
+use super::threads;
 use super::train::{Follower, TrainArgs};
 use densify_run::failure::Failure;
 use densify_run::plan;
@@ -21,7 +22,8 @@ pub(super) fn run(
     }
     let follower = Follower::new(console);
     let (spec, _) = args.describe(matches, &follower)?;
-    let plan = plan(&spec, args.companion(), &follower)?;
+    threads::limit(spec.device.threads);
+    let plan = plan(&spec, args.host(&follower))?;
     for line in &plan.lines {
         console.result(line);
     }

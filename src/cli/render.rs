@@ -7,12 +7,11 @@ use densify_policies::policy::Needs;
 
 use super::console::Console;
 use super::film::{self, FilmArgs};
+use super::threads::open_machine;
 use densify_data::views::ViewSource;
 use densify_inspect::{CameraRoute, Channels, FilmSource, PictureFolder, file_names};
 use densify_run::failure::Failure;
-use densify_run::finished::{
-    Machine, Opened, is_model, iteration, model_file, open, open_alone, open_run,
-};
+use densify_run::finished::{Opened, is_model, iteration, model_file, open, open_alone, open_run};
 use densify_run::{DataSpec, DeviceSpec, Fraction, RunConfig};
 use densify_train::evaluate::Split;
 
@@ -160,7 +159,7 @@ impl Named<'_> {
         if is_run {
             refuse_options_of_a_file(matches)?;
         }
-        let machine = Machine::open(&rendering.device, console)?;
+        let machine = open_machine(&rendering.device, console)?;
         if is_run {
             RunConfig::read(self.model)?;
             let iteration = iteration(self.model, self.iteration)?;
@@ -180,7 +179,7 @@ impl Named<'_> {
 
     /// Opens a model without a dataset.
     fn alone(&self, rendering: &RenderingArgs, console: &Console) -> Result<FilmSource, Failure> {
-        let machine = Machine::open(&rendering.device, console)?;
+        let machine = open_machine(&rendering.device, console)?;
         let model = model_file(self.model, self.iteration)?;
         let (backend, normalisation, sh_degree) =
             open_alone(&model, (rendering.near.0, machine), console)?;

@@ -6,6 +6,7 @@ use clap::Args;
 
 use super::console::Console;
 use super::export::check_output;
+use super::threads;
 use densify_core::files::FileError;
 use densify_core::memory::Bytes;
 use densify_report as report;
@@ -69,6 +70,7 @@ pub(super) fn run(args: &ReportArgs, console: &Console) -> Result<(), Failure> {
         scene: args.scene.as_deref(),
         device: &args.device,
     };
+    threads::limit(args.device.threads);
     report::write(&wanted, file, console)?;
     let size = file.metadata().map_err(FileError::io("read", file))?.len();
     console.result(format_args!("report   {} ({})", file.display(), Bytes(size)));

@@ -10,9 +10,10 @@ use densify_scenegen::{
 use image::{DynamicImage, RgbaImage};
 
 use super::console::Console;
+use super::threads;
 use densify_core::numbers;
-use densify_run::failure::{Failure, INPUT, OTHER};
-use densify_run::{Threads, use_threads};
+use densify_run::Threads;
+use densify_run::failure::Failure;
 use densify_train::pictures::write_png;
 
 /// Ray-traces a mesh into posed images of known geometry.
@@ -228,7 +229,7 @@ pub(super) fn run(args: &ScenegenArgs, console: &Console) -> Result<(), Failure>
     if let Some(output) = &args.output {
         check_target(output, args.overwrite)?;
     }
-    use_threads(args.threads);
+    threads::limit(args.threads);
     let scene = Scene::prepare(&source, &args.options())?;
     describe(&scene, console);
     if let Some(path) = &args.contact_sheet {
@@ -307,7 +308,7 @@ mod tests {
             let (done, met) = with_fault(Some(fault), || run(&args, &Console::new(true)));
             let failure = done.unwrap_err();
             assert!(
-                met > 0 && failure.code == OTHER && failure.message.contains(file),
+                met > 0 && failure.code == OTHER && failure.to_string().contains(file),
                 "{failure}"
             );
             assert_eq!(std::fs::read_dir(root.path()).unwrap().count(), 0, "{operation:?}");

@@ -88,13 +88,13 @@ fn verdict(tested: &[SubjectReport]) -> Result<usize, Failure> {
     if failed == 0 {
         return Ok(count);
     }
-    Err(Failure {
-        code: OTHER,
-        message: format!(
+    Err(Failure::new(
+        OTHER,
+        format!(
             "{failed} of {count} figures are beyond their tolerances; please report the table above, and \
              where it is a GPU that fails, train with --backend cpu until it is known why"
         ),
-    })
+    ))
 }
 
 /// What is to be tested.
@@ -143,7 +143,7 @@ mod tests {
         let two: Vec<u8> = chosen(&[13, 7]).unwrap().iter().map(|case| case.number).collect();
         assert_eq!(two, [7, 13]);
         let refused = chosen(&[7, 4]).unwrap_err();
-        assert!(refused.message.contains("no case 4") && refused.code == 2, "{refused:?}");
+        assert!(refused.to_string().contains("no case 4") && refused.code == 2, "{refused:?}");
     }
 
     #[test]
@@ -163,7 +163,7 @@ mod tests {
         for wrong in [1.1e-5, f64::NAN, f64::INFINITY] {
             let failure = verdict(&tested(&[0.0, wrong])).unwrap_err();
             assert_eq!(failure.code, OTHER);
-            assert!(failure.message.starts_with("1 of 2 figures"), "{}", failure.message);
+            assert!(failure.to_string().starts_with("1 of 2 figures"), "{failure}");
         }
     }
 }

@@ -8,9 +8,9 @@ use clap::{ArgMatches, Args};
 use super::console::Console;
 use super::interrupt::Interrupts;
 use super::render::{RenderingArgs, refuse_options_of_a_file};
+use super::threads::open_machine;
 use densify_core::numbers::grouped;
 use densify_run::failure::Failure;
-use densify_run::finished::Machine;
 use densify_view as view;
 use densify_view::{FIRST_PORT, Looked, Place, Server};
 
@@ -66,7 +66,7 @@ pub(super) fn run(args: &ViewArgs, matches: &ArgMatches, console: &Console) -> R
     // The port first: it is known at once, and a model may take long to read.
     let server = Server::open(Place { host: args.host, port: args.port, has_secret: false })?;
     let RenderingArgs { near, device, data } = &args.rendering;
-    let machine = Machine::open(device, console)?;
+    let machine = open_machine(device, console)?;
     let looked = Looked {
         what: &args.what,
         other: args.other.as_deref(),

@@ -44,21 +44,7 @@ pub enum BackendKind {
     Gpu,
 }
 
-/// Knobs that exist on one backend only.
-const KNOBS_OF_ONE: [(&str, BackendKind); 4] = [
-    ("pairs_per_row", BackendKind::Cpu),
-    ("param_storage", BackendKind::Cpu),
-    ("moment_storage", BackendKind::Cpu),
-    ("accumulation", BackendKind::Gpu),
-];
-
 impl BackendKind {
-    /// The only backend that has a knob; `None` if both do.
-    #[must_use]
-    pub fn only_one_with(knob: &str) -> Option<Self> {
-        KNOBS_OF_ONE.iter().find(|(name, _)| *name == knob).map(|(_, kind)| *kind)
-    }
-
     /// The name in messages.
     #[must_use]
     pub const fn name(self) -> &'static str {

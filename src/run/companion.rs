@@ -1,14 +1,14 @@
-//! What a caller keeps beside a run while it trains, such as a page that shows it.
+//! A part of the program that stays beside a run while it trains, such as a page that shows it.
 
 use densify_core::memory::Ledger;
 use densify_render::Device;
 
-/// A part of the program that stays beside a run and takes memory of its own. It changes nothing of the result.
+/// A part of the program that stays beside a run and takes memory of its own. The result of the run does not depend on it.
 #[derive(Debug, Clone, Copy)]
 pub struct Companion {
     /// Adds the bytes it needs to the ledger of a run of this size.
     pub reserve: fn(&CompanionSize<'_>, &mut Ledger),
-    /// How many of the dataset's points it is given, at most.
+    /// Most points of the dataset that it is given.
     pub points: usize,
 }
 
@@ -17,11 +17,11 @@ pub struct Companion {
 pub struct CompanionSize<'a> {
     /// Most Gaussians there may ever be.
     pub budget: u64,
-    /// Where the run trains.
+    /// The device that trains.
     pub device: &'a Device,
     /// Width and height of the largest image `[px]`.
     pub largest_image: (u32, u32),
-    /// Bytes of one decoded photograph, with what decoding it takes.
+    /// Bytes of one decoded photograph, and of decoding it.
     pub photograph: u64,
     /// Number of views, training and test.
     pub views: usize,

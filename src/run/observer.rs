@@ -1,33 +1,39 @@
-//! Who follows a run: hears what there is to say, sees each step, and may ask it to stop.
+//! Observers of a run: they are told its progress, see each step, and may ask it to stop.
 
 use std::fmt;
 
+use densify_core::spelling::Spelling;
 use densify_render::Backend;
 use densify_train::evaluate::Mean;
 use densify_train::output::StepRecord;
 use densify_train::trainer::{EditEvent, RowHistory};
 
-/// A signal that asks a run to end in order.
+/// A signal that asks a run to end in an orderly way.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Interrupt {
-    /// Its name, such as SIGINT.
+    /// Such as SIGINT.
     pub name: &'static str,
-    /// The exit code of a process that it ends.
+    /// Exit code of a process that the signal ends.
     pub exit_code: u8,
 }
 
-/// What a run does where an observer has looked at its model.
+/// An observer's answer after it has looked at the model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Between {
-    /// The next step.
+    /// Go on with the next step.
     Step,
-    /// It writes a checkpoint, and asks again.
+    /// Write a checkpoint, then ask again.
     Checkpoint,
 }
 
-/// Follows a run. All methods do nothing unless they are implemented.
+/// Observes a run. Methods that are not implemented do nothing.
 pub trait Observer {
-    /// A line of information.
+    /// The spelling of options in [lines](Self::say).
+    fn spelling(&self) -> Spelling {
+        Spelling::Terminal
+    }
+
+    /// A line of information for the user.
     fn say(&self, _line: fmt::Arguments<'_>) {}
 
     /// Training begins after `done` steps and goes to step `last`, with at most `budget` rows.
@@ -36,7 +42,7 @@ pub trait Observer {
     /// A step is done.
     fn step(&self, _step: u32, _loss: f32, _rows: usize) {}
 
-    /// A record of the log, over the steps since the one before.
+    /// A record of the log, over the steps since the previous record.
     fn recorded(&self, _record: &StepRecord) {}
 
     /// The rows were edited.
@@ -45,25 +51,25 @@ pub trait Observer {
     /// The test views were measured.
     fn tested(&self, _step: u32, _mean: &Mean) {}
 
-    /// A checkpoint was written, or this is why it could not be.
+    /// A checkpoint was written, or failed because of `trouble`.
     fn kept(&self, _step: u32, _trouble: Option<&str>) {}
 
-    /// Before every step the model may be looked at: what is rendered here changes nothing. Training waits. When rows
-    /// were made and edited is known where there is a [companion](super::Companion).
+    /// Called before every step, so that the model can be rendered while training waits; rendering changes nothing. The
+    /// history of rows is known if there is a [companion](crate::Companion).
     fn between(&self, _model: &mut dyn Backend, _rows: Option<&RowHistory>) -> Between {
         Between::Step
     }
 
-    /// Training has ended, or failed.
+    /// Training has ended or failed.
     fn end(&self) {}
 
-    /// What asks the run to stop, if anything does. It is asked for before every step.
+    /// The signal that asks the run to stop, if there is one. Called before every step.
     fn interrupt(&self) -> Option<Interrupt> {
         None
     }
 }
 
-/// Follows nothing.
+/// Ignores everything.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Silent;
 

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use clap::{ArgMatches, Args};
 
 use super::console::Console;
+use super::threads::open_machine;
 use super::render::{RenderingArgs, refuse_options_of_a_file};
 use densify_core::files::{FileError, write_atomically};
 use densify_core::gaussians::Gaussians;
@@ -16,7 +17,7 @@ use densify_data::models::{Format, export_formats, find, find_by_extension, is_u
 use densify_inspect::Reference;
 use densify_run::RunConfig;
 use densify_run::failure::{Failure, INPUT};
-use densify_run::finished::{Machine, model_file, read_model};
+use densify_run::finished::{model_file, read_model};
 use table::Line;
 
 /// The name that stands for every format.
@@ -94,7 +95,7 @@ pub(super) fn run(
             Ok(()) => {}
             // The other formats may hold it.
             Err(failure) if failure.code == INPUT && files.len() > 1 => {
-                console.say(format_args!("note: not written: {}", failure.message));
+                console.say(format_args!("note: not written: {failure}"));
                 unfit = unfit.or(Some(failure));
                 continue;
             }
@@ -135,8 +136,8 @@ fn open_reference(
     } else {
         (args.rendering.data.clone(), args.rendering.near.0)
     };
-    let machine = Machine::open(&args.rendering.device, console)?;
-    Reference::open(args.model.display(), model, scene, data, (near, machine), console)
+    let machine = open_machine(&args.rendering.device, console)?;
+    Reference::open(&args.model, model, scene, data, (near, machine), console)
 }
 
 /// Formats, each with its file.

@@ -16,9 +16,10 @@ use super::console::Console;
 use super::flags;
 use super::interrupt::Interrupts;
 use super::progress::Progress;
+use super::threads;
 use densify_run as run;
 use densify_run::failure::Failure;
-use densify_run::{Companion, Interrupt, Observer, Occupied, Partial, Resumed, Run, RunSpec};
+use densify_run::{Host, Interrupt, Observer, Occupied, Partial, Resumed, Run, RunSpec};
 use densify_train::output::RunFolder;
 
 /// Trains a scene.
@@ -70,9 +71,9 @@ Examples:
   densify train data/garden --view            and look at it meanwhile";
 
 impl TrainArgs {
-    /// The page that is to stay beside the run, if there is one.
-    pub(super) fn companion(&self) -> Option<Companion> {
-        self.view.map(|_| page::COMPANION)
+    /// What this call provides for the run: the page, if it is asked for, and who follows it.
+    pub(super) fn host<'a>(&self, follower: &'a Follower<'_>) -> Host<'a> {
+        Host { companion: self.view.map(|_| page::COMPANION), ..Host::new(follower) }
     }
 
     /// The run that this call describes, by file or by flag; with the checkpoint that it goes on from, if it
@@ -111,7 +112,8 @@ pub(super) fn run(
     }
     // The port first: it is known at once, and a scene may take long to read.
     let page = args.view.map(page::open).transpose()?;
-    let run = Run::prepare_observed(&spec, resumed, args.companion(), &follower)?;
+    threads::limit(spec.device.threads);
+    let run = Run::prepare_on(&spec, resumed, args.host(&follower))?;
     if occupied != Occupied::Resume {
         announce_preset(&spec, console)?;
     }

@@ -59,7 +59,7 @@ impl Case {
         let (done, met) = with_fault(Some(fault), || self.train(""));
         assert!(met > 0, "{fault:?} was not met");
         self.nothing_half_written();
-        done.map_or_else(|failure| (failure.code, failure.message), |()| (0, String::new()))
+        done.map_or_else(|failure| (failure.code, failure.to_string()), |()| (0, String::new()))
     }
 
     fn nothing_half_written(&self) {
@@ -175,7 +175,7 @@ fn what_stops_a_run_leaves_what_it_goes_on_from() {
                 assert!(message.contains(words), "{words:?} is not in: {what}");
             }
             assert_eq!(case.checkpoints(), left, "{what}");
-            case.train("--resume").unwrap_or_else(|e| panic!("{what}: {}", e.message));
+            case.train("--resume").unwrap_or_else(|e| panic!("{what}: {e}"));
             assert!(case.model() == expected, "{what}");
             assert!(is_there(&case.run(), "stats/summary.json"), "{what}");
         }
@@ -214,7 +214,8 @@ fn a_device_that_is_lost_leaves_what_the_run_goes_on_from() {
                 assert!(done.is_ok() && after > 0, "{driver}: {checks} checks are too many");
                 continue;
             }
-            let Failure { code, message } = done.unwrap_err();
+            let failure = done.unwrap_err();
+            let (code, message) = (failure.code, failure.to_string());
             let what = format!("{driver}, {checks} checks: {message}");
             assert_eq!(code, DEVICE, "{what}");
             assert!(message.contains("was lost") && message.contains(&driver), "{what}");
@@ -226,7 +227,7 @@ fn a_device_that_is_lost_leaves_what_the_run_goes_on_from() {
                     after += 1;
                     let words = format!("iteration_{step}.safetensors; go on with: ");
                     assert!(message.contains(&words), "{what}");
-                    case.train("--resume").unwrap_or_else(|e| panic!("{what}: {}", e.message));
+                    case.train("--resume").unwrap_or_else(|e| panic!("{what}: {e}"));
                     assert!(case.model() == expected, "{what}");
                 }
             }
@@ -256,8 +257,8 @@ fn input_faults_have_code_2_and_write_nothing() {
     std::fs::write(case.run(), "a file").unwrap();
     for flags in ["", "--overwrite", "--resume"] {
         let failure = case.train(flags).unwrap_err();
-        assert_eq!(failure.code, INPUT, "{}", failure.message);
-        assert!(failure.message.contains("is not a folder"), "{}", failure.message);
+        assert_eq!(failure.code, INPUT, "{failure}");
+        assert!(failure.to_string().contains("is not a folder"), "{failure}");
     }
     assert_eq!(std::fs::read(case.run()).unwrap(), b"a file");
 }

@@ -71,7 +71,7 @@ pub fn merge(
     }
     if rows > blocks.rows {
         let message = format!("{rows} rows of the promised {}; this is a bug", blocks.rows);
-        return Err(Failure { code: OTHER, message });
+        return Err(Failure::new(OTHER, message));
     }
     let shape = Shape { rows, sh_degree: blocks.sh_degree };
     write_atomically_from::<Failure>(output, |out| {

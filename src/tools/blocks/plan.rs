@@ -20,8 +20,8 @@ use densify_core::numbers::grouped;
 use densify_data::dataset::{Dataset, builtin, view_line};
 use densify_run::failure::Failure;
 use densify_run::{
-    AbsolutePath, Budget, InitChoice, ModelSize, Observer, Partial, RunSpec, ShDegree, Silent,
-    promised,
+    AbsolutePath, Budget, Host, InitChoice, ModelSize, Observer, Partial, RunSpec, ShDegree,
+    estimate,
 };
 use densify_train::exposure::ExposureChoice;
 
@@ -168,7 +168,7 @@ impl<'a> Planner<'a> {
                 spec.start.scene = Some(self.scene.clone());
                 spec.size.budget = Some(Budget::Rows(self.rows));
                 // Half of what fits: a block has frozen rows and its own.
-                promised(&spec, [None, None], &Silent)?.0 / 2
+                estimate(&spec, [None, None], Host::default())?.0 / 2
             }
             None => usual,
         };
@@ -329,7 +329,7 @@ impl<'a> Planner<'a> {
         models: [Option<ModelSize>; 2],
     ) -> Result<u64, Failure> {
         let wanted = spec.size.budget.and_then(Budget::most).unwrap_or_default();
-        let (rows, ledger) = promised(spec, models, &Silent)?;
+        let (rows, ledger) = estimate(spec, models, Host::default())?;
         if rows < wanted {
             let memory = Bytes(self.options.memory.unwrap_or_default());
             return Err(Failure::input(format!(
@@ -373,5 +373,5 @@ impl<'a> Planner<'a> {
 const TOO_LARGE: &str = "a task is too large";
 
 fn is_too_large(failure: &Failure) -> bool {
-    failure.message.starts_with(TOO_LARGE)
+    failure.to_string().starts_with(TOO_LARGE)
 }

@@ -14,7 +14,7 @@ use densify_data::models::PLY;
 use densify_launch::utf8;
 use densify_run::failure::Failure;
 use densify_run::finished::{iteration, read_model};
-use densify_run::{Observer, Occupied, Partial, Run, start};
+use densify_run::{Host, Observer, Occupied, Partial, Run, start};
 use densify_train::output::model_path;
 
 /// Names of a block's views.
@@ -57,7 +57,7 @@ pub fn run(
         None => own,
     };
     let (spec, resumed) = start(own.over(given), observer)?;
-    let run = Run::prepare_observed(&spec, resumed, None, observer)?;
+    let run = Run::prepare_on(&spec, resumed, Host::new(observer))?;
     run.train(Occupied::Resume, observer)?;
     Ok(())
 }

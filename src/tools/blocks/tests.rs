@@ -96,7 +96,7 @@ fn a_plan_is_read_as_it_was_written_and_leads_nowhere_else() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join(PLAN_FILE);
     let absent = Blocks::read(folder.path()).unwrap_err();
-    assert!(absent.code == 2 && absent.message.contains("blocks plan"), "{absent:?}");
+    assert!(absent.code == 2 && absent.to_string().contains("blocks plan"), "{absent:?}");
     let mut plan = example();
     std::fs::write(&path, toml::to_string(&plan).unwrap()).unwrap();
     assert_eq!(Blocks::read(folder.path()), Ok(plan.clone()));
@@ -105,5 +105,5 @@ fn a_plan_is_read_as_it_was_written_and_leads_nowhere_else() {
         std::fs::write(&path, toml::to_string(&plan).unwrap()).unwrap();
         assert_eq!(Blocks::read(folder.path()).unwrap_err().code, 2, "{bad:?}");
     }
-    assert!(example().task("block-3-0").unwrap_err().message.contains("block-2-0"));
+    assert!(example().task("block-3-0").unwrap_err().to_string().contains("block-2-0"));
 }

@@ -34,9 +34,11 @@ impl Write for Counted {
 /// The size of a model's file in a format.
 pub(super) fn bytes(format: &Format, model: &Gaussians) -> Result<u64, Failure> {
     let mut counted = Counted::default();
-    format.write(model, &mut counted).map_err(|error| Failure {
-        code: if is_unfit(&error) { INPUT } else { OTHER },
-        message: format!("cannot write the model as {}: {error}", format.name),
+    format.write(model, &mut counted).map_err(|error| {
+        Failure::new(
+            if is_unfit(&error) { INPUT } else { OTHER },
+            format!("cannot write the model as {}: {error}", format.name),
+        )
     })?;
     Ok(counted.0)
 }

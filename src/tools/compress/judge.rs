@@ -8,9 +8,9 @@ use densify_data::dataset::Dataset;
 use densify_data::models::Format;
 use densify_data::views::ViewSource;
 use densify_run::Observer;
+use densify_run::coordinate_check::CoordinateCheck;
 use densify_run::failure::Failure;
 use densify_run::finished::{Machine, load, views_of};
-use densify_run::likeness::Likeness;
 use densify_train::evaluate::Split;
 use densify_train::exposure::fitted;
 use densify_train::metrics::psnr;
@@ -46,8 +46,8 @@ impl Judge {
         let degree = model.sh_degree;
         let mut backend = self.machine.backend(&self.dataset, model.clone(), self.near)?;
         let views = views_of(&self.dataset, Split::Train)?;
-        let likeness = Likeness::of(backend.as_mut(), &views, (self.background, degree))?;
-        likeness.require(file.display(), observer)
+        let check = CoordinateCheck::measure(backend.as_mut(), &views, (self.background, degree))?;
+        check.require(None, file, observer)
     }
 
     /// Measures a model whose file has this size.

@@ -56,7 +56,7 @@ fn a_size_that_no_gaussian_fits_is_refused_before_training() {
     let formats = [sog(), PLY];
     let check = |to: u64| {
         let options = options(Target::Bytes(to), Path::new(""), &formats);
-        fit::check(&options, &colourful(3)).map_err(|failure| failure.message)
+        fit::check(&options, &colourful(3)).map_err(|failure| failure.to_string())
     };
     let one = fit::bytes(PLY, &colourful(1).with_degree(0)).expect("it is written");
     let refused = check(one - 1).expect_err("too small");

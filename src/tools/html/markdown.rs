@@ -109,6 +109,6 @@ mod tests {
         }
         assert!(!page.contains("---|") && !page.contains("```"), "{page}");
         let fails = |_: &str| Err(Failure::input("gone"));
-        assert_eq!(from_markdown(text, &fails).unwrap_err().message, "gone");
+        assert_eq!(from_markdown(text, &fails).unwrap_err().to_string(), "gone");
     }
 }

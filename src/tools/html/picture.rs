@@ -47,9 +47,8 @@ impl Embedded {
         encode: impl FnOnce(&mut Vec<u8>) -> ImageResult<()>,
     ) -> Result<Self, Failure> {
         let mut bytes = Vec::new();
-        encode(&mut bytes).map_err(|error| Failure {
-            code: OTHER,
-            message: format!("a picture of the report cannot be encoded: {error}"),
+        encode(&mut bytes).map_err(|error| {
+            Failure::new(OTHER, format!("a picture of the report cannot be encoded: {error}"))
         })?;
         Ok(Self { uri: uri(kind, &bytes), size: image.dimensions() })
     }
@@ -61,9 +60,8 @@ fn uri(kind: &str, bytes: &[u8]) -> String {
 
 /// The URI of a picture in a file, SVG or PNG.
 pub fn embed_file(path: &Path) -> Result<String, Failure> {
-    let failed = |why: &dyn std::fmt::Display| Failure {
-        code: OTHER,
-        message: format!("cannot read {}: {why}", path.display()),
+    let failed = |why: &dyn std::fmt::Display| {
+        Failure::new(OTHER, format!("cannot read {}: {why}", path.display()))
     };
     let bytes = std::fs::read(path).map_err(|error| failed(&error))?;
     match path.extension().and_then(|ending| ending.to_str()) {

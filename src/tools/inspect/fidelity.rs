@@ -1,6 +1,5 @@
 //! How closely a model in another format reproduces the original, by the pictures of the views held out.
 
-use std::fmt::Display;
 use std::path::Path;
 
 use densify_core::gaussians::Gaussians;
@@ -9,7 +8,7 @@ use densify_data::views::ViewSource;
 use densify_render::Backend;
 use densify_run::failure::Failure;
 use densify_run::finished::{Machine, load, views_of};
-use densify_run::likeness::Likeness;
+use densify_run::coordinate_check::CoordinateCheck;
 use densify_run::{DataSpec, Observer};
 use densify_train::evaluate::Split;
 use densify_train::metrics::psnr_between;
@@ -26,13 +25,13 @@ pub struct Reference {
 }
 
 impl Reference {
-    /// Loads the dataset at `scene` and renders `model`, called `name` in notes. `near` is a fraction of the
+    /// Loads the dataset at `scene` and renders `model`, which was read from `file`. `near` is a fraction of the
     /// scene's extent. Without a split of its own every 8th photograph is held out.
     ///
     /// # Errors
     /// When the dataset cannot be loaded, or the model shows nothing of it.
     pub fn open(
-        name: impl Display,
+        file: &Path,
         model: &Gaussians,
         scene: &Path,
         mut data: DataSpec,
@@ -46,7 +45,8 @@ impl Reference {
         let (background, sh_degree) = (data.background.fixed(), model.sh_degree);
         let views = views_of(&dataset, Split::Test)?;
         // A model that is not in the pictures looks alike in every format.
-        Likeness::of(backend.as_mut(), &views, (background, sh_degree))?.note(name, observer);
+        CoordinateCheck::measure(backend.as_mut(), &views, (background, sh_degree))?
+            .note(None, file, observer);
         Ok(Self { dataset, machine, near, background, sh_degree, backend })
     }
 

@@ -233,9 +233,8 @@ fn asked(program: &str, arguments: &[&str], remedy: &str) -> Result<String, Fail
 /// # Errors
 /// When the system does not say where it is.
 pub fn program() -> Result<PathBuf, Failure> {
-    std::env::current_exe().map_err(|error| Failure {
-        code: OTHER,
-        message: format!("cannot find the program that is running: {error}"),
+    std::env::current_exe().map_err(|error| {
+        Failure::new(OTHER, format!("cannot find the program that is running: {error}"))
     })
 }
 

@@ -11,7 +11,7 @@ use densify_core::files::FileError;
 use densify_core::memory::Bytes;
 use densify_run::Observer;
 use densify_run::failure::{Failure, OTHER};
-use densify_run::memory::grant;
+use densify_run::grant;
 
 /// How often it is looked whether a task has ended.
 const LOOK: Duration = Duration::from_millis(100);
@@ -80,7 +80,7 @@ fn run_stage(
                         last_line(&log),
                         log.display()
                     );
-                    failed.get_or_insert(Failure { code: code.unwrap_or(OTHER), message });
+                    failed.get_or_insert(Failure::new(code.unwrap_or(OTHER), message));
                 }
             }
         }
@@ -90,7 +90,7 @@ fn run_stage(
         if let Some(interrupt) = observer.interrupt() {
             // The same signal has reached the tasks, which end in order.
             let message = format!("stopped by {}; the same command goes on", interrupt.name);
-            failed.get_or_insert(Failure { code: interrupt.exit_code, message });
+            failed.get_or_insert(Failure::new(interrupt.exit_code, message));
         }
         while failed.is_none() && running.len() < count {
             let Some(next) = waiting.next() else { break };
@@ -121,10 +121,7 @@ fn started(batch: &Batch, job: &Job, threads: u32, logs: &Path) -> Result<Child,
     }
     command.stdin(Stdio::null()).stdout(log).stderr(copy);
     let child = command.spawn();
-    child.map_err(|error| Failure {
-        code: OTHER,
-        message: format!("cannot start {}: {error}", job.name),
-    })
+    child.map_err(|error| Failure::new(OTHER, format!("cannot start {}: {error}", job.name)))
 }
 
 /// Held while tasks run here: they are not run twice at a time.
@@ -151,5 +148,5 @@ fn last_line(log: &Path) -> String {
 }
 
 fn cannot_wait(error: std::io::Error) -> Failure {
-    Failure { code: OTHER, message: format!("cannot wait for a task: {error}") }
+    Failure::new(OTHER, format!("cannot wait for a task: {error}"))
 }

@@ -52,8 +52,7 @@ mod as_table {
     }
 
     pub(super) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Partial, D::Error> {
-        Partial::new(Table::deserialize(from)?, "spec")
-            .map_err(|failure| D::Error::custom(failure.message))
+        Partial::new(Table::deserialize(from)?, "spec").map_err(|failure| D::Error::custom(failure))
     }
 }
 
@@ -163,8 +162,8 @@ impl Cell {
             return Err(Failure::input(format!("{scene}: no view is held out to measure")));
         };
         let path = model_path(folder, iterations);
-        let model = fs::read(&path)
-            .map_err(|e| Failure { code: OTHER, message: format!("{}: {e}", path.display()) })?;
+        let model =
+            fs::read(&path).map_err(|e| Failure::new(OTHER, format!("{}: {e}", path.display())))?;
         Ok(Outcome {
             densify: summary.densify,
             scene: self.label.clone(),

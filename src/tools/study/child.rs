@@ -75,21 +75,20 @@ fn wait_for(command: &mut Command) -> Result<(), Failure> {
         .stdin(Stdio::null())
         .stdout(Stdio::null())
         .output()
-        .map_err(|e| Failure { code: OTHER, message: format!("cannot start a run: {e}") })?;
+        .map_err(|e| Failure::new(OTHER, format!("cannot start a run: {e}")))?;
     if child.status.success() {
         return Ok(());
     }
     let said = String::from_utf8_lossy(&child.stderr);
     let message = said.trim().trim_start_matches("error: ").to_owned();
     let code = child.status.code().and_then(|code| u8::try_from(code).ok());
-    Err(Failure { code: code.unwrap_or(OTHER), message })
+    Err(Failure::new(code.unwrap_or(OTHER), message))
 }
 
 /// `stats/summary.json` of a run.
 pub(super) fn summary(run: &Path) -> Result<Summary, Failure> {
-    summary_of(run)?.ok_or_else(|| Failure {
-        code: OTHER,
-        message: format!("{}: there is no stats/summary.json", run.display()),
+    summary_of(run)?.ok_or_else(|| {
+        Failure::new(OTHER, format!("{}: there is no stats/summary.json", run.display()))
     })
 }
 

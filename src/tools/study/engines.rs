@@ -8,7 +8,7 @@ use super::cell::Cell;
 use densify_launch as launch;
 use densify_launch::{Batch, Engine, Job, Stage, Submission, SubmissionArgs, utf8};
 use densify_run::failure::Failure;
-use densify_run::{Observer, Partial, RunSpec, Silent, promised_bytes};
+use densify_run::{Host, Observer, Partial, RunSpec, host_bytes};
 
 /// Who makes the runs of a study.
 #[derive(Debug, Clone, Default, Args)]
@@ -109,7 +109,7 @@ fn promised(cell: &Cell, spec: &RunSpec, known: &mut Vec<(Partial, u64)>) -> Res
     if let Some((_, bytes)) = known.iter().find(|(other, _)| *other == kind) {
         return Ok(*bytes);
     }
-    let bytes = promised_bytes(spec, &Silent)?;
+    let bytes = host_bytes(spec, Host::default())?;
     known.push((kind, bytes));
     Ok(bytes)
 }

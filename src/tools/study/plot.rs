@@ -26,7 +26,7 @@ pub(super) fn svg(
         area.present()?;
         Ok(())
     };
-    drawn().map_err(|error| Failure { code: OTHER, message: error.to_string() })?;
+    drawn().map_err(|error| Failure::new(OTHER, error))?;
     Ok(text)
 }
 

@@ -149,9 +149,11 @@ fn is_equal(a: &str, b: &str) -> bool {
 /// 128 bits that nobody can guess.
 fn secret() -> Result<String, Failure> {
     let mut bytes = [0; 16];
-    getrandom::fill(&mut bytes).map_err(|error| Failure {
-        code: OTHER,
-        message: format!("--host: the system has no random numbers for the address: {error}"),
+    getrandom::fill(&mut bytes).map_err(|error| {
+        Failure::new(
+            OTHER,
+            format!("--host: the system has no random numbers for the address: {error}"),
+        )
     })?;
     Ok(bytes.iter().map(|byte| format!("{byte:02x}")).collect())
 }
@@ -250,7 +252,7 @@ mod tests {
         let host = Ipv4Addr::LOCALHOST.into();
         let refused = Door::open(Place { host, port: Some(port), has_secret: false }).unwrap_err();
         assert!(
-            refused.code == 2 && refused.message.contains(&format!("--port {port}")),
+            refused.code == 2 && refused.to_string().contains(&format!("--port {port}")),
             "{refused}"
         );
         let two =
@@ -259,6 +261,6 @@ mod tests {
         let elsewhere =
             Place { host: Ipv4Addr::new(192, 0, 2, 7).into(), port: Some(0), has_secret: false };
         let refused = Door::open(elsewhere).unwrap_err();
-        assert!(refused.code == 2 && refused.message.contains("--host 192.0.2.7"), "{refused}");
+        assert!(refused.code == 2 && refused.to_string().contains("--host 192.0.2.7"), "{refused}");
     }
 }

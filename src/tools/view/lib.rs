@@ -76,7 +76,7 @@ impl Server {
             description: describe::describe(&mut stage),
             board: None,
         };
-        let failed = |message: String| Failure { code: OTHER, message };
+        let failed = |message: String| Failure::new(OTHER, message);
         thread::scope(|scope| {
             let (desk, stage) = (&desk, &stage);
             let develops = darkroom::open(scope, desk, stage)

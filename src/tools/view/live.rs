@@ -122,9 +122,11 @@ impl Server {
         thread::scope(|scope| {
             let _closing = Closing(&desk);
             let (desk, routes) = (&desk, &routes);
-            let no_thread = |error| Failure {
-                code: OTHER,
-                message: format!("--view: the system gives no thread for the page: {error}"),
+            let no_thread = |error| {
+                Failure::new(
+                    OTHER,
+                    format!("--view: the system gives no thread for the page: {error}"),
+                )
             };
             let develops = darkroom::open(scope, desk, &stage).map_err(no_thread)?;
             let serves = thread::Builder::new().stack_size(STACK).spawn_scoped(scope, move || {

@@ -97,7 +97,7 @@ pub fn open(
         }
         let dataset = load(what, &data, observer).map_err(|failure| match builtin::name(what) {
             Some(_) => failure,
-            None => no_run(what).and(&failure.message),
+            None => no_run(what).and(&failure.to_string()),
         })?;
         return of_points(machine, what, dataset, &data, near);
     };

@@ -8,6 +8,7 @@ use densify_policies::rng::PolicyRng;
 
 use super::policy_views::call_policy;
 use super::{EditEvent, TrainError, Trainer};
+use densify_core::budget::RowBudget;
 use densify_data::views::ViewSource;
 
 impl<V: ViewSource> Trainer<V> {
@@ -32,8 +33,14 @@ impl<V: ViewSource> Trainer<V> {
 
     /// An empty plan for the rows that are not frozen.
     pub(super) fn new_plan(&self) -> EditPlan {
-        let frozen = self.options.frozen;
-        EditPlan::new(self.backend.rows() - frozen, self.row_limit() - frozen)
+        let (rows, budget) = self.trained_rows_and_budget();
+        EditPlan::new(rows, budget)
+    }
+
+    /// Rows as policies count them, who do not know of frozen ones: how many there are, and the most there may be.
+    pub(super) fn trained_rows_and_budget(&self) -> (usize, usize) {
+        let budget = RowBudget { total: self.row_limit(), frozen: self.options.frozen };
+        (budget.trained(self.backend.rows()), budget.trainable())
     }
 
     /// Executes a plan. A plan that changes no row and had nothing refused is not an event.
@@ -68,8 +75,7 @@ impl<V: ViewSource> Trainer<V> {
     /// Checks the budget and all invariants once more, so that a broken plan is an error here and not a
     /// panic in the backend.
     fn check_plan(&self, step: u32, ops: &RowOps) -> Result<(), TrainError> {
-        let frozen = self.options.frozen;
-        let (rows, budget) = (self.backend.rows() - frozen, self.row_limit() - frozen);
+        let (rows, budget) = self.trained_rows_and_budget();
         let reason = if ops.rows_before != rows || ops.budget != budget {
             let RowOps { rows_before, budget: planned, .. } = ops;
             format!(

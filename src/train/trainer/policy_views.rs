@@ -12,8 +12,7 @@ use densify_render::AuxInput;
 impl<V: ViewSource> Trainer<V> {
     /// Renders the auxiliary views for the policy's event after `step`, one by one.
     pub(super) fn show_aux_views(&mut self, step: u32) -> Result<(), TrainError> {
-        let frozen = self.options.frozen;
-        let (rows, budget) = (self.backend.rows() - frozen, self.row_limit() - frozen);
+        let (rows, budget) = self.trained_rows_and_budget();
         let count = call_policy(|| self.policy.aux_views(step, rows, budget));
         let count = count.map_err(|e| self.policy_error(step, e))? as usize;
         let Some(request) = self.needs.aux.clone().filter(|_| count > 0) else {
@@ -36,7 +35,7 @@ impl<V: ViewSource> Trainer<V> {
             });
             let mut measured = measured.map_err(|e| self.backend_error(step, e))?;
             for (_, column) in &mut measured.columns {
-                column.drain(..frozen);
+                column.drain(..self.options.frozen);
             }
             self.extra_forwards += 1;
             let (loss, columns, points) = (measured.loss, &measured.columns, &measured.points);

@@ -3,6 +3,7 @@
 use densify_policies::policy::{DensityPolicy, Needs, SceneInfo};
 
 use super::{TrainError, TrainOptions};
+use densify_core::budget::RowBudget;
 use densify_render::Backend;
 
 /// Checks that scene, options, views and backend agree.
@@ -31,7 +32,8 @@ pub(super) fn check_options(
     }
     let (rows, budget) = (backend.rows(), backend.budget());
     let frozen = options.frozen;
-    if budget != scene.budget + frozen || rows > budget || rows < frozen {
+    let expected = RowBudget::for_trainable(scene.budget, frozen).total;
+    if budget != expected || rows > budget || rows < frozen {
         let of_scene = scene.budget;
         return bad(format!("{rows} rows, {frozen} frozen, budget {budget} (scene: {of_scene})"));
     }

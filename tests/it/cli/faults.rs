@@ -137,7 +137,7 @@ fn a_photograph_lost_late_in_a_run_costs_no_step() {
     for cut_after in [16, 28] {
         let part = root.path().join(format!("part{cut_after}"));
         let failure = train(&part, cut_after).expect_err("a photograph is cut short");
-        let message = &failure.message;
+        let message = &failure.to_string();
         let step = message.strip_prefix("step ").and_then(|rest| rest.split(':').next());
         let step: u32 = step.and_then(|step| step.parse().ok()).expect(message);
         assert!(step > cut_after && message.contains("--resume"), "{message}");

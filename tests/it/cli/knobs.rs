@@ -108,8 +108,7 @@ fn every_level_does_what_its_class_says() {
     }
     let mut changed = 0;
     // Those of a GPU are tried in `accumulation.rs`.
-    let here = |name| BackendKind::only_one_with(name) != Some(BackendKind::Gpu);
-    for knob in KNOBS.iter().filter(|knob| here(knob.name)) {
+    for knob in KNOBS.iter().filter(|knob| knob.only_on != Some(BackendKind::Gpu)) {
         for level in knob.levels {
             let (what, run) = (format!("--knob {}={level}", knob.name), root.path().join("level"));
             short(scene.path(), &run, &format!("{what} --overwrite")).ok();

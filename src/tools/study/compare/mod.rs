@@ -271,7 +271,7 @@ mod tests {
     fn all_are_those_registered_that_are_not_named_besides() {
         let expanded = |text: &str| {
             let named: Vec<String> = text.split(',').map(String::from).collect();
-            all_policies(&named).map_err(|failure| failure.message)
+            all_policies(&named).map_err(|failure| failure.to_string())
         };
         let registered = registry::policies().expect("the registry is sound");
         let names = || registered.iter().map(|entry| entry.name.to_owned());
@@ -297,7 +297,7 @@ mod tests {
                 text.split(',').map(SceneBudget::parse).collect();
             budgets(&asked.expect("they parse"), &labels)
         };
-        let rows = |text| of(text).map_err(|failure| failure.message);
+        let rows = |text| of(text).map_err(|failure| failure.to_string());
         assert_eq!(rows("30k"), Ok(vec![vec![30_000]; 2]));
         assert_eq!(rows("30k,room=28k,room=1k"), Ok(vec![vec![28_000, 1_000], vec![30_000]]));
         assert!(rows("room=28k").is_err_and(|m| m.contains("cup=ROWS")));

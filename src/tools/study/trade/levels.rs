@@ -3,7 +3,7 @@
 use super::Trade;
 use densify_render::{BackendChoice, BackendKind};
 use densify_run::failure::Failure;
-use densify_run::knobs::{Class, KNOBS, find};
+use densify_run::knobs::{Class, KNOBS, Knob, find};
 use densify_run::{Observer, Partial, RunOption};
 
 /// A knob or an option of a run that a study varies.
@@ -49,15 +49,15 @@ pub(super) fn factors(
         _ => BackendKind::Cpu,
     };
     if study.knobs.is_empty() {
-        let here = |name: &str| BackendKind::only_one_with(name).is_none_or(|only| only == kind);
-        let knobs = KNOBS.iter().map(|knob| knob.name).filter(|name| here(name));
+        let here = |knob: &&Knob| knob.only_on.is_none_or(|only| only == kind);
+        let knobs = KNOBS.iter().filter(here).map(|knob| knob.name);
         let names = knobs.chain(OPTIONS.iter().map(|(name, ..)| *name));
         let mut all = Vec::new();
         for name in names {
             match factor(study, name, &[]).and_then(|one| check(train, &one).map(|()| one)) {
                 Ok(one) => all.push(one),
                 Err(failure) => {
-                    observer.say(format_args!("note: {name} is left out: {}", failure.message));
+                    observer.say(format_args!("note: {name} is left out: {failure}"));
                 }
             }
         }

@@ -1,0 +1,33 @@
+//! The row budget of a model that may have frozen rows.
+
+/// The most rows that a model may have, frozen ones included.
+///
+/// Frozen rows are rendered but neither trained nor edited. They come first, they count towards the budget, and
+/// policies do not know of them: the arithmetic between the two views of a budget is done here only.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RowBudget {
+    /// Most rows in all.
+    pub total: usize,
+    /// Rows that never change.
+    pub frozen: usize,
+}
+
+impl RowBudget {
+    /// The budget that leaves room for `trainable` rows besides the frozen ones.
+    #[must_use]
+    pub fn for_trainable(trainable: usize, frozen: usize) -> Self {
+        Self { total: trainable.saturating_add(frozen), frozen }
+    }
+
+    /// Most rows that can be trained.
+    #[must_use]
+    pub fn trainable(self) -> usize {
+        self.total.saturating_sub(self.frozen)
+    }
+
+    /// The trained rows of a model that has `rows` in all.
+    #[must_use]
+    pub fn trained(self, rows: usize) -> usize {
+        rows.saturating_sub(self.frozen)
+    }
+}

@@ -1,0 +1,62 @@
+//! The spelling of options in messages. Errors name options by their name, as data; whoever shows a message says how its
+//! reader writes them.
+
+use std::fmt::Display;
+
+/// The way in which a reader of messages writes options.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Spelling {
+    /// Flags of a command: `--tile-cap 90000`.
+    #[default]
+    Terminal,
+    /// Keyword arguments of a function: `tile_cap=90000`.
+    Keyword,
+}
+
+impl Spelling {
+    /// An option without its value.
+    #[must_use]
+    pub fn option(self, name: &str) -> String {
+        match (self, name) {
+            (Self::Terminal, "scene") => "SCENE".to_owned(),
+            (Self::Terminal, _) => format!("--{}", name.replace('_', "-")),
+            (Self::Keyword, _) => format!("{name}="),
+        }
+    }
+
+    /// An option that is on or off, switched on.
+    #[must_use]
+    pub fn switch(self, name: &str) -> String {
+        match self {
+            Self::Terminal => self.option(name),
+            Self::Keyword => format!("{name}=True"),
+        }
+    }
+
+    /// An option with a number.
+    #[must_use]
+    pub fn set(self, name: &str, value: impl Display) -> String {
+        match self {
+            Self::Terminal => format!("{} {value}", self.option(name)),
+            Self::Keyword => format!("{name}={value}"),
+        }
+    }
+
+    /// An option with a text, such as a word, a size with its unit, or a file.
+    #[must_use]
+    pub fn text(self, name: &str, value: impl Display) -> String {
+        match self {
+            Self::Terminal => self.set(name, value),
+            Self::Keyword => format!("{name}=\"{value}\""),
+        }
+    }
+
+    /// One member of an option that has several, with its value.
+    #[must_use]
+    pub fn member(self, name: &str, member: &str, value: impl Display) -> String {
+        match self {
+            Self::Terminal => format!("{} {member}={value}", self.option(name)),
+            Self::Keyword => format!("{name}={{\"{member}\": \"{value}\"}}"),
+        }
+    }
+}

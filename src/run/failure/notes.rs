@@ -1,0 +1,120 @@
+//! The words of notes that name options, for the user of a run that goes well.
+
+use std::path::Path;
+
+use densify_core::memory::Bytes;
+use densify_core::numbers::grouped;
+use densify_core::spelling::Spelling;
+use densify_render::Accumulation;
+
+/// The order in which gradients are added up.
+pub(crate) fn accumulation(s: Spelling, taken: Accumulation) -> String {
+    let note = if taken.is_deterministic() {
+        "runs are reproducible byte for byte".to_owned()
+    } else {
+        format!(
+            "results vary slightly between runs; {} makes them reproducible",
+            s.switch("deterministic")
+        )
+    };
+    format!("sums     accumulation={taken}: {note}")
+}
+
+/// Colours of a model that are truncated.
+pub(crate) fn degree_cut(s: Spelling, own: u8, degree: u8) -> String {
+    format!(
+        "note: colours of degree {own} are cut to {degree}; {} keeps them",
+        s.set("sh_degree", own)
+    )
+}
+
+/// A model that may be in other coordinates.
+pub(crate) fn other_coordinates(
+    s: Spelling,
+    option: Option<&str>,
+    file: &Path,
+    correlation: f64,
+) -> String {
+    let file = file.display();
+    let model = option.map_or_else(|| file.to_string(), |option| s.text(option, &file));
+    format!(
+        "note: {model}: it shows little of the photographs (their correlation is {correlation:.2}); its coordinates \
+         may not be those of the dataset (axes, scale, or origin)"
+    )
+}
+
+/// The way to learn exposures that tracks do not decide.
+pub(crate) fn learn_exposures(s: Spelling) -> String {
+    format!("{} learns exposures all the same", s.text("exposure", "on"))
+}
+
+/// The budget, and the reason for it.
+pub(crate) enum BudgetReason {
+    /// The default.
+    Default,
+    /// The most of an automatic budget.
+    Automatic,
+    /// The option.
+    Given,
+    /// The memory holds fewer than the budget that was given.
+    LessThanGiven { memory: u64, given: usize },
+    /// The memory holds the budget that was given.
+    AsGiven { memory: u64 },
+    /// The memory.
+    Memory { memory: u64 },
+    /// The device.
+    Device,
+}
+
+/// The budget and its reason.
+pub(crate) fn budget(s: Spelling, rows: usize, reason: &BudgetReason) -> String {
+    let rows = grouped(rows);
+    let memory = |bytes: u64| s.text("memory", Bytes(bytes));
+    let reason = match *reason {
+        BudgetReason::Default => {
+            format!(" (default; choose with {} or {})", s.option("budget"), s.option("memory"))
+        }
+        BudgetReason::Automatic => " at most (auto: as many as improve the model)".to_owned(),
+        BudgetReason::Given => String::new(),
+        BudgetReason::LessThanGiven { memory: bytes, given } => {
+            let given = s.text("budget", grouped(given));
+            format!(": {} holds fewer than {given}", memory(bytes))
+        }
+        BudgetReason::AsGiven { memory: bytes } => {
+            format!(": {} would hold as many or more", memory(bytes))
+        }
+        BudgetReason::Memory { memory: bytes } => {
+            format!(", as many as {} holds", memory(bytes))
+        }
+        BudgetReason::Device => ", as many as the device takes".to_owned(),
+    };
+    format!("budget   {rows} rows{reason}")
+}
+
+/// A degree that memory has lowered.
+pub(crate) fn degree_lowered(
+    s: Spelling,
+    [degree, wanted]: [u8; 2],
+    at_wanted: usize,
+    start: usize,
+) -> String {
+    format!(
+        "note: degree {degree} instead of {wanted}, at which only {} rows fit and the scene starts with {}; {} insists",
+        grouped(at_wanted),
+        grouped(start),
+        s.set("sh_degree", wanted)
+    )
+}
+
+/// The rest of the memory given.
+pub(crate) fn memory_left(s: Spelling, bytes: u64) -> String {
+    format!("\n  {:<11} {} of {}", "left", Bytes(bytes), s.option("memory"))
+}
+
+/// A run that has nothing left to do.
+pub(crate) fn all_done(s: Spelling, last: u32) -> String {
+    format!(
+        "note: all {last} iterations are done; {} with a larger number extends the run",
+        s.option("iterations")
+    )
+}

@@ -1,0 +1,445 @@
+//! The words of every [`Problem`], with options as their reader spells them. One piece, so that all can be compared.
+
+use densify_core::memory::Bytes;
+use densify_core::numbers::grouped;
+use densify_core::spelling::Spelling;
+use densify_render::Accumulation;
+
+use super::problem::{
+    BackendRemedy, Difference, ModelProblem, OptionProblem, Problem, Remedy, ResumeProblem, SizeProblem,
+    TrainingProblem,
+};
+
+impl Problem {
+    /// A sentence that names what is wrong, and the remedy.
+    #[must_use]
+    pub fn words(&self, spelling: Spelling) -> String {
+        match self {
+            Self::Options(problem) => problem.words(spelling),
+            Self::Size(problem) => problem.words(spelling),
+            Self::Model(problem) => problem.words(spelling),
+            Self::Resume(problem) => problem.words(spelling),
+            Self::Training(problem) => problem.words(spelling),
+            Self::Backend(remedy) => remedy.words(spelling),
+        }
+    }
+}
+
+impl BackendRemedy {
+    fn words(self, s: Spelling) -> String {
+        let native = s.text("backend", "cpu");
+        match self {
+            Self::LessMemory => format!(
+                "lower {}, {} or {}",
+                s.option("budget"),
+                s.option("sh_degree"),
+                s.option("tile_cap")
+            ),
+            Self::FewerThreads => format!("lower {}", s.option("threads")),
+            Self::SmallerImages => format!("shrink the images with {}", s.option("resolution")),
+            Self::ListAdapters => {
+                format!("`densify devices` lists the adapters, and {native} needs none")
+            }
+            Self::NoAdapterOrGpu => format!("leave out {} or {native}", s.option("gpu")),
+            Self::BuildWithGpu => format!(
+                "add it to the features of densify in Cargo.toml, or leave out {} and {}",
+                s.text("backend", "gpu"),
+                s.option("gpu")
+            ),
+            Self::Budget(rows) => format!("use {}", s.set("budget", rows)),
+            Self::TileCap(pairs) => format!("use {}", s.set("tile_cap", pairs)),
+            Self::NativeBackend => format!("use {native}"),
+            Self::StartAgain => format!("start again from what was saved, or use {native}"),
+            Self::SlotsOrOtherDriver => format!(
+                "{} goes through more; otherwise try another driver, or {native}",
+                s.member("knob", "accumulation", Accumulation::Slots)
+            ),
+            Self::OtherDriver => format!("try another driver, or {native}"),
+        }
+    }
+}
+
+impl OptionProblem {
+    fn words(&self, s: Spelling) -> String {
+        match self {
+            Self::UnknownOption { name, nearest } => {
+                let like =
+                    nearest.as_ref().map_or_else(String::new, |like| format!(" (did you mean `{like}`?)"));
+                format!("no option is called `{name}`{like}; docs/options.md lists them all")
+            }
+            Self::Value { option, problem } => format!("{}: {problem}", s.option(option)),
+            Self::Conflict { option, problem } => format!("{} {problem}", s.option(option)),
+            Self::PolicySetting { setting } => format!(
+                "{}: `{setting}` is not of the form policy.parameter=value, such as diet.rho=0.2",
+                s.option("policy_set")
+            ),
+            Self::NotUtf8 { option, path } => format!(
+                "{}: the name {path:?} is not UTF-8, as config.toml must be; rename the folder, or name a link to it",
+                s.option(option)
+            ),
+            Self::FolderOccupied { folder } => format!(
+                "{} holds another run; choose another folder with {}, or replace it with {}",
+                folder.display(),
+                match s {
+                    Spelling::Terminal => "-o".to_owned(),
+                    Spelling::Keyword => s.option("output"),
+                },
+                s.switch("overwrite")
+            ),
+            Self::NoScene => "no scene is given; name a dataset's folder, or a built-in scene such as scene:spheres \
+                              (in a file: scene = \"...\")"
+                .to_owned(),
+            Self::IterationOutOfRange { option, step, last } => format!(
+                "{} is out of range: the run has iterations 1 to {last}",
+                s.set(option, step)
+            ),
+            Self::Malformed { origin, problem } => format!("{origin}: {problem}"),
+            Self::AccumulationConflict { given } => format!(
+                "{}, which takes accumulation={}, and {} contradict each other; give one of them",
+                s.switch("deterministic"),
+                Accumulation::Slots,
+                s.member("knob", "accumulation", given)
+            ),
+            Self::KnobOfOtherBackend { knob, value, backend, only_on, default } => format!(
+                "{}: knob {knob}={value}: the {} backend does not have it; the nearest that works there is \
+                 {knob}={default}, or use {}",
+                s.option("knob"),
+                backend.name(),
+                s.text("backend", only_on.choice().word())
+            ),
+            Self::AutomaticWithFull { option } => {
+                let full = s.switch("full");
+                let other = match *option {
+                    "budget" => "a number of Gaussians".to_owned(),
+                    option => s.set(option, 3),
+                };
+                format!(
+                    "{full} disables automatic reductions, and {} is one; give one of the two, or {full} with {other}",
+                    s.text(option, "auto")
+                )
+            }
+            Self::AutoBudgetWithFreeze => format!(
+                "{} asks of all Gaussians what each is worth, and {} keeps some whatever it is; give {} a number of \
+                 Gaussians",
+                s.text("budget", "auto"),
+                s.option("freeze"),
+                s.option("budget")
+            ),
+            Self::UnusedInitPoints { points } => format!(
+                "{}: it is for a random start; leave it out, or use {}",
+                s.set("init_points", points),
+                s.text("init", "random")
+            ),
+            Self::NothingToTest => format!(
+                "{}: no view is held out to measure; add {} or {}",
+                s.option("test_iterations"),
+                s.switch("eval"),
+                s.set("test_every", "K")
+            ),
+        }
+    }
+}
+
+impl SizeProblem {
+    fn words(&self, s: Spelling) -> String {
+        let memory = |bytes: &u64| s.text("memory", Bytes(*bytes));
+        match self {
+            Self::TooManyViews => "the scene has more than 4 billion views".to_owned(),
+            Self::FreezeFillsBudget { frozen, budget } => format!(
+                "{}: its {} Gaussians leave no room in a budget of {}, which counts them too; give a larger {}, or {} \
+                 fewer",
+                s.option("freeze"),
+                grouped(*frozen),
+                grouped(*budget),
+                s.option("budget"),
+                s.option("freeze")
+            ),
+            Self::TileCapConflict { cap, pairs } => format!(
+                "{cap} and {} contradict each other; give one of them, such as {cap} with pairs_per_row=auto",
+                s.member("knob", "pairs_per_row", pairs),
+                cap = s.set("tile_cap", cap)
+            ),
+            Self::OverMemory { memory: given, needed, remedies } => {
+                let remedy = match &remedies[..] {
+                    [] => format!(
+                        "leave out {}, {} and {}",
+                        s.option("tile_cap"),
+                        s.option("image_cache"),
+                        s.option("threads")
+                    ),
+                    remedies => format!("give {}", any_of(remedies, s)),
+                };
+                format!("{}: this run takes {}; {remedy}", memory(given), Bytes(*needed))
+            }
+            Self::OverGrant { needed, resident, limit, left, remedies } => {
+                let remedy = match &remedies[..] {
+                    [] => "free memory, or raise that limit".to_owned(),
+                    remedies => format!("give {}, or free memory", any_of(remedies, s)),
+                };
+                format!(
+                    "this run takes {} of the host's memory, of which the process has {}; {limit} leaves it {}; \
+                     {remedy}",
+                    Bytes(*needed),
+                    Bytes(*resident),
+                    Bytes(*left)
+                )
+            }
+            Self::NoSize { memory: given } => {
+                format!("{}: no size of a run can be computed", memory(given))
+            }
+            Self::NoModelFits { memory: given, rows, sh_degree, needed, remedies } => format!(
+                "{} holds no model of this scene: {} rows at degree {sh_degree} take {needed} MiB; give {}",
+                memory(given),
+                grouped(*rows),
+                any_of(remedies, s)
+            ),
+        }
+    }
+}
+
+impl ModelProblem {
+    fn words(&self, s: Spelling) -> String {
+        match self {
+            Self::EmptyModel { option, file } => format!(
+                "{}: the model has no Gaussian; give another one, or leave {} out",
+                s.text(option, file.display()),
+                s.option(option)
+            ),
+            Self::ModelOfRun { file } => format!("its model is {}", file.display()),
+            Self::InitOutOfView { file, seen, rows } => format!(
+                "{}: only {} of its {} Gaussians lie in any training view; it must be in the coordinates of the \
+                 dataset: export it untransformed, or transform it back",
+                s.text("init", file.display()),
+                grouped(*seen),
+                grouped(*rows)
+            ),
+            Self::FreezeOutOfView { file, rows } => format!(
+                "{}: none of its {} Gaussians lies in any training view; it must be in the coordinates of the dataset: \
+                 export it untransformed, or transform it back",
+                s.text("freeze", file.display()),
+                grouped(*rows)
+            ),
+            Self::FreezeChanged { file, rows, expected } => format!(
+                "{}: it has {} Gaussians, but had {} before; begin a new run",
+                s.text("freeze", file.display()),
+                grouped(*rows),
+                grouped(*expected)
+            ),
+            Self::OtherCoordinates { option, file, correlation } => {
+                let file = file.display();
+                let model = option.map_or_else(|| file.to_string(), |option| s.text(option, &file));
+                format!(
+                    "{model}: it shows nothing of the photographs (their correlation is {correlation:.2}); it must be \
+                     in the coordinates of the dataset (axes, scale and origin): export it untransformed, or \
+                     transform it back"
+                )
+            }
+            Self::NoTestViews => format!(
+                "no view was held out (a run holds views out with {} or {}); use {}",
+                s.switch("eval"),
+                s.set("test_every", "K"),
+                s.text("split", "train")
+            ),
+            Self::DatasetMoved => {
+                format!("if the dataset has moved, say where it is with {}", scene_of_run(s))
+            }
+            Self::NoModelYet { run, step } => {
+                let run = run.display();
+                format!(
+                    "{run} holds a run that was stopped before it saved a model, with a checkpoint of iteration \
+                     {step}; `densify train --resume -o {run}` goes on from there, and saves its model at the end, or \
+                     earlier with {}",
+                    s.set("save_iterations", "N")
+                )
+            }
+            Self::NoSuchIteration { iteration, run, saved } => {
+                let saved: Vec<String> = saved.iter().map(u32::to_string).collect();
+                format!(
+                    "{}: {} has saved only {}",
+                    s.set("iteration", iteration),
+                    run.display(),
+                    saved.join(", ")
+                )
+            }
+            Self::StillTraining { run } => format!(
+                "{} is being trained and has saved no model yet; wait until it has, or train with {} to look at it \
+                 before its end",
+                run.display(),
+                s.set("save_iterations", "1000,2000")
+            ),
+            Self::IterationOfFile => {
+                format!(
+                    "{} is for a run's folder; a file has only one model",
+                    s.option("iteration")
+                )
+            }
+        }
+    }
+}
+
+impl ResumeProblem {
+    fn words(&self, s: Spelling) -> String {
+        let resume = s.switch("resume");
+        match self {
+            Self::InterruptedReplacement { output, staged } => format!(
+                "{resume}: {} holds a run that was to replace the one there and was interrupted: {}; go on with it by \
+                 naming that folder with {}, or remove it",
+                output.display(),
+                staged.display(),
+                output_option(s)
+            ),
+            Self::Shortened { asked, origin, length, done } => format!(
+                "{} contradicts {origin}: that run has {length} iterations, of which {done} are done; it can be \
+                 extended, not shortened",
+                s.set("iterations", asked)
+            ),
+            Self::AutoOnResume { option, origin, saved } => format!(
+                "{resume}: {} contradicts {origin}, which was given {saved}; leave it out, or begin a new run without \
+                 {resume}",
+                s.text(option, "auto")
+            ),
+            Self::NoSoundCheckpoint { output, errors } => {
+                let errors: String = errors.iter().map(|error| format!("\n  {error}")).collect();
+                format!(
+                    "{resume}: no checkpoint in {} can be used:{errors}\nto begin anew, leave {resume} out and give {}",
+                    output.display(),
+                    s.switch("overwrite")
+                )
+            }
+            Self::NoCheckpoint { output } => format!(
+                "{resume}: {} holds a run, but no checkpoint to go on from; to begin anew, leave {resume} out and \
+                 give {}, or choose another folder with {}",
+                output.display(),
+                s.switch("overwrite"),
+                output_option(s)
+            ),
+            Self::ResultWouldDiffer { origin, differences } => {
+                let shown = |value: &Option<String>| value.clone().unwrap_or("not set".to_owned());
+                let line = |difference: &Difference| {
+                    let Difference { option, member, now, then } = difference;
+                    let option = format!("{} {member}", s.option(option));
+                    let (now, then) = (shown(now), shown(then));
+                    format!("\n  {}: {now} now, {then} in that run", option.trim())
+                };
+                format!(
+                    "{resume}: this call contradicts {}:{}\nleave these options out, or begin a new run without \
+                     {resume}",
+                    origin.display(),
+                    differences.iter().map(line).collect::<String>()
+                )
+            }
+            Self::OtherDataset { origin, difference } => format!(
+                "{resume}: this is not the dataset of {}: {difference}; give the dataset of that run, or begin a new \
+                 run without {resume}",
+                origin.display()
+            ),
+        }
+    }
+}
+
+impl TrainingProblem {
+    fn words(&self, s: Spelling) -> String {
+        match self {
+            Self::DrawsNothing { empty, views } => format!(
+                "the model draws nothing in {empty} of the last {views} views; check the poses of the cameras, and \
+                 that they and the points use the same coordinate system, or lower {}",
+                s.option("near")
+            ),
+            Self::Stopped { by, step: None } => format!("stopped by {by}; nothing was written"),
+            Self::Stopped { by, step: Some(step) } => format!("stopped by {by} after step {step}"),
+            Self::CheckpointFailed { error } => {
+                format!("no checkpoint could be written: {error}")
+            }
+            Self::ModelSaved { saved: Ok(file) } => {
+                format!("the model as it was before is saved in {}", file.display())
+            }
+            Self::ModelSaved { saved: Err(error) } => {
+                format!("the model could not be saved: {error}")
+            }
+            Self::CompleteAllTheSame { run } => {
+                format!("the run is complete in {} all the same", run.display())
+            }
+            Self::LeftBehind { run, checkpoint: None, .. } => {
+                format!("what was written until then is in {}", run.display())
+            }
+            Self::LeftBehind { run, checkpoint: Some(checkpoint), scene } => format!(
+                "what was written until then is in {run}, with the checkpoint {}; go on with: densify train {} -o \
+                 {run} --resume",
+                checkpoint.display(),
+                scene.display(),
+                run = run.display()
+            ),
+        }
+    }
+}
+
+/// `A`, `A, or B`, `A, or B, or C`; each may be several changes.
+fn any_of(remedies: &[Vec<Remedy>], s: Spelling) -> String {
+    let all = remedies.iter().map(|changes| {
+        let changes: Vec<String> = changes.iter().map(|change| change.words(s)).collect();
+        changes.join(" ")
+    });
+    all.collect::<Vec<_>>().join(", or ")
+}
+
+impl Remedy {
+    fn words(self, s: Spelling) -> String {
+        match self {
+            Self::NoImages => s.set("image_cache", 0),
+            Self::NoTileCap => format!("no {}", s.option("tile_cap")),
+            Self::TileCap(pairs) => s.set("tile_cap", pairs),
+            Self::Preset(name) => s.text("preset", name),
+            Self::LeastDegree => s.set("sh_degree", 0),
+            Self::Shrink(divisor) => match s {
+                Spelling::Terminal => format!("-r {divisor}"),
+                Spelling::Keyword => s.set("resolution", divisor),
+            },
+            Self::Memory(mib) => s.text("memory", format_args!("{mib}MiB")),
+            Self::Budget(rows) => s.set("budget", rows),
+        }
+    }
+}
+
+/// The output folder, in its short form on a terminal.
+fn output_option(s: Spelling) -> String {
+    match s {
+        Spelling::Terminal => "-o".to_owned(),
+        Spelling::Keyword => s.option("output"),
+    }
+}
+
+/// The option of commands that look at a run; that of the run itself is a positional argument.
+fn scene_of_run(s: Spelling) -> String {
+    match s {
+        Spelling::Terminal => "--scene".to_owned(),
+        Spelling::Keyword => s.option("scene"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::failure::{Failure, INPUT};
+
+    #[test]
+    fn options_are_spelled_as_their_reader_writes_them() {
+        let remedies = vec![vec![Remedy::NoImages, Remedy::Shrink(4)], vec![Remedy::Memory(96)]];
+        let (memory, rows, sh_degree, needed) = (64 << 20, 1_000, 0, 96);
+        let fits = SizeProblem::NoModelFits { memory, rows, sh_degree, needed, remedies };
+        let failure = Failure::from(fits).within_option("config", Some("a.toml".to_owned()));
+        assert_eq!(failure.code, INPUT);
+        assert_eq!(
+            failure.to_string(),
+            "--config a.toml: --memory 64.0 MiB holds no model of this scene: 1,000 rows at degree 0 take 96 MiB; \
+             give --image-cache 0 -r 4, or --memory 96MiB"
+        );
+        assert_eq!(
+            failure.words(Spelling::Keyword),
+            "config=\"a.toml\": memory=\"64.0 MiB\" holds no model of this scene: 1,000 rows at degree 0 take 96 \
+             MiB; give image_cache=0 resolution=4, or memory=\"96MiB\""
+        );
+        let given = OptionProblem::AutomaticWithFull { option: "sh_degree" };
+        let words = Failure::from(given).words(Spelling::Keyword);
+        assert!(words.ends_with("or full=True with sh_degree=3"), "{words}");
+    }
+}

@@ -1,0 +1,30 @@
+//! The caller's side of a run: who observes it, and how it may measure its process.
+
+use crate::companion::Companion;
+use crate::observer::{Observer, Silent};
+use crate::process::ProcessMemory;
+
+/// The surroundings of a run, which its caller provides.
+#[derive(Clone, Copy)]
+pub struct Host<'a> {
+    /// Is told everything, and may stop the run.
+    pub observer: &'a dyn Observer,
+    /// Measures the memory of the process.
+    pub process: ProcessMemory,
+    /// The part of the program that stays beside the run while it trains.
+    pub companion: Option<Companion>,
+}
+
+impl<'a> Host<'a> {
+    /// A host that measures the process as the operating system reports it.
+    #[must_use]
+    pub fn new(observer: &'a dyn Observer) -> Self {
+        Self { observer, process: ProcessMemory::SYSTEM, companion: None }
+    }
+}
+
+impl Default for Host<'static> {
+    fn default() -> Self {
+        Self::new(&Silent)
+    }
+}

@@ -1,0 +1,135 @@
+//! Files of models: single files, and those that a run has saved.
+
+use std::path::{Path, PathBuf};
+
+use crate::failure::{Failure, ModelProblem};
+use crate::observer::Observer;
+use densify_core::files;
+use densify_core::gaussians::Gaussians;
+use densify_data::dataset::is_archive;
+use densify_data::models;
+use densify_train::checkpoint::newest_step;
+use densify_train::output::{is_in_use, model_path, saved_iterations};
+
+/// True for a file that is not the archive of a dataset, and for a folder of SOG.
+pub fn is_model(path: &Path) -> bool {
+    (path.is_file() && !is_archive(path)) || path.join("meta.json").is_file()
+}
+
+/// The iteration asked for, or the last one saved.
+///
+/// # Errors
+/// When the run has not saved that iteration, or none.
+pub fn iteration(run: &Path, asked: Option<u32>) -> Result<u32, Failure> {
+    let saved = saved_iterations(run).map_err(|error| -> Failure {
+        match newest_step(run) {
+            None => error.into(),
+            Some(step) => ModelProblem::NoModelYet { run: run.to_owned(), step }.into(),
+        }
+    })?;
+    let last = saved[saved.len() - 1];
+    match asked {
+        None => Ok(last),
+        Some(n) if saved.contains(&n) => Ok(n),
+        Some(iteration) => {
+            Err(ModelProblem::NoSuchIteration { iteration, run: run.to_owned(), saved }.into())
+        }
+    }
+}
+
+/// The iteration asked for, or the last one saved, of a run that may be training. Returns, too, whether it is, and notes
+/// it.
+///
+/// # Errors
+/// As [`iteration`].
+pub fn iteration_so_far(
+    run: &Path,
+    asked: Option<u32>,
+    observer: &dyn Observer,
+) -> Result<(u32, bool), Failure> {
+    let trains = is_in_use(run);
+    if trains && saved_iterations(run).is_err() {
+        return Err(ModelProblem::StillTraining { run: run.to_owned() }.into());
+    }
+    let iteration = iteration(run, asked)?;
+    if trains {
+        let run = run.display();
+        observer.say(format_args!(
+            "note: {run} is being trained; what is shown is its model of iteration {iteration}"
+        ));
+    }
+    Ok((iteration, trains))
+}
+
+/// The last part of a path, to be shown without the private names of the folders above it.
+pub fn name_of(path: &Path) -> String {
+    names_of(&[path]).swap_remove(0)
+}
+
+/// Names of paths that are shown together: each has as many of its last parts as tell it from the others.
+pub fn names_of(paths: &[&Path]) -> Vec<String> {
+    let whole = |path: &&Path| path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
+    let whole: Vec<PathBuf> = paths.iter().map(whole).collect();
+    let last = |path: &Path, parts: usize| -> PathBuf {
+        let all: Vec<_> = path.components().collect();
+        all[all.len().saturating_sub(parts)..].iter().collect()
+    };
+    let name = |path: &PathBuf| {
+        let tells_apart = |parts: &usize| {
+            let mut others = whole.iter().filter(|other| *other != path);
+            others.all(|other| last(other, *parts) != last(path, *parts))
+        };
+        let most = path.components().count();
+        let parts = (1..most).find(tells_apart).unwrap_or(most);
+        files::one_line(&last(path, parts).to_string_lossy())
+    };
+    whole.iter().map(name).collect()
+}
+
+/// The file of a model that is named by itself, or by its run and the iteration asked for, or else the last.
+///
+/// # Errors
+/// As [`iteration`], and when an iteration is asked for of a file.
+pub fn model_file(named: &Path, asked: Option<u32>) -> Result<PathBuf, Failure> {
+    if !is_model(named) {
+        return Ok(model_path(named, iteration(named, asked)?));
+    }
+    match asked {
+        Some(_) => Err(ModelProblem::IterationOfFile.into()),
+        None => Ok(named.to_owned()),
+    }
+}
+
+/// Reads a file of Gaussian splats by any program, in its own coordinates, and notes what was repaired.
+///
+/// # Errors
+/// When it cannot be read.
+pub fn read_model(path: &Path, observer: &dyn Observer) -> Result<Gaussians, Failure> {
+    let file = import::read_model(path)?;
+    for (number, what) in [
+        (file.dropped, "left out: a value is not finite"),
+        (file.repaired, "with a zero quaternion, read as unrotated"),
+    ] {
+        if number > 0 {
+            observer.say(format_args!("note: {}: {number} rows {what}", path.display()));
+        }
+    }
+    Ok(file.gaussians)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn paths_are_called_by_as_little_as_tells_them_apart() {
+        let names = |paths: &[&str]| names_of(&paths.iter().map(Path::new).collect::<Vec<_>>());
+        assert_eq!(names(&["/home/me/out/a", "/home/me/out/b"]), ["a", "b"]);
+        assert_eq!(names(&["/x/one/run", "/x/two/run", "/x/b"]), ["one/run", "two/run", "b"]);
+        assert_eq!(names(&["/x/one/run", "/y/one/run"]), ["x/one/run", "y/one/run"]);
+        assert_eq!(names(&["/run", "/x/run"]), ["/run", "x/run"]);
+        // The same path twice has the same name.
+        assert_eq!(names(&["/x/run", "/x/run"]), ["run", "run"]);
+        assert_eq!(names(&["/x/a\u{1b}[1m"]), ["a\\u{1b}[1m"]);
+    }
+}

@@ -1,0 +1,323 @@
+//! A description with the inputs it names and all choices that do not depend on its size.
+
+use std::borrow::Cow;
+
+use densify_policies::policy::{Needs, SceneInfo, SignalSet};
+use densify_policies::registry::PolicyEntry;
+use toml::Table;
+
+use super::config::{ModelSize, RunConfig};
+use super::degree::Degree;
+use super::exposure::Exposure;
+use super::inputs::{Evidence, Inputs, Reading, open_device};
+use super::size::LEAST_ROWS;
+use crate::failure::{Failure, OptionProblem, SizeProblem};
+use crate::host::Host;
+use crate::spec::knobs::Knobs;
+use crate::spec::{AbsolutePath, Budget, InitChoice, RunSpec, ShDegree};
+use densify_core::budget::RowBudget;
+use densify_core::spelling::Spelling;
+use densify_train::exposure::ExposureChoice;
+use densify_train::schedule::Background;
+use densify_train::trainer::{AutoChoices, growth_signals};
+
+/// Most points of a random initialisation without `--init-points` (Kerbl et al. 2023 use 100,000).
+const RANDOM_POINTS: usize = 100_000;
+/// Resident memory by which a process that resumes a run may exceed the one that began it `[bytes]`. The ledger keeps more
+/// room than this for the allocator.
+const RESUME_TOLERANCE: u64 = 1 << 20;
+/// Threads that decode training views ahead of the trainer.
+pub(crate) const DECODERS: usize = 2;
+/// Threads that decode test views.
+pub(crate) const TEST_DECODERS: usize = 1;
+
+/// A run before its size is known. Trials of other sizes and options share the inputs.
+pub(crate) struct Case<'a> {
+    /// As it was asked for.
+    pub(crate) spec: &'a RunSpec,
+    pub(crate) inputs: Cow<'a, Inputs>,
+    pub(crate) choices: Choices,
+}
+
+/// Decisions that do not depend on the size of the run.
+#[derive(Clone)]
+pub(crate) struct Choices {
+    pub(crate) entry: &'static PolicyEntry,
+    /// The policy's parameters as set; the others have the policy's defaults.
+    pub(crate) parameters: Table,
+    pub(crate) knobs: Knobs,
+    pub(crate) degree: Degree,
+    pub(crate) exposure: Exposure,
+    /// Choices that the run makes while it trains.
+    pub(crate) automatic: AutoChoices,
+    /// Threads that train and measure.
+    pub(crate) threads: usize,
+}
+
+/// The first Gaussians of a run, besides frozen ones.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Init {
+    /// One on each point of the dataset.
+    Points,
+    /// At this many random points.
+    Random(usize),
+    /// The model of a file.
+    Model(AbsolutePath),
+}
+
+impl Choices {
+    fn new(
+        spec: &RunSpec,
+        (entry, parameters): (&'static PolicyEntry, Table),
+        knobs: Knobs,
+        degree: Degree,
+        exposure: Exposure,
+    ) -> Self {
+        Self {
+            entry,
+            parameters,
+            knobs,
+            degree,
+            exposure,
+            automatic: AutoChoices {
+                rows: spec.size.budget.is_some_and(Budget::is_auto),
+                scored_views: !spec.size.full,
+            },
+            threads: spec
+                .device
+                .threads
+                .map_or_else(rayon::current_num_threads, |threads| threads.0 as usize),
+        }
+    }
+
+    /// Choices that the colours of the scene decided, for the user.
+    pub(super) fn lines(&self, spelling: Spelling) -> impl Iterator<Item = String> {
+        self.degree.line().into_iter().chain(self.exposure.line(spelling))
+    }
+}
+
+impl<'a> Case<'a> {
+    /// A new run.
+    pub(super) fn anew(spec: &'a RunSpec, host: Host<'_>) -> Result<Self, Failure> {
+        let is_exposed = spec.schedule.exposure != ExposureChoice::Off;
+        let reading = Reading {
+            models: None,
+            tracks: spec.size.sh_degree == Some(ShDegree::Auto(None)) || is_exposed,
+            colours: true,
+            exif: is_exposed,
+            tolerance: 0,
+        };
+        Self::open(spec, &reading, host, |evidence| {
+            let degree = Degree::decide(spec, None, evidence);
+            (degree, Exposure::decide(spec, evidence))
+        })
+    }
+
+    /// A run that goes on.
+    pub(super) fn from_saved(
+        spec: &'a RunSpec,
+        saved: &RunConfig,
+        has_checkpoint: bool,
+        host: Host<'_>,
+    ) -> Result<Self, Failure> {
+        let finds_exposures = spec.schedule.exposure != ExposureChoice::Off && !has_checkpoint;
+        let found = &saved.resolved;
+        let reading = Reading {
+            // The checkpoint has their rows; the files may be gone.
+            models: Some([found.init_model, found.frozen]),
+            tracks: finds_exposures,
+            colours: true,
+            exif: finds_exposures,
+            tolerance: RESUME_TOLERANCE,
+        };
+        Self::open(spec, &reading, host, |evidence| {
+            let degree = Degree::decide(spec, Some(found.sh_degree_from), evidence);
+            let exposure = if has_checkpoint {
+                Exposure::known(found.has_exposures, found.exposure_from)
+            } else {
+                Exposure::decide(spec, evidence)
+            };
+            (degree, exposure)
+        })
+    }
+
+    /// A run whose models do not exist yet, only to know what it takes.
+    pub(super) fn for_estimate(
+        spec: &'a RunSpec,
+        models: [Option<ModelSize>; 2],
+        host: Host<'_>,
+    ) -> Result<Self, Failure> {
+        let has_exposures = spec.schedule.exposure != ExposureChoice::Off;
+        let reading = Reading {
+            models: Some(models),
+            tracks: has_exposures,
+            colours: false,
+            exif: false,
+            tolerance: 0,
+        };
+        Self::open(spec, &reading, host, |evidence| {
+            let exposure = Exposure::known(has_exposures, super::ExposureSource::Given);
+            (Degree::decide(spec, None, evidence), exposure)
+        })
+    }
+
+    fn open(
+        spec: &'a RunSpec,
+        reading: &Reading,
+        host: Host<'_>,
+        decide: impl FnOnce(&Evidence) -> (Degree, Exposure),
+    ) -> Result<Self, Failure> {
+        let policy = spec.policy()?;
+        let mut knobs = spec.knobs()?;
+        check_automatic(spec)?;
+        let device = open_device(spec, &mut knobs, host.observer)?;
+        let (inputs, evidence) = Inputs::open(spec, device, reading, host)?;
+        let (degree, exposure) = decide(&evidence);
+        drop(evidence);
+        for note in exposure.notes() {
+            host.observer.say(format_args!("note: {note}"));
+        }
+        let choices = Choices::new(spec, policy, knobs, degree, exposure);
+        let mut case = Self { spec, inputs: Cow::Owned(inputs), choices };
+        let driver = case.driver_bytes(host)?;
+        let inputs = case.inputs.to_mut();
+        inputs.resident = inputs.resident.map(|bytes| bytes + driver);
+        Ok(case)
+    }
+
+    /// Bytes of the process that the device's driver takes for its kernels.
+    fn driver_bytes(&self, host: Host<'_>) -> Result<u64, Failure> {
+        if self.inputs.device.adapter().is_none() {
+            return Ok(0);
+        }
+        let resident = || (host.process.resident)().unwrap_or(0);
+        let before = resident();
+        // Kernels depend on which signals there are, not on how many rows.
+        self.inputs.device.prove(&self.needs(LEAST_ROWS)?)?;
+        Ok(resident().saturating_sub(before))
+    }
+
+    /// The same inputs for a run with other options of size, policy, knobs or resolution.
+    pub(super) fn with<'b>(&'b self, spec: &'b RunSpec) -> Result<Case<'b>, Failure> {
+        let inputs = if spec.data.resolution == self.spec.data.resolution {
+            Cow::Borrowed(&*self.inputs)
+        } else {
+            Cow::Owned(self.inputs.at_resolution_of(spec)?)
+        };
+        let degree = if spec.size.sh_degree == self.spec.size.sh_degree {
+            self.choices.degree.clone()
+        } else {
+            Degree::decide(spec, None, &Evidence::default())
+        };
+        let knobs = if spec.schedule.knob == self.spec.schedule.knob {
+            self.choices.knobs.clone()
+        } else {
+            spec.knobs()?
+        };
+        let (entry, parameters) = spec.policy()?;
+        let choices = Choices { entry, parameters, knobs, degree, ..self.choices.clone() };
+        Ok(Case { spec, inputs, choices })
+    }
+
+    /// The first rows of a run with this budget.
+    pub(super) fn first_rows(&self, rows: usize) -> Init {
+        match self.init() {
+            InitChoice::Points => Init::Points,
+            InitChoice::Random => Init::Random(
+                self.start().unwrap_or_else(|| random_points(self.budget(rows).trainable())),
+            ),
+            InitChoice::Model(file) => Init::Model(file),
+        }
+    }
+
+    fn init(&self) -> InitChoice {
+        let start = &self.spec.start;
+        match &start.init {
+            Some(init) => init.clone(),
+            None if self.inputs.dataset.points.is_empty() || start.init_points.is_some() => {
+                InitChoice::Random
+            }
+            None => InitChoice::Points,
+        }
+    }
+
+    /// Rows that the scene starts with if nothing limits them; `None` if the limit decides.
+    pub(super) fn start(&self) -> Option<usize> {
+        match self.init() {
+            InitChoice::Model(_) => self.inputs.init_model.map(|model| model.rows),
+            InitChoice::Points => Some(self.inputs.usable_points),
+            InitChoice::Random => self.spec.start.init_points.map(|points| points.0),
+        }
+    }
+
+    /// Rows to start with besides the frozen ones.
+    pub(super) fn initial_rows(&self, rows: usize) -> usize {
+        let trainable = self.budget(rows).trainable();
+        self.start().unwrap_or_else(|| random_points(trainable)).min(trainable)
+    }
+
+    /// A budget of this many rows, frozen ones included.
+    pub(crate) fn budget(&self, total: usize) -> RowBudget {
+        RowBudget { total, frozen: self.frozen_rows() }
+    }
+
+    /// All rows of a budget in which this many can be trained.
+    pub(super) fn rows_for(&self, trainable: usize) -> usize {
+        RowBudget::for_trainable(trainable, self.frozen_rows()).total
+    }
+
+    fn frozen_rows(&self) -> usize {
+        self.inputs.frozen_model.map_or(0, |model| model.rows)
+    }
+
+    /// The scene as policies see it, which do not know of frozen rows.
+    pub(super) fn scene(&self, rows: usize, initial_rows: usize) -> Result<SceneInfo, Failure> {
+        let dataset = &self.inputs.dataset;
+        Ok(SceneInfo {
+            extent: dataset.extent() as f32,
+            train_views: u32::try_from(dataset.train.len())
+                .map_err(|_| SizeProblem::TooManyViews)?,
+            budget: self.budget(rows).trainable().max(1),
+            initial_rows,
+            iterations: self.spec.schedule.iterations.0,
+            white_background: self.spec.data.background == Background::White,
+        })
+    }
+
+    /// The needs of a run with this budget: the signals and terms that its backend computes.
+    pub(crate) fn needs(&self, rows: usize) -> Result<Needs, Failure> {
+        let scene = self.scene(rows, self.initial_rows(rows))?;
+        let policy = self.choices.entry.build(&self.choices.parameters, &scene)?;
+        Ok(self.backend_needs(policy.needs(&scene)))
+    }
+
+    /// The needs of a policy with those of the trainer.
+    pub(crate) fn backend_needs(&self, needs: Needs) -> Needs {
+        let signals = if self.choices.automatic.rows {
+            growth_signals().iter().fold(needs.signals, SignalSet::with)
+        } else {
+            needs.signals
+        };
+        Needs { signals, ..needs }
+    }
+}
+
+/// Random points to start from if no number is given.
+fn random_points(trainable: usize) -> usize {
+    (trainable / 2).clamp(1, RANDOM_POINTS)
+}
+
+/// Fails if an automatic choice contradicts `--full` or `--freeze`.
+fn check_automatic(spec: &RunSpec) -> Result<(), Failure> {
+    let is_auto_budget = spec.size.budget.is_some_and(Budget::is_auto);
+    let is_auto_degree = matches!(spec.size.sh_degree, Some(ShDegree::Auto(_)));
+    for (is_given, option) in [(is_auto_budget, "budget"), (is_auto_degree, "sh_degree")] {
+        if spec.size.full && is_given {
+            return Err(OptionProblem::AutomaticWithFull { option }.into());
+        }
+    }
+    if is_auto_budget && spec.start.freeze.is_some() {
+        return Err(OptionProblem::AutoBudgetWithFreeze.into());
+    }
+    Ok(())
+}

@@ -1,0 +1,324 @@
+//! `config.toml`: a run with every option decided, and the findings that decided them. This is the one place that turns
+//! a description and what was resolved for it into a file, and back.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use toml::{Table, Value};
+
+use super::case::Init;
+use super::{ResolvedRun, ResolvedTraining};
+use crate::failure::Failure;
+use crate::spec::{
+    Assignment, Budget, FOUND_OUT, ImageCache, InitChoice, Partial, Rows, RunSpec, ShDegree,
+    assignments,
+};
+use densify_core::files::{FileError, write_atomically};
+use densify_data::track_colours::Spread;
+use densify_data::track_colours::exposures::ExposureSpread;
+use densify_train::output::CONFIG_FILE;
+
+/// A resolved run as its `config.toml` has it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RunConfig {
+    /// Version of densify that made the run.
+    pub densify: String,
+    /// A description that makes the same run: it asks for everything that was decided.
+    pub spec: RunSpec,
+    /// The findings that decided them.
+    pub resolved: Findings,
+    pub(crate) budget: usize,
+    pub(crate) sh_degree: u8,
+}
+
+/// Facts that were found when a run was prepared.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Findings {
+    /// The folder that relative paths start from.
+    pub working_directory: Option<PathBuf>,
+    /// The GPU adapter that trained; `None`: the processor.
+    pub adapter: Option<String>,
+    /// The order in which a GPU added up gradients; `None`: the processor.
+    pub accumulation: Option<String>,
+    /// The iteration to which a resumed run was extended beyond its length. Schedules do not depend on it: learning
+    /// rates stay at their end.
+    pub extended_to: Option<u32>,
+    /// The reason for the degree.
+    pub sh_degree_from: DegreeSource,
+    /// `--memory` made the degree lower than was wanted.
+    pub sh_degree_lowered: bool,
+    /// The reason for learning exposures, or for not learning them.
+    pub exposure_from: ExposureSource,
+    /// Exposures are learned.
+    pub has_exposures: bool,
+    /// The model that the run began from.
+    pub init_model: Option<ModelSize>,
+    /// The model whose Gaussians never change.
+    pub frozen: Option<ModelSize>,
+}
+
+/// The size of a model in a file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ModelSize {
+    /// Number of Gaussians.
+    pub rows: usize,
+    /// Spherical-harmonic degree.
+    pub sh_degree: u8,
+}
+
+/// The reason why each photograph has an exposure of its own, or has none.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ExposureSource {
+    /// The options.
+    #[default]
+    Given,
+    /// The colours of tracks, before training.
+    Tracks(ExposureSpread),
+    /// None: too few tracks are known, so exposures are not learned.
+    Undecided,
+}
+
+/// The reason for the spherical-harmonic degree of a run.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum DegreeSource {
+    /// The options.
+    #[default]
+    Given,
+    /// The colours of tracks, before training.
+    Spread(Spread),
+    /// None: too few tracks are known, so the degree is the highest.
+    Undecided,
+}
+
+impl RunConfig {
+    /// A run that ends at step `last`, with the policy and rates of `training`.
+    pub(crate) fn new(
+        run: &ResolvedRun<'_>,
+        training: &ResolvedTraining,
+        last: u32,
+    ) -> Result<Self, Failure> {
+        let ResolvedRun { case, size, init, degree_lowered, .. } = run;
+        let (inputs, choices, asked) = (&case.inputs, &case.choices, case.spec);
+        let mut spec = asked.clone();
+        // The file's own folder is the output.
+        spec.output.output = None;
+        let budget = asked.size.budget.unwrap_or(Budget::Rows(size.rows));
+        spec.size.budget = Some(budget.limited_to(size.rows));
+        spec.size.sh_degree = Some(match asked.size.sh_degree {
+            Some(ShDegree::Auto(_)) => ShDegree::Auto(Some(size.sh_degree)),
+            _ => ShDegree::Fixed(size.sh_degree),
+        });
+        // The knob gives the tile lists their length.
+        spec.size.tile_cap = choices.knobs.pairs_per_row.is_none().then_some(Rows(size.tile_cap));
+        spec.size.image_cache = Some(ImageCache::Bytes(size.image_cache));
+        spec.device.backend = inputs.device.kind().choice();
+        spec.device.gpu = inputs.device.adapter().map(str::to_owned);
+        spec.start.init = Some(match init {
+            Init::Points => InitChoice::Points,
+            Init::Random(points) => {
+                spec.start.init_points = Some(Rows(*points));
+                InitChoice::Random
+            }
+            Init::Model(file) => InitChoice::Model(file.clone()),
+        });
+        let rates = Table::try_from(training.rates).map_err(Failure::input)?;
+        spec.schedule.lr = assignments(&in_shortest_decimals(rates));
+        spec.schedule.knob = assignments(&choices.knobs.table());
+        // Parameters of other policies stay, as one file may serve several.
+        let name = choices.entry.name;
+        spec.density.policy_set.retain(|set| set.path.first().is_none_or(|policy| policy != name));
+        spec.density.policy_set.extend(assignments(&training.parameters).into_iter().map(|set| {
+            let path = std::iter::once(name.to_owned()).chain(set.path).collect();
+            Assignment { path, value: set.value }
+        }));
+        let is_relative = asked.start.scene.as_ref().is_some_and(|scene| scene.is_relative());
+        let resolved = Findings {
+            // A name that is not UTF-8 cannot be in the file.
+            working_directory: std::env::current_dir()
+                .ok()
+                .filter(|folder| is_relative && folder.to_str().is_some()),
+            adapter: inputs.device.adapter().map(str::to_owned),
+            accumulation: inputs.device.accumulation().map(|order| order.name().to_owned()),
+            extended_to: (last > asked.schedule.iterations.0).then_some(last),
+            sh_degree_from: choices.degree.source,
+            sh_degree_lowered: *degree_lowered,
+            exposure_from: choices.exposure.source,
+            has_exposures: choices.exposure.is_on,
+            init_model: inputs.init_model,
+            frozen: inputs.frozen_model,
+        };
+        Ok(Self {
+            densify: env!("CARGO_PKG_VERSION").to_owned(),
+            spec,
+            resolved,
+            budget: size.rows,
+            sh_degree: size.sh_degree,
+        })
+    }
+
+    /// The content of `config.toml`.
+    pub fn table(&self) -> Result<Table, Failure> {
+        let mut table = self.spec.table()?;
+        table.insert("densify".into(), self.densify.clone().into());
+        let resolved = Table::try_from(&self.resolved).map_err(Failure::input)?;
+        table.insert("resolved".into(), resolved.into());
+        Ok(table)
+    }
+
+    /// Reads what [`table`](Self::table) wrote.
+    ///
+    /// # Errors
+    /// Names the key, and what was expected.
+    pub fn from_table(mut table: Table, origin: &str) -> Result<Self, Failure> {
+        let fail = |problem: &str| Failure::input(problem).within(origin);
+        let [densify, resolved] = FOUND_OUT.map(|key| table.remove(key));
+        let Some(Value::String(densify)) = densify else {
+            return Err(fail("`densify` must be a string, the version that wrote the file"));
+        };
+        let resolved = resolved.unwrap_or_else(|| Table::new().into());
+        let resolved = Findings::deserialize(resolved)
+            .map_err(|error| fail(&format!("resolved: {}", error.to_string().trim())))?;
+        let spec = Partial::new(table, origin)?.spec()?;
+        match (spec.size.budget.and_then(Budget::most), spec.size.sh_degree) {
+            (Some(budget), Some(ShDegree::Fixed(sh_degree) | ShDegree::Auto(Some(sh_degree)))) => {
+                Ok(Self { densify, spec, resolved, budget, sh_degree })
+            }
+            _ => Err(fail("`budget` and `sh_degree` must be numbers in the file of a run")),
+        }
+    }
+
+    /// Writes `config.toml` into the run's folder.
+    pub fn write(&self, run: &Path) -> Result<(), Failure> {
+        let text = toml::to_string_pretty(&self.table()?).map_err(Failure::input)?;
+        let path = run.join(CONFIG_FILE);
+        write_atomically(&path, |out| out.write_all(text.as_bytes()))?;
+        Ok(())
+    }
+
+    /// Reads the `config.toml` of a run.
+    ///
+    /// # Errors
+    /// When there is none, or it is malformed.
+    pub fn read(run: &Path) -> Result<Self, Failure> {
+        let path = run.join(CONFIG_FILE);
+        let text = densify_core::files::read_text(&path, densify_core::files::MAX_OPTIONS)
+            .map_err(|error| match error.kind() {
+                std::io::ErrorKind::NotFound => FileError::no_run(run, CONFIG_FILE).into(),
+                _ => Failure::input(format!("cannot read {}: {error}", path.display())),
+            })?;
+        let malformed = |problem: String| Failure::from(FileError::malformed(&path, problem));
+        let table: Table = text
+            .parse()
+            .map_err(|error: toml::de::Error| malformed(error.to_string().trim().into()))?;
+        Self::from_table(table, &path.display().to_string())
+    }
+
+    /// The most rows there may ever be.
+    #[must_use]
+    pub fn budget(&self) -> usize {
+        self.budget
+    }
+
+    /// The highest spherical-harmonic degree.
+    #[must_use]
+    pub fn sh_degree(&self) -> u8 {
+        self.sh_degree
+    }
+
+    /// The step at which the run ends.
+    #[must_use]
+    pub fn last(&self) -> u32 {
+        self.resolved.extended_to.unwrap_or(0).max(self.spec.schedule.iterations.0)
+    }
+
+    /// The dataset's folder: relative to the folder in which the run was started, if it exists there, or else as given.
+    #[must_use]
+    pub fn scene_path(&self) -> PathBuf {
+        let given = self.spec.start.scene.clone().unwrap_or_default();
+        let from_there = self.resolved.working_directory.as_ref().map(|folder| folder.join(&given));
+        from_there.filter(|path| path.exists()).unwrap_or(given)
+    }
+}
+
+/// `f32` values in their shortest decimals: 0.005 rather than 0.004999999888241291.
+fn in_shortest_decimals(mut table: Table) -> Table {
+    for value in table.iter_mut().map(|(_, value)| value) {
+        if let Value::Float(number) = value
+            && f64::from(*number as f32).total_cmp(number).is_eq()
+        {
+            *number = (*number as f32).to_string().parse().unwrap_or(*number);
+        }
+    }
+    table
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+    use crate::spec::ByteCount;
+    use densify_train::schedule::Background;
+
+    pub(crate) fn sample() -> RunConfig {
+        let mut spec = RunSpec::default();
+        spec.start.scene = Some("data/room".into());
+        spec.start.init = Some(InitChoice::Points);
+        spec.data.images = Some("elsewhere".into());
+        spec.data.eval = true;
+        spec.data.background = Background::Colour([255, 0, 16]);
+        spec.size.budget = Some(Budget::Auto(Some(28_000)));
+        spec.size.memory = Some(ByteCount(1 << 28));
+        spec.size.sh_degree = Some(ShDegree::Auto(Some(3)));
+        spec.schedule.seed = i64::MAX as u64;
+        spec.schedule.knob = vec!["alpha_min=1/128".parse::<Assignment>().unwrap()];
+        spec.density.policy_set = vec!["diet.rho=0.2".parse().unwrap()];
+        let spread = Spread {
+            tracks: 4_000,
+            on_surface: 0.75,
+            median: 0.5,
+            tenth: 1.5,
+            twentieth: 2.5,
+            rms: 6.0,
+        };
+        let resolved =
+            Findings { sh_degree_from: DegreeSource::Spread(spread), ..Findings::default() };
+        RunConfig { densify: "0.1.0".into(), spec, resolved, budget: 28_000, sh_degree: 3 }
+    }
+
+    #[test]
+    fn what_is_written_is_read_back() {
+        let root = tempfile::tempdir().unwrap();
+        sample().write(root.path()).unwrap();
+        assert_eq!(RunConfig::read(root.path()).unwrap(), sample());
+        let text = std::fs::read_to_string(root.path().join(CONFIG_FILE)).unwrap();
+        assert!(text.contains("background = \"#ff0010\""), "{text}");
+        // A run's file describes the run: it is a file for --config, too.
+        let again = Partial::read(&root.path().join(CONFIG_FILE)).unwrap();
+        assert_eq!(again.describe().unwrap(), sample().spec);
+    }
+
+    #[test]
+    fn a_missing_or_broken_file_is_named() {
+        let root = tempfile::tempdir().unwrap();
+        let message = RunConfig::read(root.path()).unwrap_err().to_string();
+        assert!(message.contains("holds no run") && message.contains("config.toml"), "{message}");
+        for (text, word) in [("densify = 3", "string"), ("densify = \"1\"\nnear = 2", "near")] {
+            std::fs::write(root.path().join(CONFIG_FILE), text).unwrap();
+            let message = RunConfig::read(root.path()).unwrap_err().to_string();
+            assert!(message.contains("config.toml") && message.contains(word), "{message}");
+        }
+    }
+
+    #[test]
+    fn a_relative_scene_is_found_from_where_the_run_was_started() {
+        let root = tempfile::tempdir().unwrap();
+        std::fs::create_dir_all(root.path().join("data/room")).unwrap();
+        let mut config = sample();
+        assert_eq!(config.scene_path(), Path::new("data/room"));
+        config.resolved.working_directory = Some(root.path().to_owned());
+        assert_eq!(config.scene_path(), root.path().join("data/room"));
+    }
+}

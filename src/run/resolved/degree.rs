@@ -1,0 +1,70 @@
+//! `--sh-degree`: how colours may depend on the viewing direction.
+
+use std::ops::RangeInclusive;
+
+use super::config::DegreeSource;
+use super::inputs::Evidence;
+use crate::spec::{RunSpec, ShDegree};
+use densify_core::gaussians::MAX_SH_DEGREE;
+use densify_core::numbers::grouped;
+use densify_data::track_colours::{self, MIN_TRACKS};
+
+/// The degree of a run, before its memory is known.
+#[derive(Debug, Clone)]
+pub(crate) struct Degree {
+    /// The highest wanted, and how far memory may lower it.
+    pub(crate) range: RangeInclusive<u8>,
+    pub(crate) source: DegreeSource,
+}
+
+impl Degree {
+    pub(crate) fn highest(&self) -> u8 {
+        *self.range.end()
+    }
+
+    /// Decides the degree as the options say, or else from the colours of the dataset's tracks, if it has enough. A
+    /// number was decided by `source` in a run that goes on.
+    pub(super) fn decide(
+        spec: &RunSpec,
+        source: Option<DegreeSource>,
+        evidence: &Evidence,
+    ) -> Self {
+        let given = |range| Self { range, source: DegreeSource::Given };
+        match spec.size.sh_degree {
+            Some(ShDegree::Fixed(degree) | ShDegree::Auto(Some(degree))) => {
+                Self { range: degree..=degree, source: source.unwrap_or_default() }
+            }
+            None if spec.size.full => given(MAX_SH_DEGREE..=MAX_SH_DEGREE),
+            None => given(0..=MAX_SH_DEGREE),
+            Some(ShDegree::Auto(None)) => {
+                let colours = evidence.colours.as_ref();
+                let spread = colours.map(|all| track_colours::measure(&evidence.tracks, all));
+                let decided = spread.and_then(|spread| Some((spread.degree()?, spread)));
+                let (degree, source) = match decided {
+                    Some((degree, spread)) => (degree, DegreeSource::Spread(spread)),
+                    None => (MAX_SH_DEGREE, DegreeSource::Undecided),
+                };
+                Self { range: 0..=degree, source }
+            }
+        }
+    }
+
+    /// Evidence of an automatic choice, for the user.
+    pub(super) fn line(&self) -> Option<String> {
+        match self.source {
+            DegreeSource::Given => None,
+            DegreeSource::Spread(found) => Some(format!(
+                "colour   degree {} (auto): between their views a twentieth of {} points differ by {:.1}/255 or \
+                 more",
+                self.highest(),
+                grouped(found.tracks),
+                found.twentieth,
+            )),
+            DegreeSource::Undecided => Some(format!(
+                "colour   degree {} (auto): points of a reconstruction decide nothing, as fewer than \
+                 {MIN_TRACKS} are known in enough views, or fewer than half of them lie on surfaces",
+                self.highest()
+            )),
+        }
+    }
+}

@@ -1,0 +1,36 @@
+//! The memory of runs that are not prepared here, such as those of a batch.
+
+use super::{ModelSize, ResolvedRun};
+use crate::failure::Failure;
+use crate::host::Host;
+use crate::spec::RunSpec;
+use densify_core::memory::Ledger;
+
+/// The rows and the ledger of a run whose models of `--init` and `--freeze` do not exist yet. Exposures count where
+/// they may be learned.
+///
+/// # Errors
+/// As preparing the run.
+pub fn estimate(
+    spec: &RunSpec,
+    models: [Option<ModelSize>; 2],
+    host: Host<'_>,
+) -> Result<(usize, Ledger), Failure> {
+    let run = ResolvedRun::for_estimate(spec, models, host)?;
+    Ok((run.size.rows, run.ledger()?))
+}
+
+/// Host memory of a run, at most `[bytes]`.
+///
+/// # Errors
+/// As preparing the run.
+pub fn host_bytes(spec: &RunSpec, host: Host<'_>) -> Result<u64, Failure> {
+    Ok(ResolvedRun::anew(spec, host)?.ledger()?.on_host())
+}
+
+impl ResolvedRun<'_> {
+    fn ledger(&self) -> Result<Ledger, Failure> {
+        let Self { case, size, .. } = self;
+        Ok(case.ledger(size, &case.needs(size.rows)?))
+    }
+}

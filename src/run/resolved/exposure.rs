@@ -1,0 +1,227 @@
+//! `--exposure`: an exposure of its own for each photograph.
+
+use super::config::ExposureSource;
+use super::inputs::Evidence;
+use crate::failure::notes;
+use crate::spec::RunSpec;
+use densify_core::numbers::grouped;
+use densify_core::spelling::Spelling;
+use densify_data::dataset::Dataset;
+use densify_data::track_colours::MIN_TRACKS;
+use densify_data::track_colours::exposures::{ExposureSpread, MIN_STOPS};
+use densify_train::exposure::reported::{Believed, complete, spread};
+use densify_train::exposure::{ExposureChoice, Exposures};
+
+/// The exposures of a run.
+#[derive(Debug, Clone)]
+pub(crate) struct Exposure {
+    /// Exposures are learned.
+    pub(crate) is_on: bool,
+    pub(crate) source: ExposureSource,
+    /// Gains of the training views to begin with; empty: all begin alike.
+    gains: Vec<[f32; 3]>,
+    /// The colours of tracks gave the gains.
+    by_tracks: bool,
+    /// Use of the exposures in EXIF.
+    believed: Believed,
+    /// Standard deviation of the exposures in EXIF `[stops]`.
+    reported: f64,
+    /// Problems with EXIF, for the user.
+    notes: Vec<String>,
+}
+
+impl Exposure {
+    /// A decision that was made before. What the run begins with, a checkpoint has.
+    pub(super) fn known(is_on: bool, source: ExposureSource) -> Self {
+        Self {
+            is_on,
+            source,
+            gains: Vec::new(),
+            by_tracks: false,
+            believed: Believed::Nothing,
+            reported: 0.0,
+            notes: Vec::new(),
+        }
+    }
+
+    /// Decides as the option says, or else from the colours of tracks. Gains to begin with come from these, and from
+    /// EXIF where they say nothing.
+    pub(super) fn decide(spec: &RunSpec, evidence: &Evidence) -> Self {
+        let Evidence { colours, reported, .. } = evidence;
+        let colours = colours.as_ref();
+        let measured = colours.map(ExposureSpread::measure);
+        let source = |found: Option<ExposureSpread>| match found {
+            Some(found) => ExposureSource::Tracks(found),
+            None => ExposureSource::Undecided,
+        };
+        let decided = measured
+            .as_ref()
+            .and_then(|(found, gains)| Some((found.decides(gains.len())?, *found)));
+        let (is_on, source) = match spec.schedule.exposure {
+            ExposureChoice::Off => (false, ExposureSource::Given),
+            ExposureChoice::On => (true, ExposureSource::Given),
+            ExposureChoice::Auto => {
+                (decided.is_some_and(|(differ, _)| differ), source(decided.map(|(_, found)| found)))
+            }
+        };
+        let stops = spread(reported.stops.iter().copied().flatten());
+        let mut found = Self { reported: stops, ..Self::known(is_on, source) };
+        if !is_on {
+            return found;
+        }
+        let views = reported.stops.len();
+        let known = match (measured, colours) {
+            (Some((_, gains)), Some(colours)) if decided.is_some() => {
+                (found.gains, found.by_tracks) = (gains, true);
+                (0..views).map(|view| colours.knows(view)).collect()
+            }
+            _ => vec![false; views],
+        };
+        found.gains.resize(views, [1.0; 3]);
+        found.believed = complete(&mut found.gains, &known, &reported.stops);
+        if !found.by_tracks && found.believed == Believed::Nothing {
+            found.gains.clear();
+        }
+        if let Believed::Contradicted { by } = found.believed {
+            found.notes.push(format!(
+                "the exposures in EXIF are {by:.1} stops (rms) from what the colours of points show, and are not used"
+            ));
+        }
+        if let Some(example) = &reported.example {
+            found.notes.push(format!(
+                "{} photographs have nonsense in their EXIF, which is not used ({example})",
+                reported.nonsense
+            ));
+        }
+        found
+    }
+
+    pub(super) fn notes(&self) -> &[String] {
+        &self.notes
+    }
+
+    /// The exposures that the run begins with, if they are learned.
+    pub(crate) fn first(&self, spec: &RunSpec, dataset: &Dataset) -> Option<Exposures> {
+        let alike = vec![[1.0; 3]; dataset.train.len()];
+        let gains = if self.gains.is_empty() { &alike } else { &self.gains };
+        self.is_on.then(|| Exposures::new(spec.schedule.exposure_model, gains))
+    }
+
+    /// The choice and its evidence, for the user.
+    pub(super) fn line(&self, spelling: Spelling) -> Option<String> {
+        let word = if self.is_on { "on" } else { "off" };
+        match self.source {
+            ExposureSource::Given if self.is_on => Some(match (self.by_tracks, self.believed) {
+                (true, _) => {
+                    format!(
+                        "exposure on, from the gains of points in several views{}",
+                        self.from_exif()
+                    )
+                }
+                (false, Believed::Views(views)) => {
+                    format!("exposure on, from the EXIF of {} views", grouped(views))
+                }
+                (false, _) => "exposure on, from one for all views".to_owned(),
+            }),
+            ExposureSource::Given => None,
+            ExposureSource::Tracks(found) => Some(format!(
+                "exposure {word} (auto): by the colours of {} points, {} views differ by {:.2} stops (rms); \
+                 with gains, colours differ by {:.1}/255 instead of {:.1}/255{}",
+                grouped(found.tracks),
+                found.views,
+                found.stops,
+                found.with_gains,
+                found.alike,
+                self.from_exif(),
+            )),
+            ExposureSource::Undecided => Some(format!(
+                "exposure {word} (auto): fewer than {MIN_TRACKS} points of a reconstruction are known in enough \
+                 views to say{}; {}",
+                if self.reported >= MIN_STOPS {
+                    format!(", but by EXIF photographs differ by {:.2} stops (rms)", self.reported)
+                } else {
+                    String::new()
+                },
+                notes::learn_exposures(spelling)
+            )),
+        }
+    }
+
+    /// The number of views that begin from EXIF where the others begin from tracks.
+    fn from_exif(&self) -> String {
+        match self.believed {
+            Believed::Views(views) => format!("; {} views begin from their EXIF", grouped(views)),
+            Believed::Nothing | Believed::Contradicted { .. } => String::new(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use densify_data::dataset::ReportedExposures;
+    use densify_train::exposure::ExposureModel;
+
+    fn decided(choice: ExposureChoice, reported: &ReportedExposures) -> Exposure {
+        let mut spec = RunSpec::default();
+        spec.schedule.exposure = choice;
+        let evidence = Evidence { reported: reported.clone(), ..Evidence::default() };
+        Exposure::decide(&spec, &evidence)
+    }
+
+    fn two_stops_apart() -> ReportedExposures {
+        let stops = vec![Some(-5.0), Some(-7.0), None];
+        ReportedExposures {
+            stops,
+            nonsense: 1,
+            example: Some("c.jpg says an exposure of 0 s".to_owned()),
+        }
+    }
+
+    #[test]
+    fn where_no_tracks_are_known_exposures_begin_from_exif() {
+        let found = decided(ExposureChoice::On, &two_stops_apart());
+        assert_eq!(
+            found.line(Spelling::Terminal).as_deref(),
+            Some("exposure on, from the EXIF of 2 views")
+        );
+        // A stop up and a stop down, by the power 1/2.4 of the encoding.
+        let up = 2.0_f32.powf(1.0 / 2.4);
+        let begun = Exposures::new(ExposureModel::Channels, &found.gains);
+        for (view, gain) in [up, 1.0 / up, 1.0].into_iter().enumerate() {
+            let diagonal = begun.of(view).matrix[1][1];
+            assert!((diagonal / gain - 1.0).abs() < 1e-5, "{view}: {diagonal} {gain}");
+        }
+        let [note] = found.notes() else { panic!("{:?}", found.notes()) };
+        assert!(
+            note.contains("1 photographs have nonsense") && note.contains("c.jpg says"),
+            "{note}"
+        );
+        // Where nothing is told, all begin alike.
+        let nothing = ReportedExposures { stops: vec![None; 3], ..ReportedExposures::default() };
+        let found = decided(ExposureChoice::On, &nothing);
+        assert_eq!(
+            found.line(Spelling::Terminal).as_deref(),
+            Some("exposure on, from one for all views")
+        );
+        assert!(found.gains.is_empty() && found.notes().is_empty());
+    }
+
+    #[test]
+    fn exif_alone_switches_nothing_on_but_is_told_of() {
+        let found = decided(ExposureChoice::Auto, &two_stops_apart());
+        assert!(!found.is_on && found.gains.is_empty());
+        let line = found.line(Spelling::Terminal).unwrap();
+        assert!(line.contains("off (auto)") && line.contains("differ by 1.00 stops"), "{line}");
+        assert!(line.contains("--exposure on"), "{line}");
+        let alike =
+            ReportedExposures { stops: vec![Some(-5.0); 3], ..ReportedExposures::default() };
+        let line = decided(ExposureChoice::Auto, &alike).line(Spelling::Terminal).unwrap();
+        assert!(!line.contains("EXIF"), "{line}");
+        let found = decided(ExposureChoice::Off, &two_stops_apart());
+        assert_eq!(
+            (found.is_on, found.line(Spelling::Terminal), found.gains.len()),
+            (false, None, 0)
+        );
+    }
+}

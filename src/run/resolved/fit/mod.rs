@@ -1,0 +1,169 @@
+//! Finds the largest run that fits a memory limit: rows, degree, tile lists and image cache.
+//!
+//! Pure functions of the bytes of a size. Guarantees: the result fits; one more row does not, unless another limit holds;
+//! and more memory never gives a lower degree, or fewer rows at the same degree.
+
+use std::ops::RangeInclusive;
+
+/// The size of a run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct RunSize {
+    /// Most rows there may ever be, >= 1.
+    pub(crate) rows: usize,
+    /// Highest spherical-harmonic degree, 0 to 3.
+    pub(crate) sh_degree: u8,
+    /// Most (row, tile) pairs held at a time, >= rows.
+    pub(crate) tile_cap: usize,
+    /// Bytes of decoded images held at a time.
+    pub(crate) image_cache: u64,
+    /// Bytes of training images that stay on a GPU, at most.
+    pub(crate) images_on_gpu: u64,
+}
+
+/// The memory limit, the wanted size, and the choices that are open.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct SizeRequest {
+    /// The limit `[bytes]`.
+    pub(crate) memory: u64,
+    /// Fewest rows of a useful model, >= 1.
+    pub(crate) least_rows: usize,
+    /// Rows at the start: the degree is lowered if fewer fit.
+    pub(crate) enough_rows: usize,
+    /// Most rows wanted or possible, >= 1.
+    pub(crate) most_rows: usize,
+    /// Degrees to choose from; the highest is the one wanted.
+    pub(crate) sh_degree: RangeInclusive<u8>,
+    /// Most (row, tile) pairs; `None`: to be chosen.
+    pub(crate) tile_cap: Option<usize>,
+    /// (Row, tile) pairs per row if they are chosen: the minimum, and larger numbers that are used if
+    /// memory is left, in rising order.
+    pub(crate) pairs: [usize; 3],
+    /// Most (row, tile) pairs possible.
+    pub(crate) most_pairs: usize,
+    /// Bytes of decoded images; `None`: to be chosen.
+    pub(crate) image_cache: Option<u64>,
+    /// Most bytes of decoded images that are chosen at the expense of rows.
+    pub(crate) most_images: u64,
+    /// Bytes of all images decoded.
+    pub(crate) all_images: u64,
+}
+
+/// The result of [`fit`].
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Fit {
+    /// The setting.
+    pub(crate) setting: RunSize,
+    /// Memory limits the number of rows.
+    pub(crate) by_memory: bool,
+    /// Rows that fit at the wanted degree.
+    pub(crate) at_wanted_degree: usize,
+}
+
+/// Default (row, tile) pairs per row: the minimum, and larger numbers if memory is left. A view rarely
+/// has three per row; views with more than the limit are rendered in bands, with the same result.
+pub(super) const PAIRS: [usize; 3] = [4, 8, 16];
+/// Decoded images may take one part in this many of the memory.
+pub(super) const IMAGES: u64 = 8;
+
+impl SizeRequest {
+    /// A size with this many pairs per row, and at most one part in [`IMAGES`] of the memory for images.
+    fn setting(&self, rows: usize, sh_degree: u8, pairs: usize) -> RunSize {
+        let most = self.most_pairs.max(rows);
+        let tile_cap = self.tile_cap.unwrap_or_else(|| rows.saturating_mul(pairs).min(most));
+        let share = self.memory / IMAGES;
+        let images = || self.all_images.min(share).min(self.most_images);
+        let image_cache = self.image_cache.unwrap_or_else(images);
+        let images_on_gpu = image_cache.min(share);
+        RunSize { rows, sh_degree, tile_cap: tile_cap.max(rows), image_cache, images_on_gpu }
+    }
+}
+
+/// Finds the largest size; `None` if not even the fewest rows fit. `bytes` returns the memory of a size: once above the
+/// limit, it must stay above it as rows, pairs or images grow, and images must take at most their cache and a fixed part.
+///
+/// The degree is the highest at which enough rows fit, or else the lowest. As many rows as possible are chosen; if all
+/// wanted rows fit, the remaining memory goes to the tile lists and then to the images.
+pub(super) fn fit<E>(
+    request: &SizeRequest,
+    mut bytes: impl FnMut(&RunSize) -> Result<u64, E>,
+) -> Result<Option<Fit>, E> {
+    let most = request.most_rows.max(1);
+    let least = request.least_rows.clamp(1, most);
+    let enough = request.enough_rows.clamp(least, most);
+    let mut at_wanted_degree = None;
+    let mut found = None;
+    for degree in request.sh_degree.clone().rev() {
+        let setting = |rows| request.setting(rows, degree, request.pairs[0]);
+        let rows = most_within(least, most, |rows| Ok(bytes(&setting(rows))? <= request.memory))?;
+        at_wanted_degree.get_or_insert(rows.unwrap_or(0));
+        found = rows.map(|rows| (rows, degree));
+        if rows.is_some_and(|rows| rows >= enough) {
+            break;
+        }
+    }
+    let Some((rows, degree)) = found else { return Ok(None) };
+    let mut setting = request.setting(rows, degree, request.pairs[0]);
+    if rows == most {
+        for pairs in request.pairs.into_iter().skip(1) {
+            let larger = request.setting(rows, degree, pairs);
+            if bytes(&larger)? <= request.memory {
+                setting = larger;
+            }
+        }
+        if request.image_cache.is_none() {
+            let all = RunSize { image_cache: request.all_images, ..setting };
+            let left = request.memory.saturating_sub(bytes(&setting)?);
+            // Images in use are counted even if the cache is smaller.
+            setting.image_cache = if bytes(&all)? <= request.memory {
+                request.all_images
+            } else {
+                setting.image_cache.saturating_add(left).min(request.all_images)
+            };
+        }
+    }
+    let at_wanted_degree = at_wanted_degree.unwrap_or(rows);
+    Ok(Some(Fit { setting, by_memory: rows < most, at_wanted_degree }))
+}
+
+/// The smallest memory in which a model fits, in multiples of `step` bytes, if there is any.
+pub(super) fn min_memory<E>(
+    request: &SizeRequest,
+    step: u64,
+    mut bytes: impl FnMut(&RunSize) -> Result<u64, E>,
+) -> Result<Option<u64>, E> {
+    let fits = |steps: usize, bytes: &mut dyn FnMut(&RunSize) -> Result<u64, E>| {
+        let request = SizeRequest { memory: steps as u64 * step, ..request.clone() };
+        fit(&request, bytes).map(|fit| fit.is_some())
+    };
+    // The smallest model with all of its images.
+    let all = SizeRequest { memory: u64::MAX, ..request.clone() };
+    let least = request.least_rows.clamp(1, request.most_rows.max(1));
+    let most = bytes(&all.setting(least, *request.sh_degree.start(), request.pairs[0]))?;
+    let Ok(most) = usize::try_from(most.div_ceil(step)) else { return Ok(None) };
+    let too_little = most_within(0, most, |steps| Ok(!fits(steps, &mut bytes)?))?;
+    Ok(Some(too_little.map_or(0, |steps| steps as u64 + 1) * step))
+}
+
+/// The largest number in `least..=most` for which `holds` is true; it must be true up to some number
+/// and false above.
+pub(super) fn most_within<E>(
+    least: usize,
+    most: usize,
+    mut holds: impl FnMut(usize) -> Result<bool, E>,
+) -> Result<Option<usize>, E> {
+    if least > most || !holds(least)? {
+        return Ok(None);
+    }
+    if holds(most)? {
+        return Ok(Some(most));
+    }
+    let (mut good, mut bad) = (least, most);
+    while bad - good > 1 {
+        let middle = good + (bad - good) / 2;
+        *(if holds(middle)? { &mut good } else { &mut bad }) = middle;
+    }
+    Ok(Some(good))
+}
+
+#[cfg(test)]
+mod tests;

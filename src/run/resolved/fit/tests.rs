@@ -1,0 +1,177 @@
+//! The guarantees of the solver, for random runs whose bytes grow as those of a backend.
+
+use std::convert::Infallible;
+
+use proptest::prelude::*;
+
+use super::*;
+
+/// Bytes of an imaginary run that grow as those of real runs.
+#[derive(Debug, Clone)]
+struct Model {
+    fixed: u64,
+    per_row: u64,
+    per_coefficient: u64,
+    per_pair: u64,
+    largest_image: u64,
+    all_images: u64,
+}
+
+impl Model {
+    fn bytes(&self, setting: &RunSize) -> u64 {
+        let RunSize { rows, sh_degree, tile_cap, image_cache, .. } = *setting;
+        let coefficients = (u64::from(sh_degree) + 1).pow(2);
+        let rows = rows.next_multiple_of(16) as u64;
+        let held = image_cache.max(2 * self.largest_image) + self.largest_image;
+        self.fixed
+            + rows * (self.per_row + coefficients * self.per_coefficient)
+            + tile_cap as u64 * self.per_pair
+            + held.min(self.all_images)
+    }
+
+    fn fit(&self, request: &SizeRequest) -> Option<Fit> {
+        let bytes = |setting: &RunSize| Ok::<_, Infallible>(self.bytes(setting));
+        fit(request, bytes).unwrap_or_else(|never| match never {})
+    }
+}
+
+fn models() -> impl Strategy<Value = Model> {
+    let sizes = (0..50_000_000_u64, 1..500_u64, 1..100_u64, 1..80_u64, 1..1_000_000_u64);
+    (sizes, 1..300_u64).prop_map(|(sizes, views)| {
+        let (fixed, per_row, per_coefficient, per_pair, largest_image) = sizes;
+        let all_images = views * largest_image;
+        Model { fixed, per_row, per_coefficient, per_pair, largest_image, all_images }
+    })
+}
+
+fn request(model: &Model, memory: u64) -> SizeRequest {
+    SizeRequest {
+        memory,
+        least_rows: 1_000,
+        enough_rows: 20_000,
+        most_rows: u32::MAX as usize,
+        sh_degree: 0..=3,
+        tile_cap: None,
+        pairs: PAIRS,
+        most_pairs: u32::MAX as usize,
+        image_cache: None,
+        most_images: 1 << 30,
+        all_images: model.all_images,
+    }
+}
+
+/// Requests of any memory for runs with or without given sizes.
+fn requests() -> impl Strategy<Value = (Model, SizeRequest)> {
+    let sizes = (
+        0..2_000_000_000_u64,
+        prop_oneof![Just(u32::MAX as usize), 1..200_000_usize],
+        prop_oneof![Just(None), (1..500_000_usize).prop_map(Some)],
+        prop_oneof![Just(None), (0..200_000_000_u64).prop_map(Some)],
+        0..=3_u8,
+        prop_oneof![Just(PAIRS), Just([1; 3]), Just([4; 3])],
+    );
+    (models(), sizes).prop_map(|(model, sizes)| {
+        let (memory, most_rows, tile_cap, image_cache, lowest, pairs) = sizes;
+        let sh_degree = lowest..=3;
+        let open = request(&model, memory);
+        let request = SizeRequest { most_rows, tile_cap, image_cache, sh_degree, pairs, ..open };
+        (model, request)
+    })
+}
+
+/// The size fits, keeps what was given, and cannot be larger.
+fn check_fit(model: &Model, request: &SizeRequest) -> Result<(), TestCaseError> {
+    let SizeRequest { memory, most_rows: most, tile_cap, image_cache, pairs, .. } = *request;
+    let lowest = *request.sh_degree.start();
+    let Some(Fit { setting, by_memory, at_wanted_degree }) = model.fit(request) else {
+        let least = request.setting(1_000.min(most), lowest, pairs[0]);
+        prop_assert!(model.bytes(&least) > memory);
+        return Ok(());
+    };
+    prop_assert!(model.bytes(&setting) <= memory);
+    prop_assert!(setting.rows <= most && setting.rows <= setting.tile_cap);
+    prop_assert_eq!(by_memory, setting.rows < most);
+    // Given values are kept.
+    prop_assert!(setting.sh_degree >= lowest);
+    prop_assert!(tile_cap.is_none_or(|cap| setting.tile_cap == cap.max(setting.rows)));
+    prop_assert!(image_cache.is_none_or(|cache| setting.image_cache == cache));
+    if by_memory {
+        let more = request.setting(setting.rows + 1, setting.sh_degree, pairs[0]);
+        prop_assert!(model.bytes(&more) > memory);
+    } else {
+        let more = request.setting(setting.rows, setting.sh_degree, pairs[2]);
+        prop_assert!(setting.tile_cap == more.tile_cap || model.bytes(&more) > memory);
+        let images = RunSize { image_cache: model.all_images, ..setting };
+        prop_assert!(
+            image_cache.is_some()
+                || setting.image_cache == model.all_images
+                || model.bytes(&images) > memory
+        );
+    }
+    // A lower degree needs a reason.
+    let enough = 20_000.min(most);
+    prop_assert!(setting.sh_degree == 3 || at_wanted_degree < enough);
+    if setting.sh_degree < 3 {
+        let higher = request.setting(enough, setting.sh_degree + 1, pairs[0]);
+        prop_assert!(model.bytes(&higher) > memory);
+    }
+    Ok(())
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { failure_persistence: None, ..Default::default() })]
+
+    #[test]
+    fn what_is_found_fits_and_a_row_more_does_not((model, request) in requests()) {
+        check_fit(&model, &request)?;
+    }
+
+    #[test]
+    fn more_memory_is_never_a_smaller_model(
+        model in models(),
+        memory in 0..2_000_000_000_u64,
+        more in 0..200_000_000_u64,
+    ) {
+        let size = |memory| {
+            let fit = model.fit(&request(&model, memory));
+            fit.map(|fit| (fit.setting.sh_degree, fit.setting.rows))
+        };
+        prop_assert!(size(memory) <= size(memory + more));
+    }
+
+    #[test]
+    fn the_least_memory_is_the_least(model in models(), step in 1..2_000_000_u64) {
+        let request = request(&model, 0);
+        let bytes = |setting: &RunSize| Ok::<_, Infallible>(model.bytes(setting));
+        let least = min_memory(&request, step, bytes).unwrap_or_else(|never| match never {});
+        let least = least.expect("a number");
+        prop_assert!(least.is_multiple_of(step));
+        let fits = |memory| model.fit(&SizeRequest { memory, ..request.clone() }).is_some();
+        prop_assert!(fits(least));
+        prop_assert!(least < step || !fits(least - step));
+    }
+}
+
+#[test]
+fn a_degree_is_lowered_only_for_the_rows_that_the_scene_starts_with() {
+    let model = Model {
+        fixed: 0,
+        per_row: 100,
+        per_coefficient: 36,
+        per_pair: 0,
+        largest_image: 0,
+        all_images: 0,
+    };
+    // 676, 424, 244 and 136 bytes a row at degrees 3 to 0.
+    for (memory, degree, rows) in [
+        (20_000 * 676, 3, 20_000),
+        (20_000 * 676 - 1, 2, 31_872),
+        (20_000 * 244, 1, 20_000),
+        (19_999 * 136, 0, 19_984),
+        (1_008 * 136, 0, 1_008),
+    ] {
+        let found = model.fit(&request(&model, memory)).expect("it fits").setting;
+        assert_eq!((found.sh_degree, found.rows), (degree, rows), "{memory}");
+    }
+    assert_eq!(model.fit(&request(&model, 1_008 * 136 - 1)), None);
+}

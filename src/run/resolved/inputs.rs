@@ -1,0 +1,180 @@
+//! The inputs of a run, opened once: device, dataset, and the sizes of the models that it starts from.
+
+use std::path::Path;
+
+use crate::companion::Companion;
+use crate::failure::{Failure, OptionProblem, notes};
+use crate::host::Host;
+use crate::observer::Observer;
+use crate::spec::knobs::Knobs;
+use crate::spec::{InitChoice, RunSpec, StartSpec};
+use densify_data::dataset::images::ImageDemand;
+use densify_data::dataset::{Dataset, ReportedExposures, Tracks, View};
+use densify_data::track_colours::{self, MIN_TRACKS, TrackColours};
+use densify_render::{Accumulation, BackendKind, Device};
+use densify_train::init::usable_points;
+
+use super::config::ModelSize;
+use super::models::size_of_model;
+
+/// Everything that a run reads and runs on.
+#[derive(Clone)]
+pub(crate) struct Inputs {
+    pub(crate) device: Device,
+    /// The dataset without its tracks, which are part of the [`Evidence`].
+    pub(crate) dataset: Dataset,
+    /// The memory that training and test images take.
+    pub(crate) images: [ImageDemand; 2],
+    /// The model that `--init` names, if it names one.
+    pub(crate) init_model: Option<ModelSize>,
+    /// The model that `--freeze` names, if it names one.
+    pub(crate) frozen_model: Option<ModelSize>,
+    /// Gaussians that a start on all points of the dataset has.
+    pub(super) usable_points: usize,
+    /// Bytes that reading the colours of tracks takes, besides an image; 0 where they decide nothing.
+    pub(super) track_bytes: u64,
+    /// Resident memory with the dataset and the device's driver, if it is known `[bytes]`.
+    pub(super) resident: Option<u64>,
+    /// The most resident memory before the driver had its kernels, if it is known `[bytes]`.
+    pub(super) peak: Option<u64>,
+    pub(super) companion: Option<Companion>,
+}
+
+/// Evidence for automatic choices. It is freed before training.
+#[derive(Default)]
+pub(super) struct Evidence {
+    pub(super) tracks: Tracks,
+    /// The colours of the tracks; `None` if they are too few, or were not read.
+    pub(super) colours: Option<TrackColours>,
+    /// Exposures in EXIF.
+    pub(super) reported: ReportedExposures,
+}
+
+/// The evidence that is read besides the dataset, and the source of the sizes of models.
+pub(super) struct Reading {
+    /// Sizes of the models of `--init` and `--freeze`; `None`: their files are read.
+    pub(super) models: Option<[Option<ModelSize>; 2]>,
+    /// The tracks of the reconstruction.
+    pub(super) tracks: bool,
+    /// The colours of the tracks.
+    pub(super) colours: bool,
+    /// The exposures in EXIF.
+    pub(super) exif: bool,
+    /// Bytes of resident memory not counted, so that a resumed run is not refused for a process that takes a little
+    /// more than the one that began it.
+    pub(super) tolerance: u64,
+}
+
+impl Inputs {
+    /// Loads the dataset, and the evidence that `reading` names.
+    pub(super) fn open(
+        spec: &RunSpec,
+        device: Device,
+        reading: &Reading,
+        host: Host<'_>,
+    ) -> Result<(Self, Evidence), Failure> {
+        let observer = host.observer;
+        let scene = spec.scene()?;
+        let mut dataset = Dataset::load(scene, &spec.data.load_options(reading.tracks))?;
+        for note in &dataset.notes {
+            observer.say(format_args!("note: {note}"));
+        }
+        observer.say(format_args!("scene    {}: {}", scene.display(), dataset.describe()));
+        let usable_points = usable_points(&dataset.points);
+        let StartSpec { init, freeze, .. } = &spec.start;
+        let size = |flag, file: Option<&Path>| {
+            file.map(|file| size_of_model(flag, file, observer)).transpose()
+        };
+        let [init_model, frozen_model] = match reading.models {
+            Some(models) => models,
+            None => [
+                size("init", init.as_ref().and_then(InitChoice::file))?,
+                size("freeze", freeze.as_ref().map(|file| &*file.0))?,
+            ],
+        };
+        // Tracks have a line of their own in the ledger, and are freed before training.
+        let apart = dataset.tracks.bytes() + reading.tolerance;
+        let resident = (host.process.resident)().map(|now| now.saturating_sub(apart));
+        let peak = (host.process.peak)();
+        let tracks = std::mem::take(&mut dataset.tracks);
+        let colours = if reading.colours && tracks.len() >= MIN_TRACKS {
+            Some(TrackColours::read(&tracks, &dataset.train)?)
+        } else {
+            None
+        };
+        let track_bytes =
+            if reading.tracks { tracks.bytes() + track_colours::bytes(&tracks) } else { 0 };
+        let reported = if reading.exif {
+            ReportedExposures::of(&dataset.train)
+        } else {
+            ReportedExposures::default()
+        };
+        let inputs = Self {
+            images: image_demand(&dataset),
+            device,
+            dataset,
+            init_model,
+            frozen_model,
+            usable_points,
+            track_bytes,
+            resident,
+            peak,
+            companion: host.companion,
+        };
+        Ok((inputs, Evidence { tracks, colours, reported }))
+    }
+
+    /// The same inputs with the photographs in another resolution.
+    pub(super) fn at_resolution_of(&self, spec: &RunSpec) -> Result<Self, Failure> {
+        let dataset = Dataset::load(spec.scene()?, &spec.data.load_options(false))?;
+        Ok(Self { images: image_demand(&dataset), dataset, ..self.clone() })
+    }
+}
+
+/// The memory that training and test images take.
+fn image_demand(dataset: &Dataset) -> [ImageDemand; 2] {
+    let demand = |views: &[View]| ImageDemand::of(views.iter().map(|view| &view.source));
+    [demand(&dataset.train), demand(&dataset.test)]
+}
+
+/// Opens the device, checks that it has the knobs that are set, and sets the knob of how it adds up gradients.
+pub(super) fn open_device(
+    spec: &RunSpec,
+    knobs: &mut Knobs,
+    observer: &dyn Observer,
+) -> Result<Device, Failure> {
+    let accumulation = match (spec.schedule.deterministic, knobs.accumulation) {
+        (true, Some(given)) if !given.is_deterministic() => {
+            return Err(OptionProblem::AccumulationConflict { given }.into());
+        }
+        (true, _) => Some(Accumulation::Slots),
+        (false, given) => given,
+    };
+    let device = Device::open(spec.device.backend, spec.device.gpu.as_deref(), accumulation)?;
+    observer.say(format_args!("device   {}", device.describe()));
+    check_knobs(knobs, device.kind())?;
+    if let Some(taken) = device.accumulation() {
+        knobs
+            .set("accumulation", taken.name())
+            .map_err(|error| OptionProblem::value("knob", error))?;
+        observer.say(format_args!("{}", notes::accumulation(observer.spelling(), taken)));
+    }
+    Ok(device)
+}
+
+/// Fails if a knob is set that this backend does not have.
+fn check_knobs(knobs: &Knobs, kind: BackendKind) -> Result<(), Failure> {
+    for (knob, value) in knobs.changed() {
+        if let Some(only_on) = knob.only_on.filter(|only| *only != kind) {
+            let problem = OptionProblem::KnobOfOtherBackend {
+                knob: knob.name,
+                value: value.to_owned(),
+                backend: kind,
+                only_on,
+                default: knob.default,
+            };
+            return Err(problem.into());
+        }
+    }
+    Ok(())
+}

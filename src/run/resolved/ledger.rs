@@ -1,0 +1,232 @@
+//! The memory of a run, buffer by buffer, for any size of it, before anything is allocated. A run, the solver for
+//! `--memory` and `densify plan` read this ledger, so they cannot disagree. It is a pure function of what was opened,
+//! what was decided, and the size.
+
+use densify_policies::plan::bytes_per_row;
+use densify_policies::policy::Needs;
+use glam::DVec3;
+
+use super::case::{Case, DECODERS};
+use super::fit::RunSize;
+use super::measuring::Measuring;
+use super::models::{first_bytes, reading_bytes};
+use crate::companion::CompanionSize;
+use densify_core::gaussians::sh_coefficients;
+use densify_core::memory::{Ledger, Section};
+use densify_core::pieces::ROWS_AT_A_TIME;
+use densify_data::dataset::images::ImageDemand;
+use densify_data::dataset::{Dataset, View};
+use densify_data::models::{PLY, Shape};
+use densify_render::{KeptPhotographs, MomentStorage, Setup, Shortcuts, Storage};
+use densify_train::exposure::Exposures;
+use densify_train::metrics::{geometry, scratch_bytes};
+use densify_train::trainer::AutoChoices;
+
+/// The program itself: the pages of code that run, and the stacks of its threads. Measured at 10 to 13 MiB, and at about
+/// 14 MiB in builds for tests (profile `dev`).
+const PROGRAM: u64 = 16 << 20;
+/// A program that takes more, such as one with a driver in it, counts as what it has, rounded up to these steps so that
+/// the promise does not change from call to call.
+const PROGRAM_STEP: u64 = 8 << 20;
+/// Memory that the system's allocator keeps between two uses. Measured at up to 5 MiB.
+const KEPT: u64 = 6 << 20;
+/// Bytes per row that a policy derives from its signals before it plans: means, orders, sums of weights and draws.
+/// Columns of auxiliary views are counted twice for policies that derive more from them. Sorting rows takes at most as
+/// much, when this is free again.
+const PLANNING: u64 = 20;
+/// Bytes per thread of either pool: the part of its stack that it touches, and buffers that it keeps. Measured at 44 to
+/// 52 KiB for both together, from 64 to 256 threads.
+const THREAD: u64 = 64 << 10;
+/// The promise holds for any number of threads up to this, so that it does not depend on them.
+const THREADS: usize = 64;
+/// Bytes of a copy and of the text of exposures, at most, per byte.
+const EXPOSURE_TEXT: u64 = 1 + 4;
+/// A point with its colour.
+const POINT: u64 = (size_of::<DVec3>() + 3) as u64;
+
+impl Case<'_> {
+    /// The backend of a size.
+    pub(crate) fn backend_setup(&self, size: &RunSize, needs: Needs) -> Setup {
+        Setup {
+            frozen: self.budget(size.rows).frozen,
+            near: (self.spec.start.near.0 * self.inputs.dataset.extent()) as f32,
+            tile_cap: Some(size.tile_cap),
+            record_cap: self.record_cap(size),
+            threads: self.spec.device.threads.map(|threads| threads.0 as usize),
+            largest_image: self.inputs.dataset.largest_image(),
+            photographs: self.kept_photographs(size),
+            storage: self.choices.knobs.storage,
+            shortcuts: self.choices.knobs.shortcuts,
+            needs,
+            exposures: self.choices.exposure.is_on,
+            ..Setup::new(size.rows)
+        }
+    }
+
+    /// Gradient records for two pairs in five, where pairs are counted; else for all.
+    fn record_cap(&self, size: &RunSize) -> usize {
+        match self.choices.knobs.pairs_per_row {
+            Some(_) => (size.tile_cap / 5 * 2).max(1),
+            None => usize::MAX,
+        }
+    }
+
+    /// The training images that stay on a GPU.
+    fn kept_photographs(&self, size: &RunSize) -> KeptPhotographs {
+        let train = &self.inputs.dataset.train;
+        let with_masks = train.iter().any(|view| view.source.is_masked());
+        let one = KeptPhotographs::bytes(self.inputs.dataset.largest_image(), with_masks);
+        let count = size.images_on_gpu / one.iter().sum::<u64>().max(1);
+        let count = usize::try_from(count).unwrap_or(usize::MAX);
+        KeptPhotographs { count: count.min(train.len()), with_masks }
+    }
+
+    /// All memory of a run with these needs. The solver finds the largest size by this function.
+    pub(crate) fn ledger(&self, size: &RunSize, needs: &Needs) -> Ledger {
+        let threads = self.choices.threads.max(THREADS);
+        let degree = size.sh_degree;
+        let options = self.backend_setup(size, needs.clone());
+        let mut ledger = self.inputs.device.promise(degree, &options, threads);
+        let [train, test] = self.inputs.images;
+        let held = train.held(size.image_cache);
+        ledger.add_to(Section::Images, "decoded training views", held);
+        ledger.add_to(Section::Images, "decoding", train.decoding(DECODERS));
+        if needs.least_resolution.is_some() {
+            ledger.add_to(Section::Images, "a view at a lower resolution", train.largest);
+        }
+        let budget = size.rows as u64;
+        let float = size_of::<f32>() as u64;
+        let row = float * (11 + 3 * sh_coefficients(degree) as u64);
+        // Values and moments of the exposures; the same again, as text, in a checkpoint.
+        let exposures = if self.choices.exposure.is_on {
+            Exposures::bytes(self.inputs.dataset.train.len())
+        } else {
+            0
+        };
+        if exposures > 0 {
+            ledger.add_to(Section::Model, "exposures of the views", exposures);
+        }
+        if self.inputs.track_bytes > 0 {
+            let bytes = self.inputs.track_bytes + train.held(0) + train.decoding(1);
+            ledger.add_to(Section::Before, "colours of tracks", bytes);
+        }
+        if let Some(model) = self.inputs.init_model {
+            let bytes = first_bytes(model, self, size, threads);
+            ledger.add_to(Section::Before, "the model it starts from", bytes);
+        }
+        if let Some(model) = self.inputs.frozen_model {
+            ledger.add_to(Section::Before, "the frozen model", reading_bytes(model));
+        }
+        let mut pass = |what: &str, bytes| ledger.add_to(Section::Passing, what, bytes);
+        // Points, their order, neighbours in f64, and the rows before the backend has them.
+        let first = self.rows_for(self.initial_rows(size.rows)) as u64;
+        let points =
+            self.spec.start.init_points.map_or(self.inputs.dataset.points.len(), |points| points.0)
+                as u64;
+        pass("first rows", points.max(first) * (POINT + 16) + first * (row + 96));
+        pass("a policy's event", self.event_bytes(size, needs));
+        // A piece of rows, as much again because allocators keep some freed arrays for a while, and what the
+        // writer holds.
+        let piece = budget.min(ROWS_AT_A_TIME as u64);
+        let held = PLY.held_bytes(Shape { rows: size.rows, sh_degree: degree });
+        pass("export of the model, checkpoint", 2 * piece * row + held + EXPOSURE_TEXT * exposures);
+        if let Some(companion) = self.inputs.companion {
+            let sizes = CompanionSize {
+                budget,
+                device: &self.inputs.device,
+                largest_image: self.inputs.dataset.largest_image(),
+                photograph: train.held(0).max(test.held(0))
+                    + train.decoding(1).max(test.decoding(1)),
+                views: self.inputs.dataset.train.len() + self.inputs.dataset.test.len(),
+                threads,
+            };
+            (companion.reserve)(&sizes, &mut ledger);
+        }
+        let mut pass = |what: &str, bytes| ledger.add_to(Section::Passing, what, bytes);
+        let measures_test = !self.inputs.dataset.test.is_empty();
+        if measures_test
+            || self.choices.automatic != AutoChoices::default()
+            || self.inputs.init_model.is_some()
+        {
+            let (width, height) = self.inputs.dataset.largest_image();
+            // Exposures need another copy of the colours, with the exposure that fits best.
+            let planes = if self.choices.exposure.is_on { 8 } else { 5 };
+            let rendering = u64::from(width) * u64::from(height) * planes * float;
+            let one = |images: &ImageDemand| images.held(0) + images.decoding(1);
+            let tested = if measures_test { one(&test) } else { 0 };
+            let image = tested.max(if self.inputs.init_model.is_some() { one(&train) } else { 0 });
+            // While the rows that matter least are found: the order of all rows, and their opacities twice or, after
+            // that, a plan.
+            let row = float + (2 * float).max(bytes_per_row(&Needs::default()) as u64);
+            let asked = if self.choices.automatic.rows { budget * row } else { 0 };
+            pass("measuring a view", rendering + image + scratch_bytes(width, threads) + asked);
+        }
+        let process = self.process_bytes();
+        if let Some(beyond) = self.inputs.peak.and_then(|peak| peak.checked_sub(process)) {
+            ledger.add_to(Section::Before, "loading the scene", beyond);
+        }
+        ledger.add_to(Section::Process, "program and dataset", process);
+        let stacks = threads as u64 * THREAD;
+        ledger.add_to(Section::Process, format!("up to {threads} threads"), stacks);
+        let Some(measuring) = self.measuring(size, threads) else { return ledger };
+        let counted = measuring.counted(&ledger, size.rows, degree);
+        // Measuring does not lower the number of rows: if the memory given is too little for it, it is left out.
+        match self.memory() {
+            Some(memory) if self.inputs.device.limited_bytes(&counted) > memory => ledger,
+            _ => counted,
+        }
+    }
+
+    /// The measurement at the end, if views are held out and the surface is known.
+    pub(crate) fn measuring(&self, size: &RunSize, threads: usize) -> Option<Measuring> {
+        let surface =
+            self.inputs.dataset.surface_bytes.filter(|_| !self.inputs.dataset.test.is_empty())?;
+        let options = Setup {
+            photographs: KeptPhotographs::default(),
+            // Nothing is trained, so moments may be small.
+            storage: Storage { moments: MomentStorage::Both8, ..Storage::default() },
+            shortcuts: Shortcuts::default(),
+            ..self.backend_setup(size, geometry::needs())
+        };
+        let (device, views) = (self.inputs.device.clone(), self.inputs.dataset.test.len());
+        Some(Measuring { device, options, threads, surface, views })
+    }
+
+    /// Bytes of signals on the host, of the plan, and of what the policy derives from the signals.
+    fn event_bytes(&self, size: &RunSize, needs: &Needs) -> u64 {
+        let float = size_of::<f32>() as u64;
+        let candidate = size_of::<densify_policies::policy::Candidate>() as u64;
+        let seed = size_of::<densify_policies::plan::Seed>() as u64;
+        // The native backend lends its own memory for signals.
+        let signals = self.inputs.device.columns_on_host(needs.signals.width()) as u64;
+        // One auxiliary view's columns, and as many that a policy derives from them; all views' points.
+        let aux = needs.aux.as_ref();
+        let columns = aux.map_or(0, |request| 2 * request.columns.len()) as u64;
+        let points = aux.map_or(0, |request| u64::from(request.points));
+        // The policy keeps a point, makes a seed of it, and compiles the seed.
+        let plan = bytes_per_row(needs) as u64;
+        size.rows as u64 * ((signals + columns) * float + plan + PLANNING)
+            + points * self.inputs.dataset.train.len() as u64 * (candidate + 3 * seed)
+    }
+
+    /// Bytes of the program and the dataset that have no other line in the ledger. The number does not depend on what
+    /// else the process has done, unless it takes more than expected.
+    fn process_bytes(&self) -> u64 {
+        let Dataset { train, test, points, .. } = &self.inputs.dataset;
+        let views = train.iter().chain(test);
+        let rendered = |view: &View| view.source.rendered.as_ref().map_or(0, |image| image.bytes());
+        // A view's name and path, in the dataset and again for its images.
+        let view = |view: &View| (3 * size_of::<View>() + 512) as u64 + rendered(view);
+        let expected = PROGRAM + views.map(view).sum::<u64>() + points.len() as u64 * POINT;
+        let program = match self.inputs.resident {
+            Some(resident) if resident > expected => resident.next_multiple_of(PROGRAM_STEP),
+            _ => expected,
+        };
+        program + KEPT
+    }
+
+    /// Bytes of all training images decoded.
+    pub(super) fn all_images(&self) -> u64 {
+        self.inputs.images[0].all
+    }
+}

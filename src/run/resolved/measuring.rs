@@ -1,0 +1,54 @@
+//! Measuring the finished model against a known surface: the backend that does it, and the memory that it takes.
+
+use densify_core::memory::{Ledger, Section};
+use densify_render::{Device, Setup};
+use densify_train::metrics::geometry;
+
+/// A measurement of a model in a scene whose surface is known.
+#[derive(Debug, Clone)]
+pub(crate) struct Measuring {
+    pub(crate) device: Device,
+    /// Setup of the backend, for any number of rows.
+    pub(crate) options: Setup,
+    /// Threads that measure.
+    pub(crate) threads: usize,
+    /// Memory of the known surface `[bytes]`.
+    pub(crate) surface: u64,
+    /// Number of views held out.
+    pub(crate) views: usize,
+}
+
+impl Measuring {
+    /// The ledger of training with the memory of measuring a model of this many rows after it.
+    pub(super) fn counted(&self, training: &Ledger, rows: usize, sh_degree: u8) -> Ledger {
+        let mut counted = training.clone();
+        let [host, device] = self.bytes(rows, sh_degree);
+        // The device's memory is that of training; what is beyond it would come on top.
+        let beyond = device.saturating_sub(training.on_device());
+        counted.add_to(Section::After, "measuring geometry", host + beyond);
+        counted
+    }
+
+    /// Memory of measuring besides the process, on the host and on the device `[bytes]`.
+    pub(crate) fn bytes(&self, rows: usize, sh_degree: u8) -> [u64; 2] {
+        let options = self.for_rows(rows);
+        let promise = self.device.promise(sh_degree, &options, self.threads);
+        let geometry = geometry::bytes(rows, sh_degree, options.largest_image, self.views);
+        [promise.on_host() + geometry + self.surface, promise.on_device()]
+    }
+
+    /// The backend for a model of this many rows.
+    pub(crate) fn for_rows(&self, rows: usize) -> Setup {
+        let rows = rows.max(1);
+        // A view rarely has more pairs; it is rendered in bands then, with the same result.
+        let pairs = rows.saturating_mul(3).min(self.device.most_pairs(&self.options.needs));
+        let cap = self.options.tile_cap.map_or(pairs, |cap| cap.min(pairs));
+        Setup {
+            budget: rows,
+            tile_cap: Some(cap.max(rows)),
+            // Nothing is differentiated.
+            record_cap: rows,
+            ..self.options.clone()
+        }
+    }
+}

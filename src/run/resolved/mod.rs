@@ -1,0 +1,103 @@
+//! A run with everything decided. [`Inputs`] are what it reads; a [`Case`] is a description with these and with the
+//! choices that do not depend on its size; a [`ResolvedRun`] has its size, too. The ledger is a function of inputs,
+//! choices and size. Nothing is written.
+
+mod case;
+mod config;
+mod degree;
+mod estimate;
+mod exposure;
+mod fit;
+mod inputs;
+mod ledger;
+mod measuring;
+mod models;
+mod plan;
+mod remedy;
+mod size;
+#[cfg(test)]
+mod tests;
+mod training;
+
+pub(crate) use case::{Case, DECODERS, Init, TEST_DECODERS};
+#[cfg(test)]
+pub(crate) use config::tests::sample;
+pub use config::{DegreeSource, ExposureSource, Findings, ModelSize, RunConfig};
+pub use estimate::{estimate, host_bytes};
+pub(crate) use fit::RunSize;
+pub(crate) use measuring::Measuring;
+pub(crate) use models::{measuring_setup, read};
+pub use plan::{Alternatives, Plan, plan};
+pub use size::DEFAULT_BUDGET;
+pub(crate) use training::ResolvedTraining;
+
+use crate::failure::Failure;
+use crate::host::Host;
+use crate::spec::RunSpec;
+use size::Size;
+
+/// A run with everything decided, before the model that it starts from is made.
+pub(crate) struct ResolvedRun<'a> {
+    pub(crate) case: Case<'a>,
+    /// Rows, degree, tile lists and image cache.
+    pub(crate) size: RunSize,
+    /// The first Gaussians.
+    pub(crate) init: Init,
+    /// `--memory` made the degree lower than was wanted.
+    pub(crate) degree_lowered: bool,
+    /// Why the run has this size, and what the colours of the scene decided: lines for the user.
+    pub(crate) reasons: Vec<String>,
+}
+
+impl<'a> ResolvedRun<'a> {
+    /// Resolves a new run.
+    ///
+    /// # Errors
+    /// When options contradict each other, something cannot be opened, or no model fits.
+    pub(crate) fn anew(spec: &'a RunSpec, host: Host<'_>) -> Result<Self, Failure> {
+        let case = Case::anew(spec, host)?;
+        let size = Size::choose(&case)?;
+        let degree_lowered = size.is_lowered(&case);
+        Ok(Self::new(case, &size, degree_lowered, host))
+    }
+
+    /// Resolves a run that goes on, as `saved` had decided. `spec` is the saved description with the options given
+    /// now. Only a checkpoint has the exposures that photographs begin with; without one they are found again.
+    ///
+    /// # Errors
+    /// As [`anew`](Self::anew).
+    pub(crate) fn from_saved(
+        spec: &'a RunSpec,
+        saved: &RunConfig,
+        has_checkpoint: bool,
+        host: Host<'_>,
+    ) -> Result<Self, Failure> {
+        let case = Case::from_saved(spec, saved, has_checkpoint, host)?;
+        let size = Size::as_given(&case)?;
+        Ok(Self::new(case, &size, saved.resolved.sh_degree_lowered, host))
+    }
+
+    /// Resolves a run whose models of `--init` and `--freeze` do not exist yet, to know what it takes. Exposures count
+    /// where they may be learned.
+    ///
+    /// # Errors
+    /// As [`anew`](Self::anew).
+    pub(crate) fn for_estimate(
+        spec: &'a RunSpec,
+        models: [Option<ModelSize>; 2],
+        host: Host<'_>,
+    ) -> Result<Self, Failure> {
+        let case = Case::for_estimate(spec, models, host)?;
+        let size = Size::choose(&case)?;
+        let degree_lowered = size.is_lowered(&case);
+        Ok(Self::new(case, &size, degree_lowered, host))
+    }
+
+    fn new(case: Case<'a>, size: &Size, degree_lowered: bool, host: Host<'_>) -> Self {
+        let spelling = host.observer.spelling();
+        let colours = case.choices.lines(spelling);
+        let reasons = colours.chain(size.lines(&case, spelling)).collect();
+        let init = case.first_rows(size.setting.rows);
+        Self { init, size: size.setting, degree_lowered, reasons, case }
+    }
+}

@@ -1,0 +1,93 @@
+//! Sizes of the models that a run starts from, and the memory that reading them takes.
+
+use std::path::Path;
+
+use super::case::Case;
+use super::config::ModelSize;
+use super::fit::RunSize;
+use crate::failure::{Failure, ModelProblem};
+use crate::models::{model_file, read_model};
+use crate::observer::Observer;
+use densify_core::gaussians::{Gaussians, sh_coefficients};
+use densify_render::{MomentStorage, Setup, Storage};
+use densify_train::importance::needs;
+
+/// Pairs per row while importance is measured; views with more are rendered in bands.
+const PAIRS_PER_ROW: usize = 3;
+
+/// Rows and degree of the model in a file. Reads all of it, so that a damaged file is found before anything is decided.
+///
+/// # Errors
+/// When the file holds no model, or one without rows. Names the option.
+pub(super) fn size_of_model(
+    option: &'static str,
+    file: &Path,
+    observer: &dyn Observer,
+) -> Result<ModelSize, Failure> {
+    let model = read(option, file, observer)?;
+    if model.is_empty() {
+        return Err(ModelProblem::EmptyModel { option, file: file.to_owned() }.into());
+    }
+    Ok(ModelSize { rows: model.len(), sh_degree: model.sh_degree })
+}
+
+/// Reads the model that an option names; errors name the option.
+pub(crate) fn read(
+    option: &'static str,
+    file: &Path,
+    observer: &dyn Observer,
+) -> Result<Gaussians, Failure> {
+    read_model(file, observer).map_err(|failure| {
+        let failure = failure.within_option(option, None);
+        match model_file(file, None) {
+            // The folder of a run.
+            Ok(model) if model != file => failure.with(ModelProblem::ModelOfRun { file: model }),
+            _ => failure,
+        }
+    })
+}
+
+/// Bytes of a model's rows as they are read.
+fn bytes_of(model: ModelSize) -> u64 {
+    (model.rows * size_of::<f32>() * (11 + 3 * sh_coefficients(model.sh_degree))) as u64
+}
+
+/// Bytes that reading a model takes, into arrays that grow.
+pub(super) fn reading_bytes(model: ModelSize) -> u64 {
+    3 * bytes_of(model)
+}
+
+/// Bytes that the model of `--init` takes before the run has its own rows: as it is read, or while its importance is
+/// measured because it exceeds the budget.
+pub(super) fn first_bytes(
+    model: ModelSize,
+    case: &Case<'_>,
+    size: &RunSize,
+    threads: usize,
+) -> u64 {
+    let reading = reading_bytes(model);
+    if model.rows <= case.budget(size.rows).trainable() {
+        return reading;
+    }
+    let setup = measuring_setup(model.rows, case, size);
+    let backend = case.inputs.device.promise(model.sh_degree, &setup, threads).on_host();
+    let [train, _] = case.inputs.images;
+    let image = train.held(0) + train.decoding(1);
+    // The model beside its copy in the backend, then beside the rows that are kept.
+    reading.max(bytes_of(model) + backend + image + densify_train::importance::bytes(model.rows))
+}
+
+/// The backend that measures the importance of this many rows.
+pub(crate) fn measuring_setup(rows: usize, case: &Case<'_>, size: &RunSize) -> Setup {
+    let needs = needs();
+    let pairs = rows.saturating_mul(PAIRS_PER_ROW).min(case.inputs.device.most_pairs(&needs));
+    Setup {
+        budget: rows,
+        frozen: 0,
+        tile_cap: Some(pairs.max(rows)),
+        // Nothing is differentiated, and no moment matters.
+        record_cap: rows,
+        storage: Storage { moments: MomentStorage::Both8, ..Storage::default() },
+        ..case.backend_setup(size, needs)
+    }
+}

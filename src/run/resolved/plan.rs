@@ -1,0 +1,108 @@
+//! `densify plan`: the size and memory of a run, and alternatives to them.
+
+use std::fmt;
+
+use super::ResolvedRun;
+use super::case::Case;
+use super::size::{self, MIB, RESOLUTIONS};
+use crate::failure::Failure;
+use crate::host::Host;
+use crate::spec::{ByteCount, RunSpec};
+use densify_core::memory::Ledger;
+use densify_core::numbers::grouped;
+use densify_core::spelling::Spelling;
+use densify_data::dataset::Resolution;
+
+/// The size and memory of a run.
+#[derive(Debug, Clone)]
+pub struct Plan {
+    /// Bytes per buffer.
+    pub ledger: Ledger,
+    /// The size with the reasons for it, and the ledger, for the user.
+    pub lines: Vec<String>,
+    /// Other sizes that fit the same memory.
+    pub alternatives: Alternatives,
+}
+
+/// Rows that a memory holds, by degree and by size of the images.
+#[derive(Debug, Clone)]
+pub struct Alternatives {
+    /// The memory `[bytes]`.
+    pub memory: u64,
+    /// `--resolution`, and width and height of the largest image `[px]`.
+    pub images: Vec<(u32, (u32, u32))>,
+    /// Rows at each degree and each size of the images; `None` if none fit.
+    pub rows: Vec<Vec<Option<usize>>>,
+}
+
+/// Resolves a run without training or writing anything.
+///
+/// # Errors
+/// As preparing the run.
+pub fn plan(spec: &RunSpec, host: Host<'_>) -> Result<Plan, Failure> {
+    let ResolvedRun { case, size, mut reasons, .. } = ResolvedRun::anew(spec, host)?;
+    let ledger = case.ledger(&size, &case.needs(size.rows)?);
+    reasons.push(case.promise(&ledger, host.observer.spelling()));
+    let limited = case.inputs.device.limited_bytes(&ledger);
+    let memory = case.memory().unwrap_or(limited.next_multiple_of(MIB));
+    let alternatives = alternatives(&case, memory, size.rows)?;
+    Ok(Plan { ledger, lines: reasons, alternatives })
+}
+
+/// Sizes of this run that fit `memory` without `--budget`. As few as `planned` rows count as a useful model.
+fn alternatives(case: &Case<'_>, memory: u64, planned: usize) -> Result<Alternatives, Failure> {
+    let own = case.spec.data.resolution.unwrap_or(Resolution::Divisor(1));
+    let mut resolutions = vec![own];
+    resolutions.extend(RESOLUTIONS.into_iter().filter(|&other| other != own));
+    resolutions.sort_by_key(|resolution| match resolution {
+        Resolution::Width(_) => 0,
+        Resolution::Divisor(divisor) => *divisor,
+    });
+    let specs = resolutions.into_iter().map(|resolution| {
+        let mut spec = case.spec.clone();
+        spec.size.memory = Some(ByteCount(memory));
+        spec.data.resolution =
+            Some(resolution).filter(|_| resolution != own).or(spec.data.resolution);
+        (resolution, spec)
+    });
+    let specs: Vec<(Resolution, RunSpec)> = specs.collect();
+    // A size is left out if there are no images of it.
+    let at = |(resolution, spec)| Some((resolution, case.with(spec).ok()?));
+    let all: Vec<(&Resolution, Case<'_>)> =
+        specs.iter().filter_map(|(resolution, spec)| at((resolution, spec))).collect();
+    let rows_at = |degree| {
+        let at = |(_, case): &(_, Case<'_>)| size::rows_at(case, memory, degree, planned);
+        all.iter().map(at).collect()
+    };
+    Ok(Alternatives {
+        memory,
+        images: all
+            .iter()
+            .map(|(resolution, case)| (resolution.number(), case.inputs.dataset.largest_image()))
+            .collect(),
+        rows: (0..=3).map(rows_at).collect::<Result<_, _>>()?,
+    })
+}
+
+impl fmt::Display for Alternatives {
+    /// A table for a terminal.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        // In a form that can be typed, without rounding.
+        let memory = match self.memory % MIB {
+            0 => format!("{}MiB", self.memory / MIB),
+            _ => self.memory.to_string(),
+        };
+        let memory = Spelling::Terminal.text("memory", memory);
+        write!(f, "Gaussians that {memory} holds\n  {:<11}", "")?;
+        for (resolution, (width, height)) in &self.images {
+            write!(f, "{:>22}", format!("-r {resolution} ({width}x{height})"))?;
+        }
+        for (degree, rows) in self.rows.iter().enumerate() {
+            write!(f, "\n  degree {degree:<4}")?;
+            for rows in rows {
+                write!(f, "{:>22}", rows.map_or_else(|| "none".to_owned(), grouped))?;
+            }
+        }
+        Ok(())
+    }
+}

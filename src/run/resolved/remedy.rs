@@ -1,0 +1,93 @@
+//! Changes of the options that make a run fit, each tried, the cheapest first.
+
+use super::case::Case;
+use super::size::MIB;
+use crate::failure::{Failure, Remedy};
+use crate::spec::knobs::DEFAULT_PRESET;
+use crate::spec::{Budget, ByteCount, ImageCache, Partial, Rows, RunSpec, ShDegree};
+use densify_data::dataset::Resolution;
+use densify_render::BackendKind;
+
+/// The preset for runs that are short of memory.
+const SMALL: &str = "tiny-memory";
+
+impl Remedy {
+    /// Changes of a new run, the cheapest first: time, then view-dependent colours, then detail.
+    pub(super) const NEW: [Self; 7] = [
+        Self::NoImages,
+        Self::NoTileCap,
+        Self::Preset(SMALL),
+        Self::LeastDegree,
+        Self::Shrink(2),
+        Self::Shrink(4),
+        Self::Shrink(8),
+    ];
+
+    /// The description with this change; `None` if it changes nothing.
+    fn apply(self, spec: &RunSpec, kind: BackendKind) -> Option<RunSpec> {
+        let mut new = spec.clone();
+        let size = &mut new.size;
+        match self {
+            Self::NoImages => size.image_cache = Some(ImageCache::Bytes(0)),
+            Self::NoTileCap => size.tile_cap = None,
+            Self::TileCap(pairs) => size.tile_cap = Some(Rows(pairs)),
+            Self::Preset(name) => {
+                new = with_preset(name, spec).filter(|_| kind == BackendKind::Cpu)?;
+            }
+            Self::LeastDegree => {
+                let is_fixed = size.full || matches!(size.sh_degree, Some(ShDegree::Fixed(_)));
+                size.sh_degree = is_fixed.then_some(ShDegree::Fixed(0)).or(size.sh_degree);
+            }
+            Self::Shrink(divisor) => new.data.resolution = Some(Resolution::Divisor(divisor)),
+            Self::Memory(mib) => size.memory = Some(ByteCount(mib * MIB)),
+            Self::Budget(rows) => size.budget = Some(Budget::Rows(rows)),
+        }
+        (new != *spec).then_some(new)
+    }
+}
+
+/// The same run with another preset in place of its own; other options stay.
+fn with_preset(preset: &str, spec: &RunSpec) -> Option<RunSpec> {
+    let own = spec.schedule.preset.as_deref().unwrap_or(DEFAULT_PRESET);
+    let (own, defaults) = (Partial::preset(own).ok()?, Partial::all(&RunSpec::default()).ok()?);
+    let all = Partial::all(spec).ok()?;
+    let is_given = |name: &str| {
+        let value = all.get(name);
+        name != "preset" && value != defaults.get(name) && value != own.get(name)
+    };
+    let given = Partial::given(spec, is_given).ok()?;
+    Partial::option("preset", preset).over(given).describe().ok()
+}
+
+/// The changes after which the run `fits`, each alone; or else the fewest of them together. Of smaller photographs only
+/// the largest that fit are named.
+pub(super) fn remedies(
+    case: &Case<'_>,
+    base: &RunSpec,
+    changes: &[Remedy],
+    fits: impl Fn(&Case<'_>) -> Result<bool, Failure>,
+) -> Vec<Vec<Remedy>> {
+    let kind = case.inputs.device.kind();
+    // A change that cannot be tried is no remedy.
+    let is_remedy = |spec: &RunSpec| case.with(spec).and_then(|case| fits(&case)).unwrap_or(false);
+    let shrinks = |change: &Remedy| matches!(change, Remedy::Shrink(_));
+    let mut found = Vec::new();
+    let mut together = (Vec::new(), base.clone());
+    let (mut is_shrunk, mut joint) = (false, None);
+    for &change in changes {
+        let alone = change.apply(base, kind).filter(|_| !(shrinks(&change) && is_shrunk));
+        if alone.is_some_and(|spec| is_remedy(&spec)) {
+            found.push(vec![change]);
+            is_shrunk |= shrinks(&change);
+        }
+        if let Some(spec) = change.apply(&together.1, kind) {
+            together.0.retain(|other| !(shrinks(&change) && shrinks(other)));
+            together.0.push(change);
+            together.1 = spec;
+            if found.is_empty() && joint.is_none() && is_remedy(&together.1) {
+                joint = Some(together.0.clone());
+            }
+        }
+    }
+    if found.is_empty() { joint.into_iter().collect() } else { found }
+}

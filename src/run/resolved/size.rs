@@ -1,0 +1,315 @@
+//! The size of a run: as the options say, or solved for `--memory`.
+
+use super::ResolvedRun;
+use super::case::{Case, DECODERS, TEST_DECODERS};
+use super::fit::{Fit, IMAGES, PAIRS, RunSize, SizeRequest, fit, min_memory, most_within};
+use super::remedy::remedies;
+use crate::failure::notes::{self, BudgetReason};
+use crate::failure::{DEVICE, Failure, Remedy as Change, SizeProblem};
+use crate::process::{MemoryLimit, ProcessMemory};
+use crate::spec::{Budget, ByteCount, ImageCache};
+use densify_core::memory::{Bytes, Ledger};
+use densify_core::numbers::grouped;
+use densify_core::spelling::Spelling;
+use densify_data::dataset::Resolution;
+use densify_render::BackendKind;
+
+/// Most rows without `--budget`: trains on a laptop in well under 2 GiB, and is enough for a room or an object; large
+/// outdoor scenes need more.
+pub const DEFAULT_BUDGET: usize = 200_000;
+/// Memory for decoded photographs without `--image-cache` `[bytes]`.
+const DEFAULT_IMAGE_CACHE: u64 = 1 << 30;
+/// (Row, tile) pairs per row of the budget without `--memory`.
+const PAIRS_PER_ROW: usize = 16;
+/// Fewest trained rows of a useful model, unless fewer are asked for.
+pub(super) const LEAST_ROWS: usize = 1_000;
+/// Memory in messages is rounded up to this `[bytes]`.
+pub(super) const MIB: u64 = 1 << 20;
+/// Image sizes that `densify plan` shows as alternatives.
+pub(super) const RESOLUTIONS: [Resolution; 3] =
+    [Resolution::Divisor(1), Resolution::Divisor(2), Resolution::Divisor(4)];
+
+/// The size of a run.
+pub(super) struct Size {
+    pub(super) setting: RunSize,
+    /// The memory given, and the solution for it.
+    solved: Option<(u64, Fit)>,
+}
+
+impl Size {
+    /// As the options say.
+    pub(super) fn as_given(case: &Case<'_>) -> Result<Self, Failure> {
+        let rows = case.asked_budget().unwrap_or(DEFAULT_BUDGET);
+        let most = most_pairs(case, rows)?;
+        let per_row = case.choices.knobs.pairs_per_row.unwrap_or(PAIRS_PER_ROW);
+        let pairs = rows.saturating_mul(per_row).min(most);
+        let mut setting = RunSize {
+            rows,
+            sh_degree: case.choices.degree.highest(),
+            tile_cap: case.tile_cap().unwrap_or(pairs).max(rows),
+            image_cache: 0,
+            images_on_gpu: 0,
+        };
+        setting.image_cache = match case.spec.size.image_cache {
+            None => DEFAULT_IMAGE_CACHE,
+            Some(ImageCache::Bytes(bytes)) => bytes,
+            // An eighth of the total, which includes the images.
+            Some(ImageCache::Auto) => {
+                let rest = case.ledger(&setting, &case.needs(rows)?).on_host();
+                (rest / (IMAGES - 1)).min(DEFAULT_IMAGE_CACHE).min(case.all_images())
+            }
+        };
+        let share = case.memory().map_or(u64::MAX, |memory| memory / IMAGES);
+        setting.images_on_gpu = case.image_cache().unwrap_or(DEFAULT_IMAGE_CACHE).min(share);
+        Ok(Self { setting, solved: None })
+    }
+
+    /// As the options say, or as large as `--memory` allows.
+    ///
+    /// # Errors
+    /// When nothing fits, with changes of the options after which it does.
+    pub(super) fn choose(case: &Case<'_>) -> Result<Self, Failure> {
+        match (solve(case)?, case.memory()) {
+            (Some(size), _) if case.budget(size.setting.rows).trainable() == 0 => {
+                let budget = case.budget(size.setting.rows);
+                Err(SizeProblem::FreezeFillsBudget { frozen: budget.frozen, budget: budget.total }
+                    .into())
+            }
+            (Some(size), _) => Ok(size),
+            (None, memory) => Err(too_little(case, &request(case, memory.unwrap_or(0))?)?),
+        }
+    }
+
+    /// True if memory made the degree lower than was wanted.
+    pub(super) fn is_lowered(&self, case: &Case<'_>) -> bool {
+        self.setting.sh_degree < case.choices.degree.highest()
+    }
+
+    /// The size and the reason for it, for the user.
+    pub(super) fn lines(&self, case: &Case<'_>, spelling: Spelling) -> Vec<String> {
+        let RunSize { rows, sh_degree, tile_cap, image_cache, .. } = self.setting;
+        let Some((memory, fit)) = &self.solved else {
+            let reason = match case.spec.size.budget {
+                None => BudgetReason::Default,
+                Some(Budget::Auto(_)) => BudgetReason::Automatic,
+                Some(Budget::Rows(_)) => BudgetReason::Given,
+            };
+            return vec![notes::budget(spelling, rows, &reason)];
+        };
+        let memory = *memory;
+        let reason = match case.asked_budget() {
+            Some(given) if fit.by_memory => BudgetReason::LessThanGiven { memory, given },
+            Some(_) => BudgetReason::AsGiven { memory },
+            None if fit.by_memory => BudgetReason::Memory { memory },
+            None => BudgetReason::Device,
+        };
+        let mut lines = vec![notes::budget(spelling, rows, &reason)];
+        let memory = Bytes(memory);
+        lines.push(format!(
+            "memory   {memory} given: degree {sh_degree}, {} (Gaussian, tile) pairs, images {}",
+            grouped(tile_cap),
+            match case.all_images() {
+                all if image_cache >= all => format!("all held decoded ({})", Bytes(all)),
+                all => format!(
+                    "{} of {} held decoded, the rest streams",
+                    Bytes(image_cache),
+                    Bytes(all)
+                ),
+            }
+        ));
+        let wanted = case.choices.degree.highest();
+        if self.is_lowered(case) {
+            let start = case.start().unwrap_or(LEAST_ROWS);
+            let degrees = [sh_degree, wanted];
+            lines.push(notes::degree_lowered(spelling, degrees, fit.at_wanted_degree, start));
+        }
+        lines
+    }
+}
+
+impl Case<'_> {
+    /// The ledger, and the rest of `--memory`, for the user.
+    pub(crate) fn promise(&self, ledger: &Ledger, spelling: Spelling) -> String {
+        let left = self
+            .memory()
+            .map(|memory| memory.saturating_sub(self.inputs.device.limited_bytes(ledger)));
+        let left = left.map_or_else(String::new, |left| notes::memory_left(spelling, left));
+        format!("memory promised\n{ledger}{left}")
+    }
+
+    /// Fewest rows of a useful model, unless fewer are asked for.
+    fn least_rows(&self) -> usize {
+        self.rows_for(LEAST_ROWS)
+    }
+
+    /// The budget, if it is a number.
+    fn asked_budget(&self) -> Option<usize> {
+        self.spec.size.budget.and_then(Budget::most)
+    }
+
+    pub(super) fn memory(&self) -> Option<u64> {
+        self.spec.size.memory.map(|bytes| bytes.0)
+    }
+
+    fn tile_cap(&self) -> Option<usize> {
+        self.spec.size.tile_cap.map(|pairs| pairs.0)
+    }
+
+    /// Bytes of decoded photographs, if a number is given.
+    fn image_cache(&self) -> Option<u64> {
+        match self.spec.size.image_cache? {
+            ImageCache::Bytes(bytes) => Some(bytes),
+            ImageCache::Auto => None,
+        }
+    }
+}
+
+impl ResolvedRun<'_> {
+    /// Fails if the run would take more than `--memory`. A size that was solved for it cannot, but a run that goes on
+    /// may have new tile lists and a new image cache.
+    pub(crate) fn check_memory(&self, ledger: &Ledger) -> Result<(), Failure> {
+        let Self { case, size, .. } = self;
+        let needed = case.inputs.device.limited_bytes(ledger);
+        let Some(memory) = case.memory().filter(|memory| needed > *memory) else { return Ok(()) };
+        let fits = |pairs: usize| {
+            let size = RunSize { tile_cap: pairs, ..*size };
+            Ok::<_, Failure>(bytes(case, &size)? <= memory)
+        };
+        let pairs = most_within(size.rows, size.tile_cap, fits)?.unwrap_or(size.rows);
+        let changes = [Change::NoImages, Change::TileCap(pairs)];
+        let remedies = remedies(case, case.spec, &changes, |case| {
+            Ok(bytes(case, &Size::as_given(case)?.setting)? <= memory)
+        });
+        Err(SizeProblem::OverMemory { memory, needed, remedies }.into())
+    }
+
+    /// Fails if the system does not grant this process the memory of the run.
+    pub(crate) fn check_grant(
+        &self,
+        process: ProcessMemory,
+        is_resumed: bool,
+    ) -> Result<(), Failure> {
+        let Self { case, size, .. } = self;
+        let ledger = case.ledger(size, &case.needs(size.rows)?);
+        let granted = (process.grant)(case.choices.threads + DECODERS + TEST_DECODERS);
+        let (Some(MemoryLimit { left, by }), Some(now)) = (granted, (process.resident)()) else {
+            return Ok(());
+        };
+        let more = ledger.on_host().saturating_sub(now);
+        if more <= left {
+            return Ok(());
+        }
+        // Not all: the grant varies from call to call.
+        let most = (now + left) / 64 * 63;
+        let on_host = |case: &Case<'_>| {
+            let Some(Size { setting, .. }) = solve(case)? else { return Ok(false) };
+            let ledger = case.ledger(&setting, &case.needs(setting.rows)?);
+            Ok::<_, Failure>(ledger.on_host() <= most)
+        };
+        let mut base = case.spec.clone();
+        let mut found = Vec::new();
+        if !is_resumed && case.inputs.device.kind() == BackendKind::Cpu {
+            // On a GPU it would limit the device's memory.
+            let less = Change::Memory(most / MIB);
+            base.size.memory = Some(ByteCount(most / MIB * MIB));
+            let fits = case.with(&base).and_then(|case| on_host(&case)).unwrap_or(false);
+            found = if fits {
+                vec![vec![less]]
+            } else {
+                let mut found = remedies(case, &base, &Change::NEW, on_host);
+                found.iter_mut().for_each(|changes| changes.insert(0, less));
+                found
+            };
+        } else if !is_resumed {
+            found = remedies(case, &base, &Change::NEW, on_host);
+        }
+        let needed = ledger.on_host();
+        let problem =
+            SizeProblem::OverGrant { needed, resident: now, limit: by, left, remedies: found };
+        Err(Failure::with_code(DEVICE, problem))
+    }
+}
+
+/// The size of a run as the options say, or as large as `--memory` allows; `None` if nothing fits.
+///
+/// # Errors
+/// When options contradict each other.
+pub(super) fn solve(case: &Case<'_>) -> Result<Option<Size>, Failure> {
+    if let (Some(cap), Some(pairs)) = (case.tile_cap(), case.choices.knobs.pairs_per_row) {
+        return Err(SizeProblem::TileCapConflict { cap, pairs }.into());
+    }
+    let Some(memory) = case.memory() else {
+        return Size::as_given(case).map(Some);
+    };
+    let fit = fit(&request(case, memory)?, |setting| bytes(case, setting))?;
+    Ok(fit.map(|fit| Size { setting: fit.setting, solved: Some((memory, fit)) }))
+}
+
+/// The rows that fit in `memory` at a degree if nothing else limits them; fewer than [`LEAST_ROWS`] only if as few were
+/// planned.
+pub(super) fn rows_at(
+    case: &Case<'_>,
+    memory: u64,
+    sh_degree: u8,
+    planned: usize,
+) -> Result<Option<usize>, Failure> {
+    let request = SizeRequest {
+        sh_degree: sh_degree..=sh_degree,
+        least_rows: case.least_rows().min(planned),
+        most_rows: case.inputs.device.largest_budget(sh_degree),
+        ..request(case, memory)?
+    };
+    let fit = fit(&request, |setting| bytes(case, setting))?;
+    Ok(fit.map(|fit| fit.setting.rows))
+}
+
+/// Bytes of a run of this size that `--memory` limits.
+fn bytes(case: &Case<'_>, setting: &RunSize) -> Result<u64, Failure> {
+    let needs = case.needs(setting.rows)?;
+    Ok(case.inputs.device.limited_bytes(&case.ledger(setting, &needs)))
+}
+
+fn request(case: &Case<'_>, memory: u64) -> Result<SizeRequest, Failure> {
+    let degrees = case.choices.degree.range.clone();
+    let possible = case.inputs.device.largest_budget(*degrees.end());
+    Ok(SizeRequest {
+        memory,
+        least_rows: case.least_rows(),
+        enough_rows: case.rows_for(case.start().unwrap_or(LEAST_ROWS)),
+        most_rows: case.asked_budget().map_or(possible, |budget| budget.min(possible)),
+        sh_degree: degrees,
+        tile_cap: case.tile_cap(),
+        pairs: case.choices.knobs.pairs_per_row.map_or(PAIRS, |pairs| [pairs; 3]),
+        most_pairs: most_pairs(case, case.least_rows())?,
+        // Host memory, while the limit is the device's.
+        image_cache: match case.inputs.device.kind() {
+            BackendKind::Gpu => Some(case.image_cache().unwrap_or(DEFAULT_IMAGE_CACHE)),
+            BackendKind::Cpu => case.image_cache(),
+        },
+        most_images: DEFAULT_IMAGE_CACHE,
+        all_images: case.all_images(),
+    })
+}
+
+/// Most (row, tile) pairs that the backend can hold at a time.
+fn most_pairs(case: &Case<'_>, rows: usize) -> Result<usize, Failure> {
+    Ok(case.inputs.device.most_pairs(&case.needs(rows)?))
+}
+
+/// The error if not even the smallest model fits: the memory that it takes, and changes that make it fit, each tried.
+fn too_little(case: &Case<'_>, request: &SizeRequest) -> Result<Failure, Failure> {
+    let rows = case.least_rows().min(request.most_rows);
+    let degree = *request.sh_degree.start();
+    let memory = request.memory;
+    let Some(least) = min_memory(request, MIB, |setting| bytes(case, setting))? else {
+        return Ok(SizeProblem::NoSize { memory }.into());
+    };
+    let mut remedies = remedies(case, case.spec, &Change::NEW, |case| Ok(solve(case)?.is_some()));
+    let fewer = SizeRequest { least_rows: case.rows_for(1), ..request.clone() };
+    if let Some(fewer) = fit(&fewer, |setting| bytes(case, setting))? {
+        remedies.push(vec![Change::Budget(fewer.setting.rows)]);
+    }
+    let needed = least / MIB;
+    remedies.push(vec![Change::Memory(needed)]);
+    Ok(SizeProblem::NoModelFits { memory, rows, sh_degree: degree, needed, remedies }.into())
+}

@@ -1,0 +1,177 @@
+//! Sizes and bytes are one function in both directions: what a number of rows takes holds as many, and what
+//! a memory holds takes no more.
+
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+
+use densify_policies::plan::bytes_per_row;
+use proptest::prelude::*;
+
+use super::size;
+use super::*;
+use crate::process::ProcessMemory;
+use crate::spec::knobs::{PRESETS, Preset};
+use crate::spec::{Budget, ByteCount, Partial};
+use densify_core::memory::Section;
+use densify_fixtures::Made;
+use densify_policies::policy::Needs;
+use densify_render::gpu::adapters;
+
+/// A run of these options.
+fn described(options: &[(&str, toml::Value)]) -> RunSpec {
+    let lay = |all: Partial, (name, value): &(&str, toml::Value)| {
+        Partial::option(name, value.clone()).over(all)
+    };
+    options.iter().fold(Partial::default(), lay).describe().expect("a run")
+}
+
+/// Rows of a run, and its bytes that `--memory` limits.
+fn sized(case: &Case<'_>) -> (usize, u64) {
+    let setting = size::solve(case).expect("it is solved").expect("it fits").setting;
+    let ledger = case.ledger(&setting, &case.needs(setting.rows).expect("needs"));
+    (setting.rows, case.inputs.device.limited_bytes(&ledger))
+}
+
+fn check(case: &Case<'_>, rows: usize) -> Result<(), TestCaseError> {
+    let rows = rows.min(case.inputs.device.largest_budget(case.choices.degree.highest()));
+    let sized_for = |budget, memory| {
+        let mut spec = case.spec.clone();
+        spec.size.budget = Some(Budget::Rows(budget));
+        spec.size.memory = memory;
+        sized(&case.with(&spec).expect("a scene"))
+    };
+    let (_, bytes) = sized_for(rows, None);
+    for degree in 0..=case.choices.degree.highest() {
+        let held = size::rows_at(case, bytes, degree, rows).expect("it is solved");
+        prop_assert!(held >= Some(rows), "{rows} rows take {bytes}, which hold {held:?}");
+    }
+    for memory in [bytes, bytes + bytes / 3] {
+        let open = size::rows_at(case, memory, 3, rows).expect("it is solved").expect("it fits");
+        for asked in [rows, open] {
+            let (found, taken) = sized_for(asked, Some(ByteCount(memory)));
+            prop_assert!(taken <= memory, "{found} rows take {taken} of {memory}");
+            prop_assert_eq!(found, asked, "{} bytes", memory);
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn detailed_edits_are_counted_where_they_are_declared() {
+    let made = Made::colmap_txt();
+    let scene = made.path().to_str().expect("UTF-8");
+    let spec = described(&[("scene", scene.into()), ("backend", "cpu".into())]);
+    let case = Case::anew(&spec, Host::default()).expect("a scene");
+    let setting = size::solve(&case).expect("it is solved").expect("it fits").setting;
+    let declared = [false, true].map(|detailed_edits| {
+        let needs = case.needs(setting.rows).expect("needs");
+        let needs = Needs { detailed_edits, ..needs };
+        let ledger = case.ledger(&setting, &needs);
+        let event = ledger.lines.iter().find(|line| line.what == "a policy's event");
+        let event = event.expect("a line").bytes;
+        (event, bytes_per_row(&needs) as u64 * setting.rows as u64)
+    });
+    let [(plain, plain_plan), (detailed, detailed_plan)] = declared;
+    assert!(plain_plan < detailed_plan);
+    assert_eq!(detailed - plain, detailed_plan - plain_plan);
+}
+
+/// The lines of a small run's ledger, without what depends on what else this process has done; and its total.
+fn plain_ledger(made: &Made, exposure: &str) -> (Vec<(Section, String, u64)>, u64) {
+    let scene = made.path().to_str().expect("UTF-8");
+    let spec = described(&[
+        ("scene", scene.into()),
+        ("backend", "cpu".into()),
+        ("policy", "mcmc".into()),
+        ("budget", 1000.into()),
+        ("sh_degree", 1.into()),
+        ("iterations", 100.into()),
+        ("eval", true.into()),
+        ("threads", 1.into()),
+        ("exposure", exposure.into()),
+    ]);
+    let host = Host { process: ProcessMemory::UNKNOWN, ..Host::default() };
+    let case = Case::anew(&spec, host).expect("a scene");
+    let setting = size::solve(&case).expect("it is solved").expect("it fits").setting;
+    let ledger = case.ledger(&setting, &case.needs(setting.rows).expect("needs"));
+    let total = ledger.total();
+    (ledger.lines.into_iter().map(|line| (line.section, line.what, line.bytes)).collect(), total)
+}
+
+/// The memory of a run without exposures, masks and lenses is a fixed number: nothing that these need is
+/// paid for without them, not a byte of a view.
+#[cfg(all(unix, target_pointer_width = "64"))]
+#[test]
+fn what_is_not_used_of_photographs_takes_no_byte() {
+    let made = Made::colmap_txt();
+    let (plain, total) = plain_ledger(&made, "off");
+    // Whoever makes a run take more or less on purpose writes the new number here.
+    assert_eq!(total, 34_785_170, "{plain:#?}");
+    let differing = |other: &[(Section, String, u64)]| {
+        let found = other.iter().filter(|line| !plain.contains(line));
+        found.map(|(_, what, _)| what.clone()).collect::<Vec<_>>()
+    };
+    // No track is known in enough views to decide.
+    let auto = differing(&plain_ledger(&made, "auto").0);
+    let exposed = differing(&plain_ledger(&made, "on").0);
+    let folder = made.path().join("masks");
+    std::fs::create_dir(&folder).expect("a folder");
+    let mask = image::GrayImage::from_fn(20, 12, |x, _| [if x < 9 { 0 } else { 255 }].into());
+    for name in ["a.png", "b.png", "c.png"] {
+        mask.save(folder.join(name)).expect("a mask");
+    }
+    let masked = differing(&plain_ledger(&made, "off").0);
+    let none: [&str; 0] = [];
+    let exposures =
+        ["exposures of the views", "export of the model, checkpoint", "measuring a view"];
+    let masks = ["decoded training views", "decoding", "measuring a view"];
+    assert!(
+        auto == none && exposed == exposures && masked == masks,
+        "{auto:?}, {exposed:?}, {masked:?}"
+    );
+}
+
+/// True after a case of the test below has run on a GPU.
+static ON_GPU: AtomicBool = AtomicBool::new(false);
+
+proptest! {
+    #![proptest_config(ProptestConfig { failure_persistence: None, cases: 4, ..Default::default() })]
+
+    #[test]
+    fn what_rows_take_holds_them_and_what_is_held_takes_no_more(
+        rows in prop_oneof![1..1_000_usize, 1_000..50_000_usize, 50_000..20_000_000_usize],
+        given in prop_oneof![Just(None), Just(Some("tile_cap")), Just(Some("image_cache"))],
+        policy: prop::sample::Index,
+        is_built_in: bool,
+        eval: bool,
+    ) {
+        let made = Made::colmap_txt();
+        let scene = if is_built_in { "scene:spheres" } else { made.path().to_str().expect("UTF-8") };
+        let policies = densify_policies::registry::policies().expect("the registry is sound");
+        let policy = policy.get(&policies).name;
+        let mut backends = vec![("cpu", PRESETS)];
+        // On a GPU only a preset without knobs of the native backend, and one case: software drivers take minutes to
+        // compile the kernels of each policy.
+        let is_on_gpu = !adapters().is_empty() && !ON_GPU.swap(true, Relaxed);
+        backends.extend(is_on_gpu.then_some(("gpu", &PRESETS[1..2])));
+        for (backend, presets) in backends {
+            let mut shared: Vec<(&str, toml::Value)> = vec![
+                ("scene", scene.into()),
+                ("backend", backend.into()),
+                ("policy", policy.into()),
+                ("eval", eval.into()),
+            ];
+            shared.extend(given.map(|name| (name, 90_000.into())));
+            let spec = described(&shared);
+            let case = Case::anew(&spec, Host::default()).expect("a scene");
+            // Both say how long tile lists are.
+            let contradicts = |preset: &&Preset| {
+                let sets_pairs = preset.levels.iter().any(|(knob, _)| *knob == "pairs_per_row");
+                given == Some("tile_cap") && sets_pairs
+            };
+            for preset in presets.iter().filter(|preset| !contradicts(preset)) {
+                let spec = described(&[&shared[..], &[("preset", preset.name.into())]].concat());
+                check(&case.with(&spec).expect("a scene"), rows)?;
+            }
+        }
+    }
+}

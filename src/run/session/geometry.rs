@@ -1,0 +1,69 @@
+//! Measures the model of a complete run against the known surface, as `densify eval` does, in a backend of its own once
+//! that of training is freed.
+
+use std::path::Path;
+
+use super::Session;
+use crate::failure::Failure;
+use crate::finished::Opened;
+use crate::models::read_model;
+use densify_core::memory::{Bytes, Section};
+use densify_core::numbers::percent;
+use densify_train::evaluate::Split;
+use densify_train::output::{geometry_of, model_path, write_geometry};
+
+/// Writes `geometry.json` for the test views, if the surface is known and the promised memory has room for measuring.
+/// `folder` has the run's model.
+///
+/// # Errors
+/// When the files of the surface are damaged, or as [`geometry::measure`].
+pub(super) fn measure(session: Session<'_>, folder: &Path) -> Result<(), Failure> {
+    // The rest of the session keeps the folder locked.
+    let (run, observer) = (session.run, session.observer);
+    let Some(measuring) = run.measuring else { return Ok(()) };
+    let iteration = run.trainer.steps_done();
+    if geometry_of(folder, iteration)?.is_some() || observer.interrupt().is_some() {
+        return Ok(());
+    }
+    let [host, device] = measuring.bytes(run.trainer.rows(), run.config.sh_degree());
+    let process = run.ledger.lines.iter().filter(|line| line.section == Section::Process);
+    let host = host + process.map(|line| line.bytes).sum::<u64>();
+    drop(run.trainer);
+    // A complete run is not refused for a grant that is too small by now: the measurement is left out.
+    let granted = (run.process.grant)(measuring.threads).zip((run.process.resident)());
+    let granted = granted.map_or(u64::MAX, |(limit, now)| now.saturating_add(limit.left));
+    let promised = run.ledger.total();
+    let limits = [(host + device, promised), (device, run.ledger.on_device()), (host, granted)];
+    let left_out = |why: std::fmt::Arguments<'_>| {
+        let folder = folder.display();
+        observer.say(format_args!(
+            "note: geometry is not measured: {why}; `densify eval {folder}` measures it"
+        ));
+        Ok(())
+    };
+    if let Some(&(needed, room)) = limits.iter().find(|(needed, room)| needed > room) {
+        let (needed, room) = (Bytes(needed), Bytes(room));
+        return left_out(format_args!("that takes {needed}, and there is room for {room}"));
+    }
+    let model = read_model(&model_path(folder, iteration), observer)?;
+    let model = run.dataset.normalisation.model_from_world(model);
+    let backend = measuring.device.backend(&model, &measuring.for_rows(model.len()))?;
+    let (dataset, data) = (run.dataset, run.spec.data);
+    let mut opened = Opened { sh_degree: model.sh_degree, backend, dataset, data };
+    drop(model);
+    let measured = match opened.geometry(&run.test, &|| observer.interrupt().is_some()) {
+        Ok(None) => return Ok(()),
+        Ok(Some(measured)) => measured,
+        Err(_) if observer.interrupt().is_some() => return left_out(format_args!("stopped")),
+        Err(failure) => return Err(failure),
+    };
+    write_geometry(folder, Split::Test, iteration, &measured)?;
+    let peak =
+        (run.process.peak)().map_or_else(String::new, |peak| format!("; peak {}", Bytes(peak)));
+    observer.say(format_args!(
+        "geometry depth RMSE {}, Chamfer distance {} of the diagonal{peak}",
+        percent(measured.depth.rmse),
+        percent(measured.centres.chamfer)
+    ));
+    Ok(())
+}

@@ -1,0 +1,402 @@
+//! The session of a run: the loop around the trainer with its progress, logs, saved models, measurements and checkpoints.
+//! One piece, as all of it happens between two steps, in an order that matters.
+
+mod first_model;
+mod geometry;
+mod prepare;
+mod records;
+mod requirements;
+mod resume;
+mod run;
+mod summary;
+
+pub use requirements::{LeftOut, Reductions, Requirements};
+pub use resume::{Resumed, start};
+pub use run::Run;
+
+use std::collections::BTreeSet;
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use cpu_time::ProcessTime;
+
+use crate::failure::{Failure, INPUT, OTHER, TrainingProblem};
+use crate::observer::{Between, Interrupt, Observer};
+use densify_core::files::{FileError, write_atomically};
+use densify_data::models::{PLY, Shape};
+use densify_data::views::ViewSource;
+use densify_train::checkpoint::{CheckpointError, Header, checkpoint_path, remove_older, write};
+use densify_train::evaluate::{Comparison, EvaluateError, Split, evaluate};
+use densify_train::exposure::named_transforms;
+use densify_train::output::{
+    CHECKPOINTS, CONFIG_FILE, Guard, Mean, RunFolder, cameras_json, model_path, saved_iterations,
+    write_json, write_scores,
+};
+use densify_train::trainer::{StepReport, TrainError};
+use geometry::measure;
+use records::{Logs, Totals};
+
+/// The file beside a model with the exposures of its training views.
+const EXPOSURES: &str = "exposure.json";
+/// Steps between two records of the log.
+const RECORD_EVERY: u32 = 10;
+
+/// A run in progress.
+struct Session<'a> {
+    run: Run,
+    /// The configuration as checkpoints have it.
+    config: toml::Table,
+    observer: &'a dyn Observer,
+    /// The folder that files are written to.
+    folder: PathBuf,
+    logs: Logs,
+    totals: Totals,
+    /// Detects that another run has taken the folder.
+    guard: Guard,
+    /// Step of the last checkpoint that this process has written or resumed from.
+    checkpoint: Option<u32>,
+}
+
+/// The steps after which models are saved, measured or kept.
+struct Duties {
+    saves: BTreeSet<u32>,
+    tests: BTreeSet<u32>,
+    checkpoint_every: u32,
+    last: u32,
+}
+
+/// The treatment of a run that is in the output folder already.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Occupied {
+    /// Keep it, and refuse the new run.
+    Refuse,
+    /// Replace it by the new run once that is complete.
+    Replace,
+    /// Go on with it.
+    Resume,
+}
+
+/// Trains to the end and writes all files of the run; returns the folder.
+fn train(run: Run, occupied: Occupied, observer: &dyn Observer) -> Result<PathBuf, Failure> {
+    let last = run.last;
+    // Nothing of a run that goes on is removed, even if it is only the description.
+    let has_begun = run.session.is_some() || run.output.join(CONFIG_FILE).exists();
+    let resumes = occupied == Occupied::Resume && has_begun;
+    let folder = match occupied {
+        Occupied::Resume => RunFolder::resume(&run.output, run.session.is_none())?,
+        Occupied::Refuse => RunFolder::create(&run.output, false)?,
+        Occupied::Replace => RunFolder::create(&run.output, true)?,
+    };
+    let output = &run.spec.output;
+    let duties = Duties {
+        saves: output.save_iterations.iter().copied().chain([last]).collect(),
+        tests: output.test_iterations.iter().copied().chain([last]).collect(),
+        checkpoint_every: output.checkpoint_every,
+        last,
+    };
+    let mut session = match Session::start(run, &folder, observer) {
+        Ok(session) => session,
+        // If nothing can be written, nothing is lost.
+        Err(error) if resumes => return Err(error),
+        Err(error) => {
+            folder.discard();
+            return Err(error);
+        }
+    };
+    let done = session.go(&duties);
+    let guard = folder.guard();
+    let finished = done
+        .and_then(|()| guard.check().map_err(Failure::from))
+        .and_then(|()| session.write_summary(true).map_err(Failure::from));
+    match finished {
+        Ok(()) => {
+            let path = folder.finish()?;
+            session.report(&path);
+            measure(session, &path).map_err(|failure| {
+                failure.with(TrainingProblem::CompleteAllTheSame { run: path.clone() })
+            })?;
+            Ok(path)
+        }
+        // Another run may have taken the folder.
+        Err(failure) if guard.check().is_err() => Err(failure),
+        // Such as a photograph that cannot be decoded, before anything worth keeping was learned.
+        Err(failure) if failure.code == INPUT && !resumes && has_nothing(&folder.path()) => {
+            // The lock goes with its last holder, and then the folder can be removed.
+            drop((session, guard));
+            folder.discard();
+            Err(failure)
+        }
+        // The cause is reported first; another error of writing would add nothing.
+        Err(failure) => {
+            let _ = session.write_summary(false);
+            let scene = session.run.spec.start.scene.clone().unwrap_or_default();
+            let kept = session.checkpoint;
+            drop(session);
+            let run = folder.abandon();
+            let checkpoint = kept.map(|step| checkpoint_path(&run, step));
+            Err(failure.with(TrainingProblem::LeftBehind { run, checkpoint, scene }))
+        }
+    }
+}
+
+/// True if a run has left neither a model nor a checkpoint.
+fn has_nothing(folder: &Path) -> bool {
+    saved_iterations(folder).is_err() && !folder.join(CHECKPOINTS).exists()
+}
+
+impl<'a> Session<'a> {
+    fn start(
+        mut run: Run,
+        folder: &RunFolder,
+        observer: &'a dyn Observer,
+    ) -> Result<Self, Failure> {
+        let (guard, folder) = (folder.guard(), folder.path());
+        let folder = folder.as_path();
+        run.config.write(folder)?;
+        let config = run.config.table()?;
+        let to_world = &run.dataset.normalisation;
+        if let Some(warning) = to_world.f32_warning() {
+            observer.say(format_args!("note: {warning}"));
+        }
+        let views = run.dataset.test.iter().chain(&run.dataset.train);
+        let cameras =
+            views.map(|view| (&*view.name, to_world.world_from_scene_camera(&view.camera)));
+        write_atomically(&folder.join("cameras.json"), |out| {
+            out.write_all(cameras_json(cameras)?.as_bytes())
+        })?;
+        let mut checkpoint = None;
+        let (logs, totals) = match run.session.take() {
+            None => (Logs::create(folder)?, Totals::new()),
+            Some(saved) => {
+                checkpoint = Some(run.trainer.steps_done());
+                let (logs, totals, lost) = Logs::resume(folder, saved)?;
+                for name in lost {
+                    observer.say(format_args!("note: {name} has lost records; they stay missing"));
+                }
+                (logs, totals)
+            }
+        };
+        let folder = folder.to_owned();
+        Ok(Self { run, config, observer, folder, logs, totals, guard, checkpoint })
+    }
+
+    /// Does all remaining steps.
+    fn go(&mut self, duties: &Duties) -> Result<(), Failure> {
+        let done = self.run.trainer.steps_done();
+        let (last, budget) = (duties.last, self.run.config.budget());
+        if done > 0 {
+            // A run may have been stopped before the duties of its last step.
+            self.after(done, duties, true)?;
+        }
+        self.observer.begin(done, last, budget);
+        let stepped = (done + 1..=last).try_for_each(|step| {
+            self.rest();
+            if let Some(interrupt) = self.observer.interrupt() {
+                return Err(self.interrupted(interrupt));
+            }
+            let report = self.step()?;
+            self.observer.step(step, report.output.loss, report.rows);
+            self.after(step, duties, false)
+        });
+        self.observer.end();
+        stepped.and_then(|()| self.check_drawn())
+    }
+
+    /// Lets the observer render the model, and writes the checkpoints that it asks for.
+    fn rest(&mut self) {
+        loop {
+            let (model, rows) = self.run.trainer.looked_at();
+            match self.observer.between(model, rows) {
+                Between::Checkpoint => self.keep_or_say(),
+                Between::Step => return,
+            }
+        }
+    }
+
+    /// Writes a checkpoint. If it cannot be written, training goes on: the run is worth more, and the previous checkpoint
+    /// is still there.
+    fn keep_or_say(&mut self) {
+        let step = self.run.trainer.steps_done();
+        let trouble = self.keep().err().map(|error| {
+            tracing::error!(step, "the checkpoint could not be written, training goes on: {error}");
+            format!("the checkpoint of step {step} could not be written: {error}")
+        });
+        self.observer.kept(step, trouble.as_deref());
+    }
+
+    /// Fails if the model draws nothing in most of the last views, which is no result.
+    fn check_drawn(&self) -> Result<(), Failure> {
+        let drawn = &self.totals.drawn;
+        let (views, empty) = (drawn.len(), drawn.iter().filter(|drawn| !**drawn).count());
+        if 2 * empty <= views {
+            return Ok(());
+        }
+        Err(Failure::with_code(OTHER, TrainingProblem::DrawsNothing { empty, views }))
+    }
+
+    /// Saves and measures the model and writes a checkpoint if they are due after `step`; in a resumed run, only those
+    /// that do not exist yet.
+    fn after(&mut self, step: u32, duties: &Duties, resumed: bool) -> Result<(), Failure> {
+        let every = duties.checkpoint_every;
+        let due = every > 0 && (step.is_multiple_of(every) || step == duties.last);
+        if due || duties.saves.contains(&step) || duties.tests.contains(&step) {
+            self.guard.check()?;
+        }
+        let there = |path: PathBuf| resumed && path.is_file();
+        if duties.saves.contains(&step) && !there(model_path(&self.folder, step)) {
+            self.save(step)?;
+        }
+        if duties.tests.contains(&step) && !(resumed && self.totals.tested.contains_key(&step)) {
+            self.test(step, step == duties.last)?;
+        }
+        if due && !there(checkpoint_path(&self.folder, step)) {
+            self.keep_or_say();
+        }
+        Ok(())
+    }
+
+    /// Writes a checkpoint.
+    fn keep(&mut self) -> Result<(), CheckpointError> {
+        let step = self.run.trainer.steps_done();
+        if self.checkpoint == Some(step) {
+            return Ok(());
+        }
+        self.guard.check()?;
+        let trainer = self.run.trainer.state();
+        let header = Header {
+            densify: self.run.config.densify.clone(),
+            budget: self.run.config.budget(),
+            sh_degree: self.run.config.sh_degree(),
+            config: self.config.clone(),
+            dataset: self.run.fingerprint.clone(),
+            trainer: trainer.map_err(|source| CheckpointError::Policy { source })?,
+            session: self.logs.keep(&self.totals, self.run.process)?,
+        };
+        write(&checkpoint_path(&self.folder, step), &header, self.run.trainer.backend())?;
+        remove_older(&self.folder, step);
+        self.checkpoint = Some(step);
+        Ok(())
+    }
+
+    /// Ends the run so that it can be resumed later.
+    fn interrupted(&mut self, Interrupt { name, exit_code }: Interrupt) -> Failure {
+        let step = self.run.trainer.steps_done();
+        let stopped = TrainingProblem::Stopped { by: name, step: Some(step) };
+        self.kept(Failure::with_code(exit_code, stopped))
+    }
+
+    /// Writes a checkpoint of a run that ends with `failure`.
+    fn kept(&mut self, failure: Failure) -> Failure {
+        match self.keep() {
+            Ok(()) => failure,
+            Err(error) => {
+                failure.with(TrainingProblem::CheckpointFailed { error: error.to_string() })
+            }
+        }
+    }
+
+    /// Does one step and records it. If the policy fails, the model is saved; if values are not finite, or a photograph
+    /// can no longer be read, a checkpoint is written.
+    fn step(&mut self) -> Result<StepReport, Failure> {
+        let (wall, cpu) = (Instant::now(), ProcessTime::try_now().ok());
+        let train_views = self.run.dataset.train.len();
+        let stepped = self.run.trainer.step();
+        self.totals.time(wall, cpu);
+        for &(stage, time) in self.run.trainer.backend().stage_times() {
+            self.totals.stage(stage, time);
+        }
+        match stepped {
+            Ok(report) => {
+                self.record(&report)?;
+                Ok(report)
+            }
+            Err(error @ TrainError::Policy { .. }) => {
+                let step = self.run.trainer.steps_done();
+                let saved = self.save(step).map_err(|failure| failure.to_string());
+                Err(Failure::from(error).with(TrainingProblem::ModelSaved { saved }))
+            }
+            Err(error @ TrainError::Unsound { .. }) => Err(self.kept(error.into())),
+            // The photograph could be read before. In the first epoch little is lost.
+            Err(error @ TrainError::View { step, .. })
+                if step > self.run.trainer.steps_done() && step as usize > train_views =>
+            {
+                Err(self.kept(error.into()))
+            }
+            Err(error) => Err(error.into()),
+        }
+    }
+
+    fn record(&mut self, report: &StepReport) -> Result<(), FileError> {
+        let Self { logs, totals, run, observer, .. } = self;
+        for event in &report.events {
+            observer.edited(event);
+            logs.events.append(event)?;
+        }
+        totals.step(&report.output, run.dataset.train.len());
+        let step = report.step;
+        // The original end of an extended run has a record, too, so that records do not depend on the extension.
+        let ends = [run.spec.schedule.iterations.0, run.last].contains(&step);
+        if step.is_multiple_of(RECORD_EVERY) || ends {
+            let record = totals.record(step, report.rows, (run.process.resident)());
+            observer.recorded(&record);
+            logs.steps.append(&record)?;
+            logs.board.scalars(step, &[("loss", record.loss), ("rows", report.rows as f32)])?;
+        }
+        Ok(())
+    }
+
+    /// Writes the model and returns its file.
+    fn save(&mut self, step: u32) -> Result<PathBuf, Failure> {
+        self.guard.check()?;
+        let path = model_path(&self.folder, step);
+        let (backend, to_world) = (self.run.trainer.backend(), &self.run.dataset.normalisation);
+        let shape = Shape { rows: backend.rows(), sh_degree: backend.sh_degree() };
+        PLY.write_file(&path, shape, |piece| {
+            Ok::<_, Failure>(to_world.world_from_model(backend.download_rows(piece)?))
+        })?;
+        if let Some(exposures) = self.run.trainer.exposures() {
+            let names = self.run.dataset.train.iter().map(|view| &*view.name);
+            let named = named_transforms(exposures, names);
+            write_json(&path.with_file_name(EXPOSURES), &named)?;
+        }
+        Ok(path)
+    }
+
+    /// Measures the test views, if there are any.
+    fn test(&mut self, step: u32, is_last: bool) -> Result<(), Failure> {
+        let Run { spec, trainer, test, config, .. } = &mut self.run;
+        if test.count() == 0 {
+            return Ok(());
+        }
+        let (background, degree) = (spec.data.background.fixed(), config.sh_degree());
+        let observer = self.observer;
+        let fits_exposure = config.resolved.has_exposures;
+        let comparison = Comparison { lpips: None, fits_exposure };
+        let scores = evaluate(trainer.backend(), test, background, degree, comparison, |_| {
+            observer.interrupt().map_or(ControlFlow::Continue(()), |_| ControlFlow::Break(()))
+        });
+        let scores = match (scores, self.observer.interrupt()) {
+            (Err(EvaluateError::Stopped), Some(interrupt)) => {
+                return Err(self.interrupted(interrupt));
+            }
+            (scores, _) => scores?,
+        };
+        let mean = Mean::of(&scores);
+        write_scores(&self.folder, Split::Test, step, &scores)?;
+        let Mean { psnr, ssim, flip, .. } = mean;
+        let scalars = [("test/psnr", psnr), ("test/ssim", ssim), ("test/flip", flip)];
+        self.logs.board.scalars(step, &scalars.map(|(name, value)| (name, value as f32)))?;
+        if let Some(fitted) = mean.fitted {
+            self.logs.board.scalars(step, &[("test/psnr fitted", fitted.psnr as f32)])?;
+        }
+        self.totals.tested.insert(step, mean);
+        self.observer.tested(step, &mean);
+        if !is_last {
+            self.observer.say(format_args!(
+                "step {step}: test PSNR {psnr:.2} dB, SSIM {ssim:.4}, FLIP {flip:.4}"
+            ));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,159 @@
+//! Prepares a run: resolves it, makes the model that it starts from, and builds the trainer. Every error that the user can
+//! mend is found here, before anything is written.
+
+use std::path::Path;
+
+use super::first_model::{behind_frozen, check_coordinates, first_model};
+use super::resume::{self, Resumed};
+use super::run::Run;
+use crate::failure::{Failure, OptionProblem};
+use crate::host::Host;
+use crate::observer::Observer;
+use crate::resolved::{DECODERS, Init, ResolvedRun, ResolvedTraining, RunConfig, TEST_DECODERS};
+use crate::spec::RunSpec;
+use densify_core::numbers::grouped;
+use densify_data::dataset::PointCloud;
+use densify_data::views::DatasetViews;
+use densify_train::checkpoint::Fingerprint;
+use densify_train::init::restart;
+use densify_train::schedule::RateOptions;
+use densify_train::trainer::{TrainOptions, Trainer};
+
+/// Views announced ahead: enough that each decoder has one at work and one waiting.
+const AHEAD: usize = 2 * DECODERS;
+
+/// Prepares a new run, or one that goes on.
+pub(super) fn prepare(
+    spec: &RunSpec,
+    resumed: Option<Resumed>,
+    host: Host<'_>,
+) -> Result<Run, Failure> {
+    let Host { observer, process, companion } = host;
+    let last = resumed.as_ref().map_or(spec.schedule.iterations.0, |resumed| resumed.last);
+    spec.check_iterations(last)?;
+    let output = spec.output_folder()?;
+    let checkpoint = resumed.as_ref().and_then(|resumed| resumed.checkpoint.as_ref());
+    let run = match &resumed {
+        None => ResolvedRun::anew(spec, host)?,
+        Some(resumed) => {
+            ResolvedRun::from_saved(spec, &resumed.config, checkpoint.is_some(), host)?
+        }
+    };
+    if !spec.output.test_iterations.is_empty() && run.case.inputs.dataset.test.is_empty() {
+        return Err(OptionProblem::NothingToTest.into());
+    }
+    run.check_grant(process, resumed.is_some())?;
+    let mut model = match checkpoint {
+        None => first_model(&run, observer)?,
+        Some(checkpoint) => checkpoint.blank_model()?,
+    };
+    let initial_rows =
+        checkpoint.map_or(model.len(), |checkpoint| checkpoint.header().trainer.initial_rows);
+    let training = ResolvedTraining::new(&run, initial_rows)?;
+    let file = match &run.init {
+        Init::Model(file) => Some(file.0.clone()),
+        Init::Points | Init::Random(_) => None,
+    };
+    if checkpoint.is_none() {
+        // A model keeps its opacities and sizes, whatever the policy's paper starts with.
+        if file.is_none() {
+            restart(&mut model, &training.declared.start);
+        }
+        model = behind_frozen(&run, model, observer)?;
+    }
+    let config = RunConfig::new(&run, &training, last)?;
+    let fingerprint = Fingerprint::of(&run.case.inputs.dataset);
+    if let Some(resumed) = &resumed {
+        resume::check(&config, resumed, &fingerprint, &output)?;
+    }
+    announce(&run, &training, &output, observer);
+    let ResolvedRun { case, size, .. } = &run;
+    let needs = case.backend_needs(training.declared.clone());
+    let ledger = case.ledger(size, &needs);
+    run.check_memory(&ledger)?;
+    observer.say(format_args!("{}", case.promise(&ledger, observer.spelling())));
+    let measuring = case.measuring(size, case.choices.threads);
+    let mut backend = case.inputs.device.backend(&model, &case.backend_setup(size, needs))?;
+    drop(model);
+    if let Some(file) = file.filter(|_| checkpoint.is_none()) {
+        check_coordinates(&file, &run, backend.as_mut(), observer)?;
+    }
+    let options = train_options(&run, training.rates);
+    let ResolvedRun { case, size, .. } = run;
+    let exposures = case.choices.exposure.first(spec, &case.inputs.dataset);
+    let (name, automatic) = (case.choices.entry.name, case.choices.automatic);
+    let mut dataset = case.inputs.into_owned().dataset;
+    let views = DatasetViews::new(dataset.train.clone(), size.image_cache, DECODERS);
+    let test = DatasetViews::new(dataset.test.clone(), 0, TEST_DECODERS);
+    // Once the first rows are made, training needs no points.
+    dataset.points = companion
+        .map_or_else(PointCloud::default, |companion| dataset.points.thinned(companion.points));
+    let ResolvedTraining { policy, scene, .. } = training;
+    let trainer = Trainer::new(views, backend, (name, policy), scene, options)?;
+    let mut trainer = trainer.requiring(automatic).exposing(exposures);
+    let session = match resumed {
+        Some(resumed) => resume::restore(resumed, &mut trainer, observer)?,
+        None => None,
+    };
+    if companion.is_some() {
+        trainer.remember_rows()?;
+    }
+    Ok(Run {
+        spec: spec.clone(),
+        config,
+        output,
+        trainer,
+        test,
+        dataset,
+        ledger,
+        measuring,
+        fingerprint,
+        last,
+        session,
+        process,
+    })
+}
+
+fn train_options(run: &ResolvedRun<'_>, rates: RateOptions) -> TrainOptions {
+    let ResolvedRun { case, size, .. } = run;
+    let RunSpec { schedule, data, .. } = case.spec;
+    TrainOptions {
+        iterations: schedule.iterations.0,
+        seed: schedule.seed,
+        sh_degree: size.sh_degree,
+        frozen: case.budget(size.rows).frozen,
+        // A trained model shows all of its bands from the start.
+        has_all_bands: case.inputs.init_model.is_some() || case.inputs.frozen_model.is_some(),
+        background: data.background,
+        rates,
+        prefetch: AHEAD,
+        on_nan: schedule.on_nan,
+    }
+}
+
+/// Tells the user what was decided.
+fn announce(
+    run: &ResolvedRun<'_>,
+    training: &ResolvedTraining,
+    output: &Path,
+    observer: &dyn Observer,
+) {
+    for line in &run.reasons {
+        observer.say(format_args!("{line}"));
+    }
+    let RunSpec { density, schedule, data, .. } = run.case.spec;
+    let summary = run.case.choices.entry.summary;
+    observer.say(format_args!("policy   {}: {summary}", density.policy));
+    observer.say(format_args!(
+        "run      {} iterations, seed {}, degree {}, background {}",
+        grouped(schedule.iterations.0 as usize),
+        schedule.seed,
+        run.size.sh_degree,
+        data.background
+    ));
+    observer.say(format_args!("output   {}", output.display()));
+    let steps = training.steps(run);
+    if !steps.is_empty() {
+        observer.say(format_args!("steps    {steps}"));
+    }
+}

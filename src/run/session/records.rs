@@ -1,0 +1,164 @@
+//! The logs of a run and its totals so far. Checkpoints have both, so that the records of an interrupted run have no gap.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use cpu_time::ProcessTime;
+use serde::{Deserialize, Serialize};
+
+use crate::process::ProcessMemory;
+use densify_core::files::FileError;
+use densify_render::StepOutput;
+use densify_train::output::{Mean, RecordLog, StepRecord, TensorBoard};
+
+/// Sums and scores so far.
+#[derive(Debug, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Totals {
+    window: Window,
+    /// Wall time of all steps.
+    pub(super) wall: Duration,
+    /// Processor time of all steps, if the system measures it.
+    pub(super) cpu: Option<Duration>,
+    /// Wall time by stage.
+    pub(super) stages: BTreeMap<String, Duration>,
+    /// For each of the last steps, as many as there are training views: true if anything was drawn.
+    #[serde(default)]
+    pub(super) drawn: VecDeque<bool>,
+    /// Scores of the test views, by step.
+    pub(super) tested: BTreeMap<u32, Mean>,
+    /// Largest resident memory of the processes before this one.
+    peak_before: Option<u64>,
+}
+
+/// Sums over the steps since the last record.
+#[derive(Debug, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Window {
+    steps: u32,
+    loss: f32,
+    l1: f32,
+    ssim: f32,
+}
+
+impl Totals {
+    pub(super) fn new() -> Self {
+        Self { cpu: Some(Duration::ZERO), ..Self::default() }
+    }
+
+    /// Adds the time since `wall` and `cpu`.
+    pub(super) fn time(&mut self, wall: Instant, cpu: Option<ProcessTime>) {
+        self.wall = self.wall.saturating_add(wall.elapsed());
+        let spent = cpu.and_then(|start| start.try_elapsed().ok());
+        self.cpu = self.cpu.zip(spent).map(|(sum, spent)| sum.saturating_add(spent));
+    }
+
+    pub(super) fn stage(&mut self, stage: &str, time: Duration) {
+        match self.stages.get_mut(stage) {
+            Some(sum) => *sum = sum.saturating_add(time),
+            None => _ = self.stages.insert(stage.to_owned(), time),
+        }
+    }
+
+    /// Adds a step of a run with this many training views.
+    pub(super) fn step(&mut self, output: &StepOutput, views: usize) {
+        self.drawn.push_back(output.entries > 0);
+        while self.drawn.len() > views {
+            self.drawn.pop_front();
+        }
+        let Window { steps, loss, l1, ssim } = &mut self.window;
+        *steps = steps.saturating_add(1);
+        *loss += output.loss;
+        *l1 += output.l1;
+        *ssim += output.ssim;
+    }
+
+    /// The means since the last record.
+    pub(super) fn record(&mut self, step: u32, rows: usize, resident: Option<u64>) -> StepRecord {
+        let Window { steps, loss, l1, ssim } = std::mem::take(&mut self.window);
+        let steps = steps as f32;
+        StepRecord {
+            step,
+            loss: loss / steps,
+            l1: l1 / steps,
+            ssim: ssim / steps,
+            rows,
+            seconds: self.wall.as_secs_f64(),
+            resident_bytes: resident,
+        }
+    }
+
+    /// Largest resident memory of all processes of this run.
+    pub(super) fn peak_bytes(&self, process: ProcessMemory) -> Option<u64> {
+        (process.peak)().max(self.peak_before)
+    }
+}
+
+/// The log files of a run.
+pub(super) struct Logs {
+    pub(super) steps: RecordLog,
+    pub(super) events: RecordLog,
+    pub(super) board: TensorBoard,
+}
+
+/// Lengths of the logs at a checkpoint `[bytes]`.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Lengths {
+    steps: u64,
+    events: u64,
+    board: (String, u64),
+}
+
+/// The state of the session in a checkpoint.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct SavedSession {
+    totals: Totals,
+    logs: Lengths,
+}
+
+const STEPS: &str = "stats/train.jsonl";
+const EVENTS: &str = "stats/events.jsonl";
+
+impl Logs {
+    pub(super) fn create(folder: &Path) -> Result<Self, FileError> {
+        Ok(Self {
+            steps: RecordLog::create(&folder.join(STEPS))?,
+            events: RecordLog::create(&folder.join(EVENTS))?,
+            board: TensorBoard::create(folder)?,
+        })
+    }
+
+    /// The state of the session as JSON, after all records are on disk.
+    pub(super) fn keep(
+        &self,
+        totals: &Totals,
+        process: ProcessMemory,
+    ) -> Result<serde_json::Value, FileError> {
+        let lengths = Lengths {
+            steps: self.steps.synced()?,
+            events: self.events.synced()?,
+            board: self.board.synced()?,
+        };
+        let peak = totals.peak_bytes(process);
+        let mut totals = serde_json::to_value(totals).unwrap_or_default();
+        totals["peak_before"] = peak.into();
+        Ok(serde_json::json!({ "totals": totals, "logs": lengths }))
+    }
+
+    /// Reopens the logs at their lengths, and returns the names of those that have lost records meanwhile.
+    pub(super) fn resume(
+        folder: &Path,
+        kept: SavedSession,
+    ) -> Result<(Self, Totals, Vec<&'static str>), FileError> {
+        let SavedSession { totals, logs } = kept;
+        let (steps, steps_whole) = RecordLog::resume(&folder.join(STEPS), logs.steps)?;
+        let (events, events_whole) = RecordLog::resume(&folder.join(EVENTS), logs.events)?;
+        let board = TensorBoard::resume(folder, &logs.board.0, logs.board.1)?;
+        let lost = [(STEPS, steps_whole), (EVENTS, events_whole)];
+        let lost = lost.into_iter().filter(|(_, whole)| !whole).map(|(name, _)| name).collect();
+        Ok((Self { steps, events, board }, totals, lost))
+    }
+}

@@ -1,0 +1,260 @@
+//! `stats/requirements.json`: the automatic reductions of a run, with their evidence and cost.
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use crate::resolved::{DegreeSource, ExposureSource, RunConfig};
+use densify_core::files::FileError;
+use densify_core::gaussians::MAX_SH_DEGREE;
+use densify_core::spelling::Spelling;
+use densify_train::output::read_stats;
+use densify_train::trainer::{AutoBudget, MIN_GAIN};
+
+/// Path within the folder of the run.
+pub(super) const REQUIREMENTS: &str = "stats/requirements.json";
+
+/// The report of a run.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Requirements {
+    /// Automatic reductions were disabled (`--full`).
+    pub full: bool,
+    /// Spherical-harmonic degree of the model.
+    pub sh_degree: u8,
+    /// The reason for the degree.
+    pub sh_degree_from: DegreeSource,
+    /// Each photograph has an exposure of its own.
+    pub exposures: bool,
+    /// The reason for that, or against it.
+    pub exposures_from: ExposureSource,
+    /// Measurements of `--budget auto`.
+    pub rows: Option<AutoBudget>,
+    /// Number of training views not rendered for scores because of near-duplicates.
+    pub unscored_views: usize,
+    /// Automatic reductions, without those that the options ask for.
+    pub left_out: Vec<LeftOut>,
+}
+
+/// The reductions in a `stats/requirements.json`.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+pub struct Reductions {
+    /// Automatic reductions were disabled.
+    pub full: bool,
+    /// The reductions.
+    pub left_out: Vec<LeftOut>,
+}
+
+impl Reductions {
+    /// Reads those of a run; `None` if the file does not exist.
+    ///
+    /// # Errors
+    /// When the file cannot be read.
+    pub fn read(run: &Path) -> Result<Option<Self>, FileError> {
+        read_stats(&run.join(REQUIREMENTS))
+    }
+}
+
+/// One automatic reduction.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct LeftOut {
+    /// The part of the model or of training that was left out.
+    pub what: String,
+    /// The reason to consider it useless.
+    pub evidence: String,
+    /// The measured loss of quality, with its method.
+    pub loss: String,
+}
+
+impl Requirements {
+    /// The report of a run that ended with `rows` rows.
+    #[must_use]
+    pub fn new(
+        config: &RunConfig,
+        rows: usize,
+        auto_budget: Option<&AutoBudget>,
+        unscored_views: usize,
+    ) -> Self {
+        let left_out = [
+            degree_left_out(config),
+            exposures_left_out(config),
+            auto_budget.and_then(|auto| rows_left_out(auto, rows, config.budget())),
+            auto_budget.and_then(rows_removed),
+            (unscored_views > 0).then(|| unscored(unscored_views)),
+        ];
+        Self {
+            full: config.spec.size.full,
+            sh_degree: config.sh_degree(),
+            sh_degree_from: config.resolved.sh_degree_from,
+            exposures: config.resolved.has_exposures,
+            exposures_from: config.resolved.exposure_from,
+            rows: auto_budget.cloned(),
+            unscored_views,
+            left_out: left_out.into_iter().flatten().collect(),
+        }
+    }
+
+    /// The report in a few lines.
+    #[must_use]
+    pub fn lines(&self, spelling: Spelling) -> Vec<String> {
+        if self.left_out.is_empty() {
+            let full = spelling.switch("full");
+            let why = if self.full { format!(" ({full})") } else { String::new() };
+            return vec![format!("left out nothing{why}")];
+        }
+        let line =
+            |left: &LeftOut| format!("left out {}: {}; {}", left.what, left.evidence, left.loss);
+        self.left_out.iter().map(line).collect()
+    }
+}
+
+fn degree_left_out(config: &RunConfig) -> Option<LeftOut> {
+    let degree = config.sh_degree();
+    let what = match MAX_SH_DEGREE.checked_sub(degree)? {
+        0 => return None,
+        1 => format!("degree {MAX_SH_DEGREE} of colour"),
+        _ => format!("degrees {} to {MAX_SH_DEGREE} of colour", degree + 1),
+    };
+    if config.resolved.sh_degree_lowered {
+        return Some(LeftOut {
+            what,
+            // The file is the same whoever started the run.
+            evidence: format!(
+                "{} holds fewer rows at it than the scene starts with",
+                Spelling::Terminal.option("memory")
+            ),
+            loss: "its loss was not measured".to_owned(),
+        });
+    }
+    // Any other degree below the highest is what the options say.
+    let DegreeSource::Spread(found) = config.resolved.sh_degree_from else { return None };
+    Some(LeftOut {
+        what,
+        evidence: format!(
+            "between their views, a twentieth of {} points differ by {:.2}/255 or more",
+            found.tracks, found.twentieth
+        ),
+        loss: format!(
+            "the colours of all differ by {:.2}/255 (rms); at equal rows degree 3 was worth 0.5 to \
+             1.4 dB on matt scenes all the same (docs/tradeoffs.md)",
+            found.rms
+        ),
+    })
+}
+
+fn exposures_left_out(config: &RunConfig) -> Option<LeftOut> {
+    let ExposureSource::Tracks(found) = config.resolved.exposure_from else { return None };
+    (!config.resolved.has_exposures).then(|| LeftOut {
+        what: "an exposure for each photograph".to_owned(),
+        evidence: format!(
+            "by the colours of {} points, those of {} views differ by {:.2} stops (rms)",
+            found.tracks, found.views, found.stops
+        ),
+        loss: "its loss was not measured".to_owned(),
+    })
+}
+
+fn rows_left_out(auto: &AutoBudget, rows: usize, budget: usize) -> Option<LeftOut> {
+    let last = auto.intervals.iter().find(|interval| Some(interval.step) == auto.stopped)?;
+    let gain = last.gain.filter(|_| rows < budget && auto.idle >= 2)?;
+    auto.stopped.map(|step| LeftOut {
+        what: format!("rows beyond {}", last.rows),
+        evidence: format!(
+            "growth ended at step {step}, as a doubling of rows gained less than {MIN_GAIN:.2} dB \
+             twice in a row"
+        ),
+        loss: format!("about {gain:.2} dB per doubling on training views"),
+    })
+}
+
+fn rows_removed(auto: &AutoBudget) -> Option<LeftOut> {
+    let removals = auto.removals.iter().filter(|removal| removal.after < removal.before);
+    let removals: Vec<_> = removals.collect();
+    let change: f64 = removals.iter().map(|removal| removal.change).sum();
+    let removed: usize = removals.iter().map(|removal| removal.before - removal.after).sum();
+    (removed > 0).then(|| LeftOut {
+        what: format!("{removed} rows of low weight"),
+        evidence: format!(
+            "{} times, hiding them cost less than {MIN_GAIN:.2} dB per halving",
+            removals.len()
+        ),
+        loss: format!("{change:.3} dB in all on training views, measured at removal"),
+    })
+}
+
+fn unscored(views: usize) -> LeftOut {
+    LeftOut {
+        what: format!("{views} training views from the policy's scores"),
+        evidence: "each has a near-duplicate within 1 % of the scene's extent and one degree"
+            .into(),
+        loss: "its loss was not measured".into(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::resolved::sample;
+    use densify_data::track_colours::Spread;
+    use densify_train::trainer::{Interval, Removal};
+
+    fn spread() -> Spread {
+        let (median, tenth, twentieth, rms) = (0.0, 0.25, 0.5, 0.125);
+        Spread { tracks: 4000, on_surface: 0.9, median, tenth, twentieth, rms }
+    }
+
+    #[test]
+    fn what_the_options_say_is_not_left_out() {
+        let mut config = sample();
+        let lines = |config: &RunConfig, unscored| {
+            Requirements::new(config, 500, None, unscored).lines(Spelling::Terminal).join("\n")
+        };
+        config.resolved.sh_degree_from = DegreeSource::Given;
+        config.sh_degree = 0;
+        assert_eq!(lines(&config, 0), "left out nothing");
+        config.resolved.sh_degree_from = DegreeSource::Undecided;
+        config.sh_degree = MAX_SH_DEGREE;
+        assert_eq!(lines(&config, 0), "left out nothing");
+        assert!(lines(&config, 4).starts_with("left out 4 training views"));
+        config.spec.size.full = true;
+        assert_eq!(lines(&config, 0), "left out nothing (--full)");
+    }
+
+    #[test]
+    fn each_decision_has_its_evidence_and_its_loss() {
+        let mut config = sample();
+        let line = |config: &RunConfig, auto_budget: Option<&AutoBudget>| {
+            Requirements::new(config, 900, auto_budget, 0).lines(Spelling::Terminal).join("\n")
+        };
+        config.resolved.sh_degree_from = DegreeSource::Spread(spread());
+        config.sh_degree = 0;
+        let text = line(&config, None);
+        for words in ["degrees 1 to 3", "4000 points", "0.50/255", "0.12/255"] {
+            assert!(text.contains(words), "{words}: {text}");
+        }
+        config.resolved.sh_degree_lowered = true;
+        config.sh_degree = 2;
+        let text = line(&config, None);
+        assert!(text.contains("degree 3 of") && text.contains("not measured"), "{text}");
+        config.sh_degree = 3;
+        let interval = |step, rows, gain| Interval { step, rows, psnr: 30.0, settled: true, gain };
+        let auto_budget = AutoBudget {
+            limit: 900,
+            stopped: Some(300),
+            idle: 2,
+            intervals: vec![
+                interval(200, 700, Some(0.06)),
+                interval(300, 1000, Some(0.04)),
+                interval(400, 1000, None),
+            ],
+            removals: vec![
+                Removal { step: 400, before: 1000, after: 900, change: -0.015 },
+                Removal { step: 500, before: 900, after: 900, change: -0.125 },
+            ],
+        };
+        let text = line(&config, Some(&auto_budget));
+        for words in ["rows beyond 1000", "step 300", "0.04 dB", "100 rows", "1 times", "-0.015 dB"]
+        {
+            assert!(text.contains(words), "{words}: {text}");
+        }
+    }
+}

@@ -1,0 +1,117 @@
+//! A run that is prepared.
+
+use std::path::PathBuf;
+
+use super::records::SavedSession;
+use super::resume::Resumed;
+use super::{Occupied, prepare, train};
+use crate::failure::{Failure, TrainingProblem};
+use crate::host::Host;
+use crate::observer::{Interrupt, Observer};
+use crate::process::ProcessMemory;
+use crate::resolved::{Measuring, RunConfig};
+use crate::spec::RunSpec;
+use densify_core::gaussians::Gaussians;
+use densify_core::memory::Ledger;
+use densify_data::dataset::{Dataset, PointCloud};
+use densify_data::views::DatasetViews;
+use densify_train::checkpoint::Fingerprint;
+use densify_train::trainer::Trainer;
+
+/// A run, ready to train.
+pub struct Run {
+    /// As it was asked for.
+    pub(super) spec: RunSpec,
+    /// With everything decided, as `config.toml` has it.
+    pub(super) config: RunConfig,
+    pub(super) output: PathBuf,
+    pub(super) trainer: Trainer<DatasetViews>,
+    /// The test views.
+    pub(super) test: DatasetViews,
+    /// The dataset; of its points only those that a companion asks for.
+    pub(super) dataset: Dataset,
+    pub(super) ledger: Ledger,
+    /// The measurement at the end, if the surface is known.
+    pub(super) measuring: Option<Measuring>,
+    /// Identifies the dataset in checkpoints.
+    pub(super) fingerprint: Fingerprint,
+    /// The step at which the run ends.
+    pub(super) last: u32,
+    /// State of the logs, for a run that goes on.
+    pub(super) session: Option<SavedSession>,
+    pub(super) process: ProcessMemory,
+}
+
+impl Run {
+    /// Prepares a new run: opens scene and device, decides its size, and makes the trainer. Nothing is written.
+    ///
+    /// # Errors
+    /// When the description, one of its files or the device is unfit.
+    pub fn prepare(spec: &RunSpec) -> Result<Self, Failure> {
+        Self::prepare_on(spec, None, Host::default())
+    }
+
+    /// Prepares a run on `host`. With `resumed` it goes on with the run that [`start`] has found.
+    ///
+    /// # Errors
+    /// As [`prepare`](Self::prepare), and when the result would differ from that of the run that goes on.
+    pub fn prepare_on(
+        spec: &RunSpec,
+        resumed: Option<Resumed>,
+        host: Host<'_>,
+    ) -> Result<Self, Failure> {
+        prepare::prepare(spec, resumed, host)
+    }
+
+    /// Bytes per buffer, as promised.
+    #[must_use]
+    pub fn ledger(&self) -> &Ledger {
+        &self.ledger
+    }
+
+    /// The run with everything decided.
+    #[must_use]
+    pub fn config(&self) -> &RunConfig {
+        &self.config
+    }
+
+    /// The dataset; of its points only those that a companion asks for.
+    #[must_use]
+    pub fn dataset(&self) -> &Dataset {
+        &self.dataset
+    }
+
+    /// The points of the dataset that a companion asks for.
+    pub fn take_points(&mut self) -> PointCloud {
+        std::mem::take(&mut self.dataset.points)
+    }
+
+    /// The trainer.
+    pub fn trainer(&mut self) -> &mut Trainer<DatasetViews> {
+        &mut self.trainer
+    }
+
+    /// Trains to the end, writes nothing, and returns the model in the dataset's own coordinates.
+    ///
+    /// # Errors
+    /// When a view cannot be read, the device fails, or the observer asks to stop.
+    pub fn model_after_training(mut self, observer: &dyn Observer) -> Result<Gaussians, Failure> {
+        while self.trainer.steps_done() < self.last {
+            if let Some(Interrupt { name, exit_code }) = observer.interrupt() {
+                let stopped = TrainingProblem::Stopped { by: name, step: None };
+                return Err(Failure::with_code(exit_code, stopped));
+            }
+            self.trainer.step()?;
+        }
+        Ok(self.dataset.normalisation.world_from_model(self.trainer.model()?))
+    }
+
+    /// Trains to the end and writes everything that a run leaves; returns its folder.
+    ///
+    /// # Errors
+    /// When a view cannot be read, or the device, the disk or the policy fails. The error names the files that were written
+    /// until then; they stay.
+    pub fn train(self, occupied: Occupied, observer: &dyn Observer) -> Result<PathBuf, Failure> {
+        train(self, occupied, observer)
+    }
+}

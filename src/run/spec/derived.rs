@@ -1,0 +1,242 @@
+//! Values that follow from the options alone: the dataset's split, the knobs, the learning rates, the policy's parameters,
+//! the output folder.
+
+use std::path::{Path, PathBuf};
+
+use densify_policies::policy::RateOverrides;
+use densify_policies::registry::{PolicyEntry, find};
+use toml::{Table, Value};
+
+use super::knobs::Knobs;
+use super::values;
+use super::{DataSpec, InitChoice, RunSpec};
+use crate::failure::{Failure, OptionProblem};
+use densify_data::dataset::{LoadOptions, Split, builtin};
+use densify_train::schedule::{InitRates, RateOptions};
+
+impl DataSpec {
+    /// The options for reading the dataset, with or without tracks.
+    #[must_use]
+    pub fn load_options(&self, tracks: bool) -> LoadOptions {
+        LoadOptions {
+            images: self.images.clone(),
+            resolution: self.resolution,
+            split: match self.test_every {
+                Some(every) => Split::Every(every),
+                None if self.eval => Split::Eval,
+                None => Split::None,
+            },
+            views: self.views.as_ref().map(|file| file.0.clone()),
+            far_cameras: self.far_cameras,
+            keep_fov: self.keep_fov,
+            invert_masks: self.invert_masks,
+            mask_mode: self.mask_mode,
+            cache: builtin::folder().filter(|_| !self.no_cache),
+            tracks,
+        }
+    }
+}
+
+impl RunSpec {
+    /// The options as the table of a file, without those that are `None`.
+    ///
+    /// # Errors
+    /// When a path is not UTF-8, which a file cannot hold.
+    pub fn table(&self) -> Result<Table, Failure> {
+        let Self { start, data, output, .. } = self;
+        for (option, path) in
+            [("scene", &start.scene), ("images", &data.images), ("output", &output.output)]
+        {
+            if let Some(path) = path.as_ref().filter(|path| path.to_str().is_none()) {
+                return Err(OptionProblem::NotUtf8 { option, path: path.clone() }.into());
+            }
+        }
+        Table::try_from(self).map_err(|error| Failure::input(error.to_string().trim()))
+    }
+
+    /// The dataset.
+    ///
+    /// # Errors
+    /// When none is named.
+    pub fn scene(&self) -> Result<&Path, Failure> {
+        let scene = self.start.scene.as_deref();
+        scene.ok_or_else(|| OptionProblem::NoScene.into())
+    }
+
+    /// The folder to write to. The default is `output/SCENE-POLICY`, with the name of the dataset's folder, or of its
+    /// archive without the ending.
+    ///
+    /// # Errors
+    /// When neither scene nor folder is given.
+    pub fn output_folder(&self) -> Result<PathBuf, Failure> {
+        if let Some(folder) = &self.output.output {
+            return Ok(folder.clone());
+        }
+        let (scene, policy) = (self.scene()?, &self.density.policy);
+        if let Some(name) = builtin::label(scene) {
+            return Ok(Path::new("output").join(format!("{name}-{policy}")));
+        }
+        let full = scene.canonicalize().unwrap_or_else(|_| scene.to_owned());
+        let last = if full.is_file() { full.file_stem() } else { full.file_name() };
+        let name = last.map_or_else(|| "scene".into(), |name| name.to_string_lossy());
+        Ok(Path::new("output").join(format!("{name}-{policy}")))
+    }
+
+    /// The knobs.
+    ///
+    /// # Errors
+    /// When there is no such knob, or its value is outside its domain.
+    pub fn knobs(&self) -> Result<Knobs, Failure> {
+        let table = values::table(&self.schedule.knob)
+            .map_err(|problem| OptionProblem::Conflict { option: "knob", problem })?;
+        Knobs::from_table(&table).map_err(|error| OptionProblem::value("knob", error).into())
+    }
+
+    /// The learning rates: the defaults for a run of this length, overlaid with those of the policy, reduced if the run
+    /// starts from a model, and overlaid with `--lr`.
+    ///
+    /// # Errors
+    /// When there is no such rate, or it is not a positive number.
+    pub fn learning_rates(&self, of_policy: &RateOverrides) -> Result<RateOptions, Failure> {
+        let fail = |problem: &str| Failure::from(OptionProblem::value("lr", problem.trim()));
+        let iterations = self.schedule.iterations.0;
+        let mut defaults = RateOptions::for_run(iterations).with(of_policy);
+        let is_model = matches!(self.start.init, Some(InitChoice::Model(_)));
+        if is_model && self.start.init_rates == InitRates::Fine {
+            defaults = defaults.fine();
+        }
+        let mut table = Table::try_from(defaults).map_err(|error| fail(&error.to_string()))?;
+        let given = values::table(&self.schedule.lr).map_err(|error| fail(&error))?;
+        for (name, rate) in given {
+            let number = match rate {
+                Value::Integer(number) => number as f64,
+                Value::Float(number) => number,
+                other => {
+                    return Err(fail(&format!(
+                        "{name}={other} is not of the form NAME=RATE, such as opacity=0.05"
+                    )));
+                }
+            };
+            table.insert(name, number.into());
+        }
+        let rates: RateOptions = table.try_into().map_err(|error| fail(&format!("{error}")))?;
+        match rates.invalid() {
+            Some(name) => Err(fail(&format!("{name} must be a positive number"))),
+            None => Ok(rates),
+        }
+    }
+
+    /// The policy, and the parameters that are set for it.
+    ///
+    /// # Errors
+    /// When there is no such policy, or a parameter is set twice.
+    pub fn policy(&self) -> Result<(&'static PolicyEntry, Table), Failure> {
+        let entry = find(&self.density.policy)?;
+        let mut tables = values::table(&self.density.policy_set)
+            .map_err(|problem| OptionProblem::Conflict { option: "policy_set", problem })?;
+        let own = tables.remove(entry.name);
+        Ok((entry, own.and_then(|own| own.as_table().cloned()).unwrap_or_default()))
+    }
+
+    /// Fails if the run does not have an iteration after which to save or to test.
+    pub(crate) fn check_iterations(&self, last: u32) -> Result<(), Failure> {
+        for (option, chosen) in [
+            ("save_iterations", &self.output.save_iterations),
+            ("test_iterations", &self.output.test_iterations),
+        ] {
+            if let Some(&step) = chosen.iter().find(|&&step| step == 0 || step > last) {
+                return Err(OptionProblem::IterationOutOfRange { option, step, last }.into());
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use densify_policies::policy::{Fade, Rate};
+
+    use super::*;
+    use crate::spec::Partial;
+
+    fn spec(option: &str, value: &str) -> Result<RunSpec, Failure> {
+        let file: Table = format!("{option} = {value}").parse().unwrap();
+        Partial::new(file, "file.toml")?.describe()
+    }
+
+    #[test]
+    fn learning_rates_by_name() {
+        let rates = |lr: &str, of_policy: &RateOverrides| {
+            let mut spec = spec("lr", lr).unwrap();
+            spec.schedule.iterations.0 = 30_000;
+            spec.learning_rates(of_policy).unwrap()
+        };
+        let given = rates("{ opacity = 0.05, mean_end = 1e-5 }", &RateOverrides::default());
+        let expected = RateOptions { opacity: 0.05, mean_end: 1e-5, ..RateOptions::default() };
+        assert_eq!(given, expected);
+        let of_policy = RateOverrides {
+            mean: Some(Rate { start: 1.6e-4, end: 3e-6 }),
+            opacity: Some(Rate { start: 0.5, end: 0.25 }),
+            sh_rest: Some(Rate::constant(2e-4)),
+            fade: Some(Fade { from: 0.5, to: 0.25 }),
+            ..RateOverrides::default()
+        };
+        let both = rates("{ mean_end = 1e-5, opacity_end = 0.125 }", &of_policy);
+        let expected = RateOptions {
+            mean_end: 1e-5,
+            opacity: 0.5,
+            opacity_end: Some(0.125),
+            sh_rest: 2e-4,
+            fade: 0.25,
+            fade_from: 0.5,
+            ..RateOptions::default()
+        };
+        assert_eq!(both, expected);
+        for (bad, part) in [
+            ("{ opacity = \"x\" }", "NAME=RATE"),
+            ("{ colour = 1 }", "colour"),
+            ("{ quat = 0 }", "quat"),
+            ("{ quat = inf }", "quat"),
+        ] {
+            let message = spec("lr", bad).unwrap_err().to_string();
+            assert!(message.contains(part) && message.contains("--lr"), "{bad}: {message}");
+        }
+    }
+
+    #[test]
+    fn the_output_is_named_after_the_scene_and_the_policy() {
+        let root = tempfile::tempdir().unwrap();
+        let scene = root.path().join("garden");
+        std::fs::create_dir(&scene).unwrap();
+        for spelling in [scene.clone(), scene.join(""), scene.join("."), scene.join("../garden")] {
+            let mut spec = RunSpec::default();
+            spec.start.scene = Some(spelling);
+            assert_eq!(spec.output_folder().unwrap(), Path::new("output/garden-diet"));
+        }
+        let archive = root.path().join("garden.v2.zip");
+        std::fs::write(&archive, "").unwrap();
+        let mut packed = RunSpec::default();
+        packed.start.scene = Some(archive);
+        assert_eq!(packed.output_folder().unwrap(), Path::new("output/garden.v2-diet"));
+        let mut built_in = RunSpec::default();
+        built_in.start.scene = Some("scene:town:4".into());
+        assert_eq!(built_in.output_folder().unwrap(), Path::new("output/town-4-diet"));
+        assert!(RunSpec::default().output_folder().unwrap_err().to_string().contains("no scene"));
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn folders_whose_names_are_not_utf_8_are_named_with_their_option() {
+        use std::os::unix::ffi::OsStringExt;
+        let folder = || Some(std::ffi::OsString::from_vec(b"caf\xe9".to_vec()).into());
+        let [mut scene, mut images, mut output] = [(); 3].map(|()| RunSpec::default());
+        scene.start.scene = folder();
+        images.data.images = folder();
+        output.output.output = folder();
+        for (option, spec) in [("SCENE", scene), ("--images", images), ("--output", output)] {
+            let message = spec.table().unwrap_err().to_string();
+            let told = message.starts_with(option) && message.contains("rename the folder");
+            assert!(told, "{message}");
+        }
+    }
+}

@@ -1,0 +1,151 @@
+//! Presets: knobs and options that go together, named by what they promise. Levels are chosen from what
+//! `densify trade` measures, and each says what that was.
+
+use std::fmt;
+
+use super::KnobError;
+
+/// Knobs and options that go together.
+#[derive(Debug)]
+pub struct Preset {
+    /// Such as `fast`.
+    pub name: &'static str,
+    /// The promise, in a line.
+    pub promise: &'static str,
+    /// Knobs and options by name, each with its value.
+    pub levels: &'static [(&'static str, &'static str)],
+    /// Measured cost and gain; `None` for the reference.
+    pub measured: Option<Measured>,
+}
+
+/// Measured cost and gain of a preset against `exact`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Measured {
+    /// Mean difference of PSNR on views held out `[dB]`.
+    pub psnr: f64,
+    /// 95 % interval of this difference `[dB]`.
+    pub interval: [f64; 2],
+    /// Processor time of training, as a ratio.
+    pub seconds: f64,
+    /// Peak memory of the process, as a ratio.
+    pub peak: f64,
+    /// Scenes and size of the runs.
+    pub on: &'static str,
+    /// The command that measured it.
+    pub command: &'static str,
+}
+
+/// The runs behind the figures of `tiny-memory`.
+const STUDY: &str = "two built-in scenes, an object and photographs, 2,000 iterations, 20,000 rows, image_cache=0, 4 seeds";
+
+/// The command of these runs.
+const COMMAND: &str = "densify trade scene:spheres scene:room data/chair data/cup --knobs preset:tiny-memory --seeds 4 \
+                       -i 2000 -b 20k -- --threads 1 --backend cpu";
+
+/// The runs behind the figures of shorter presets, at full length.
+const LONG_STUDY: &str = "two built-in scenes, an object and photographs at half their size, 30,000 iterations in \
+                          exact, 5,000 rows, 5 seeds";
+
+/// The command of these runs.
+const LONG_COMMAND: &str = "densify trade scene:spheres scene:room data/chair data/cup \
+                            --knobs iterations:24000:15000 --seeds 5 -i 30000 -b 5k \
+                            -- -r 2 --threads 1 --backend cpu";
+
+/// The preset that others are measured against.
+pub const EXACT: &str = "exact";
+
+/// The preset of a run that names none.
+pub const DEFAULT_PRESET: &str = "balanced";
+
+/// All presets.
+pub static PRESETS: &[Preset] = &[
+    Preset {
+        name: EXACT,
+        promise: "no shortcut that a knob can take",
+        levels: &[
+            ("alpha_min", "1/255"),
+            ("transmittance_stop", "1e-4"),
+            ("param_storage", "f32"),
+            ("moment_storage", "f32"),
+        ],
+        measured: None,
+    },
+    // In runs as long as these, every other level loses more for the time that it saves:
+    // docs/tradeoffs.md.
+    Preset {
+        name: "balanced",
+        promise: "four fifths of the iterations; what the others bring cannot be seen",
+        levels: &[("iterations", "24000")],
+        measured: Some(Measured {
+            psnr: -0.01,
+            interval: [-0.15, 0.17],
+            seconds: 0.79,
+            peak: 1.00,
+            on: LONG_STUDY,
+            command: LONG_COMMAND,
+        }),
+    },
+    Preset {
+        name: "fast",
+        promise: "half of the iterations",
+        levels: &[("iterations", "15000")],
+        measured: Some(Measured {
+            psnr: 0.03,
+            interval: [-0.15, 0.21],
+            seconds: 0.49,
+            peak: 1.00,
+            on: LONG_STUDY,
+            command: LONG_COMMAND,
+        }),
+    },
+    Preset {
+        name: "tiny-memory",
+        promise: "memory before time",
+        // 478 bytes per row at degree 3 with `diet`; docs/memory.md has the table.
+        levels: &[
+            ("image_cache", "auto"),
+            ("param_storage", "f16"),
+            ("moment_storage", "both8"),
+            ("pairs_per_row", "1"),
+        ],
+        measured: Some(Measured {
+            psnr: 0.11,
+            interval: [-0.01, 0.24],
+            seconds: 1.40,
+            peak: 0.69,
+            on: STUDY,
+            command: COMMAND,
+        }),
+    },
+];
+
+/// The preset of this name.
+///
+/// # Errors
+/// When there is none; names all presets.
+pub fn preset(name: &str) -> Result<&'static Preset, KnobError> {
+    let preset = PRESETS.iter().find(|preset| preset.name == name);
+    preset.ok_or_else(|| KnobError::UnknownPreset { name: name.to_owned() })
+}
+
+/// The names of all presets.
+pub(super) fn names() -> String {
+    PRESETS.iter().map(|preset| preset.name).collect::<Vec<_>>().join(", ")
+}
+
+impl fmt::Display for Preset {
+    /// `fast: half of the iterations; iterations=15000; +0.03 dB [-0.15, +0.21], …`.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let levels: Vec<String> =
+            self.levels.iter().map(|(knob, value)| format!("{knob}={value}")).collect();
+        write!(f, "{}: {}; {}; ", self.name, self.promise, levels.join(" "))?;
+        match self.measured {
+            None => f.write_str("what the others are measured against"),
+            Some(Measured { psnr, interval: [low, high], seconds, peak, on, .. }) => write!(
+                f,
+                "{psnr:+.2} dB [{low:+.2}, {high:+.2}], {seconds:.2} of the processor time and {peak:.2} \
+                 of the memory of exact ({on})"
+            ),
+        }
+    }
+}

@@ -1,0 +1,91 @@
+//! The knobs. `densify trade` measures what they cost and gain; docs/tradeoffs.md has the figures.
+
+use super::Class::{Bounded, Exact};
+use super::{Domain, Knob, number};
+use densify_render::BackendKind::{Cpu, Gpu};
+use densify_render::{Accumulation, MomentStorage, ParameterStorage};
+
+/// All knobs: exact ones, then bounded ones.
+pub static KNOBS: &[Knob] = &[
+    Knob {
+        name: "pairs_per_row",
+        default: "auto",
+        domain: Domain::Choice(&["auto", "4", "2", "1"]),
+        unit: "pairs",
+        only_on: Some(Cpu),
+        class: Exact,
+        effect: "tile_cap per Gaussian, with gradients for 2 in 5; auto: 16, or 4 to 16 with --memory, and for all",
+        levels: &["4", "2", "1"],
+        set: |knobs, value| knobs.pairs_per_row = value.parse().ok(),
+    },
+    Knob {
+        name: "alpha_min",
+        default: "1/255",
+        domain: Domain::Number { least: 1.0 / 1024.0, most: 1.0 / 32.0 },
+        unit: "",
+        only_on: None,
+        class: Bounded,
+        effect: "alpha below this is not blended; a larger one shrinks splats, so that fewer pairs are left",
+        levels: &["1/1024", "1/128", "1/64", "1/32"],
+        set: |knobs, value| knobs.shortcuts.alpha_min = real(value) as f32,
+    },
+    Knob {
+        name: "transmittance_stop",
+        default: "1e-4",
+        domain: Domain::Number { least: 1e-5, most: 1e-2 },
+        unit: "",
+        only_on: None,
+        class: Bounded,
+        effect: "a pixel stops before its transmittance falls below this; a larger one stops sooner",
+        levels: &["1e-5", "1e-3", "1e-2"],
+        set: |knobs, value| knobs.shortcuts.transmittance_min = real(value) as f32,
+    },
+    Knob {
+        name: "accumulation",
+        default: "auto",
+        domain: Domain::Choice(&["auto", "slots", "cas", "atomics"]),
+        unit: "",
+        only_on: Some(Gpu),
+        class: Bounded,
+        effect: "how gradients are added up: slots in one order; cas and atomics in any, so that runs differ slightly",
+        levels: &["slots", "cas", "atomics"],
+        set: |knobs, value| knobs.accumulation = Accumulation::from_name(value),
+    },
+    Knob {
+        name: "param_storage",
+        default: "f32",
+        domain: Domain::Choice(&["f32", "f16"]),
+        unit: "",
+        only_on: Some(Cpu),
+        class: Bounded,
+        effect: "f16: parameters other than means in 2 bytes, rounded at random; 112 bytes less per Gaussian of degree 3",
+        levels: &["f16"],
+        set: |knobs, value| {
+            knobs.storage.parameters = match value {
+                "f16" => ParameterStorage::F16,
+                _ => ParameterStorage::F32,
+            }
+        },
+    },
+    Knob {
+        name: "moment_storage",
+        default: "f32",
+        domain: Domain::Choice(&["f32", "both8"]),
+        unit: "",
+        only_on: Some(Cpu),
+        class: Bounded,
+        effect: "both8: both moments of the optimiser in a byte each",
+        levels: &["both8"],
+        set: |knobs, value| {
+            knobs.storage.moments = match value {
+                "both8" => MomentStorage::Both8,
+                _ => MomentStorage::F32,
+            }
+        },
+    },
+];
+
+/// The number of a value in the table's spelling.
+fn real(value: &str) -> f64 {
+    number(value).unwrap_or_default()
+}

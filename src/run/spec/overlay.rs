@@ -1,0 +1,186 @@
+//! Partial descriptions of a run, and their overlays: defaults < preset < file < flags.
+
+use std::path::Path;
+
+use serde::Deserialize;
+use toml::{Table, Value};
+
+use super::knobs::{self, DEFAULT_PRESET};
+use super::{OPTIONS, RunOption, RunSpec};
+use crate::failure::{Failure, OptionProblem};
+use densify_core::files;
+use densify_policies::parameters::{nearest, parse_value};
+use densify_policies::policy::RateOverrides;
+
+/// Keys of a run's `config.toml` that are not options: the version and the findings.
+pub(crate) const FOUND_OUT: [&str; 2] = ["densify", "resolved"];
+
+/// Some options of a run by name, each with a value that is valid by itself.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Partial(Table);
+
+impl Partial {
+    /// Checks that every key is an option and every value is valid. Messages name `origin`, the source of the table.
+    ///
+    /// # Errors
+    /// Names the key, the expected values, and the nearest valid name.
+    pub fn new(table: Table, origin: &str) -> Result<Self, Failure> {
+        Self::checked(table).map_err(|failure| failure.within(origin))
+    }
+
+    fn checked(table: Table) -> Result<Self, Failure> {
+        for (name, value) in &table {
+            if RunOption::find(name).is_none() {
+                let nearest = nearest(name, OPTIONS.iter().map(|option| option.name));
+                return Err(OptionProblem::UnknownOption { name: name.clone(), nearest }.into());
+            }
+            let alone: Table = [(name.clone(), value.clone())].into_iter().collect();
+            let spec = RunSpec::deserialize(alone);
+            let malformed = |error: toml::de::Error| OptionProblem::Malformed {
+                origin: name.clone(),
+                problem: error.to_string().trim().to_owned(),
+            };
+            check_names(&spec.map_err(malformed)?)?;
+        }
+        Ok(Self(table))
+    }
+
+    /// Reads a TOML file with any of the options, such as the `config.toml` of a run, of which the findings are
+    /// ignored.
+    ///
+    /// # Errors
+    /// As [`new`](Self::new), and when the file cannot be read.
+    pub fn read(path: &Path) -> Result<Self, Failure> {
+        let read = || {
+            let text = files::read_text(path, files::MAX_OPTIONS).map_err(Failure::input)?;
+            let mut table: Table = text
+                .parse()
+                .map_err(|error: toml::de::Error| Failure::input(error.to_string().trim()))?;
+            table.retain(|key, _| !FOUND_OUT.contains(&key));
+            Self::checked(table)
+        };
+        read().map_err(|failure| failure.within_config_file(path))
+    }
+
+    /// The options of a description for which `is_given` returns true.
+    ///
+    /// # Errors
+    /// When a value is invalid.
+    pub fn given(spec: &RunSpec, is_given: impl Fn(&str) -> bool) -> Result<Self, Failure> {
+        let all = spec.table()?;
+        check_names(spec)?;
+        Ok(Self(all.into_iter().filter(|(name, _)| is_given(name)).collect()))
+    }
+
+    /// All options of a description.
+    ///
+    /// # Errors
+    /// When a value is invalid.
+    pub fn all(spec: &RunSpec) -> Result<Self, Failure> {
+        Self::given(spec, |_| true)
+    }
+
+    /// A single option.
+    #[must_use]
+    pub fn option(name: &str, value: impl Into<Value>) -> Self {
+        Self([(name.to_owned(), value.into())].into_iter().collect())
+    }
+
+    /// The levels of a preset.
+    ///
+    /// # Errors
+    /// When there is no such preset.
+    pub fn preset(name: &str) -> Result<Self, Failure> {
+        let preset = knobs::preset(name).map_err(|error| OptionProblem::value("preset", error))?;
+        Ok(preset
+            .levels
+            .iter()
+            .fold(Self::default(), |all, (name, value)| Self::setting(name, value).over(all)))
+    }
+
+    /// An option, or else a knob, by name and with its value as text.
+    #[must_use]
+    pub fn setting(name: &str, value: &str) -> Self {
+        let value = parse_value(value);
+        match RunOption::find(name) {
+            Some(_) => Self::option(name, value),
+            None => Self::option("knob", [(name.to_owned(), value)].into_iter().collect::<Table>()),
+        }
+    }
+
+    /// Overlays other options with these, which win; tables are joined key by key.
+    #[must_use]
+    pub fn over(self, mut lower: Self) -> Self {
+        join(self.0, &mut lower.0);
+        lower
+    }
+
+    /// The value of an option, if it is there.
+    #[must_use]
+    pub fn get(&self, name: &str) -> Option<&Value> {
+        self.0.get(name)
+    }
+
+    /// Removes an option.
+    pub fn remove(&mut self, name: &str) {
+        self.0.remove(name);
+    }
+
+    /// The options with their values.
+    pub fn iter(&self) -> impl Iterator<Item = (&str, &Value)> {
+        self.0.iter().map(|(name, value)| (&**name, value))
+    }
+
+    /// True if a file with this table describes the same options.
+    #[must_use]
+    pub fn is_table(&self, table: &Table) -> bool {
+        self.0 == *table
+    }
+
+    /// The options as the table of a file.
+    #[must_use]
+    pub fn into_table(self) -> Table {
+        self.0
+    }
+
+    /// The run that these options describe, over their preset (`balanced` if they name none) and the defaults.
+    ///
+    /// # Errors
+    /// When the preset does not exist.
+    pub fn describe(self) -> Result<RunSpec, Failure> {
+        let name = self.get("preset").and_then(Value::as_str).unwrap_or(DEFAULT_PRESET);
+        let preset = Self::preset(name)?;
+        self.over(preset).spec()
+    }
+
+    /// The run that these options describe, over the defaults.
+    pub(crate) fn spec(self) -> Result<RunSpec, Failure> {
+        RunSpec::deserialize(self.0).map_err(Failure::input)
+    }
+}
+
+fn join(upper: Table, lower: &mut Table) {
+    for (key, value) in upper {
+        match (value, lower.get_mut(&key)) {
+            (Value::Table(upper), Some(Value::Table(lower))) => join(upper, lower),
+            (value, _) => _ = lower.insert(key, value),
+        }
+    }
+}
+
+/// Checks the members of options that have several: knobs, learning rates, policies.
+fn check_names(spec: &RunSpec) -> Result<(), Failure> {
+    spec.knobs()?;
+    spec.learning_rates(&RateOverrides::default())?;
+    for setting in &spec.density.policy_set {
+        if let [policy, _] = &setting.path[..] {
+            densify_policies::registry::find(policy)
+                .map_err(|error| OptionProblem::value("policy_set", error))?;
+        } else {
+            let name = setting.path.join(".");
+            let setting = format!("{name}={}", setting.value);
+            return Err(OptionProblem::PolicySetting { setting }.into());
+        }
+    }
+    Ok(())
+}
