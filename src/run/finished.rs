@@ -1,5 +1,6 @@
 //! Finished runs and bare models, opened to render or measure them.
 
+use crate::device::describe;
 use std::path::{Path, PathBuf};
 
 use densify_policies::policy::Needs;
@@ -32,7 +33,7 @@ impl Machine {
     /// Opens the device that the options name.
     pub fn open(spec: &DeviceSpec, observer: &dyn Observer) -> Result<Self, Failure> {
         let device = Device::open_to_render(spec.backend, spec.gpu.as_deref())?;
-        observer.say(format_args!("device   {}", device.describe()));
+        observer.say(format_args!("device   {}", describe(&device)));
         Ok(Self { threads: spec.threads.map(|threads| threads.0 as usize), device })
     }
 

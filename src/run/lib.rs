@@ -8,6 +8,7 @@
 //! coordinate_check, resolved, finished, session.
 
 mod companion;
+mod device;
 pub mod coordinate_check;
 pub mod failure;
 pub mod finished;

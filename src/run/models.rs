@@ -105,7 +105,7 @@ pub fn model_file(named: &Path, asked: Option<u32>) -> Result<PathBuf, Failure> 
 /// # Errors
 /// When it cannot be read.
 pub fn read_model(path: &Path, observer: &dyn Observer) -> Result<Gaussians, Failure> {
-    let file = import::read_model(path)?;
+    let file = models::read_model(path)?;
     for (number, what) in [
         (file.dropped, "left out: a value is not finite"),
         (file.repaired, "with a zero quaternion, read as unrotated"),

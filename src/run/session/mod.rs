@@ -316,7 +316,7 @@ impl<'a> Session<'a> {
                 let saved = self.save(step).map_err(|failure| failure.to_string());
                 Err(Failure::from(error).with(TrainingProblem::ModelSaved { saved }))
             }
-            Err(error @ TrainError::Unsound { .. }) => Err(self.kept(error.into())),
+            Err(error @ TrainError::NonFinite { .. }) => Err(self.kept(error.into())),
             // The photograph could be read before. In the first epoch little is lost.
             Err(error @ TrainError::View { step, .. })
                 if step > self.run.trainer.steps_done() && step as usize > train_views =>

@@ -154,7 +154,7 @@ fn rendered(
 }
 
 fn failed(error: impl Into<Failure>) -> Unmade {
-    Unmade::Failed(error.into().message)
+    Unmade::Failed(error.into().to_string())
 }
 
 fn milliseconds(since: Instant) -> f64 {
