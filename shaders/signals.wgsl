@@ -17,7 +17,7 @@
 
 const FOLD: f32 = 0.8493218;
 // Least largest weight of a view that counts as support.
-const SUPPORT_WEIGHT: f32 = 0.02;
+override SUPPORT_WEIGHT: f32;
 
 // The signals' numbers, which are places in frame.planes; policies/src/signals.rs has the table.
 override VISIBLE_COUNT: u32;

@@ -1,5 +1,5 @@
-//! Everything that opens strangers' files: datasets, and models of Gaussian splats in all formats; and the writers
-//! of those formats. Knows no backend and no run.
+//! Reads datasets and models of Gaussian splats in all formats, which are untrusted, and writes models. Independent of
+//! backends and runs.
 
 pub mod dataset;
 pub mod export;

@@ -82,7 +82,7 @@ pub(super) fn build(
         None => size.is_lowered(&inputs),
     };
     config.resolved.extended_to = (last > spec.schedule.iterations.0).then_some(last);
-    let fingerprint = Fingerprint::of(&inputs.dataset);
+    let fingerprint = Fingerprint::new(&inputs.dataset);
     if let Some(resumed) = &resumed {
         resume::check(&config, resumed, &fingerprint, &output)?;
     }
@@ -115,13 +115,13 @@ pub(super) fn build(
         companion.map_or_else(PointCloud::default, |it| dataset.points.thinned(it.points));
     let policy: Box<dyn DensityPolicy> = policy;
     let trainer = Trainer::new(views, backend, (name, policy), scene, options)?;
-    let mut trainer = trainer.requiring(required).exposing(exposures);
+    let mut trainer = trainer.with_auto_choices(required).with_exposures(exposures);
     let session = match resumed {
         Some(resumed) => resume::restore(resumed, &mut trainer, observer)?,
         None => None,
     };
     if companion.is_some() {
-        trainer.remember_rows()?;
+        trainer.record_history()?;
     }
     Ok(Run {
         config,

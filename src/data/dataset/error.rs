@@ -1,11 +1,11 @@
-//! Errors of loading a dataset: each message names the file, the field and the remedy.
+//! The error of loading datasets and models; each message names the file, the field and the remedy.
 
 use std::fmt::Display;
 use std::path::Path;
 
 use densify_core::files::one_line;
 
-/// Why a dataset, one of its images, or a model of another program cannot be loaded.
+/// Reason why a dataset, an image or a model cannot be loaded.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0}")]
 pub struct DatasetError(pub(crate) String);
@@ -14,7 +14,7 @@ impl DatasetError {
     /// A file cannot be opened or read.
     pub(crate) fn io(path: &Path) -> impl FnOnce(std::io::Error) -> Self + '_ {
         move |source| {
-            // What this program says of a file, with the remedy, rather than the system.
+            // Errors of this program, which name the remedy, have no code of the operating system.
             let is_ours = source.raw_os_error().is_none();
             let path = path.display();
             if is_ours && source.kind() == std::io::ErrorKind::Other {
@@ -24,7 +24,7 @@ impl DatasetError {
         }
     }
 
-    /// A file's contents contradict its format or themselves; `field` is the record, line or field.
+    /// A file that contradicts its format or itself; `field` names the record, line or field.
     pub(crate) fn malformed(
         path: &Path,
         field: impl Display,
@@ -35,7 +35,7 @@ impl DatasetError {
         Self(format!("{}: {field}: {problem}; {remedy}", path.display()))
     }
 
-    /// A lens that cannot be converted to a pinhole.
+    /// A lens that cannot be converted to a pinhole camera.
     pub(super) fn lens(path: &Path, field: &str, problem: impl Display) -> Self {
         let remedy = "undistort the images first, e.g. with `colmap image_undistorter`";
         Self::malformed(path, field, problem, remedy)
@@ -45,7 +45,7 @@ impl DatasetError {
     pub(super) fn size(path: &Path, (width, height): (u32, u32), camera: (u32, u32)) -> Self {
         Self(format!(
             "{} is {width}x{height} px, but its camera says {}x{} px; use the images that the cameras were \
-             made from, or a proportional rescale of them",
+             estimated from, or a proportional rescale of them",
             path.display(),
             camera.0,
             camera.1
@@ -62,7 +62,7 @@ impl DatasetError {
         ))
     }
 
-    /// An image that a field of a file names is not there.
+    /// An image that a field of a file names does not exist.
     pub(super) fn missing_image(path: &Path, field: &str, image: &Path) -> Self {
         let problem = format!("the file {} does not exist", image.display());
         let remedy = "restore it, or name the folder that holds the images with --images";

@@ -6,7 +6,7 @@ use densify_core::numbers::grouped;
 use densify_data::dataset::{Dataset, ReportedExposures};
 use densify_data::track_colours::exposures::{ExposureSpread, MIN_STOPS};
 use densify_data::track_colours::{MIN_TRACKS, TrackColours};
-use densify_train::exposure::reported::{Believed, complete, spread};
+use densify_train::exposure::reported::{ExifUse, complete_gains, spread};
 use densify_train::exposure::{ExposureChoice, Exposures};
 
 /// The exposures of a run.
@@ -21,7 +21,7 @@ pub(crate) struct Exposure {
     /// Whether the colours of tracks gave them.
     by_tracks: bool,
     /// What became of the exposures in EXIF.
-    believed: Believed,
+    believed: ExifUse,
     /// How these differ `[stops]`.
     reported: f64,
     /// What else there is to say of EXIF.
@@ -42,7 +42,7 @@ impl Exposure {
             source,
             gains: Vec::new(),
             by_tracks: false,
-            believed: Believed::Nothing,
+            believed: ExifUse::Unused,
             reported: spread(reported.stops.iter().copied().flatten()),
             notes: Vec::new(),
         };
@@ -77,11 +77,11 @@ impl Exposure {
             _ => vec![false; views],
         };
         found.gains.resize(views, [1.0; 3]);
-        found.believed = complete(&mut found.gains, &known, &reported.stops);
-        if !found.by_tracks && found.believed == Believed::Nothing {
+        found.believed = complete_gains(&mut found.gains, &known, &reported.stops);
+        if !found.by_tracks && found.believed == ExifUse::Unused {
             found.gains.clear();
         }
-        if let Believed::Contradicted { by } = found.believed {
+        if let ExifUse::Contradicted { by } = found.believed {
             found.notes.push(format!(
                 "the exposures in EXIF are {by:.1} stops (rms) from what the colours of points show, and are not used"
             ));
@@ -89,7 +89,7 @@ impl Exposure {
         if let Some(example) = &reported.example {
             found.notes.push(format!(
                 "{} photographs have nonsense in their EXIF, which is not used ({example})",
-                reported.nonsense
+                reported.implausible
             ));
         }
         found
@@ -118,7 +118,7 @@ impl Exposure {
                         self.others()
                     )
                 }
-                (false, Believed::Views(views)) => {
+                (false, ExifUse::Views(views)) => {
                     format!("exposure on, from the EXIF of {} views", grouped(views))
                 }
                 (false, _) => "exposure on, from one for all views".to_owned(),
@@ -151,8 +151,8 @@ impl Exposure {
     /// What is said of views that begin from EXIF beside those that begin from tracks.
     fn others(&self) -> String {
         match self.believed {
-            Believed::Views(views) => format!("; {} views begin from their EXIF", grouped(views)),
-            Believed::Nothing | Believed::Contradicted { .. } => String::new(),
+            ExifUse::Views(views) => format!("; {} views begin from their EXIF", grouped(views)),
+            ExifUse::Unused | ExifUse::Contradicted { .. } => String::new(),
         }
     }
 }
@@ -172,7 +172,7 @@ mod tests {
         let stops = vec![Some(-5.0), Some(-7.0), None];
         ReportedExposures {
             stops,
-            nonsense: 1,
+            implausible: 1,
             example: Some("c.jpg says an exposure of 0 s".to_owned()),
         }
     }

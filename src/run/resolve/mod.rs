@@ -149,7 +149,7 @@ impl<'a> Inputs<'a> {
         let apart = dataset.tracks.bytes() + if is_resumed { UNSTEADY } else { 0 };
         let resident = resident().map(|now| now.saturating_sub(apart));
         let peak = peak_resident();
-        let colours = match dataset.tracks.len() {
+        let colours = match dataset.tracks.count() {
             ..MIN_TRACKS => None,
             _ if exposures == Begun::Reckoned => None,
             _ => Some(TrackColours::read(&dataset.tracks, &dataset.train)?),
@@ -161,7 +161,7 @@ impl<'a> Inputs<'a> {
         };
         let degree = Degree::decide(spec, saved, &dataset, colours.as_ref());
         let reported = match is_exposed && exposures == Begun::Anew {
-            true => ReportedExposures::of(&dataset.train),
+            true => ReportedExposures::read(&dataset.train),
             false => ReportedExposures::default(),
         };
         let exposure = Exposure::decide(spec, kept, colours.as_ref(), &reported);
@@ -400,7 +400,7 @@ fn check_automatic(spec: &RunSpec) -> Result<(), Failure> {
 }
 
 fn images(dataset: &Dataset) -> [ImageDemand; 2] {
-    let demand = |views: &[View]| ImageDemand::of(views.iter().map(|view| &view.source));
+    let demand = |views: &[View]| ImageDemand::total(views.iter().map(|view| &view.source));
     [demand(&dataset.train), demand(&dataset.test)]
 }
 

@@ -1,4 +1,4 @@
-//! The policy's edit: what the policy sees, its plan, and the plan's execution.
+//! Edits by the policy: its inputs, its plan, and the execution of the plan.
 
 use std::time::Instant;
 
@@ -11,7 +11,7 @@ use super::{EditEvent, TrainError, Trainer};
 use densify_data::views::ViewSource;
 
 impl<V: ViewSource> Trainer<V> {
-    /// Lets the policy plan and executes the plan. `None` if there was nothing to do.
+    /// Lets the policy plan an edit, and executes the plan. `None` if nothing changed.
     pub(super) fn edit(&mut self, step: u32) -> Result<Option<EditEvent>, TrainError> {
         let start = Instant::now();
         self.show_aux_views(step)?;
@@ -36,7 +36,7 @@ impl<V: ViewSource> Trainer<V> {
         EditPlan::new(self.backend.rows() - frozen, self.row_limit() - frozen)
     }
 
-    /// Executes a plan. A plan that changes no row and had nothing refused is not an event.
+    /// Executes a plan. The result is an event only if rows changed or edits were refused.
     pub(super) fn execute(
         &mut self,
         step: u32,
@@ -45,13 +45,13 @@ impl<V: ViewSource> Trainer<V> {
         let mut ops = plan.compile();
         self.check_plan(step, &ops)?;
         ops = ops.behind(self.options.frozen);
-        // The backend checks the budget, which the trainer's own limit may be below.
+        // The backend checks its own budget, which may be larger than the trainer's current limit.
         ops.budget = self.backend.budget();
         self.backend
             .apply(&ops, self.options.seed, step)
             .map_err(|e| self.backend_error(step, e))?;
         if let Some(history) = &mut self.history {
-            history.follow(&ops, step);
+            history.record(&ops, step);
         }
         self.peak_rows = self.peak_rows.max(peak_rows(&ops)).max(self.backend.rows());
         if !ops.edits_rows() && ops.counts.denied == 0 {
@@ -65,8 +65,8 @@ impl<V: ViewSource> Trainer<V> {
         Ok(Some(event))
     }
 
-    /// Checks the budget and all invariants once more, so that a broken plan is an error here and not a
-    /// panic in the backend.
+    /// Checks the budget and all invariants again, so that a broken plan becomes an error instead of a panic in the
+    /// backend.
     fn check_plan(&self, step: u32, ops: &RowOps) -> Result<(), TrainError> {
         let frozen = self.options.frozen;
         let (rows, budget) = (self.backend.rows() - frozen, self.row_limit() - frozen);
@@ -85,8 +85,7 @@ impl<V: ViewSource> Trainer<V> {
     }
 }
 
-/// Most rows in use at any instant of an edit: children and seeds are written before moves shorten the
-/// model.
+/// Largest number of rows in use during an edit: children and seeds are written before moves shorten the model.
 fn peak_rows(ops: &RowOps) -> usize {
     let new = ops.child_slots.iter().copied().chain(ops.seeds.iter().map(|(slot, _)| *slot));
     let highest = new.max().map_or(0, |slot| slot as usize + 1);

@@ -1,4 +1,4 @@
-//! Checks before the first step: that scene, options, views, backend and policy agree.
+//! Checks before the first step that scene, options, views, backend and policy agree.
 
 use densify_policies::policy::{DensityPolicy, Needs, SceneInfo};
 
@@ -32,20 +32,22 @@ pub(super) fn check_options(
     let (rows, budget) = (backend.rows(), backend.budget());
     let frozen = options.frozen;
     if budget != scene.budget + frozen || rows > budget || rows < frozen {
-        let of_scene = scene.budget;
-        return bad(format!("{rows} rows, {frozen} frozen, budget {budget} (scene: {of_scene})"));
+        let scene_budget = scene.budget;
+        return bad(format!(
+            "{rows} rows, {frozen} frozen, budget {budget} (scene: {scene_budget})"
+        ));
     }
     Ok(())
 }
 
-/// The needs of a run, if their numbers are valid.
+/// The needs of a policy, after checking their values.
 pub(super) fn checked_needs(
     name: &str,
     policy: &dyn DensityPolicy,
     scene: &SceneInfo,
 ) -> Result<Needs, TrainError> {
     let needs = policy.needs(scene);
-    let bad = |why| TrainError::BadOption(format!("the needs of policy `{name}`: {why}"));
+    let bad = |error| TrainError::BadOption(format!("the needs of policy `{name}`: {error}"));
     needs.check().map_err(bad)?;
     Ok(needs)
 }
