@@ -16,8 +16,8 @@
 @group(0) @binding(10) var<storage, read> mask_offsets: array<f32>;
 
 const FOLD: f32 = 0.8493218;
-// A view supports a row if the row's largest blend weight in it is at least this.
-const SUPPORT_WEIGHT: f32 = 0.02;
+// Least largest weight of a view that counts as support.
+override SUPPORT_WEIGHT: f32;
 
 // Numbers of the signals, which index frame.planes; policies/src/signals.rs has the table.
 override VISIBLE_COUNT: u32;

@@ -106,7 +106,7 @@ pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> R
         line(&view.name, view.psnr, view.ssim, view.flip, view.lpips);
         ControlFlow::Continue(())
     })?;
-    let mean = Mean::of(&scores);
+    let mean = Mean::over(&scores);
     line("mean", mean.psnr, mean.ssim, mean.flip, mean.lpips);
     if let Some(FittedScore { psnr, ssim, flip, lpips }) = mean.fitted {
         line("fitted", psnr, ssim, flip, lpips);

@@ -24,7 +24,7 @@ impl LoadError {
         }
     }
 
-    /// A file's contents contradict its format or themselves; `field` is the record, line or field.
+    /// A file that contradicts its format or itself; `field` names the record, line or field.
     pub(crate) fn malformed(
         path: &Path,
         field: impl Display,
@@ -50,7 +50,7 @@ impl LoadError {
     pub(crate) fn size(path: &Path, (width, height): (u32, u32), camera: (u32, u32)) -> Self {
         Self(format!(
             "{} is {width}x{height} px, but its camera says {}x{} px; use the images that the cameras were \
-             made from, or a proportional rescale of them",
+             estimated from, or a proportional rescale of them",
             path.display(),
             camera.0,
             camera.1

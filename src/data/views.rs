@@ -1,4 +1,4 @@
-//! Views by number: the part of a dataset that training and evaluation use.
+//! Access to views by index, for training and evaluation.
 
 use std::error::Error;
 
@@ -10,9 +10,9 @@ use densify_core::image::SharedImage;
 /// The error of a source of views.
 pub type ViewError = Box<dyn Error + Send + Sync>;
 
-/// Views by number.
+/// Views with their cameras and images, by index.
 pub trait ViewSource: Send {
-    /// Number of views, >= 1.
+    /// Number of views, at least 1.
     fn count(&self) -> usize;
 
     /// Name of a view, for messages.
@@ -21,22 +21,25 @@ pub trait ViewSource: Send {
     /// Camera of a view.
     fn camera(&self, view: usize) -> &Camera;
 
-    /// Pixels of a view, of the camera's size.
+    /// Image of a view, of the camera's size.
+    ///
+    /// # Errors
+    /// When the image cannot be loaded.
     fn image(&self, view: usize) -> Result<SharedImage, ViewError>;
 
-    /// Announces the next views, soonest first.
+    /// Announces the views that are needed next, in order.
     fn prefetch(&self, upcoming: &[usize]) {
         let _ = upcoming;
     }
 
-    /// Announces the views after this one, for whoever takes all in their order.
+    /// Announces the views after this one, for loops over all views in order.
     fn prefetch_after(&self, view: usize) {
         let ahead: Vec<usize> = (view + 1..self.count().min(view + 3)).collect();
         self.prefetch(&ahead);
     }
 }
 
-/// Views of a dataset, with a cache of decoded images.
+/// The views of a dataset with a cache of decoded images.
 #[derive(Debug)]
 pub struct DatasetViews {
     views: Vec<View>,
@@ -44,8 +47,7 @@ pub struct DatasetViews {
 }
 
 impl DatasetViews {
-    /// Serves `views` with a cache of about `cache_bytes` of decoded images, which `threads` threads
-    /// fill ahead of use.
+    /// Views with a cache of about `cache_bytes` of decoded images, which `threads` threads fill ahead of use.
     #[must_use]
     pub fn new(views: Vec<View>, cache_bytes: u64, threads: usize) -> Self {
         let sources = views.iter().map(|view| view.source.clone()).collect();

@@ -167,7 +167,7 @@ pub fn open_alone(
     observer: &dyn Observer,
 ) -> Result<(Box<dyn Backend>, Normalisation, u8), Failure> {
     let model = read_model(model, observer)?;
-    let normalisation = Normalisation::of_model(&model);
+    let normalisation = Normalisation::fit_model(&model);
     let model = normalisation.model_from_world(model);
     let near = (near * EXTENT) as f32;
     let backend = machine.device.backend(&model, &machine.setup_in_scene(&model, near))?;

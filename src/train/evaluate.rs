@@ -5,10 +5,11 @@ use std::ops::ControlFlow;
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::exposure::fitted;
+pub use crate::metrics::EvaluateError;
 use crate::metrics::{Lpips, MetricError, flip, psnr, ssim};
 use densify_core::image::Image8;
-use densify_data::views::{ViewError, ViewSource};
-use densify_render::{Backend, BackendError};
+use densify_data::views::ViewSource;
+use densify_render::Backend;
 
 /// Part of a dataset.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Deserialize)]
@@ -31,9 +32,9 @@ pub struct ViewScore {
     pub ssim: f64,
     /// FLIP error.
     pub flip: f64,
-    /// LPIPS, where there are weights for it.
+    /// LPIPS, if its weights are available.
     pub lpips: Option<f64>,
-    /// The same with the exposure that fits the photograph best, if asked for.
+    /// Scores of the rendering with the exposure that fits the photograph best, if requested.
     pub fitted: Option<FittedScore>,
 }
 
@@ -49,16 +50,15 @@ pub struct Mean {
     /// FLIP error: visible difference, 0 for equal images.
     #[serde(rename = "FLIP")]
     pub flip: f64,
-    /// LPIPS: distance by the features of a network, 0 for equal images; where there were weights for it.
+    /// LPIPS: distance of network features, 0 for equal images; if its weights were available.
     #[serde(rename = "LPIPS", default, skip_serializing_if = "Option::is_none")]
     pub lpips: Option<f64>,
-    /// The same of renderings that are exposed as their photographs were, where asked for.
+    /// Means for renderings with the exposures of their photographs, if requested.
     #[serde(flatten)]
     pub fitted: Option<FittedScore>,
 }
 
-/// Scores of a rendering, or means of several, with the factor and the offset per channel that bring it nearest
-/// to its photograph.
+/// Scores of a rendering, or means of several, after fitting a factor and an offset per channel to the photograph.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct FittedScore {
     /// Peak signal-to-noise ratio `[dB]`.
@@ -70,12 +70,12 @@ pub struct FittedScore {
     /// FLIP error.
     #[serde(rename = "FLIP_fitted")]
     pub flip: f64,
-    /// LPIPS, where there are weights for it.
+    /// LPIPS, if its weights are available.
     #[serde(rename = "LPIPS_fitted", default, skip_serializing_if = "Option::is_none")]
     pub lpips: Option<f64>,
 }
 
-/// JSON has no infinity, the ratio of two equal images, and writes it as null.
+/// Reads a PSNR. That of equal images is infinite, which JSON writes as null.
 fn or_infinite<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
     Ok(Option::deserialize(from)?.unwrap_or(f64::INFINITY))
 }
@@ -83,73 +83,47 @@ fn or_infinite<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
 impl Mean {
     /// Mean over the views; NaN without views.
     #[must_use]
-    pub fn of(views: &[ViewScore]) -> Self {
+    pub fn over(views: &[ViewScore]) -> Self {
         let mean = |score: fn(&ViewScore) -> f64| {
             views.iter().map(score).sum::<f64>() / views.len() as f64
         };
-        // Of what was not measured in every view there is none.
-        let mean_of = |score: &dyn Fn(&ViewScore) -> Option<f64>| {
+        // An optional score has a mean only if every view has it.
+        let optional_mean = |score: &dyn Fn(&ViewScore) -> Option<f64>| {
             let sum = views.iter().map(score).sum::<Option<f64>>();
             sum.filter(|_| !views.is_empty()).map(|sum| sum / views.len() as f64)
         };
         let fitted = |score: fn(&FittedScore) -> Option<f64>| {
-            mean_of(&|view| view.fitted.as_ref().and_then(score))
+            optional_mean(&|view| view.fitted.as_ref().and_then(score))
         };
-        let of_fitted = |psnr| {
-            let (ssim, flip) = (fitted(|it| Some(it.ssim))?, fitted(|it| Some(it.flip))?);
-            Some(FittedScore { psnr, ssim, flip, lpips: fitted(|it| it.lpips) })
+        let fitted_scores = |psnr| {
+            let (ssim, flip) =
+                (fitted(|score| Some(score.ssim))?, fitted(|score| Some(score.flip))?);
+            Some(FittedScore { psnr, ssim, flip, lpips: fitted(|score| score.lpips) })
         };
         Self {
             psnr: mean(|view| view.psnr),
             ssim: mean(|view| view.ssim),
             flip: mean(|view| view.flip),
-            lpips: mean_of(&|view| view.lpips),
-            fitted: fitted(|it| Some(it.psnr)).and_then(of_fitted),
+            lpips: optional_mean(&|view| view.lpips),
+            fitted: fitted(|score| Some(score.psnr)).and_then(fitted_scores),
         }
     }
 }
 
-/// Why a model cannot be measured.
-#[derive(Debug, thiserror::Error)]
-pub enum EvaluateError {
-    /// A view's pixels or known surface could not be read, or not be compared with the rendering.
-    #[error("view `{view}`: {source}")]
-    View {
-        /// The view's name.
-        view: String,
-        /// What is wrong with it.
-        source: ViewError,
-    },
-    /// A view could not be rendered.
-    #[error("view `{view}`: {source}")]
-    Backend {
-        /// The view's name.
-        view: String,
-        /// The error of the backend.
-        source: BackendError,
-    },
-    /// The model or its signals could not be copied from the device.
-    #[error(transparent)]
-    Model(#[from] BackendError),
-    /// The neighbour search does not support so many rows.
-    #[error("{0} rows are too many to search for neighbours")]
-    TooManyRows(usize),
-    /// Stopped by the caller.
-    #[error("stopped before all views were measured")]
-    Stopped,
-}
-
-/// How renderings are compared with photographs.
+/// Metrics by which renderings are compared with photographs.
 #[derive(Clone, Copy, Default)]
 pub struct Comparison<'a> {
-    /// The network for LPIPS, which is measured where there is one.
+    /// Network for LPIPS, which is measured only with one.
     pub lpips: Option<&'a Lpips>,
-    /// Whether each is compared a second time, with the exposure that fits the photograph best.
+    /// Whether renderings are also compared with the exposure that fits the photograph best.
     pub fits_exposure: bool,
 }
 
 impl Comparison<'_> {
-    /// Scores of a rendering, as it is.
+    /// Scores of a rendering, without fitting an exposure.
+    ///
+    /// # Errors
+    /// When the images cannot be compared.
     pub fn score(
         self,
         rendered: &[f32],
@@ -168,6 +142,9 @@ impl Comparison<'_> {
 
 /// Renders every view and compares it with its image. `after_view` is called after each view and may stop the
 /// evaluation.
+///
+/// # Errors
+/// When a view cannot be read, rendered or compared, and when `after_view` stops the evaluation.
 pub fn evaluate(
     backend: &mut dyn Backend,
     views: &impl ViewSource,
@@ -189,9 +166,10 @@ pub fn evaluate(
         let metric = |e: MetricError| EvaluateError::View { view: name(), source: e.into() };
         let score = |rendered: &[f32]| comparison.score(rendered, &image, background);
         let FittedScore { psnr, ssim, flip, lpips } = score(&rendering.rgb).map_err(metric)?;
-        let fitted = match comparison.fits_exposure {
-            true => Some(score(&fitted(&rendering.rgb, &image, background)).map_err(metric)?),
-            false => None,
+        let fitted = if comparison.fits_exposure {
+            Some(score(&fitted(&rendering.rgb, &image, background)).map_err(metric)?)
+        } else {
+            None
         };
         let score = ViewScore { name: name(), psnr, ssim, flip, lpips, fitted };
         let flow = after_view(&score);

@@ -1,13 +1,13 @@
-//! How much each Gaussian shows in the training views, by which a model that is too large is cut.
+//! Importance of Gaussians in the training views, for reducing models that exceed the budget.
 
 use densify_policies::policy::{AuxColumn, AuxRequest, Needs, PixelMap};
 
-use crate::evaluate::EvaluateError;
+use crate::metrics::EvaluateError;
 use densify_core::gaussians::{Gaussians, sigmoid};
 use densify_data::views::ViewSource;
 use densify_render::{AuxInput, Backend, BackendError};
 
-/// What a backend must have been made for.
+/// The needs with which the backend for [`importance`] must be made.
 #[must_use]
 pub fn needs() -> Needs {
     Needs { aux: Some(request()), ..Needs::default() }
@@ -17,14 +17,14 @@ fn request() -> AuxRequest {
     AuxRequest { map: PixelMap::default(), columns: vec![AuxColumn::WeightSum], points: 0 }
 }
 
-/// Bytes that [`importance`] takes beside the backend and an image, for a model of so many rows.
+/// Memory for [`importance`] in addition to the backend and an image `[bytes]`.
 #[must_use]
 pub fn bytes(rows: usize) -> u64 {
-    // A view's column, the sums, and the order of the rows.
+    // The column of a view, the sums, and the order of the rows.
     rows as u64 * (size_of::<f32>() + size_of::<f64>() + size_of::<usize>()) as u64
 }
 
-/// For each row the sum over all views and pixels of its blend weight α·T, >= 0. Shape: `[rows]`.
+/// The sum of each row's blend weights α·T over all pixels of all views, >= 0. Shape: `[rows]`.
 ///
 /// # Errors
 /// When a view cannot be read or rendered.
@@ -62,19 +62,19 @@ pub fn importance(
     Ok(sums)
 }
 
-/// For each row the logarithm of how much of an image it could cover, alone and seen from where it is largest: opacity
-/// times the two longest axes. For where no views are at hand. Shape: `[rows]`.
+/// A substitute for importance if there are no views: the logarithm of each row's largest possible contribution to an
+/// image, which is its opacity times its two longest axes. Shape: `[rows]`.
 #[must_use]
 pub fn footprints(model: &Gaussians) -> Vec<f64> {
-    let of = |row: usize| {
+    let footprint = |row: usize| {
         let mut log_scales = model.log_scales[row];
         log_scales.sort_unstable_by(f32::total_cmp);
         f64::from(sigmoid(model.opacity_logits[row]).ln() + log_scales[1] + log_scales[2])
     };
-    (0..model.len()).map(of).collect()
+    (0..model.len()).map(footprint).collect()
 }
 
-/// The `count` rows of the largest importance, in their order; of equals the first.
+/// The `count` most important rows in ascending order; of equal ones the first.
 #[must_use]
 pub fn largest(importance: &[f64], count: usize) -> Vec<usize> {
     let mut rows: Vec<usize> = (0..importance.len()).collect();

@@ -1,5 +1,5 @@
-//! Training: the loop, what it starts from, its schedule, checkpoints, metrics, and the folder of results. Knows no
-//! run and prints nothing.
+//! Training: initialisation, schedules, the training loop, checkpoints, metrics, and the output folder of a run.
+//! Prints nothing.
 
 pub mod checkpoint;
 pub mod evaluate;

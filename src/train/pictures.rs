@@ -1,4 +1,4 @@
-//! Pictures of renderings and photographs, eight bits a channel, and PNG files of them.
+//! 8-bit images of renderings and photographs, and PNG files of them.
 
 use std::io::Cursor;
 use std::path::Path;
@@ -10,12 +10,12 @@ use densify_core::files::{FileError, write_atomically};
 use densify_core::image::Image8;
 use densify_render::Rendering;
 
-/// A value in `[0, 1]` in eight bits.
+/// Converts a value in `[0, 1]` to 8 bits.
 pub fn to_u8(value: f32) -> u8 {
     (value.clamp(0.0, 1.0) * 255.0).round() as u8
 }
 
-/// The colours of a rendering.
+/// The 8-bit image of a rendering.
 pub fn picture(Rendering { width, height, rgb, .. }: &Rendering) -> RgbImage {
     let mut image = RgbImage::new(*width, *height);
     let row = 3 * *width as usize;
@@ -24,14 +24,14 @@ pub fn picture(Rendering { width, height, rgb, .. }: &Rendering) -> RgbImage {
     image
 }
 
-/// A photograph over a background.
+/// The image of a photograph, composited on a background.
 pub fn photograph(image: &Image8, background: [f32; 3]) -> RgbImage {
     let pixel =
         |x: u32, y: u32| Rgb(image.composited(x as usize, y as usize, background).map(to_u8));
     RgbImage::from_fn(image.width, image.height, pixel)
 }
 
-/// Pictures from left to right, with white gaps `[px]` between them.
+/// Images from left to right, with white gaps `[px]` between them.
 pub fn side_by_side(pictures: &[RgbImage], gap: u32) -> RgbImage {
     let width = pictures.iter().map(|picture| picture.width() + gap).sum::<u32>() - gap;
     let height = pictures.iter().map(RgbImage::height).max().unwrap_or(1);
@@ -44,6 +44,10 @@ pub fn side_by_side(pictures: &[RgbImage], gap: u32) -> RgbImage {
     all
 }
 
+/// Writes an image as a PNG file.
+///
+/// # Errors
+/// When the file cannot be written.
 pub fn write_png(path: &Path, image: &DynamicImage) -> Result<(), FileError> {
     write_atomically(path, |out| {
         let mut encoded = Cursor::new(Vec::new());

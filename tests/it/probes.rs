@@ -65,7 +65,7 @@ fn bits(backend: Box<dyn Backend>, dataset: &Dataset, measures: bool) -> (Gaussi
     let views = DatasetViews::new(dataset.train.clone(), 1 << 20, 1);
     let trainer = Trainer::new(views, backend, ("idle", Box::new(Idle)), scene, options);
     let mut trainer = trainer.expect("they agree");
-    trainer = trainer.requiring(AutoChoices { rows: measures, ..AutoChoices::default() });
+    trainer = trainer.with_auto_choices(AutoChoices { rows: measures, ..AutoChoices::default() });
     for _ in 0..MEASURED_AT {
         trainer.step().expect("a small image is rendered");
     }

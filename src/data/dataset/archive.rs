@@ -1,8 +1,7 @@
-//! Datasets in ZIP archives: unpacked into a temporary folder, which is removed with the last view of it.
+//! Datasets in ZIP archives, unpacked into a temporary folder that is removed with the dataset's last view.
 //!
-//! All readers then see a folder, and photographs are decoded as fast as from one. Nothing of an archive is
-//! trusted: no name leads out of the folder, no link is made, and what is unpacked is bounded beforehand and
-//! while it is written.
+//! Readers then see a folder, and photographs are decoded as fast as from one. Archives are untrusted: no name leads out
+//! of the folder, no links are created, and the unpacked size is bounded before and during unpacking.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufReader, Read};
@@ -19,31 +18,31 @@ use super::{Dataset, LoadOptions, View};
 use densify_core::files;
 use densify_core::memory::Bytes;
 
-/// Most files of an archive.
+/// Largest number of files in an archive.
 const MAX_FILES: usize = 4_000_000;
-/// Most folders around a dataset that hold nothing else.
-const MAX_AROUND: usize = 8;
-/// What systems add to archives, by the first part of its path or its name.
-const NOT_DATA: [&str; 4] = ["__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini"];
-const REMEDY: &str = "pack the folder again, or unpack it and name that";
+/// Most nested folders that contain nothing but the next one, above the dataset's folder.
+const MAX_OUTER: usize = 8;
+/// Names of files and folders that operating systems add to archives.
+const SYSTEM_FILES: [&str; 4] = ["__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini"];
+const REMEDY: &str = "pack the folder again, or unpack it and name the folder";
 
-/// An archive's files in a folder of their own, as long as this lives.
+/// The files of an archive in a temporary folder, which is removed when this value is dropped.
 #[derive(Debug)]
 pub(super) struct Unpacked {
     archive: PathBuf,
-    /// Holds the files, and removes them.
+    /// The temporary folder.
     all: TempDir,
-    /// The dataset's folder in it.
+    /// The dataset's folder inside it.
     folder: PathBuf,
     bytes: u64,
 }
 
-/// Whether a file is a whole ZIP archive that is not a model (SOG), by its contents.
+/// Whether a file is a complete ZIP archive other than a SOG model, by its contents.
 pub fn is_archive(path: &Path) -> bool {
     is_zip(path) && open(path).is_ok_and(|archive| archive.index_for_name("meta.json").is_none())
 }
 
-/// Whether a file begins as a ZIP archive, which may be damaged.
+/// Whether a file begins like a ZIP archive, which may be damaged.
 pub(super) fn is_zip(path: &Path) -> bool {
     let mut start = [0; 2];
     path.is_file()
@@ -54,10 +53,10 @@ pub(super) fn is_zip(path: &Path) -> bool {
 /// Loads the dataset in an archive.
 ///
 /// # Errors
-/// When the archive is damaged or not to be trusted, there is no room for it, or as [`Dataset::load`].
+/// When the archive is damaged, unsafe or too large for the disk, and as [`Dataset::load`].
 pub(super) fn load(path: &Path, options: &LoadOptions) -> Result<Dataset, DatasetError> {
     let unpacked = Arc::new(Unpacked::new(path)?);
-    let mut dataset = Dataset::in_folder(&unpacked.folder, options)
+    let mut dataset = Dataset::load_folder(&unpacked.folder, options)
         .map_err(|error| DatasetError(unpacked.named(&error.0)))?;
     for note in &mut dataset.notes {
         *note = unpacked.named(note);
@@ -68,9 +67,9 @@ pub(super) fn load(path: &Path, options: &LoadOptions) -> Result<Dataset, Datase
         path.display()
     ));
     for View { source, .. } in dataset.train.iter_mut().chain(&mut dataset.test) {
-        source.file = source.file.clone().of_archive(&unpacked);
+        source.file = source.file.clone().in_archive(&unpacked);
         if let Some(mask) = &mut source.mask {
-            mask.file = mask.file.clone().of_archive(&unpacked);
+            mask.file = mask.file.clone().in_archive(&unpacked);
         }
     }
     path.clone_into(&mut dataset.root);
@@ -93,7 +92,7 @@ impl Unpacked {
             let Some(name) = data_name(path, &file)? else { continue };
             let target = all.path().join(&name);
             let made = target.parent().map_or(Ok(()), fs::create_dir_all);
-            // A second file of the same name does not replace the first.
+            // A second file of the same name must not replace the first.
             let made =
                 made.and_then(|()| OpenOptions::new().write(true).create_new(true).open(&target));
             let mut output = made.map_err(|error| match error.kind() {
@@ -102,7 +101,7 @@ impl Unpacked {
                 }
                 _ => no_room(path, all.path(), bytes, &error),
             })?;
-            // Its length in the table of contents is only a claim.
+            // The length in the table of contents is only a claim.
             let mut input = (&mut file).take(left + 1);
             let copied = copy(&mut input, &mut output).map_err(|error| match error {
                 Copying::Reading(error) => {
@@ -112,7 +111,7 @@ impl Unpacked {
             })?;
             left = left.checked_sub(copied).ok_or_else(|| bomb(path, most))?;
         }
-        let folder = inmost(all.path());
+        let folder = innermost(all.path());
         Ok(Self { archive: path.to_owned(), all, folder, bytes })
     }
 
@@ -121,7 +120,7 @@ impl Unpacked {
         &self.folder
     }
 
-    /// A text in which files are named by their place in the archive.
+    /// Replaces the temporary folder by the archive's name in a message.
     pub(super) fn named(&self, text: &str) -> String {
         let archive = self.archive.to_string_lossy();
         [&*self.folder, self.all.path()].iter().fold(text.to_owned(), |text, folder| {
@@ -129,7 +128,7 @@ impl Unpacked {
         })
     }
 
-    /// The same of a path.
+    /// Replaces the temporary folder by the archive's name in a path.
     pub(super) fn shown(&self, path: &Path) -> PathBuf {
         let inside =
             path.strip_prefix(&self.folder).or_else(|_| path.strip_prefix(self.all.path()));
@@ -142,13 +141,13 @@ fn open(path: &Path) -> Result<ZipArchive<BufReader<File>>, DatasetError> {
     ZipArchive::new(BufReader::new(file)).map_err(|error| broken(path, &error))
 }
 
-/// Most bytes that an archive may be unpacked to.
+/// Largest unpacked size that is accepted `[bytes]`.
 fn most_bytes(path: &Path) -> Result<u64, DatasetError> {
     let packed = fs::metadata(path).map_err(DatasetError::io(path))?.len();
     Ok(files::most_unpacked(packed))
 }
 
-/// Checks all that the table of contents says; returns the bytes of the files.
+/// Checks the table of contents; returns the size of the unpacked files `[bytes]`.
 fn check<R: Read + io::Seek>(
     path: &Path,
     archive: &mut ZipArchive<R>,
@@ -167,17 +166,17 @@ fn check<R: Read + io::Seek>(
     if bytes > most { Err(bomb(path, most)) } else { Ok(bytes) }
 }
 
-/// The path of a file in the archive; `None` where it is a folder, or something that systems add.
+/// The path of a file in the archive; `None` for folders and for files that operating systems add.
 fn data_name<R: Read>(
     path: &Path,
     file: &zip::read::ZipFile<'_, R>,
 ) -> Result<Option<String>, DatasetError> {
-    // Many programs write UTF-8 without saying so.
+    // Many programs write UTF-8 without declaring it.
     let name = match std::str::from_utf8(file.name_raw()) {
         Ok(name) => name.to_owned(),
         Err(_) => file.name().map_err(|error| broken(path, &error))?.into_owned(),
     };
-    // Some write the separators of Windows.
+    // Some programs write the separators of Windows.
     let name = name.replace('\\', "/");
     let shown: String = name.chars().take(200).collect();
     if let Some(problem) = lexical_fault(&name) {
@@ -186,7 +185,7 @@ fn data_name<R: Read>(
     if file.is_symlink() {
         return Err(malformed(path, &shown, "it is a symbolic link, which is not followed"));
     }
-    let is_data = |part: &str| !NOT_DATA.contains(&part);
+    let is_data = |part: &str| !SYSTEM_FILES.contains(&part);
     if name.ends_with('/') || file.is_dir() || !relative(&name).split('/').all(is_data) {
         return Ok(None);
     }
@@ -202,10 +201,10 @@ fn data_name<R: Read>(
     Ok(Some(relative(&name)))
 }
 
-/// The folder inside which all is.
-fn inmost(folder: &Path) -> PathBuf {
+/// Descends through folders that contain nothing but one folder.
+fn innermost(folder: &Path) -> PathBuf {
     let mut folder = folder.to_owned();
-    for _ in 0..MAX_AROUND {
+    for _ in 0..MAX_OUTER {
         let mut entries = fs::read_dir(&folder).into_iter().flatten().flatten();
         match (entries.next(), entries.next()) {
             (Some(only), None) if only.path().is_dir() => folder = only.path(),
@@ -220,7 +219,7 @@ enum Copying {
     Writing(io::Error),
 }
 
-/// Copies all there is; tells a damaged archive from a full disk.
+/// Copies a file; the error tells a damaged archive from a full disk.
 fn copy(input: &mut impl Read, output: &mut File) -> Result<u64, Copying> {
     let mut buffer = vec![0; 1 << 16];
     let mut copied = 0;
@@ -243,7 +242,8 @@ fn broken(path: &Path, error: &ZipError) -> DatasetError {
 }
 
 fn bomb(path: &Path, most: u64) -> DatasetError {
-    let problem = format!("it unpacks to more than {}, which no photographs do", Bytes(most));
+    let problem =
+        format!("it unpacks to more than {}, which is implausible for photographs", Bytes(most));
     DatasetError::malformed(
         path,
         "archive",

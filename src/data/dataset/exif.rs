@@ -1,7 +1,6 @@
-//! What cameras write into photographs (EXIF): which way up they were held, and how they exposed.
+//! EXIF fields of photographs: orientation and exposure.
 //!
-//! It is a hint and nothing more. Files without it, with a damaged one or with one of nonsense are read all
-//! the same.
+//! EXIF is optional: a photograph is read even if its EXIF is missing, damaged or implausible.
 
 use std::fs::File;
 use std::io::BufReader;
@@ -14,86 +13,106 @@ use image::metadata::Orientation;
 use super::View;
 use densify_core::files;
 
-/// Longest file in which it is looked for `[bytes]`.
+/// Largest file that is searched for EXIF `[bytes]`.
 const MAX_BYTES: u64 = 256 << 20;
-/// Exposure times of cameras `[s]`.
+/// Plausible exposure times `[s]`.
 const SECONDS: RangeInclusive<f64> = 1e-7..=3600.0;
-/// F-numbers of lenses.
+/// Plausible f-numbers.
 const F_NUMBERS: RangeInclusive<f64> = 0.3..=256.0;
-/// Sensitivities of sensors (ISO).
+/// Plausible sensitivities (ISO).
 const SENSITIVITIES: RangeInclusive<f64> = 1.0..=1e8;
 
-/// How bright the photographs of some views were exposed, as far as they say.
+/// The EXIF fields of a photograph that are used.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct ReportedExposures {
-    /// In stops above 1 s at f/1 and ISO 1, by view.
-    pub stops: Vec<Option<f64>>,
-    /// Number of photographs that say something which no camera does.
-    pub nonsense: usize,
-    /// The first of them, and what it says.
-    pub example: Option<String>,
+pub(super) struct Exif {
+    orientation: Option<Orientation>,
+    /// Brightness of the exposure `[stops above 1 s at f/1 and ISO 1]`, or the implausible value.
+    exposure: Option<Result<f64, String>>,
 }
 
-impl ReportedExposures {
-    /// Reads the exposure times, f-numbers and sensitivities of the photographs of these views.
-    #[must_use]
-    pub fn of(views: &[View]) -> Self {
-        let mut all = Self::default();
-        for view in views {
-            // Pictures that were rendered into memory say nothing.
-            let found = match view.source.rendered {
-                Some(_) => None,
-                None => view.source.file.open().ok().and_then(read),
-            };
-            let stops = match found.as_ref().and_then(exposure) {
-                Some(Ok(stops)) => Some(stops),
-                Some(Err(what)) => {
-                    all.nonsense += 1;
-                    all.example.get_or_insert_with(|| format!("{} says {what}", view.name));
-                    None
-                }
-                None => None,
-            };
-            all.stops.push(stops);
-        }
-        all
+impl Exif {
+    /// Reads the fields of a file; empty if the file cannot be read.
+    pub(super) fn open(path: &Path) -> Self {
+        files::open(path).map(Self::read).unwrap_or_default()
+    }
+
+    /// Reads the fields of an open file, from its start.
+    pub(super) fn read(file: File) -> Self {
+        // The length bounds the allocations, whatever lengths the file claims.
+        let is_readable = file.metadata().is_ok_and(|data| data.len() <= MAX_BYTES);
+        let fields =
+            is_readable.then(|| exif::Reader::new().read_from_container(&mut BufReader::new(file)));
+        let Some(Ok(fields)) = fields else { return Self::default() };
+        Self { orientation: orientation(&fields), exposure: exposure(&fields) }
+    }
+
+    /// The quarter turn that makes the photograph upright, if there is one. Other orientations keep width and height.
+    pub(super) fn quarter_turn(&self) -> Option<Orientation> {
+        self.orientation.filter(|turn| (5..=8).contains(&turn.to_exif()))
     }
 }
 
-/// The quarter turn that makes a photograph upright, if it says that one does.
-pub(super) fn quarter_turn(path: &Path) -> Option<Orientation> {
-    let found = read(files::open(path).ok()?)?;
-    let number = found.get_field(Tag::Orientation, In::PRIMARY)?.value.get_uint(0)?;
-    let turn = Orientation::from_exif(u8::try_from(number).ok()?)?;
-    // The others leave width and height as they are.
-    let is_quarter = (5..=8).contains(&turn.to_exif());
-    is_quarter.then_some(turn)
+fn orientation(fields: &exif::Exif) -> Option<Orientation> {
+    let number = fields.get_field(Tag::Orientation, In::PRIMARY)?.value.get_uint(0)?;
+    Orientation::from_exif(u8::try_from(number).ok()?)
 }
 
-fn read(file: File) -> Option<exif::Exif> {
-    // What is read is never longer than the file, whatever lengths that claims.
-    let is_sensible = file.metadata().ok()?.len() <= MAX_BYTES;
-    let found =
-        is_sensible.then(|| exif::Reader::new().read_from_container(&mut BufReader::new(file)));
-    found?.ok()
-}
-
-/// How bright a photograph was exposed `[stops]`, or what it says instead; `None` where it does not say.
-fn exposure(found: &exif::Exif) -> Option<Result<f64, String>> {
-    let number = |tag| match &found.get_field(tag, In::PRIMARY)?.value {
+/// As [`Exif::exposure`]; `None` if a field is missing.
+fn exposure(fields: &exif::Exif) -> Option<Result<f64, String>> {
+    let number = |tag| match &fields.get_field(tag, In::PRIMARY)?.value {
         Value::Rational(values) => values.first().map(exif::Rational::to_f64),
         value => value.get_uint(0).map(f64::from),
     };
     let (seconds, aperture) = (number(Tag::ExposureTime)?, number(Tag::FNumber)?);
     let sensitivity = number(Tag::PhotographicSensitivity)?;
-    for (value, range, what) in [
+    for (value, range, text) in [
         (seconds, SECONDS, "an exposure of {} s"),
         (aperture, F_NUMBERS, "f/{}"),
         (sensitivity, SENSITIVITIES, "ISO {}"),
     ] {
         if !range.contains(&value) {
-            return Some(Err(what.replace("{}", &value.to_string())));
+            return Some(Err(text.replace("{}", &value.to_string())));
         }
     }
     Some(Ok((seconds * sensitivity / (aperture * aperture)).log2()))
+}
+
+/// Exposures of views according to the EXIF fields of their photographs.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct ReportedExposures {
+    /// Brightness of the exposure of each view `[stops above 1 s at f/1 and ISO 1]`, if reported. Shape: `[views]`.
+    pub stops: Vec<Option<f64>>,
+    /// Number of views with implausible values.
+    pub implausible: usize,
+    /// The first of them and its value, for messages.
+    pub example: Option<String>,
+}
+
+impl ReportedExposures {
+    /// Collects the exposures of these views, reading the EXIF of each photograph that has not been read yet.
+    #[must_use]
+    pub fn read(views: &[View]) -> Self {
+        let mut all = Self::default();
+        // The views of one photograph follow each other.
+        let mut last: Option<(&Path, Exif)> = None;
+        for View { name, source, .. } in views {
+            let path = &*source.file.path;
+            let exif = match last.take().filter(|(other, _)| *other == path) {
+                Some((_, exif)) => exif,
+                None => source.file.exif(),
+            };
+            let stops = match &exif.exposure {
+                Some(Err(value)) => {
+                    all.implausible += 1;
+                    all.example.get_or_insert_with(|| format!("{name} says {value}"));
+                    None
+                }
+                Some(Ok(stops)) => Some(*stops),
+                None => None,
+            };
+            all.stops.push(stops);
+            last = Some((path, exif));
+        }
+        all
+    }
 }

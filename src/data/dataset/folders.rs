@@ -1,37 +1,37 @@
-//! Finds the files of images: `images`, `images_2`/`_4`/`_8`, or `--images DIR`.
+//! Finds image files in `images`, `images_2`/`_4`/`_8`, or the folder given by `--images`.
 
 use std::fs::DirEntry;
 use std::path::PathBuf;
 
 use super::DatasetError;
-use super::masks;
+use super::mask_files;
 use super::paths::{DataPath, Root, is_absolute, relative};
 use super::{LoadOptions, Resolution};
 
-/// Extensions tried for names without one, as in NeRF-synthetic files.
+/// Extensions that are tried for names without one, as in NeRF-synthetic files.
 const ENDINGS: [&str; 8] = ["", ".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG"];
 
 /// The folders of one dataset.
 #[derive(Debug)]
 pub(super) struct Folders {
     pub(super) root: Root,
-    /// The folder named by `--images`.
+    /// The folder given by `--images`.
     pub(super) chosen: Option<Root>,
-    /// `images_K` and K, if requested by `-r K` and present.
+    /// The folder `images_K` and K, if requested by `-r K` and present.
     reduced: Option<(Root, u32)>,
-    /// Whether names are relative to `images/` (COLMAP) or to the dataset.
+    /// Whether names are relative to `images/`, as in COLMAP models, rather than to the dataset's folder.
     within_images: bool,
 }
 
 /// The file of an image.
 #[derive(Debug)]
 pub(super) struct ImageFile {
-    /// The name of its view: its path as listed, or what of an absolute one is below `--images`.
+    /// Name of the view: the path as listed, or the part of an absolute path that exists below `--images`.
     pub(super) name: String,
     pub(super) path: PathBuf,
-    /// K, if it is in the folder `images_K`.
+    /// K, if the file is in the folder `images_K`.
     pub(super) reduced: Option<u32>,
-    /// Whether it is missing in `images_K`, and the full size is used instead.
+    /// Whether the file is missing in `images_K`, so that the full-size image is shrunk instead.
     pub(super) fell_back: bool,
 }
 
@@ -41,7 +41,7 @@ impl Folders {
         options: &LoadOptions,
         within_images: bool,
     ) -> Result<Self, DatasetError> {
-        // A folder named by the user may be anywhere; a relative one is relative to the dataset.
+        // The user may name any folder; a relative path is relative to the dataset.
         let chosen = options
             .images
             .as_ref()
@@ -59,11 +59,11 @@ impl Folders {
 
     /// The file of an image, if there is one.
     pub(super) fn image(&self, named: DataPath<'_>) -> Result<Option<ImageFile>, DatasetError> {
-        if let Some(folder) = self.elsewhere(named.value) {
-            return self.moved(folder, named);
+        if let Some(folder) = self.folder_for_absolute(named.value) {
+            return self.image_by_suffix(folder, named);
         }
         match self.image_as_listed(named)? {
-            // Programs on Windows write names with its separators.
+            // Programs on Windows write backslashes.
             None if named.value.contains('\\') => {
                 let value = named.value.replace('\\', "/");
                 self.image_as_listed(DataPath { value: &value, ..named })
@@ -72,14 +72,13 @@ impl Folders {
         }
     }
 
-    /// The folder named by `--images`, where this is an absolute path: programs write where photographs lay on their
-    /// own machine.
-    pub(super) fn elsewhere(&self, value: &str) -> Option<&Root> {
+    /// The folder given by `--images`, if this is an absolute path, which is mostly that of another machine.
+    pub(super) fn folder_for_absolute(&self, value: &str) -> Option<&Root> {
         self.chosen.as_ref().filter(|_| is_absolute(value))
     }
 
     fn image_as_listed(&self, named: DataPath<'_>) -> Result<Option<ImageFile>, DatasetError> {
-        // Checked as written first: a path out of the folder is refused even if no file is there.
+        // A path that leads out of the folder is refused even if no such file exists.
         self.root.join(named)?;
         let (name, inside) = (relative(named.value), self.inside_images(named.value));
         for ending in self.endings() {
@@ -109,9 +108,13 @@ impl Folders {
         Ok(None)
     }
 
-    /// The image of an absolute path: as many of its last parts count as are found in the folder that the user names.
-    fn moved(&self, folder: &Root, named: DataPath<'_>) -> Result<Option<ImageFile>, DatasetError> {
-        for name in named.ends()? {
+    /// The image whose path is the longest suffix of an absolute path that exists below the folder.
+    fn image_by_suffix(
+        &self,
+        folder: &Root,
+        named: DataPath<'_>,
+    ) -> Result<Option<ImageFile>, DatasetError> {
+        for name in named.suffixes()? {
             for ending in self.endings() {
                 let value = format!("{name}{ending}");
                 if let Some(path) = folder.existing(DataPath { value: &value, ..named })? {
@@ -122,20 +125,20 @@ impl Folders {
         Ok(None)
     }
 
-    /// What may be missing of a name; COLMAP names files in full.
+    /// Extensions to try; COLMAP files always name them.
     fn endings(&self) -> &'static [&'static str] {
         if self.within_images { &ENDINGS[..1] } else { &ENDINGS }
     }
 
     pub(super) fn missing(&self, named: DataPath<'_>) -> DatasetError {
-        DatasetError::missing_image(named.file, named.field, &self.place(named))
+        DatasetError::missing_image(named.file, named.field, &self.first_path(named))
     }
 
-    /// Where an image is looked for first.
-    pub(super) fn place(&self, named: DataPath<'_>) -> PathBuf {
+    /// The first path at which an image is looked for.
+    pub(super) fn first_path(&self, named: DataPath<'_>) -> PathBuf {
         match &self.chosen {
             Some(folder) if is_absolute(named.value) => {
-                let last = named.ends().ok().and_then(Iterator::last);
+                let last = named.suffixes().ok().and_then(Iterator::last);
                 folder.path().join(last.unwrap_or_default())
             }
             Some(folder) => folder.path().join(self.inside_images(named.value)),
@@ -143,19 +146,19 @@ impl Folders {
         }
     }
 
-    /// How many files but masks lie directly in the folder of the images.
+    /// Number of files directly in the folder of images, masks not counted.
     pub(super) fn count(&self) -> usize {
         let images = || self.root.path().join("images");
         let folder = self.chosen.as_ref().map_or_else(images, |folder| folder.path().to_owned());
         let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
         let is_file = |entry: &DirEntry| entry.file_type().is_ok_and(|kind| !kind.is_dir());
-        entries.filter(|entry| is_file(entry) && !masks::is_mask(&entry.file_name())).count()
+        entries.filter(|entry| is_file(entry) && !mask_files::is_mask(&entry.file_name())).count()
     }
 
     pub(super) fn fell_back_note(&self, count: usize) -> String {
         let folder = self.reduced.as_ref().map(|(root, _)| root.path().display().to_string());
         format!(
-            "{count} images are not in {} and are shrunk from the full size",
+            "{count} images are not in {} and are shrunk from full size instead",
             folder.unwrap_or_default()
         )
     }

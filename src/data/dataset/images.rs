@@ -1,8 +1,9 @@
-//! Decodes photographs, and shrinks and undistorts them.
+//! Decodes photographs, undistorts them and shrinks them to the training resolution.
 //!
 //! Files are untrusted: sides, pixels and decoded bytes are checked before anything is allocated.
 
-use std::io::{BufReader, Cursor, Read};
+use std::fs::File;
+use std::io::{BufReader, Cursor, Read, Seek};
 use std::path::Path;
 
 use image::error::ImageFormatHint;
@@ -10,7 +11,7 @@ use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits};
 
 use super::DatasetError;
-pub use super::cache::{ImageCache, ImageDemand};
+pub use super::image_cache::{ImageCache, ImageDemand};
 use super::jpeg;
 pub use super::mask::{Hides, Mask};
 use super::options::MaskMode;
@@ -22,40 +23,40 @@ pub use densify_core::image::{Image8, SharedImage};
 use densify_core::resample;
 
 /// Longest side accepted `[px]`.
-pub const MAX_SIDE: u32 = 16_384;
+const MAX_SIDE: u32 = 16_384;
 /// Most pixels accepted.
-pub const MAX_PIXELS: u64 = 1 << 28;
-/// Most bytes of one image as decoded.
+const MAX_PIXELS: u64 = 1 << 28;
+/// Most bytes of one decoded image.
 const MAX_DECODED_BYTES: u64 = 1 << 30;
-/// Most bytes of an image file that are read: no JPEG of [`MAX_PIXELS`] has more.
+/// Most bytes read from an image file: no JPEG of [`MAX_PIXELS`] is larger.
 const MAX_FILE_BYTES: u64 = MAX_DECODED_BYTES;
 /// Supported formats.
 const FORMATS: [ImageFormat; 3] = [ImageFormat::Jpeg, ImageFormat::Png, ImageFormat::WebP];
-/// Almost always enough of a file to hold the header.
+/// Bytes at the start of a file that almost always contain the header.
 const HEADER_BYTES: u64 = 256 << 10;
 
-/// Where the pixels of a view come from, and how they are processed on load.
+/// The source of a view's pixels and their processing on load.
 #[derive(Debug, Clone)]
 pub struct ImageSource {
     /// The image file.
     pub file: SourceFile,
-    /// What of it is hidden, if there is a file of that.
+    /// Mask of the photograph, if there is one.
     pub mask: Option<Mask>,
-    /// Width after loading, before the window is cut out `[px]`.
+    /// Width after loading, before cropping to the window `[px]`.
     pub width: u32,
-    /// Height after loading, before the window is cut out `[px]`.
+    /// Height after loading, before cropping to the window `[px]`.
     pub height: u32,
-    /// Resampling of the whole file to a pinhole, if the lens has distortion.
+    /// Resampling of the whole image to a pinhole camera, if the lens is distorted.
     pub undistortion: Option<Undistortion>,
     /// Header of the image file.
     pub header: ImageHeader,
-    /// Pixels already in memory, at the size of the header; then no file is read.
+    /// Pixels in memory, at the size of the header, instead of a file.
     pub rendered: Option<SharedImage>,
-    /// What of the result is used, if not all.
+    /// The part of the result that is used, if not all.
     pub window: Option<Window>,
 }
 
-/// The header of an image file.
+/// The header of an image file. Its `Debug` text is part of the fingerprint in checkpoints.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ImageHeader {
     /// Width `[px]`.
@@ -64,28 +65,28 @@ pub struct ImageHeader {
     pub height: u32,
     /// Whether there is an alpha channel.
     pub has_alpha: bool,
-    /// How the image is turned before anything else. Width and height are those afterwards.
+    /// Rotation applied before anything else; width and height are those after it.
     pub turn: Option<Orientation>,
-    /// Size as decoded `[bytes]`.
+    /// Size after decoding `[bytes]`.
     pub decoded_bytes: u64,
     /// Size of the file `[bytes]`.
     pub file_bytes: u64,
 }
 
 impl ImageSource {
-    /// An image file as it is.
+    /// An image file without further processing.
     #[cfg(test)]
     pub(super) fn whole(path: std::path::PathBuf) -> Self {
-        let header = probe(&path).expect("an image");
+        let header = read_header(&path).expect("an image");
         let (width, height) = (header.width, header.height);
         let (mask, undistortion, rendered) = (None, None, None);
         let file = SourceFile::found(path).expect("an image");
         Self { file, mask, width, height, undistortion, header, rendered, window: None }
     }
 
-    /// Most bytes of the loaded image.
+    /// Largest size of the loaded image `[bytes]`.
     #[must_use]
-    pub fn loaded_bytes(&self) -> u64 {
+    pub(crate) fn loaded_bytes(&self) -> u64 {
         let [width, height] = match self.window {
             Some(window) => [window.width, window.height],
             None => [self.width, self.height],
@@ -93,9 +94,9 @@ impl ImageSource {
         u64::from(width) * u64::from(height) * self.channels()
     }
 
-    /// Most bytes used while loading, including the result.
+    /// Peak memory while loading, including the result `[bytes]`.
     #[must_use]
-    pub fn working_bytes(&self) -> u64 {
+    pub(super) fn working_bytes(&self) -> u64 {
         let bytes = |(width, height)| u64::from(width) * u64::from(height) * self.channels();
         let packed = bytes((self.header.width, self.header.height));
         let decode = self.header.file_bytes + self.header.decoded_bytes;
@@ -113,7 +114,7 @@ impl ImageSource {
         3 + u64::from(self.header.has_alpha || self.is_carved()) + u64::from(self.is_masked())
     }
 
-    /// Whether its images have a mask, of their own or of what their lens saw.
+    /// Whether loaded images have a mask: from a file, or of the field of view of the lens.
     #[must_use]
     pub fn is_masked(&self) -> bool {
         let is_ignored = |mask: &Mask| mask.mode == MaskMode::Ignore;
@@ -121,12 +122,12 @@ impl ImageSource {
             || self.undistortion.as_ref().is_some_and(Undistortion::is_masked)
     }
 
-    /// Whether a mask makes its images transparent.
+    /// Whether the mask becomes transparency.
     fn is_carved(&self) -> bool {
         self.mask.as_ref().is_some_and(|mask| mask.mode == MaskMode::Background)
     }
 
-    /// Width and height before it is shrunk `[px]`.
+    /// Width and height before shrinking `[px]`.
     fn whole_size(&self) -> (u32, u32) {
         match &self.undistortion {
             Some(undistortion) => (undistortion.pinhole().width, undistortion.pinhole().height),
@@ -138,10 +139,10 @@ impl ImageSource {
         (self.width, self.height) != self.whole_size()
     }
 
-    /// Decodes, undistorts, shrinks, and cuts out the window. A file without a transparent pixel yields no alpha.
+    /// Decodes, undistorts, shrinks and crops the image. The result has alpha only if a pixel is transparent.
     ///
     /// # Errors
-    /// When a file is missing, unreadable, over the limits, or not what its header said at first.
+    /// When a file is missing, unreadable, over the limits, or differs from the header read at first.
     pub fn load(&self) -> Result<Image8, DatasetError> {
         let image = self.load_whole()?;
         Ok(match self.window {
@@ -169,7 +170,7 @@ impl ImageSource {
         }
         let mut image = pack(decoded);
         if let Some(mask) = &self.mask {
-            mask.put_on(&mut image)?;
+            mask.apply(&mut image)?;
         }
         if let Some(undistortion) = &self.undistortion {
             image = undistortion.apply(&image);
@@ -181,7 +182,7 @@ impl ImageSource {
     }
 }
 
-/// Converts to 8 bits per channel, without a copy if it is RGB already.
+/// Converts to 8 bits per channel, without a copy if the image is RGB already.
 fn pack(decoded: DynamicImage) -> Image8 {
     let (width, height) = (decoded.width(), decoded.height());
     if !decoded.color().has_alpha() {
@@ -214,20 +215,24 @@ fn limits() -> Limits {
 }
 
 /// Reads the header of an image file, without decoding it, and checks it against the limits.
-pub(super) fn probe(path: &Path) -> Result<ImageHeader, DatasetError> {
+pub(super) fn read_header(path: &Path) -> Result<ImageHeader, DatasetError> {
     let mut file = files::open(path).map_err(DatasetError::io(path))?;
+    header_of(path, &mut file)
+}
+
+/// As [`read_header`], from an open file.
+fn header_of(path: &Path, file: &mut File) -> Result<ImageHeader, DatasetError> {
     let file_bytes = file.metadata().map_err(DatasetError::io(path))?.len();
     let mut start = Vec::new();
-    file.by_ref().take(HEADER_BYTES).read_to_end(&mut start).map_err(DatasetError::io(path))?;
+    file.take(HEADER_BYTES).read_to_end(&mut start).map_err(DatasetError::io(path))?;
     if let Some(problem) = files::wrong_kind(&start) {
         return Err(DatasetError::malformed(path, "the image", problem, "put the image there"));
     }
-    let header = read_header(ImageReader::new(Cursor::new(&start)), file_bytes);
-    let header = match header {
+    let header = match parse_header(ImageReader::new(Cursor::new(&start)), file_bytes) {
         // The header may follow a long preview or colour profile.
         Err(_) if file_bytes > HEADER_BYTES => {
-            let file = files::open(path).map_err(DatasetError::io(path))?;
-            read_header(ImageReader::new(BufReader::new(file)), file_bytes)
+            file.rewind().map_err(DatasetError::io(path))?;
+            parse_header(ImageReader::new(BufReader::new(file)), file_bytes)
         }
         header => header,
     }
@@ -237,13 +242,14 @@ pub(super) fn probe(path: &Path) -> Result<ImageHeader, DatasetError> {
         return Err(DatasetError::image(path, "it has no pixels"));
     }
     if pixels > MAX_PIXELS || header.decoded_bytes > MAX_DECODED_BYTES {
-        let problem = format!("{}x{} px are more than supported", header.width, header.height);
+        let (width, height) = (header.width, header.height);
+        let problem = format!("{width}x{height} px are more than supported");
         return Err(DatasetError::image(path, problem));
     }
     Ok(header)
 }
 
-fn read_header<R: std::io::BufRead + std::io::Seek>(
+fn parse_header<R: std::io::BufRead + Seek>(
     reader: ImageReader<R>,
     file_bytes: u64,
 ) -> Result<ImageHeader, image::ImageError> {
@@ -261,9 +267,25 @@ fn read_header<R: std::io::BufRead + std::io::Seek>(
     Ok(ImageHeader { width, height, has_alpha, turn: None, decoded_bytes, file_bytes })
 }
 
+/// Decodes an image whose header has been checked.
 pub(super) fn decode(source: &SourceFile) -> Result<DynamicImage, DatasetError> {
+    decode_file(&source.path, source.open()?)
+}
+
+/// Reads the header of an image, passes it to `check`, and decodes the image from the same open file.
+pub(super) fn decode_checked(
+    source: &SourceFile,
+    check: impl FnOnce(ImageHeader) -> Result<(), DatasetError>,
+) -> Result<DynamicImage, DatasetError> {
     let path = &source.path;
-    let mut reader = ImageReader::new(BufReader::new(source.open()?))
+    let mut file = source.open()?;
+    check(header_of(path, &mut file)?)?;
+    file.rewind().map_err(DatasetError::io(path))?;
+    decode_file(path, file)
+}
+
+fn decode_file(path: &Path, file: File) -> Result<DynamicImage, DatasetError> {
+    let mut reader = ImageReader::new(BufReader::new(file))
         .with_guessed_format()
         .map_err(DatasetError::io(path))?;
     if reader.format() == Some(ImageFormat::Jpeg) {
@@ -341,10 +363,10 @@ mod tests {
         {
             let path = folder.path().join(name);
             std::fs::write(&path, contents).unwrap();
-            let message = probe(&path).unwrap_err().to_string();
+            let message = read_header(&path).unwrap_err().to_string();
             assert!(message.contains(name), "{message}");
         }
-        let message = probe(&folder.path().join("none.png")).unwrap_err().to_string();
+        let message = read_header(&folder.path().join("none.png")).unwrap_err().to_string();
         assert!(message.contains("cannot read"), "{message}");
     }
 

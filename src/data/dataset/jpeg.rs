@@ -1,5 +1,5 @@
-//! Decodes JPEG files, and refuses those that are not whole: browsers, and the crate `image`, fill what is
-//! missing with grey, which would be trained on.
+//! Decodes JPEG files and refuses truncated ones. (Browsers and the crate `image` fill the missing part with grey,
+//! which would then be trained on.)
 
 use image::{DynamicImage, GrayImage, RgbImage};
 use zune_core::bytestream::ZCursor;
@@ -10,14 +10,14 @@ use zune_jpeg::JpegDecoder;
 /// Decodes a file whose header is within the limits.
 ///
 /// # Errors
-/// When it is damaged, or its end is missing.
+/// When the file is damaged or truncated.
 pub(super) fn decode(bytes: &[u8]) -> Result<DynamicImage, String> {
     let lenient = DecoderOptions::default()
         .set_strict_mode(false)
         .set_max_width(usize::MAX)
         .set_max_height(usize::MAX);
     let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), lenient);
-    // Cameras write headers of many kinds; only the pixels must be whole.
+    // Headers may deviate from the standard, as those of many cameras do; only the pixels must be complete.
     decoder.decode_headers().map_err(|error| error.to_string())?;
     let grey = decoder.input_colorspace() == Some(ColorSpace::Luma);
     let colours = if grey { ColorSpace::Luma } else { ColorSpace::RGB };
@@ -36,8 +36,8 @@ pub(super) fn decode(bytes: &[u8]) -> Result<DynamicImage, String> {
     image.ok_or_else(|| "the decoder returned another number of pixels".to_owned())
 }
 
-/// Whether a marker for the end follows the first scan. Segments before that are passed over by their
-/// lengths, since a preview in them has an end of its own; compressed pixels cannot hold the marker.
+/// Whether an end marker follows the first scan. Earlier segments are skipped by their lengths, since an embedded preview
+/// has an end marker of its own. Compressed pixels cannot contain the marker.
 fn has_end(bytes: &[u8]) -> bool {
     const SCAN: u8 = 0xda;
     const END: [u8; 2] = [0xff, 0xd9];
@@ -45,7 +45,7 @@ fn has_end(bytes: &[u8]) -> bool {
     while let Some(&[a, b, high, low]) = bytes.get(at..at + 4) {
         match (a, b) {
             (0xff, SCAN) => return bytes[at..].windows(2).any(|pair| pair == END),
-            // Fill bytes, or something between segments.
+            // Fill bytes, or other bytes between segments.
             (0xff, 0xff) => at += 1,
             (0xff, _) => at += 2 + usize::from(u16::from_be_bytes([high, low])),
             _ => at += 1,
@@ -73,7 +73,7 @@ mod tests {
         let bytes = sample();
         let expected = image::load_from_memory(&bytes).unwrap();
         assert_eq!(decode(&bytes).unwrap(), expected);
-        // What cameras append is no damage.
+        // Data appended by cameras is not damage.
         assert_eq!(decode(&[&bytes[..], b"appended"].concat()).unwrap(), expected);
         let mut grey = Vec::new();
         let image = GrayImage::from_fn(20, 9, |x, y| image::Luma([(x * y) as u8]));

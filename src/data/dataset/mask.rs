@@ -1,28 +1,48 @@
-//! Masks of photographs: what of them is hidden, and what hidden pixels are.
+//! Masks of photographs: decoding them, and hiding pixels.
 
-use image::DynamicImage;
+use image::{DynamicImage, GrayImage};
 
 use super::DatasetError;
-use super::images::{SourceFile, decode};
+use super::images::{ImageHeader, SourceFile, decode, decode_checked};
 use super::options::MaskMode;
 use densify_core::image::Image8;
 use densify_core::resample;
 
-/// A greyscale image of what is to be seen: the weights of pixels in the loss, or their coverage.
+/// A mask: a greyscale image whose values become weights of pixels in the loss, or transparency.
 #[derive(Debug, Clone)]
 pub struct Mask {
     /// The image file.
     pub file: SourceFile,
-    /// Which of its values hide a pixel.
+    /// The values that hide a pixel.
     pub hides: Hides,
-    /// What hidden pixels are.
+    /// The meaning of hidden pixels.
     pub mode: MaskMode,
 }
 
+/// The values of a mask that hide a pixel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Hides {
+    /// Black hides a pixel completely, grey in part.
+    Black,
+    /// White hides a pixel completely, grey in part.
+    White,
+    /// Every value but black hides a pixel completely.
+    AllButBlack,
+}
+
 impl Mask {
-    /// Decodes it at its own size; 0 is hidden, whichever colour of the file that is.
-    pub(super) fn weights(&self) -> Result<image::GrayImage, DatasetError> {
-        let mut mask = shape(decode(&self.file)?);
+    /// Decodes the mask at its own size; weight 0 is hidden. `check` may refuse its header first.
+    ///
+    /// The decoded mask is not kept: masks of all photographs together would exceed the promised memory.
+    pub(super) fn read_weights(
+        &self,
+        check: impl FnOnce(ImageHeader) -> Result<(), DatasetError>,
+    ) -> Result<GrayImage, DatasetError> {
+        Ok(self.weights(decode_checked(&self.file, check)?))
+    }
+
+    fn weights(&self, decoded: DynamicImage) -> GrayImage {
+        let mut mask = values(decoded);
         match self.hides {
             Hides::Black => {}
             Hides::White => mask.iter_mut().for_each(|weight| *weight = 255 - *weight),
@@ -30,12 +50,12 @@ impl Mask {
                 mask.iter_mut().for_each(|weight| *weight = if *weight == 0 { 255 } else { 0 });
             }
         }
-        Ok(mask)
+        mask
     }
 
-    /// Hides pixels of a photograph, of any size, as it says.
-    pub(super) fn put_on(&self, image: &mut Image8) -> Result<(), DatasetError> {
-        let mask = self.weights()?;
+    /// Hides the masked pixels of a photograph, whose size may differ from that of the mask.
+    pub(super) fn apply(&self, image: &mut Image8) -> Result<(), DatasetError> {
+        let mask = self.weights(decode(&self.file)?);
         if mask.iter().all(|&weight| weight == 0) {
             let (path, problem) = (&self.file.path, "the mask hides every pixel");
             let remedy = "repair it, or remove the photograph and its pose";
@@ -49,42 +69,29 @@ impl Mask {
         };
         match self.mode {
             MaskMode::Ignore => image.mask = Some(mask),
-            MaskMode::Background => image.alpha = carved(image.alpha.take(), mask),
+            MaskMode::Background => image.alpha = masked_alpha(image.alpha.take(), mask),
         }
         Ok(())
     }
 }
 
-/// The values of a mask: its brightness; or its coverage, where that alone makes it.
-fn shape(mask: DynamicImage) -> image::GrayImage {
+/// The values of a mask: its brightness, or its alpha channel if only that varies.
+fn values(mask: DynamicImage) -> GrayImage {
     if !mask.color().has_alpha() {
         return mask.into_luma8();
     }
     let both = mask.into_luma_alpha8();
     let channel = |number: usize| {
-        image::GrayImage::from_fn(both.width(), both.height(), |x, y| {
-            [both[(x, y)].0[number]].into()
-        })
+        GrayImage::from_fn(both.width(), both.height(), |x, y| [both[(x, y)].0[number]].into())
     };
-    let [luma, coverage] = [0, 1].map(channel);
+    let [luma, alpha] = [0, 1].map(channel);
     let is_one_colour = luma.iter().all(|value| Some(value) == luma.first());
-    let is_covered = coverage.iter().all(|&value| value == 255);
-    if is_one_colour && !is_covered { coverage } else { luma }
+    let is_opaque = alpha.iter().all(|&value| value == 255);
+    if is_one_colour && !is_opaque { alpha } else { luma }
 }
 
-/// Which values of a mask hide a pixel.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Hides {
-    /// Black wholly, grey in part.
-    Black,
-    /// White wholly, grey in part.
-    White,
-    /// All but black, wholly.
-    AllButBlack,
-}
-
-/// The coverage of an image of which a mask hides some; none where all is covered.
-fn carved(alpha: Option<Vec<u8>>, mut mask: Vec<u8>) -> Option<Vec<u8>> {
+/// The product of an alpha channel and a mask; `None` if all pixels are opaque.
+fn masked_alpha(alpha: Option<Vec<u8>>, mut mask: Vec<u8>) -> Option<Vec<u8>> {
     for (m, a) in mask.iter_mut().zip(alpha.iter().flatten()) {
         *m = ((u32::from(*m) * u32::from(*a) + 127) / 255) as u8;
     }
@@ -106,9 +113,7 @@ mod tests {
         let path = folder.path().join("a.png");
         RgbImage::from_pixel(4, 4, [10, 20, 30].into()).save(&path).unwrap();
         let mask = folder.path().join("m.png");
-        image::GrayImage::from_fn(8, 8, |x, _| [if x < 4 { 0 } else { 255 }].into())
-            .save(&mask)
-            .unwrap();
+        GrayImage::from_fn(8, 8, |x, _| [if x < 4 { 0 } else { 255 }].into()).save(&mask).unwrap();
         let mask = Some(mask_of(mask, Hides::Black));
         let source = ImageSource { mask, width: 2, height: 2, ..ImageSource::whole(path) };
         let loaded = source.load().unwrap();
@@ -122,17 +127,15 @@ mod tests {
         Mask { file: SourceFile::found(path).unwrap(), hides, mode: MaskMode::Ignore }
     }
 
-    /// What a mask hides is as transparent as what the photograph has transparent.
+    /// Masked pixels and transparent pixels of the photograph are both transparent.
     #[test]
-    fn what_is_to_be_carved_is_transparent() {
+    fn carved_pixels_are_transparent() {
         let folder = tempfile::tempdir().unwrap();
         let [path, plain, mask] = ["a.png", "b.png", "m.png"].map(|name| folder.path().join(name));
         let alpha = |x, _| image::Rgba([10_u8, 20, 30, if x == 0 { 102 } else { 255 }]);
         ImageBuffer::from_fn(2, 2, alpha).save(&path).unwrap();
         RgbImage::from_pixel(2, 2, [10, 20, 30].into()).save(&plain).unwrap();
-        image::GrayImage::from_fn(2, 2, |_, y| [if y == 0 { 0 } else { 255 }].into())
-            .save(&mask)
-            .unwrap();
+        GrayImage::from_fn(2, 2, |_, y| [if y == 0 { 0 } else { 255 }].into()).save(&mask).unwrap();
         for (path, hides, expected) in [
             (&path, Hides::Black, Some(vec![0, 0, 102, 255])),
             (&path, Hides::White, Some(vec![102, 255, 0, 0])),
@@ -147,18 +150,18 @@ mod tests {
         }
     }
 
-    /// Its brightness, unless only its coverage differs.
+    /// The alpha channel counts only where brightness is the same everywhere.
     #[test]
-    fn a_mask_can_be_drawn_by_coverage() {
-        let of = |values: [[u8; 2]; 2]| {
-            let image = image::GrayAlphaImage::from_fn(2, 1, |x, _| values[x as usize].into());
-            shape(image.into()).into_raw()
+    fn a_mask_may_be_an_alpha_channel() {
+        let read = |pixels: [[u8; 2]; 2]| {
+            let image = image::GrayAlphaImage::from_fn(2, 1, |x, _| pixels[x as usize].into());
+            values(image.into()).into_raw()
         };
-        assert_eq!(of([[0, 0], [0, 255]]), [0, 255]);
-        assert_eq!(of([[255, 255], [255, 90]]), [255, 90]);
-        assert_eq!(of([[0, 0], [255, 255]]), [0, 255]);
-        assert_eq!(of([[0, 255], [255, 0]]), [0, 255], "brightness");
-        assert_eq!(of([[7, 255], [7, 255]]), [7, 7]);
+        assert_eq!(read([[0, 0], [0, 255]]), [0, 255]);
+        assert_eq!(read([[255, 255], [255, 90]]), [255, 90]);
+        assert_eq!(read([[0, 0], [255, 255]]), [0, 255]);
+        assert_eq!(read([[0, 255], [255, 0]]), [0, 255], "brightness");
+        assert_eq!(read([[7, 255], [7, 255]]), [7, 7]);
     }
 
     #[test]
@@ -167,7 +170,7 @@ mod tests {
         let [path, mask] = ["a.png", "m.png"].map(|name| folder.path().join(name));
         RgbImage::from_pixel(4, 4, [10, 20, 30].into()).save(&path).unwrap();
         for (colour, hides) in [(0, Hides::Black), (255, Hides::White), (1, Hides::AllButBlack)] {
-            image::GrayImage::from_pixel(4, 4, [colour].into()).save(&mask).unwrap();
+            GrayImage::from_pixel(4, 4, [colour].into()).save(&mask).unwrap();
             let mask = Some(mask_of(mask.clone(), hides));
             let source = ImageSource { mask, ..ImageSource::whole(path.clone()) };
             let message = source.load().unwrap_err().to_string();

@@ -1,22 +1,21 @@
 //! Loads datasets: photographs with known cameras, in any of the supported formats.
 //!
-//! The files in the folder decide the format: `transforms_train.json` with `transforms_test.json`,
-//! else a COLMAP model under `sparse/0`, else `transforms.json`, else a CSV file of RealityCapture. An
-//! archive is read as the folder in it. All files are untrusted: see [`DatasetError`].
+//! `FORMATS` lists the formats; the first that recognises its files in a folder reads it. A ZIP archive is read as the
+//! folder inside it. All files are untrusted: see [`DatasetError`].
 
 mod archive;
 pub mod builtin;
-mod cache;
 mod colmap;
 mod exif;
 mod folders;
 mod formats;
+mod image_cache;
 pub mod images;
 mod jpeg;
 mod json;
-pub mod lens;
+mod lens;
 mod mask;
-mod masks;
+mod mask_files;
 pub mod normalise;
 mod options;
 mod paths;
@@ -27,8 +26,8 @@ mod realitycapture;
 mod source_file;
 mod tracks;
 mod transforms;
-pub mod undistort;
-mod wanted;
+mod undistort;
+mod view_list;
 mod window;
 
 #[cfg(test)]
@@ -54,65 +53,66 @@ use densify_core::numbers::grouped;
 pub use exif::ReportedExposures;
 use formats::read_scene;
 pub use formats::{DatasetFormat, formats};
+use images::ImageHeader;
 use lens::Lens;
-use masks::MaskFile;
+use mask_files::MaskFile;
 use normalise::Normalisation;
 pub use options::{FarCameras, LoadOptions, MaskMode, Resolution, Split};
 use paths::Root;
-pub use tracks::{MIN_VIEWS, Tracks};
-pub use wanted::view_line;
+pub(crate) use tracks::MIN_VIEWS;
+pub use tracks::Tracks;
+pub use view_list::view_line;
 pub use window::Part;
 
 /// A scene ready for training: cameras and points in normalised coordinates.
 #[derive(Debug, Clone)]
 pub struct Dataset {
-    /// Folder of the dataset, or its archive; no image lies outside it, except with `--images`.
+    /// Folder or archive of the dataset. All images lie inside it unless the options name another folder of images.
     pub root: PathBuf,
-    /// The files of an archive.
+    /// The unpacked files of an archive.
     unpacked: Option<Arc<archive::Unpacked>>,
-    /// Views to train on, sorted by name; never empty.
+    /// Training views, sorted by name; never empty.
     pub train: Vec<View>,
-    /// Views held out, sorted by name.
+    /// Views held out for testing, sorted by name.
     pub test: Vec<View>,
-    /// Points of the reconstruction, if the dataset has any.
+    /// Points of the reconstruction; empty if the dataset has none.
     pub points: PointCloud,
-    /// Which training views show which point, if [requested](LoadOptions::tracks) and known.
+    /// Training views that show each point, if [requested](LoadOptions::tracks) and known.
     pub tracks: Tracks,
-    /// From the dataset's own coordinates to the normalised ones used here.
+    /// Transform from the dataset's coordinates to the normalised ones used here.
     pub normalisation: Normalisation,
-    /// What [the surface](Self::ground_truth) that the images were rendered from takes at most while it is
-    /// made `[bytes]`; `None` where it is not known.
+    /// Peak memory for building the [known surface](Self::ground_truth) `[bytes]`; `None` if the surface is not known.
     pub surface_bytes: Option<u64>,
-    /// Notes for the user from loading (dropped points, missing frames).
+    /// Notes for the user about dropped points, missing frames and the like.
     pub notes: Vec<String>,
 }
 
 /// One posed image.
 #[derive(Debug, Clone)]
 pub struct View {
-    /// Name as in the dataset, unique, with `/` as separator.
+    /// Unique name, as in the dataset, with `/` as separator.
     pub name: String,
     /// Camera at training resolution, in normalised coordinates.
     pub camera: Camera,
-    /// Where the pixels come from.
+    /// Source of the pixels.
     pub source: images::ImageSource,
 }
 
-/// What the reader of a format returns.
+/// The contents of a dataset's files, as the reader of a format returns them.
 #[derive(Debug, Default)]
 struct Scene {
     /// The file that lists the frames.
     listing: PathBuf,
     frames: Vec<Frame>,
-    /// Where the first image that does not exist was looked for.
+    /// The first place where a missing image was looked for.
     first_missing: Option<PathBuf>,
     points: PointCloud,
     points_file: Option<PathBuf>,
-    /// Tracks; they name views by [`Frame::id`].
+    /// Tracks, which name photographs by [`Frame::id`].
     tracks: Tracks,
-    /// Whether the dataset brings its own test split.
+    /// Whether the dataset defines its own test split.
     own_split: bool,
-    /// As [`Dataset::surface_bytes`], where the reader knows.
+    /// As [`Dataset::surface_bytes`], if the reader knows it.
     surface_bytes: Option<u64>,
     notes: Vec<String>,
 }
@@ -121,32 +121,31 @@ struct Scene {
 #[derive(Debug)]
 struct Frame {
     name: String,
-    /// Name of the frame in tracks, if there are any.
+    /// Id of the frame in tracks.
     id: Option<u32>,
     /// File and frame, for messages.
     origin: String,
-    /// The path of the image as the file lists it.
+    /// Path of the image as listed in the file.
     listed: String,
     image: PathBuf,
-    /// The divisor of the folder `images_K` that the image is in.
+    /// Divisor K of the folder `images_K` that contains the image.
     reduced: Option<u32>,
     mask: Option<MaskFile>,
     lens: Lens,
-    /// Whether the pose file says what size the lens is for, and not the image.
-    is_sized: bool,
+    /// Header of the image, where the pose file states no image size and the lens is for that of the image.
+    header: Option<ImageHeader>,
     rotation: DMat3,
     translation: DVec3,
     held_out: bool,
 }
 
 impl Dataset {
-    /// Loads the dataset in the folder or ZIP archive `path`, or the built-in scene that `path` names
-    /// (`scene:NAME`, see [`builtin`]). Image files are checked by their headers; pixels
-    /// are read later, through [`images::ImageCache`].
+    /// Loads the dataset in the folder or ZIP archive `path`, or the built-in scene `scene:NAME` (see [`builtin`]).
+    /// Images are checked by their headers; their pixels are read later, through [`images::ImageCache`].
     ///
     /// # Errors
-    /// When the format is unknown, a file is missing, unreadable or contradicts itself, or no
-    /// view is left to train on. The message names file, field and remedy.
+    /// When the format is unknown, a file is missing, unreadable or contradictory, or no view is left to train on. The
+    /// message names the file, the field and the remedy.
     pub fn load(path: &Path, options: &LoadOptions) -> Result<Self, DatasetError> {
         if let Some(name) = builtin::name(path) {
             return builtin::load(path, name, options);
@@ -155,17 +154,16 @@ impl Dataset {
             return archive::load(path, options);
         }
         if path.is_file() {
-            let remedy = "name the dataset's folder, or a whole ZIP archive of it: if this was one, it is damaged, or \
-                          its download has failed";
             return Err(DatasetError(format!(
-                "{}: this file is no dataset and no ZIP archive; {remedy}",
+                "{}: this file is no dataset and no ZIP archive; name the dataset's folder, or a complete ZIP \
+                 archive of it (a damaged or incompletely downloaded archive is not recognised)",
                 path.display()
             )));
         }
-        Self::in_folder(path, options)
+        Self::load_folder(path, options)
     }
 
-    fn in_folder(path: &Path, options: &LoadOptions) -> Result<Self, DatasetError> {
+    fn load_folder(path: &Path, options: &LoadOptions) -> Result<Self, DatasetError> {
         let root = Root::new(path)?;
         let scene = read_scene(&root, options)?;
         if scene.frames.is_empty() {
@@ -181,22 +179,21 @@ impl Dataset {
         prepare::prepare(path, scene, options)
     }
 
-    /// The scene's extent `[scene units]`: 1.1 times the largest distance of a training camera from
-    /// their mean. Normalisation makes it the same for every scene; where all cameras are at one
-    /// place, it follows the spread of the points instead.
+    /// The scene's extent `[scene units]`: 1.1 times the largest distance of a training camera from the mean of all
+    /// training cameras. It is the same for every normalised scene.
     #[must_use]
     pub fn extent(&self) -> f64 {
         normalise::EXTENT
     }
 
-    /// Width and height that hold every view `[px]`.
+    /// Largest width and largest height of all views `[px]`.
     #[must_use]
     pub fn largest_image(&self) -> (u32, u32) {
         let cameras = self.train.iter().chain(&self.test).map(|view| &view.camera);
         cameras.fold((1, 1), |(w, h), camera| (w.max(camera.width), h.max(camera.height)))
     }
 
-    /// A line about it: views, their size, points.
+    /// One line for the user: numbers of views and points, and image sizes.
     #[must_use]
     pub fn describe(&self) -> String {
         let (width, height) = self.largest_image();

@@ -1,8 +1,8 @@
-//! Moves scenes to normalised coordinates, in f64: remote and tiny scenes lose no precision in f32.
+//! Moves scenes to normalised coordinates in f64, so that remote and tiny scenes lose no precision in f32.
 //!
-//! The unit of the scene is the largest distance of a training camera from their mean, as in nerf++
-//! (Zhang et al. 2020, §4); 3DGS calls 1.1 times that the extent. Rotations do not change, and so
-//! neither do quaternions and spherical harmonics.
+//! The unit of the scene is the largest distance of a training camera from the mean of all, as in NeRF++
+//! (Zhang et al. 2020, §4); 3DGS calls 1.1 times that the extent. Rotations stay the same, and with them quaternions and
+//! spherical harmonics.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -10,23 +10,25 @@ use serde::{Deserialize, Serialize};
 use densify_core::camera::Camera;
 use densify_core::gaussians::Gaussians;
 
-/// Extent of every normalised scene `[scene units]`: the factor between the radius of the cameras and the
-/// extent (3DGS, `getNerfppNorm`).
+/// Extent of every normalised scene `[scene units]`: the factor between the radius of the cameras and the extent (3DGS,
+/// `getNerfppNorm`).
 pub const EXTENT: f64 = 1.1;
-/// Cameras are at one place if their radius is below this fraction of their distance from the origin:
-/// the precision of f64 is 2.2e-16, and poses from other programs have a few digits less.
+/// Cameras count as being at one place if their radius is below this fraction of their distance from the origin:
+/// the precision of f64 is 2.2e-16, and poses of other programs have a few digits less.
 const SAME_PLACE: f64 = 1e-12;
-/// Distance from the origin, in extents, beyond which f32 world coordinates are too coarse: at 1e4
-/// about half a pixel at a focal length of 1,500 px and distance 10.
+/// Distance from the origin, in extents, beyond which f32 world coordinates are too coarse. At 1e4 their rounding is
+/// about half a pixel, for a focal length of 1,500 px and distance 10.
 const F32_OFFSET: f64 = 1e4;
 
-/// A camera is far if its distance from the median of the cameras is more than this many times the median
-/// of these distances. Drone flights and walks around an object stay below 5.
-const FAR: f64 = 10.0;
-/// Far cameras are a part of the scene if there are more than this share of all.
-const MOST_FAR: f64 = 0.05;
+/// A camera is an outlier if its distance from the median position exceeds this many times the median of all these
+/// distances. Drone flights and walks around an object stay below 5.
+const OUTLIER_DISTANCE: f64 = 10.0;
+/// If a larger share of the cameras is that far away, they are a part of the scene.
+const MAX_OUTLIERS: f64 = 0.05;
+/// Smallest number of cameras among which outliers can be recognised.
+const MIN_CAMERAS: usize = 10;
 
-/// scene = (world − centre) · scale.
+/// The transform scene = (world − centre) · scale.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Normalisation {
     /// The world point at the origin of the scene.
@@ -35,24 +37,21 @@ pub struct Normalisation {
     pub scale: f64,
 }
 
-/// Mean of the centres and their largest distance from it.
-fn rig(centres: &[DVec3]) -> (DVec3, f64) {
+/// The mean of the centres and their largest distance from it.
+fn mean_and_radius(centres: &[DVec3]) -> (DVec3, f64) {
     let centre = centres.iter().sum::<DVec3>() / centres.len().max(1) as f64;
     (centre, centres.iter().map(|c| c.distance(centre)).fold(0.0, f64::max))
 }
 
-/// The middle of these values, the upper one of two.
+/// The upper median; `None` without values.
 pub fn median(mut values: Vec<f64>) -> Option<f64> {
     let middle = values.len() / 2;
     (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
-/// Fewer cameras than this do not show what is usual.
-const FEW: usize = 10;
-
-/// Which cameras are so far from the others, and so few, that their poses are hardly right.
+/// Marks cameras whose poses are probably wrong, because they are few and far away from all others. Shape: `[cameras]`.
 #[must_use]
-pub(super) fn far(centres: &[DVec3]) -> Vec<bool> {
+pub(super) fn outliers(centres: &[DVec3]) -> Vec<bool> {
     let along = |axis: usize| {
         median(centres.iter().map(|centre| centre[axis]).collect()).unwrap_or_default()
     };
@@ -60,21 +59,23 @@ pub(super) fn far(centres: &[DVec3]) -> Vec<bool> {
     let distances: Vec<f64> = centres.iter().map(|centre| centre.distance(middle)).collect();
     let unit = median(distances.clone()).unwrap_or_default();
     let is_one_place = unit <= SAME_PLACE * middle.length();
-    if is_one_place || centres.len() < FEW {
+    if is_one_place || centres.len() < MIN_CAMERAS {
         return vec![false; centres.len()];
     }
-    let far: Vec<bool> = distances.iter().map(|&distance| distance > FAR * unit).collect();
+    let far: Vec<bool> =
+        distances.iter().map(|&distance| distance > OUTLIER_DISTANCE * unit).collect();
     let count = far.iter().filter(|&&far| far).count();
-    let most = ((MOST_FAR * centres.len() as f64) as usize).max(1);
+    let most = ((MAX_OUTLIERS * centres.len() as f64) as usize).max(1);
     if count > most { vec![false; centres.len()] } else { far }
 }
 
 impl Normalisation {
-    /// Changes nothing.
+    /// The identity.
     pub const IDENTITY: Self = Self { centre: DVec3::ZERO, scale: 1.0 };
 
-    /// Of a model alone: puts the middle of its rows at the origin, and most of them within distance 1.
-    pub fn of_model(model: &Gaussians) -> Self {
+    /// Normalises a model without cameras: the median of its means becomes the origin, and four fifths of them are within
+    /// distance 1.
+    pub fn fit_model(model: &Gaussians) -> Self {
         let middle = |axis: usize| {
             let along = model.means.iter().map(|mean| f64::from(mean[axis]));
             median(along.collect()).unwrap_or_default()
@@ -83,70 +84,70 @@ impl Normalisation {
         let away = |mean: &[f32; 3]| DVec3::from(mean.map(f64::from)).distance(centre);
         let mut away: Vec<f64> = model.means.iter().map(away).collect();
         away.sort_unstable_by(f64::total_cmp);
-        // Backgrounds reach far; most rows are on what was photographed.
+        // The last fifth is mostly background, which may be very far away.
         let most =
             away.get(away.len().saturating_sub(1) * 4 / 5).copied().filter(|&most| most > 0.0);
         let all = || away.last().map_or(1.0, |last| last.max(1.0));
         let scale = 1.0 / most.unwrap_or_else(all);
-        match scale.is_normal() && centre.is_finite() {
-            true => Self { centre, scale },
-            false => Self::IDENTITY,
+        if scale.is_normal() && centre.is_finite() {
+            Self { centre, scale }
+        } else {
+            Self::IDENTITY
         }
     }
 
-    /// Puts the mean of the camera centres at the origin and the farthest of them at distance 1. If
-    /// all cameras are at one place, the median distance of the points becomes 1; without points the
-    /// unit stays.
+    /// Moves the mean of the camera centres to the origin and the farthest of them to distance 1. If all cameras are at
+    /// one place, the median distance of the points becomes 1; without points the unit stays the same.
     #[must_use]
     pub fn fit(centres: &[DVec3], points: &[DVec3]) -> Self {
-        let (centre, mut unit) = rig(centres);
+        let (centre, mut unit) = mean_and_radius(centres);
         if unit <= SAME_PLACE * centre.length() {
             unit = median(points.iter().map(|p| p.distance(centre)).collect()).unwrap_or(1.0);
         }
         let scale = 1.0 / unit;
-        // Zero, and numbers without a normal inverse, cannot be the unit.
+        // A unit of zero, or without a normal inverse, is not usable.
         Self { centre, scale: if scale.is_normal() { scale } else { 1.0 } }
     }
 
-    /// A point from world to scene coordinates.
+    /// Transforms a point from world to scene coordinates.
     #[must_use]
     pub fn scene_from_world(&self, world: DVec3) -> DVec3 {
         (world - self.centre) * self.scale
     }
 
-    /// A point from scene to world coordinates.
+    /// Transforms a point from scene to world coordinates.
     #[must_use]
     pub fn world_from_scene(&self, scene: DVec3) -> DVec3 {
         scene / self.scale + self.centre
     }
 
-    /// A camera from world to scene coordinates.
+    /// Transforms a camera from world to scene coordinates.
     #[must_use]
     pub fn scene_from_world_camera(&self, world: &Camera) -> Camera {
         let translation = (world.rotation * self.centre + world.translation) * self.scale;
         Camera { translation, ..*world }
     }
 
-    /// A camera from scene to world coordinates.
+    /// Transforms a camera from scene to world coordinates.
     #[must_use]
     pub fn world_from_scene_camera(&self, scene: &Camera) -> Camera {
         let translation = scene.translation / self.scale - scene.rotation * self.centre;
         Camera { translation, ..*scene }
     }
 
-    /// A model from scene to world coordinates, computed in f64.
+    /// Transforms a model from scene to world coordinates, computing in f64.
     #[must_use]
     pub fn world_from_model(&self, scene: Gaussians) -> Gaussians {
         self.mapped(scene, -self.scale.ln(), |mean| self.world_from_scene(mean))
     }
 
-    /// A model from world to scene coordinates, computed in f64.
+    /// Transforms a model from world to scene coordinates, computing in f64.
     #[must_use]
     pub fn model_from_world(&self, world: Gaussians) -> Gaussians {
         self.mapped(world, self.scale.ln(), |mean| self.scene_from_world(mean))
     }
 
-    /// In place: the model may be most of the memory.
+    /// Transforms a model in place, as it may take most of the memory.
     fn mapped(
         &self,
         mut model: Gaussians,
@@ -164,7 +165,7 @@ impl Normalisation {
         model
     }
 
-    /// A warning if world coordinates lose precision in f32.
+    /// A warning if world coordinates in f32 are too coarse for this scene.
     #[must_use]
     pub fn f32_warning(&self) -> Option<String> {
         let offset = self.centre.length() * self.scale / EXTENT;
@@ -187,7 +188,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_few_cameras_far_from_all_others_are_told() {
+    fn a_few_cameras_far_from_all_others_are_outliers() {
         let ring = |count: usize, radius: f64| -> Vec<DVec3> {
             let angle = |number: usize| number as f64 / count as f64 * std::f64::consts::TAU;
             (0..count).map(|n| DVec3::new(angle(n).cos(), angle(n).sin(), 0.2) * radius).collect()
@@ -195,16 +196,16 @@ mod tests {
         let far_of = |near: usize, lonely: &[f64]| -> Vec<usize> {
             let mut centres = ring(near, 3.0);
             centres.extend(lonely.iter().map(|&x| DVec3::new(x, 0.0, 0.0)));
-            let far = far(&centres).into_iter().enumerate().filter(|(_, far)| *far);
+            let far = outliers(&centres).into_iter().enumerate().filter(|(_, far)| *far);
             far.map(|(number, _)| number).collect()
         };
         assert_eq!(far_of(39, &[500.0]), [39]);
         assert_eq!(far_of(39, &[40.0, -1e30]), [39, 40]);
         assert_eq!(far_of(39, &[25.0]), [0; 0]);
-        // More than a few are a part of the scene, and a handful of cameras says nothing.
+        // More than a few are a part of the scene, and a handful of cameras is not enough.
         assert_eq!(far_of(38, &[500.0, 510.0, 520.0]), [0; 0]);
         assert_eq!(far_of(8, &[500.0]), [0; 0]);
-        assert_eq!(far(&vec![DVec3::ONE; 30]), [false; 30]);
+        assert_eq!(outliers(&vec![DVec3::ONE; 30]), [false; 30]);
     }
 
     fn camera(centre: DVec3) -> Camera {
@@ -218,7 +219,7 @@ mod tests {
         let centres = [DVec3::X * 3.0, DVec3::Y * 5.0, DVec3::Z * -2.0].map(|c| c + offset);
         let n = Normalisation::fit(&centres, &[]);
         let scene = centres.map(|c| n.scene_from_world_camera(&camera(c)).centre());
-        assert!((rig(&scene).1 - 1.0).abs() < 1e-8);
+        assert!((mean_and_radius(&scene).1 - 1.0).abs() < 1e-8);
         assert!((scene.iter().sum::<DVec3>()).length() < 1e-8);
         assert!(n.f32_warning().is_some());
         assert!(Normalisation::fit(&[DVec3::X, DVec3::Y], &[]).f32_warning().is_none());

@@ -6,45 +6,44 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// How to load a dataset.
+/// Options for loading a dataset.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct LoadOptions {
-    /// Folder of the images (`--images`) instead of the one named in the dataset's files; relative
-    /// to the dataset. The only way to use images outside the dataset's folder.
+    /// Folder of the images instead of the one named in the dataset's files, relative to the dataset. Images outside
+    /// the dataset's folder can only be used with this option.
     pub images: Option<PathBuf>,
-    /// Size to train at (`--resolution`); `None`: the size of the images.
+    /// Training resolution; `None`: the size of the images.
     pub resolution: Option<Resolution>,
-    /// Which views are held out.
+    /// Rule for holding out test views.
     pub split: Split,
-    /// File that names the views to use, one in each line (`--views`); `None`: all.
+    /// File that names the views to use, one per line; `None`: all.
     pub views: Option<PathBuf>,
-    /// What happens to views whose camera is far from all others.
+    /// Treatment of views whose camera is far from all others.
     pub far_cameras: FarCameras,
-    /// Whether undistorted images hold all that the lens saw (`--keep-fov`), with what it did not masked,
-    /// instead of the largest rectangle without such pixels.
+    /// Whether undistorted images show the whole field of view of the lens, with the rest masked, instead of the
+    /// largest rectangle inside it.
     pub keep_fov: bool,
-    /// Whether masks are white, not black, where pixels are ignored (`--invert-masks`).
+    /// Whether white pixels of masks hide those of the photographs, instead of black ones.
     pub invert_masks: bool,
-    /// What masked pixels are (`--mask-mode`).
+    /// Meaning of masked pixels.
     pub mask_mode: MaskMode,
-    /// Folder that keeps built-in scenes as they were rendered; `None`: they are rendered.
+    /// Cache folder of rendered built-in scenes; `None`: they are rendered each time.
     pub cache: Option<PathBuf>,
-    /// Whether to read which views show which points ([`Tracks`](super::Tracks)).
+    /// Whether to read the [`Tracks`](super::Tracks) of the reconstruction's points.
     pub tracks: bool,
 }
 
-/// The size to train at. Images are never enlarged.
+/// Training resolution. Images are never enlarged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Resolution {
-    /// Sides divided by this: 1, 2, 4 or 8. Uses the folder `images_2`, `images_4` or `images_8`
-    /// where there is one.
+    /// Divisor of both sides: 1, 2, 4 or 8. The folder `images_2`, `images_4` or `images_8` is used if it exists.
     Divisor(u32),
     /// Width `[px]`, above 8.
     Width(u32),
 }
 
-/// What happens to views whose camera is far from all others, as structure from motion places some by
-/// mistake. In neither case do they count for the extent of the scene.
+/// Treatment of views whose camera is far from all others, which are mostly errors of structure from motion. They never
+/// count for the extent of the scene.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 pub enum FarCameras {
@@ -55,7 +54,7 @@ pub enum FarCameras {
     Keep,
 }
 
-/// What the pixels are that a mask hides.
+/// Meaning of the pixels that a mask hides.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 pub enum MaskMode {
@@ -66,25 +65,25 @@ pub enum MaskMode {
     Background,
 }
 
-/// Which views are held out for tests.
+/// Rule for holding out test views.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Split {
-    /// Those of the dataset's own test file, if it has one; else none.
+    /// The dataset's own test split, if it has one; otherwise no view.
     #[default]
     None,
-    /// Those of the dataset's own test file, if it has one; else every 8th by sorted name.
+    /// The dataset's own test split, if it has one; otherwise every 8th view by sorted name.
     Eval,
-    /// Every K-th of all views by sorted name, the first included, whatever the dataset says.
+    /// Every K-th of all views by sorted name, starting with the first, instead of the dataset's own split.
     Every(NonZeroU32),
 }
 
 impl Split {
     /// Every 8th view, as is usual in the literature.
-    pub const EVAL_EVERY: u32 = 8;
+    pub(super) const EVAL_EVERY: u32 = 8;
 }
 
 impl Resolution {
-    /// The number that stands for it on the command line.
+    /// The resolution as a number, as on the command line.
     #[must_use]
     pub fn number(self) -> u32 {
         let (Self::Divisor(number) | Self::Width(number)) = self;

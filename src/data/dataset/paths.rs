@@ -1,4 +1,4 @@
-//! Paths in data files: untrusted, and never followed out of the dataset's folder.
+//! Paths in data files. They are untrusted and never followed out of the dataset's folder.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -9,7 +9,7 @@ use unicode_normalization::UnicodeNormalization;
 
 use super::DatasetError;
 
-/// What separates the parts of a path: both, as paths may come from another system.
+/// Path separators of all systems, as paths may come from another one.
 const SEPARATORS: [char; 2] = ['/', '\\'];
 /// Longest name accepted from a data file `[bytes]`.
 pub(super) const MAX_NAME: usize = 4096;
@@ -17,17 +17,17 @@ pub(super) const MAX_NAME: usize = 4096;
 /// A folder that paths from data files may not leave.
 #[derive(Debug, Clone)]
 pub(super) struct Root {
-    /// As the user wrote it, for messages.
+    /// The path as the user wrote it, for messages.
     shown: PathBuf,
     canonical: PathBuf,
-    /// Folders that were searched for names which Unicode can write in several ways.
+    /// Listings of folders that were searched for names with several Unicode spellings.
     searched: Arc<Mutex<BTreeMap<PathBuf, Names>>>,
 }
 
-/// Entries of a folder by their composed names, those of ASCII alone left out.
+/// Entries of a folder with non-ASCII names, by their names in Unicode normalisation form C.
 type Names = BTreeMap<String, PathBuf>;
 
-/// A path in a data file, with its place for error messages.
+/// A path in a data file, with its location for error messages.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct DataPath<'a> {
     pub(super) file: &'a Path,
@@ -48,7 +48,7 @@ impl Root {
         &self.shown
     }
 
-    /// The full path, after all checks that need no file system. The file need not exist.
+    /// The full path, after all checks that do not need the file system. The file need not exist.
     pub(super) fn join(&self, named: DataPath<'_>) -> Result<PathBuf, DatasetError> {
         match lexical_fault(named.value) {
             None => Ok(self.shown.join(relative(named.value))),
@@ -56,9 +56,11 @@ impl Root {
         }
     }
 
-    /// As [`existing`](Self::existing), or else with the separators of Windows read as such. Where there is a file of
-    /// the literal name, it is that one.
-    pub(super) fn listed(&self, named: DataPath<'_>) -> Result<Option<PathBuf>, DatasetError> {
+    /// As [`existing`](Self::existing); if there is no file of the literal name, backslashes count as separators.
+    pub(super) fn existing_on_any_system(
+        &self,
+        named: DataPath<'_>,
+    ) -> Result<Option<PathBuf>, DatasetError> {
         match self.existing(named)? {
             None if named.value.contains('\\') => {
                 self.existing(DataPath { value: &named.value.replace('\\', "/"), ..named })
@@ -67,11 +69,11 @@ impl Root {
         }
     }
 
-    /// As [`join`](Self::join), also refusing links that lead out; `None` if there is no such file.
+    /// As [`join`](Self::join), but also refuses links that lead out of the folder; `None` if there is no such file.
     pub(super) fn existing(&self, named: DataPath<'_>) -> Result<Option<PathBuf>, DatasetError> {
         let mut path = self.join(named)?;
         if !named.value.is_ascii() && !path.exists() {
-            path = self.spelled_otherwise(&relative(named.value)).unwrap_or(path);
+            path = self.other_spelling(&relative(named.value)).unwrap_or(path);
         }
         match path.canonicalize() {
             Ok(real) if !real.starts_with(&self.canonical) => {
@@ -82,23 +84,21 @@ impl Root {
         }
     }
 
-    /// The file with the same letters: an accent may be a part of its letter or follow it. macOS writes names of
-    /// files in the one way, and what lists them mostly in the other.
-    fn spelled_otherwise(&self, value: &str) -> Option<PathBuf> {
+    /// The file whose name is the same in another Unicode spelling: an accent may be a part of its letter or follow it.
+    /// macOS stores file names in one form, and programs mostly list them in the other.
+    fn other_spelling(&self, value: &str) -> Option<PathBuf> {
         let mut path = self.shown.clone();
         for part in value.split('/') {
             let plain = path.join(part);
-            path = match part.is_ascii() || plain.exists() {
-                true => plain,
-                false => self.entry(path, part)?,
-            };
+            let is_plain = part.is_ascii() || plain.exists();
+            path = if is_plain { plain } else { self.entry(path, part)? };
         }
         Some(path)
     }
 
-    /// The entry of a folder that has this name in any spelling.
+    /// The entry of a folder with this name in any Unicode spelling.
     fn entry(&self, folder: PathBuf, name: &str) -> Option<PathBuf> {
-        // What is outside is not even listed.
+        // Folders outside are not even listed.
         if !folder.canonicalize().ok()?.starts_with(&self.canonical) {
             return None;
         }
@@ -111,7 +111,7 @@ impl Root {
 fn names(folder: &Path) -> Names {
     let mut entries: Vec<PathBuf> =
         fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path()).collect();
-    // Of several with the same letters the last counts, in whatever order the system lists them.
+    // Of several spellings of one name the last in sorted order counts, whatever order the system lists them in.
     entries.sort();
     let name = |path: PathBuf| {
         let name = path.file_name()?.to_str().filter(|name| !name.is_ascii())?;
@@ -121,53 +121,52 @@ fn names(folder: &Path) -> Names {
 }
 
 impl<'a> DataPath<'a> {
-    /// What of an absolute path of any system may lie below a folder: all of it, then without its first part, and so
-    /// on. What would be absolute itself is left out.
-    pub(super) fn ends(self) -> Result<impl Iterator<Item = String> + use<'a>, DatasetError> {
+    /// The suffixes of an absolute path of any system, longest first, each of which is a relative path.
+    pub(super) fn suffixes(self) -> Result<impl Iterator<Item = String> + use<'a>, DatasetError> {
         let parts = parts(self.value);
         let problem = if parts.is_empty() { Some("is empty") } else { text_fault(self.value) };
         match problem {
             Some(problem) => Err(self.fault(problem)),
             None => Ok((0..parts.len())
                 .map(move |first| parts[first..].join("/"))
-                .filter(|end| !is_absolute(end))),
+                .filter(|suffix| !is_absolute(suffix))),
         }
     }
 
     fn fault(self, problem: &str) -> DatasetError {
         let value: String = self.value.chars().take(200).collect();
         let problem = format!("the path {value:?} {problem}");
-        let remedy = "only paths below the dataset's folder are followed (a folder elsewhere can be named with \
+        let remedy = "only paths below the dataset's folder are followed (another folder of images can be given with \
                       --images)";
         DatasetError::malformed(self.file, self.field, problem, remedy)
     }
 }
 
-/// The path without `./` parts, with `/` as separator: the name of a view.
+/// The path without `./` parts, with `/` as separator, as in the names of views.
 pub(super) fn relative(value: &str) -> String {
     value.split('/').filter(|part| !part.is_empty() && *part != ".").collect::<Vec<_>>().join("/")
 }
 
-/// Whether it begins at the root, a drive or a scheme, of whatever system.
+/// Whether a path of any system begins with a root, a drive or a scheme.
 pub(super) fn is_absolute(value: &str) -> bool {
     value.starts_with(['/', '\\'])
         || value.as_bytes().get(1) == Some(&b':')
         || value.starts_with("file:")
 }
 
-/// What is wrong with a path, as far as its text says.
+/// The problem with the text of a path, if there is one.
 pub(super) fn lexical_fault(value: &str) -> Option<&'static str> {
     if relative(value).is_empty() {
         Some("is empty")
     } else if is_absolute(value) {
-        // What is worse is said of such a path, too.
+        // More serious problems take precedence.
         text_fault(value).or(Some("is absolute"))
     } else {
         text_fault(value)
     }
 }
 
-/// The same, wherever it begins.
+/// As [`lexical_fault`], for paths that may be absolute.
 fn text_fault(value: &str) -> Option<&'static str> {
     if value.len() > MAX_NAME {
         Some("is longer than 4 KiB")
@@ -180,8 +179,8 @@ fn text_fault(value: &str) -> Option<&'static str> {
     }
 }
 
-/// The parts of an absolute path of any system, without its scheme and drive: `file:///C:/a`, `\\?\C:\a` and `/a`
-/// are all `a`.
+/// The parts of an absolute path of any system without scheme and drive: `file:///C:/a`, `\\?\C:\a` and `/a` all
+/// become `a`.
 fn parts(value: &str) -> Vec<&str> {
     let local = value.strip_prefix("file:").unwrap_or(value).trim_start_matches(SEPARATORS);
     let local = local.strip_prefix(['?', '.']).filter(|rest| rest.starts_with(SEPARATORS));
@@ -198,7 +197,7 @@ fn parts(value: &str) -> Vec<&str> {
 mod tests {
     use super::*;
 
-    /// Both ways to write "Küche/é.png".
+    /// The two Unicode spellings of "Küche/é.png".
     const SPELLINGS: [&str; 2] = ["K\u{fc}che/\u{e9}.png", "Ku\u{308}che/e\u{301}.png"];
 
     fn existing(root: &Root, value: &str) -> Result<Option<PathBuf>, DatasetError> {
@@ -206,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn letters_count_and_not_how_they_are_written() {
+    fn names_are_found_in_either_unicode_spelling() {
         for (listed, written) in [(0, 1), (1, 0)].map(|(a, b)| (SPELLINGS[a], SPELLINGS[b])) {
             let folder = tempfile::tempdir().unwrap();
             let file = folder.path().join(written);
@@ -217,7 +216,7 @@ mod tests {
             assert_eq!(fs::read(found).unwrap(), b"photograph");
             assert_eq!(existing(&root, "K\u{fc}che/e.png").unwrap(), None, "another letter");
             assert!(existing(&root, "../K\u{fc}che/\u{e9}.png").is_err());
-            // Where there are both, the one that is listed.
+            // If both spellings exist, the listed one counts.
             let both = folder.path().join(listed);
             fs::create_dir_all(both.parent().unwrap()).unwrap();
             fs::write(&both, "itself").unwrap();

@@ -1,36 +1,38 @@
-//! Turns frames into photographs with their views: checks files against cameras, and cuts what lenses saw into
-//! pinholes.
+//! Turns frames into photographs with their views: checks image files against cameras, and replaces distorted
+//! lenses by pinhole cameras.
 
+use std::cell::OnceCell;
 use std::path::Path;
 
 use glam::{DMat3, DVec2};
+use image::GrayImage;
 use rayon::prelude::*;
 
 use super::DatasetError;
-use super::exif;
+use super::exif::Exif;
 use super::images::{self, Hides, ImageHeader, ImageSource, Mask, SourceFile};
-use super::lens::{Cut, CutFault, Lens};
+use super::lens::{Lens, PinholeError, Pinholes};
 use super::undistort::{Pinhole, Undistortion};
 use super::{Frame, LoadOptions, MaskMode, Resolution, View};
 use densify_core::camera::Camera;
 
-/// Share of a photograph that may be cropped without a word.
-const UNSAID: f64 = 0.005;
+/// Share of a photograph that may be cropped without a note.
+const SILENTLY_CROPPED: f64 = 0.005;
 
-/// The views of one photograph, which stay together.
+/// The views of one photograph, which are never split between training and test.
 #[derive(Debug)]
 pub(super) struct Photograph {
-    /// At least one; several where the lens saw too wide a field for one.
+    /// One view, or several if the field of view of the lens is too wide for one pinhole camera.
     pub(super) views: Vec<View>,
-    /// Which of them a mask hides wholly; empty if there is no mask.
+    /// Whether the mask hides all of each view; empty without a mask. Shape: `[views]`.
     pub(super) hidden: Vec<bool>,
-    /// Whether the dataset holds it out.
+    /// Whether the dataset holds the photograph out.
     pub(super) held_out: bool,
-    /// The name that tracks have for it.
+    /// Id of the photograph in tracks.
     pub(super) id: Option<u32>,
 }
 
-/// The photographs of frames in their order, in the dataset's own coordinates.
+/// The photographs of frames, in the same order and in the dataset's own coordinates.
 pub(super) fn photographs(
     listing: &Path,
     frames: &[Frame],
@@ -41,15 +43,14 @@ pub(super) fn photographs(
     let flag = if options.invert_masks { "--invert-masks" } else { "--mask-mode background" };
     if (options.invert_masks || carves) && frames.iter().all(|frame| frame.mask.is_none()) {
         let problem = "no photograph has a mask";
-        let remedy =
-            "put masks into `masks/`, each as NAME.png after its photograph, or leave the flag out";
+        let remedy = "put masks into `masks/`, named after their photographs as NAME.png, or leave the flag out";
         return Err(DatasetError::malformed(listing, flag, problem, remedy));
     }
-    // All first, then the first error: the message does not depend on the threads.
-    let checked: Vec<_> = frames.par_iter().map(|frame| checked(listing, frame)).collect();
+    // All frames are checked before the first error is reported, so that the message does not depend on the threads.
+    let checked: Vec<_> = frames.par_iter().map(|frame| check(listing, frame)).collect();
     let checked: Vec<Checked> = checked.into_iter().collect::<Result<_, _>>()?;
     notes.extend(turned_note(frames, &checked));
-    notes.extend(unsure_note(frames, &checked));
+    notes.extend(orientation_note(frames, &checked));
     notes.extend(masks_note(frames));
     if let (Some(Resolution::Width(width)), Some(first)) = (options.resolution, frames.first())
         && checked.iter().any(|checked| checked.header.width < width)
@@ -57,55 +58,61 @@ pub(super) fn photographs(
         let first = &first.name;
         notes.push(format!("images narrower than {width} px are not enlarged ({first})"));
     }
-    // Photographs of one camera mostly follow each other, and are cut alike.
+    // Consecutive photographs mostly share a camera, and thus its pinholes.
     let mut runs = Vec::new();
     let mut first = 0;
     for run in checked.chunk_by(|a, b| a.lens == b.lens) {
         runs.push((first, run));
         first += run.len();
     }
-    let cut = |&(first, run): &(usize, &[Checked])| -> Result<_, DatasetError> {
+    let pinholes = |&(first, run): &(usize, &[Checked])| -> Result<_, DatasetError> {
         let lens = &run[0].lens;
         if !lens.is_distorted() {
             return Ok(None);
         }
-        Cut::of(lens, options.keep_fov)
+        Pinholes::covering(lens, options.keep_fov)
             .map(Some)
-            .map_err(|fault| refusal(&frames[first], lens, fault))
+            .map_err(|error| lens_error(&frames[first], lens, error))
     };
-    let cuts: Vec<Result<Option<Cut>, _>> = runs.par_iter().map(cut).collect();
-    let cuts: Vec<Option<Cut>> = cuts.into_iter().collect::<Result<_, _>>()?;
-    notes.extend(cut_notes(runs.iter().map(|(_, run)| run.len()).zip(&cuts), options.keep_fov));
-    let cut_of = runs.iter().zip(&cuts).flat_map(|((_, run), cut)| run.iter().map(move |_| cut));
-    let each = frames.iter().zip(&checked).zip(cut_of);
-    each.map(|((frame, checked), cut)| photograph(frame, checked, cut.as_ref(), options)).collect()
+    let all: Vec<Result<Option<Pinholes>, _>> = runs.par_iter().map(pinholes).collect();
+    let all: Vec<Option<Pinholes>> = all.into_iter().collect::<Result<_, _>>()?;
+    notes.extend(pinhole_notes(runs.iter().map(|(_, run)| run.len()).zip(&all), options.keep_fov));
+    let by_frame = runs.iter().zip(&all).flat_map(|((_, run), all)| run.iter().map(move |_| all));
+    let by_frame: Vec<&Option<Pinholes>> = by_frame.collect();
+    let each = frames.iter().zip(checked).zip(by_frame);
+    each.map(|((frame, checked), pinholes)| photograph(frame, checked, pinholes.as_ref(), options))
+        .collect()
 }
 
-/// What is known of a photograph whose image fits its camera.
+/// The headers of a photograph whose image matches its camera.
 #[derive(Debug)]
 struct Checked {
     header: ImageHeader,
-    /// At the image's size.
+    /// The lens at the image's size.
     lens: Lens,
-    /// Whether EXIF turns the image by a quarter, and nothing says whether the poses mean that.
-    is_unsure: bool,
+    /// EXIF fields, if they were needed.
+    exif: Option<Exif>,
+    /// Whether EXIF asks for a quarter turn, and the pose file does not say whether its poses include it.
+    is_turn_ambiguous: bool,
 }
 
-/// Checks an image's header against its camera. An image that lies on its side for this camera, and says so in its
-/// EXIF, is turned: some programs do so before they find poses, and others do not.
-fn checked(listing: &Path, frame: &Frame) -> Result<Checked, DatasetError> {
-    let mut header = images::probe(&frame.image)?;
+/// Checks an image's header against its camera. An image that fits only after the quarter turn in its EXIF is turned:
+/// some programs turn images before they estimate poses, others do not.
+fn check(listing: &Path, frame: &Frame) -> Result<Checked, DatasetError> {
+    let mut header = frame.header.map_or_else(|| images::read_header(&frame.image), Ok)?;
+    let exif = OnceCell::new();
+    let quarter_turn = || exif.get_or_init(|| Exif::open(&frame.image)).quarter_turn();
     let lens = &frame.lens;
     let k = frame.reduced.unwrap_or(1);
     let expected = (divided(lens.width, k), divided(lens.height, k));
     let fits = |size: (u32, u32)| match frame.reduced {
         Some(_) => size.0.abs_diff(expected.0) <= 1 && size.1.abs_diff(expected.1) <= 1,
-        None => proportional(size, (lens.width, lens.height)),
+        None => is_proportional(size, (lens.width, lens.height)),
     };
     let (width, height) = (header.height, header.width);
     if !fits((header.width, header.height))
         && fits((width, height))
-        && let turn @ Some(_) = exif::quarter_turn(&frame.image)
+        && let turn @ Some(_) = quarter_turn()
     {
         header = ImageHeader { width, height, turn, ..header };
     }
@@ -113,16 +120,8 @@ fn checked(listing: &Path, frame: &Frame) -> Result<Checked, DatasetError> {
     if !fits(size) {
         return Err(DatasetError::size(&frame.image, size, expected));
     }
-    if let Some(mask) = &frame.mask {
-        let mask = &mask.path;
-        let found = images::probe(mask)?;
-        let found = (found.width, found.height);
-        if !proportional(found, size) {
-            return Err(DatasetError::size(mask, found, size));
-        }
-    }
     let lens = lens.resized(header.width, header.height);
-    // Cut-outs of a photograph have it outside, but hardly by more than their own size.
+    // The principal point of a crop may lie outside, but hardly by more than the size of the image.
     let extent = lens.size();
     if !(lens.principal.cmpge(-extent) & lens.principal.cmple(2.0 * extent)).all() {
         let DVec2 { x, y } = lens.principal;
@@ -130,44 +129,45 @@ fn checked(listing: &Path, frame: &Frame) -> Result<Checked, DatasetError> {
         let remedy = "repair the camera or remove the frame";
         return Err(DatasetError::malformed(listing, &frame.name, problem, remedy));
     }
-    let is_unsure = !frame.is_sized && exif::quarter_turn(&frame.image).is_some();
-    Ok(Checked { header, lens, is_unsure })
+    let is_turn_ambiguous = frame.header.is_some() && quarter_turn().is_some();
+    Ok(Checked { header, lens, exif: exif.into_inner(), is_turn_ambiguous })
 }
 
-/// What is said about photographs that are turned.
+/// Note about photographs that are turned to match their cameras.
 fn turned_note(frames: &[Frame], checked: &[Checked]) -> Option<String> {
     let turned = || frames.iter().zip(checked).filter(|(_, checked)| checked.header.turn.is_some());
     let (first, _) = turned().next()?;
     Some(format!(
-        "{} photographs lie on their side for their cameras, and are turned as their EXIF says ({} is the first)",
+        "{} photographs lie on their side compared with their cameras and are turned according to their EXIF (first: \
+         {})",
         turned().count(),
         first.name
     ))
 }
 
-/// What is said about photographs that EXIF turns by a quarter while nothing says whether the poses mean that.
-fn unsure_note(frames: &[Frame], checked: &[Checked]) -> Option<String> {
-    let unsure = || frames.iter().zip(checked).filter(|(_, checked)| checked.is_unsure);
-    let first = &unsure().next()?.0.name;
+/// Note about photographs whose EXIF orientation may or may not be part of the poses.
+fn orientation_note(frames: &[Frame], checked: &[Checked]) -> Option<String> {
+    let ambiguous = || frames.iter().zip(checked).filter(|(_, checked)| checked.is_turn_ambiguous);
+    let first = &ambiguous().next()?.0.name;
     Some(format!(
-        "{} photographs are to be turned by a quarter, as their EXIF says, but the pose file has no size that would \
-         tell whether its poses mean that; they are taken as they are stored ({first} is the first). If the model is \
+        "{} photographs have an EXIF orientation that asks for a quarter turn, but the pose file states no image size \
+         that would show whether its poses include it; they are used as stored (first: {first}). If the model is \
          poor, turn the files themselves",
-        unsure().count()
+        ambiguous().count()
     ))
 }
 
-/// How many photographs have masks, if any.
+/// Note about the number of photographs with masks.
 fn masks_note(frames: &[Frame]) -> Option<String> {
     let masked = frames.iter().filter(|frame| frame.mask.is_some()).count();
     (masked > 0).then(|| format!("{masked} of {} photographs have a mask", frames.len()))
 }
 
-/// Why a lens cannot be cut, with the remedy.
-fn refusal(frame: &Frame, lens: &Lens, fault: CutFault) -> DatasetError {
-    let problem = format!("{fault} ({})", lens.distortion());
-    let remedy = match fault {
-        CutFault::Folds(degrees) if degrees > 1.0 => {
+/// The error for a lens that no pinhole camera can replace, with the remedy.
+fn lens_error(frame: &Frame, lens: &Lens, error: PinholeError) -> DatasetError {
+    let problem = format!("{error} ({})", lens.distortion());
+    let remedy = match error {
+        PinholeError::Folds(degrees) if degrees > 1.0 => {
             "train on that field alone with --keep-fov, or calibrate again with fewer terms, or undistort the \
              images first, e.g. with `colmap image_undistorter`"
         }
@@ -176,32 +176,33 @@ fn refusal(frame: &Frame, lens: &Lens, fault: CutFault) -> DatasetError {
     DatasetError::malformed(&frame.image, &frame.origin, problem, remedy)
 }
 
-/// What is said about the pinholes of so many photographs each.
-fn cut_notes<'a>(
-    cuts: impl Iterator<Item = (usize, &'a Option<Cut>)> + Clone,
-    keep: bool,
+/// Notes about split and cropped photographs, from numbers of photographs and their pinholes.
+fn pinhole_notes<'a>(
+    all: impl Iterator<Item = (usize, &'a Option<Pinholes>)> + Clone,
+    keep_fov: bool,
 ) -> Vec<String> {
-    let cuts = cuts.filter_map(|(count, cut)| Some((count, cut.as_ref()?)));
+    let all = all.filter_map(|(count, pinholes)| Some((count, pinholes.as_ref()?)));
     let mut notes = Vec::new();
-    let wide = || cuts.clone().filter(|(_, cut)| cut.faces.len() > 1);
-    if let Some(most) = wide().max_by_key(|(_, cut)| cut.faces.len()) {
-        let names: Vec<&str> = most.1.faces.iter().map(|(name, _)| *name).collect();
+    let wide = || all.clone().filter(|(_, pinholes)| pinholes.faces.len() > 1);
+    if let Some(widest) = wide().max_by_key(|(_, pinholes)| pinholes.faces.len()) {
+        let names: Vec<&str> = widest.1.faces.iter().map(|(name, _)| *name).collect();
         notes.push(format!(
-            "the field of view of {} photographs is too wide for one pinhole; each becomes up to {} views: {}",
+            "the field of view of {} photographs is too wide for one pinhole camera; each becomes up to {} views: {}",
             wide().map(|(count, _)| count).sum::<usize>(),
             names.len(),
             names.join(", ")
         ));
     }
-    let lost = cuts.clone().filter(|(_, cut)| cut.cropped > UNSAID);
-    let most = lost.clone().map(|(_, cut)| cut.cropped).fold(0.0, f64::max);
+    let lost = all.clone().filter(|(_, pinholes)| pinholes.cropped > SILENTLY_CROPPED);
+    let most = lost.clone().map(|(_, pinholes)| pinholes.cropped).fold(0.0, f64::max);
     if most > 0.0 {
-        let what = match keep {
-            true => "is beyond what their lens is known to image, and is not used",
-            false => "is cropped by undistortion (--keep-fov keeps what the lens saw)",
+        let reason = if keep_fov {
+            "is beyond what the lens model can invert, and is not used"
+        } else {
+            "is cropped by undistortion (--keep-fov keeps the whole field of view)"
         };
         notes.push(format!(
-            "up to {:.0} % of {} photographs {what}",
+            "up to {:.0} % of {} photographs {reason}",
             (100.0 * most).max(1.0),
             lost.map(|(count, _)| count).sum::<usize>()
         ));
@@ -209,14 +210,14 @@ fn cut_notes<'a>(
     notes
 }
 
-/// The views of a frame whose image and lens are checked.
+/// The views of a frame whose image and lens have been checked.
 fn photograph(
     frame: &Frame,
-    Checked { header, lens, .. }: &Checked,
-    cut: Option<&Cut>,
+    Checked { header, lens, exif, .. }: Checked,
+    pinholes: Option<&Pinholes>,
     options: &LoadOptions,
 ) -> Result<Photograph, DatasetError> {
-    let file = SourceFile::found(frame.image.clone())?;
+    let file = SourceFile::found(frame.image.clone())?.with_exif(exif);
     let mask = frame.mask.as_ref().map(|mask| {
         let hides = match (mask.hides_all_but_black, options.invert_masks) {
             (false, false) | (true, true) => Hides::Black,
@@ -235,11 +236,11 @@ fn photograph(
             principal: lens.principal,
         };
         let pinhole = undistortion.as_ref().map_or(whole, |undistortion| *undistortion.pinhole());
-        // A rotation changes nothing if there is none, to the last bit.
-        let looks =
+        // Multiplying by an identity matrix could still change the last bits.
+        let turn =
             undistortion.as_ref().map(|undistortion| undistortion.lens_from_pinhole().transpose());
-        let (rotation, translation) = match looks.filter(|looks| *looks != DMat3::IDENTITY) {
-            Some(looks) => (looks * frame.rotation, looks * frame.translation),
+        let (rotation, translation) = match turn.filter(|turn| *turn != DMat3::IDENTITY) {
+            Some(turn) => (turn * frame.rotation, turn * frame.translation),
             None => (frame.rotation, frame.translation),
         };
         let camera = Camera {
@@ -264,48 +265,56 @@ fn photograph(
                 width,
                 height,
                 undistortion,
-                header: *header,
+                header,
                 rendered: None,
                 window: None,
             },
         }
     };
-    let views = match cut {
+    let views = match pinholes {
         None => vec![view("", None)],
-        Some(cut) => cut.faces.iter().map(|&(name, face)| view(name, Some(face))).collect(),
+        Some(pinholes) => {
+            pinholes.faces.iter().map(|&(name, face)| view(name, Some(face))).collect()
+        }
     };
-    let hidden = hidden(&views, lens)?;
+    let hidden = match &mask {
+        None => Vec::new(),
+        // One mask at a time is decoded, which the memory of a run allows for.
+        Some(mask) => {
+            let weights = mask.read_weights(|found| check_mask(mask, found, header))?;
+            views.iter().map(|view| is_hidden(view, views.len() > 1, &weights, &lens)).collect()
+        }
+    };
     Ok(Photograph { views, hidden, held_out: frame.held_out, id: frame.id })
 }
 
-/// Which views of a photograph its mask hides wholly. One mask at a time is decoded, which a run has room for.
-fn hidden(views: &[View], lens: &Lens) -> Result<Vec<bool>, DatasetError> {
-    /// Most pixels along a side of a mask that are asked which of several views they are in.
-    const ASKED: u32 = 512;
-    let Some(mask) = views.first().and_then(|view| view.source.mask.as_ref()) else {
-        return Ok(Vec::new());
-    };
-    let mask = mask.weights()?;
-    let (width, height) = mask.dimensions();
-    let lens = lens.resized(width, height);
-    let stride = if views.len() > 1 { (width.max(height) / ASKED).max(1) } else { 1 };
-    let places = || {
-        (0..height)
-            .step_by(stride as usize)
-            .flat_map(|y| (0..width).step_by(stride as usize).map(move |x| (x, y)))
-    };
-    let counted = || places().filter(|&(x, y)| mask.get_pixel(x, y).0 != [0]);
-    let is_hidden = |view: &View| match &view.source.undistortion {
-        None => counted().next().is_none(),
-        Some(undistortion) => !counted().any(|(x, y)| {
-            let ray = lens.unproject(DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5));
-            ray.is_ok_and(|ray| undistortion.shows(ray))
-        }),
-    };
-    Ok(views.iter().map(is_hidden).collect())
+/// Checks that a mask is a rescale of its photograph.
+fn check_mask(mask: &Mask, found: ImageHeader, image: ImageHeader) -> Result<(), DatasetError> {
+    let (found, size) = ((found.width, found.height), (image.width, image.height));
+    if is_proportional(found, size) {
+        return Ok(());
+    }
+    Err(DatasetError::size(&mask.file.path, found, size))
 }
 
-/// The name of one view of several: `a/b@left.png`.
+/// Whether a mask hides all of a view, which may be one of `several` of its photograph.
+fn is_hidden(view: &View, several: bool, mask: &GrayImage, lens: &Lens) -> bool {
+    /// Most pixels along a side of a mask that are tested against each of several views.
+    const SAMPLED_SIDE: u32 = 512;
+    let (width, height) = mask.dimensions();
+    let stride = if several { (width.max(height) / SAMPLED_SIDE).max(1) } else { 1 } as usize;
+    let rows = (0..height).step_by(stride);
+    let pixels = rows.flat_map(|y| (0..width).step_by(stride).map(move |x| (x, y)));
+    let mut visible = pixels.filter(|&(x, y)| mask.get_pixel(x, y).0 != [0]);
+    let Some(undistortion) = &view.source.undistortion else { return visible.next().is_none() };
+    let lens = lens.resized(width, height);
+    !visible.any(|(x, y)| {
+        let ray = lens.unproject(DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5));
+        ray.is_ok_and(|ray| undistortion.shows(ray))
+    })
+}
+
+/// The name of one of several views: `a/b@left.png`.
 fn face_name(name: &str, face: &str) -> String {
     if face.is_empty() {
         return name.to_owned();
@@ -315,18 +324,18 @@ fn face_name(name: &str, face: &str) -> String {
     format!("{}@{face}{}", &name[..dot], &name[dot..])
 }
 
-/// The size to train at of a pinhole of this size, from a file of this width.
+/// The training resolution of a pinhole image of this size, from a file of this width.
 pub(super) fn target_size(
     (width, height): (u32, u32),
     file_width: u32,
     resolution: Option<Resolution>,
-    reduced: bool,
+    is_reduced: bool,
 ) -> (u32, u32) {
     match resolution {
-        Some(Resolution::Divisor(k)) if !reduced => (divided(width, k), divided(height, k)),
-        Some(Resolution::Width(wanted)) if wanted < file_width => {
+        Some(Resolution::Divisor(k)) if !is_reduced => (divided(width, k), divided(height, k)),
+        Some(Resolution::Width(target)) if target < file_width => {
             let scaled = |side: u32| {
-                let side = f64::from(side) * f64::from(wanted) / f64::from(file_width);
+                let side = f64::from(side) * f64::from(target) / f64::from(file_width);
                 (side.round() as u32).max(1)
             };
             (scaled(width), scaled(height))
@@ -340,14 +349,14 @@ fn divided(side: u32, k: u32) -> u32 {
     ((f64::from(side) / f64::from(k.max(1))).round() as u32).max(1)
 }
 
-/// Whether scaling `of` by one factor gives `size` within 1 px along both axes.
-fn proportional(size: (u32, u32), of: (u32, u32)) -> bool {
-    let range = |side: u32, of: u32| {
-        let (side, of) = (f64::from(side), f64::from(of));
-        ((side - 1.0) / of, (side + 1.0) / of)
+/// Whether one factor scales `reference` to `size` within 1 px along both axes.
+fn is_proportional(size: (u32, u32), reference: (u32, u32)) -> bool {
+    let range = |side: u32, reference: u32| {
+        let (side, reference) = (f64::from(side), f64::from(reference));
+        ((side - 1.0) / reference, (side + 1.0) / reference)
     };
-    let ((x0, x1), (y0, y1)) = (range(size.0, of.0), range(size.1, of.1));
-    size == of || x0.max(y0) < x1.min(y1)
+    let ((x0, x1), (y0, y1)) = (range(size.0, reference.0), range(size.1, reference.1));
+    size == reference || x0.max(y0) < x1.min(y1)
 }
 
 #[cfg(test)]
@@ -367,7 +376,7 @@ mod tests {
             ((619, 420), false),
             ((1280, 822), false),
         ] {
-            assert_eq!(proportional(size, (1237, 822)), fits, "{size:?}");
+            assert_eq!(is_proportional(size, (1237, 822)), fits, "{size:?}");
         }
         assert_eq!((divided(1237, 2), divided(3, 8)), (619, 1));
     }

@@ -1,4 +1,4 @@
-//! Checks the poses and intrinsics in data files.
+//! Checks poses and intrinsics from data files.
 
 use std::path::Path;
 
@@ -7,21 +7,21 @@ use glam::{DMat3, DVec3};
 use super::DatasetError;
 use super::lens::{Lens, Plane};
 
-/// Fields of view accepted for a pinhole camera `[degrees]`.
+/// Accepted fields of view of pinhole cameras `[degrees]`.
 const FIELD_OF_VIEW: std::ops::RangeInclusive<f64> = 0.5..=160.0;
 
-/// Widest field of view accepted for a fisheye whose distortion is not counted `[degrees]`: its corners may lie
-/// outside of what it images.
+/// Largest accepted field of view of fisheyes without their distortion `[degrees]`. It is large because the corners of
+/// the image may lie outside the image circle.
 const WIDEST_FISHEYE: f64 = 720.0;
-/// Largest ω of the FOV model `[rad]`, where tan(ω/2) is 20.
+/// Largest accepted ω of the FOV model `[rad]`, for which tan(ω/2) is 20.
 const MAX_OMEGA: f64 = 3.04;
 
-/// Largest entry of |RᵀR − I| accepted; smaller deviations are corrected.
+/// Largest accepted entry of |RᵀR − I|; smaller deviations are corrected.
 const ROTATION_TOLERANCE: f64 = 1e-3;
 
 pub(super) const POSE_REMEDY: &str = "repair the pose or remove the frame";
 
-/// Checks `camera_from_world` and makes the rotation orthonormal.
+/// Checks a pose `camera_from_world` and makes its rotation orthonormal.
 pub(super) fn checked_pose(
     file: &Path,
     frame: &str,
@@ -50,7 +50,7 @@ pub(super) fn checked_pose(
     Ok((r, translation))
 }
 
-/// The rotation of a quaternion (w, x, y, z) of unit length, checked.
+/// Checks that a quaternion (w, x, y, z) has unit length, and returns its rotation.
 pub(super) fn checked_quaternion(
     file: &Path,
     frame: &str,
@@ -95,7 +95,7 @@ pub(super) fn check_lens(file: &Path, camera: &str, lens: &Lens) -> Result<(), D
         let degrees = 2.0 * half.to_degrees();
         if !(*FIELD_OF_VIEW.start()..=most).contains(&degrees) {
             let wide = if degrees > most && lens.distortion().plane == Plane::Perspective {
-                "; a lens this wide is a fisheye: name a fisheye model, or undistort its images to a pinhole"
+                "; a lens this wide is a fisheye: use a fisheye model, or undistort its images to a pinhole"
             } else {
                 ""
             };
@@ -139,9 +139,9 @@ mod tests {
     fn fields_of_view_that_no_pinhole_has_are_refused() {
         let check = |degrees: f64| {
             let focal = 50.0 / (0.5 * degrees.to_radians()).tan();
-            // A principal point outside of the image is no fault.
+            // A principal point outside the image is allowed.
             let principal = DVec2::new(-70.0, 130.0);
-            let none = Distortion::of(Plane::Perspective);
+            let none = Distortion::none(Plane::Perspective);
             let lens = Lens::new((100, 100), DVec2::splat(focal), principal, none);
             check_lens(Path::new("f"), "camera 7", &lens)
         };

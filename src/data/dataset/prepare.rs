@@ -1,4 +1,4 @@
-//! Turns the frames of any format into a dataset: sorts, splits, normalises.
+//! Turns the frames of any format into a dataset: sorts, splits and normalises them.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -6,37 +6,37 @@ use std::path::Path;
 use glam::DVec3;
 
 use super::DatasetError;
-use super::masks::unused_masks_note;
+use super::mask_files::unused_masks_note;
 use super::normalise::{self, Normalisation};
 use super::photographs::{Photograph, photographs};
 use super::pose::POSE_REMEDY;
-use super::wanted::{self, Wanted};
+use super::view_list::{ViewList, select};
 use super::{Dataset, FarCameras, Frame, LoadOptions, PointCloud, Scene, Split, View};
 use densify_core::files::one_line;
 
-/// Fraction of the points that may be unusable.
+/// Largest fraction of unusable points.
 const MAX_BAD_POINTS: f64 = 0.01;
 
-/// Checks every frame of a format's reader, splits, and moves all into normalised coordinates.
+/// Checks the frames of a format's reader, and assembles the dataset.
 pub(super) fn prepare(
     path: &Path,
     mut scene: Scene,
     options: &LoadOptions,
 ) -> Result<Dataset, DatasetError> {
     let mut frames = std::mem::take(&mut scene.frames);
-    // Bytewise, as other trainers sort names for their test splits.
+    // Sorted bytewise, as other trainers do for their test splits.
     frames.sort_by(|a, b| (a.name.as_bytes(), a.held_out).cmp(&(b.name.as_bytes(), b.held_out)));
     refuse_duplicates(&scene.listing, &frames)?;
     let mut notes = std::mem::take(&mut scene.notes);
-    let all = photographs(&scene.listing, &frames, options, &mut notes)?;
+    let photographs = photographs(&scene.listing, &frames, options, &mut notes)?;
     if frames.iter().all(|frame| frame.mask.is_none()) {
         notes.extend(unused_masks_note(path));
     }
     scene.notes = notes;
-    assemble(path, all, scene, options)
+    assemble(path, photographs, scene, options)
 }
 
-/// Splits photographs, which are sorted by name, and moves all into normalised coordinates.
+/// Splits photographs, which are sorted by name, and moves everything to normalised coordinates.
 pub(super) fn assemble(
     path: &Path,
     photographs: Vec<Photograph>,
@@ -49,7 +49,7 @@ pub(super) fn assemble(
     let surface_bytes = surface_bytes.or_else(|| super::builtin::surface_bytes(path));
     let centres: Vec<_> =
         photographs.iter().map(|photograph| photograph.views[0].camera.centre()).collect();
-    let is_far = normalise::far(&centres);
+    let is_far = normalise::outliers(&centres);
     let far = photographs.iter().zip(&is_far).filter(|(_, is_far)| **is_far);
     let far: Vec<&str> = far.map(|(photograph, _)| &*photograph.views[0].name).collect();
     notes.extend(far_note(&far, options.far_cameras));
@@ -58,15 +58,15 @@ pub(super) fn assemble(
         Split::Eval if !own_split => Some(Split::EVAL_EVERY as usize),
         Split::None | Split::Eval => None,
     };
-    let mut wanted = options.views.as_deref().map(Wanted::read).transpose()?;
-    // Numbers of the training views of a photograph, by the id that tracks use.
+    let mut view_list = options.views.as_deref().map(ViewList::read).transpose()?;
+    // Indices of the training views of a photograph, by its id in tracks.
     let mut numbers_of = HashMap::new();
     let (mut train, mut test) = (Vec::<View>::new(), Vec::new());
     let mut hidden_names = Vec::new();
-    // Centres of the training cameras that are not far from all others.
+    // Centres of the training cameras that are not outliers.
     let mut near = Vec::new();
     for (index, photograph) in photographs.into_iter().enumerate() {
-        // It keeps its place in the order: the others are split as without it.
+        // Skipped photographs still count for the split, so that the others are split as without the option.
         if is_far[index] && options.far_cameras == FarCameras::LeaveOut {
             continue;
         }
@@ -76,7 +76,7 @@ pub(super) fn assemble(
             views.into_iter().zip(hidden).partition(|(_, hidden)| *hidden);
         hidden_names.extend(out.into_iter().map(|(view, _)| view.name));
         let views: Vec<View> = views.into_iter().map(|(view, _)| view).collect();
-        let Some(views) = wanted::of(&mut wanted, views) else { continue };
+        let Some(views) = select(view_list.as_mut(), views) else { continue };
         if every.map_or(held_out, |every| index % every == 0) {
             test.extend(views);
         } else {
@@ -86,11 +86,12 @@ pub(super) fn assemble(
             train.extend(views);
         }
     }
-    wanted.map_or(Ok(()), |wanted| wanted.check(&train))?;
+    view_list.map_or(Ok(()), |list| list.check(&train))?;
     if train.is_empty() && test.is_empty() && !hidden_names.is_empty() {
-        let (ignored, remedy) = match options.invert_masks {
-            true => ("white", "leave --invert-masks out"),
-            false => ("black", "give --invert-masks"),
+        let (ignored, remedy) = if options.invert_masks {
+            ("white", "leave --invert-masks out")
+        } else {
+            ("black", "give --invert-masks")
         };
         return Err(DatasetError(format!(
             "no view is left to train on: masks hide every pixel of all {} ({ignored} is ignored); {remedy}, or \
@@ -98,7 +99,7 @@ pub(super) fn assemble(
             hidden_names.len()
         )));
     }
-    if let Some(shown) = named(&hidden_names) {
+    if let Some(shown) = first_names(&hidden_names) {
         notes.push(format!(
             "masks hide every pixel of {} views, which are left out: {shown}",
             hidden_names.len()
@@ -127,7 +128,7 @@ pub(super) fn assemble(
     drop_bad(points_path, &mut points, &mut notes, "within reach of f32", |p| {
         p.as_vec3().is_finite()
     })?;
-    // Of several views of a photograph, the one that shows the point.
+    // Of several views of a photograph, a track is assigned to the one that shows its point.
     let shows = |number: u32, point: DVec3| {
         train[number as usize].camera.depth_in_image(point, 0.0).is_some()
     };
@@ -140,18 +141,18 @@ pub(super) fn assemble(
     Ok(Dataset { root, unpacked, train, test, points, tracks, normalisation, surface_bytes, notes })
 }
 
-/// Names the views whose camera is far from all others.
-fn far_note(names: &[&str], what: FarCameras) -> Option<String> {
-    let shown = named(names)?;
-    let fate = match what {
+/// Note about views whose camera is far from all others.
+fn far_note(names: &[&str], treatment: FarCameras) -> Option<String> {
+    let shown = first_names(names)?;
+    let treatment = match treatment {
         FarCameras::LeaveOut => "left out (use --far-cameras keep to train on them)",
         FarCameras::Keep => "kept, but not counted for the extent of the scene",
     };
-    Some(format!("cameras far from all others, {} {fate}: {shown}", names.len()))
+    Some(format!("cameras far from all others, {} {treatment}: {shown}", names.len()))
 }
 
-/// The first names of a list, and how many more there are; `None` if it is empty.
-fn named(names: &[impl AsRef<str>]) -> Option<String> {
+/// The first names of a list and the number of further ones; `None` if the list is empty.
+fn first_names(names: &[impl AsRef<str>]) -> Option<String> {
     const SHOWN: usize = 5;
     let shown: Vec<&str> = names.iter().take(SHOWN).map(AsRef::as_ref).collect();
     let more = names.len().saturating_sub(SHOWN);
@@ -160,14 +161,15 @@ fn named(names: &[impl AsRef<str>]) -> Option<String> {
 }
 
 fn refuse_duplicates(listing: &Path, frames: &[Frame]) -> Result<(), DatasetError> {
-    // Of a path only its end may count, which another path may have too; one that is trained on would be held out.
+    // Absolute paths are matched by suffix, so that two may refer to one file, which could then be both trained on and
+    // held out.
     let mut by_image = HashMap::new();
     for frame in frames {
         let first = *by_image.entry(&frame.image).or_insert(frame);
         if first.listed != frame.listed {
             return Err(DatasetError(one_line(&format!(
-                "{} and {} are the same file, {}; name with --images a folder that has both, as they lay, or remove one \
-                 of the two",
+                "{} and {} are the same file, {}; give with --images a folder that contains both at their original \
+                 paths, or remove one of the two",
                 first.origin,
                 frame.origin,
                 frame.image.display()
@@ -183,11 +185,12 @@ fn refuse_duplicates(listing: &Path, frames: &[Frame]) -> Result<(), DatasetErro
     Ok(())
 }
 
+/// Drops the points that `keep` refuses, and notes their number.
 fn drop_bad(
     path: &Path,
     points: &mut PointCloud,
     notes: &mut Vec<String>,
-    what: &str,
+    condition: &str,
     keep: impl Fn(DVec3) -> bool,
 ) -> Result<(), DatasetError> {
     let total = points.len();
@@ -200,7 +203,7 @@ fn drop_bad(
     }
     if bad > 0 {
         notes.push(format!(
-            "{}: {bad} of {total} points are not {what} and are dropped",
+            "{}: {bad} of {total} points are not {condition} and are dropped",
             path.display()
         ));
     }

@@ -1,14 +1,15 @@
 //! Reads the CSV file that RealityCapture (RealityScan) exports as "Internal/External camera parameters".
 //!
-//! A line per photograph: `#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2`, angles in degrees;
-//! RealityScan 2 names the same `yaw`, `f_35mm`, `px_norm` and `py_norm`. With all angles 0 a camera looks straight down, its image's upper side to the north (+y); heading turns it clockwise
-//! about the vertical, pitch lifts its view towards the horizon, roll tilts it (Capturing Reality, *Registration
-//! export and camera orientations*). `f` is the focal length of a picture whose longer side is 36 mm; `px` and
-//! `py` are the principal point from the middle, in longer sides. Distortion is that of Brown: k1 to k4 of r² to
-//! r⁸; t1 and t2 are OpenCV's p2 and p1, the order in which its own OpenCV export writes them.
+//! Each line is a photograph: `#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2`, angles in degrees.
+//! RealityScan 2 calls some columns `yaw`, `f_35mm`, `px_norm` and `py_norm`. With all angles 0 a camera looks straight
+//! down and the top of its image is north (+y); heading turns it clockwise about the vertical, pitch raises its view
+//! towards the horizon, roll tilts it (Capturing Reality, *Registration export and camera orientations*). `f` is the
+//! focal length for an image whose longer side is 36 mm; `px` and `py` are the offset of the principal point from the
+//! centre, in longer sides. The distortion is Brown's: k1 to k4 of r² to r⁸; t1 and t2 are OpenCV's p2 and p1, the order
+//! in which RealityCapture's own OpenCV export writes them.
 //!
-//! The table is read here, without a crate for tables: its template writes plain commas and decimal points
-//! whatever the system's language, and names without quotes. Quotes are understood all the same.
+//! The table is parsed here rather than by a CSV crate: the export writes plain commas and decimal points whatever the
+//! system's language, and names without quotes. Quotes are accepted nevertheless.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -16,28 +17,35 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DVec2, DVec3};
 
 use super::folders::Folders;
-use super::formats::DatasetFormat;
-use super::images;
-use super::lens::table::Term;
+use super::images::{self, ImageHeader};
+use super::lens::models::Term;
 use super::lens::{Distortion, Lens, Plane};
 use super::paths::{DataPath, Root, relative};
 use super::pose::{check_lens, checked_pose};
 use super::transforms::usual_points;
-use super::{DatasetError, Frame, Scene};
-use crate::points::read_points;
+use super::formats::DatasetFormat;
+use super::{DatasetError, Frame, LoadOptions, Scene};
 use densify_core::files;
 
-/// Largest file read `[bytes]`: some 200 per photograph.
+pub(super) const FORMAT: DatasetFormat = DatasetFormat {
+    name: "realitycapture",
+    title: "RealityCapture",
+    file: "cameras.csv",
+    files: "a .csv table of its camera parameters",
+    read,
+};
+
+/// Largest file read `[bytes]`; a photograph takes about 200.
 const MAX_BYTES: u64 = 256 << 20;
-/// Files that are looked at in the dataset's folder.
+/// Most CSV files that are examined in the dataset's folder.
 const MAX_CANDIDATES: usize = 64;
 const MAX_FRAMES: usize = 1_000_000;
 const REMEDY: &str = "export \"Internal/External camera parameters\" again";
-/// Width of the film that focal lengths are told for `[mm]`.
+/// Film width that focal lengths refer to `[mm]`.
 const FILM: f64 = 36.0;
-/// Columns that must be there; the first by which a file is known.
+/// Required columns, which identify the table.
 const NEEDED: [&str; 8] = ["name", "x", "y", "alt", "heading", "pitch", "roll", "f"];
-/// Columns of the distortion; those that are missing are 0.
+/// Columns of the distortion; a missing one is 0.
 const DISTORTION: [(&str, Term); 6] = [
     ("k1", Term::Radial(0)),
     ("k2", Term::Radial(1)),
@@ -46,26 +54,14 @@ const DISTORTION: [(&str, Term); 6] = [
     ("t1", Term::Tangential(1)),
     ("t2", Term::Tangential(0)),
 ];
-/// What RealityScan 2 calls columns, and their older names.
+/// Column names of RealityScan 2, and their older names.
 const RENAMED: [(&str, &str); 4] =
     [("yaw", "heading"), ("f_35mm", "f"), ("px_norm", "px"), ("py_norm", "py")];
 
-/// The format.
-pub(super) const FORMAT: DatasetFormat = DatasetFormat {
-    name: "realitycapture",
-    file: "cameras.csv",
-    marker: "a .csv of RealityCapture's camera parameters",
-    read: |root, options| {
-        let Some(file) = find(root)? else { return Ok(None) };
-        let [inside, beside] = [true, false].map(|within| Folders::new(root, options, within));
-        read(root, &file, &[inside?, beside?]).map(Some)
-    },
-};
-
-/// The file in the dataset's folder, if there is one, whatever its name.
+/// The table in the dataset's folder, if there is one, whatever its name.
 ///
 /// # Errors
-/// When there are several: they may be of different scenes.
+/// When there are several, as they may belong to different scenes.
 fn find(root: &Root) -> Result<Option<PathBuf>, DatasetError> {
     let is_csv = |name: &str| name.to_ascii_lowercase().ends_with(".csv");
     let entries = fs::read_dir(root.path()).into_iter().flatten().flatten();
@@ -76,7 +72,7 @@ fn find(root: &Root) -> Result<Option<PathBuf>, DatasetError> {
     for name in names.iter().take(MAX_CANDIDATES) {
         let path = root.path().join(name);
         let Ok(text) = files::read_text(&path, MAX_BYTES) else { continue };
-        if text.lines().take(3).any(|line| Columns::of(line).is_some()) {
+        if text.lines().take(3).any(|line| Columns::parse(line).is_some()) {
             root.existing(DataPath { file: &path, field: "the file", value: name })?;
             found.push(path);
         }
@@ -90,15 +86,17 @@ fn find(root: &Root) -> Result<Option<PathBuf>, DatasetError> {
     Ok(found.pop())
 }
 
-/// Reads the file. Photographs are looked for in the first of the folders, then in the second: names do not say
-/// where these are.
+/// Reads the table in a folder, if there is one. Photographs are looked for in `images/`, then in the dataset's folder.
 ///
 /// # Errors
-/// When a line is damaged, or a camera is none.
-fn read(root: &Root, path: &Path, folders: &[Folders; 2]) -> Result<Scene, DatasetError> {
+/// When a line is damaged or a camera is impossible.
+fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, DatasetError> {
+    let Some(path) = &find(root)? else { return Ok(None) };
+    let [first, second] = [true, false].map(|within| Folders::new(root, options, within));
+    let (first, second) = (first?, second?);
     let text = files::read_text(path, MAX_BYTES).map_err(DatasetError::io(path))?;
     let mut lines = (1..).zip(text.lines()).filter(|(_, line)| !line.trim().is_empty());
-    let Some(columns) = lines.find_map(|(_, line)| Columns::of(line)) else {
+    let Some(columns) = lines.find_map(|(_, line)| Columns::parse(line)) else {
         return Err(DatasetError::malformed(
             path,
             "the first line",
@@ -121,22 +119,21 @@ fn read(root: &Root, path: &Path, folders: &[Folders; 2]) -> Result<Scene, Datas
         let name = row.text("name").trim();
         let field = format!("line {number}: name");
         let named = DataPath { file: path, field: &field, value: name };
-        let [first, second] = folders;
         let (folders, found) = match first.image(named)? {
-            Some(found) => (first, found),
+            Some(found) => (&first, found),
             None => {
                 let Some(found) = second.image(named)? else {
-                    first_missing.get_or_insert_with(|| first.place(named));
+                    first_missing.get_or_insert_with(|| first.first_path(named));
                     missing.push(name.to_owned());
                     continue;
                 };
-                (second, found)
+                (&second, found)
             }
         };
         fell_back += usize::from(found.fell_back);
         let origin = format!("line {number} ({name})");
         let (rotation, translation) = row.pose(&origin)?;
-        let lens = row.lens(&origin, &found.path, found.reduced)?;
+        let (lens, header) = row.lens(&origin, &found.path, found.reduced)?;
         let mask = folders.mask(&found, named)?;
         frames.push(Frame {
             name: found.name,
@@ -147,7 +144,7 @@ fn read(root: &Root, path: &Path, folders: &[Folders; 2]) -> Result<Scene, Datas
             reduced: found.reduced,
             mask,
             lens,
-            is_sized: false,
+            header: Some(header),
             rotation,
             translation,
             held_out: false,
@@ -158,24 +155,25 @@ fn read(root: &Root, path: &Path, folders: &[Folders; 2]) -> Result<Scene, Datas
         let (missing, all) = (missing.len(), missing.len() + frames.len());
         let file = path.file_name().unwrap_or_default().display();
         notes.push(format!(
-            "{file}: {missing} of {all} photographs are not there and are skipped ({first} is the first)"
+            "{file}: {missing} of {all} photographs do not exist and are skipped (first: {first})"
         ));
     }
     if fell_back > 0 {
-        notes.push(folders[0].fell_back_note(fell_back));
+        notes.push(first.fell_back_note(fell_back));
     }
     let points_file = usual_points(root, path, &mut notes)?;
-    let points = points_file.as_deref().map(read_points).transpose()?;
+    let points = points_file.as_deref().map(crate::points::read_points).transpose()?;
     let (points, listing) = (points.unwrap_or_default(), path.to_owned());
-    Ok(Scene { listing, frames, first_missing, points, points_file, notes, ..Scene::default() })
+    let rest = Scene::default();
+    Ok(Some(Scene { listing, frames, first_missing, points, points_file, notes, ..rest }))
 }
 
-/// The names of the columns, in lower case; the older of two.
+/// Column names in lower case, with the older of two names.
 struct Columns(Vec<String>);
 
 impl Columns {
-    /// Those of a line that names them.
-    fn of(line: &str) -> Option<Self> {
+    /// Parses a header line; `None` if a required column is missing.
+    fn parse(line: &str) -> Option<Self> {
         let name = |cell: String| {
             let name = cell.trim().trim_start_matches('#').to_ascii_lowercase();
             let older = RENAMED.iter().find(|(newer, _)| *newer == name);
@@ -186,7 +184,7 @@ impl Columns {
     }
 }
 
-/// The cells of a line; those in quotes may hold commas.
+/// The cells of a line; quoted cells may contain commas.
 fn cells(line: &str) -> Vec<String> {
     let (mut cells, mut quoted) = (vec![String::new()], false);
     for c in line.chars() {
@@ -199,7 +197,7 @@ fn cells(line: &str) -> Vec<String> {
     cells
 }
 
-/// One line.
+/// One line of the table.
 struct Row<'a> {
     path: &'a Path,
     number: u64,
@@ -213,7 +211,7 @@ impl Row<'_> {
         at.and_then(|at| self.cells.get(at)).map_or("", String::as_str)
     }
 
-    /// A number; 0 where there is no such column, unless it is needed.
+    /// A number; 0 if an optional column is missing or empty.
     fn number(&self, column: &str) -> Result<f64, DatasetError> {
         let text = self.text(column).trim();
         if text.is_empty() && !NEEDED.contains(&column) {
@@ -233,20 +231,25 @@ impl Row<'_> {
         let world_from_camera = DMat3::from_rotation_z(-heading)
             * DMat3::from_rotation_x(pitch)
             * DMat3::from_rotation_y(roll)
-            // Of a camera that looks straight down: right is east, down is south.
+            // The camera that looks straight down: right is east, down is south.
             * DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
         let (rotation, centre) =
             checked_pose(self.path, frame, world_from_camera.transpose(), centre)?;
         Ok((rotation, -(rotation * centre)))
     }
 
-    /// The lens at the size of the image, which the file does not tell.
-    fn lens(&self, frame: &str, image: &Path, reduced: Option<u32>) -> Result<Lens, DatasetError> {
-        let header = images::probe(image)?;
+    /// The lens at the size of the image, which the table does not state, and the header of the image.
+    fn lens(
+        &self,
+        frame: &str,
+        image: &Path,
+        reduced: Option<u32>,
+    ) -> Result<(Lens, ImageHeader), DatasetError> {
+        let header = images::read_header(image)?;
         let k = reduced.unwrap_or(1);
         let (width, height) = (header.width * k, header.height * k);
         let longer = f64::from(width.max(height));
-        let mut distortion = Distortion::of(Plane::Perspective);
+        let mut distortion = Distortion::none(Plane::Perspective);
         for (column, term) in DISTORTION {
             distortion.set(term, self.number(column)?);
         }
@@ -255,6 +258,6 @@ impl Row<'_> {
         let focal = DVec2::splat(self.number("f")? * longer / FILM);
         let lens = Lens::new((width, height), focal, principal, distortion);
         check_lens(self.path, frame, &lens)?;
-        Ok(lens)
+        Ok((lens, header))
     }
 }

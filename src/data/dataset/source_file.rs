@@ -1,4 +1,4 @@
-//! A file within the folder or the archive of a dataset, which links may not lead out of.
+//! An image or mask file of a dataset, pinned to the file that was found when the dataset was loaded.
 
 use std::fs::File;
 use std::path::{Path, PathBuf};
@@ -6,50 +6,65 @@ use std::sync::Arc;
 
 use super::DatasetError;
 use super::archive::Unpacked;
+use super::exif::Exif;
 use densify_core::files;
 
-/// An image file that was found within the folder it may not leave.
+/// An image file inside the folder or archive of its dataset.
 #[derive(Debug, Clone)]
 pub struct SourceFile {
-    /// Where it is, as messages show it.
+    /// Path of the file, as messages show it.
     pub path: PathBuf,
-    /// Where links led when it was checked.
+    /// The path without links, as it was when the dataset was loaded.
     real: Box<Path>,
-    /// The archive that it is in, if any.
+    /// The archive that contains the file, if any.
     archive: Option<Arc<Unpacked>>,
+    /// EXIF fields, if they have been read while loading.
+    exif: Option<Exif>,
 }
 
 impl SourceFile {
-    /// The file at this path, which has been checked.
+    /// A file whose path has been checked.
     ///
     /// # Errors
-    /// When it is no longer there.
-    pub fn found(path: PathBuf) -> Result<Self, DatasetError> {
+    /// When the file no longer exists.
+    pub(super) fn found(path: PathBuf) -> Result<Self, DatasetError> {
         let real = path.canonicalize().map_err(DatasetError::io(&path))?;
-        Ok(Self { path, real: real.into(), archive: None })
+        Ok(Self { path, real: real.into(), archive: None, exif: None })
     }
 
-    /// Stands for pixels that no file holds.
+    /// A placeholder for pixels in memory, which have no EXIF.
     #[must_use]
-    pub fn rendered(path: PathBuf) -> Self {
-        Self { path, real: Path::new("").into(), archive: None }
+    pub(crate) fn rendered(path: PathBuf) -> Self {
+        Self { path, real: Path::new("").into(), archive: None, exif: Some(Exif::default()) }
     }
 
-    /// The same, as one of an archive's files, which is named so.
-    pub(super) fn of_archive(self, archive: &Arc<Unpacked>) -> Self {
-        Self {
-            path: archive.shown(&self.path),
-            real: self.real,
-            archive: Some(Arc::clone(archive)),
-        }
+    /// Keeps EXIF fields that have been read already.
+    pub(super) fn with_exif(self, exif: Option<Exif>) -> Self {
+        Self { exif, ..self }
     }
 
-    /// Its length `[bytes]`; 0 if it is no longer there.
+    /// The same file as a part of an archive, whose name messages show.
+    pub(super) fn in_archive(self, archive: &Arc<Unpacked>) -> Self {
+        Self { path: archive.shown(&self.path), archive: Some(Arc::clone(archive)), ..self }
+    }
+
+    /// Length of the file `[bytes]`; 0 if it no longer exists.
     pub fn length(&self) -> u64 {
         self.real.metadata().map_or(0, |data| data.len())
     }
 
-    /// Opens it, unless links lead elsewhere by now.
+    /// EXIF fields; read from the file only if that has not been done before.
+    pub(super) fn exif(&self) -> Exif {
+        match &self.exif {
+            Some(exif) => exif.clone(),
+            None => self.open().map(Exif::read).unwrap_or_default(),
+        }
+    }
+
+    /// Opens the file.
+    ///
+    /// # Errors
+    /// When it cannot be opened, or has been replaced by a link to another file.
     pub(super) fn open(&self) -> Result<File, DatasetError> {
         if self.archive.is_some() {
             return files::open(&self.real).map_err(DatasetError::io(&self.path));

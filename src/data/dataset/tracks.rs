@@ -1,46 +1,45 @@
 //! Tracks: the views in which a reconstruction has found a point.
 //!
-//! They are read only on request, and sampled while they are read: a statistic over points needs
-//! some thousands, and a reconstruction may have millions.
+//! They are read only on request and sampled while being read, because statistics need some thousands and a
+//! reconstruction may have millions.
 
 use glam::DVec3;
 
 use super::normalise::Normalisation;
 
-/// Between this and twice as many tracks are kept, or all if there are fewer.
+/// Smallest number of tracks to which more of them are thinned; up to twice as many are kept.
 const MAX_TRACKS: usize = 1 << 15;
-/// Most views kept per track.
+/// Largest number of views kept per track.
 pub(super) const MAX_VIEWS: u64 = 64;
-/// Tracks in fewer views are ignored: they do not show how a colour changes with the view.
-pub const MIN_VIEWS: usize = 4;
+/// Smallest number of views of a track; with fewer, changes of colour with the view cannot be measured.
+pub(crate) const MIN_VIEWS: usize = 4;
 
-/// Points with the views that show them, in structure of arrays.
+/// Points and the views that show them, as a structure of arrays.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Tracks {
     /// Positions. Shape: `[tracks]`.
     pub positions: Vec<DVec3>,
-    /// sRGB colours of the reconstruction. Shape: `[tracks]`.
+    /// sRGB colours from the reconstruction. Shape: `[tracks]`.
     pub colours: Vec<[u8; 3]>,
-    /// Numbers of training views, ascending, each once, at least [`MIN_VIEWS`]. Shape: `[tracks]`,
-    /// then views.
+    /// Indices of training views, ascending and distinct, at least [`MIN_VIEWS`] per track. Shape: `[tracks]`, then views.
     pub views: Vec<Vec<u32>>,
 }
 
 impl Tracks {
     /// Number of tracks.
-    pub fn len(&self) -> usize {
+    pub fn count(&self) -> usize {
         self.positions.len()
     }
 
-    /// Their size `[bytes]`.
+    /// Size in memory `[bytes]`.
     pub fn bytes(&self) -> u64 {
         let track = size_of::<DVec3>() + 3 + size_of::<Vec<u32>>();
         let views: usize = self.views.iter().map(Vec::len).sum();
-        (self.len() * track + views * size_of::<u32>()) as u64
+        (self.count() * track + views * size_of::<u32>()) as u64
     }
 
-    /// The tracks in normalised coordinates and in training views only: `view_of` returns the number of the
-    /// training view that shows a point, from the id of its photograph in the file.
+    /// Moves tracks to normalised coordinates and restricts them to training views. `view_of` returns the training view
+    /// that shows a point, from the id of its photograph.
     pub(super) fn in_training_views(
         self,
         normalisation: &Normalisation,
@@ -64,11 +63,11 @@ impl Tracks {
     }
 }
 
-/// Samples tracks while a file is read: all, or every second, fourth, … if there are too many.
+/// Samples tracks while a file is read: all of them, or every second, fourth, … if there are too many.
 #[derive(Debug)]
 pub(super) struct TrackSampler {
     tracks: Tracks,
-    /// Every so many-th track is kept.
+    /// Distance between kept tracks.
     stride: usize,
     seen: usize,
 }
@@ -78,7 +77,7 @@ impl TrackSampler {
         Self { tracks: Tracks::default(), stride: 1, seen: 0 }
     }
 
-    /// Counts the next track, which has so many views; says whether it is to be [added](Self::add).
+    /// Counts the next track; returns whether it shall be [added](Self::add).
     pub(super) fn wants(&mut self, views: u64) -> bool {
         if views < MIN_VIEWS as u64 {
             return false;
@@ -87,7 +86,7 @@ impl TrackSampler {
         (self.seen - 1).is_multiple_of(self.stride)
     }
 
-    /// Adds a track, with the ids of its views; at most [`MAX_VIEWS`] of them are kept.
+    /// Adds a track with the ids of its photographs, of which [`MAX_VIEWS`] are kept.
     pub(super) fn add(
         &mut self,
         position: DVec3,
@@ -97,7 +96,7 @@ impl TrackSampler {
         self.tracks.positions.push(position);
         self.tracks.colours.push(colour);
         self.tracks.views.push(views.into_iter().take(MAX_VIEWS as usize).collect());
-        if self.tracks.len() >= 2 * MAX_TRACKS {
+        if self.tracks.count() >= 2 * MAX_TRACKS {
             self.stride *= 2;
             keep_every_second(&mut self.tracks.positions);
             keep_every_second(&mut self.tracks.colours);
@@ -132,7 +131,7 @@ mod tests {
             }
         }
         let tracks = sampler.finish();
-        assert!((MAX_TRACKS..2 * MAX_TRACKS).contains(&tracks.len()), "{}", tracks.len());
+        assert!((MAX_TRACKS..2 * MAX_TRACKS).contains(&tracks.count()), "{}", tracks.count());
         let gaps: Vec<f64> =
             tracks.positions.windows(2).map(|pair| pair[1].x - pair[0].x).collect();
         assert!(gaps.iter().all(|gap| (gap - 4.0).abs() < 1e-9), "{:?}", &gaps[..4]);

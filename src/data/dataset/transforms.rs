@@ -12,23 +12,42 @@ use glam::{DMat3, DVec2, DVec3};
 use serde_json::{Map, Value};
 
 use super::folders::{Folders, ImageFile};
-use super::formats::DatasetFormat;
-use super::images;
+use super::images::{self, ImageHeader};
 use super::json;
-use super::lens::table::{FISHEYE_FIELDS, OPENCV_FIELDS};
+use super::lens::models::{FISHEYE_FIELDS, OPENCV_FIELDS};
 use super::lens::{Distortion, Lens, Plane};
-use super::masks::MaskFile;
+use super::mask_files::MaskFile;
 use super::paths::{DataPath, Root, is_absolute, relative};
 use super::pose::{check_lens, checked_pose};
-use super::{DatasetError, Frame, Scene, colmap};
-use crate::points::read_points;
+use super::formats::DatasetFormat;
+use super::{DatasetError, Frame, LoadOptions, Scene, colmap};
+
+/// The pair of files that defines its own test split.
+pub(super) const SPLIT_FORMAT: DatasetFormat = DatasetFormat {
+    name: "nerf-synthetic",
+    title: "NeRF-synthetic",
+    file: PAIR[0],
+    files: "transforms_train.json and transforms_test.json",
+    read: read_pair,
+};
+/// The single file.
+pub(super) const FORMAT: DatasetFormat = DatasetFormat {
+    name: "transforms",
+    title: "nerfstudio or instant-ngp",
+    file: SINGLE,
+    files: SINGLE,
+    read: read_single,
+};
+
+const PAIR: [&str; 2] = ["transforms_train.json", "transforms_test.json"];
+const SINGLE: &str = "transforms.json";
 
 const MAX_FRAMES: usize = 1_000_000;
 const REMEDY: &str = "correct the file or export it again";
 
-/// File names of initial points that 3DGS and nerfstudio use without naming them in the JSON.
+/// File names that 3DGS and nerfstudio use for initial points without naming them in the JSON.
 const POINT_FILES: [&str; 3] = ["points3d.ply", "sparse_pc.ply", "points3D.ply"];
-/// Names of camera models that are a pinhole with OpenCV's distortion.
+/// Names of camera models that are pinholes with OpenCV's distortion.
 const PINHOLES: [&str; 7] = [
     "OPENCV",
     "FULL_OPENCV",
@@ -38,56 +57,35 @@ const PINHOLES: [&str; 7] = [
     "SIMPLE_RADIAL",
     "PERSPECTIVE",
 ];
-/// The name of the one that is a fisheye with k1 to k4.
+/// Name of the camera model that is a fisheye with k1 to k4.
 const FISHEYE: &str = "OPENCV_FISHEYE";
 
-/// The pair of files that defines its own test split.
-const PAIR: [&str; 2] = ["transforms_train.json", "transforms_test.json"];
-/// The single file.
-const SINGLE: &str = "transforms.json";
-
-/// The format with the pair of files.
-pub(super) const NERF_SYNTHETIC: DatasetFormat = DatasetFormat {
-    name: "nerf-synthetic",
-    file: PAIR[0],
-    marker: "transforms_train.json with transforms_test.json",
-    read: |root, options| {
-        if !PAIR.iter().all(|name| root.path().join(name).is_file()) {
-            return Ok(None);
-        }
-        let mut scene = read_pair(root, &Folders::new(root, options, false)?)?;
-        if let Some(folder) = colmap::find(root.path()).filter(|_| options.tracks) {
-            colmap::adopt_tracks(root, &folder, &mut scene);
-        }
-        Ok(Some(scene))
-    },
-};
-
-/// The format with the single file.
-pub(super) const NERFSTUDIO: DatasetFormat = DatasetFormat {
-    name: "transforms",
-    file: SINGLE,
-    marker: SINGLE,
-    read: |root, options| {
-        if !root.path().join(SINGLE).is_file() {
-            return Ok(None);
-        }
-        read(root, &Folders::new(root, options, false)?, SINGLE, false).map(Some)
-    },
-};
-
-/// Reads `transforms_train.json` and `transforms_test.json`.
-fn read_pair(root: &Root, folders: &Folders) -> Result<Scene, DatasetError> {
-    let mut scene = read(root, folders, PAIR[0], false)?;
-    let test = read(root, folders, PAIR[1], true)?;
+/// Reads `transforms_train.json` and `transforms_test.json`, with the tracks of a COLMAP model of the same scene.
+fn read_pair(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, DatasetError> {
+    if !PAIR.iter().all(|name| root.path().join(name).is_file()) {
+        return Ok(None);
+    }
+    let folders = Folders::new(root, options, false)?;
+    let mut scene = read(root, &folders, PAIR[0], false)?;
+    let test = read(root, &folders, PAIR[1], true)?;
     scene.frames.extend(test.frames);
     scene.notes.extend(test.notes);
     scene.own_split = true;
-    Ok(scene)
+    if options.tracks {
+        colmap::adopt_tracks(root, &mut scene);
+    }
+    Ok(Some(scene))
 }
 
-/// Reads the file `name`. Its own test split, if any, is under `test_filenames`, or under `val_filenames`
-/// if there is no other, as in nerfstudio.
+/// Reads `transforms.json`.
+fn read_single(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, DatasetError> {
+    if !root.path().join(SINGLE).is_file() {
+        return Ok(None);
+    }
+    read(root, &Folders::new(root, options, false)?, SINGLE, false).map(Some)
+}
+
+/// Reads the file `name`. As in nerfstudio, the test split is in `test_filenames`, else in `val_filenames`.
 fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Scene, DatasetError> {
     let path = root.path().join(name);
     root.existing(DataPath { file: &path, field: "the file", value: name })?;
@@ -120,7 +118,7 @@ fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Sc
         let field = fields.full("file_path");
         let named = DataPath { file: &path, field: &field, value: file };
         let Some(found) = folders.image(named)? else {
-            first_missing.get_or_insert_with(|| folders.place(named));
+            first_missing.get_or_insert_with(|| folders.first_path(named));
             missing.push(file.to_owned());
             continue;
         };
@@ -130,7 +128,7 @@ fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Sc
             Some(value) => Some(fields.mask(root, folders, &found, value)?),
             None => folders.mask(&found, named)?,
         };
-        let lens = fields.lens(&found.path, found.reduced)?;
+        let (lens, header) = fields.lens(&found.path, found.reduced)?;
         let is_test = |tests: &HashSet<String>| {
             tests.contains(&relative(file)) || tests.contains(&found.name)
         };
@@ -145,7 +143,7 @@ fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Sc
             reduced: found.reduced,
             mask,
             lens,
-            is_sized: fields.size()?.is_some(),
+            header,
             rotation,
             translation,
             held_out,
@@ -164,12 +162,12 @@ fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Sc
     let rest = Scene::default();
     let mut scene = Scene { frames, first_missing, notes, points_file, listing, own_split, ..rest };
     if !held_out && let Some(file) = &scene.points_file {
-        scene.points = read_points(file)?;
+        scene.points = crate::points::read_points(file)?;
     }
     Ok(scene)
 }
 
-/// The file of the initial points: the one that the JSON names, or one of [`POINT_FILES`].
+/// The file of the initial points: the one named in the JSON, or one of [`POINT_FILES`].
 fn points_file(
     (root, folders): (&Root, &Folders),
     top: &Fields<'_>,
@@ -178,26 +176,26 @@ fn points_file(
 ) -> Result<Option<PathBuf>, DatasetError> {
     if let Some(value) = top.text("ply_file_path")? {
         let named = DataPath { file: top.path, field: "ply_file_path", value };
-        if folders.elsewhere(value).is_none() {
+        if folders.folder_for_absolute(value).is_none() {
             let missing =
                 || top.fault("ply_file_path", format!("the file {value:?} does not exist"));
-            return Ok(Some(root.listed(named)?.ok_or_else(missing)?));
+            return Ok(Some(root.existing_on_any_system(named)?.ok_or_else(missing)?));
         }
-        // Of another machine: as the photographs, it may have come along.
-        for value in named.ends()? {
+        // The path is from another machine; the file may have been copied along with the photographs.
+        for value in named.suffixes()? {
             if let Some(found) = root.existing(DataPath { value: &value, ..named })? {
                 return Ok(Some(found));
             }
         }
         let file = top.path.file_name().unwrap_or_default().display();
         notes.push(densify_core::files::one_line(&format!(
-            "{file}: the initial points {value:?} are not in the dataset's folder, and are left out"
+            "{file}: the initial points {value:?} are not in the dataset's folder and are left out"
         )));
     }
     if held_out { Ok(None) } else { usual_points(root, top.path, notes) }
 }
 
-/// The file of initial points under one of the [usual names](POINT_FILES), which `file` does not name.
+/// The file of initial points under one of the [usual names](POINT_FILES), for pose files that name none.
 pub(super) fn usual_points(
     root: &Root,
     file: &Path,
@@ -215,7 +213,7 @@ pub(super) fn usual_points(
 /// The fields of one frame, with those at the top level as defaults.
 struct Fields<'a> {
     path: &'a Path,
-    /// Prefix of field names in messages: the frame.
+    /// The frame, as prefix of field names in messages.
     place: String,
     frame: Option<&'a Map<String, Value>>,
     top: &'a Map<String, Value>,
@@ -230,7 +228,7 @@ impl<'a> Fields<'a> {
         DatasetError::malformed(self.path, self.full(field), problem, REMEDY)
     }
 
-    /// A field of the frame itself, or of the top where there is no frame.
+    /// A field of the frame itself, or of the top level if there is no frame.
     fn own(&self, field: &str) -> Option<&'a Value> {
         self.frame.unwrap_or(self.top).get(field).filter(|value| !value.is_null())
     }
@@ -243,7 +241,7 @@ impl<'a> Fields<'a> {
         }
     }
 
-    /// A list of file names, each as it is listed and as the view is named whose image it is.
+    /// A list of file names: each as listed, and as the name of its view.
     fn held_out(
         &self,
         folders: &Folders,
@@ -257,7 +255,7 @@ impl<'a> Fields<'a> {
         for name in value.as_array().ok_or_else(fault)? {
             let value = name.as_str().ok_or_else(fault)?;
             names.insert(relative(value));
-            // Only such names may be written otherwise than in the frame.
+            // Only these may be written differently in the frame.
             if is_absolute(value) || value.contains('\\') {
                 let named = DataPath { file: self.path, field, value };
                 names.extend(folders.image(named)?.map(|found| found.name));
@@ -266,7 +264,7 @@ impl<'a> Fields<'a> {
         Ok(Some(names))
     }
 
-    /// The mask of a frame whose file names it.
+    /// The mask that a frame names.
     fn mask(
         &self,
         root: &Root,
@@ -276,18 +274,20 @@ impl<'a> Fields<'a> {
     ) -> Result<MaskFile, DatasetError> {
         let field = self.full("mask_path");
         let named = DataPath { file: self.path, field: &field, value };
-        if folders.elsewhere(value).is_none() {
+        if folders.folder_for_absolute(value).is_none() {
             let missing = || {
                 let place = root.path().join(relative(value));
                 DatasetError::missing_image(self.path, &field, &place)
             };
-            return Ok(MaskFile::of(root.listed(named)?.ok_or_else(missing)?));
+            return Ok(MaskFile::black_hides(
+                root.existing_on_any_system(named)?.ok_or_else(missing)?,
+            ));
         }
-        // Of another machine: where it lay, but below this folder, or where masks are looked for. Its name alone
-        // may be that of a photograph.
-        for value in named.ends()?.filter(|end| end.contains('/')) {
+        // The path is from another machine: the end of the path is looked for in this folder, then the usual places.
+        // The bare file name does not count, as a photograph may have the same.
+        for value in named.suffixes()?.filter(|end| end.contains('/')) {
             if let Some(found) = root.existing(DataPath { value: &value, ..named })? {
-                return Ok(MaskFile::of(found));
+                return Ok(MaskFile::black_hides(found));
             }
         }
         folders.mask(image, named)?.ok_or_else(|| {
@@ -343,21 +343,25 @@ impl<'a> Fields<'a> {
         Ok((rotation, -(rotation * centre)))
     }
 
-    /// The lens, at the size stated in the file, or else at that of the image.
-    /// The size that intrinsics are for, if the file says it.
+    /// The image size that the intrinsics are for, if the file states it.
     fn size(&self) -> Result<Option<(u32, u32)>, DatasetError> {
         Ok(self.side("w")?.zip(self.side("h")?))
     }
 
-    fn lens(&self, image: &Path, reduced: Option<u32>) -> Result<Lens, DatasetError> {
+    /// The lens at the size stated in the file, else at the size of the image, whose header is then returned as well.
+    fn lens(
+        &self,
+        image: &Path,
+        reduced: Option<u32>,
+    ) -> Result<(Lens, Option<ImageHeader>), DatasetError> {
         let distortion = self.distortion()?;
-        let (width, height) = match self.size()? {
-            Some(size) => size,
+        let ((width, height), header) = match self.size()? {
+            Some(size) => (size, None),
             None => {
-                // Without a size, the intrinsics are those of the image at full size.
-                let header = images::probe(image)?;
+                // Without a stated size, the intrinsics are those of the image at full size.
+                let header = images::read_header(image)?;
                 let k = reduced.unwrap_or(1);
-                (header.width * k, header.height * k)
+                ((header.width * k, header.height * k), Some(header))
             }
         };
         let from_angle = |side: u32, angle: f64| 0.5 * f64::from(side) / (0.5 * angle).tan();
@@ -378,10 +382,10 @@ impl<'a> Fields<'a> {
         let (focal, principal) = (DVec2::new(fx, fy), DVec2::new(cx, cy));
         let lens = Lens::new((width, height), focal, principal, distortion);
         check_lens(self.path, &self.full("intrinsics"), &lens)?;
-        Ok(lens)
+        Ok((lens, header))
     }
 
-    /// The plane and its distortion.
+    /// The lens model and its coefficients.
     fn distortion(&self) -> Result<Distortion, DatasetError> {
         let named = match self.inherited("camera_model") {
             None => None,
@@ -394,19 +398,20 @@ impl<'a> Fields<'a> {
             let problem = format!("{model:?} is not one of {}, {FISHEYE}", PINHOLES.join(", "));
             return Err(DatasetError::lens(self.path, &self.full("camera_model"), problem));
         }
-        let (plane, fields) = match is_fisheye {
-            true => (Plane::Equidistant, &FISHEYE_FIELDS[..]),
-            false => (Plane::Perspective, &OPENCV_FIELDS[..]),
+        let (plane, fields) = if is_fisheye {
+            (Plane::Equidistant, &FISHEYE_FIELDS[..])
+        } else {
+            (Plane::Perspective, &OPENCV_FIELDS[..])
         };
-        let mut distortion = Distortion::of(plane);
+        let mut distortion = Distortion::none(plane);
         for (field, _) in OPENCV_FIELDS {
             let value = self.number(field)?.unwrap_or(0.0);
             match fields.iter().find(|(name, _)| *name == field) {
                 Some(&(_, term)) => distortion.set(term, value),
-                // nerfstudio writes all fields, with zeros for those that a model lacks.
+                // nerfstudio writes all fields, with zeros for those that the model does not have.
                 None if value == 0.0 => {}
                 None => {
-                    let problem = format!("a fisheye has k1 to k4, but no {field} = {value}");
+                    let problem = format!("{field} = {value}, but a fisheye has only k1 to k4");
                     return Err(DatasetError::lens(self.path, &self.full(field), problem));
                 }
             }

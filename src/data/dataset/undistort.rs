@@ -1,4 +1,4 @@
-//! Resampling from a lens to a pinhole that sees a part of what it saw.
+//! Undistortion: resampling the image of a lens to that of a pinhole camera.
 
 use glam::{DMat3, DVec2, DVec3};
 
@@ -7,27 +7,27 @@ use densify_core::image::Image8;
 use densify_core::resample::PixelMean;
 use densify_core::spline::catmull_rom;
 
-/// A camera's image without distortion. The upper left corner is (0, 0); pixel centres are at +0.5.
+/// The image of a camera without distortion. The upper left corner is (0, 0); pixel centres are at +0.5.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Pinhole {
+pub(super) struct Pinhole {
     /// Image width `[px]`.
-    pub width: u32,
+    pub(super) width: u32,
     /// Image height `[px]`.
-    pub height: u32,
+    pub(super) height: u32,
     /// Focal lengths `[px]`.
-    pub focal: DVec2,
+    pub(super) focal: DVec2,
     /// Principal point `[px]`.
-    pub principal: DVec2,
+    pub(super) principal: DVec2,
 }
 
-/// How to resample an image of a lens to a pinhole's.
+/// Resampling of a lens's image to a pinhole's. Its `Debug` text is part of the fingerprint in checkpoints.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Undistortion {
     /// The lens that took the image, at the image's size.
     from: Lens,
     to: Pinhole,
     lens_from_pinhole: DMat3,
-    /// Whether the lens did not see all of the pinhole's image; the rest is masked.
+    /// Whether the lens saw only a part of the pinhole's image, so that the rest is masked.
     masked: bool,
 }
 
@@ -36,40 +36,40 @@ impl Undistortion {
         Self { from, to, lens_from_pinhole, masked }
     }
 
-    /// The pinhole resampled to.
+    /// The pinhole that images are resampled to.
     #[must_use]
-    pub fn pinhole(&self) -> &Pinhole {
+    pub(super) fn pinhole(&self) -> &Pinhole {
         &self.to
     }
 
-    /// From the pinhole's axes to the lens's.
+    /// Rotation from the pinhole's axes to the lens's.
     #[must_use]
-    pub fn lens_from_pinhole(&self) -> DMat3 {
+    pub(super) fn lens_from_pinhole(&self) -> DMat3 {
         self.lens_from_pinhole
     }
 
-    /// Whether its images have a mask of what the lens saw.
+    /// Whether resampled images have a mask of the field of view of the lens.
     #[must_use]
-    pub fn is_masked(&self) -> bool {
+    pub(super) fn is_masked(&self) -> bool {
         self.masked
     }
 
-    /// Whether a ray of the lens falls into the pinhole's image.
+    /// Whether the pinhole's image contains a ray of the lens.
     pub(super) fn shows(&self, ray: DVec3) -> bool {
         let ray = self.lens_from_pinhole.transpose() * ray;
         let at = ray.truncate() / ray.z * self.to.focal + self.to.principal;
         let size = DVec2::new(f64::from(self.to.width), f64::from(self.to.height));
-        // The rim of a lens is within rounding of the pinhole's.
+        // The borders of both images agree up to rounding.
         ray.z > 0.0 && (at.cmpge(DVec2::splat(-1e-6)) & at.cmple(size + 1e-6)).all()
     }
 
-    /// Position in the lens's image of a place in the pinhole's `[px]`; `None` where the lens saw nothing.
+    /// Position in the lens's image of a point in the pinhole's `[px]`; `None` if the lens did not see it.
     #[must_use]
-    pub fn source_of(&self, pixel: DVec2) -> Option<DVec2> {
+    pub(super) fn source_of(&self, pixel: DVec2) -> Option<DVec2> {
         let p = (pixel - self.to.principal) / self.to.focal;
         let ray = self.lens_from_pinhole * p.extend(1.0);
         if !self.masked {
-            // Seen by construction; on the rim rounding must not make a hole.
+            // Every point was seen by construction; rounding must not make holes at the border.
             return self.from.extrapolate(ray);
         }
         let is_in_image = |at: &DVec2| (at.cmpge(DVec2::ZERO) & at.cmple(self.from.size())).all();
@@ -78,10 +78,10 @@ impl Undistortion {
 
     /// Resamples an image of the lens in one row-major pass.
     ///
-    /// Bicubically: bilinear means blur, which cost half a dB of test views (docs/data.md). Where a mask hides a
-    /// pixel nearby it is bilinear all the same, so that nothing hidden reaches what counts.
+    /// Interpolation is bicubic, because bilinear interpolation blurs and costs half a dB in test views (docs/data.md).
+    /// Near masked pixels it is bilinear, so that hidden colours do not reach pixels that count.
     #[must_use]
-    pub fn apply(&self, image: &Image8) -> Image8 {
+    pub(super) fn apply(&self, image: &Image8) -> Image8 {
         let (width, height) = (self.to.width, self.to.height);
         let mut out = Image8::blank(width, height, image);
         if self.masked && out.mask.is_none() {
@@ -92,19 +92,20 @@ impl Undistortion {
             for x in 0..width {
                 let source = self.source_of(DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5));
                 let mut mean = PixelMean::default();
-                // Within half a pixel of the border its pixels are repeated.
+                // Beyond the centres of the outermost pixels these are repeated.
                 if let Some(at) = source {
                     let at = (at - 0.5).clamp(DVec2::ZERO, last);
                     let [columns, rows] =
-                        [Stencil::of(at.x, image.width), Stencil::of(at.y, image.height)];
+                        [Stencil::around(at.x, image.width), Stencil::around(at.y, image.height)];
                     let hides = |mask: &Vec<u8>| {
                         let row = |y: u32| y as usize * image.width as usize;
                         let hidden = |x: u32, y: u32| mask[row(y) + x as usize] < 255;
                         rows.places.iter().any(|&y| columns.places.iter().any(|&x| hidden(x, y)))
                     };
-                    let weights = match image.mask.as_ref().is_some_and(hides) {
-                        true => [columns.linear(), rows.linear()],
-                        false => [columns.cubic(), rows.cubic()],
+                    let weights = if image.mask.as_ref().is_some_and(hides) {
+                        [columns.linear(), rows.linear()]
+                    } else {
+                        [columns.cubic(), rows.cubic()]
                     };
                     for (&y, wy) in rows.places.iter().zip(weights[1]) {
                         for (&x, wx) in columns.places.iter().zip(weights[0]) {
@@ -119,17 +120,17 @@ impl Undistortion {
     }
 }
 
-/// The four pixels around a place along one axis.
+/// The four pixels around a position along one axis.
 struct Stencil {
-    /// Those beyond the border are the one at the border.
+    /// Indices of the pixels; beyond the border, that of the outermost pixel.
     places: [u32; 4],
-    /// How far the place is from the second pixel to the third.
+    /// Position between the second pixel (0) and the third (1).
     t: f32,
 }
 
 impl Stencil {
-    /// Of a place between the centres of the first and of the last pixel.
-    fn of(at: f64, side: u32) -> Self {
+    /// The stencil of a position between the centres of the first and the last pixel.
+    fn around(at: f64, side: u32) -> Self {
         let second = at as u32;
         let places = [second.saturating_sub(1), second, second + 1, second + 2];
         let t = (at - f64::from(second)) as f32;
@@ -147,12 +148,12 @@ impl Stencil {
 
 #[cfg(test)]
 mod tests {
-    use super::super::lens::{Cut, Distortion, Plane};
+    use super::super::lens::{Distortion, Pinholes, Plane};
     use super::*;
 
     const SIZE: (u32, u32) = (90, 60);
 
-    /// A fisheye's image with these channels at each pixel centre, and what becomes of it.
+    /// Resamples a fisheye's image with these channels (grey, alpha, mask) at each pixel centre.
     fn resampled(image: impl Fn(DVec2) -> [u8; 3]) -> (Image8, Undistortion) {
         let (width, height) = SIZE;
         let place = |i: u32| DVec2::new(f64::from(i % width) + 0.5, f64::from(i / width) + 0.5);
@@ -166,8 +167,8 @@ mod tests {
 
     fn undistortion() -> Undistortion {
         let (focal, middle) = (DVec2::splat(70.0), DVec2::new(45.0, 30.0));
-        let lens = Lens::new(SIZE, focal, middle, Distortion::of(Plane::Equidistant));
-        Cut::of(&lens, false).unwrap().faces[0].1
+        let lens = Lens::new(SIZE, focal, middle, Distortion::none(Plane::Equidistant));
+        Pinholes::covering(&lens, false).unwrap().faces[0].1
     }
 
     fn centre(out: &Image8, index: usize) -> DVec2 {
@@ -175,9 +176,9 @@ mod tests {
         DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5)
     }
 
-    /// A wave of 5 px, which bilinear means flatten by up to a fifth.
+    /// A wave of 5 px, which bilinear interpolation flattens by up to a fifth.
     #[test]
-    fn what_is_sharp_stays_so() {
+    fn sharp_images_stay_sharp() {
         let wave = |at: DVec2| 128.0 + 100.0 * (at.x * 1.1).sin() * (at.y * 0.7).cos();
         let (out, undistortion) = resampled(|at| [wave(at).round() as u8, 255, 255]);
         let (mut squares, mut count) = (0.0, 0);
@@ -192,10 +193,10 @@ mod tests {
         assert!(count > 4000 && error < 4.0, "{error} of {count}");
     }
 
-    /// Beside an edge a cubic leaves the range of its pixels, which must not become another colour; and the
-    /// border's pixels go on beyond it.
+    /// Bicubic interpolation overshoots beside an edge, which must not produce other colours, and the outermost pixels
+    /// are repeated beyond the border.
     #[test]
-    fn an_edge_has_no_other_colours_and_the_border_none_of_its_own() {
+    fn edges_and_borders_get_no_other_colours() {
         let (out, undistortion) = resampled(|at| [if at.x < 45.0 { 0 } else { 255 }, 255, 255]);
         for (index, pixel) in out.rgb.chunks_exact(3).enumerate() {
             let at = undistortion.source_of(centre(&out, index)).unwrap().x;
@@ -212,14 +213,14 @@ mod tests {
     }
 
     #[test]
-    fn beyond_the_border_are_the_pixels_at_it() {
+    fn the_outermost_pixels_are_repeated() {
         for (at, places) in [
             (0.2, [0, 0, 1, 2]),
             (5.5, [4, 5, 6, 7]),
             (88.5, [87, 88, 89, 89]),
             (89.0, [88, 89, 89, 89]),
         ] {
-            assert_eq!(Stencil::of(at, 90).places, places, "{at}");
+            assert_eq!(Stencil::around(at, 90).places, places, "{at}");
         }
     }
 
@@ -235,7 +236,7 @@ mod tests {
         let mut counted = 0;
         for (index, &weight) in dark.mask.as_ref().unwrap().iter().enumerate() {
             let [a, b] = [&dark, &bright].map(|out| out.rgb[3 * index]);
-            // A pixel counts as far as what it shows does.
+            // Hidden colours may contribute only as much as the pixel's weight is below 1.
             let most = f64::from(255 - weight) + 1.0;
             assert!(f64::from(a.abs_diff(b)) <= most, "{a} {b} {weight}");
             counted += usize::from(weight == 255);
@@ -243,7 +244,6 @@ mod tests {
         assert!(counted > 4000 && dark.mask.unwrap().contains(&0));
     }
 
-    /// A mask is resampled as a photograph would be bilinearly.
     #[test]
     fn transparent_colour_does_not_bleed_and_masks_are_not_sharpened() {
         let covers = |at: DVec2| at.x + at.y < 70.0;

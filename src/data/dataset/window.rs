@@ -1,25 +1,29 @@
-//! Parts of images: a view that is a window into a photograph, as a block of a large scene shows in it.
+//! Crops views to a part of their image, such as the part that shows a block of a large scene.
 
 use std::fmt;
 use std::str::FromStr;
 
 use super::View;
 use densify_core::camera::Camera;
-pub use densify_core::image::Window;
+use densify_core::image::Window;
 
-/// Fewest pixels along a side of a window: below it, most of what is rendered lies outside.
-const LEAST_SIDE: u32 = 32;
+/// Smallest side of a window `[px]`: with a smaller one, most rendered pixels would lie outside.
+const MIN_SIDE: u32 = 32;
 
-/// A part of an image, each side in `[0, 1]` of its width and height.
+/// A rectangular part of an image. Coordinates are fractions of its width and height, in `[0, 1]`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Part {
+    /// Left side.
     pub left: f64,
+    /// Upper side.
     pub top: f64,
+    /// Right side.
     pub right: f64,
+    /// Lower side.
     pub bottom: f64,
 }
 
-/// Left, top, right and bottom.
+/// The text form of a part: left, top, right and bottom.
 impl fmt::Display for Part {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { left, top, right, bottom } = self;
@@ -39,13 +43,13 @@ impl FromStr for Part {
 }
 
 impl Part {
-    /// Whether its sides are in order, and in the image.
+    /// Whether the sides are in order and inside the image.
     fn is_valid(&self) -> bool {
         let is_span = |from: f64, to: f64| 0.0 <= from && from < to && to <= 1.0;
         is_span(self.left, self.right) && is_span(self.top, self.bottom)
     }
 
-    /// Its pixels in an image of this size; `None` where they are all.
+    /// The pixels of the part in an image of this size; `None` if it covers the whole image.
     fn window(&self, width: u32, height: u32) -> Option<Window> {
         let [x, across] = span(self.left, self.right, width);
         let [y, down] = span(self.top, self.bottom, height);
@@ -54,13 +58,13 @@ impl Part {
     }
 }
 
-/// First pixel and number of pixels of a span, of at least [`LEAST_SIDE`] as far as there are so many.
+/// First pixel and number of pixels of a span, widened to [`MIN_SIDE`] pixels if the image has as many.
 fn span(from: f64, to: f64, size: u32) -> [u32; 2] {
     let (from, to) = (from * f64::from(size), to * f64::from(size));
-    let least = f64::from(LEAST_SIDE.min(size));
+    let least = f64::from(MIN_SIDE.min(size));
     let middle = 0.5 * (from + to);
     let (from, to) = (from.min(middle - 0.5 * least), to.max(middle + 0.5 * least));
-    // Back into the image where it was widened beyond.
+    // Shift the span back into the image.
     let back = (-from).max(0.0) - (to - f64::from(size)).max(0.0);
     let first = (from + back).max(0.0).floor() as u32;
     let last = ((to + back).ceil() as u32).min(size);
@@ -68,7 +72,7 @@ fn span(from: f64, to: f64, size: u32) -> [u32; 2] {
 }
 
 impl View {
-    /// The view as a window into itself.
+    /// Crops the view to a part of its image.
     pub(crate) fn windowed(mut self, part: &Part) -> Self {
         if let Some(window) = part.window(self.camera.width, self.camera.height) {
             self.camera = Camera {
@@ -95,15 +99,15 @@ mod tests {
     #[test]
     fn windows_hold_their_part_and_stay_in_the_image() {
         let part = |left, right| Part { left, right, top: 0.25, bottom: 0.75 };
-        let of = |left, right| part(left, right).window(200, 100);
-        assert_eq!(of(0.5, 0.9), Some(Window { x: 100, y: 25, width: 80, height: 50 }));
+        let window = |left, right| part(left, right).window(200, 100);
+        assert_eq!(window(0.5, 0.9), Some(Window { x: 100, y: 25, width: 80, height: 50 }));
         // Too narrow: widened evenly, or inwards at a border.
-        assert_eq!(of(0.5, 0.52), Some(Window { x: 86, y: 25, width: 32, height: 50 }));
-        assert_eq!(of(0.0, 0.01).map(|it| (it.x, it.width)), Some((0, 32)));
-        assert_eq!(of(0.99, 1.0).map(|it| (it.x, it.width)), Some((168, 32)));
+        assert_eq!(window(0.5, 0.52), Some(Window { x: 86, y: 25, width: 32, height: 50 }));
+        assert_eq!(window(0.0, 0.01).map(|window| (window.x, window.width)), Some((0, 32)));
+        assert_eq!(window(0.99, 1.0).map(|window| (window.x, window.width)), Some((168, 32)));
         let whole = Part { left: 0.0, top: 0.0, right: 1.0, bottom: 1.0 };
         assert_eq!(whole.window(200, 100), None);
-        // So small an image is its own window.
+        // A smaller image is used as a whole.
         assert_eq!(part(0.4, 0.6).window(30, 30), None);
         assert!(
             part(0.1, 0.2).is_valid() && !part(0.2, 0.1).is_valid() && !part(0.5, 1.1).is_valid()

@@ -1,56 +1,58 @@
-//! The colours of tracks in their views, and the gain of each view that accounts best for how they differ.
+//! The colours of tracks in their views, and the gains of the views that best explain the differences.
 
 use crate::dataset::{DatasetError, MIN_VIEWS, Tracks, View};
 use densify_core::image::Image8;
 
 /// Rounds of alternately fitting gains and colours of tracks.
 const ROUNDS: usize = 3;
-/// Values used to fit gains: darker ones are noise, brighter ones are clipped.
+/// Values used to fit gains; darker ones are noise, brighter ones may be clipped.
 pub(crate) const TRUSTED: std::ops::RangeInclusive<u8> = 16..=245;
-/// A view with fewer trusted values keeps a gain of 1.
+/// Smallest number of trusted values of a view; with fewer, its gain stays 1.
 const MIN_COLOURS: usize = 30;
 
 /// The colours of a track in one view.
 #[derive(Debug, Clone, Copy)]
-pub struct Observation {
-    pub(crate) track: u32,
-    pub view: u32,
-    pub centre: [u8; 3],
-    /// Smallest and largest value within a pixel.
+pub(super) struct Observation {
+    pub(super) track: u32,
+    /// Index of the view.
+    pub(super) view: u32,
+    /// Colour at the point.
+    pub(super) centre: [u8; 3],
+    /// Smallest and largest values within a pixel.
     lowest: [u8; 3],
     highest: [u8; 3],
 }
 
-/// Most bytes that reading and measuring them takes in addition to an image.
+/// Peak memory for reading and measuring the colours of tracks, in addition to an image `[bytes]`.
 #[must_use]
 pub fn bytes(tracks: &Tracks) -> u64 {
     let colours: usize = tracks.views.iter().map(Vec::len).sum();
-    // The observations, and one channel of them that is sorted for a median.
+    // The observations, and one channel of them, which is sorted for a median.
     (colours * (size_of::<Observation>() + 2 * size_of::<f32>())) as u64
 }
 
-/// The colours of all tracks, with the gains and the colours of tracks that are fitted to them.
+/// The observed colours of all tracks, and the gains and track colours fitted to them.
 #[derive(Debug, Clone)]
 pub struct TrackColours {
-    /// Track by track, and each of these in the order of the views.
+    /// Observations by track, then by view.
     observations: Vec<Observation>,
-    /// By channel: gains of the views, and colours of the tracks.
+    /// The fit of each channel.
     fits: [Fit; 3],
 }
 
-/// What is fitted in a channel.
+/// Gains of the views and colours of the tracks in one channel.
 #[derive(Debug, Clone)]
 struct Fit {
-    /// Whether enough colours were seen of a view. Shape: `[views]`.
+    /// Whether a view has enough trusted values. Shape: `[views]`.
     is_known: Vec<bool>,
-    /// Shape: `[views]`.
+    /// Gains. Shape: `[views]`.
     gains: Vec<f32>,
-    /// Shape: `[tracks]`, those with enough views.
+    /// Colours of the tracks with enough views. Shape: `[tracks]`.
     references: Vec<f32>,
 }
 
 impl TrackColours {
-    /// Reads the tracks in their views; decodes each view once.
+    /// Reads the colours of tracks in their views; each image is decoded once.
     ///
     /// # Errors
     /// When an image cannot be read.
@@ -83,17 +85,17 @@ impl TrackColours {
         Ok(Self { observations, fits })
     }
 
-    /// The colours of each track that enough views show.
-    pub fn by_track(&self) -> impl Iterator<Item = &[Observation]> {
+    /// The observations of each track with enough views.
+    pub(super) fn by_track(&self) -> impl Iterator<Item = &[Observation]> {
         by_track(&self.observations)
     }
 
-    /// The gains of a view; 1 where too few colours were seen.
+    /// The gains of a view; 1 in channels with too few trusted values.
     pub fn gains(&self, view: usize) -> [f32; 3] {
         self.fits.each_ref().map(|fit| fit.gains[view])
     }
 
-    /// Whether enough colours of a view were seen in every channel.
+    /// Whether a view has enough trusted values in every channel.
     pub fn knows(&self, view: usize) -> bool {
         self.fits.iter().all(|fit| fit.is_known[view])
     }
@@ -103,8 +105,8 @@ impl TrackColours {
         self.fits[0].gains.len()
     }
 
-    /// The colour of a track, by its place among those that enough views show.
-    pub fn reference(&self, place: usize) -> [f32; 3] {
+    /// The fitted colour of a track, by its index among those with enough views.
+    pub(super) fn reference(&self, place: usize) -> [f32; 3] {
         self.fits.each_ref().map(|fit| fit.references[place])
     }
 }
@@ -115,7 +117,7 @@ fn by_track(observations: &[Observation]) -> impl Iterator<Item = &[Observation]
 }
 
 impl Observation {
-    /// Squared difference from a colour, mean over the channels.
+    /// Squared distance of a colour from the observed range, mean over the channels.
     pub(super) fn squared_difference(&self, colour: [f32; 3], gains: [f32; 3]) -> f64 {
         let square = |channel: usize| {
             let expected = colour[channel] * gains[channel];
@@ -127,8 +129,8 @@ impl Observation {
     }
 }
 
-/// The colour of a pixel, and the smallest and largest values of it and its eight neighbours; `None`
-/// unless all of them are inside the image, opaque and not masked.
+/// The colour of a pixel, and the smallest and largest values among it and its eight neighbours; `None`
+/// unless all nine are inside the image, opaque and not masked.
 fn neighbourhood(image: &Image8, pixel: glam::DVec2) -> Option<([u8; 3], [u8; 3], [u8; 3])> {
     let (width, height) = (i64::from(image.width), i64::from(image.height));
     let (x, y) = (pixel.x.floor() as i64, pixel.y.floor() as i64);
@@ -153,8 +155,8 @@ fn neighbourhood(image: &Image8, pixel: glam::DVec2) -> Option<([u8; 3], [u8; 3]
     Some((centre, lowest, highest))
 }
 
-/// Fits the gains of the views and the colours of the tracks, in one channel. An exposure is a factor
-/// in encoded values too, because the sRGB curve is nearly a power.
+/// Fits the gains of the views and the colours of the tracks in one channel. Exposures are factors in sRGB-encoded values
+/// too, because the sRGB curve is nearly a power.
 fn fit(by_track: &[&[Observation]], views: usize, channel: usize) -> Fit {
     let (mut gains, mut is_known) = (vec![1.0_f32; views], vec![false; views]);
     let mut references = vec![0.0_f32; by_track.len()];
@@ -185,8 +187,8 @@ fn fit(by_track: &[&[Observation]], views: usize, channel: usize) -> Fit {
     Fit { is_known, gains, references }
 }
 
-/// The lower median; 0 if there are no values.
-pub fn median(values: &mut [f32]) -> f32 {
+/// The lower median; 0 without values.
+pub(super) fn median(values: &mut [f32]) -> f32 {
     if values.is_empty() {
         return 0.0;
     }

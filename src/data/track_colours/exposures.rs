@@ -1,49 +1,49 @@
-//! Whether the photographs of a scene were exposed differently, from the colours of the reconstruction's
-//! points in them, before training.
+//! Decides before training whether the photographs of a scene differ in exposure, from the colours of tracks.
 //!
-//! A gain per view and channel is fitted to the colours that each view shows of the same points. Gains are
-//! evidence where they differ, and where they explain how the colours differ: highlights, wrong points and
-//! noise make gains differ a little too, but leave the colours apart.
+//! A gain per view and channel is fitted to the colours in which the views show the same points. Exposures differ if the
+//! gains differ and also explain most of the differences between colours. Highlights, wrong points and noise change gains
+//! a little too, but leave the colours different.
 
 use serde::{Deserialize, Serialize};
 
 use super::{MIN_TRACKS, TrackColours, median};
 
-/// From this spread on, exposures are learned `[stops]`. Jitter of ±1 stop over 20 views may differ by as little as 0.42.
+/// Smallest spread at which exposures are learned `[stops]`. Random exposures within ±1 stop over 20 views may have a
+/// spread of only 0.42.
 pub const MIN_STOPS: f64 = 0.3;
-/// Gains must leave at most this share of the difference between the colours. Jitter leaves 0.34 or less; photographs
-/// of one exposure whose colours change with the view leave 0.6 or more, at 0.4 stops: learned there, exposures lost
-/// what test views are as photographed. docs/tradeoffs.md has the scenes that both numbers were chosen on.
-pub const MOST_LEFT: f64 = 0.45;
-/// Stops per doubling of an encoded value: the sRGB curve is nearly the power 1/2.4.
+/// Largest share of the colour differences that the gains may leave unexplained. With random exposures 0.34 or less is
+/// left. In photographs of one exposure whose colours change with the view, 0.6 or more is left, at a spread of
+/// 0.4 stops; learning exposures there made test views worse. docs/tradeoffs.md lists the scenes of both measurements.
+const MAX_UNEXPLAINED: f64 = 0.45;
+/// Stops per doubling of an sRGB-encoded value, as the sRGB curve is nearly the power 1/2.4.
 pub const STOPS: f64 = 2.4;
 
-/// How the exposures of the training views differ.
+/// Differences between the exposures of the training views.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ExposureSpread {
     /// Number of tracks measured in enough views.
     pub tracks: usize,
-    /// Views of which enough colours are known.
+    /// Number of views with enough trusted colours.
     pub views: usize,
     /// Root mean square difference of the gains from their mean, over these views and the channels `[stops]`.
     pub stops: f64,
-    /// Median difference of a colour from that of its track, with one exposure for all views `[1/255]`.
+    /// Median difference between an observed colour and that of its track, with equal exposures `[1/255]`.
     pub alike: f64,
-    /// The same with the gains `[1/255]`.
+    /// Median difference with the fitted gains `[1/255]`.
     pub with_gains: f64,
 }
 
 impl ExposureSpread {
-    /// Measures it; also returns the gains of all views, whose product is 1, and 1 where too few colours are
-    /// known.
+    /// Measures the spread. Also returns the gains of all views, normalised to a geometric mean of 1; views with too few
+    /// trusted colours have gain 1.
     #[must_use]
     pub fn measure(colours: &TrackColours) -> (Self, Vec<[f32; 3]>) {
         let known: Vec<usize> = (0..colours.views()).filter(|&view| colours.knows(view)).collect();
-        let mean = |of: &dyn Fn([f32; 3]) -> [f64; 3]| {
+        let mean = |function: &dyn Fn([f32; 3]) -> [f64; 3]| {
             let mut mean = [0.0; 3];
             for &view in &known {
-                let gains = of(colours.gains(view));
+                let gains = function(colours.gains(view));
                 mean.iter_mut().zip(gains).for_each(|(sum, gain)| *sum += gain);
             }
             mean.map(|sum| sum / known.len().max(1) as f64)
@@ -56,11 +56,12 @@ impl ExposureSpread {
         });
         let factor = middle.map(|stops| (stops / STOPS).exp2());
         let gains = (0..colours.views())
-            .map(|view| match colours.knows(view) {
-                true => std::array::from_fn(|channel| {
-                    (f64::from(colours.gains(view)[channel]) / factor[channel]) as f32
-                }),
-                false => [1.0; 3],
+            .map(|view| {
+                if !colours.knows(view) {
+                    return [1.0; 3];
+                }
+                let gains = colours.gains(view);
+                std::array::from_fn(|channel| (f64::from(gains[channel]) / factor[channel]) as f32)
             })
             .collect();
         let (mut alike, mut with_gains, mut own) = (Vec::new(), Vec::new(), Vec::new());
@@ -80,21 +81,21 @@ impl ExposureSpread {
                 }
             }
         }
-        let found = Self {
+        let spread = Self {
             tracks,
             views: known.len(),
             stops: (squares.iter().sum::<f64>() / 3.0).sqrt(),
             alike: f64::from(median(&mut alike)),
             with_gains: f64::from(median(&mut with_gains)),
         };
-        (found, gains)
+        (spread, gains)
     }
 
-    /// Whether exposures are to be learned; `None` if too few tracks or views are known to say.
+    /// Whether exposures shall be learned; `None` if too few tracks or views are known for a decision.
     #[must_use]
     pub fn decides(&self, views: usize) -> Option<bool> {
         let is_enough = self.tracks >= MIN_TRACKS && 2 * self.views > views;
-        let differ = self.stops >= MIN_STOPS && self.with_gains <= MOST_LEFT * self.alike;
+        let differ = self.stops >= MIN_STOPS && self.with_gains <= MAX_UNEXPLAINED * self.alike;
         is_enough.then_some(differ)
     }
 }

@@ -1,20 +1,19 @@
-//! Measures how much colours change with the view, in the photographs and before training, to choose
-//! the degree of spherical harmonics.
+//! Measures before training how much colours in the photographs change with the view, to choose the degree of spherical
+//! harmonics.
 //!
-//! Each track of the reconstruction is a surface point with the views that show it. Its colour is
-//! read in each of them. Photographs differ in exposure and white balance, so a gain per view and
-//! channel is fitted first. Three other causes of differences must not count:
+//! Each track of the reconstruction is a point with the views that show it, and its colour is read in each of them.
+//! Photographs differ in exposure and white balance, so a gain per view and channel is fitted first. Three other causes
+//! of differences are excluded:
 //!
-//! - Reconstructed points lie on edges and corners, where one pixel changes the colour more than any
-//!   highlight. So the difference is the distance of the track's colour (the median over its views)
-//!   from the range of *all* colours within a pixel.
-//! - The point may be hidden in some views. The quarter of its views that differ most is ignored.
-//! - The point may not lie on a surface. It does if most views show the colour that the
-//!   reconstruction gives it; if less than half of all points do, tracks decide nothing.
+//! - Reconstructed points lie on edges and corners, where the colour changes more within a pixel than by any highlight.
+//!   So the difference is the distance of the track's colour (the median over its views) from the range of *all* colours
+//!   within a pixel.
+//! - The point may be occluded in some views. The quarter of its views that differ most is ignored.
+//! - The point may not lie on a surface. A point counts as on a surface if most views show the colour that the
+//!   reconstruction gives it; if fewer than half of all points do, no decision is made.
 //!
-//! The spread of a track is the root mean square over its remaining views. Highlights may cover a
-//! small part of a scene, so the 95th percentile of the tracks decides. Only photographs, poses and
-//! the reconstruction are read.
+//! The spread of a track is the root mean square over its remaining views. Highlights may cover a small part of a scene,
+//! so the 95th percentile of the tracks decides. Only photographs, poses and the reconstruction are used.
 //!
 //! This differs from the per-Gaussian rule of Reduced-3DGS (Papantonakis et al. 2024, section 4.2),
 //! which needs a trained model and therefore cannot save memory while training.
@@ -25,27 +24,27 @@ pub mod exposures;
 use serde::{Deserialize, Serialize};
 
 use crate::dataset::Tracks;
-pub use colours::median;
+use colours::median;
 pub use colours::{TrackColours, bytes};
 
-/// With fewer measured tracks, the degree is not decided.
+/// Smallest number of measured tracks for a decision.
 pub const MIN_TRACKS: usize = 500;
-/// From these 95th percentiles on, degrees 1, 2 and 3 are chosen `[1/255]`. `docs/tradeoffs.md` lists
-/// the scenes that they were fitted to.
-pub const THRESHOLDS: [f64; 3] = [1.0, 2.0, 3.0];
-/// Largest difference between the reconstruction's colour of a point and its colour in a view for
-/// the point to count as on a surface `[1/255]`.
+/// The 95th percentiles from which on degrees 1, 2 and 3 are chosen `[1/255]`. `docs/tradeoffs.md` lists the scenes that
+/// they were fitted to.
+const THRESHOLDS: [f64; 3] = [1.0, 2.0, 3.0];
+/// Largest difference between a point's colour in the reconstruction and in a view, if the point lies on a surface
+/// `[1/255]`.
 const SAME_COLOUR: f64 = 4.0;
-/// Fraction of a track's views that count: those that differ least.
+/// Fraction of a track's views that count, namely those that differ least.
 const AGREEING: f64 = 0.75;
 
-/// How much the colours of tracks change with the view.
+/// Statistics of the change of track colours with the view.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Spread {
     /// Number of tracks measured in enough views.
     pub tracks: usize,
-    /// Fraction of them that lie on a surface.
+    /// Fraction of these tracks that lie on a surface.
     pub on_surface: f64,
     /// Median over the tracks `[1/255]`.
     pub median: f64,
@@ -58,8 +57,7 @@ pub struct Spread {
 }
 
 impl Spread {
-    /// The degree to train with; `None` if too few tracks were measured, or too few of them lie on
-    /// surfaces.
+    /// The degree of spherical harmonics to train with; `None` if too few tracks were measured or lie on surfaces.
     #[must_use]
     pub fn degree(&self) -> Option<u8> {
         let above = THRESHOLDS.iter().filter(|&&from| self.twentieth >= from).count();
@@ -67,7 +65,7 @@ impl Spread {
     }
 }
 
-/// Measures how much the colours of tracks change with the view, where exposures do not account for it.
+/// Measures how much the colours of tracks change with the view, after correcting exposures.
 #[must_use]
 pub fn measure(tracks: &Tracks, colours: &TrackColours) -> Spread {
     let (mut each, mut on_surface, mut buffer) = (Vec::new(), 0, Vec::new());

@@ -1,4 +1,4 @@
-//! Colours of tracks in made-up views: what makes them disagree, and what must not.
+//! Tests of track colours in synthetic views.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -20,14 +20,14 @@ fn measured(tracks: &Tracks, views: &[View]) -> Result<Spread, DatasetError> {
     Ok(measure(tracks, &TrackColours::read(tracks, views)?))
 }
 
-/// Views of a wall of 20 x 20 coloured squares, 3 px wide each, from one place; `shade` is what a view
-/// makes of a square's colour.
+/// Views of a wall of 20 x 20 coloured squares, each 3 px wide, from one place; `shade` changes the colour of a square
+/// in a view.
 fn scene(shade: impl Fn(usize, usize, f32) -> f32) -> (Tracks, Vec<View>) {
     let squares = (SIZE / 3) as usize;
     let colour =
         |square: usize| [square * 37, square * 59, square * 83].map(|v| (40 + v % 120) as f32);
     let mut tracks = Tracks::default();
-    // Not those at the border, where a pixel's neighbours end.
+    // Squares at the border are left out, because their pixels lack neighbours.
     for square in (0..squares * squares).filter(|s| s / squares > 0 && s / squares < squares - 1) {
         let (x, y) = (3 * (square % squares) + 1, 3 * (square / squares) + 1);
         tracks.positions.push(DVec3::new(x as f64 + 0.5, y as f64 + 0.5, 1.0));
@@ -73,20 +73,19 @@ fn colours_that_stay_ask_for_degree_0_whatever_the_exposure() {
     for exposures in [[1.0; VIEWS], [1.0, 0.8, 1.1, 0.7, 1.0, 1.2, 0.9, 1.05]] {
         let (tracks, views) = scene(|view, _, value| value * exposures[view]);
         let found = measured(&tracks, &views).unwrap();
-        assert_eq!(found.tracks, tracks.len());
+        assert_eq!(found.tracks, tracks.count());
         assert!(found.twentieth < 0.75, "rounding to whole steps: {found:?}");
     }
 }
 
-/// The gains of the views are found, and decide that exposures are learned; colours that change by view
-/// without a common factor do not.
+/// Gains of the views lead to learned exposures; colours that change per view without a common factor do not.
 #[test]
 fn exposures_are_found_where_gains_explain_the_colours() {
     let exposures = [1.0, 0.8, 1.1, 0.7, 1.0, 1.2, 0.9, 1.05];
     let found = |shade: &dyn Fn(usize, usize, f32) -> f32| {
         let (tracks, views) = scene(shade);
         let (found, gains) = ExposureSpread::measure(&TrackColours::read(&tracks, &views).unwrap());
-        assert_eq!((found.tracks, found.views), (tracks.len(), VIEWS));
+        assert_eq!((found.tracks, found.views), (tracks.count(), VIEWS));
         // As many tracks as decide.
         (ExposureSpread { tracks: MIN_TRACKS, ..found }, gains)
     };
@@ -128,7 +127,7 @@ fn colours_that_change_with_the_view_ask_for_more() {
 }
 
 #[test]
-fn what_stands_before_a_point_in_a_quarter_of_its_views_is_left_out() {
+fn occlusion_in_a_quarter_of_the_views_is_ignored() {
     let hidden = |share: usize| {
         let (tracks, views) =
             scene(|view, _, value| if view < share { 255.0 - value } else { value });

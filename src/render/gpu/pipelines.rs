@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use densify_policies::policy::Signal;
+use densify_policies::policy::{SUPPORT_WEIGHT, Signal};
 use wgpu::{ComputePipeline, Device, ShaderModule};
 
 use super::kernels::{Binding, kernels, parse};
@@ -33,6 +33,7 @@ impl Variant {
             ("ALPHA_MIN".to_owned(), f64::from(self.shortcuts.alpha_min)),
             ("LOG2_REACH".to_owned(), f64::from(self.shortcuts.log2_reach())),
             ("TRANSMITTANCE_MIN".to_owned(), f64::from(self.shortcuts.transmittance_min)),
+            ("SUPPORT_WEIGHT".to_owned(), f64::from(SUPPORT_WEIGHT)),
         ];
         let offset = |field| self.records.at(field).unwrap_or(0) as f64;
         all.extend(Field::ALL.map(|field| (field.constant().to_owned(), offset(field))));

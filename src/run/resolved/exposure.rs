@@ -9,7 +9,7 @@ use densify_core::spelling::Spelling;
 use densify_data::dataset::Dataset;
 use densify_data::track_colours::MIN_TRACKS;
 use densify_data::track_colours::exposures::{ExposureSpread, MIN_STOPS};
-use densify_train::exposure::reported::{Believed, complete, spread};
+use densify_train::exposure::reported::{ExifUse, complete_gains, spread};
 use densify_train::exposure::{ExposureChoice, Exposures};
 
 /// The exposures of a run.
@@ -23,7 +23,7 @@ pub(crate) struct Exposure {
     /// The colours of tracks gave the gains.
     by_tracks: bool,
     /// Use of the exposures in EXIF.
-    believed: Believed,
+    believed: ExifUse,
     /// Standard deviation of the exposures in EXIF `[stops]`.
     reported: f64,
     /// Problems with EXIF, for the user.
@@ -38,7 +38,7 @@ impl Exposure {
             source,
             gains: Vec::new(),
             by_tracks: false,
-            believed: Believed::Nothing,
+            believed: ExifUse::Unused,
             reported: 0.0,
             notes: Vec::new(),
         }
@@ -78,11 +78,11 @@ impl Exposure {
             _ => vec![false; views],
         };
         found.gains.resize(views, [1.0; 3]);
-        found.believed = complete(&mut found.gains, &known, &reported.stops);
-        if !found.by_tracks && found.believed == Believed::Nothing {
+        found.believed = complete_gains(&mut found.gains, &known, &reported.stops);
+        if !found.by_tracks && found.believed == ExifUse::Unused {
             found.gains.clear();
         }
-        if let Believed::Contradicted { by } = found.believed {
+        if let ExifUse::Contradicted { by } = found.believed {
             found.notes.push(format!(
                 "the exposures in EXIF are {by:.1} stops (rms) from what the colours of points show, and are not used"
             ));
@@ -90,7 +90,7 @@ impl Exposure {
         if let Some(example) = &reported.example {
             found.notes.push(format!(
                 "{} photographs have nonsense in their EXIF, which is not used ({example})",
-                reported.nonsense
+                reported.implausible
             ));
         }
         found
@@ -118,7 +118,7 @@ impl Exposure {
                         self.from_exif()
                     )
                 }
-                (false, Believed::Views(views)) => {
+                (false, ExifUse::Views(views)) => {
                     format!("exposure on, from the EXIF of {} views", grouped(views))
                 }
                 (false, _) => "exposure on, from one for all views".to_owned(),
@@ -150,8 +150,8 @@ impl Exposure {
     /// The number of views that begin from EXIF where the others begin from tracks.
     fn from_exif(&self) -> String {
         match self.believed {
-            Believed::Views(views) => format!("; {} views begin from their EXIF", grouped(views)),
-            Believed::Nothing | Believed::Contradicted { .. } => String::new(),
+            ExifUse::Views(views) => format!("; {} views begin from their EXIF", grouped(views)),
+            ExifUse::Unused | ExifUse::Contradicted { .. } => String::new(),
         }
     }
 }
@@ -173,7 +173,7 @@ mod tests {
         let stops = vec![Some(-5.0), Some(-7.0), None];
         ReportedExposures {
             stops,
-            nonsense: 1,
+            implausible: 1,
             example: Some("c.jpg says an exposure of 0 s".to_owned()),
         }
     }

@@ -98,7 +98,7 @@ impl Inputs {
         let resident = (host.process.resident)().map(|now| now.saturating_sub(apart));
         let peak = (host.process.peak)();
         let tracks = std::mem::take(&mut dataset.tracks);
-        let colours = if reading.colours && tracks.len() >= MIN_TRACKS {
+        let colours = if reading.colours && tracks.count() >= MIN_TRACKS {
             Some(TrackColours::read(&tracks, &dataset.train)?)
         } else {
             None
@@ -106,7 +106,7 @@ impl Inputs {
         let track_bytes =
             if reading.tracks { tracks.bytes() + track_colours::bytes(&tracks) } else { 0 };
         let reported = if reading.exif {
-            ReportedExposures::of(&dataset.train)
+            ReportedExposures::read(&dataset.train)
         } else {
             ReportedExposures::default()
         };
@@ -134,7 +134,7 @@ impl Inputs {
 
 /// The memory that training and test images take.
 fn image_demand(dataset: &Dataset) -> [ImageDemand; 2] {
-    let demand = |views: &[View]| ImageDemand::of(views.iter().map(|view| &view.source));
+    let demand = |views: &[View]| ImageDemand::total(views.iter().map(|view| &view.source));
     [demand(&dataset.train), demand(&dataset.test)]
 }
 

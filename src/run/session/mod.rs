@@ -206,7 +206,7 @@ impl<'a> Session<'a> {
     /// Lets the observer render the model, and writes the checkpoints that it asks for.
     fn rest(&mut self) {
         loop {
-            let (model, rows) = self.run.trainer.looked_at();
+            let (model, rows) = self.run.trainer.backend_and_history();
             match self.observer.between(model, rows) {
                 Between::Checkpoint => self.keep_or_say(),
                 Between::Step => return,
@@ -382,7 +382,7 @@ impl<'a> Session<'a> {
             }
             (scores, _) => scores?,
         };
-        let mean = Mean::of(&scores);
+        let mean = Mean::over(&scores);
         write_scores(&self.folder, Split::Test, step, &scores)?;
         let Mean { psnr, ssim, flip, .. } = mean;
         let scalars = [("test/psnr", psnr), ("test/ssim", ssim), ("test/flip", flip)];

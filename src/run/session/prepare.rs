@@ -62,7 +62,7 @@ pub(super) fn prepare(
         model = behind_frozen(&run, model, observer)?;
     }
     let config = RunConfig::new(&run, &training, last)?;
-    let fingerprint = Fingerprint::of(&run.case.inputs.dataset);
+    let fingerprint = Fingerprint::new(&run.case.inputs.dataset);
     if let Some(resumed) = &resumed {
         resume::check(&config, resumed, &fingerprint, &output)?;
     }
@@ -90,13 +90,13 @@ pub(super) fn prepare(
         .map_or_else(PointCloud::default, |companion| dataset.points.thinned(companion.points));
     let ResolvedTraining { policy, scene, .. } = training;
     let trainer = Trainer::new(views, backend, (name, policy), scene, options)?;
-    let mut trainer = trainer.requiring(automatic).exposing(exposures);
+    let mut trainer = trainer.with_auto_choices(automatic).with_exposures(exposures);
     let session = match resumed {
         Some(resumed) => resume::restore(resumed, &mut trainer, observer)?,
         None => None,
     };
     if companion.is_some() {
-        trainer.remember_rows()?;
+        trainer.record_history()?;
     }
     Ok(Run {
         spec: spec.clone(),

@@ -31,7 +31,7 @@ impl DataSpec {
             keep_fov: self.keep_fov,
             invert_masks: self.invert_masks,
             mask_mode: self.mask_mode,
-            cache: builtin::folder().filter(|_| !self.no_cache),
+            cache: builtin::cache_folder().filter(|_| !self.no_cache),
             tracks,
         }
     }

@@ -103,7 +103,7 @@ fn edits_of(shown: &Shown) -> Result<Option<(RowHistory, u32)>, CheckpointError>
     let edited = checkpoint.ages()?.into_iter().map(|age| step.saturating_sub(age));
     let edited: Vec<u32> = edited.collect();
     if edited.len() == shown.rows {
-        return Ok(Some((RowHistory::of(&edited, shown.rows), step)));
+        return Ok(Some((RowHistory::from_edits(&edited, shown.rows), step)));
     }
     let problem = format!("it has {} Gaussians, and the model {}", edited.len(), shown.rows);
     Err(CheckpointError::Invalid { path: path.clone(), problem })

@@ -182,7 +182,7 @@ fn without_cameras(
             "{what} holds no Gaussian: there is nothing to look at"
         )));
     }
-    let normalisation = Normalisation::of_model(model);
+    let normalisation = Normalisation::fit_model(model);
     let none = || [Vec::new(), Vec::new()];
     let points = PointCloud::default();
     let background = data.background.fixed();

@@ -155,7 +155,7 @@ pub(super) fn colours(
         }
         Kind::RowAge | Kind::RowEdit => {
             let steps = known.history.map_or(&[][..], |(history, _)| match kind {
-                Kind::RowAge => history.made(),
+                Kind::RowAge => history.created(),
                 _ => history.edited(),
             });
             let now = known.history.map_or(0, |(_, step)| step);
@@ -227,15 +227,15 @@ mod tests {
 
     /// Steps 0, 6 and 9.
     fn history() -> RowHistory {
-        let mut history = RowHistory::of(&[0; 3], 3);
+        let mut history = RowHistory::from_edits(&[0; 3], 3);
         let ops = |rows: std::ops::RangeInclusive<u32>| -> RowOps {
             let needs = Needs { detailed_edits: true, ..Needs::default() };
             let mut plan = EditPlan::new(3, 3).allowing(&needs);
             rows.for_each(|row| plan.update(row, Update::NONE).unwrap());
             plan.compile()
         };
-        history.follow(&ops(0..=1), 6);
-        history.follow(&ops(0..=0), 9);
+        history.record(&ops(0..=1), 6);
+        history.record(&ops(0..=0), 9);
         history
     }
 

@@ -1,6 +1,7 @@
-//! Fingerprints of datasets: a run continues only with the views that it was started with.
+//! Fingerprints of datasets: a run can be continued only with the views that it was started with.
 //!
-//! Reading all pixels could take minutes, so the sizes of image files stand in for them.
+//! Reading all pixels could take minutes, so the sizes of image files stand in for them. The `Debug` texts of cameras,
+//! image headers and lenses are part of the fingerprint and must therefore not change.
 
 use std::fmt::{self, Write};
 
@@ -17,36 +18,36 @@ pub struct Fingerprint {
     pub train: ViewsFingerprint,
     /// Views held out.
     pub test: ViewsFingerprint,
-    /// From the dataset's coordinates to normalised ones.
+    /// Transform from the dataset's coordinates to normalised ones.
     pub normalisation: Normalisation,
 }
 
-/// The fingerprint of views: their number and checksums (CRC-32C).
+/// The fingerprint of views: their number, and checksums (CRC-32C).
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ViewsFingerprint {
     /// Number of views.
     pub count: usize,
-    /// Their names, in order.
+    /// Checksum of their names, in order.
     pub names: u32,
-    /// Poses, intrinsics and sizes.
+    /// Checksum of poses, intrinsics and sizes.
     pub cameras: u32,
-    /// Sizes of image files and masks, lens distortions; pixels of images without a file.
+    /// Checksum of lens distortions, of the sizes of image files and masks, and of pixels of images without a file.
     pub images: u32,
 }
 
 impl Fingerprint {
     /// The fingerprint of a dataset.
     #[must_use]
-    pub fn of(dataset: &Dataset) -> Self {
+    pub fn new(dataset: &Dataset) -> Self {
         Self {
-            train: ViewsFingerprint::of(&dataset.train),
-            test: ViewsFingerprint::of(&dataset.test),
+            train: ViewsFingerprint::new(&dataset.train),
+            test: ViewsFingerprint::new(&dataset.test),
             normalisation: dataset.normalisation,
         }
     }
 
-    /// The first difference to another dataset, if there is one.
+    /// A description of the first difference from another dataset, if there is one.
     #[must_use]
     pub fn difference(&self, other: &Self) -> Option<String> {
         let train = self.train.difference(&other.train, "views to train on");
@@ -60,7 +61,7 @@ impl Fingerprint {
 }
 
 impl ViewsFingerprint {
-    fn of(views: &[View]) -> Self {
+    fn new(views: &[View]) -> Self {
         let [mut names, mut cameras, mut images] = [0; 3].map(Checksum);
         for View { name, camera, source } in views {
             names.add(format_args!("{name}\0"));
@@ -76,10 +77,10 @@ impl ViewsFingerprint {
         Self { count: views.len(), names: names.0, cameras: cameras.0, images: images.0 }
     }
 
-    fn difference(&self, other: &Self, what: &str) -> Option<String> {
+    fn difference(&self, other: &Self, views: &str) -> Option<String> {
         let Self { count, names, cameras, images } = self;
         if *count != other.count {
-            return Some(format!("{count} {what}, now {}", other.count));
+            return Some(format!("{count} {views}, now {}", other.count));
         }
         let parts = [
             (*names != other.names, "names"),
@@ -87,11 +88,11 @@ impl ViewsFingerprint {
             (*images != other.images, "image files"),
         ];
         let differs = parts.iter().find(|(differs, _)| *differs)?.1;
-        Some(format!("the {differs} of the {what} differ"))
+        Some(format!("the {differs} of the {views} differ"))
     }
 }
 
-/// A running CRC-32C over text. Different numbers always have different texts.
+/// A running CRC-32C over text.
 struct Checksum(u32);
 
 impl Checksum {

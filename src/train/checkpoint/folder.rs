@@ -1,4 +1,4 @@
-//! Lists, finds and removes the checkpoints of a run; the two newest are kept.
+//! Lists, finds and removes the checkpoints of a run. The two newest are kept.
 
 use std::ffi::OsStr;
 use std::fs;
@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use super::{Checkpoint, CheckpointError};
 use crate::output::CHECKPOINTS;
 
-/// Number of checkpoints kept: the newest may turn out to be damaged.
+/// Number of checkpoints kept, as the newest may turn out to be damaged.
 const MAX_CHECKPOINTS: usize = 2;
 
 /// Path of the checkpoint of a step.
@@ -35,8 +35,7 @@ pub fn newest_step(run: &Path) -> Option<u32> {
     list(run).first().map(|(step, _)| *step)
 }
 
-/// The newest undamaged checkpoint of a run, if there is one, and why newer ones were rejected, newest
-/// first.
+/// The newest undamaged checkpoint of a run, if there is one, and the errors of newer ones, newest first.
 #[must_use]
 pub fn newest(run: &Path) -> (Option<Checkpoint>, Vec<CheckpointError>) {
     let mut rejected = Vec::new();
@@ -49,8 +48,8 @@ pub fn newest(run: &Path) -> (Option<Checkpoint>, Vec<CheckpointError>) {
     (None, rejected)
 }
 
-/// Removes all but the two newest checkpoints up to `step`, which has just been written. Later ones,
-/// which may be damaged, stay until they are overwritten. Errors are ignored.
+/// Removes all but the two newest checkpoints up to `step`, whose checkpoint has just been written. Later ones, which may
+/// be damaged, stay until they are overwritten. Errors are ignored.
 pub fn remove_older(run: &Path, step: u32) {
     let past = list(run).into_iter().filter(|&(saved, _)| saved <= step);
     for (_, path) in past.skip(MAX_CHECKPOINTS) {

@@ -5,13 +5,13 @@ use serde::{Deserialize, Serialize};
 
 use densify_core::gaussians::{ModelArray, sh_coefficients};
 
-/// Version of the format, for writing and reading.
+/// Version of the format that is written and read.
 pub const VERSION: u32 = 2;
 // Keys of the metadata.
 pub(super) const VERSION_KEY: &str = "densify.version";
 pub(super) const HEADER_KEY: &str = "densify.header";
 pub(super) const CHECKSUM_KEY: &str = "densify.crc32c";
-/// Size of the length before the header `[bytes]`.
+/// Size of the field before the header that states its length `[bytes]`.
 pub(super) const LENGTH: u64 = 8;
 
 /// Description of an array.
@@ -21,7 +21,7 @@ pub(super) struct Record {
     pub(super) name: String,
     pub(super) kind: Dtype,
     pub(super) shape: Vec<usize>,
-    /// CRC-32C of its bytes.
+    /// CRC-32C of the values.
     pub(super) crc32c: u32,
 }
 
@@ -43,7 +43,7 @@ impl Record {
     }
 }
 
-/// The name of an array.
+/// The name of a model array in the file.
 pub(super) fn name_of(array: ModelArray) -> &'static str {
     match array {
         ModelArray::Means => "model.means",
@@ -54,7 +54,7 @@ pub(super) fn name_of(array: ModelArray) -> &'static str {
     }
 }
 
-/// The shape of an array of so many rows; `sh_degree` is at most
+/// The shape of a model array; `sh_degree` is at most
 /// [`MAX_SH_DEGREE`](densify_core::gaussians::MAX_SH_DEGREE).
 pub(super) fn shape_of(array: ModelArray, rows: usize, sh_degree: u8) -> Vec<usize> {
     match array {

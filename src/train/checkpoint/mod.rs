@@ -1,6 +1,6 @@
 //! Saves the complete state of a run in one file, and restores it.
 //!
-//! A run that continues from a checkpoint gives the same bits as one that was never interrupted.
+//! A run that continues from a checkpoint ends with the same bits as one that was never interrupted.
 //!
 //! ```text
 //! RUN/checkpoints/iteration_N.safetensors     the two newest are kept
@@ -14,7 +14,7 @@
 //! the version of the format, [`Header`], the arrays with a checksum each (CRC-32C), and a checksum
 //! of that JSON. So every byte is checked before it is used.
 //!
-//! A file appears under its name when it is complete and synced to disk. Files are untrusted: sizes
+//! A file appears under its name only when it is complete and synced to disk. Files are untrusted: sizes
 //! are checked against the length of the file before anything is allocated.
 
 mod fingerprint;
@@ -42,23 +42,23 @@ use densify_render::{BackendError, StateError};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Header {
-    /// Version of densify that wrote it.
+    /// Version of densify that wrote the checkpoint.
     pub densify: String,
-    /// The most rows there may ever be.
+    /// Largest number of rows that the run allows.
     pub budget: usize,
     /// Spherical-harmonic degree of the model.
     pub sh_degree: u8,
-    /// The run's configuration, as `config.toml` has it.
+    /// Configuration of the run, as in `config.toml`.
     pub config: toml::Table,
-    /// The dataset.
+    /// Fingerprint of the dataset.
     pub dataset: Fingerprint,
     /// State of the trainer.
     pub trainer: TrainerState,
-    /// State of the program around the trainer; may be `null`.
+    /// State of the code that drives the trainer; may be `null`.
     pub session: serde_json::Value,
 }
 
-/// Why a checkpoint cannot be written or used.
+/// Reason why a checkpoint cannot be written or used.
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointError {
     /// The file is damaged, or not a checkpoint.
@@ -66,7 +66,7 @@ pub enum CheckpointError {
     Invalid {
         /// The file.
         path: PathBuf,
-        /// Which part of it, and what is wrong.
+        /// The damaged part and the fault.
         problem: String,
     },
     /// The file cannot be read or written.
@@ -75,7 +75,7 @@ pub enum CheckpointError {
     /// The policy cannot save its state.
     #[error("the policy's state: {source}")]
     Policy {
-        /// The error of the policy.
+        /// The policy's error.
         source: PolicyError,
     },
     /// The backend cannot save or restore its state.

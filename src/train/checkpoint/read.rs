@@ -1,4 +1,4 @@
-//! Reads checkpoints: checks everything before use, and reads arrays some rows at a time.
+//! Reads checkpoints. Everything is checked before use, and arrays are read some rows at a time.
 
 use std::fs::File;
 use std::io::{self, Read, Seek, SeekFrom};
@@ -17,10 +17,10 @@ use densify_render::{Backend, BackendError, StateArray, Tensor, Values};
 
 /// Longest header accepted `[bytes]`.
 const MAX_HEADER: u64 = 64 << 20;
-/// Bytes read at a time; a multiple of every type's size.
+/// Bytes read at a time; a multiple of the size of every type.
 const CHUNK: usize = 1 << 16;
 
-/// An undamaged checkpoint: all of the file has been checked.
+/// A checkpoint whose file has been checked completely.
 #[derive(Debug)]
 pub struct Checkpoint {
     path: PathBuf,
@@ -31,7 +31,7 @@ pub struct Checkpoint {
 }
 
 impl Checkpoint {
-    /// Opens a checkpoint and checks all of it.
+    /// Opens a checkpoint and checks the whole file.
     ///
     /// # Errors
     /// [`CheckpointError::File`], [`CheckpointError::Invalid`].
@@ -77,11 +77,11 @@ impl Checkpoint {
         &self.header
     }
 
-    /// A model of zeros of the checkpoint's size, to make the backend that is then
+    /// A model of zeros with the checkpoint's size, for making the backend that is then
     /// [restored](Self::restore).
     ///
     /// # Errors
-    /// [`CheckpointError::Invalid`] if the model contradicts its own configuration.
+    /// [`CheckpointError::Invalid`] if the model contradicts the checkpoint's own header.
     pub fn blank_model(&self) -> Result<Gaussians, CheckpointError> {
         let Header { budget, sh_degree, .. } = self.header;
         if sh_degree > MAX_SH_DEGREE {
@@ -121,13 +121,13 @@ impl Checkpoint {
     /// [blank model](Self::blank_model).
     ///
     /// # Errors
-    /// [`CheckpointError::Invalid`] if the arrays are not those of this backend;
+    /// [`CheckpointError::Invalid`] if the arrays do not match the backend;
     /// [`CheckpointError::File`], [`CheckpointError::Backend`].
     pub fn restore(&mut self, backend: &mut dyn Backend) -> Result<(), CheckpointError> {
-        let wanted = backend.state();
+        let expected = backend.state();
         let known = |name: &str| {
             ModelArray::ALL.into_iter().any(|array| name_of(array) == name)
-                || wanted.iter().any(|array| array.name == name)
+                || expected.iter().any(|array| array.name == name)
         };
         if let Some((_, record)) = self.places.iter().find(|(_, record)| !known(&record.name)) {
             let name = &record.name;
@@ -147,7 +147,7 @@ impl Checkpoint {
             }
             reader.finish()?;
         }
-        for StateArray { name, by_rows } in wanted {
+        for StateArray { name, by_rows } in expected {
             let place = self.place(&name)?;
             let has_rows = self.places[place].1.shape.first() == Some(&rows);
             if has_rows && by_rows {
@@ -164,15 +164,15 @@ impl Checkpoint {
         Ok(())
     }
 
-    /// Steps since each row was made or rewritten last, as the optimiser counts them. Shape: `[rows]`.
+    /// Optimiser steps since each row was created or rewritten. Shape: `[rows]`.
     ///
     /// # Errors
-    /// [`CheckpointError::Invalid`] if it has none, [`CheckpointError::File`].
+    /// [`CheckpointError::Invalid`] if the checkpoint has no ages, [`CheckpointError::File`].
     pub fn ages(&mut self) -> Result<Vec<u32>, CheckpointError> {
-        let missing = || self.invalid("it has no ages of its rows");
+        let missing = || self.invalid("it has no ages of rows");
         let is_ages = |(_, record): &(u64, Record)| Tensor::has_ages(&record.name);
         let place = self.places.iter().position(is_ages).ok_or_else(missing)?;
-        self.tensor(place)?.ages().ok_or_else(|| self.invalid("it has no ages of its rows"))
+        self.tensor(place)?.ages().ok_or_else(|| self.invalid("it has no ages of rows"))
     }
 
     fn invalid(&self, problem: impl ToString) -> CheckpointError {
@@ -184,7 +184,7 @@ impl Checkpoint {
         found.ok_or_else(|| self.invalid(format!("there is no tensor `{name}`")))
     }
 
-    /// A whole array.
+    /// Reads a whole array.
     fn tensor(&mut self, place: usize) -> Result<Tensor, CheckpointError> {
         let mut reader = ArrayReader::new(self, place)?;
         let whole = reader.tensor(reader.record.shape.first().copied().unwrap_or(0))?;
@@ -193,7 +193,7 @@ impl Checkpoint {
     }
 }
 
-/// Reads an array from the file.
+/// Reads an array piece by piece.
 struct ArrayReader<'a> {
     path: &'a Path,
     file: &'a mut File,
@@ -218,7 +218,7 @@ impl<'a> ArrayReader<'a> {
         FileError::io("read", self.path)(source).into()
     }
 
-    /// The next `entries` along the first dimension.
+    /// Reads the next `entries` along the first dimension.
     fn tensor(&mut self, entries: usize) -> Result<Tensor, CheckpointError> {
         let Record { name, kind, shape, .. } = self.record;
         let mut shape = shape.clone();
@@ -270,7 +270,7 @@ impl<'a> ArrayReader<'a> {
         Ok(values)
     }
 
-    /// Reads the rest and checks the checksum.
+    /// Reads the rest of the array and verifies the checksum.
     fn finish(mut self) -> Result<(), CheckpointError> {
         self.bytes(self.left, |_| ())?;
         let (Record { name, crc32c, .. }, crc) = (self.record, self.crc);

@@ -1,4 +1,4 @@
-//! The file: what is written is read back, and nothing that was changed passes.
+//! Tests of checkpoint files: round trips, and refusal of damaged files.
 
 use std::io::{Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
@@ -18,7 +18,7 @@ use densify_render::Setup;
 use densify_render::cpu::CpuBackend;
 use densify_render::{Backend, StateArray, Tensor, Values};
 
-/// More than go to the file at a time.
+/// More rows than are written at a time.
 const ROWS: usize = ROWS_AT_A_TIME + 13;
 
 fn numbers(count: usize, seed: f32) -> Vec<f32> {
@@ -57,7 +57,7 @@ fn options() -> Setup {
     Setup { needs, threads: Some(1), ..Setup::new(ROWS + 3) }
 }
 
-/// A backend in the midst of a run: arbitrary values in every array of its state.
+/// A backend with arbitrary values in every array of its state, as during a run.
 fn backend() -> CpuBackend {
     let mut backend = CpuBackend::new(&gaussians(), &options()).unwrap();
     for (i, StateArray { name, .. }) in backend.state().into_iter().enumerate() {
@@ -107,7 +107,7 @@ fn header() -> Header {
     }
 }
 
-/// A checkpoint in a folder of its own.
+/// Writes a checkpoint to its own folder.
 fn written() -> (tempfile::TempDir, PathBuf) {
     let root = tempfile::tempdir().unwrap();
     let path = checkpoint_path(root.path(), 17);
@@ -116,7 +116,7 @@ fn written() -> (tempfile::TempDir, PathBuf) {
 }
 
 #[test]
-fn the_ages_of_the_rows_are_read_alone() {
+fn ages_of_rows_are_read_on_their_own() {
     let (_root, path) = written();
     let ages = Checkpoint::open(&path).unwrap().ages().unwrap();
     let signals = backend().take_signals(SignalSet::from([Signal::Age])).unwrap();
@@ -130,7 +130,7 @@ fn problem(path: &Path) -> String {
 }
 
 #[test]
-fn what_is_written_is_read_back_to_the_bit() {
+fn checkpoints_are_read_back_bit_for_bit() {
     let (_root, path) = written();
     let mut checkpoint = Checkpoint::open(&path).unwrap();
     assert_eq!(*checkpoint.header(), header());
@@ -146,7 +146,7 @@ fn what_is_written_is_read_back_to_the_bit() {
 }
 
 #[test]
-fn equal_states_are_equal_files() {
+fn equal_states_give_equal_files() {
     let [(_one, a), (_other, b)] = [written(), written()];
     assert!(std::fs::read(a).unwrap() == std::fs::read(b).unwrap());
 }
@@ -164,7 +164,7 @@ fn other_programs_read_the_arrays() {
 }
 
 #[test]
-fn a_file_cut_anywhere_is_refused() {
+fn truncated_files_are_refused() {
     let (_root, path) = written();
     let mut file = std::fs::OpenOptions::new().append(true).open(&path).unwrap();
     let size = file.metadata().unwrap().len();
@@ -177,7 +177,7 @@ fn a_file_cut_anywhere_is_refused() {
     }
 }
 
-/// Flips a bit of each byte from `first` on, `step` bytes apart.
+/// Flips one bit in every `step`-th byte from `first` on.
 fn flip_bits(first: usize, step: usize) {
     let (_root, path) = written();
     let bytes = std::fs::read(&path).unwrap();
@@ -198,13 +198,13 @@ fn flip_bits(first: usize, step: usize) {
 }
 
 #[test]
-fn hardly_a_flipped_bit_passes() {
+fn flipped_bits_are_refused() {
     flip_bits(5, 41);
 }
 
 #[test]
 #[ignore = "takes minutes: run by .ci/run"]
-fn no_flipped_bit_passes() {
+fn every_flipped_bit_is_refused() {
     flip_bits(0, 1);
 }
 
@@ -245,7 +245,7 @@ fn a_state_of_another_run_is_refused_by_name() {
     refused(more, "there is no tensor `signals.PixelCount`");
     let mut less = options();
     less.needs.cadence = Cadence { all: 1, sh_rest: 4 };
-    // Of the rows that are read first.
+    // The shapes are those of the first piece of rows.
     refused(less, "`summed.gradients`: its shape is [48, 23]; this run needs [48, 9]");
     let mut fewer = options();
     fewer.needs.candidates = fewer.needs.candidates.map(|c| CandidateRequest { capacity: 3, ..c });
@@ -253,7 +253,7 @@ fn a_state_of_another_run_is_refused_by_name() {
     let mut small = CpuBackend::new(&Gaussians::zeros(3, 1), &options()).unwrap();
     let problem = Checkpoint::open(&path).unwrap().restore(&mut small).unwrap_err().to_string();
     assert!(problem.contains("`model.means`: it is F32 of shape [61, 3]"), "{problem}");
-    // A model larger than its own budget, or of a degree that there is not.
+    // A model larger than its own budget, or with an invalid degree.
     for (budget, sh_degree, words) in
         [(60, 1, "61 rows, but its budget is 60"), (64, 9, "at most 3")]
     {

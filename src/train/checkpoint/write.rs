@@ -1,4 +1,4 @@
-//! Writes checkpoints array by array and some rows at a time, to limit memory.
+//! Writes checkpoints array by array, some rows at a time, to limit memory.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -17,14 +17,14 @@ use densify_core::gaussians::ModelArray;
 use densify_core::pieces::pieces;
 use densify_render::{Backend, BackendError, StateArray, Tensor, Values};
 
-/// Writes the state of a run: `header`, and the model and state of `backend`. The file appears under
-/// its name when it is complete and on disk; an existing file stays until then.
+/// Writes the header of a checkpoint, and the model and state of the backend. The file appears under its name when it is
+/// complete and on disk; an existing file stays until then.
 ///
 /// # Errors
 /// [`CheckpointError::File`], [`CheckpointError::Backend`].
 pub fn write(path: &Path, header: &Header, backend: &dyn Backend) -> Result<(), CheckpointError> {
     write_atomically_from(path, |out| {
-        // Two passes over the arrays: the header, which comes first, has their checksums.
+        // The arrays are encoded twice, because the header, which comes first, contains their checksums.
         let records = write_arrays(backend, |_| Ok(()))?;
         let bytes = header_bytes(header, &records)?;
         out.write_all(&(bytes.len() as u64).to_le_bytes())?;
@@ -57,16 +57,17 @@ fn write_arrays(
     }
     for StateArray { name, by_rows } in backend.state() {
         let piece = |rows| backend.save_rows(&name, rows);
-        records.push(match by_rows {
-            true => Record::write(pieces(rows).map(piece), &mut sink)?,
-            false => Record::write([piece(0..rows)], &mut sink)?,
+        records.push(if by_rows {
+            Record::write(pieces(rows).map(piece), &mut sink)?
+        } else {
+            Record::write([piece(0..rows)], &mut sink)?
         });
     }
     Ok(records)
 }
 
 impl Record {
-    /// Passes the bytes of an array, which comes in one or more pieces of rows, to `sink`; returns its
+    /// Passes the bytes of an array, which consists of one or more pieces of rows, to `sink`; returns its
     /// description.
     fn write(
         pieces: impl IntoIterator<Item = Result<Tensor, BackendError>>,
@@ -97,7 +98,7 @@ impl Record {
     }
 }
 
-/// The safetensors header. The library has its metadata in an order that changes from run to run.
+/// The safetensors header. The library's own type writes the metadata in an order that changes from run to run.
 #[derive(Serialize)]
 struct Table {
     #[serde(rename = "__metadata__")]
@@ -106,7 +107,7 @@ struct Table {
     tensors: Metadata,
 }
 
-/// The safetensors header, padded to align the arrays.
+/// Encodes the safetensors header, padded to align the arrays.
 fn header_bytes(header: &Header, records: &[Record]) -> io::Result<Vec<u8>> {
     let contents = Contents { header, tensors: records.to_vec() };
     let json = serde_json::to_string(&contents)?;

@@ -1,38 +1,38 @@
-//! Exposures that cameras report in EXIF, held against the colours of tracks.
+//! Initial exposures from EXIF, verified against the colours of tracks.
 //!
-//! Tracks measure what a photograph shows, white balance included; EXIF knows exposure alone, and not what the
-//! camera or a program did to the picture afterwards. So EXIF stands in for tracks where these say nothing of a
-//! photograph, and is not believed where the two contradict each other.
+//! Track colours measure the actual photograph, including white balance; EXIF knows only the exposure, not later
+//! processing by the camera or a program. So EXIF is used only for photographs without track colours, and not at all
+//! if it contradicts the track colours of the others.
 
 use densify_data::track_colours::exposures::STOPS;
 
-/// Fewest photographs of which both must be known to compare them.
+/// Smallest number of photographs with both EXIF and track colours for a comparison.
 const MIN_COMPARED: usize = 3;
 /// Largest difference between the two, as a share of the larger spread.
-const MOST_APART: f64 = 0.5;
-/// A difference that is believed however small the spread `[stops]`.
-const NO_CONTRADICTION: f64 = 0.3;
+const MAX_DIFFERENCE: f64 = 0.5;
+/// A difference that is accepted however small the spread `[stops]`.
+const NEGLIGIBLE_DIFFERENCE: f64 = 0.3;
 
-/// What became of the exposures that are reported.
+/// The use made of exposures from EXIF.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Believed {
-    /// None is needed or usable.
-    Nothing,
-    /// So many views begin with them.
+pub enum ExifUse {
+    /// None was needed or usable.
+    Unused,
+    /// Number of views that start with the exposure from EXIF.
     Views(usize),
-    /// None: they contradict tracks by so much (root mean square).
+    /// Not used, because they contradict the track colours.
     Contradicted {
-        /// `[stops]`.
+        /// Root mean square difference `[stops]`.
         by: f64,
     },
 }
 
-/// Completes gains, which are `known` of some views by their tracks' colours, with the exposures that others
-/// report `[stops]`; the mean over all of which anything is known becomes 1.
+/// Sets the gains of views without `known` track colours from exposures in EXIF `[stops]`. Afterwards the geometric mean of
+/// all known gains is 1.
 ///
 /// # Panics
-/// When the three are not of as many views.
-pub fn complete(gains: &mut [[f32; 3]], known: &[bool], stops: &[Option<f64>]) -> Believed {
+/// When the slices have different lengths.
+pub fn complete_gains(gains: &mut [[f32; 3]], known: &[bool], stops: &[Option<f64>]) -> ExifUse {
     assert!(gains.len() == known.len() && known.len() == stops.len(), "views differ");
     let by_tracks = |view: usize| {
         let sum: f64 = gains[view].iter().map(|&gain| f64::from(gain).log2()).sum();
@@ -42,14 +42,14 @@ pub fn complete(gains: &mut [[f32; 3]], known: &[bool], stops: &[Option<f64>]) -
     let both: Vec<(f64, f64)> =
         both.filter_map(|view| Some((by_tracks(view), stops[view]?))).collect();
     let offset = if known.contains(&true) {
-        let apart = spread(both.iter().map(|(tracks, exif)| exif - tracks));
+        let difference = spread(both.iter().map(|(tracks, exif)| exif - tracks));
         let [tracks, exif] =
             [spread(both.iter().map(|pair| pair.0)), spread(both.iter().map(|pair| pair.1))];
         if both.len() < MIN_COMPARED {
-            return Believed::Nothing;
+            return ExifUse::Unused;
         }
-        if apart > NO_CONTRADICTION.max(MOST_APART * tracks.max(exif)) {
-            return Believed::Contradicted { by: apart };
+        if difference > NEGLIGIBLE_DIFFERENCE.max(MAX_DIFFERENCE * tracks.max(exif)) {
+            return ExifUse::Contradicted { by: difference };
         }
         mean(both.iter().map(|(tracks, exif)| exif - tracks))
     } else {
@@ -59,26 +59,26 @@ pub fn complete(gains: &mut [[f32; 3]], known: &[bool], stops: &[Option<f64>]) -
     let reporting: Vec<(usize, f64)> =
         reporting.filter_map(|view| Some((view, stops[view]?))).collect();
     if reporting.is_empty() {
-        return Believed::Nothing;
+        return ExifUse::Unused;
     }
     for &(view, stops) in &reporting {
         gains[view] = [((stops - offset) / STOPS).exp2() as f32; 3];
     }
-    let told: Vec<usize> =
+    let with_gains: Vec<usize> =
         (0..known.len()).filter(|&view| known[view] || stops[view].is_some()).collect();
     let log = |gains: &[[f32; 3]], channel: usize| {
-        mean(told.iter().map(|&view| f64::from(gains[view][channel]).log2()))
+        mean(with_gains.iter().map(|&view| f64::from(gains[view][channel]).log2()))
     };
     let middle = [0, 1, 2].map(|channel| log(gains, channel));
-    for &view in &told {
+    for &view in &with_gains {
         for (gain, middle) in gains[view].iter_mut().zip(middle) {
             *gain = (f64::from(*gain) / middle.exp2()) as f32;
         }
     }
-    Believed::Views(reporting.len())
+    ExifUse::Views(reporting.len())
 }
 
-/// Root mean square difference from the mean; 0 of nothing.
+/// Root mean square difference from the mean; 0 without values.
 #[must_use]
 pub fn spread(values: impl Iterator<Item = f64> + Clone) -> f64 {
     let middle = mean(values.clone());
@@ -103,24 +103,24 @@ mod tests {
     }
 
     #[test]
-    fn without_tracks_the_reported_differences_are_begun_with() {
+    fn without_tracks_gains_follow_exif() {
         let mut gains = [[1.0; 3]; 4];
         let stops = [Some(-7.0), Some(-5.0), None, Some(-6.0)];
-        assert_eq!(complete(&mut gains, &[false; 4], &stops), Believed::Views(3));
+        assert_eq!(complete_gains(&mut gains, &[false; 4], &stops), ExifUse::Views(3));
         for (found, expected) in gains.into_iter().zip([-1.0, 1.0, 0.0, 0.0].map(gain)) {
             assert!(near(found, expected), "{found:?} {expected:?}");
         }
     }
 
     #[test]
-    fn views_that_tracks_do_not_know_are_placed_among_those_that_they_do() {
+    fn exif_fills_in_views_without_track_colours() {
         let tracks = [-1.0, 0.0, 1.0, 0.0];
         let mut gains = tracks.map(gain);
         gains[3] = [1.0; 3];
-        // A tenth of a stop of error, and another zero.
+        // Errors of a tenth of a stop, and another zero point.
         let stops = [Some(4.1), Some(5.0), Some(5.9), Some(6.0)];
         let known = [true, true, true, false];
-        assert_eq!(complete(&mut gains, &known, &stops), Believed::Views(1));
+        assert_eq!(complete_gains(&mut gains, &known, &stops), ExifUse::Views(1));
         // The fourth lies a stop above the second, and the mean of all four is 1.
         for (found, expected) in gains.into_iter().zip([-1.25, -0.25, 0.75, 0.75].map(gain)) {
             assert!(near(found, expected), "{found:?} {expected:?}");
@@ -128,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn what_contradicts_tracks_or_cannot_be_compared_changes_nothing() {
+    fn contradicting_or_incomparable_exif_changes_nothing() {
         let known = [true, true, true, false];
         let tracks = [-1.0, 0.0, 1.0, 0.0].map(gain);
         for (stops, expected) in [
@@ -138,21 +138,21 @@ mod tests {
             ([Some(4.0), Some(5.0), Some(6.0), None], false),
         ] {
             let mut gains = tracks;
-            let found = complete(&mut gains, &known, &stops);
-            assert_eq!(matches!(found, Believed::Contradicted { .. }), expected, "{found:?}");
-            assert!(expected || found == Believed::Nothing, "{found:?}");
+            let found = complete_gains(&mut gains, &known, &stops);
+            assert_eq!(matches!(found, ExifUse::Contradicted { .. }), expected, "{found:?}");
+            assert!(expected || found == ExifUse::Unused, "{found:?}");
             assert_eq!(gains, tracks);
         }
-        // Tracks that show no difference are believed too.
+        // Track colours without differences also contradict EXIF.
         let mut alike = [[1.0; 3]; 4];
         let stops = [Some(1.0), Some(3.0), Some(5.0), Some(9.0)];
-        assert!(matches!(complete(&mut alike, &known, &stops), Believed::Contradicted { .. }));
+        assert!(matches!(complete_gains(&mut alike, &known, &stops), ExifUse::Contradicted { .. }));
         assert_eq!(alike, [[1.0; 3]; 4]);
-        // Spreads of 0.35 and of 0.24 stops.
+        // EXIF spreads of 0.35 and 0.24 stops.
         for (apart, expected) in [(0.43, true), (0.3, false)] {
             let stops = [Some(5.0 - apart), Some(5.0), Some(5.0 + apart), Some(5.0)];
-            let found = complete(&mut alike.clone(), &known, &stops);
-            assert_eq!(matches!(found, Believed::Contradicted { .. }), expected, "{found:?}");
+            let found = complete_gains(&mut alike.clone(), &known, &stops);
+            assert_eq!(matches!(found, ExifUse::Contradicted { .. }), expected, "{found:?}");
         }
     }
 }

@@ -1,8 +1,8 @@
-//! Makes the first Gaussians from points, never more than the budget.
+//! Initialises Gaussians from points, never more than the budget.
 //!
-//! As in 3DGS (Kerbl et al. 2023, §4 and its code): isotropic, the standard deviation the root
-//! mean square distance to the 3 nearest neighbours, opacity 0.1, colour in band 0. All in f64 and
-//! relative to the scene's size, so that remote and tiny scenes lose no precision.
+//! As in 3DGS (Kerbl et al. 2023, §4 and its code), Gaussians are isotropic with the root mean square distance to the 3
+//! nearest neighbours as standard deviation, opacity 0.1, and colour in band 0. Everything is computed in f64 and
+//! relative to the size of the scene, so that remote and tiny scenes lose no precision.
 
 mod random;
 
@@ -20,49 +20,52 @@ use densify_data::dataset::normalise::EXTENT;
 pub use random::random_points;
 
 /// Diameter D of a normalised scene `[scene units]`; scales and floors are relative to it.
-pub const SCENE_DIAMETER: f64 = 2.0 * EXTENT;
-/// Smallest root mean square distance used: points closer than 1e-4·D are one surface sample. (The
-/// absolute floor of the original would exceed a scene of a few millimetres.)
+const SCENE_DIAMETER: f64 = 2.0 * EXTENT;
+/// Smallest root mean square distance used: points closer than 1e-4·D count as one surface sample. (The absolute floor
+/// of the original code would exceed the size of a scene of a few millimetres.)
 const DISTANCE_FLOOR: f64 = 1e-4 * SCENE_DIAMETER;
-/// Standard deviation if there is only one point.
+/// Standard deviation for a single point.
 const SINGLE_POINT_SCALE: f64 = 0.01 * SCENE_DIAMETER;
-/// Opacity at the start.
+/// Initial opacity.
 const OPACITY: f64 = 0.1;
-/// Colours stay half an 8-bit step away from 0 and 1: the renderer clamps colours at 0, where black
-/// would have no gradient.
+/// Colours stay half an 8-bit step away from 0 and 1, because the renderer clamps colours at 0, where black would have no
+/// gradient.
 const COLOUR_MARGIN: f64 = 1.0 / 510.0;
 
-/// Numbers of points used and dropped.
+/// Numbers of points that were used and dropped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct InitReport {
-    /// Points given.
+    /// Number of points before initialisation.
     pub points: usize,
-    /// Points dropped because another is at exactly the same place.
+    /// Points dropped because another has exactly the same position.
     pub duplicates: usize,
     /// Points dropped because they are not finite in f32.
     pub unusable: usize,
-    /// Points dropped, at random by the seed, because they exceed the budget.
+    /// Points dropped at random because they exceed the budget.
     pub over_budget: usize,
-    /// Rows made from the others.
+    /// Gaussians created from the remaining points.
     pub rows: usize,
 }
 
-/// Why the first Gaussians cannot be made, with the remedy.
+/// Reason why Gaussians cannot be initialised, with the remedy.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0}")]
 pub struct InitError(String);
 
-/// Makes one Gaussian per point, in normalised coordinates. If there are more points than `budget`,
-/// the seed chooses a subset. Rows near each other in space are mostly near each other in order.
+/// Creates one Gaussian per point, in normalised coordinates. If there are more points than `budget`, the seed determines
+/// a random subset. Gaussians close in space are mostly close in order, too.
+///
+/// # Errors
+/// When there is no usable point, and when the budget or the degree is invalid.
 pub fn initialise(
     points: &PointCloud,
     budget: usize,
     sh_degree: u8,
     seed: u64,
 ) -> Result<(Gaussians, InitReport), InitError> {
-    let bad = |why: &str| Err(InitError(why.to_owned()));
+    let bad = |reason: &str| Err(InitError(reason.to_owned()));
     if budget == 0 {
-        return bad("a budget of 0 Gaussians holds no model; give --budget at least 1");
+        return bad("a budget of 0 Gaussians leaves no model; give --budget at least 1");
     }
     if sh_degree > densify_core::gaussians::MAX_SH_DEGREE {
         return bad(&format!(
@@ -77,7 +80,7 @@ pub fn initialise(
     report.duplicates = usable - chosen.len();
     if chosen.is_empty() {
         return bad(
-            "the scene has no usable point to start from; start from random ones with --init random",
+            "the scene has no usable initial points; start from random points with --init random",
         );
     }
     if chosen.len() > budget {
@@ -110,7 +113,7 @@ pub fn initialise(
     Ok((gaussians, report))
 }
 
-/// Number of rows that [`initialise`] makes of these points without a limit.
+/// Number of Gaussians that [`initialise`] creates from these points without a budget.
 #[must_use]
 pub fn usable_points(points: &PointCloud) -> usize {
     let mut chosen = finite(points);
@@ -122,7 +125,7 @@ fn finite(points: &PointCloud) -> Vec<usize> {
     (0..points.len()).filter(|&i| points.positions[i].as_vec3().is_finite()).collect()
 }
 
-/// Applies the start that a policy requests.
+/// Applies the initial opacity and scale that a policy requests.
 pub fn restart(model: &mut Gaussians, rule: &StartRule) {
     if let Some(opacity) = rule.opacity {
         model.opacity_logits.fill(logit(opacity));
@@ -133,7 +136,7 @@ pub fn restart(model: &mut Gaussians, rule: &StartRule) {
     }
 }
 
-/// Keeps the first of several points at the same place.
+/// Keeps the first of several points with the same position.
 fn drop_duplicates(chosen: &mut Vec<usize>, positions: &[DVec3]) {
     // −0 equals 0.
     let key = |i: usize| positions[i].to_array().map(|v| (v + 0.0).to_bits());
@@ -144,13 +147,12 @@ fn drop_duplicates(chosen: &mut Vec<usize>, positions: &[DVec3]) {
     *chosen = order;
 }
 
-/// Logarithm of the root mean square distance to the (up to) three nearest neighbours. The points are
-/// distinct.
+/// Logarithms of the root mean square distances to the (up to) three nearest neighbours. The points are distinct.
 fn log_scales(positions: &[[f64; 3]]) -> Result<Vec<f32>, InitError> {
     if u32::try_from(positions.len()).is_err() {
         let count = positions.len();
-        let why = format!("{count} points are too many for the neighbour search; use fewer");
-        return Err(InitError(why));
+        let reason = format!("{count} points are too many for the neighbour search; use fewer");
+        return Err(InitError(reason));
     }
     if positions.len() == 1 {
         return Ok(vec![SINGLE_POINT_SCALE.ln() as f32]);

@@ -1,4 +1,4 @@
-//! Random points for datasets without points.
+//! Random initial points for datasets without points.
 
 use glam::{DMat3, DVec2, DVec3};
 use rand_chacha::ChaCha8Rng;
@@ -7,22 +7,22 @@ use rand_chacha::rand_core::{Rng, SeedableRng};
 use densify_core::camera::Camera;
 use densify_data::dataset::PointCloud;
 
-/// Half side of the cube around the focus, as a fraction of the cameras' distance. As in the original:
-/// ±1.3 in NeRF-synthetic scenes, whose cameras are 4.03 away.
+/// Half the side of the cube around the focus, as a fraction of the cameras' distance. As in the original code, it is 1.3
+/// in NeRF-synthetic scenes, whose cameras are 4.03 away.
 const HALF_CUBE: f64 = 1.0 / 3.0;
 /// Depths of background points, as fractions of the cameras' distance from the focus.
 const BACKGROUND_DEPTHS: (f64, f64) = (2.0 / 3.0, 4.0);
 /// Depths in scenes without a focus `[scene units]`; the cameras are within a radius of 1.
 const FREE_DEPTHS: (f64, f64) = (0.25, 5.0);
-/// Smallest colour and width of the range: the middle half, away from the clamp.
+/// Smallest colour and width of the range: the middle half, away from clamping.
 const COLOURS: (u8, u8) = (64, 128);
 
 /// Random points in view of the cameras, in normalised coordinates, with random colours.
 ///
-/// If the cameras look at one object, the points fill a cube around it. With a `background` (images
-/// without alpha) only every other point does; the rest are spread over the views, uniformly in image
-/// and inverse depth. If the cameras have no common focus (a room from inside, a street), all points
-/// are spread over the views. The same arguments give the same points.
+/// If the cameras look at one object, the points fill a cube around it. With a `background` (images without alpha) only
+/// every other point does; the rest are spread over the views, uniformly in image position and inverse depth. If the
+/// cameras have no common focus (a room from inside, a street), all points are spread over the views. Equal arguments
+/// give equal points.
 #[must_use]
 pub fn random_points(count: usize, cameras: &[Camera], background: bool, seed: u64) -> PointCloud {
     let focus = focus(cameras);
@@ -49,8 +49,8 @@ pub fn random_points(count: usize, cameras: &[Camera], background: bool, seed: u
     points
 }
 
-/// The point closest to all optical axes in least squares, and the median distance of the cameras;
-/// `None` if the axes are parallel or do not meet in front of the cameras.
+/// The point closest to all optical axes by least squares, and the median distance of the cameras from it; `None` if the
+/// axes are parallel or do not meet in front of the cameras.
 fn focus(cameras: &[Camera]) -> Option<(DVec3, f64)> {
     let (mut normal, mut right) = (DMat3::ZERO, DVec3::ZERO);
     for camera in cameras {
@@ -61,8 +61,8 @@ fn focus(cameras: &[Camera]) -> Option<(DVec3, f64)> {
         right += across * camera.centre();
     }
     let count = cameras.len() as f64;
-    // The smallest eigenvalue over `count` is the mean square spread of the axes [rad²]; a spread of
-    // a milliradian is noise.
+    // The smallest eigenvalue divided by `count` is the mean square spread of the axes [rad²]; a spread of a milliradian
+    // is noise.
     if (normal * (1.0 / count)).determinant() < 1e-6 || cameras.is_empty() {
         return None;
     }
@@ -72,7 +72,7 @@ fn focus(cameras: &[Camera]) -> Option<(DVec3, f64)> {
         .map(|camera| {
             let offset = focus - camera.centre();
             let depth = offset.dot(camera.forward());
-            // A focus behind the camera does not count.
+            // A camera that looks away from the focus misses it.
             let miss = if depth > 0.0 {
                 (offset - depth * camera.forward()).length()
             } else {
@@ -84,12 +84,12 @@ fn focus(cameras: &[Camera]) -> Option<(DVec3, f64)> {
     distances.sort_unstable_by(f64::total_cmp);
     misses.sort_unstable_by(f64::total_cmp);
     let distance = distances[distances.len() / 2];
-    // Nine of ten cameras see the focus in about the middle third of their image.
+    // Nine in ten cameras must see the focus roughly in the middle third of their images.
     let miss = misses[misses.len() * 9 / 10];
     (miss < 0.5 * distance).then_some((focus, distance))
 }
 
-/// A point in view of one of the cameras.
+/// A random point in view of a random camera.
 fn point_in_view(draw: &mut Draw, cameras: &[Camera], (near, far): (f64, f64)) -> DVec3 {
     let camera = &cameras[((draw.unit() * cameras.len() as f64) as usize).min(cameras.len() - 1)];
     let pixel =
@@ -99,10 +99,11 @@ fn point_in_view(draw: &mut Draw, cameras: &[Camera], (near, far): (f64, f64)) -
     camera.rotation.transpose() * (depth * ray - camera.translation)
 }
 
+/// A random number generator for coordinates.
 struct Draw(ChaCha8Rng);
 
 impl Draw {
-    /// Uniform in [0, 1), 53 bits.
+    /// A uniform number in [0, 1) with 53 bits.
     fn unit(&mut self) -> f64 {
         (self.0.next_u64() >> 11) as f64 * (1.0 / 9_007_199_254_740_992.0)
     }

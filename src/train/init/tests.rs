@@ -1,4 +1,4 @@
-//! Scales, colours and numbers of the first rows; where random points lie.
+//! Tests of initialisation: scales, colours and numbers of Gaussians, and positions of random points.
 
 use rand_chacha::rand_core::Rng;
 
@@ -19,12 +19,12 @@ fn scattered(count: usize, seed: u64) -> PointCloud {
     cloud(&(0..count).map(|_| [unit(), 2.0 * unit(), 0.1 * unit()]).collect::<Vec<_>>())
 }
 
-/// The point that each row was made of.
+/// The point from which each row was created.
 fn origins(model: &Gaussians, points: &PointCloud) -> Vec<usize> {
-    let of = |mean: &[f32; 3]| {
+    let origin = |mean: &[f32; 3]| {
         points.positions.iter().position(|p| p.as_vec3().to_array() == *mean).unwrap()
     };
-    model.means.iter().map(of).collect()
+    model.means.iter().map(origin).collect()
 }
 
 #[test]
@@ -59,7 +59,7 @@ fn scales_agree_with_brute_force() {
 }
 
 #[test]
-fn rows_are_as_the_original_starts_them() {
+fn rows_start_as_in_the_original_code() {
     let points = scattered(100, 1);
     let (model, _) = initialise(&points, 1000, 3, 0).unwrap();
     assert_eq!((model.len(), model.sh.len(), model.sh_degree), (100, 100 * 48, 3));
@@ -108,7 +108,7 @@ fn duplicates_are_merged_and_counted_and_break_nothing() {
     assert_eq!(model, alone);
     let same = cloud(&[[1.0, 2.0, 3.0]; 1000]);
     assert_eq!(initialise(&same, 1000, 0, 0).unwrap().0.len(), 1);
-    // A plane, a line: every coordinate but one is equal.
+    // On a line all coordinates but one are equal.
     let line = cloud(&(0..1000).map(|i| [0.0, f64::from(i), 0.0]).collect::<Vec<_>>());
     assert_eq!(initialise(&line, 1000, 0, 0).unwrap().0.len(), 1000);
 }
@@ -124,7 +124,7 @@ fn the_budget_is_kept_by_a_seeded_subsample() {
     assert_eq!(a.len(), 300);
     assert_eq!(a, initialise(&points, 300, 1, 7).unwrap().0);
     assert_ne!(a.means, initialise(&points, 300, 1, 8).unwrap().0.means);
-    // Every part of the cloud is drawn from, not the first 300 points only.
+    // The subset comes from all parts of the cloud, not only from the first points.
     let late = origins(&a, &points).iter().filter(|&&i| i >= 500).count();
     assert!((110..190).contains(&late), "{late} of 300 from the second half");
 }
@@ -143,7 +143,7 @@ fn impossible_requests_are_errors() {
     }
 }
 
-/// Cameras on a circle of radius 1, looking along `direction` of their place.
+/// Cameras on a circle of radius 1, looking in the direction that `direction` returns for their position.
 fn ring(direction: impl Fn(DVec3) -> DVec3) -> Vec<Camera> {
     let camera = |i: u32| {
         let angle = std::f64::consts::TAU * f64::from(i) / 12.0;
@@ -192,7 +192,7 @@ fn random_points_are_where_cameras_look() {
 }
 
 #[test]
-fn a_policy_may_start_otherwise() {
+fn policies_may_change_the_initial_opacity_and_scale() {
     let mut model = Gaussians {
         log_scales: vec![[0.0, 1.0, -2.0]; 2],
         opacity_logits: vec![-3.0, 2.0],

@@ -3,20 +3,20 @@
 //! The image metrics compare a rendered image with a packed target, both in sRGB encoding, and sum
 //! in `f64`, so that results do not depend on the size of the image or the number of threads.
 //! Renders are clamped to `[0, 1]` first, as in a viewer. A target with coverage is composited on
-//! the background of the render. A mask weights the pixels, and scales the error of the render
-//! before windows are taken, so that masked pixels do not affect the SSIM of their neighbours.
+//! the background of the render. A mask weights the pixels. It also scales the error of the render
+//! before filtering, so that masked pixels do not affect their neighbours.
 
+mod error;
 mod flip;
 pub mod geometry;
 mod lpips;
 mod psnr;
 mod ssim;
 
-pub use flip::flip;
-pub use flip::flip_map;
+pub use error::{EvaluateError, MetricError};
+pub use flip::{flip, flip_map};
 pub use lpips::{Lpips, LpipsError, Network};
-pub use psnr::psnr;
-pub use psnr::psnr_between;
+pub use psnr::{psnr, psnr_between};
 pub use ssim::ssim;
 
 use std::ops::Range;
@@ -30,22 +30,22 @@ use densify_core::image::Image8;
 /// Rows of pixels filtered together: few enough that their buffers take a few megabytes, and enough
 /// that rows filtered twice are less than half of the work.
 const BLOCK: usize = 32;
-/// Blocks filtered at a time, so that memory does not grow with the number of processor cores. They have
-/// threads of their own: of each thread that ever filtered one, the allocator would keep the buffers.
-const AT_ONCE: usize = 4;
+/// Number of blocks filtered in parallel, so that memory does not grow with the number of processor cores. Blocks have
+/// their own threads, because the allocator keeps the buffers of every thread that ever filtered one.
+const PARALLEL_BLOCKS: usize = 4;
 static THREADS: LazyLock<Option<ThreadPool>> = LazyLock::new(|| {
-    let threads = rayon::current_num_threads().min(AT_ONCE);
+    let threads = rayon::current_num_threads().min(PARALLEL_BLOCKS);
     ThreadPoolBuilder::new().num_threads(threads).build().ok()
 });
 
-/// Memory for scoring an image of this width with so many threads `[bytes]`: that of [`flip()`],
-/// which needs the most.
+/// Memory for scoring an image of this width with a number of threads `[bytes]`: that of [`flip()`], which needs the
+/// most.
 #[must_use]
 pub fn scratch_bytes(width: u32, threads: usize) -> u64 {
-    flip::bytes_per_block(u64::from(width)) * threads.min(AT_ONCE) as u64
+    flip::bytes_per_block(u64::from(width)) * threads.min(PARALLEL_BLOCKS) as u64
 }
 
-/// The results of `function` for each block of rows of pixels, in order.
+/// Applies a function to each block of rows of pixels in parallel; returns the results in order.
 fn by_blocks<T: Send>(height: usize, function: impl Fn(Range<usize>) -> T + Sync) -> Vec<T> {
     let block = |first: usize| first..(first + BLOCK).min(height);
     let blocks: Vec<_> = (0..height).step_by(BLOCK).map(block).collect();
@@ -55,47 +55,16 @@ fn by_blocks<T: Send>(height: usize, function: impl Fn(Range<usize>) -> T + Sync
     }
 }
 
-/// The sum of pairs of a weighted error and its weight, in order; the weight is above 0.
+/// Adds pairs of a weighted error and its weight, in order.
+///
+/// # Errors
+/// When the total weight is 0.
 fn total(sums: &[[f64; 2]]) -> Result<[f64; 2], MetricError> {
     let total = sums.iter().fold([0.0; 2], |sum, part| [sum[0] + part[0], sum[1] + part[1]]);
     if total[1] == 0.0 { Err(MetricError::NothingToCompare) } else { Ok(total) }
 }
 
-/// Why two images cannot be compared.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum MetricError {
-    /// The render, or a channel of the target, does not have the target's size.
-    #[error("the {part} has {found} values, the target of {width}x{height} px needs {expected}")]
-    Size {
-        /// The render, or the target's colours, coverage or mask.
-        part: &'static str,
-        /// Values it has.
-        found: usize,
-        /// Values it should have.
-        expected: usize,
-        /// The target's width `[px]`.
-        width: u32,
-        /// The target's height `[px]`.
-        height: u32,
-    },
-    /// The image is too small for a network.
-    #[error(
-        "an image of {width}x{height} px is too small for LPIPS; its sides must have at least {least} px"
-    )]
-    TooSmall {
-        /// Least side `[px]`.
-        least: usize,
-        /// The target's width `[px]`.
-        width: u32,
-        /// The target's height `[px]`.
-        height: u32,
-    },
-    /// The mask ignores every pixel.
-    #[error("the mask ignores every pixel of the target; remove the mask, or leave this view out")]
-    NothingToCompare,
-}
-
-/// A render and a target whose sizes agree.
+/// A render and a target of the same size.
 struct Pair<'a> {
     rendered: &'a [f32],
     target: &'a Image8,
@@ -127,12 +96,12 @@ impl<'a> Pair<'a> {
         Ok(Self { rendered, target, background: background.map(f64::from), width, height })
     }
 
-    /// Weight of pixel `p`, in `[0, 1]`.
+    /// Weight of pixel `p` by the mask, in `[0, 1]`.
     fn weight(&self, p: usize) -> f64 {
         self.target.mask.as_ref().map_or(1.0, |mask| f64::from(mask[p]) / 255.0)
     }
 
-    /// Channel `c` of the target at pixel `p`, on the background.
+    /// Channel `c` of pixel `p` of the target, composited on the background.
     fn truth(&self, p: usize, c: usize) -> f64 {
         let colour = f64::from(self.target.rgb[3 * p + c]) / 255.0;
         self.target.alpha.as_ref().map_or(colour, |alpha| {

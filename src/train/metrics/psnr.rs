@@ -5,11 +5,10 @@ use rayon::prelude::*;
 use super::{MetricError, Pair, total};
 use densify_core::image::Image8;
 
-/// PSNR `[dB]` of a render against a target: one mean over all pixels and channels of the image.
+/// PSNR `[dB]` of a render against a target, from one mean over all pixels and channels of the image.
 ///
-/// `rendered`: shape `[height, width, 3]`, clamped to `[0, 1]` here. `background` in `[0, 1]` is the
-/// background of targets with coverage. Infinite when both are equal, NaN when the render
-/// holds a NaN.
+/// `rendered`: shape `[height, width, 3]`, clamped to `[0, 1]` here. Targets with coverage are composited on
+/// `background`, in `[0, 1]`. Infinite for equal images, NaN if the render contains a NaN.
 ///
 /// # Errors
 /// When the sizes differ or the target's mask ignores every pixel.

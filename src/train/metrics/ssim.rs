@@ -12,8 +12,8 @@
 use super::{MetricError, Pair, by_blocks, total};
 use densify_core::image::Image8;
 
-/// Pixels from the window's centre to its edge.
-const REACH: usize = 5;
+/// Radius of the window `[px]`.
+const RADIUS: usize = 5;
 /// Standard deviation of the window `[px]`.
 const SIGMA: f64 = 1.5;
 /// (0.01 · peak)², peak = 1.
@@ -23,9 +23,9 @@ const C2: f64 = 0.03 * 0.03;
 
 /// Mean SSIM of a render against a target, <= 1.
 ///
-/// `rendered`: shape `[height, width, 3]`, clamped to `[0, 1]` here. `background` in `[0, 1]` is the
-/// background of targets with coverage. Images smaller than the window need no special case: beyond
-/// the border both are zero. NaN when the render holds a NaN.
+/// `rendered`: shape `[height, width, 3]`, clamped to `[0, 1]` here. Targets with coverage are composited on
+/// `background`, in `[0, 1]`. Images smaller than the window need no special case, because both are zero beyond the
+/// border. NaN if the render contains a NaN.
 ///
 /// # Errors
 /// When the sizes differ or the target's mask ignores every pixel.
@@ -49,11 +49,11 @@ pub fn ssim(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Result<f
     Ok(similarity / (3.0 * weight))
 }
 
-/// The window along one axis; sums to 1. The window in the plane is its outer product.
-fn window() -> [f64; 2 * REACH + 1] {
-    let mut window = [0.0; 2 * REACH + 1];
+/// The window along one axis, with sum 1. The two-dimensional window is its outer product.
+fn window() -> [f64; 2 * RADIUS + 1] {
+    let mut window = [0.0; 2 * RADIUS + 1];
     for (i, w) in window.iter_mut().enumerate() {
-        let distance = i as f64 - REACH as f64;
+        let distance = i as f64 - RADIUS as f64;
         *w = (-0.5 * (distance / SIGMA).powi(2)).exp();
     }
     let sum: f64 = window.iter().sum();
@@ -66,16 +66,16 @@ type Moments = [f64; 4];
 /// SSIM of rows `first..last`. Shape: `[last − first, width, 3]`.
 fn block_map(pair: &Pair<'_>, window: &[f64], first: usize, last: usize) -> Vec<f64> {
     let values = 3 * pair.width;
-    let above = first.saturating_sub(REACH);
-    let below = (last + REACH).min(pair.height);
+    let above = first.saturating_sub(RADIUS);
+    let below = (last + RADIUS).min(pair.height);
     let mut across: Vec<Moments> = Vec::with_capacity((below - above) * values);
     let mut row = Vec::with_capacity(values);
     for y in above..below {
         moments_of_row(pair, y, &mut row);
         for i in 0..values {
             let (x, c) = (i / 3, i % 3);
-            let (from, to) = (x.saturating_sub(REACH), (x + REACH + 1).min(pair.width));
-            let taps = &window[from + REACH - x..];
+            let (from, to) = (x.saturating_sub(RADIUS), (x + RADIUS + 1).min(pair.width));
+            let taps = &window[from + RADIUS - x..];
             let mut sum = Moments::default();
             for (w, moments) in
                 taps.iter().zip(row[3 * from + c..].iter().step_by(3)).take(to - from)
@@ -87,11 +87,11 @@ fn block_map(pair: &Pair<'_>, window: &[f64], first: usize, last: usize) -> Vec<
     }
     let mut map = Vec::with_capacity((last - first) * values);
     for y in first..last {
-        let (from, to) = (y.saturating_sub(REACH), (y + REACH + 1).min(pair.height));
+        let (from, to) = (y.saturating_sub(RADIUS), (y + RADIUS + 1).min(pair.height));
         for i in 0..values {
             let mut sum = Moments::default();
             for row in from..to {
-                add(&mut sum, window[row + REACH - y], &across[(row - above) * values + i]);
+                add(&mut sum, window[row + RADIUS - y], &across[(row - above) * values + i]);
             }
             map.push(similarity(sum));
         }
@@ -134,7 +134,7 @@ mod tests {
     use rand::{RngExt, SeedableRng};
     use rand_chacha::ChaCha8Rng;
 
-    /// The textbook formula, straight: a window in the plane, 121 taps per pixel, no identity.
+    /// The textbook formula: a two-dimensional window with 121 taps per pixel.
     fn textbook(x: &[f64], y: &[f64], width: usize, height: usize) -> Vec<f64> {
         let mut window = [[0.0; 11]; 11];
         for (j, row) in window.iter_mut().enumerate() {
@@ -234,7 +234,7 @@ mod tests {
     #[test]
     fn one_pixel_has_a_closed_form() {
         // The window sees the pixel with weight w and zeros elsewhere: μ = w·x, E[x²] = w·x².
-        let w = window()[REACH].powi(2);
+        let w = window()[RADIUS].powi(2);
         let (x, y) = (f64::from(0.75_f32), 51.0 / 255.0);
         let (c1, c2) = (0.01_f64.powi(2), 0.03_f64.powi(2));
         let expected = (2.0 * w * w * x * y + c1) * (2.0 * (w - w * w) * x * y + c2)
@@ -253,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn masked_pixels_leave_no_trace() {
+    fn masked_pixels_have_no_effect() {
         let (mut rendered, mut target) = noisy(20, 20, 0.1, 5);
         let mask: Vec<u8> = (0..400).map(|p| if p % 20 < 10 { 255 } else { 0 }).collect();
         target.mask = Some(mask.clone());

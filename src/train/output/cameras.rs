@@ -13,13 +13,13 @@ struct CameraRecord<'a> {
     height: u32,
     /// The camera's centre.
     position: [f64; 3],
-    /// `world_from_camera`, row by row; columns are the camera's axes (x right, y down, z forward).
+    /// Rows of `world_from_camera`, whose columns are the camera's axes (x right, y down, z forward).
     rotation: [[f64; 3]; 3],
     fy: f64,
     fx: f64,
 }
 
-/// Cameras in world coordinates with the names of their images, numbered in order, as JSON.
+/// JSON of cameras in world coordinates with the names of their images, numbered in order.
 pub fn cameras_json<'a>(
     cameras: impl IntoIterator<Item = (&'a str, Camera)>,
 ) -> serde_json::Result<String> {

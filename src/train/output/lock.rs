@@ -1,4 +1,4 @@
-//! The lock on the folder of a run: at most one process trains in it, from its first file to its last.
+//! The lock on the folder of a run, which ensures that only one process trains in it.
 
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{Read, Seek, Write};
@@ -7,16 +7,15 @@ use std::path::{Path, PathBuf};
 use densify_core::files;
 use densify_core::files::FileError;
 
-/// Name of the locked file. It holds the number of the process that trains.
+/// Name of the locked file, which contains the id of the training process.
 pub(super) const LOCK: &str = "densify.lock";
 
-/// How often the file is locked just when its holder removes it, at most.
+/// Number of attempts if the file is removed by its previous holder while it is being locked.
 const TRIES: usize = 10;
 
-/// The lock of a process on a folder; it ends with the process, even by a kill.
+/// A lock on a folder, which the system releases when the process ends, even if it is killed.
 ///
-/// Only Unix has locks that readers of the file need not mind; elsewhere, and on a file system without
-/// locks, folders are not guarded.
+/// Folders are locked only on Unix, whose locks do not prevent reading the file, and only on file systems with locks.
 #[derive(Debug)]
 pub(super) struct FolderLock {
     path: PathBuf,
@@ -40,13 +39,13 @@ impl FolderLock {
             match file.try_lock() {
                 Ok(()) => {}
                 Err(TryLockError::WouldBlock) => return Err(in_use(folder, file)),
-                // Such as a network file system without a lock service.
+                // The file system has no locks, as some network file systems.
                 Err(TryLockError::Error(_)) => break,
             }
-            // The process that had it may have removed the file just before.
+            // The previous holder may have removed the file in the meantime.
             if is_at(&file, &path) {
                 let number = std::process::id().to_string();
-                // The lock holds without the number, too.
+                // The lock works without the id, too.
                 let _ = file.set_len(0).and_then(|()| file.write_all(number.as_bytes()));
                 return Ok(Self { path, file: Some(file) });
             }
@@ -55,7 +54,7 @@ impl FolderLock {
         Ok(Self { path, file: None })
     }
 
-    /// Fails while a process has the lock on a folder. Writes nothing.
+    /// Checks that no process holds the lock on a folder, without writing anything.
     ///
     /// # Errors
     /// [`FileError::Unfit`].
@@ -69,8 +68,7 @@ impl FolderLock {
         Ok(())
     }
 
-    /// Fails when the folder is no longer locked by this process: it, or the file in it, may have been
-    /// moved or replaced meanwhile.
+    /// Checks that this process still holds the lock: the folder or the locked file may have been moved or replaced.
     ///
     /// # Errors
     /// [`FileError::Lost`].
@@ -94,14 +92,14 @@ fn in_use(folder: &Path, mut file: File) -> FileError {
     let mut number = String::new();
     let read = file.rewind().and_then(|()| Read::take(&mut file, 32).read_to_string(&mut number));
     let process = read.ok().and_then(|_| number.parse::<u32>().ok());
-    let who = process.map_or("another process".to_owned(), |number| format!("process {number}"));
+    let holder = process.map_or("another process".to_owned(), |number| format!("process {number}"));
     let folder = folder.display();
     FileError::Unfit(format!(
-        "{folder} is in use: {who} is training there; wait for it, stop it, or choose another folder with -o"
+        "{folder} is in use: {holder} is training there; wait for it, stop it, or choose another folder with -o"
     ))
 }
 
-/// Whether an open file is the one at a path.
+/// Whether an open file is the file at a path.
 #[cfg(unix)]
 fn is_at(file: &File, path: &Path) -> bool {
     use std::os::unix::fs::MetadataExt;
@@ -121,7 +119,7 @@ mod tests {
 
     #[cfg(unix)]
     #[test]
-    fn one_holder_at_a_time_who_is_named_and_leaves_nothing() {
+    fn there_is_one_holder_at_a_time() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path();
         FolderLock::check(path).unwrap();
@@ -134,11 +132,11 @@ mod tests {
         }
         drop(held);
         assert_eq!(std::fs::read_dir(path).unwrap().count(), 0);
-        // What a killed process leaves does not lock.
+        // The file of a killed process does not lock the folder.
         std::fs::write(path.join(LOCK), "1").unwrap();
         FolderLock::check(path).unwrap();
         let held = FolderLock::take(path).unwrap();
-        // Whoever replaces the file has the folder.
+        // A process that replaces the file gets the lock.
         std::fs::remove_file(path.join(LOCK)).unwrap();
         let other = FolderLock::take(path).unwrap();
         assert!(held.confirm().is_err() && other.confirm().is_ok());

@@ -1,20 +1,20 @@
-//! Writes the folder of a run, and reads it back; no file in it is ever half written.
+//! Writes and reads the folder of a run. Files in it are never incomplete.
 //!
 //! ```text
 //! RUN/
-//!   config.toml                                  everything needed to repeat the run
+//!   config.toml                                  everything needed to reproduce the run
 //!   cameras.json                                 all cameras, world coordinates
 //!   point_cloud/iteration_N/point_cloud.ply      the model
-//!   point_cloud/iteration_N/exposure.json        how the training views were exposed
-//!   checkpoints/iteration_N.safetensors          to continue the run from
+//!   point_cloud/iteration_N/exposure.json        exposures of the training views
+//!   checkpoints/iteration_N.safetensors          state for continuing the run
 //!   stats/train.jsonl  events.jsonl  summary.json  requirements.json
-//!   results.json  per_view.json                  test scores, as the original trainer lays them out
+//!   results.json  per_view.json                  test scores in the format of the original trainer
 //!   geometry.json                                errors against a known surface
 //!   events.out.tfevents.*                        the same curves for TensorBoard
 //! ```
 //!
 //! A file appears under its name only when it is complete ([`densify_core::files::write_atomically`]). The two logs and
-//! the TensorBoard file grow by whole records.
+//! the TensorBoard file grow by complete records.
 
 mod cameras;
 mod folder;

@@ -1,4 +1,4 @@
-//! Reads the numbers that a run has written.
+//! Reads the statistics and scores in the folder of a run.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -14,68 +14,71 @@ use crate::trainer::EditEvent;
 use densify_core::files;
 use densify_core::files::FileError;
 
-/// Most bytes of a file of numbers that is read.
+/// Largest file that is read `[bytes]`.
 const MOST_BYTES: u64 = 256 << 20;
 
-/// The mean scores of an iteration on the test views, if there are any.
+/// The mean scores of an iteration on the test views, if it was evaluated.
+///
+/// # Errors
+/// When the file exists but cannot be read. This also holds for the other functions of this module.
 pub fn scores_of(run: &Path, iteration: u32) -> Result<Option<Mean>, FileError> {
     entry_of(&run.join("results.json"), iteration)
 }
 
-/// The geometric measurements of an iteration on the test views, if there are any.
+/// The geometric measurements of an iteration on the test views, if it was measured.
 pub fn geometry_of(run: &Path, iteration: u32) -> Result<Option<Geometry>, FileError> {
     entry_of(&run.join(geometry_file(Split::Test)), iteration)
 }
 
-/// The mean scores of all measured iterations on the test views.
+/// The mean scores on the test views by iteration.
 pub fn all_scores(run: &Path) -> Result<BTreeMap<u32, Mean>, FileError> {
     let path = run.join("results.json");
     let score = |(name, entry): (String, Value)| {
         let iteration = name.strip_prefix("ours_").and_then(|number| number.parse().ok());
-        let iteration = iteration
-            .ok_or_else(|| FileError::malformed(&path, format!("{name:?} is no iteration")))?;
+        let iteration = iteration.ok_or_else(|| {
+            FileError::malformed(&path, format!("{name:?} is not an iteration"))
+        })?;
         let mean = serde_json::from_value(entry).map_err(|e| FileError::malformed(&path, e))?;
         Ok((iteration, mean))
     };
     read_entries(&path)?.into_iter().map(score).collect()
 }
 
-/// The PSNR of each test view with the model of an iteration `[dB]`, by the view's name; none where it was not
-/// measured.
+/// The PSNR of each test view with the model of an iteration `[dB]`, by the view's name; empty if it was not evaluated.
 pub fn psnr_by_view(run: &Path, iteration: u32) -> Result<BTreeMap<String, f64>, FileError> {
     let path = run.join("per_view.json");
     let columns: Option<BTreeMap<String, BTreeMap<String, Option<f64>>>> =
         entry_of(&path, iteration)?;
     let psnr = columns.and_then(|mut columns| columns.remove("PSNR")).unwrap_or_default();
-    // Equal images have no number.
+    // The infinite PSNR of equal images is null in JSON.
     Ok(psnr.into_iter().map(|(name, psnr)| (name, psnr.unwrap_or(f64::INFINITY))).collect())
 }
 
-/// The records of `stats/train.jsonl`; none without the file.
+/// The records of `stats/train.jsonl`; empty without the file.
 pub fn steps_of(run: &Path) -> Result<Vec<StepRecord>, FileError> {
     read_log(&run.join("stats/train.jsonl"))
 }
 
-/// The records of `stats/events.jsonl`; none without the file.
+/// The records of `stats/events.jsonl`; empty without the file.
 pub fn events_of(run: &Path) -> Result<Vec<EditEvent>, FileError> {
     read_log(&run.join("stats/events.jsonl"))
 }
 
-/// `stats/summary.json`; `None` without the file, as while the run trains.
+/// Reads `stats/summary.json`; `None` without the file, as during training.
 pub fn summary_of(run: &Path) -> Result<Option<Summary>, FileError> {
     read_stats(&run.join("stats/summary.json"))
 }
 
-/// A JSON file of a run; `None` where it does not exist.
+/// Reads a JSON file; `None` if it does not exist.
 pub fn read_stats<T: DeserializeOwned>(path: &Path) -> Result<Option<T>, FileError> {
     let parsed = text_of(path)?.map(|text| serde_json::from_str(&text));
     parsed.transpose().map_err(|e| FileError::malformed(path, e))
 }
 
-/// The records of a log.
+/// Reads the complete records of a log.
 fn read_log<T: DeserializeOwned>(path: &Path) -> Result<Vec<T>, FileError> {
     let text = text_of(path)?.unwrap_or_default();
-    // What a process writes just now may not be whole yet.
+    // The last record may be incomplete while a process writes it.
     let whole = text.rfind('\n').map_or("", |end| &text[..end]);
     let record = |(at, line): (usize, &str)| {
         let record = serde_json::from_str(line);
@@ -95,18 +98,18 @@ pub(super) fn entry_name(iteration: u32) -> String {
     format!("ours_{iteration}")
 }
 
-/// The entry of an iteration, if there is any.
+/// Reads the entry of an iteration, if there is one.
 fn entry_of<T: DeserializeOwned>(path: &Path, iteration: u32) -> Result<Option<T>, FileError> {
     let entry = read_entries(path)?.remove(&entry_name(iteration));
     entry.map(serde_json::from_value).transpose().map_err(|e| FileError::malformed(path, e))
 }
 
-/// The entries of a file; none if it does not exist.
+/// Reads the entries of a file; empty if it does not exist.
 pub(super) fn read_entries(path: &Path) -> Result<Map<String, Value>, FileError> {
     Ok(read_stats(path)?.unwrap_or_default())
 }
 
-/// The text of a file; `None` where it does not exist.
+/// Reads the text of a file; `None` if it does not exist.
 fn text_of(path: &Path) -> Result<Option<String>, FileError> {
     match files::read_text(path, MOST_BYTES) {
         Ok(text) => Ok(Some(text)),

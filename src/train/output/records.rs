@@ -1,4 +1,4 @@
-//! Writes the numbers of a run: logs, the summary, test scores.
+//! Writes the logs, the summary and the scores of a run.
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
@@ -23,7 +23,10 @@ pub struct RecordLog {
 }
 
 impl RecordLog {
-    /// Starts an empty log; creates the folder.
+    /// Starts an empty log, creating its folder.
+    ///
+    /// # Errors
+    /// [`FileError::Io`].
     pub fn create(path: &Path) -> Result<Self, FileError> {
         if let Some(folder) = path.parent() {
             std::fs::create_dir_all(folder).map_err(FileError::io("create the folder", folder))?;
@@ -35,8 +38,11 @@ impl RecordLog {
         Ok(Self { file, path: path.to_owned() })
     }
 
-    /// Continues a log, cut to the `bytes` that it had at the checkpoint. Also returns whether it still
-    /// had them; missing records stay missing.
+    /// Continues a log, truncated to the length that it had at the checkpoint. Also returns whether the log was still that
+    /// long; missing records stay missing.
+    ///
+    /// # Errors
+    /// [`FileError::Io`].
     pub fn resume(path: &Path, bytes: u64) -> Result<(Self, bool), FileError> {
         let Ok(mut file) = OpenOptions::new().read(true).write(true).open(path) else {
             return Ok((Self::create(path)?, bytes == 0));
@@ -44,7 +50,7 @@ impl RecordLog {
         let mut cut = || {
             let there = file.metadata()?.len();
             if there < bytes {
-                // Keep whole lines only.
+                // Keep complete lines only.
                 let mut text = Vec::new();
                 file.read_to_end(&mut text)?;
                 let end = text.iter().rposition(|&byte| byte == b'\n').map_or(0, |at| at + 1);
@@ -59,7 +65,10 @@ impl RecordLog {
         Ok((Self { file, path: path.to_owned() }, whole))
     }
 
-    /// Syncs the file; returns its length `[bytes]`.
+    /// Syncs the file to disk; returns its length `[bytes]`.
+    ///
+    /// # Errors
+    /// [`FileError::Io`].
     pub fn synced(&self) -> Result<u64, FileError> {
         let length = attempt(Operation::Sync, &self.path)
             .and_then(|()| self.file.sync_all())
@@ -67,22 +76,25 @@ impl RecordLog {
         Ok(length.map_err(FileError::io("write", &self.path))?.len())
     }
 
-    /// Adds a line.
+    /// Appends a record.
+    ///
+    /// # Errors
+    /// [`FileError::Io`].
     pub fn append(&mut self, record: &impl Serialize) -> Result<(), FileError> {
         let line = serde_json::to_string(record).map_err(std::io::Error::other);
-        // One write per line: readers, and a killed process, leave whole lines.
+        // One write per line, so that readers see, and killed processes leave, complete lines.
         let Self { file, path } = self;
         line.and_then(|line| WatchedFile { file, path }.write_all((line + "\n").as_bytes()))
             .map_err(FileError::io("write", path))
     }
 }
 
-/// A line of `stats/train.jsonl`.
+/// A record of `stats/train.jsonl`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct StepRecord {
     /// Iteration, 1-based.
     pub step: u32,
-    /// 0.8·L1 + 0.2·(1 − SSIM), mean over the steps since the last record.
+    /// Mean loss 0.8·L1 + 0.2·(1 − SSIM) over the steps since the last record.
     pub loss: f32,
     /// Mean |I − G| over the same steps.
     pub l1: f32,
@@ -96,7 +108,7 @@ pub struct StepRecord {
     pub resident_bytes: Option<u64>,
 }
 
-/// `stats/summary.json`.
+/// The contents of `stats/summary.json`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Summary {
     /// Version of densify.
@@ -109,15 +121,15 @@ pub struct Summary {
     pub iterations: u32,
     /// Rows at the end.
     pub rows: usize,
-    /// Most rows at any instant.
+    /// Largest number of rows at any time.
     pub peak_rows: usize,
-    /// Most rows allowed.
+    /// Largest number of rows allowed.
     pub budget: usize,
-    /// Training views rendered for the policy's decisions, in addition to one per step.
+    /// Number of training views rendered for the policy's decisions, in addition to one per step.
     pub extra_forwards: u64,
     /// Largest resident memory of the process `[bytes]`, if known.
     pub peak_bytes: Option<u64>,
-    /// The limit set by `--memory` `[bytes]`.
+    /// The memory limit, if one was set `[bytes]`.
     pub memory: Option<u64>,
     /// The ledger's total `[bytes]`.
     pub ledger_bytes: u64,
@@ -125,8 +137,7 @@ pub struct Summary {
     pub ledger: Ledger,
     /// Wall time of all steps `[s]`.
     pub seconds: f64,
-    /// Total wall time of each stage, of the policy's events, of the views rendered for them, and of
-    /// waiting for images `[s]`.
+    /// Total wall time of each stage, of the policy's events, of rendering views for them, and of waiting for images `[s]`.
     pub stage_seconds: BTreeMap<String, f64>,
     /// CPU time of all steps, summed over the threads `[s]`, if known.
     pub cpu_seconds: Option<f64>,
@@ -139,6 +150,9 @@ pub struct Summary {
 }
 
 /// Writes a value as indented JSON.
+///
+/// # Errors
+/// [`FileError::Io`].
 pub fn write_json(path: &Path, value: &impl Serialize) -> Result<(), FileError> {
     write_atomically(path, |out| {
         serde_json::to_writer_pretty(&mut *out, value)?;
@@ -149,6 +163,9 @@ pub fn write_json(path: &Path, value: &impl Serialize) -> Result<(), FileError> 
 /// Adds scores to the files of a split: mean scores to `results.json` as
 /// `{"ours_3000": {"PSNR": …, "SSIM": …, "FLIP": …}}`, scores by view to `per_view.json` as
 /// `{"ours_3000": {"PSNR": {"00000.png": …}, "SSIM": …}}`. Entries of other iterations stay.
+///
+/// # Errors
+/// When an existing file cannot be read, or a file cannot be written.
 pub fn write_scores(
     run: &Path,
     split: Split,
@@ -179,12 +196,15 @@ pub fn write_scores(
         }
     }
     insert_entry(&run.join(per_view), iteration, views.into())?;
-    let mean = serde_json::to_value(Mean::of(scores)).unwrap_or_default();
+    let mean = serde_json::to_value(Mean::over(scores)).unwrap_or_default();
     insert_entry(&run.join(results), iteration, mean)
 }
 
-/// Adds geometric measurements to `geometry.json` (`geometry_train.json` for the views trained
-/// on) as `{"ours_3000": {"depth": {…}, …}}`. Entries of other iterations stay.
+/// Adds geometric measurements to `geometry.json` (`geometry_train.json` for training views) as
+/// `{"ours_3000": {"depth": {…}, …}}`. Entries of other iterations stay.
+///
+/// # Errors
+/// As [`write_scores`].
 pub fn write_geometry(
     run: &Path,
     split: Split,
@@ -249,7 +269,7 @@ mod tests {
     }
 
     #[test]
-    fn a_log_goes_on_where_the_checkpoint_was() {
+    fn a_log_continues_at_the_checkpoint() {
         let root = tempfile::tempdir().unwrap();
         let path = root.path().join("stats/events.jsonl");
         let mut log = RecordLog::create(&path).unwrap();
@@ -262,7 +282,7 @@ mod tests {
             (std::fs::read_to_string(&path).unwrap(), whole)
         };
         assert_eq!(go_on(sound), ("1\n3\n".to_owned(), true));
-        // A log that was cut: its last line is no longer whole.
+        // The last line of a truncated log is incomplete.
         std::fs::write(&path, "1\n2").unwrap();
         assert_eq!(go_on(9), ("1\n3\n".to_owned(), false));
         std::fs::remove_file(&path).unwrap();

@@ -1,6 +1,6 @@
 //! Writes scalars for TensorBoard.
 //!
-//! The file is a sequence of TFRecords, each one an `Event` message in protobuf encoding. Only the
+//! The file is a sequence of TFRecords, each of them an `Event` message in protobuf encoding. Only the
 //! four fields of a scalar are written (`event.proto` and `summary.proto` of TensorFlow), so that no
 //! protobuf library is needed.
 
@@ -23,7 +23,10 @@ pub struct TensorBoard {
 }
 
 impl TensorBoard {
-    /// Starts an event file in `folder`.
+    /// Starts an event file in a folder.
+    ///
+    /// # Errors
+    /// [`FileError::Io`].
     pub fn create(folder: &Path) -> Result<Self, FileError> {
         let now = wall_time();
         // TensorBoard reads any file whose name contains "tfevents", in the order of their names.
@@ -36,8 +39,11 @@ impl TensorBoard {
         Ok(board)
     }
 
-    /// Continues the event file `name` in `folder`, cut to the `bytes` that it had at the checkpoint.
-    /// Starts another file if it is missing or shorter, or if `name` is not the name of an event file.
+    /// Continues the event file `name` in a folder, truncated to the length that it had at the checkpoint. Starts another
+    /// file if it is missing or shorter, or if `name` is not the name of an event file.
+    ///
+    /// # Errors
+    /// [`FileError::Io`].
     pub fn resume(folder: &Path, name: &str, bytes: u64) -> Result<Self, FileError> {
         let path = folder.join(name);
         let ours = name.starts_with(PREFIX) && !name.contains(['/', '\\']);
@@ -50,7 +56,10 @@ impl TensorBoard {
         Ok(Self { file: cut.map_err(FileError::io("cut", &path))?, path })
     }
 
-    /// Syncs the file; returns its name and length `[bytes]`.
+    /// Syncs the file to disk; returns its name and length `[bytes]`.
+    ///
+    /// # Errors
+    /// [`FileError::Io`].
     pub fn synced(&self) -> Result<(String, u64), FileError> {
         let length = attempt(Operation::Sync, &self.path)
             .and_then(|()| self.file.sync_all())
@@ -60,13 +69,16 @@ impl TensorBoard {
         Ok((name.unwrap_or_default(), length))
     }
 
-    /// Adds the value of each tag at `step`.
+    /// Appends the value of each tag at `step`.
+    ///
+    /// # Errors
+    /// [`FileError::Io`].
     pub fn scalars(&mut self, step: u32, values: &[(&str, f32)]) -> Result<(), FileError> {
         self.append(&scalar_event(wall_time(), step, values))
     }
 
     fn append(&mut self, event: &[u8]) -> Result<(), FileError> {
-        // One write per record: readers, and a killed process, leave whole records.
+        // One write per record, so that readers see, and killed processes leave, complete records.
         let Self { file, path } = self;
         WatchedFile { file, path }.write_all(&record(event)).map_err(FileError::io("write", path))
     }
@@ -88,13 +100,13 @@ fn record(data: &[u8]) -> Vec<u8> {
     out
 }
 
-/// The checksum of a TFRecord: CRC-32C, rotated and offset, so that the CRC of data that contains CRCs
-/// is not degenerate.
+/// The checksum of a TFRecord: CRC-32C, rotated and offset, so that CRCs of data that contains CRCs are not
+/// degenerate.
 fn masked_crc(data: &[u8]) -> u32 {
     crc32c::crc32c(data).rotate_right(15).wrapping_add(0xa282_ead8)
 }
 
-/// `Event { wall_time = 1, file_version = 3 }`, the first of a file.
+/// The first event of a file, `Event { wall_time = 1, file_version = 3 }`.
 fn version_event(wall_time: f64) -> Vec<u8> {
     let mut event = Vec::new();
     put_fixed(&mut event, 1, &wall_time.to_le_bytes());
@@ -102,7 +114,7 @@ fn version_event(wall_time: f64) -> Vec<u8> {
     event
 }
 
-/// `Event { wall_time = 1, step = 2, summary = 5 { value = 1 { tag = 1, simple_value = 2 } … } }`.
+/// An event `Event { wall_time = 1, step = 2, summary = 5 { value = 1 { tag = 1, simple_value = 2 } … } }`.
 fn scalar_event(wall_time: f64, step: u32, values: &[(&str, f32)]) -> Vec<u8> {
     let mut summary = Vec::new();
     for (tag, scalar) in values {
@@ -119,13 +131,13 @@ fn scalar_event(wall_time: f64, step: u32, values: &[(&str, f32)]) -> Vec<u8> {
     event
 }
 
-/// A field of 8 or 4 bytes (wire types 1 and 5).
+/// Appends a field of 8 or 4 bytes (wire types 1 and 5).
 fn put_fixed(out: &mut Vec<u8>, field: u8, bytes: &[u8]) {
     out.push(field << 3 | if bytes.len() == 8 { 1 } else { 5 });
     out.extend(bytes);
 }
 
-/// A field with its length in front (wire type 2).
+/// Appends a length-delimited field (wire type 2).
 fn put_bytes(out: &mut Vec<u8>, field: u8, bytes: &[u8]) {
     out.push(field << 3 | 2);
     put_varint(out, bytes.len() as u64);
@@ -145,7 +157,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_first_record_begins_as_every_event_file_does() {
+    fn the_first_record_has_the_signature_of_event_files() {
         let first = record(&version_event(1.7e9));
         // Length 24, its checksum, then the tag of a double: the signature of event files.
         assert_eq!(&first[..13], b"\x18\0\0\0\0\0\0\0\xa3\x7fK\"\x09");
@@ -171,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_goes_on_where_the_checkpoint_was() {
+    fn a_file_continues_at_the_checkpoint() {
         let root = tempfile::tempdir().unwrap();
         let mut board = TensorBoard::create(root.path()).unwrap();
         board.scalars(1, &[("loss", 0.25)]).unwrap();
@@ -179,7 +191,7 @@ mod tests {
         board.scalars(2, &[("loss", 0.5)]).unwrap();
         let board = TensorBoard::resume(root.path(), &name, bytes).unwrap();
         assert_eq!(board.synced().unwrap(), (name.clone(), bytes));
-        // None of ours: it is not touched.
+        // Other files are not modified.
         let other = root.path().join("notes");
         std::fs::write(&other, "mine").unwrap();
         for foreign in ["notes", "../notes", "events.out.tfevents./../notes"] {

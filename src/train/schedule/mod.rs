@@ -1,9 +1,9 @@
 //! Schedules of a run: step sizes, spherical-harmonic degree, view order, background.
 //!
-//! All are pure functions of their arguments, so that a run can be repeated, or resumed at any
-//! step, without replaying the steps before. Constants are those of Kerbl et al., *3D
-//! Gaussian Splatting for Real-Time Radiance Field Rendering* (SIGGRAPH 2023), section 5 and its
-//! published code, for a run of 30,000 steps; shorter and longer runs scale them in proportion.
+//! All are pure functions of their arguments, so that a run can be reproduced, or resumed at any step without replaying
+//! the steps before. Constants are those of Kerbl et al., *3D Gaussian Splatting for Real-Time Radiance Field Rendering*
+//! (SIGGRAPH 2023), section 5 and its published code, for a run of 30,000 steps; they are scaled in proportion to the
+//! length of a run.
 
 use std::fmt;
 use std::str::FromStr;
@@ -17,28 +17,28 @@ use densify_core::gaussians::MAX_SH_DEGREE;
 use densify_render::LearningRates;
 
 /// Length of the run for which the published constants were chosen `[steps]`.
-pub const REFERENCE_ITERATIONS: u32 = 30_000;
+pub use densify_policies::parameters::REFERENCE_ITERATIONS;
 
-/// Step sizes of a run. The means' step size is a fraction of the scene's extent and falls
-/// log-linearly over the run; all others are constant unless their value at the end is given.
+/// Step sizes (learning rates) of a run. That of the means is a fraction of the scene's extent and falls log-linearly over
+/// the run; all others are constant unless their value at the end is given.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RateOptions {
-    /// Means, at the start of the run `[fraction of the extent per step]`, > 0.
+    /// Means at the start of the run `[fraction of the extent per step]`, > 0.
     pub mean_start: f64,
-    /// Means, at the end of the run `[fraction of the extent per step]`, > 0.
+    /// Means at the end of the run `[fraction of the extent per step]`, > 0.
     pub mean_end: f64,
     /// Log-scales, > 0.
     pub log_scale: f32,
     /// Quaternions, > 0.
     pub quat: f32,
-    /// Opacity logits, > 0. The first release used 0.05, those since October 2024 use 0.025.
+    /// Opacity logits, > 0. The first release of 3DGS used 0.05; those since October 2024 use 0.025.
     pub opacity: f32,
     /// Spherical-harmonic coefficients of band 0, > 0.
     pub sh_dc: f32,
     /// Spherical-harmonic coefficients of bands 1–3, > 0.
     pub sh_rest: f32,
-    /// Log-scales at the end of the run, > 0; `None`: as at the start, for this and the next four.
+    /// Log-scales at the end of the run, > 0. For this and the next four, `None` means as at the start.
     pub log_scale_end: Option<f32>,
     /// Quaternions at the end of the run.
     pub quat_end: Option<f32>,
@@ -48,13 +48,13 @@ pub struct RateOptions {
     pub sh_dc_end: Option<f32>,
     /// Spherical-harmonic coefficients of bands 1–3 at the end of the run.
     pub sh_rest_end: Option<f32>,
-    /// Factor, at the end of the run, of the step sizes of opacities and of all spherical-harmonic
-    /// coefficients, > 0. It falls log-linearly from 1, which it is up to `fade_from`.
+    /// Final factor of the step sizes of opacities and all spherical-harmonic coefficients, > 0. The factor is 1 up to
+    /// `fade_from` and then changes log-linearly.
     pub fade: f64,
     /// Share of the run after which these step sizes fade, in (0, 1].
     pub fade_from: f64,
-    /// Factor of all step sizes at the start of the run, > 0; it falls log-linearly to 1 at the end,
-    /// so that the last steps are as fine as in a long run.
+    /// Initial factor of all step sizes, > 0. It falls log-linearly to 1 at the end of the run, so that the last steps are
+    /// as fine as in a long run.
     pub boost: f64,
 }
 
@@ -81,17 +81,16 @@ impl Default for RateOptions {
 }
 
 impl RateOptions {
-    /// The default step sizes of a run of so many iterations. Runs of fewer than 30,000 start with
-    /// b = (30,000 / iterations)^0.6 times the published ones, at most 5 times, and the step size of
-    /// colour bands 1–3 keeps an additional factor of min(b, 2) to the end.
+    /// The default step sizes of a run. Runs of fewer than 30,000 iterations start with b = (30,000 / iterations)^0.6
+    /// times the published step sizes, at most 5 times, and the step size of colour bands 1–3 keeps an additional factor
+    /// of min(b, 2) to the end.
     ///
-    /// A short run has to come as far in fewer steps. Measured on three scenes at 2,000–3,000
-    /// iterations: with the published sizes rows are still far from their optimum at the end, and
-    /// training views are as blurred as test views. View-dependent colour, which has the smallest
-    /// steps and starts last, still lags behind: twice its step size gave +0.39, +0.23 and +0.18 dB
-    /// (cup, three seeds), +0.20 (office), +0.59 (beercan) and −0.04 (room256);
-    /// four times gave less. It costs where colour does not depend on the view: −0.76 dB on the
-    /// built-in `scene:room` (`--lr sh_rest=1.25e-4` is the published size).
+    /// Short runs must reach the same result in fewer steps. In measurements on three scenes at 2,000–3,000 iterations,
+    /// the published step sizes left Gaussians far from their optimum, with training views as blurred as test views.
+    /// View-dependent colour, which has the smallest steps and starts last, still lagged behind: twice its step size gave
+    /// +0.39, +0.23 and +0.18 dB (cup, three seeds), +0.20 (office), +0.59 (beercan) and −0.04 (room256); four times gave
+    /// less. It costs quality where colour does not depend on the view: −0.76 dB on the built-in `scene:room` (the
+    /// published value of `sh_rest` is 1.25e-4).
     #[must_use]
     pub fn for_run(iterations: u32) -> Self {
         let shortage = f64::from(REFERENCE_ITERATIONS) / f64::from(iterations.max(1));
@@ -100,8 +99,8 @@ impl RateOptions {
         Self { boost, sh_rest: published.sh_rest * boost.min(2.0) as f32, ..published }
     }
 
-    /// These step sizes as they are at the end, from the start on: a model that is trained already keeps what it has
-    /// learned, of which larger steps take 4 to 6 dB at first.
+    /// The final step sizes for the whole run, for models that are trained already: larger steps would cost them 4 to 6 dB
+    /// at first.
     #[must_use]
     pub fn fine(self) -> Self {
         Self {
@@ -121,7 +120,7 @@ impl RateOptions {
         }
     }
 
-    /// These step sizes, overlaid with those of a policy's paper.
+    /// These step sizes, with those that a policy overrides.
     #[must_use]
     pub fn with(self, overrides: &RateOverrides) -> Self {
         let mut rates = self;
@@ -147,8 +146,7 @@ impl RateOptions {
         rates
     }
 
-    /// Step sizes of iteration `step` (1-based) of `iterations`, in a scene of this extent
-    /// `[scene units]`.
+    /// Step sizes of iteration `step` (1-based), in a scene with an extent in `[scene units]`.
     #[must_use]
     pub fn at(&self, step: u32, iterations: u32, extent: f32) -> LearningRates {
         let t = f64::from(step.min(iterations)) / f64::from(iterations.max(1));
@@ -172,7 +170,7 @@ impl RateOptions {
         }
     }
 
-    /// The first step size that is not a positive finite number, by name.
+    /// The name of the first step size that is not a positive finite number.
     #[must_use]
     pub fn invalid(&self) -> Option<&'static str> {
         let end = |end: Option<f32>| f64::from(end.unwrap_or(1.0));
@@ -198,7 +196,7 @@ impl RateOptions {
     }
 }
 
-/// Step sizes of a run that starts from a model.
+/// Step sizes of a run that starts from an existing model.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 pub enum InitRates {
@@ -209,8 +207,7 @@ pub enum InitRates {
     Full,
 }
 
-/// A number of steps chosen for a run of [`REFERENCE_ITERATIONS`], scaled to a run of
-/// `iterations`; at least 1.
+/// Scales a number of steps for a run of [`REFERENCE_ITERATIONS`] to a run of `iterations`; at least 1.
 #[must_use]
 pub fn scaled(steps: u32, iterations: u32) -> u32 {
     let exact = u64::from(steps) * u64::from(iterations);
@@ -219,22 +216,22 @@ pub fn scaled(steps: u32, iterations: u32) -> u32 {
     u32::try_from(rounded.max(1)).unwrap_or(u32::MAX)
 }
 
-/// Spherical-harmonic degree of iteration `step`: 0 at first, one more every 1,000 steps of a run
-/// of 30,000, at most `highest`.
+/// Spherical-harmonic degree of iteration `step`: it starts at 0 and rises by one every 1,000 steps of a run of 30,000, up
+/// to `highest`.
 #[must_use]
 pub fn sh_degree(step: u32, iterations: u32, highest: u8) -> u8 {
     let reached = step / scaled(1_000, iterations);
     u8::try_from(reached).unwrap_or(u8::MAX).min(highest).min(MAX_SH_DEGREE)
 }
 
-/// What lies behind the Gaussians. As text: `black`, `white`, `random` or `#rrggbb`.
+/// Background colour behind the Gaussians. The text form is `black`, `white`, `random` or `#rrggbb`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Background {
     /// (0, 0, 0).
     Black,
     /// (1, 1, 1).
     White,
-    /// This colour, sRGB-encoded.
+    /// An sRGB-encoded colour.
     Colour([u8; 3]),
     /// A new colour at each step, uniform in `[0, 1]`³.
     Random,
@@ -246,7 +243,7 @@ impl Background {
     pub fn at(self, seed: u64, step: u32) -> [f32; 3] {
         match self {
             Self::Random => {
-                let mut draws = random_stream(seed, Use::Background, u64::from(step));
+                let mut draws = random_stream(seed, Purpose::Background, u64::from(step));
                 // The top 24 bits fill an f32's significand exactly.
                 std::array::from_fn(|_| (draws.next_u32() >> 8) as f32 / 16_777_215.0)
             }
@@ -254,7 +251,7 @@ impl Background {
         }
     }
 
-    /// The background for evaluation; black if training draws it at random.
+    /// The background for evaluation, which is black if training uses random ones.
     #[must_use]
     pub fn fixed(self) -> [f32; 3] {
         match self {
@@ -283,7 +280,7 @@ impl FromStr for Background {
         let colour = |hex: &str| {
             let value = u32::from_str_radix(hex, 16).ok()?;
             let [_, r, g, b] = value.to_be_bytes();
-            // `from_str_radix` takes a sign as well.
+            // `from_str_radix` also accepts a sign.
             (hex.len() == 6 && !hex.starts_with('+')).then_some(Self::Colour([r, g, b]))
         };
         match text {
@@ -309,31 +306,30 @@ impl Serialize for Background {
     }
 }
 
-/// The order of training views in one epoch (0-based): a permutation of
-/// `0..views`, drawn from (seed, epoch).
+/// The order of training views in an epoch (0-based): a random permutation of `0..views` that depends on seed and epoch.
 #[must_use]
 pub fn view_order(views: usize, seed: u64, epoch: u32) -> Vec<usize> {
     let mut order: Vec<usize> = (0..views).collect();
-    let mut draws = random_stream(seed, Use::Views, u64::from(epoch));
-    // Fisher–Yates, written out because the shuffle of a library may change with its version.
+    let mut draws = random_stream(seed, Purpose::Views, u64::from(epoch));
+    // Fisher–Yates, implemented here because the shuffle of a library may change with its version.
     for last in (1..views).rev() {
         order.swap(last, below(&mut draws, last as u64 + 1) as usize);
     }
     order
 }
 
-/// `count` of the training views, or all of them if there are fewer, drawn at random without
-/// replacement from (seed, step), for policies that look at views of their own.
+/// A random sample of `count` training views without replacement, or of all views if there are fewer, that depends on seed
+/// and step. Used for views that are rendered for decisions.
 #[must_use]
 pub fn fresh_views(views: usize, count: usize, seed: u64, step: u32) -> Vec<usize> {
     let mut chosen: Vec<usize> = (0..views).collect();
-    let mut draws = random_stream(seed, Use::FreshViews, u64::from(step));
+    let mut draws = random_stream(seed, Purpose::FreshViews, u64::from(step));
     draw(&mut chosen, count.min(views), &mut draws);
     chosen
 }
 
-/// Keeps `count` of the values, all choices equally likely: the first elements of a Fisher–Yates shuffle,
-/// written out because the sampling functions of a library may change with its version.
+/// Keeps a uniform random sample of `count` values: the first elements of a Fisher–Yates shuffle, implemented here because
+/// the sampling functions of a library may change with its version.
 pub(crate) fn draw(values: &mut Vec<usize>, count: usize, rng: &mut ChaCha8Rng) {
     for place in 0..count {
         let other = place + below(rng, (values.len() - place) as u64) as usize;
@@ -342,16 +338,16 @@ pub(crate) fn draw(values: &mut Vec<usize>, count: usize, rng: &mut ChaCha8Rng) 
     values.truncate(count);
 }
 
-/// What random numbers are used for; the streams of different uses are independent.
+/// Purpose of random numbers. The streams of different purposes are independent.
 #[derive(Debug, Clone, Copy)]
-enum Use {
+enum Purpose {
     Views = 1,
     Background = 2,
     FreshViews = 3,
 }
 
-/// The stream number `counter` of one use: ChaCha is a hash of (key, stream, position).
-fn random_stream(seed: u64, purpose: Use, counter: u64) -> ChaCha8Rng {
+/// The random stream number `counter` for a purpose. ChaCha is a hash of (key, stream, position).
+fn random_stream(seed: u64, purpose: Purpose, counter: u64) -> ChaCha8Rng {
     let mut key = [0_u8; 32];
     key[..8].copy_from_slice(&seed.to_le_bytes());
     key[8] = purpose as u8;
@@ -360,7 +356,7 @@ fn random_stream(seed: u64, purpose: Use, counter: u64) -> ChaCha8Rng {
     rng
 }
 
-/// A number in `0..n`: the high half of a 64 × 64-bit product, with a bias of at most n / 2⁶⁴.
+/// A random number in `0..n`: the high half of a 64 × 64-bit product, with a bias of at most n / 2⁶⁴.
 fn below(rng: &mut ChaCha8Rng, n: u64) -> u64 {
     ((u128::from(rng.next_u64()) * u128::from(n)) >> 64) as u64
 }

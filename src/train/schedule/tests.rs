@@ -1,4 +1,4 @@
-//! Rates, degrees, view order and backgrounds along a run.
+//! Tests of step sizes, degrees, view orders and backgrounds.
 
 use densify_policies::policy::{Fade, Rate};
 
@@ -19,7 +19,7 @@ fn short_runs_start_with_longer_steps_and_end_with_the_published() {
     close(end.mean, 1.6e-6);
     close(start.sh_rest, 2.0 * published.sh_rest * factor);
     close(end.sh_rest, 2.0 * published.sh_rest);
-    // A run a little shorter than the published ones is a little different.
+    // A slightly shorter run has slightly larger step sizes.
     let factor = 1.25_f32.powf(0.6);
     close(RateOptions::for_run(24_000).sh_rest, published.sh_rest * factor);
     close(RateOptions::for_run(1).boost as f32, 5.0);
@@ -132,8 +132,8 @@ fn backgrounds() {
 }
 
 #[test]
-fn rates_end_where_they_are_told_to_and_fade_late() {
-    let of_policy = RateOverrides {
+fn final_rates_and_the_fade_are_applied() {
+    let overrides = RateOverrides {
         mean: Some(Rate { start: 1e-4, end: 1e-6 }),
         log_scale: Some(Rate { start: 0.04, end: 0.01 }),
         opacity: Some(Rate::constant(0.05)),
@@ -141,32 +141,32 @@ fn rates_end_where_they_are_told_to_and_fade_late() {
         fade: Some(Fade { from: 0.5, to: 0.25 }),
         ..RateOverrides::default()
     };
-    let rates = RateOptions::default().with(&of_policy);
+    let rates = RateOptions::default().with(&overrides);
     let at = |step| rates.at(step, 1_000, 2.0);
     let near = |found: f32, expected: f64| {
         assert!((f64::from(found) / expected - 1.0).abs() < 1e-6, "{found} against {expected}");
     };
-    // Half-way the geometric mean.
+    // Halfway, the step size is the geometric mean.
     near(at(500).mean, 2e-5);
     near(at(500).log_scale, 0.02);
     near(at(1_000).log_scale, 0.01);
     near(at(500).quat, 1e-3);
     near(at(1_000).quat, 1e-3);
-    // The fade: 1 up to the half, 0.25^½ at three quarters.
+    // The fade is 1 up to the middle, and 0.25^½ at three quarters.
     for (step, factor) in [(0, 1.0), (500, 1.0), (750, 0.5), (1_000, 0.25), (9_000, 0.25)] {
         near(at(step).opacity, 0.05 * factor);
         near(at(step).sh_rest, 1.25e-4 * factor);
     }
     near(at(1_000).sh_dc, 1e-3 * 0.25);
-    // Noise knows no boost.
+    // Noise is not boosted.
     let short = RateOptions { boost: 4.0, ..rates }.at(500, 1_000, 2.0);
     near(short.mean, 4e-5);
     near(short.noise, 2e-5);
 }
 
 #[test]
-fn fine_step_sizes_are_those_of_the_end_all_along() {
-    let of_paper = RateOptions {
+fn fine_step_sizes_are_the_final_ones_throughout() {
+    let with_ends = RateOptions {
         log_scale_end: Some(1e-3),
         quat_end: Some(2e-4),
         opacity_end: Some(3e-3),
@@ -174,7 +174,7 @@ fn fine_step_sizes_are_those_of_the_end_all_along() {
         sh_rest_end: Some(5e-5),
         ..RateOptions::for_run(2_000)
     };
-    for rates in [RateOptions::for_run(2_000), of_paper] {
+    for rates in [RateOptions::for_run(2_000), with_ends] {
         let end = rates.at(2_000, 2_000, 3.0);
         for step in [1, 700, 2_000] {
             let now = rates.fine().at(step, 2_000, 3.0);

@@ -1,4 +1,4 @@
-//! The policy's edit: what the policy sees, its plan, and the plan's execution.
+//! Edits by the policy: its inputs, its plan, and the execution of the plan.
 
 use std::time::Instant;
 
@@ -12,7 +12,7 @@ use densify_core::budget::RowBudget;
 use densify_data::views::ViewSource;
 
 impl<V: ViewSource> Trainer<V> {
-    /// Lets the policy plan and executes the plan. `None` if there was nothing to do.
+    /// Lets the policy plan an edit, and executes the plan. `None` if nothing changed.
     pub(super) fn edit(&mut self, step: u32) -> Result<Option<EditEvent>, TrainError> {
         let start = Instant::now();
         self.show_aux_views(step)?;
@@ -43,7 +43,7 @@ impl<V: ViewSource> Trainer<V> {
         (budget.trained(self.backend.rows()), budget.trainable())
     }
 
-    /// Executes a plan. A plan that changes no row and had nothing refused is not an event.
+    /// Executes a plan. The result is an event only if rows changed or edits were refused.
     pub(super) fn execute(
         &mut self,
         step: u32,
@@ -58,7 +58,7 @@ impl<V: ViewSource> Trainer<V> {
             .apply(&ops, self.options.seed, step)
             .map_err(|e| self.backend_error(step, e))?;
         if let Some(history) = &mut self.history {
-            history.follow(&ops, step);
+            history.record(&ops, step);
         }
         self.peak_rows = self.peak_rows.max(peak_rows(&ops)).max(self.backend.rows());
         if !ops.edits_rows() && ops.counts.denied == 0 {
@@ -72,8 +72,8 @@ impl<V: ViewSource> Trainer<V> {
         Ok(Some(event))
     }
 
-    /// Checks the budget and all invariants once more, so that a broken plan is an error here and not a
-    /// panic in the backend.
+    /// Checks the budget and all invariants again, so that a broken plan becomes an error instead of a panic in the
+    /// backend.
     fn check_plan(&self, step: u32, ops: &RowOps) -> Result<(), TrainError> {
         let (rows, budget) = self.trained_rows_and_budget();
         let reason = if ops.rows_before != rows || ops.budget != budget {
@@ -91,8 +91,7 @@ impl<V: ViewSource> Trainer<V> {
     }
 }
 
-/// Most rows in use at any instant of an edit: children and seeds are written before moves shorten the
-/// model.
+/// Largest number of rows in use during an edit: children and seeds are written before moves shorten the model.
 fn peak_rows(ops: &RowOps) -> usize {
     let new = ops.child_slots.iter().copied().chain(ops.seeds.iter().map(|(slot, _)| *slot));
     let highest = new.max().map_or(0, |slot| slot as usize + 1);

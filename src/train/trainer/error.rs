@@ -1,18 +1,18 @@
-//! Errors that end a run.
+//! Errors that end training.
 
 use densify_policies::policy::PolicyError;
 
 use densify_data::views::ViewError;
 use densify_render::BackendError;
 
-/// Why training cannot continue. The model stays as it was before the step's edit and can still be
-/// [read](super::Trainer::model); only after [`Diverged`](Self::Diverged) it is worthless.
+/// Reason why training cannot continue. The model stays as it was before the step's edit and can still be
+/// [read](super::Trainer::model); only after [`Diverged`](Self::Diverged) it is unusable.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainError {
     /// An option is out of its range.
     #[error("{0}")]
     BadOption(String),
-    /// A view's pixels could not be read.
+    /// The image of a view cannot be read.
     #[error("step {step}: view `{view}`: {source}")]
     View {
         /// Iteration.
@@ -35,7 +35,7 @@ pub enum TrainError {
         /// The loss.
         loss: f32,
     },
-    /// Rows hold non-finite values: too many of them, or any with [`OnNan::Stop`](super::OnNan::Stop).
+    /// Rows have non-finite values: too many of them, or any with [`OnNan::Stop`](super::OnNan::Stop).
     #[error(
         "step {step}: {count} of {rows} rows hold numbers that are not finite, first {first}; \
          lower the learning rates, and check the scene's scale and cameras"
@@ -43,11 +43,11 @@ pub enum TrainError {
     NonFinite {
         /// Iteration.
         step: u32,
-        /// How many rows hold them.
+        /// Number of rows with non-finite values.
         count: usize,
-        /// Rows of the model.
+        /// Number of rows of the model.
         rows: usize,
-        /// Names the first of them and its value.
+        /// Description of the first of them.
         first: String,
     },
     /// The policy reported an error, panicked, or returned a plan that breaks an invariant.
@@ -57,7 +57,7 @@ pub enum TrainError {
         step: u32,
         /// The policy's name.
         policy: String,
-        /// What it reported.
+        /// The policy's error.
         source: PolicyError,
     },
     /// The backend failed.

@@ -1,22 +1,20 @@
 //! The training loop, for any policy and any device.
 //!
-//! Views come from a [`ViewSource`], pixels and gradients from a [`Backend`], edits of the rows from a
-//! [`DensityPolicy`]. One step (Kerbl et al. 2023, section 5) takes the next view of the epoch, runs
-//! forward pass, backward pass and optimiser, and then, if the policy is due, one edit. A policy sees
-//! the model after the optimiser's step.
+//! Views come from a [`ViewSource`], pixels and gradients from a [`Backend`], edits of rows from a [`DensityPolicy`]. A
+//! step (Kerbl et al. 2023, section 5) takes the next view of the epoch, runs forward pass, backward pass and optimiser,
+//! and then an edit if the policy is due. Policies see the model after the optimiser's step.
 
 mod auto_budget;
-mod distinct_views;
 mod edit;
 mod error;
-mod history;
+mod near_duplicates;
 mod nonfinite;
 mod options;
 mod policy_views;
-mod probe;
 mod progress;
 mod report;
 mod resolution;
+mod row_history;
 mod state;
 mod validate;
 
@@ -28,17 +26,17 @@ use densify_policies::policy::{
 
 use crate::exposure::Exposures;
 use crate::schedule;
-pub use auto_budget::{AutoBudget, Interval, MIN_GAIN, Removal, signals as growth_signals};
+pub use auto_budget::{AutoBudget, Interval, MIN_GAIN, Removal, growth_signals};
 use densify_core::image::SharedImage;
 use densify_data::views::ViewSource;
 use densify_render::{Backend, BackendError, StepInput};
-use distinct_views::distinct_views;
 pub use error::TrainError;
-pub use history::RowHistory;
+use near_duplicates::distinct_views;
 use nonfinite::AUDIT_EVERY;
 pub use options::{AutoChoices, OnNan, TrainOptions};
 use policy_views::call_policy;
 pub use report::{EditEvent, StepReport};
+pub use row_history::RowHistory;
 pub use state::TrainerState;
 use validate::{check_options, checked_needs};
 
@@ -52,8 +50,9 @@ pub struct Trainer<V> {
     scene: SceneInfo,
     options: TrainOptions,
     step: u32,
-    /// The views of this epoch and of the next one, in order.
+    /// Order of the views in this epoch.
     order: Vec<usize>,
+    /// Order of the views in the next epoch.
     next_order: Vec<usize>,
     peak_rows: usize,
     extra_forwards: u64,
@@ -63,17 +62,20 @@ pub struct Trainer<V> {
     events: Vec<EditEvent>,
     /// Training views that the policy's scores are measured in.
     scored: Vec<usize>,
-    /// Training views that `--budget auto` measures; empty without it.
-    probes: Vec<usize>,
+    /// Training views in which the automatic budget measures the PSNR; empty without it.
+    probe_views: Vec<usize>,
     auto_budget: Option<AutoBudget>,
-    /// How each training view was exposed, where that is learned.
+    /// Exposures of the training views, if they are learned.
     exposures: Option<Exposures>,
-    /// When each row was made and edited, where somebody wants to know.
+    /// History of the rows, if it is recorded.
     history: Option<RowHistory>,
 }
 
 impl<V: ViewSource> Trainer<V> {
-    /// A new run. `backend` holds the initial model; `policy_name` is for messages only.
+    /// A new run. `backend` contains the initial model; `policy_name` is for messages only.
+    ///
+    /// # Errors
+    /// [`TrainError::BadOption`] when the arguments contradict each other.
     pub fn new(
         views: V,
         backend: Box<dyn Backend>,
@@ -101,19 +103,19 @@ impl<V: ViewSource> Trainer<V> {
             step: 0,
             events: Vec::new(),
             scored: (0..count).collect(),
-            probes: Vec::new(),
+            probe_views: Vec::new(),
             auto_budget: None,
             exposures: None,
             history: None,
         })
     }
 
-    /// Lets the run make automatic choices; to be called before the first step. To choose the number of
-    /// rows, the backend must have been made with [`growth_signals`] too.
+    /// Enables automatic choices, before the first step. For choosing the number of rows the backend must have been made
+    /// with [`growth_signals`], too.
     #[must_use]
-    pub fn requiring(mut self, choices: AutoChoices) -> Self {
+    pub fn with_auto_choices(mut self, choices: AutoChoices) -> Self {
         if choices.rows {
-            self.probes = probe::probes(self.views.count(), self.options.seed);
+            self.probe_views = auto_budget::probe_views(self.views.count(), self.options.seed);
         }
         if choices.scored_views {
             self.scored = distinct_views(&self.views, self.scene.extent);
@@ -123,13 +125,12 @@ impl<V: ViewSource> Trainer<V> {
         self
     }
 
-    /// Lets the run learn how each training view was exposed, beginning with these; to be called before the
-    /// first step. The backend must have been made for it.
+    /// Enables learning of exposures from initial ones, before the first step. The backend must have been made for it.
     ///
     /// # Panics
-    /// When there is not one for each view: a bug in the caller.
+    /// When the number of exposures is not that of views, which is a bug in the caller.
     #[must_use]
-    pub fn exposing(mut self, exposures: Option<Exposures>) -> Self {
+    pub fn with_exposures(mut self, exposures: Option<Exposures>) -> Self {
         let count = exposures.as_ref().map_or(self.views.count(), Exposures::count);
         assert_eq!(count, self.views.count(), "exposures of other views");
         self.exposures = exposures;
@@ -138,15 +139,15 @@ impl<V: ViewSource> Trainer<V> {
 
     /// One iteration: a view, a gradient step, and the policy's edit if it is due.
     ///
-    /// May be called beyond [`TrainOptions::iterations`]; learning rates then keep their final values.
+    /// May be called beyond [`TrainOptions::iterations`]; step sizes then keep their final values.
     ///
     /// # Errors
-    /// [`TrainError`]. After an error the run is over; the model can still be read.
+    /// [`TrainError`]. The run cannot continue after an error, but the model can still be read.
     pub fn step(&mut self) -> Result<StepReport, TrainError> {
         let step = self.step + 1;
         let view = self.next_view();
         let start = Instant::now();
-        // Until here nothing has changed that a checkpoint holds.
+        // If the image cannot be read, the state is still that of the last checkpoint.
         let image = self.image(step, view)?;
         if (self.step as usize).is_multiple_of(self.views.count()) {
             self.backend.begin_epoch();
@@ -156,7 +157,7 @@ impl<V: ViewSource> Trainer<V> {
         let (loss_terms, noise) = self.terms(step)?;
         let (camera, image) = self.at_resolution(step, view, image)?;
         let TrainOptions { iterations, seed, background, rates, .. } = self.options;
-        let exposure = self.exposures.as_ref().map(|exposures| exposures.of(view));
+        let exposure = self.exposures.as_ref().map(|exposures| exposures.transform(view));
         let input = StepInput {
             step,
             view,
@@ -195,7 +196,7 @@ impl<V: ViewSource> Trainer<V> {
         Ok(StepReport { step, view, output, rows: self.backend.rows(), events })
     }
 
-    /// `count` of the scored views, or all of them if there are fewer, drawn from (seed, step).
+    /// A random sample of `count` scored views, or all of them if there are fewer, that depends on seed and step.
     fn draw_scored(&self, count: usize, step: u32) -> Vec<usize> {
         let drawn = schedule::fresh_views(self.scored.len(), count, self.options.seed, step);
         drawn.into_iter().map(|place| self.scored[place]).collect()
@@ -209,7 +210,7 @@ impl<V: ViewSource> Trainer<V> {
         })
     }
 
-    /// How often the policy lets the optimiser step now.
+    /// The optimiser's cadence at this step, according to the policy.
     fn cadence(&self, step: u32) -> Result<Cadence, TrainError> {
         let cadence =
             call_policy(|| self.policy.cadence(step)).map_err(|e| self.policy_error(step, e))?;
@@ -217,11 +218,11 @@ impl<V: ViewSource> Trainer<V> {
         if cadence.is_within(declared) {
             return Ok(cadence);
         }
-        let error = format!("it wants {cadence:?}, but declared {declared:?}");
+        let error = format!("it wants the cadence {cadence:?}, but declared {declared:?}");
         Err(self.policy_error(step, PolicyError::Other(error)))
     }
 
-    /// What the policy adds to the loss and to the means now.
+    /// The policy's terms of the loss and noise of the means at this step.
     fn terms(&self, step: u32) -> Result<(LossTerms, Option<NoiseTerm>), TrainError> {
         let Needs { loss_terms, noise, .. } = self.needs;
         let both = || (self.policy.loss_terms(step, loss_terms), self.policy.noise(step, noise));
@@ -235,7 +236,7 @@ impl<V: ViewSource> Trainer<V> {
         TrainError::Policy { step, policy: self.policy_name.clone(), source }
     }
 
-    /// The view of the next step. Prefetches the views after it.
+    /// Returns the view of the next step, and prefetches those after it.
     fn next_view(&mut self) -> usize {
         let count = self.views.count();
         let place = self.step as usize % count;
@@ -244,7 +245,7 @@ impl<V: ViewSource> Trainer<V> {
             self.order = std::mem::take(&mut self.next_order);
             self.next_order = schedule::view_order(count, self.options.seed, epoch + 1);
         }
-        // Beyond the last iteration the end of the run is unknown.
+        // Beyond the last iteration the number of remaining steps is unknown.
         let left = self.options.iterations.checked_sub(self.step + 1);
         let last = left.map_or(usize::MAX, |left| left as usize);
         let upcoming: Vec<usize> = self.order[place + 1..]

@@ -3,12 +3,12 @@
 use super::{EditEvent, OnNan, TrainError, Trainer};
 use densify_data::views::ViewSource;
 
-/// Steps between two audits where the policy is not due.
+/// Number of steps between audits, in addition to those before the policy's edits.
 pub(super) const AUDIT_EVERY: u32 = 100;
-/// Largest share of the rows that one audit may remove: so few are not missed, but more of them mean that
-/// the run diverges. One row may always be removed.
+/// Largest share of the rows that an audit may remove. So few have a negligible effect; more of them mean that the run
+/// diverges. One row may always be removed.
 const MAX_SHARE: f64 = 1e-3;
-/// Most rows that one audit names in the log.
+/// Largest number of rows that an audit names in the log.
 const MAX_NAMED: usize = 10;
 
 impl<V: ViewSource> Trainer<V> {
@@ -23,7 +23,7 @@ impl<V: ViewSource> Trainer<V> {
             tracing::warn!(step, row = row.row, "non-finite value: {row}");
         }
         let few = count as f64 <= (MAX_SHARE * rows as f64).max(1.0) && count < rows;
-        // What does not change cannot become unsound.
+        // Frozen rows never change, so that non-finite values in them mean an error elsewhere.
         let frozen = self.options.frozen as u32;
         let is_frozen = unsound.iter().any(|row| row.row < frozen);
         if self.options.on_nan == OnNan::Stop || !few || is_frozen {

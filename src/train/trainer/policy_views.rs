@@ -1,4 +1,4 @@
-//! Calls the policy, and renders training views for its decisions.
+//! Calls to the policy, and renderings of training views for its decisions.
 
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -10,7 +10,7 @@ use densify_data::views::ViewSource;
 use densify_render::AuxInput;
 
 impl<V: ViewSource> Trainer<V> {
-    /// Renders the auxiliary views for the policy's event after `step`, one by one.
+    /// Renders the auxiliary views for the policy's edit after `step`, one by one.
     pub(super) fn show_aux_views(&mut self, step: u32) -> Result<(), TrainError> {
         let (rows, budget) = self.trained_rows_and_budget();
         let count = call_policy(|| self.policy.aux_views(step, rows, budget));
@@ -21,7 +21,7 @@ impl<V: ViewSource> Trainer<V> {
         let (options, degree) = (self.options, self.sh_degree(step));
         for view in self.draw_scored(count, step) {
             let image = self.image(step, view)?;
-            let exposure = self.exposures.as_ref().map(|exposures| exposures.of(view));
+            let exposure = self.exposures.as_ref().map(|exposures| exposures.transform(view));
             let measured = self.backend.observe(&AuxInput {
                 step,
                 view,
@@ -47,9 +47,9 @@ impl<V: ViewSource> Trainer<V> {
     }
 }
 
-/// The result of `call`. A policy may come from anywhere: if it panics, the run ends with an error that names
-/// it, and the model can still be read. After a panic the policy is not called again, so its state does not
-/// matter; its calls change nothing else but the plan, which is dropped.
+/// Calls the policy, which may be third-party code: if it panics, the run ends with an error that names it, and the model
+/// can still be read. Unwinding is safe because the policy is not called again, and because its calls change nothing else
+/// but the plan, which is dropped.
 ///
 /// # Errors
 /// [`PolicyError::Other`] with the message of the panic.

@@ -1,11 +1,11 @@
-//! What one step did, and what one edit of the rows changed.
+//! Reports of steps and of edits.
 
 use densify_policies::plan::RowOps;
 use serde::{Deserialize, Serialize};
 
 use densify_render::StepOutput;
 
-/// What one step did.
+/// The result of a step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StepReport {
     /// Iteration, 1-based.
@@ -14,14 +14,14 @@ pub struct StepReport {
     pub view: usize,
     /// Loss and other scalars of the step.
     pub output: StepOutput,
-    /// Rows after the step.
+    /// Number of rows after the step.
     pub rows: usize,
-    /// The edits of this step: removal of rows with non-finite values, rows that `--budget auto`
-    /// removes, and the policy's edit.
+    /// The edits of this step: removal of rows with non-finite values, removal by the automatic budget, and the policy's
+    /// edit.
     pub events: Vec<EditEvent>,
 }
 
-/// One edit of the rows.
+/// An edit of the rows. All counts are numbers of rows.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct EditEvent {
     /// Iteration, 1-based.
@@ -34,7 +34,7 @@ pub struct EditEvent {
     pub added: usize,
     /// Rows rewritten in place.
     pub updated: usize,
-    /// Edits that the plan refused, mostly for lack of room.
+    /// Edits that the plan refused, mostly because of the budget.
     pub denied: usize,
     /// Rows after.
     pub after: usize,

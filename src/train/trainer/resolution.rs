@@ -1,7 +1,7 @@
-//! Training on smaller images, where the policy asks for it.
+//! Training with smaller images on request of the policy.
 //!
-//! *EAGLES*, Girish et al. 2024, begins with small images and raises their size along the run. A view's
-//! camera shrinks with its image, so that the model stays in the same coordinates.
+//! *EAGLES* (Girish et al. 2024) starts with small images and increases their size during the run. The camera of a view
+//! is scaled with its image, so that the model stays in the same coordinates.
 
 use std::sync::Arc;
 
@@ -13,11 +13,11 @@ use densify_core::camera::Camera;
 use densify_core::image::SharedImage;
 use densify_data::views::ViewSource;
 
-/// Images are not shrunk below this side: nothing could be learned from them `[px]`.
+/// Smallest side of shrunk images, as nothing could be learned from smaller ones `[px]`.
 const MIN_SIDE: u32 = 16;
 
 impl<V: ViewSource> Trainer<V> {
-    /// The view's camera, and its image, at the size that the policy wants at this step.
+    /// A view's camera and image at the resolution that the policy requests for this step.
     pub(super) fn at_resolution(
         &self,
         step: u32,
@@ -38,11 +38,11 @@ impl<V: ViewSource> Trainer<V> {
     }
 }
 
-/// Both sides times `share`, rounded down, as far as [`MIN_SIDE`] allows.
+/// Both sides times `share`, rounded down, but not below [`MIN_SIDE`].
 fn shrunk((width, height): (u32, u32), share: f64) -> (u32, u32) {
     let least = f64::from(MIN_SIDE) / f64::from(width.min(height));
     let share = share.max(least).min(1.0);
-    // A product just below a whole number counts as this number.
+    // The small addend compensates rounding of products that should be integers.
     let side = |side: u32| ((f64::from(side) * share + 1e-6) as u32).max(1);
     (side(width), side(height))
 }

@@ -1,7 +1,6 @@
 //! The trainer's part of a checkpoint: counters, events and the policy's state.
 //!
-//! It is small because the order of views, the background and every random draw are functions of
-//! (seed, step).
+//! It is small because the order of views, the background and all random numbers are functions of seed and step.
 
 use std::time::Duration;
 
@@ -14,36 +13,39 @@ use crate::exposure::Exposures;
 use crate::schedule;
 use densify_data::views::ViewSource;
 
-/// A [`Trainer`] between two steps, without the backend's part.
+/// The state of a [`Trainer`] between two steps, without that of the backend.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TrainerState {
-    /// Steps done.
+    /// Number of steps done.
     pub step: u32,
-    /// Rows after initialisation.
+    /// Number of rows after initialisation.
     pub initial_rows: usize,
-    /// Most rows at any instant so far.
+    /// Largest number of rows so far.
     pub peak_rows: usize,
-    /// Renders so far beside the one per step.
+    /// Number of renderings so far in addition to one per step.
     pub extra_forwards: u64,
     /// Wall time of all policy events so far.
     pub policy_time: Duration,
-    /// The part of it spent on rendering views.
+    /// The part of it that was spent on rendering views.
     pub views_time: Duration,
     /// All edits so far.
     pub events: Vec<EditEvent>,
     /// The policy's state.
     pub policy: PolicyState,
-    /// The row limit of `--budget auto` and its measurements.
+    /// State of the automatic budget.
     #[serde(default)]
     pub auto_budget: Option<AutoBudget>,
-    /// How each training view was exposed, as far as it is learned.
+    /// Exposures of the training views, if they are learned.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub exposures: Option<Exposures>,
 }
 
 impl<V: ViewSource> Trainer<V> {
-    /// What a checkpoint must hold, beside the model and the backend's state.
+    /// The state for a checkpoint, in addition to the model and the backend's state.
+    ///
+    /// # Errors
+    /// When the policy cannot save its state.
     pub fn state(&self) -> Result<TrainerState, PolicyError> {
         Ok(TrainerState {
             step: self.step,
@@ -59,20 +61,20 @@ impl<V: ViewSource> Trainer<V> {
         })
     }
 
-    /// Continues a run from `state`. This trainer must be new, with the same options and views, and its
-    /// backend must hold the model and the backend state of the same step.
+    /// Continues a run from `state`. This trainer must be new, with the same options and views, and its backend must have
+    /// the model and the backend state of the same step.
     ///
     /// # Errors
-    /// [`PolicyError`] if the policy rejects its state, or the exposures are of other views; then the trainer
-    /// must not be used.
+    /// [`PolicyError`] if the policy rejects its state, or if the exposures do not match; then the trainer must not be
+    /// used.
     pub fn resume(&mut self, state: TrainerState) -> Result<(), PolicyError> {
         call_policy(|| self.policy.restore(state.policy)).and_then(|done| done)?;
-        let like = match (&state.exposures, &self.exposures) {
-            (Some(saved), Some(own)) => saved.check_like(own),
+        let matches = match (&state.exposures, &self.exposures) {
+            (Some(saved), Some(own)) => saved.check_matches(own),
             (None, None) => Ok(()),
-            _ => Err("it has exposures, or this run has, but not both".to_owned()),
+            _ => Err("only one of the checkpoint and this run has exposures".to_owned()),
         };
-        like.map_err(PolicyError::Other)?;
+        matches.map_err(PolicyError::Other)?;
         self.exposures = state.exposures;
         self.step = state.step;
         self.scene.initial_rows = state.initial_rows;
@@ -82,8 +84,7 @@ impl<V: ViewSource> Trainer<V> {
         self.views_time = state.views_time;
         self.events = state.events;
         self.auto_budget = state.auto_budget;
-        // As after `next_view`: at the end of an epoch only the next order is drawn, within one both
-        // are.
+        // As after `next_view`: at the end of an epoch only the next order exists, within one both orders do.
         let count = self.views.count();
         let (epoch, place) = (state.step / count as u32, state.step as usize % count);
         let order = |epoch| schedule::view_order(count, self.options.seed, epoch);

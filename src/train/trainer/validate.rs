@@ -1,4 +1,4 @@
-//! Checks before the first step: that scene, options, views, backend and policy agree.
+//! Checks before the first step that scene, options, views, backend and policy agree.
 
 use densify_policies::policy::{DensityPolicy, Needs, SceneInfo};
 
@@ -40,14 +40,14 @@ pub(super) fn check_options(
     Ok(())
 }
 
-/// The needs of a run, if their numbers are valid.
+/// The needs of a policy, after checking their values.
 pub(super) fn checked_needs(
     name: &str,
     policy: &dyn DensityPolicy,
     scene: &SceneInfo,
 ) -> Result<Needs, TrainError> {
     let needs = policy.needs(scene);
-    let bad = |why| TrainError::BadOption(format!("the needs of policy `{name}`: {why}"));
+    let bad = |error| TrainError::BadOption(format!("the needs of policy `{name}`: {error}"));
     needs.check().map_err(bad)?;
     Ok(needs)
 }

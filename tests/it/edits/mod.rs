@@ -173,19 +173,19 @@ fn check_plans(subject: &Subject, twin: &[Vec<Row>; 2], spare: usize, plans: &[V
     let mut expected = rows(&mut *backend);
     // As if no two had been edited in the same step.
     let steps: Vec<u32> = expected.iter().map(|row| row.steps[1]).collect();
-    let mut history = RowHistory::of(&steps, budget);
+    let mut history = RowHistory::from_edits(&steps, budget);
     for (event, calls) in (4..).zip(plans) {
         let mut plan = EditPlan::new(backend.rows(), budget).allowing(&needs());
         let taken: Vec<Call> =
             calls.iter().filter(|call| enter(&mut plan, call)).cloned().collect();
         let ops = plan.compile();
         backend.apply(&ops, SEED, event).expect("a plan is applied");
-        history.follow(&ops, event);
+        history.record(&ops, event);
         assert!(backend.rows() <= backend.budget());
         expected = execute(expected, &taken, budget, (&PolicyRng::new(SEED, event), event));
         check_rows(&rows(&mut *backend), &expected);
         let of = |at: usize| expected.iter().map(|row| row.steps[at]).collect::<Vec<u32>>();
-        assert_eq!([history.made(), history.edited()], [of(0), of(1)]);
+        assert_eq!([history.created(), history.edited()], [of(0), of(1)]);
     }
     let before = rows(&mut *backend);
     assert_eq!(step(&mut *backend, &turned_away(&view()), 9), 0);

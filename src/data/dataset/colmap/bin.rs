@@ -1,6 +1,6 @@
 //! Reads COLMAP's binary files: little endian, no padding, counts first.
 //!
-//! A count is checked against the size of the file before anything is allocated from it.
+//! Counts are checked against the size of the file before anything is allocated.
 
 use std::collections::HashMap;
 use std::fmt::Display;
@@ -13,14 +13,14 @@ use glam::DVec3;
 use super::super::DatasetError;
 use super::super::PointCloud;
 use super::super::lens::Lens;
-use super::super::lens::table::LensModel;
+use super::super::lens::models::LensModel;
 use super::super::paths::MAX_NAME;
 use super::super::tracks::{MAX_VIEWS, TrackSampler};
 use super::camera;
 use super::{Image, MAX_IMAGES, MAX_POINTS, REMEDY, RENAME};
 use densify_core::files;
 
-/// A file and the number of bytes left.
+/// An open file and the number of bytes left in it.
 struct Reader<'a> {
     path: &'a Path,
     input: BufReader<File>,
@@ -36,15 +36,15 @@ impl<'a> Reader<'a> {
     }
 
     fn fault(&self, field: &str, problem: impl Display) -> DatasetError {
-        self.mended_by(REMEDY, field, problem)
+        self.fault_with_remedy(REMEDY, field, problem)
     }
 
-    fn mended_by(&self, remedy: &str, field: &str, problem: impl Display) -> DatasetError {
+    fn fault_with_remedy(&self, remedy: &str, field: &str, problem: impl Display) -> DatasetError {
         let place = format!("byte {}: {field}", self.length - self.left);
         DatasetError::malformed(self.path, place, problem, remedy)
     }
 
-    /// Counts bytes as read; an error if the file has fewer.
+    /// Accounts for bytes that are about to be read; fails if the file has fewer left.
     fn claim(&mut self, field: &str, bytes: u64) -> Result<(), DatasetError> {
         if bytes > self.left {
             let problem = format!(
@@ -88,21 +88,21 @@ impl<'a> Reader<'a> {
     fn skip(&mut self, field: &str, count: u64, size: u64) -> Result<(), DatasetError> {
         let bytes = count.saturating_mul(size);
         self.claim(field, bytes)?;
-        // `claim` bounds it by the file's length, which fits.
+        // `claim` has bounded the number by the length of the file.
         let bytes = i64::try_from(bytes).map_err(|_| self.fault(field, "too long"))?;
         self.input.seek_relative(bytes).map_err(DatasetError::io(self.path))
     }
 
-    /// Reads a count of records that take at least `size` bytes each.
-    fn count(&mut self, what: &str, size: u64, most: u64) -> Result<u64, DatasetError> {
-        let count = self.u64(what)?;
+    /// Reads the number of records, each of which takes at least `size` bytes.
+    fn count(&mut self, field: &str, size: u64, most: u64) -> Result<u64, DatasetError> {
+        let count = self.u64(field)?;
         if count > most || count > self.left / size {
             let problem = format!(
                 "the file says {count}, but the {} bytes that follow hold at most {}",
                 self.left,
                 self.left / size
             );
-            return Err(self.fault(what, problem));
+            return Err(self.fault(field, problem));
         }
         Ok(count)
     }
@@ -117,15 +117,15 @@ impl<'a> Reader<'a> {
             }
         }
         let text = String::from_utf8(name);
-        text.map_err(|_| self.mended_by(RENAME, field, "the name is not UTF-8"))
+        text.map_err(|_| self.fault_with_remedy(RENAME, field, "the name is not UTF-8"))
     }
 
-    fn end(&self, what: &str, count: u64) -> Result<(), DatasetError> {
+    fn end(&self, field: &str, count: u64) -> Result<(), DatasetError> {
         if self.left == 0 {
             return Ok(());
         }
         Err(self.fault(
-            what,
+            field,
             format!("{} bytes follow the {count} records the file announced", self.left),
         ))
     }
@@ -134,7 +134,7 @@ impl<'a> Reader<'a> {
 /// Reads cameras.bin.
 pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, Lens>, DatasetError> {
     let mut reader = Reader::open(path)?;
-    // id, model, size, and three parameters at least.
+    // Id, model, size, and at least three parameters.
     let count = reader.count("number of cameras", 4 + 4 + 16 + 24, MAX_IMAGES)?;
     let mut cameras = HashMap::new();
     for _ in 0..count {
@@ -152,10 +152,10 @@ pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, Lens>, DatasetError> {
     Ok(cameras)
 }
 
-/// Reads images.bin; the observations in it are skipped.
+/// Reads images.bin without its observations.
 pub(super) fn images(path: &Path) -> Result<Vec<Image>, DatasetError> {
     let mut reader = Reader::open(path)?;
-    // id, pose, camera, an empty name's NUL, number of observations.
+    // Id, pose, camera, the NUL of an empty name, number of observations.
     let count = reader.count("number of images", 4 + 56 + 4 + 1 + 8, MAX_IMAGES)?;
     let mut images = Vec::new();
     for _ in 0..count {
@@ -173,13 +173,13 @@ pub(super) fn images(path: &Path) -> Result<Vec<Image>, DatasetError> {
     Ok(images)
 }
 
-/// Reads points3D.bin, and its tracks into `tracks`.
+/// Reads points3D.bin, and passes its tracks to `tracks`.
 pub(super) fn points(
     path: &Path,
     mut tracks: Option<&mut TrackSampler>,
 ) -> Result<PointCloud, DatasetError> {
     let mut reader = Reader::open(path)?;
-    // id, position, colour, error, length of the track.
+    // Id, position, colour, error, length of the track.
     let count = reader.count("number of points", 8 + 24 + 3 + 8 + 8, MAX_POINTS)?;
     let mut points = PointCloud::default();
     for _ in 0..count {
@@ -190,7 +190,7 @@ pub(super) fn points(
         reader.skip(field, 1, 8)?;
         let position = DVec3::from(position);
         let views = reader.u64(field)?;
-        // Pairs of image id and observation index.
+        // A track is a list of pairs of image id and observation index.
         let mut left = views;
         if let Some(tracks) = tracks.as_deref_mut()
             && tracks.wants(views)

@@ -1,16 +1,16 @@
-//! COLMAP's cameras: a lens model, a size and the model's parameters.
+//! Cameras of COLMAP files: a lens model, an image size and the model's parameters.
 
 use std::path::Path;
 
 use glam::DVec2;
 
 use super::super::DatasetError;
-use super::super::lens::table::LensModel;
+use super::super::lens::models::LensModel;
 use super::super::lens::{Distortion, Lens};
 use super::super::pose::check_lens;
 use super::REMEDY;
 
-/// The lens of a camera of this model and size, checked. `next` reads its parameters, one after the other.
+/// Reads and checks the lens of a camera; `next` returns the parameters of its model one by one.
 pub(super) fn lens(
     model: &LensModel,
     file: &Path,
@@ -26,7 +26,7 @@ pub(super) fn lens(
     let fx = next()?;
     let fy = if model.focals == 2 { next()? } else { fx };
     let (focal, principal) = (DVec2::new(fx, fy), DVec2::new(next()?, next()?));
-    let mut distortion = Distortion::of(model.plane);
+    let mut distortion = Distortion::none(model.plane);
     for &term in model.terms {
         distortion.set(term, next()?);
     }

@@ -1,6 +1,6 @@
 //! Reads COLMAP sparse models: `images/` beside `sparse/0/{cameras,images,points3D}.{bin,txt}`.
 //!
-//! Rigs and frames of newer versions are ignored: images.bin still holds the poses.
+//! Rigs and frames of newer COLMAP versions are ignored, because `images.bin` still contains the poses.
 
 mod bin;
 mod camera;
@@ -12,32 +12,29 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DVec3};
 
 use super::folders::Folders;
-use super::formats::DatasetFormat;
 use super::lens::Lens;
 use super::paths::{DataPath, Root, relative};
 use super::pose::{checked_pose, checked_quaternion};
 use super::tracks::{TrackSampler, Tracks};
-use super::{DatasetError, Frame, PointCloud, Scene};
+use super::formats::DatasetFormat;
+use super::{DatasetError, Frame, LoadOptions, PointCloud, Scene};
 
-const REMEDY: &str = "export the model again with COLMAP";
-/// The remedy for names of images that are not UTF-8.
-const RENAME: &str = "rename the image, and make the model again";
-
-/// The format.
 pub(super) const FORMAT: DatasetFormat = DatasetFormat {
     name: "colmap",
+    title: "COLMAP",
     file: "sparse/0/cameras.bin",
-    marker: "sparse/0/cameras.bin or .txt, nor sparse/cameras.bin or .txt",
-    read: |root, options| {
-        let Some(folder) = find(root.path()) else { return Ok(None) };
-        read(root, &folder, &Folders::new(root, options, true)?, options.tracks).map(Some)
-    },
+    files: "sparse/0/cameras.bin or .txt, or sparse/cameras.bin or .txt",
+    read,
 };
 
-/// Most records accepted.
+const REMEDY: &str = "export the model again with COLMAP";
+/// Remedy for names of images that are not UTF-8.
+const RENAME: &str = "rename the image and reconstruct the model again";
+
+/// Largest accepted numbers of images and points.
 const MAX_IMAGES: u64 = 1_000_000;
 const MAX_POINTS: u64 = 1 << 28;
-/// Largest difference between the same pose written by two programs.
+/// Largest difference between two copies of one pose that different programs wrote.
 const SAME_POSE: f64 = 1e-5;
 
 /// One registered image.
@@ -66,7 +63,7 @@ impl Image {
     }
 }
 
-/// The contents of the three files.
+/// The contents of a model's three files.
 #[derive(Debug, Default)]
 struct Model {
     cameras: HashMap<u32, Lens>,
@@ -76,7 +73,7 @@ struct Model {
 }
 
 /// The folder of the model, if there is one: `sparse/0`, else `sparse`.
-pub(super) fn find(root: &Path) -> Option<PathBuf> {
+fn find(root: &Path) -> Option<PathBuf> {
     ["sparse/0", "sparse"].iter().map(|folder| root.join(folder)).find(|folder| {
         ["cameras.bin", "cameras.txt", "images.bin", "images.txt"]
             .iter()
@@ -84,17 +81,14 @@ pub(super) fn find(root: &Path) -> Option<PathBuf> {
     })
 }
 
-/// Reads the model in `folder`.
+/// Reads the model in a folder, if there is one.
 ///
 /// # Errors
 /// When a file is missing, damaged, or contradicts another.
-fn read(
-    root: &Root,
-    folder: &Path,
-    folders: &Folders,
-    with_tracks: bool,
-) -> Result<Scene, DatasetError> {
-    let ([cameras, images, points], model) = model(root, folder, with_tracks)?;
+fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, DatasetError> {
+    let Some(folder) = find(root.path()) else { return Ok(None) };
+    let folders = Folders::new(root, options, true)?;
+    let ([cameras, images, points], model) = model(root, &folder, options.tracks)?;
     let mut frames = Vec::with_capacity(model.images.len());
     let mut reduced_missing = 0;
     for image in model.images {
@@ -116,7 +110,7 @@ fn read(
             reduced: found.reduced,
             mask,
             lens: *lens,
-            is_sized: true,
+            header: None,
             rotation: image.rotation,
             translation: image.translation,
             held_out: false,
@@ -132,7 +126,7 @@ fn read(
     if reduced_missing > 0 {
         notes.push(folders.fell_back_note(reduced_missing));
     }
-    Ok(Scene {
+    Ok(Some(Scene {
         listing: images,
         frames,
         points: model.points,
@@ -140,10 +134,10 @@ fn read(
         tracks: model.tracks,
         notes,
         ..Scene::default()
-    })
+    }))
 }
 
-/// The paths of the three files and their contents.
+/// The paths and contents of a model's three files.
 fn model(
     root: &Root,
     folder: &Path,
@@ -153,7 +147,7 @@ fn model(
     let ending = if binary { "bin" } else { "txt" };
     let file = |name: &str| folder.join(format!("{name}.{ending}"));
     let (cameras, images, points) = (file("cameras"), file("images"), file("points3D"));
-    // Links out of the dataset are refused for these files too.
+    // These files may not be links out of the dataset either.
     for path in [&cameras, &images, &points] {
         let inside = path.strip_prefix(root.path()).unwrap_or(path).to_string_lossy();
         root.existing(DataPath { file: path, field: "the file", value: &inside })?;
@@ -169,11 +163,11 @@ fn model(
     Ok(([cameras, images, points], Model { cameras: lenses, images: posed, points: cloud, tracks }))
 }
 
-/// Gives a scene of another format the tracks of the model in `folder` if both have the same images
-/// with the same poses, as written by `densify scenegen`. If not, the model is ignored: nothing says
-/// that the two belong together.
-pub(super) fn adopt_tracks(root: &Root, folder: &Path, scene: &mut Scene) {
-    let Ok((_, model)) = model(root, folder, true) else { return };
+/// Adds the tracks of the COLMAP model in a folder to a scene of another format, if both have the same images with the
+/// same poses, as `densify scenegen` writes them. Otherwise the model is ignored, as it may belong to another scene.
+pub(super) fn adopt_tracks(root: &Root, scene: &mut Scene) {
+    let Some(folder) = find(root.path()) else { return };
+    let Ok((_, model)) = model(root, &folder, true) else { return };
     let by_name: HashMap<String, &Image> =
         model.images.iter().map(|image| (relative(&image.name), image)).collect();
     let mut matched = false;

@@ -12,14 +12,14 @@ use glam::DVec3;
 use super::super::DatasetError;
 use super::super::PointCloud;
 use super::super::lens::Lens;
-use super::super::lens::table::LensModel;
+use super::super::lens::models::LensModel;
 use super::super::paths::MAX_NAME;
 use super::super::tracks::TrackSampler;
 use super::camera;
 use super::{Image, MAX_IMAGES, MAX_POINTS, REMEDY, RENAME};
 use densify_core::files;
 
-/// Longest line accepted: the observations of one image, about 40 bytes each.
+/// Longest line accepted `[bytes]`. The longest lines are the observations of an image, about 40 bytes each.
 const MAX_LINE: u64 = 64 << 20;
 
 struct Lines<'a> {
@@ -36,15 +36,15 @@ impl<'a> Lines<'a> {
     }
 
     fn fault(&self, field: &str, problem: impl Display) -> DatasetError {
-        self.mended_by(REMEDY, field, problem)
+        self.fault_with_remedy(REMEDY, field, problem)
     }
 
-    fn mended_by(&self, remedy: &str, field: &str, problem: impl Display) -> DatasetError {
+    fn fault_with_remedy(&self, remedy: &str, field: &str, problem: impl Display) -> DatasetError {
         let place = format!("line {}: {field}", self.number);
         DatasetError::malformed(self.path, place, problem, remedy)
     }
 
-    /// Reads the next line, comment or not; false at the end.
+    /// Reads the next line, even if it is a comment; false at the end of the file.
     fn advance(&mut self) -> Result<bool, DatasetError> {
         self.line.clear();
         self.number += 1;
@@ -64,7 +64,7 @@ impl<'a> Lines<'a> {
         Ok(read > 0)
     }
 
-    /// Reads on to the next line that is neither empty nor a comment; false at the end.
+    /// Reads the next line that is neither empty nor a comment; false at the end of the file.
     fn advance_to_record(&mut self) -> Result<bool, DatasetError> {
         while self.advance()? {
             let text = self.line.trim_ascii_start();
@@ -77,7 +77,7 @@ impl<'a> Lines<'a> {
 
     fn text(&self) -> Result<&str, DatasetError> {
         let text = std::str::from_utf8(&self.line);
-        text.map_err(|_| self.mended_by(RENAME, "the line", "a name in it is not UTF-8"))
+        text.map_err(|_| self.fault_with_remedy(RENAME, "the line", "a name in it is not UTF-8"))
     }
 
     /// The next word of the line as a number.
@@ -129,7 +129,7 @@ pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, Lens>, DatasetError> {
     Ok(cameras)
 }
 
-/// Reads images.txt. An image is two lines, of which the second, its observations, may be empty.
+/// Reads images.txt. An image has two lines, the second of which lists its observations and may be empty.
 pub(super) fn images(path: &Path) -> Result<Vec<Image>, DatasetError> {
     let mut lines = Lines::open(path)?;
     let mut images = Vec::new();
@@ -141,7 +141,7 @@ pub(super) fn images(path: &Path) -> Result<Vec<Image>, DatasetError> {
         let q = lines.numbers::<4>(&mut words, &field)?;
         let t = lines.numbers::<3>(&mut words, &field)?;
         let camera: u32 = lines.number(&mut words, "camera id")?;
-        // The name is the rest of the line: it may hold spaces.
+        // The name is the rest of the line and may contain spaces.
         let name = after_words(text, 9);
         if name.is_empty() || name.len() > MAX_NAME {
             return Err(lines.fault(&field, "the name is missing or longer than 4 KiB"));
@@ -165,7 +165,7 @@ pub(super) fn images(path: &Path) -> Result<Vec<Image>, DatasetError> {
     Ok(images)
 }
 
-/// What follows the first `count` words of a line.
+/// The rest of a line after its first `count` words.
 fn after_words(text: &str, count: usize) -> &str {
     let mut rest = text.trim();
     for _ in 0..count {
@@ -174,7 +174,7 @@ fn after_words(text: &str, count: usize) -> &str {
     rest
 }
 
-/// Reads points3D.txt, and its tracks into `tracks`.
+/// Reads points3D.txt, and passes its tracks to `tracks`.
 pub(super) fn points(
     path: &Path,
     mut tracks: Option<&mut TrackSampler>,

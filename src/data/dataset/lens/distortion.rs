@@ -1,39 +1,39 @@
-//! The distortion of a lens's plane, and its inverse by Newton's method.
+//! Lens distortion and its inverse by Newton's method.
 
 use glam::{DMat2, DVec2};
 
 use super::Plane;
 
-/// The plane of a lens and how it is distorted: radial, tangential and thin-prism terms, each 0 without
-/// effect (OpenCV, *Camera Calibration and 3D Reconstruction*; COLMAP, `sensor/models`).
+/// The plane of a lens and its distortion by radial, tangential and thin-prism terms (OpenCV, *Camera Calibration and
+/// 3D Reconstruction*; COLMAP, `sensor/models`). Coefficients of 0 have no effect.
 ///
-/// p becomes p·(1 + a₁r² + a₂r⁴ + a₃r⁶ + a₄r⁸) / (1 + b₁r² + b₂r⁴ + b₃r⁶), plus both other parts.
+/// p becomes p·(1 + a₁r² + a₂r⁴ + a₃r⁶ + a₄r⁸) / (1 + b₁r² + b₂r⁴ + b₃r⁶), plus the tangential and thin-prism parts.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Distortion {
-    /// What is distorted.
-    pub plane: Plane,
+pub(crate) struct Distortion {
+    /// The plane that is distorted.
+    pub(crate) plane: Plane,
     /// a₁ to a₄.
-    pub radial: [f64; 4],
+    pub(crate) radial: [f64; 4],
     /// b₁ to b₃.
-    pub denominator: [f64; 3],
+    pub(crate) denominator: [f64; 3],
     /// p₁ and p₂.
-    pub tangential: [f64; 2],
-    /// Shift along x and y for each r².
-    pub prism: [f64; 2],
+    pub(crate) tangential: [f64; 2],
+    /// Shifts of the thin prism along x and y, per r².
+    pub(crate) prism: [f64; 2],
 }
 
-/// Most steps of Newton's method, which converges quadratically; halved steps need more.
+/// Most steps of Newton's method. It converges quadratically, but halved steps need more.
 const STEPS: u32 = 60;
 
 impl Distortion {
-    /// None, of this plane.
+    /// No distortion of a plane.
     #[must_use]
-    pub fn of(plane: Plane) -> Self {
+    pub(crate) fn none(plane: Plane) -> Self {
         let (radial, denominator) = ([0.0; 4], [0.0; 3]);
         Self { plane, radial, denominator, tangential: [0.0; 2], prism: [0.0; 2] }
     }
 
-    /// All its coefficients.
+    /// All coefficients.
     pub(super) fn coefficients(&self) -> impl Iterator<Item = f64> {
         let radial = self.radial.into_iter().chain(self.denominator);
         radial.chain(self.tangential).chain(self.prism)
@@ -52,9 +52,9 @@ impl Distortion {
         (value, slope)
     }
 
-    /// Where a point of the plane goes.
+    /// Distorts a point of the plane.
     #[must_use]
-    pub fn apply(&self, p: DVec2) -> DVec2 {
+    pub(crate) fn apply(&self, p: DVec2) -> DVec2 {
         let s = p.length_squared();
         let ([n, m], _) = self.radial_at(s);
         let ([p1, p2], prism) = (self.tangential, DVec2::from(self.prism));
@@ -79,15 +79,15 @@ impl Distortion {
         ])
     }
 
-    /// The point of the plane, at most `reach` from the centre, that goes to `target`; `None` if there is
-    /// none. `reach` is at most that of this distortion.
+    /// The point of the plane that is distorted to `target`; `None` if no such point lies within `reach` of the centre,
+    /// which is at most the invertible radius.
     #[must_use]
-    pub fn inverse(&self, target: DVec2, reach: f64) -> Option<DVec2> {
+    pub(crate) fn inverse(&self, target: DVec2, reach: f64) -> Option<DVec2> {
         let mut p = target.clamp_length_max(reach);
         let mut miss = self.apply(p) - target;
         for _ in 0..STEPS {
             let mut step = self.jacobian(p).inverse() * miss;
-            // The Jacobian is regular within the reach, so that a short enough step always gains.
+            // The Jacobian is regular within the invertible radius, so that a short enough step always improves.
             let next = loop {
                 let next = (p - step).clamp_length_max(reach);
                 let missed = self.apply(next) - target;
@@ -102,12 +102,12 @@ impl Distortion {
             };
             let change = (next - p).length();
             p = next;
-            // Newton converges quadratically: the next change would be far below rounding.
+            // Because of quadratic convergence, the next change would be far below rounding.
             if change < 1e-11 * (1.0 + p.length()) {
                 break;
             }
         }
-        // A point beyond the reach ends at its rim, and misses.
+        // For a target beyond the rim the search ends at the rim and misses.
         (miss.length() < 1e-9 * (1.0 + target.length())).then_some(p)
     }
 }

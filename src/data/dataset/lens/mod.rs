@@ -1,13 +1,14 @@
-//! Lenses: from the direction of a ray to its place in the image, and back.
+//! Lenses: projection of rays into the image, and back.
 //!
-//! A lens model is a [`Plane`] onto which rays fall by their angle from the axis, and a [`Distortion`] of that
-//! plane; `table.rs` has all of them. Nothing beyond the radius that is proven invertible is used (`reach.rs`).
+//! A lens model is a [`Plane`], which maps the angle from the optical axis to a distance from the centre, and a
+//! [`Distortion`] of that plane. `models.rs` lists all models. Only the part of the plane on which the distortion is
+//! provably invertible is used (`invertible_radius.rs`).
 
-mod cut;
 mod distortion;
+mod invertible_radius;
+pub(super) mod models;
+mod pinholes;
 mod plane;
-mod reach;
-pub(super) mod table;
 #[cfg(test)]
 mod tests;
 
@@ -15,69 +16,71 @@ use std::fmt;
 
 use glam::{DVec2, DVec3};
 
-pub(super) use cut::{Cut, CutFault};
-pub use distortion::Distortion;
-pub use plane::Plane;
+pub(crate) use distortion::Distortion;
+pub(super) use pinholes::{PinholeError, Pinholes};
+pub(crate) use plane::Plane;
 
-/// A lens with its image. The upper left corner of the image is (0, 0); pixel centres are at +0.5. Axes as
-/// of a camera: x right, y down, z forward.
+/// A lens and the size of its image. The upper left corner of the image is (0, 0); pixel centres are at +0.5. The axes
+/// are x right, y down, z forward.
+///
+/// The `Debug` text of lenses is part of the fingerprint in checkpoints: renaming a field would invalidate them.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Lens {
+pub(crate) struct Lens {
     /// Image width `[px]`.
-    pub width: u32,
+    pub(crate) width: u32,
     /// Image height `[px]`.
-    pub height: u32,
+    pub(crate) height: u32,
     /// Focal lengths `[px]`.
-    pub focal: DVec2,
+    pub(crate) focal: DVec2,
     /// Principal point `[px]`.
-    pub principal: DVec2,
+    pub(crate) principal: DVec2,
     distortion: Distortion,
-    /// Distance from the centre of the plane up to which it is inverted.
+    /// Distance from the centre of the plane up to which the distortion is invertible.
     reach: f64,
-    /// Whether the distortion folds over there; else the plane ends.
+    /// Whether the distortion folds over beyond that distance; otherwise the plane ends there.
     folds: bool,
 }
 
-/// Why no ray is known for a pixel.
+/// Reason why a pixel has no ray.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Unseen {
-    /// The distortion has no inverse there.
+pub(crate) enum Unseen {
+    /// The distortion has no inverse at the pixel.
     Folds,
-    /// It is farther from the axis than is followed.
+    /// The angle from the axis is larger than the supported one.
     TooWide,
 }
 
 impl Lens {
-    /// A lens; its parameters need not be sensible.
+    /// A lens; the parameters may be invalid.
     #[must_use]
-    pub fn new(
+    pub(crate) fn new(
         (width, height): (u32, u32),
         focal: DVec2,
         principal: DVec2,
         distortion: Distortion,
     ) -> Self {
         let limit = distortion.plane.radius(distortion.plane.widest());
-        let reach = distortion.reach(limit);
-        // But for the rounding of a square root; false where the limit is not a number.
+        let reach = distortion.invertible_radius(limit);
+        // The factor allows for the rounding of a square root; false if the limit is NaN.
         let is_whole = reach >= limit * (1.0 - 1e-12);
         Self { width, height, focal, principal, distortion, reach, folds: !is_whole }
     }
 
     /// The distortion.
     #[must_use]
-    pub fn distortion(&self) -> &Distortion {
+    pub(crate) fn distortion(&self) -> &Distortion {
         &self.distortion
     }
 
-    /// Whether it is anything but a pinhole.
+    /// Whether the lens differs from a pinhole.
     #[must_use]
-    pub fn is_distorted(&self) -> bool {
-        self.distortion != Distortion::of(Plane::Perspective)
+    pub(crate) fn is_distorted(&self) -> bool {
+        self.distortion != Distortion::none(Plane::Perspective)
     }
 
     /// Whether all parameters are finite numbers.
     #[must_use]
-    pub fn is_finite(&self) -> bool {
+    pub(crate) fn is_finite(&self) -> bool {
         let omega = match self.distortion.plane {
             Plane::Fov(omega) => omega,
             Plane::Perspective | Plane::Equidistant => 0.0,
@@ -86,15 +89,15 @@ impl Lens {
         self.focal.is_finite() && self.principal.is_finite() && { rest }.all(f64::is_finite)
     }
 
-    /// Largest angle between two rays opposite to each other that it images one-to-one `[degrees]`.
+    /// Largest field of view that is imaged one-to-one `[degrees]`.
     #[must_use]
-    pub fn usable_field(&self) -> f64 {
+    pub(crate) fn usable_field(&self) -> f64 {
         2.0 * self.distortion.plane.angle(self.reach).to_degrees()
     }
 
     /// The same lens with an image of another size.
     #[must_use]
-    pub fn resized(&self, width: u32, height: u32) -> Self {
+    pub(crate) fn resized(&self, width: u32, height: u32) -> Self {
         let scale = DVec2::new(
             f64::from(width) / f64::from(self.width),
             f64::from(height) / f64::from(self.height),
@@ -105,11 +108,11 @@ impl Lens {
 
     /// Image size `[px]`.
     #[must_use]
-    pub fn size(&self) -> DVec2 {
+    pub(crate) fn size(&self) -> DVec2 {
         DVec2::new(f64::from(self.width), f64::from(self.height))
     }
 
-    /// Where the plane has a ray; `None` where it has none.
+    /// Point of a ray on the undistorted plane; `None` if the plane does not contain the ray.
     fn on_plane(&self, direction: DVec3) -> Option<DVec2> {
         let (flat, plane) = (direction.truncate(), self.distortion.plane);
         if plane == Plane::Perspective {
@@ -123,17 +126,17 @@ impl Lens {
         Some(if sine > 0.0 { flat * (plane.radius(angle) / sine) } else { DVec2::ZERO })
     }
 
-    /// Where a ray is imaged `[px]`, in the image or not; `None` beyond what is inverted.
+    /// Projection of a ray `[px]`, which may lie outside the image; `None` where the distortion is not invertible.
     #[must_use]
-    pub fn project(&self, direction: DVec3) -> Option<DVec2> {
-        // A relative 1e-9 is below any pixel, and above the rounding of a point on the rim.
+    pub(crate) fn project(&self, direction: DVec3) -> Option<DVec2> {
+        // A relative 1e-9 is far below a pixel, and above the rounding of a point on the rim.
         let is_within = |p: &DVec2| p.length() <= self.reach * (1.0 + 1e-9);
         self.on_plane(direction).filter(is_within).map(|p| self.imaged(p))
     }
 
-    /// The same without regard to whether it can be inverted.
+    /// Projection of a ray `[px]`, even where the distortion is not invertible.
     #[must_use]
-    pub fn extrapolate(&self, direction: DVec3) -> Option<DVec2> {
+    pub(crate) fn extrapolate(&self, direction: DVec3) -> Option<DVec2> {
         self.on_plane(direction).map(|p| self.imaged(p))
     }
 
@@ -141,11 +144,11 @@ impl Lens {
         self.distortion.apply(on_plane) * self.focal + self.principal
     }
 
-    /// The ray that is imaged at a place `[px]`, of any length.
+    /// A ray of any length that is imaged at a point `[px]`.
     ///
     /// # Errors
-    /// Where none is known.
-    pub fn unproject(&self, pixel: DVec2) -> Result<DVec3, Unseen> {
+    /// When no such ray is known.
+    pub(crate) fn unproject(&self, pixel: DVec2) -> Result<DVec3, Unseen> {
         let target = (pixel - self.principal) / self.focal;
         let unseen = if self.folds { Unseen::Folds } else { Unseen::TooWide };
         let p = self.distortion.inverse(target, self.reach).ok_or(unseen)?;
@@ -159,7 +162,7 @@ impl Lens {
 }
 
 impl fmt::Display for Distortion {
-    /// Plane and terms, for messages.
+    /// The plane and the coefficients, for messages.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { plane, radial, denominator, tangential, prism } = self;
         write!(f, "{plane:?}, radial {radial:?}")?;

@@ -1,8 +1,8 @@
-//! The planes that lens models start from: how far from the centre a ray falls, by its angle from the axis.
+//! Planes of lens models: the distance of a ray from the centre, as a function of its angle from the axis.
 
-/// How the angle between a ray and the optical axis becomes a distance on the plane that is then distorted.
+/// The map from the angle between a ray and the optical axis to a distance on the plane that is then distorted.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Plane {
+pub(crate) enum Plane {
     /// tan θ: a pinhole.
     Perspective,
     /// θ: a fisheye (Kannala and Brandt 2006).
@@ -11,16 +11,17 @@ pub enum Plane {
     Fov(f64),
 }
 
-/// Largest angle from the axis that is followed where a plane is infinite at 90 degrees `[rad]`: beyond it a
-/// pixel sees less than a hundredth of what one at the centre does.
+/// Largest supported angle from the axis, for planes that are infinite at 90 degrees `[rad]`. Beyond it a pixel covers
+/// less than a hundredth of the solid angle of a pixel at the centre.
 const WIDEST: f64 = 85.0_f64.to_radians();
-/// The same of a fisheye `[rad]`: the sides of the cube around the camera reach a little farther.
+/// Largest supported angle from the axis for fisheyes `[rad]`; the sides of the cube around the camera extend a little
+/// farther.
 const WIDEST_FISHEYE: f64 = 120.0_f64.to_radians();
 
 impl Plane {
-    /// Distance from the centre of a ray at this angle `[rad]`, which is below [`Self::widest`].
+    /// Distance from the centre, for an angle `[rad]` below [`Self::widest`].
     #[must_use]
-    pub fn radius(self, angle: f64) -> f64 {
+    pub(crate) fn radius(self, angle: f64) -> f64 {
         match self {
             Self::Perspective => angle.tan(),
             Self::Equidistant => angle,
@@ -30,7 +31,7 @@ impl Plane {
 
     /// Inverse of [`Self::radius`] `[rad]`.
     #[must_use]
-    pub fn angle(self, radius: f64) -> f64 {
+    pub(crate) fn angle(self, radius: f64) -> f64 {
         match self {
             Self::Perspective => radius.atan(),
             Self::Equidistant => radius,
@@ -38,19 +39,19 @@ impl Plane {
         }
     }
 
-    /// Derivative of [`Self::radius`] on the axis: how many focal lengths of the lens a pinhole needs for as
-    /// many pixels per radian.
+    /// Derivative of [`Self::radius`] on the axis: the focal length, relative to that of the lens, with which a pinhole
+    /// has as many pixels per radian.
     #[must_use]
-    pub fn slope(self) -> f64 {
+    pub(crate) fn slope(self) -> f64 {
         match self {
             Self::Perspective | Self::Equidistant => 1.0,
             Self::Fov(omega) => 2.0 * (0.5 * omega).tan() / omega,
         }
     }
 
-    /// Largest angle from the axis that is followed `[rad]`.
+    /// Largest supported angle from the axis `[rad]`.
     #[must_use]
-    pub fn widest(self) -> f64 {
+    pub(crate) fn widest(self) -> f64 {
         match self {
             Self::Perspective | Self::Fov(_) => WIDEST,
             Self::Equidistant => WIDEST_FISHEYE,

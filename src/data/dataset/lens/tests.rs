@@ -1,14 +1,14 @@
-//! Lenses against COLMAP's own projection, there and back, and their pinholes.
+//! Tests of lenses: projection against COLMAP's, round trips, and the pinholes that replace them.
 
 use glam::{DVec2, DVec3};
 
-use super::table::{LensModel, MODELS};
-use super::{Cut, CutFault, Distortion, Lens, Plane, Unseen};
+use super::models::{LensModel, MODELS};
+use super::{Distortion, Lens, PinholeError, Pinholes, Plane, Unseen};
 use densify_core::image::Image8;
 
 const SIZE: (u32, u32) = (300, 184);
 
-/// A lens of a model, from its parameters in COLMAP's order.
+/// A lens of a model, from parameters in COLMAP's order.
 fn lens(name: &str, parameters: &[f64]) -> Lens {
     let model: &LensModel = MODELS.iter().find(|model| model.name == name).unwrap();
     let mut next = parameters.iter().copied();
@@ -16,18 +16,18 @@ fn lens(name: &str, parameters: &[f64]) -> Lens {
     let fx = next();
     let fy = if model.focals == 2 { next() } else { fx };
     let principal = DVec2::new(next(), next());
-    let mut distortion = Distortion::of(model.plane);
+    let mut distortion = Distortion::none(model.plane);
     for &term in model.terms {
         distortion.set(term, next());
     }
     Lens::new(SIZE, DVec2::new(fx, fy), principal, distortion)
 }
 
-/// Rays, in this order below.
+/// Rays, in the order of the references below.
 const RAYS: [DVec3; 3] =
     [DVec3::new(0.1, -0.2, 1.0), DVec3::new(-0.7, 0.4, 1.0), DVec3::new(1.1, 0.6, 0.8)];
 
-/// Model, parameters, and where COLMAP 4.2.1 (`pycolmap.Camera.img_from_cam`) images the rays.
+/// Model, parameters, and projections of the rays by COLMAP 4.2.1 (`pycolmap.Camera.img_from_cam`).
 type Reference = (&'static str, &'static [f64], [[f64; 2]; 3]);
 
 const REFERENCES: [Reference; 7] = [
@@ -110,7 +110,7 @@ fn rays_are_imaged_where_colmap_images_them() {
     }
 }
 
-/// Lenses for the tests below: those above, and stronger ones of each kind.
+/// The lenses above, and stronger ones of each kind.
 fn lenses() -> Vec<(&'static str, Lens)> {
     let mut all: Vec<_> = REFERENCES.iter().map(|(name, p, _)| (*name, lens(name, p))).collect();
     let opencv = |k: [f64; 4]| lens("OPENCV", &[&[210.0, 214.0, 150.0, 92.0], &k[..]].concat());
@@ -137,7 +137,7 @@ fn a_grid_comes_back_through_every_model() {
             let back = lens.project(ray).unwrap_or(DVec2::INFINITY);
             worst = worst.max(back.distance(pixel));
         }
-        // The other way, over the field that is proven: 0.01 px is the promise, rounding what is met.
+        // The other way, over the invertible field. 0.01 px is promised; only rounding remains.
         let half = 0.5 * lens.usable_field().to_radians();
         for (i, j) in (0..=80).flat_map(|i| (0..48).map(move |j| (i, j))) {
             let angle = half * f64::from(i) / 80.001;
@@ -154,9 +154,9 @@ fn a_grid_comes_back_through_every_model() {
 }
 
 #[test]
-fn what_cannot_be_inverted_is_not() {
+fn folding_and_too_wide_lenses_are_not_inverted() {
     let folding = lens("OPENCV", &[210.0, 214.0, 150.0, 92.0, -1.0, 0.0, 0.0, 0.0]);
-    // r − r³ turns round at 0.577, which is 60 degrees both ways.
+    // r − r³ folds over at 0.577, which is 60 degrees both ways.
     assert!((folding.usable_field() - 60.0).abs() < 0.2, "{}", folding.usable_field());
     assert_eq!(folding.unproject(DVec2::ZERO), Err(Unseen::Folds));
     assert_eq!(folding.project(DVec3::new(0.6, 0.0, 1.0)), None);
@@ -171,8 +171,8 @@ fn what_cannot_be_inverted_is_not() {
 #[test]
 fn a_pinhole_sees_only_what_the_lens_saw_and_touches_every_side() {
     for (name, lens) in lenses() {
-        let cut = Cut::of(&lens, false).unwrap();
-        for (face, undistortion) in &cut.faces {
+        let pinholes = Pinholes::covering(&lens, false).unwrap();
+        for (face, undistortion) in &pinholes.faces {
             let to = undistortion.pinhole();
             let size = DVec2::new(f64::from(to.width), f64::from(to.height));
             let mut slack = [f64::INFINITY; 4];
@@ -184,7 +184,7 @@ fn a_pinhole_sees_only_what_the_lens_saw_and_touches_every_side() {
                 assert!(inside.iter().all(|&d| d > -0.02), "{name} {face} at {at:?}: {s}");
                 slack = std::array::from_fn(|side| slack[side].min(inside[side]));
             }
-            if cut.faces.len() == 1 {
+            if pinholes.faces.len() == 1 {
                 assert!(slack.iter().all(|&d| d < 1.5), "{name}: a side could be wider: {slack:?}");
             }
             assert!(!undistortion.is_masked(), "{name} {face}");
@@ -192,7 +192,7 @@ fn a_pinhole_sees_only_what_the_lens_saw_and_touches_every_side() {
     }
 }
 
-/// Faces tile what they show: a ray falls into one of them, but for their common edges.
+/// Faces do not overlap: a ray falls into exactly one of them, except on common edges.
 #[test]
 fn a_wide_field_becomes_faces_of_a_cube() {
     for (name, expected) in [
@@ -201,7 +201,7 @@ fn a_wide_field_becomes_faces_of_a_cube() {
         ("barrel", &[""]),
     ] {
         let lens = lenses().into_iter().find(|(other, _)| *other == name).unwrap().1;
-        let [cropped, kept] = [false, true].map(|keep| Cut::of(&lens, keep).unwrap());
+        let [cropped, kept] = [false, true].map(|keep| Pinholes::covering(&lens, keep).unwrap());
         let names: Vec<_> = cropped.faces.iter().map(|(name, _)| *name).collect();
         assert_eq!(names, expected, "{name}");
         assert!(kept.cropped <= 0.001 && cropped.cropped > kept.cropped, "{name}");
@@ -221,21 +221,28 @@ fn a_wide_field_becomes_faces_of_a_cube() {
 fn a_distortion_that_folds_over_is_refused_or_kept_where_it_does_not() {
     for k in [[-1.5, 0.0, 0.0, 0.0], [0.0, -4.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]] {
         let lens = lens("OPENCV", &[&[210.0, 214.0, 150.0, 92.0], &k[..]].concat());
-        let Err(CutFault::Folds(degrees)) = Cut::of(&lens, false) else { panic!("{k:?}") };
+        let Err(PinholeError::Folds(degrees)) = Pinholes::covering(&lens, false) else {
+            panic!("{k:?}")
+        };
         assert!((degrees - lens.usable_field()).abs() < 1e-9 && degrees > 1.0, "{k:?}: {degrees}");
-        let cut = Cut::of(&lens, true).unwrap();
-        assert!(cut.faces.len() == 1 && cut.faces[0].1.is_masked() && cut.cropped > 0.01, "{k:?}");
+        let pinholes = Pinholes::covering(&lens, true).unwrap();
+        assert!(
+            pinholes.faces.len() == 1 && pinholes.faces[0].1.is_masked() && pinholes.cropped > 0.01,
+            "{k:?}"
+        );
     }
     let nan = lens("OPENCV", &[210.0, 214.0, 150.0, 92.0, f64::NAN, 0.0, 0.0, 0.0]);
-    assert!(Cut::of(&nan, false).is_err() && Cut::of(&nan, true) == Err(CutFault::Nothing));
-    // With its axis outside, as a cut-out has it, the image is still seen.
+    assert!(
+        Pinholes::covering(&nan, false).is_err()
+            && Pinholes::covering(&nan, true) == Err(PinholeError::Nothing)
+    );
+    // An image whose axis lies outside, as in a crop, is still usable.
     let aside = lens("OPENCV", &[210.0, 214.0, -40.0, 92.0, 0.058, 0.0, 0.0, 0.0]);
-    let cut = Cut::of(&aside, false).unwrap();
-    assert!(cut.faces.len() == 1 && cut.cropped < 0.15, "{cut:?}");
+    let pinholes = Pinholes::covering(&aside, false).unwrap();
+    assert!(pinholes.faces.len() == 1 && pinholes.cropped < 0.15, "{pinholes:?}");
 }
 
-/// Dots drawn where the lens images known rays are found, after undistortion, where the pinholes project
-/// those rays.
+/// After undistortion, dots that were drawn at the lens's projection of known rays lie at the pinhole's projection.
 #[test]
 fn dots_land_where_pinholes_project_them() {
     for (name, lens) in lenses() {
@@ -257,7 +264,7 @@ fn dots_land_where_pinholes_project_them() {
         }
         let image = Image8 { width, height, rgb, alpha: None, mask: None };
         let mut found = 0;
-        for (face, undistortion) in Cut::of(&lens, true).unwrap().faces {
+        for (face, undistortion) in Pinholes::covering(&lens, true).unwrap().faces {
             let (out, to) = (undistortion.apply(&image), undistortion.pinhole());
             let size = DVec2::new(f64::from(to.width), f64::from(to.height));
             assert_eq!(out.mask.is_some(), undistortion.is_masked());

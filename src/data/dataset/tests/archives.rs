@@ -1,4 +1,4 @@
-//! Datasets in ZIP archives: the same as in folders, and nothing of an archive is trusted.
+//! Tests of datasets in ZIP archives: they load like folders, and unsafe archives are refused.
 
 use std::io::{Cursor, Write};
 use std::path::{Path, PathBuf};
@@ -10,7 +10,7 @@ use zip::{CompressionMethod, ZipWriter};
 use super::super::*;
 use densify_fixtures::Made;
 
-/// An archive in a folder of its own.
+/// An archive in its own folder.
 struct Packed {
     folder: TempDir,
 }
@@ -31,7 +31,7 @@ impl Packed {
     }
 }
 
-/// Files below a folder, by path from there.
+/// The files below a folder with their relative paths.
 fn files(folder: &Path) -> Vec<(String, Vec<u8>)> {
     let mut found = Vec::new();
     let mut open = vec![folder.to_owned()];
@@ -50,7 +50,7 @@ fn files(folder: &Path) -> Vec<(String, Vec<u8>)> {
     found
 }
 
-/// Packs files under names that begin so.
+/// Packs files under names with a prefix.
 fn pack(files: &[(String, Vec<u8>)], before: &str, method: CompressionMethod) -> Vec<u8> {
     let mut writer = ZipWriter::new(Cursor::new(Vec::new()));
     let options = SimpleFileOptions::default().compression_method(method);
@@ -65,7 +65,7 @@ fn packed(made: &Made) -> Vec<u8> {
     pack(&files(made.path()), "", CompressionMethod::Deflated)
 }
 
-/// Replaces all occurrences of a name by one as long.
+/// Replaces all occurrences of a name by another of the same length.
 fn renamed(bytes: &[u8], old: &str, new: &str) -> Vec<u8> {
     assert_eq!(old.len(), new.len());
     let (mut bytes, mut count) = (bytes.to_vec(), 0);
@@ -79,7 +79,7 @@ fn renamed(bytes: &[u8], old: &str, new: &str) -> Vec<u8> {
     bytes
 }
 
-/// Changes bytes in the headers of all files: places in a file's own header and in the table of contents.
+/// Changes one byte of each file: at an offset in its own header and at one in the table of contents.
 fn in_headers(bytes: &[u8], own: usize, table: usize, change: impl Fn(&mut u8)) -> Vec<u8> {
     let mut bytes = bytes.to_vec();
     for at in 0..bytes.len() - 4 {
@@ -92,7 +92,7 @@ fn in_headers(bytes: &[u8], own: usize, table: usize, change: impl Fn(&mut u8)) 
     bytes
 }
 
-/// Where an archive is unpacked, by what is said.
+/// The folder that an archive is unpacked in, according to the note.
 fn unpacked_in(data: &Dataset) -> PathBuf {
     let said = data.notes.iter().find_map(|note| note.split_once(" is unpacked in "));
     let (_, place) = said.unwrap_or_else(|| panic!("{:?}", data.notes));
@@ -143,7 +143,7 @@ fn an_archive_is_its_folder() {
 }
 
 #[test]
-fn it_stays_unpacked_as_long_as_a_view_of_it() {
+fn the_unpacked_folder_lives_as_long_as_a_view() {
     let archive = Packed::of(&packed(&Made::colmap_txt()));
     let data = archive.load().unwrap();
     let place = unpacked_in(&data);
@@ -153,7 +153,7 @@ fn it_stays_unpacked_as_long_as_a_view_of_it() {
     assert_eq!(view.source.load().unwrap().rgb[0], 40);
     drop(view);
     assert!(!place.exists());
-    // Nothing is left of one that is refused, either.
+    // A refused archive leaves nothing behind either.
     let made = Made::colmap_txt();
     made.remove("images/b.png");
     let error = Packed::of(&packed(&made)).load().unwrap_err().to_string();
@@ -162,9 +162,9 @@ fn it_stays_unpacked_as_long_as_a_view_of_it() {
     assert!(!error.contains("densify-zip-"), "{error}");
 }
 
-/// Masks and points are of the archive too, and messages name files by their place in it.
+/// Masks and points are read from the archive too, and messages name files by their path in it.
 #[test]
-fn what_belongs_to_photographs_is_read_from_it() {
+fn masks_and_points_are_read_from_the_archive() {
     let made = Made::colmap_txt();
     std::fs::create_dir(made.file("masks")).unwrap();
     let mask = image::GrayImage::from_fn(20, 12, |x, _| [if x < 10 { 0 } else { 255 }].into());
@@ -182,7 +182,7 @@ fn what_belongs_to_photographs_is_read_from_it() {
 }
 
 #[test]
-fn models_are_no_archives_of_photographs() {
+fn models_are_not_datasets() {
     let model = [("meta.json".to_owned(), b"{}".to_vec())];
     assert!(!is_archive(&Packed::of(&pack(&model, "", CompressionMethod::Stored)).path()));
     let archive = Packed::of(&packed(&Made::colmap_txt()));
@@ -201,7 +201,7 @@ fn refused(case: &str, bytes: &[u8], words: &str) {
 }
 
 #[test]
-fn what_is_not_to_be_trusted_is_refused() {
+fn unsafe_archives_are_refused() {
     let made = Made::colmap_txt();
     made.write("images/zz.png", b"?");
     let whole = packed(&made);
@@ -250,12 +250,12 @@ fn damaged_archives_are_refused() {
     let at = other.windows(9).position(|w| w == b"# cameras").unwrap();
     other[at + 3] ^= 1;
     refused("a checksum", &other, "sparse/0/cameras.txt, cannot be unpacked");
-    // Whatever is cut off.
+    // Truncation at any place.
     for kept in (0..whole.len()).step_by(97) {
         let archive = Packed::of(&whole[..kept]);
         let message = archive.load().unwrap_err().to_string();
         assert!(message.contains("my scan.zip"), "{kept}: {message}");
-        let remedy = "pack the folder again, or unpack it and name that";
+        let remedy = "pack the folder again, or unpack it and name the folder";
         assert!(kept < 2 || message.contains(remedy), "{kept}: {message}");
     }
     let nothing = pack(&[], "", CompressionMethod::Stored);
@@ -264,7 +264,7 @@ fn damaged_archives_are_refused() {
     refused("no dataset", &pack(&notes, "", CompressionMethod::Stored), "is not a dataset");
 }
 
-/// 65 MiB of zeros take some 64 KiB; how many they are is a claim that need not be true.
+/// 65 MiB of zeros take about 64 KiB; the stated size may be false.
 #[test]
 fn bombs_are_refused_before_they_fill_the_disk() {
     let mut all = files(Made::colmap_txt().path());

@@ -1,4 +1,4 @@
-//! Every fault is an error that names the file, the place and a remedy; never a panic.
+//! Tests of broken datasets: every fault is an error that names the file, the place and a remedy.
 
 use std::num::NonZeroU32;
 
@@ -16,7 +16,7 @@ fn refused(case: &str, made: &Made, options: &LoadOptions, words: &str) {
     }
 }
 
-/// What is replaced by what, and words of the message.
+/// A text, its replacement, and words of the message.
 type Replacement = (&'static str, &'static str, &'static str);
 
 const CAMERAS: &[Replacement] = &[
@@ -130,7 +130,7 @@ fn colmap_text() {
     }
 }
 
-/// Gives three of the 200 points these x.
+/// Replaces the x coordinates of three of the 200 points.
 fn three_points(made: &Made, x: [&str; 3]) {
     for (point, x) in (3..6).zip(x) {
         let (old, new) = (format!("\n{point} {point} "), format!("\n{point} {x} "));
@@ -138,7 +138,7 @@ fn three_points(made: &Made, x: [&str; 3]) {
     }
 }
 
-/// The file, what is done to its bytes, and words of the message.
+/// A file, a change of its bytes, and words of the message.
 type Patch = (&'static str, fn(&mut Vec<u8>), &'static str);
 
 const COLMAP_BINARY: &[Patch] = &[
@@ -171,7 +171,7 @@ fn colmap_binary() {
     }
 }
 
-/// Whatever single byte is damaged, loading ends with a dataset or an error.
+/// With any single byte damaged, loading returns a dataset or an error.
 #[test]
 fn no_damaged_byte_makes_it_panic() {
     let made = Made::colmap_bin();
@@ -195,8 +195,7 @@ fn no_damaged_byte_makes_it_panic() {
     assert!(Dataset::load(made.path(), &LoadOptions::default()).is_ok());
 }
 
-/// Pointer to a field of transforms.json, the JSON it becomes (none: it is removed), and words of the
-/// message.
+/// Pointer to a field of transforms.json, its replacement (empty: the field is removed), and words of the message.
 const TRANSFORMS: &[Replacement] = &[
     ("/test_filenames", "[1]", "transforms.json, test_filenames, list of file names"),
     ("/frames", "3", "transforms.json, frames"),
@@ -323,7 +322,7 @@ fn links_out_of_the_dataset() {
     refused("linked folder", &made, &LoadOptions::default(), "symbolic link, --images");
     let named = LoadOptions { images: Some(outside.path().to_owned()), ..LoadOptions::default() };
     assert!(Dataset::load(made.path(), &named).is_ok());
-    // Inside they are followed.
+    // Links inside the dataset are followed.
     let made = Made::colmap_txt();
     std::fs::rename(made.file("images"), made.file("photographs")).unwrap();
     std::os::unix::fs::symlink("photographs", made.file("images")).unwrap();

@@ -1,4 +1,4 @@
-//! What photographs say of themselves: how they were exposed, which way up they were held, and nonsense.
+//! Tests of EXIF fields: exposures, orientations and implausible values.
 
 use std::io::Cursor;
 use std::path::Path;
@@ -9,7 +9,7 @@ use ::exif::{Field, In, Rational, Tag, Value};
 use super::super::*;
 use densify_fixtures::{self, Made, NAMES, SIZE};
 
-/// The exposure of a photograph: seconds, f-number, sensitivity.
+/// Exposure time `[s]`, f-number and sensitivity (ISO) of a photograph.
 type Settings = ((u32, u32), (u32, u32), u16);
 
 fn exposed(((a, b), (c, d), iso): Settings) -> Vec<(Tag, Value)> {
@@ -26,7 +26,7 @@ fn turned(orientation: u16) -> Vec<(Tag, Value)> {
 }
 
 /// Writes these fields into a PNG file, after its header.
-fn say(path: &Path, fields: Vec<(Tag, Value)>) {
+fn write_exif(path: &Path, fields: Vec<(Tag, Value)>) {
     let fields = fields.into_iter().map(|(tag, value)| Field { tag, ifd_num: In::PRIMARY, value });
     let fields: Vec<Field> = fields.collect();
     let mut writer = Writer::new();
@@ -47,7 +47,7 @@ fn with(settings: [Option<Settings>; 3]) -> Made {
     let made = Made::colmap_txt();
     for (name, settings) in ["a", "b", "c"].into_iter().zip(settings) {
         if let Some(settings) = settings {
-            say(&made.file(&format!("images/{name}.png")), exposed(settings));
+            write_exif(&made.file(&format!("images/{name}.png")), exposed(settings));
         }
     }
     made
@@ -58,11 +58,11 @@ fn reported(made: &Made) -> ReportedExposures {
     for view in &data.train {
         view.source.load().unwrap();
     }
-    ReportedExposures::of(&data.train)
+    ReportedExposures::read(&data.train)
 }
 
 #[test]
-fn exposures_are_told_in_stops() {
+fn exposures_are_reported_in_stops() {
     // Twice the time; a quarter of it, at half the f-number and twice the sensitivity.
     let found = reported(&with([
         Some(((1, 100), (4, 1), 100)),
@@ -74,16 +74,16 @@ fn exposures_are_told_in_stops() {
     for (stops, more) in stops.iter().zip([0.0, 1.0, 1.0]) {
         assert!((stops - expected - more).abs() < 1e-12, "{stops} {expected}");
     }
-    assert_eq!((found.nonsense, found.example), (0, None));
-    // Some say nothing.
+    assert_eq!((found.implausible, found.example), (0, None));
+    // Photographs without EXIF have no exposure.
     let found = reported(&with([None, Some(((1, 50), (4, 1), 100)), None]));
     assert!(found.stops[0].is_none() && found.stops[1].is_some() && found.stops[2].is_none());
-    assert_eq!(found.nonsense, 0);
+    assert_eq!(found.implausible, 0);
 }
 
-/// A JPEG file has it in a segment of its own.
+/// JPEG files store EXIF in a segment of its own.
 #[test]
-fn photographs_of_other_formats_tell_it_too() {
+fn exposures_are_read_from_other_formats_too() {
     let made = Made::transforms(|json| json["frames"][0]["file_path"] = "images/a.jpg".into());
     let png = with([Some(((1, 50), (4, 1), 100)), None, None]);
     let expected = reported(&png).stops[0];
@@ -102,8 +102,20 @@ fn photographs_of_other_formats_tell_it_too() {
     assert_eq!(reported(&made).stops[0], expected);
 }
 
+/// EXIF is opened at most once: fields that loading needed for the orientation are kept.
 #[test]
-fn what_no_camera_does_is_named_and_not_used() {
+fn exif_that_was_read_while_loading_is_kept() {
+    for (made, is_kept) in [(Made::realitycapture(), true), (Made::colmap_txt(), false)] {
+        let path = made.file("images/a.png");
+        write_exif(&path, exposed(((1, 50), (4, 1), 100)));
+        let data = Dataset::load(made.path(), &LoadOptions::default()).unwrap();
+        std::fs::remove_file(path).unwrap();
+        assert_eq!(ReportedExposures::read(&data.train).stops[0].is_some(), is_kept);
+    }
+}
+
+#[test]
+fn implausible_values_are_named_and_not_used() {
     for (settings, words) in [
         (((0, 1), (4, 1), 100), "exposure of 0 s"),
         (((1, 0), (4, 1), 100), "exposure of inf s"),
@@ -114,16 +126,16 @@ fn what_no_camera_does_is_named_and_not_used() {
         (((1, 50), (4, 1), 0), "ISO 0"),
     ] {
         let found = reported(&with([Some(settings), Some(((1, 50), (4, 1), 100)), Some(settings)]));
-        assert_eq!((found.nonsense, found.stops[0], found.stops[2]), (2, None, None), "{words}");
+        assert_eq!((found.implausible, found.stops[0], found.stops[2]), (2, None, None), "{words}");
         assert!(found.stops[1].is_some());
         let example = found.example.unwrap();
         assert!(example.contains("a.png") && example.contains(words), "{words}: {example}");
     }
 }
 
-/// Whatever byte is damaged, the photograph is read without it or with another.
+/// With any byte of the EXIF damaged, the photograph is still read.
 #[test]
-fn damaged_ones_change_nothing_else() {
+fn damaged_exif_changes_nothing_else() {
     let made = with([Some(((1, 50), (4, 1), 100)), None, None]);
     let path = made.file("images/a.png");
     let whole = std::fs::read(&path).unwrap();
@@ -137,31 +149,31 @@ fn damaged_ones_change_nothing_else() {
             bytes[41 + length..45 + length].copy_from_slice(&sum.sum().to_be_bytes());
             std::fs::write(&path, &bytes).unwrap();
             let data = Dataset::load(made.path(), &LoadOptions::default()).unwrap();
-            assert_eq!(ReportedExposures::of(&data.train).stops.len(), 3, "{at}");
+            assert_eq!(ReportedExposures::read(&data.train).stops.len(), 3, "{at}");
         }
     }
 }
 
-/// A picture of upright pixels, red above and blue below, whose EXIF says how it is to be turned.
-fn on_its_side(made: &Made, orientation: Option<u16>) {
+/// Writes an upright image, red above and blue below, with an EXIF orientation.
+fn write_turned_image(made: &Made, orientation: Option<u16>) {
     let path = made.file("images/b.png");
     let (width, height) = (SIZE.1, SIZE.0);
     let colour = |y: u32| if y < height / 2 { [255, 0, 0] } else { [0, 0, 255] };
     let picture = image::RgbImage::from_fn(width, height, |_, y| colour(y).into());
     picture.save(&path).unwrap();
     if let Some(orientation) = orientation {
-        say(&path, turned(orientation));
+        write_exif(&path, turned(orientation));
     }
 }
 
 #[test]
 fn a_photograph_that_lies_on_its_side_for_its_camera_is_turned() {
-    // By EXIF: 6 is a quarter clockwise, so the upper side comes to the right; 8 the other way; 5 and 7 are
-    // mirrored, too.
+    // Orientation 6 is a quarter turn clockwise, so that the upper side comes to the right; 8 is the opposite turn; 5
+    // and 7 are also mirrored.
     let (upper, lower) = ([255, 0, 0], [0, 0, 255]);
     for (orientation, left) in [(6, lower), (8, upper), (5, upper), (7, lower)] {
         let made = Made::colmap_txt();
-        on_its_side(&made, Some(orientation));
+        write_turned_image(&made, Some(orientation));
         let data = Dataset::load(made.path(), &LoadOptions::default()).unwrap();
         let view = &data.train[1];
         let image = view.source.load().unwrap();
@@ -184,7 +196,7 @@ fn a_photograph_that_lies_on_its_side_for_its_camera_is_turned() {
     }
 }
 
-/// The pose file decides: what EXIF says of a picture that fits its camera is not done.
+/// The size in the pose file decides: the orientation of an image that fits its camera is ignored.
 #[test]
 fn a_photograph_that_fits_its_camera_is_not_turned() {
     let plain = Made::colmap_txt();
@@ -195,30 +207,30 @@ fn a_photograph_that_fits_its_camera_is_not_turned() {
     };
     for orientation in [1, 3, 6, 8, 77] {
         let made = Made::colmap_txt();
-        say(&made.file("images/b.png"), turned(orientation));
+        write_exif(&made.file("images/b.png"), turned(orientation));
         assert!(bytes(&made) == bytes(&plain), "{orientation}");
     }
-    // Nor of a square one, which fits either way.
+    // Square images fit either way and are not turned.
     let made = Made::colmap_txt();
     made.replace("sparse/0/cameras.txt", "PINHOLE 20 12 15 16 10 6", "PINHOLE 12 12 15 16 6 6");
     for name in NAMES {
         densify_fixtures::image(&made.file(&format!("images/{name}")), (12, 12), 9);
     }
-    say(&made.file("images/b.png"), turned(6));
+    write_exif(&made.file("images/b.png"), turned(6));
     let data = Dataset::load(made.path(), &LoadOptions::default()).unwrap();
     assert_eq!(data.train[1].source.header.turn, None);
-    // One that neither fits nor says how to turn it is refused.
+    // An image that fits neither way is refused.
     for orientation in [None, Some(1), Some(3), Some(77)] {
         let made = Made::colmap_txt();
-        on_its_side(&made, orientation);
+        write_turned_image(&made, orientation);
         let error = Dataset::load(made.path(), &LoadOptions::default()).unwrap_err().to_string();
         assert!(error.contains("b.png") && error.contains("12x20"), "{orientation:?}: {error}");
     }
 }
 
-/// Without a size in the pose file nothing tells whether it means the picture as it is stored.
+/// Without an image size in the pose file, it is unknown whether the poses include the turn.
 #[test]
-fn a_turn_of_which_the_poses_say_nothing_is_named() {
+fn an_ambiguous_orientation_is_noted() {
     let sizeless = || {
         Made::transforms(|json| {
             for field in ["w", "h"] {
@@ -232,9 +244,9 @@ fn a_turn_of_which_the_poses_say_nothing_is_named() {
         (Made::transforms(|_| ()), false),
         (Made::colmap_txt(), false),
     ] {
-        say(&made.file("images/b.png"), turned(6));
+        write_exif(&made.file("images/b.png"), turned(6));
         let data = Dataset::load(made.path(), &LoadOptions::default()).unwrap();
-        let said = |note: &String| note.contains("1 photographs are to be turned");
+        let said = |note: &String| note.contains("1 photographs have an EXIF orientation");
         assert_eq!(data.notes.iter().any(said), is_named, "{:?}", data.notes);
     }
 }

@@ -1,4 +1,4 @@
-//! The same scene in every format loads as the same dataset; options do what they say.
+//! Tests of formats and options: the same scene in every format loads as the same dataset.
 
 use std::num::NonZeroU32;
 use std::path::PathBuf;
@@ -71,7 +71,7 @@ fn splits() {
     let data = load_with(&made, eval.clone());
     assert_eq!((names(&data.train), names(&data.test)), (vec!["b.png", "c.png"], vec!["a.png"]));
 
-    // A test file of its own decides, unless every K-th is asked for.
+    // The dataset's own test file decides, unless every K-th view is requested.
     let made = Made::transforms(|_| ());
     let json: serde_json::Value =
         serde_json::from_slice(&std::fs::read(made.file("transforms.json")).unwrap()).unwrap();
@@ -90,7 +90,7 @@ fn splits() {
     }
     assert_eq!(names(&load_with(&made, every(3)).test), ["images/a.png"]);
 
-    // So do the names that nerfstudio's file lists, with "./" before them or without.
+    // The names listed in nerfstudio's file decide as well, with or without a leading "./".
     for field in ["test_filenames", "val_filenames"] {
         let made = Made::transforms(|json| json[field] = serde_json::json!(["images/b.png"]));
         let data = load(&made);
@@ -207,7 +207,7 @@ fn masks_of_no_photograph_are_named() {
     assert!(!load(&Made::colmap_txt()).notes.iter().any(|note| note.contains("mask")));
 }
 
-/// instant-ngp hides where its masks are anything but black.
+/// In masks of instant-ngp every value but black hides pixels.
 #[test]
 fn dynamic_masks_are_found_beside_photographs() {
     for (made, mask) in [
@@ -227,10 +227,10 @@ fn dynamic_masks_are_found_beside_photographs() {
     }
 }
 
-/// Masks lie in `masks/` of the dataset or beside the photographs, wherever these are; none is taken for a photograph.
+/// Masks are in the dataset's `masks/` or beside the photographs, and are never taken for photographs.
 #[test]
 fn masks_are_found_in_the_folder_that_is_named() {
-    // The first is preferred, and removed for the next.
+    // Each is preferred to the following ones, and then removed.
     let masks = [
         "masks/b.png.png",
         "masks/b.png",
@@ -260,7 +260,7 @@ fn masks_are_found_in_the_folder_that_is_named() {
             made.remove(mask);
         }
     }
-    // Beside the smaller photographs, or the whole ones.
+    // Masks beside the reduced photographs, or beside the full-size ones.
     let made = Made::colmap_txt();
     for name in NAMES {
         image(&made.file("images_2").join(name), (10, 6), 7);
@@ -273,7 +273,7 @@ fn masks_are_found_in_the_folder_that_is_named() {
     }
 }
 
-/// Transparent photographs are composited on the background, whatever lists them.
+/// Transparent photographs are composited on the background in every format.
 #[test]
 fn transparency_is_the_same_in_every_format() {
     for ending in ["png", "webp"] {
@@ -310,7 +310,7 @@ fn frames_override_the_intrinsics_at_the_top() {
     let data = load(&Made::transforms(|json| json["frames"][1]["fl_x"] = 12.0.into()));
     let fx: Vec<f64> = data.train.iter().map(|view| view.camera.fx).collect();
     assert_eq!(fx, [15.0, 12.0, 15.0]);
-    // NeRF-synthetic: a field of view and nothing else.
+    // NeRF-synthetic files only state a field of view.
     let data = load(&Made::transforms(|json| {
         for field in ["w", "h", "fl_x", "fl_y", "cx", "cy"] {
             json.as_object_mut().unwrap().remove(field);

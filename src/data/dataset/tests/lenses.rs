@@ -1,4 +1,4 @@
-//! Datasets of other lenses than pinholes: every format has them, and what they saw becomes views.
+//! Tests of datasets with distorted lenses and fisheyes.
 
 use glam::DVec3;
 
@@ -18,7 +18,7 @@ fn colmap(camera: &str) -> Made {
 }
 
 #[test]
-fn nerfstudio_and_colmap_mean_the_same_lenses() {
+fn nerfstudio_and_colmap_lenses_agree() {
     type Fields = &'static [(&'static str, f64)];
     let cases: [(&str, &str, Fields); 3] = [
         (
@@ -79,7 +79,7 @@ fn views_of_one_photograph_share_it_and_its_split() {
     assert!(
         data.notes.iter().any(|note| note.contains("3 photographs") && note.contains("5 views"))
     );
-    // All from one place, and at right angles to the front.
+    // All views are from one place, at right angles to the front.
     let front = &data.train[0].camera;
     for view in &data.train[1..] {
         assert!(view.camera.centre().distance(front.centre()) < 1e-12);
@@ -131,7 +131,7 @@ fn a_track_is_in_the_view_that_shows_its_point() {
 }
 
 #[test]
-fn what_is_cropped_is_said_and_can_be_kept() {
+fn cropping_is_noted_and_can_be_avoided() {
     let made = colmap("SIMPLE_RADIAL 20 12 15 10 6 -0.2");
     let [cropped, kept] = [false, true]
         .map(|keep_fov| load(&made, &LoadOptions { keep_fov, ..LoadOptions::default() }));
@@ -146,10 +146,10 @@ fn what_is_cropped_is_said_and_can_be_kept() {
     for (pixel, weight) in large.rgb.chunks_exact(3).zip(&mask) {
         assert!(*weight == 0 || pixel == [0, 100, 200], "{pixel:?} {weight}");
     }
-    // A ray that only the wider one shows.
+    // A ray that only the wider view shows.
     let [narrow, wide] = [&cropped, &kept].map(|data| data.train[0].camera.project(DVec3::ZERO).1);
     assert_eq!((narrow, cropped.train.len()), (wide, NAMES.len()));
-    // A distortion that folds within the image is trained on where it does not.
+    // A distortion that folds over within the image is used up to there.
     let folding = colmap("RADIAL 20 12 15 10 6 -3 0");
     let kept = load(&folding, &LoadOptions { keep_fov: true, ..LoadOptions::default() });
     assert!(kept.notes.iter().any(|note| note.contains("beyond what")), "{:?}", kept.notes);
@@ -167,7 +167,7 @@ fn views_that_a_mask_hides_are_named_and_left_out() {
         ..LoadOptions::default()
     };
     let names = |views: &[View]| views.iter().map(|view| view.name.clone()).collect::<Vec<_>>();
-    // One photograph; the others are split as with it.
+    // One photograph is hidden; the others are split as if it counted.
     let made = Made::colmap_txt();
     grey(&made, "a.png", |_| 0);
     let data = load(&made, &options);
@@ -186,7 +186,7 @@ fn views_that_a_mask_hides_are_named_and_left_out() {
     assert!(message.contains("all 3") && message.contains("give --invert-masks"), "{message}");
     let inverted = LoadOptions { invert_masks: true, ..options.clone() };
     assert_eq!(load(&made, &inverted).train.len(), 1);
-    // One face of a wide photograph: what lies left of its middle is hidden.
+    // One face of a wide photograph is hidden by masking its left half.
     let made = colmap("OPENCV_FISHEYE 20 12 6 6 10 6 0 0 0 0");
     grey(&made, "b.png", |x| if x < 10 { 0 } else { 255 });
     let data = load(&made, &options);

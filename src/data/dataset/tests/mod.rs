@@ -1,4 +1,4 @@
-//! Whole datasets: written here, good and bad, and real ones where they are at hand.
+//! Tests of whole datasets: generated good and bad ones, and real ones if available.
 
 mod archives;
 mod bad_input;

@@ -1,5 +1,4 @@
-//! Folders as the apps of phones write them: intrinsics in each frame, names of any kind, fields that nobody else
-//! has.
+//! Tests of datasets as phone apps export them: intrinsics per frame, arbitrary names, additional fields.
 
 use serde_json::{Value, json};
 
@@ -10,7 +9,7 @@ fn load(made: &Made) -> Dataset {
     Dataset::load(made.path(), &LoadOptions::default()).unwrap_or_else(|e| panic!("{e}"))
 }
 
-/// Renames the photographs, moves intrinsics into the frames, and adds what an app adds.
+/// Renames the photographs, moves intrinsics into the frames, and adds the fields of an app.
 fn exported(names: [&str; 3], points: &str, edit: impl Fn(&mut Value)) -> Made {
     let made = Made::transforms(|json| {
         for field in ["w", "h", "fl_x", "fl_y", "cx", "cy"] {
@@ -97,7 +96,7 @@ fn exports_of_apps_are_the_same_scene() {
     }
 }
 
-/// Phones focus and stabilise: each photograph has a camera of its own.
+/// Phones focus and stabilise, so that each photograph has its own camera.
 #[test]
 fn each_photograph_may_have_a_camera_and_a_size_of_its_own() {
     let made = exported(["a 1.png", "b 2.png", "c 3.png"], "points.ply", |json| {
@@ -117,7 +116,7 @@ fn each_photograph_may_have_a_camera_and_a_size_of_its_own() {
     assert!(a.source.undistortion.is_none() && c.source.undistortion.is_some());
 }
 
-/// What such a file lacks is said of the frame that lacks it.
+/// Missing intrinsics are reported with the frame that lacks them.
 #[test]
 fn a_frame_without_intrinsics_is_named() {
     for (field, words) in [("fl_x", "frames[1].fl_x, camera_angle_x"), ("fl_y", "")] {
@@ -138,7 +137,7 @@ fn a_frame_without_intrinsics_is_named() {
     }
 }
 
-/// Programs write where photographs lay on the machine that they ran on (RealityScan's `transforms.json`).
+/// Programs write the paths of the machine that they ran on (RealityScan's `transforms.json`).
 #[test]
 fn paths_of_another_machine_are_found_in_the_folder_that_is_named() {
     let written = [r"C:\Users\me\walk\1\a.png", "/home/me/walk/2/b.png", "file:///home/me/c.png"];
@@ -154,7 +153,7 @@ fn paths_of_another_machine_are_found_in_the_folder_that_is_named() {
         std::fs::rename(made.file(&format!("images/{name}")), made.file(&format!("moved/{name}")))
             .unwrap();
     }
-    // Of two with its name, the one in whose folder it lay.
+    // Of two files with the same name, the one with the longer matching path counts.
     image(&made.file("moved/a.png"), (20, 12), 9);
     image(&made.file("masks/1/a.png"), (20, 12), 255);
     let options = LoadOptions { images: Some("moved".into()), ..LoadOptions::default() };
@@ -166,7 +165,7 @@ fn paths_of_another_machine_are_found_in_the_folder_that_is_named() {
     let [train, test] = names(&made);
     assert_eq!(train, [("1/a.png".to_owned(), true), ("b.png".to_owned(), false)]);
     assert_eq!(test, [("c.png".to_owned(), false)]);
-    // One that is not there is skipped by name, and links are not followed out of the folder.
+    // Missing photographs are skipped and named, and links are not followed out of the folder.
     made.remove("moved/b.png");
     assert_eq!(names(&made)[0].len(), 1);
     let outside = tempfile::tempdir().unwrap();
@@ -174,15 +173,15 @@ fn paths_of_another_machine_are_found_in_the_folder_that_is_named() {
     std::os::unix::fs::symlink(outside.path().join("b.png"), made.file("moved/b.png")).unwrap();
     let error = Dataset::load(made.path(), &options).unwrap_err().to_string();
     assert!(error.contains("symbolic link"), "{error}");
-    // Nor does one that climbs lead anywhere.
+    // Paths with `..` are refused.
     made.replace("transforms.json", "/home/me/walk/2", "/home/../2");
     let error = Dataset::load(made.path(), &options).unwrap_err().to_string();
     assert!(error.contains("`..`"), "{error}");
 }
 
-/// Where a path began does not matter, nor on which system, nor whether it is told what the file ends with.
+/// Paths of any system are found, whatever their root, with or without a file extension.
 #[test]
-fn paths_of_any_system_are_found_by_their_ends() {
+fn paths_of_any_system_are_found_by_suffix() {
     let with_images = || LoadOptions { images: Some("moved".into()), ..LoadOptions::default() };
     for (written, found) in [
         ("file:///C:/Users/me/b.png", Some("b.png")),
@@ -212,7 +211,7 @@ fn paths_of_any_system_are_found_by_their_ends() {
         std::fs::create_dir(made.file("moved")).unwrap();
         refused(&made, &with_images(), words);
     }
-    // The tables of other programs.
+    // Other formats.
     let colmap = Made::colmap_txt();
     colmap.replace("sparse/0/images.txt", "b.png", "C:/walk/b.png");
     let table = Made::realitycapture();
@@ -229,7 +228,7 @@ fn paths_of_any_system_are_found_by_their_ends() {
     }
 }
 
-/// Of two paths with one end, only one can be meant; and a view that is trained on must not be held out.
+/// Two paths with the same suffix would refer to one file, which could then be both trained on and held out.
 #[test]
 fn two_paths_to_one_photograph_are_refused() {
     let twice = ["/x/train/r_0.png", "/x/test/r_0.png"];
@@ -254,7 +253,7 @@ fn two_paths_to_one_photograph_are_refused() {
         made.write(file, part.to_string());
     }
     refused(&made, &options, words);
-    // In folders of their own they are told apart.
+    // In folders of their own they are different files.
     for path in ["moved/train/r_0.png", "moved/test/r_0.png"] {
         image(&made.file(path), (20, 12), 9);
     }
@@ -263,7 +262,7 @@ fn two_paths_to_one_photograph_are_refused() {
 }
 
 #[test]
-fn what_belongs_to_photographs_of_another_machine_is_found_too() {
+fn masks_and_points_of_another_machine_are_found_too() {
     let options = LoadOptions { images: Some("moved".into()), ..LoadOptions::default() };
     let made = || {
         let made = Made::transforms(|json| {
@@ -284,25 +283,25 @@ fn what_belongs_to_photographs_of_another_machine_is_found_too() {
     let data = load(&found);
     assert_eq!((data.train.len(), data.test.len(), data.points.len()), (2, 1, 200));
     assert!(place(&data).ends_with("masks/hidden.png"));
-    // Else under the photograph's name; what lies elsewhere may be a photograph.
+    // Otherwise the mask is found by the photograph's name; files elsewhere may be photographs.
     found.remove("masks/hidden.png");
     assert!(place(&load(&found)).ends_with("masks/b.png"));
     found.remove("masks/b.png");
     refused(&found, &options, "frames[1].mask_path, hidden.png, `masks/`");
-    // Points that did not come along are left out.
+    // Points that were not copied along are left out.
     let without = made();
     image(&without.file("masks/b.png"), (20, 12), 255);
     without.remove("points.ply");
     let data = load(&without);
     let said = |note: &String| note.contains("points.ply") && note.contains("left out");
     assert!(data.points.is_empty() && data.notes.iter().any(said), "{:?}", data.notes);
-    // Without the folder nothing is guessed.
+    // Without the option no path is guessed.
     std::fs::rename(without.file("moved"), without.file("images")).unwrap();
     refused(&without, &LoadOptions::default(), "is absolute, --images");
 }
 
 #[test]
-fn names_may_have_the_separators_of_windows() {
+fn names_may_contain_backslashes() {
     let made = Made::transforms(|json| {
         json["ply_file_path"] = r"cloud\points.ply".into();
         json["frames"][1]["file_path"] = r"images\b.png".into();
@@ -320,7 +319,7 @@ fn names_may_have_the_separators_of_windows() {
     std::fs::rename(made.file("images"), made.file("moved")).unwrap();
     let options = LoadOptions { images: Some("moved".into()), ..LoadOptions::default() };
     assert_eq!(Dataset::load(made.path(), &options).unwrap().train.len(), 2);
-    // A file of that very name comes first, where there can be one.
+    // A file of the literal name takes precedence, on systems that allow it.
     #[cfg(unix)]
     {
         std::fs::rename(made.file("moved"), made.file("images")).unwrap();

@@ -1,5 +1,4 @@
-//! RealityCapture's table of cameras: poses by hand and against the same scene of COLMAP, and what is wrong with a
-//! table.
+//! Tests of RealityCapture's table of cameras: poses against hand-computed ones and COLMAP's, and damaged tables.
 
 use glam::DVec3;
 
@@ -13,7 +12,7 @@ fn load(made: &Made) -> Dataset {
 const TABLE: &str = "cameras.csv";
 
 #[test]
-fn its_cameras_are_those_of_the_same_scene() {
+fn cameras_are_those_of_the_same_colmap_scene() {
     let (colmap, table) = (load(&Made::colmap_txt()), load(&Made::realitycapture()));
     assert_eq!(table.points.colours, colmap.points.colours);
     assert_eq!(table.train.len(), 3);
@@ -27,11 +26,11 @@ fn its_cameras_are_those_of_the_same_scene() {
     }
 }
 
-/// By the words of its makers: all angles 0 look straight down with the upper side to the north.
+/// According to the documentation, with all angles 0 a camera looks straight down and its upper side points north.
 #[test]
-fn heading_pitch_and_roll_turn_the_camera_as_they_say() {
+fn heading_pitch_and_roll_turn_the_camera_as_documented() {
     let (east, north, up) = (DVec3::X, DVec3::Y, DVec3::Z);
-    // Angles, then where the camera looks and where its image's upper side points.
+    // Angles, the viewing direction, and the direction of the upper side of the image.
     for (angles, forward, upper) in [
         ("0,0,0", -up, north),
         ("90,0,0", -up, east),
@@ -58,9 +57,9 @@ fn heading_pitch_and_roll_turn_the_camera_as_they_say() {
     }
 }
 
-/// The longer side counts 36 mm, also of upright pictures; the principal point is told from the middle.
+/// The longer side is 36 mm, also in portrait format; the principal point is relative to the centre.
 #[test]
-fn lengths_are_told_for_the_longer_side() {
+fn lengths_are_relative_to_the_longer_side() {
     let made = Made::realitycapture();
     image(&made.file("images/b.png"), (12, 20), 9);
     made.replace(TABLE, ",27,0,0,", ",27,0.05,-0.1,");
@@ -85,9 +84,9 @@ fn tables_of_realityscan_are_the_same() {
     }
 }
 
-/// As COLMAP's OPENCV has k1, k2 and p2, p1.
+/// The terms are k1, k2, p2 and p1 of COLMAP's OPENCV model.
 #[test]
-fn distortion_is_that_of_other_formats() {
+fn distortion_agrees_with_other_formats() {
     let made = Made::realitycapture();
     let text = std::fs::read_to_string(made.file(TABLE)).unwrap();
     made.write(TABLE, text.replace(",27,0,0,0,0,0,0,0,0", ",27,0,0,0.02,-0.01,0,0,0.001,0.002"));
@@ -98,7 +97,7 @@ fn distortion_is_that_of_other_formats() {
         assert!(a.source.undistortion.is_some());
         assert_eq!(a.source.undistortion, b.source.undistortion);
     }
-    // The third and the fourth, too.
+    // k3 and k4 are used as well.
     let with = |from: &str, to: &str| {
         let made = Made::realitycapture();
         made.replace(TABLE, from, to);
@@ -117,12 +116,12 @@ fn names_may_have_commas_spaces_and_other_scripts_and_lie_in_images() {
     made.write("Export 1.CSV", text);
     made.remove(TABLE);
     std::fs::rename(made.file("images/a.png"), made.file("images/Küche, Süd (1).png")).unwrap();
-    // Another table, which is not of cameras.
+    // A table without cameras is ignored.
     made.write("notes.csv", "a,b\n1,2\n");
     let data = load(&made);
     let names: Vec<&str> = data.train.iter().map(|view| view.name.as_str()).collect();
     assert_eq!(names, ["Küche, Süd (1).png", "b.png", "c.png"]);
-    // One that is gone is skipped.
+    // A missing photograph is skipped.
     made.remove("images/c.png");
     let data = load(&made);
     assert_eq!(data.train.len(), 2);

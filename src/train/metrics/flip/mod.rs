@@ -10,14 +10,14 @@ use std::f64::consts::PI;
 use super::{BLOCK, MetricError, Pair, by_blocks, total};
 use densify_core::image::Image8;
 
-/// Pixels per degree of the visual field: a monitor 0.7 m wide with 3840 px, seen from 0.7 m; the
+/// Pixels per degree of the visual field for a monitor 0.7 m wide with 3840 px, seen from 0.7 m; the
 /// default of the paper and of published figures.
 const PIXELS_PER_DEGREE: f64 = 3840.0 * PI / 180.0;
-/// Contrast sensitivity of each opponent channel, Σ a·√(π/b)·exp(−π²·x²/b) with x in degrees: its
-/// terms (a, b). Table 1.
+/// Terms (a, b) of the contrast sensitivity of each opponent channel, Σ a·√(π/b)·exp(−π²·x²/b) with x in
+/// degrees. Table 1.
 const SENSITIVITY: [[(f64, f64); 2]; 3] =
     [[(1.0, 0.0047), (0.0, 1e-5)], [(1.0, 0.0053), (0.0, 1e-5)], [(34.1, 0.04), (13.5, 0.025)]];
-/// Widest term of [`SENSITIVITY`]; it sets the radius of all kernels.
+/// Widest term of [`SENSITIVITY`], which determines the radius of all kernels.
 const WIDEST: f64 = 0.04;
 /// Exponent of colour distances, q_c.
 const COLOUR_EXPONENT: f64 = 0.7;
@@ -45,9 +45,8 @@ const RGB_OF_XYZ: [[f64; 3]; 3] = [
 
 /// Mean FLIP error of a render against a target, in `[0, 1]`; 0 when they are equal.
 ///
-/// `rendered`: shape `[height, width, 3]`, clamped to `[0, 1]` here. `background` in `[0, 1]` is the
-/// background of targets with coverage. Beyond the border the last pixels are repeated. NaN when
-/// the render holds a NaN.
+/// `rendered`: shape `[height, width, 3]`, clamped to `[0, 1]` here. Targets with coverage are composited on
+/// `background`, in `[0, 1]`. The outermost pixels are repeated beyond the border. NaN if the render contains a NaN.
 ///
 /// # Errors
 /// When the sizes differ or the target's mask ignores every pixel.
@@ -79,11 +78,11 @@ pub fn flip_map(
     Ok(blocks.concat())
 }
 
-/// What `of_block` makes of each block of rows, in order, from its pixels and their errors; that of a pixel
-/// which the mask ignores is 0.
+/// Applies `block_result` to the pixels of each block of rows and their errors; returns the results in order. The error of
+/// masked pixels is 0.
 fn differences<T: Send>(
     pair: &Pair<'_>,
-    of_block: impl Fn(&mut dyn Iterator<Item = (usize, f64)>) -> T + Sync,
+    block_result: impl Fn(&mut dyn Iterator<Item = (usize, f64)>) -> T + Sync,
 ) -> Vec<T> {
     let filters = Filters::new();
     let largest = largest_distance();
@@ -94,19 +93,19 @@ fn differences<T: Send>(
         let both = pixels.zip(truth.iter().zip(&render));
         let error =
             |(p, (a, b))| (p, if pair.weight(p) > 0.0 { difference(a, b, largest) } else { 0.0 });
-        of_block(&mut both.map(error))
+        block_result(&mut both.map(error))
     })
 }
 
-/// Most memory for a block of this width `[bytes]`: in `f64` eight planes of the rows that its kernels
-/// reach and seven of its own rows, and the [responses](PixelResponse) to two images.
+/// Peak memory for a block of this width `[bytes]`: in `f64`, eight planes of the rows within the kernels' radius and
+/// seven of the block's own rows, and the [responses](PixelResponse) to two images.
 pub(super) fn bytes_per_block(width: u64) -> u64 {
-    let (rows, lines) = (BLOCK as u64, (BLOCK + 2 * Filters::new().reach()) as u64);
+    let (rows, lines) = (BLOCK as u64, (BLOCK + 2 * Filters::new().radius()) as u64);
     let float = size_of::<f64>() as u64;
     width * (8 * lines * float + rows * (7 * float + 2 * size_of::<PixelResponse>() as u64))
 }
 
-/// The response of the eye to a pixel.
+/// The perceptual response to a pixel.
 struct PixelResponse {
     /// Lightness and Hunt-adjusted chroma of the filtered image.
     colour: [f64; 3],
@@ -149,7 +148,7 @@ fn product(matrix: &[[f64; 3]; 3], v: [f64; 3]) -> [f64; 3] {
     matrix.map(|row| row[0] * v[0] + row[1] * v[1] + row[2] * v[2])
 }
 
-/// XYZ over that of white; rows of the matrix sum to white.
+/// XYZ relative to white, which is the sum of the matrix's rows.
 fn relative_xyz(rgb: [f64; 3]) -> [f64; 3] {
     let xyz = product(&XYZ_OF_RGB, rgb);
     [0, 1, 2].map(|i| xyz[i] / XYZ_OF_RGB[i].iter().sum::<f64>())
@@ -182,21 +181,21 @@ fn linear(encoded: f64) -> f64 {
     if encoded <= 0.040_45 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) }
 }
 
-/// The kernels of both pipelines along one axis; every filter is a sum of separable ones.
+/// The kernels of both pipelines along one axis. Every filter is a sum of separable ones.
 struct Filters {
-    /// Terms of each opponent channel; the two passes of a term together have its weight.
+    /// Kernels of the terms of each opponent channel; both passes together have the weight of the term.
     sensitivity: [Vec<Vec<f64>>; 3],
-    /// A Gaussian of the width of features, with sum 1; its first and second derivatives, whose
-    /// positive taps sum to 1 and negative taps to −1.
+    /// A Gaussian as wide as features, with sum 1, and its first and second derivatives, whose positive taps sum to 1 and
+    /// negative taps to −1.
     feature: [Vec<f64>; 3],
 }
 
 impl Filters {
     fn new() -> Self {
-        let reach = (3.0 * (WIDEST / (2.0 * PI * PI)).sqrt() * PIXELS_PER_DEGREE).ceil();
+        let radius = (3.0 * (WIDEST / (2.0 * PI * PI)).sqrt() * PIXELS_PER_DEGREE).ceil();
         let sensitivity = SENSITIVITY.map(|terms| {
             let kernels = terms.map(|(a, b)| {
-                let shape = sampled(reach, |x| (-(PI * x / PIXELS_PER_DEGREE).powi(2) / b).exp());
+                let shape = sampled(radius, |x| (-(PI * x / PIXELS_PER_DEGREE).powi(2) / b).exp());
                 let sum: f64 = shape.iter().sum();
                 (a * (PI / b).sqrt() * sum * sum, shape.into_iter().map(move |k| k / sum))
             });
@@ -207,38 +206,38 @@ impl Filters {
                 .collect()
         });
         let deviation = 0.5 * FEATURE_WIDTH * PIXELS_PER_DEGREE;
-        let reach = (3.0 * deviation).ceil();
+        let radius = (3.0 * deviation).ceil();
         let gaussian = |x: f64| (-0.5 * (x / deviation).powi(2)).exp();
-        let smooth = sampled(reach, gaussian);
+        let smooth = sampled(radius, gaussian);
         let sum: f64 = smooth.iter().sum();
         let feature = [
             smooth.into_iter().map(|k| k / sum).collect(),
-            balanced(sampled(reach, |x| -x * gaussian(x))),
-            balanced(sampled(reach, |x| ((x / deviation).powi(2) - 1.0) * gaussian(x))),
+            balanced(sampled(radius, |x| -x * gaussian(x))),
+            balanced(sampled(radius, |x| ((x / deviation).powi(2) - 1.0) * gaussian(x))),
         ];
         Self { sensitivity, feature }
     }
 
-    /// Pixels from the centre of the widest kernel to its edge.
-    fn reach(&self) -> usize {
+    /// Radius of the widest kernel `[px]`.
+    fn radius(&self) -> usize {
         self.sensitivity[0][0].len() / 2
     }
 }
 
-/// A function at −reach, …, reach.
-fn sampled(reach: f64, function: impl Fn(f64) -> f64) -> Vec<f64> {
-    let reach = reach as i32;
-    (-reach..=reach).map(|x| function(f64::from(x))).collect()
+/// A function at −radius, …, radius.
+fn sampled(radius: f64, function: impl Fn(f64) -> f64) -> Vec<f64> {
+    let radius = radius as i32;
+    (-radius..=radius).map(|x| function(f64::from(x))).collect()
 }
 
-/// Positive taps scaled to sum to 1, negative ones to −1.
+/// Scales positive taps to sum 1 and negative ones to sum −1.
 fn balanced(kernel: Vec<f64>) -> Vec<f64> {
     let positive: f64 = kernel.iter().filter(|k| **k > 0.0).sum();
     let negative: f64 = kernel.iter().filter(|k| **k < 0.0).sum();
     kernel.into_iter().map(|k| if k > 0.0 { k / positive } else { k / -negative }).collect()
 }
 
-/// Responses to rows `first..last` of the render, or of the target.
+/// The responses to rows `first..last` of the render, or of the target.
 fn responses(
     pair: &Pair<'_>,
     filters: &Filters,
@@ -247,12 +246,12 @@ fn responses(
     render: bool,
 ) -> Vec<PixelResponse> {
     let width = pair.width;
-    let reach = filters.reach();
-    // The rows that the kernels reach; beyond the border the last row is repeated.
-    let lines = first..last + 2 * reach;
+    let radius = filters.radius();
+    // The rows within the kernels' radius; the outermost row is repeated beyond the border.
+    let lines = first..last + 2 * radius;
     let mut planes = [const { Vec::new() }; 3];
     for line in lines {
-        let y = line.saturating_sub(reach).min(pair.height - 1);
+        let y = line.saturating_sub(radius).min(pair.height - 1);
         for p in y * width..(y + 1) * width {
             let channels = opponents([0, 1, 2].map(|c| linear(value(pair, p, c, render))));
             for (plane, channel) in planes.iter_mut().zip(channels) {
@@ -264,7 +263,7 @@ fn responses(
     let filtered = [0, 1, 2].map(|c| {
         let mut sum = vec![0.0; rows * width];
         for kernel in &filters.sensitivity[c] {
-            add_down(&mut sum, &across(&planes[c], width, kernel), width, kernel, reach);
+            add_down(&mut sum, &across(&planes[c], width, kernel), width, kernel, radius);
         }
         sum
     });
@@ -275,7 +274,7 @@ fn responses(
         .map(|kernel| across(&luminance, width, kernel));
     let derivative = |x: usize, kernel: &[f64]| {
         let mut sum = vec![0.0; rows * width];
-        add_down(&mut sum, &along[x], width, kernel, reach);
+        add_down(&mut sum, &along[x], width, kernel, radius);
         sum
     };
     let edges = [derivative(1, smooth), derivative(0, first_derivative)];
@@ -291,7 +290,7 @@ fn responses(
         .collect()
 }
 
-/// Channel `c` of pixel `p`, sRGB-encoded; of the target where the mask ignores the render.
+/// Channel `c` of pixel `p`, sRGB-encoded. Masked pixels of the render have the value of the target.
 fn value(pair: &Pair<'_>, p: usize, c: usize, render: bool) -> f64 {
     let truth = pair.truth(p, c);
     let weight = pair.weight(p);
@@ -301,13 +300,13 @@ fn value(pair: &Pair<'_>, p: usize, c: usize, render: bool) -> f64 {
 
 /// Filters along the rows.
 fn across(plane: &[f64], width: usize, kernel: &[f64]) -> Vec<f64> {
-    let reach = kernel.len() / 2;
+    let radius = kernel.len() / 2;
     let mut out = vec![0.0; plane.len()];
-    let mut padded = vec![0.0; width + 2 * reach];
+    let mut padded = vec![0.0; width + 2 * radius];
     for (row, out) in plane.chunks_exact(width).zip(out.chunks_exact_mut(width)) {
-        padded[..reach].fill(row[0]);
-        padded[reach..reach + width].copy_from_slice(row);
-        padded[reach + width..].fill(row[width - 1]);
+        padded[..radius].fill(row[0]);
+        padded[radius..radius + width].copy_from_slice(row);
+        padded[radius + width..].fill(row[width - 1]);
         for (i, k) in kernel.iter().enumerate() {
             for (sum, value) in out.iter_mut().zip(&padded[i..]) {
                 *sum += k * value;
@@ -317,9 +316,9 @@ fn across(plane: &[f64], width: usize, kernel: &[f64]) -> Vec<f64> {
     out
 }
 
-/// Filters along the columns and adds the result; `plane` has `reach` more rows above and below.
-fn add_down(sum: &mut [f64], plane: &[f64], width: usize, kernel: &[f64], reach: usize) {
-    let skipped = reach - kernel.len() / 2;
+/// Filters along the columns and adds the result; `plane` has `radius` more rows above and below.
+fn add_down(sum: &mut [f64], plane: &[f64], width: usize, kernel: &[f64], radius: usize) {
+    let skipped = radius - kernel.len() / 2;
     for (y, sum) in sum.chunks_exact_mut(width).enumerate() {
         for (i, k) in kernel.iter().enumerate() {
             let row = &plane[(y + skipped + i) * width..][..width];

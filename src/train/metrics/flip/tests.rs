@@ -1,13 +1,13 @@
-//! FLIP against the authors' program, and what must make no difference.
+//! Tests of FLIP against the authors' program, and of masks and blocks.
 
 use super::*;
 
-fn target(width: u32, height: u32, of: impl Fn(f64, f64, f64) -> f64) -> Image8 {
+fn target(width: u32, height: u32, value: impl Fn(f64, f64, f64) -> f64) -> Image8 {
     let mut rgb = Vec::new();
     for y in 0..height {
         for x in 0..width {
             for c in 0..3 {
-                let value = of(f64::from(x), f64::from(y), f64::from(c));
+                let value = value(f64::from(x), f64::from(y), f64::from(c));
                 rgb.push((255.0 * value).round() as u8);
             }
         }
@@ -31,7 +31,7 @@ fn between(render: &Image8, truth: &Image8) -> f64 {
 
 /// Means by the authors' own program, version 1.7, at its default distance.
 #[test]
-fn the_authors_program_says_the_same() {
+fn values_agree_with_the_authors_program() {
     let black = target(9, 9, |_, _, _| 0.0);
     let dot = target(9, 9, |x, y, _| if (x - 4.0).hypot(y - 4.0) < 0.5 { 1.0 } else { 0.0 });
     let cases = [
@@ -54,8 +54,8 @@ fn equal_images_do_not_differ_and_order_does_not_matter() {
 }
 
 #[test]
-fn blocks_of_rows_do_not_show() {
-    // A picture of 100 rows that repeats 1 column: as wide or as high, the error is the same.
+fn results_do_not_depend_on_blocks_of_rows() {
+    // An image and its transpose have the same error.
     let tall = |phase: f64| target(1, 100, |_, y, c| 0.5 + 0.4 * (phase + 0.2 * y + c).sin());
     let wide = |phase: f64| target(100, 1, |x, _, c| 0.5 + 0.4 * (phase + 0.2 * x + c).sin());
     let (a, b) = (between(&tall(0.5), &tall(0.0)), between(&wide(0.5), &wide(0.0)));
@@ -73,7 +73,7 @@ fn masks_coverage_and_nan() {
             *value = f32::NAN;
         }
     }
-    // What is ignored neither counts nor leaks into its neighbours.
+    // Masked pixels neither count nor affect their neighbours.
     assert!(flip(&render, &half, [0.0; 3]).unwrap() < 1e-4);
     render[0] = f32::NAN;
     assert!(flip(&render, &half, [0.0; 3]).unwrap().is_nan());

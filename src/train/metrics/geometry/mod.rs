@@ -1,9 +1,8 @@
-//! Measures how well Gaussians match the surface that the images were rendered from, where known.
+//! Measures how well Gaussians match the surface that the images were rendered from, if it is known.
 //!
-//! The model and the cameras are in normalised coordinates; everything is measured in world
-//! coordinates, those of the mesh, in `f64`. Lengths are fractions of the diagonal of the mesh's
-//! bounding box. The weight of a row, w, is the sum of its blend weights α·T over all pixels of all
-//! training views. Samples have a fixed seed, so that results can be repeated.
+//! The model and the cameras are in normalised coordinates; everything is measured in the world coordinates of the mesh,
+//! in `f64`. Lengths are fractions of the diagonal of the mesh's bounding box. The weight w of a row is the sum of its
+//! blend weights α·T over all pixels of all training views. Samples have a fixed seed, so that results are reproducible.
 
 mod measure;
 
@@ -14,11 +13,10 @@ use densify_data::dataset::GroundTruth;
 use densify_data::dataset::normalise::Normalisation;
 pub use measure::measure;
 
-/// The results. Values without data (no centre, no pixel, no thin structure) are NaN, or `null` in
-/// JSON.
+/// The measurements. Values without data (no centre, no pixel, no thin structure) are NaN, or `null` in JSON.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Geometry {
-    /// Depth on the views measured.
+    /// Depth errors in the measured views.
     pub depth: DepthErrors,
     /// Median angle between the surface's normal and the shortest axis of the Gaussian at a pixel
     /// `[degrees]`, in 0..=90. The Gaussian is the densest at the surface point among the eight of
@@ -26,18 +24,18 @@ pub struct Geometry {
     /// weight. Over the pixels of [`DepthErrors`], on a regular grid of about 2,000 per view.
     #[serde(deserialize_with = "or_nan")]
     pub normal_error: f64,
-    /// Distance from centres to surface and back.
+    /// Distances between centres and surface.
     pub centres: CentreErrors,
     /// Rows in empty space.
     pub floaters: Floaters,
     /// Recall of thin structures by width, thinnest first; empty if the scene has none.
     pub thin: Vec<ThinRecall>,
-    /// How much is spent on little.
+    /// Rows with negligible contributions.
     pub redundancy: Redundancy,
 }
 
-/// Rendered depth, Σ α·T·z / Σ α·T, against that of the first surface, over the pixels that show a
-/// surface and have a rendered alpha above 0.5.
+/// Errors of the rendered depth Σ α·T·z / Σ α·T against that of the first surface, over the pixels that show a surface
+/// and have a rendered alpha above 0.5.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct DepthErrors {
     /// Root mean square error `[diagonals]`.
@@ -51,7 +49,7 @@ pub struct DepthErrors {
     pub coverage: f64,
 }
 
-/// Distances between centres and surface. Large Gaussians may well have their centres off it.
+/// Distances between centres and surface. The centres of large Gaussians may legitimately be off the surface.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct CentreErrors {
     /// Mean distance from centre to mesh, weighted by w `[diagonals]`.
@@ -60,28 +58,27 @@ pub struct CentreErrors {
     /// 95th percentile of the distance, weighted by w `[diagonals]`.
     #[serde(deserialize_with = "or_nan")]
     pub accuracy_p95: f64,
-    /// Mean distance from the mesh to the nearest centre of opacity above 0.1 `[diagonals]`. Over
-    /// those of 20,000 uniform samples of the mesh that at least two training views see.
+    /// Mean distance from the mesh to the nearest centre of opacity above 0.1 `[diagonals]`, over those of 20,000 uniform
+    /// samples of the mesh that at least two training views see.
     #[serde(deserialize_with = "or_nan")]
     pub completeness: f64,
     /// Accuracy + completeness `[diagonals]`.
     #[serde(deserialize_with = "or_nan")]
     pub chamfer: f64,
-    /// Harmonic mean of precision (fraction of the weight w within 0.5 % of the diagonal from the
-    /// mesh) and recall (fraction of the samples within that of a centre), in 0..=1.
+    /// Harmonic mean, in 0..=1, of precision (fraction of the weight w within 0.5 % of the diagonal from the mesh) and
+    /// recall (fraction of the samples within that distance from a centre).
     #[serde(deserialize_with = "or_nan")]
     pub f_score_half_percent: f64,
-    /// The same at 1 %.
+    /// The same with 1 % of the diagonal.
     #[serde(deserialize_with = "or_nan")]
     pub f_score_one_percent: f64,
 }
 
-/// Rows of opacity above 0.05 whose distance from the mesh exceeds 1 % of the diagonal and twice their
-/// largest standard deviation, at a place that is empty in at least two training views: their first
-/// surface is farther away, or there is none.
+/// Rows of opacity above 0.05 whose distance from the mesh exceeds 1 % of the diagonal and twice their largest standard
+/// deviation, at a position that at least two training views see through: they show a farther surface there, or none.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Floaters {
-    /// Their number.
+    /// Number of floaters.
     pub count: usize,
     /// Fraction of the rows.
     #[serde(deserialize_with = "or_nan")]
@@ -91,55 +88,54 @@ pub struct Floaters {
     pub of_weight: f64,
 }
 
-/// Pixels that show a thin structure of about this width. They count as found if alpha is above 0.5,
-/// the depth error is below the thickness plus 1 % of the depth, and the colour error, mean over
-/// channels, is below 0.1.
+/// Pixels that show thin structures of about the same width. A pixel counts as found if its alpha is above 0.5, its depth
+/// error below the thickness plus 1 % of the depth, and its mean colour error over the channels below 0.1.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct ThinRecall {
     /// Width in the image, to the nearest power of two `[px]`.
     pub width: f64,
-    /// Pixels that show one.
+    /// Number of pixels that show a thin structure.
     pub pixels: usize,
-    /// Fraction of them that are found.
+    /// Fraction of these pixels that are found.
     pub recall: f64,
 }
 
-/// How much rows contribute to the training views.
+/// Contributions of rows to the training views.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Redundancy {
     /// Mean number of rows blended per pixel.
     #[serde(deserialize_with = "or_nan")]
     pub blended_per_pixel: f64,
-    /// Fraction of the rows whose largest blend weight in any pixel of any view is below 0.01.
+    /// Fraction of the rows whose blend weight is below 0.01 in every pixel of every view.
     #[serde(deserialize_with = "or_nan")]
     pub below_one_percent: f64,
 }
 
-/// The scene that a model is measured in.
+/// A scene whose surface is known.
 #[derive(Clone, Copy)]
 pub struct KnownScene<'a> {
     /// The surface.
     pub truth: &'a GroundTruth,
-    /// From the coordinates of the surface to those of the model and the cameras.
+    /// Transform from the coordinates of the surface to those of the model and the cameras.
     pub normalisation: &'a Normalisation,
     /// Background colour of the renders, sRGB-encoded in `[0, 1]`.
     pub background: [f32; 3],
     /// Spherical-harmonic degree evaluated, <= the model's.
     pub sh_degree: u8,
-    /// Asked before each view; measuring ends with an error once it is true.
+    /// Called before each view; measuring ends with an error once it returns true.
     pub is_stopped: &'a dyn Fn() -> bool,
 }
 
-/// The needs with which the backend for [`measure`] is made.
+/// The needs with which the backend for [`measure`] must be made.
 #[must_use]
 pub fn needs() -> Needs {
     let columns = vec![AuxColumn::WeightSum, AuxColumn::WeightMax, AuxColumn::PixelCount];
     Needs { aux: Some(AuxRequest { columns, ..AuxRequest::default() }), ..Needs::default() }
 }
 
-/// Memory for [`measure`] beside the backend and the surface, at most `[bytes]`: of each row two copies
-/// of the model (as it is read, or on its way from the backend), its place, axes and sums, two search
-/// trees; of each pixel the renders, the surface's depth and normals and their files; samples and angles.
+/// Peak memory for [`measure`] in addition to the backend and the surface `[bytes]`: per row, two copies of the model
+/// (while it is read or downloaded), position, axes, sums and two search trees; per pixel, the renders, and the surface's
+/// depth and normals and their files; samples and angles.
 #[must_use]
 pub fn bytes(rows: usize, sh_degree: u8, image: (u32, u32), views: usize) -> u64 {
     let row = 2 * 4 * (11 + 3 * densify_core::gaussians::sh_coefficients(sh_degree) as u64) + 512;
@@ -147,7 +143,7 @@ pub fn bytes(rows: usize, sh_degree: u8, image: (u32, u32), views: usize) -> u64
     rows as u64 * row + pixels * 128 + views as u64 * (16 << 10) + (4 << 20)
 }
 
-/// JSON has no NaN, and writes it as null.
+/// Reads a number that may be NaN, which JSON writes as null.
 fn or_nan<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
     Ok(Option::deserialize(from)?.unwrap_or(f64::NAN))
 }

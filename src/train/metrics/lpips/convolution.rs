@@ -1,7 +1,7 @@
-//! A convolution with a rectifier, as products of small matrices.
+//! Convolution with a rectifier, as products of small matrices.
 //!
-//! Sixteen pixels are taken together. What the kernel sees of them is copied side by side once, and then
-//! multiplied with the weights of six outputs at a time, whose 6×16 sums stay in registers.
+//! Sixteen pixels are processed together. The kernel's inputs for them are gathered once and then multiplied by the
+//! weights of six outputs at a time, whose 6×16 sums stay in registers.
 
 use std::ops::Range;
 
@@ -11,27 +11,27 @@ use rayon::prelude::*;
 use super::network::Activation;
 use crate::metrics::THREADS;
 
-/// Pixels taken together.
+/// Number of pixels processed together.
 const PIXELS: usize = 16;
-/// Outputs taken together.
+/// Number of outputs processed together.
 const OUTPUTS: usize = 6;
 
-/// A convolution.
+/// A convolution followed by a rectifier.
 #[derive(Debug)]
 pub(super) struct Convolution {
-    /// Channels in and out.
+    /// Numbers of input and output channels.
     pub(super) channels: [usize; 2],
     side: usize,
     step: usize,
     padding: usize,
-    /// Shape: `[outputs / 6, input channels · side · side, 6]`; outputs beyond the last are 0.
+    /// Weights, padded with zeros for outputs beyond the last. Shape: `[outputs / 6, input channels · side · side, 6]`.
     weights: Vec<[f32; OUTPUTS]>,
-    /// Shape: `[outputs]`.
+    /// Biases. Shape: `[outputs]`.
     bias: Vec<f32>,
 }
 
 impl Convolution {
-    /// From published weights. Shapes: `[outputs, inputs, side, side]`, `[outputs]`.
+    /// A convolution with published weights. Shapes: `[outputs, inputs, side, side]`, `[outputs]`.
     pub(super) fn new(
         channels: [usize; 2],
         (side, step, padding): (usize, usize, usize),
@@ -50,22 +50,22 @@ impl Convolution {
         Self { channels, side, step, padding, weights, bias }
     }
 
-    /// Pixels along a side of the result, of an image with so many; 0 if it is too small.
-    pub(super) fn side_of(&self, side: usize) -> usize {
+    /// Side of the result for an image of this side `[px]`; 0 if the image is too small.
+    pub(super) fn output_side(&self, side: usize) -> usize {
         (side + 2 * self.padding).checked_sub(self.side).map_or(0, |rest| rest / self.step + 1)
     }
 
-    /// The rows of an image of this height that some rows of the result see.
-    pub(super) fn seen(&self, rows: &Range<usize>, height: usize) -> Range<usize> {
+    /// The rows of an image of this height on which some rows of the result depend.
+    pub(super) fn input_rows(&self, rows: &Range<usize>, height: usize) -> Range<usize> {
         let first = (rows.start * self.step).saturating_sub(self.padding);
         let end = (rows.end.saturating_sub(1) * self.step + self.side).saturating_sub(self.padding);
         first..end.min(height)
     }
 
-    /// Some rows of the result; `image` has at least the rows that they see, and those that it lacks are
-    /// outside of the whole image.
+    /// Computes some rows of the result. `image` contains at least the rows on which they depend; rows beyond are outside
+    /// the whole image.
     pub(super) fn run(&self, image: &Activation, rows: Range<usize>) -> Activation {
-        let width = self.side_of(image.width);
+        let width = self.output_side(image.width);
         let pixels = rows.len() * width;
         let blocks = pixels.div_ceil(PIXELS);
         let arch = Arch::new();
@@ -95,7 +95,7 @@ impl Convolution {
         result
     }
 
-    /// What the kernel sees of some pixels of the result (row, column); 0 outside of the image. Shape:
+    /// Gathers the kernel's inputs for some pixels (row, column) of the result, with 0 outside the image. Shape:
     /// `[input channels · side · side, 16]`.
     fn gather(
         &self,
@@ -126,7 +126,7 @@ impl Convolution {
         seen
     }
 
-    /// Sums of all outputs for the pixels taken together.
+    /// Sums of all outputs for pixels that are processed together.
     #[inline(always)]
     fn multiply(&self, seen: &[[f32; PIXELS]]) -> Vec<[f32; PIXELS]> {
         let mut result = Vec::with_capacity(self.weights.len() / seen.len().max(1) * OUTPUTS);

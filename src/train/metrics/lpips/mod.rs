@@ -1,11 +1,11 @@
-//! LPIPS, a distance of images by the features of a trained network (Zhang, Isola, Efros, Shechtman, Wang,
+//! LPIPS, a distance between images by the features of a trained network (Zhang, Isola, Efros, Shechtman, Wang,
 //! *The Unreasonable Effectiveness of Deep Features as a Perceptual Metric*, CVPR 2018, arXiv 1801.03924,
 //! version 0.1).
 //!
-//! The weights are a file of the user's, as they are published and not part of this project:
-//! [`Lpips::open`]. Two networks are known, VGG-16 and AlexNet, each in five stages. After each stage the
-//! features of a pixel are scaled to unit length; the squared differences of both images, weighed by
-//! feature, are averaged over the image, and the five averages are added.
+//! The published weights are not part of this project; the user provides them in a file ([`Lpips::open`]). Two networks
+//! are supported, VGG-16 and AlexNet, each with five stages. After each stage the features of a pixel are scaled to unit
+//! length; the squared differences between both images, weighted by feature, are averaged over the image, and the five
+//! averages are added.
 
 mod convolution;
 mod network;
@@ -18,10 +18,11 @@ use super::{MetricError, Pair};
 use densify_core::image::Image8;
 use network::{Activation, Stage};
 
-/// Beside the length of a pixel's features, so that none is divided by 0; as published.
+/// Added to the length of a pixel's features to avoid division by 0; as published.
 const EPSILON: f32 = 1e-10;
-/// Mean and standard deviation of the red, green and blue that the networks were trained on, in `[-1, 1]`.
+/// Mean red, green and blue of the images that the networks were trained on, in `[-1, 1]`.
 const SHIFT: [f32; 3] = [-0.030, -0.088, -0.188];
+/// Standard deviation of red, green and blue in these images.
 const SCALE: [f32; 3] = [0.458, 0.448, 0.450];
 
 /// A network with its weights.
@@ -32,21 +33,20 @@ pub struct Lpips {
 }
 
 impl Lpips {
-    /// Which network the weights are of.
+    /// The network that the weights belong to.
     #[must_use]
     pub fn network(&self) -> Network {
         self.network
     }
 
-    /// LPIPS of a render against a target, >= 0; 0 when they are equal.
+    /// LPIPS of a render against a target, >= 0; 0 for equal images.
     ///
-    /// `rendered`: shape `[height, width, 3]`, clamped to `[0, 1]` here. `background` in `[0, 1]` is the
-    /// background of targets with coverage. A mask scales the difference of a pixel before the network
-    /// sees it. NaN when the render holds a NaN.
+    /// `rendered`: shape `[height, width, 3]`, clamped to `[0, 1]` here. Targets with coverage are composited on
+    /// `background`, in `[0, 1]`. A mask scales the differences of pixels at the input of the network. NaN if the render
+    /// contains a NaN.
     ///
     /// # Errors
-    /// When the sizes differ, the image is smaller than the network can see, or the target's mask ignores
-    /// every pixel.
+    /// When the sizes differ, the image is too small for the network, or the target's mask ignores every pixel.
     pub fn compare(
         &self,
         rendered: &[f32],
@@ -73,7 +73,7 @@ impl Lpips {
     }
 }
 
-/// Render and target as the networks take them.
+/// Render and target as inputs of the networks.
 fn images(pair: &Pair<'_>) -> [Activation; 2] {
     let (width, height) = (pair.width, pair.height);
     let scaled = |c: usize, value: f64| (2.0 * value as f32 - 1.0 - SHIFT[c]) / SCALE[c];

@@ -1,4 +1,4 @@
-//! The two networks as tables, and a stage of them: convolutions, the distance of features, pooling.
+//! The tables of both networks, and their stages: convolutions, distances of features, pooling.
 
 use std::ops::Range;
 
@@ -8,7 +8,7 @@ use super::EPSILON;
 use super::convolution::Convolution;
 use crate::metrics::THREADS;
 
-/// Rows of features that are in memory at a time: a stage of many channels never exists as a whole.
+/// Rows of features in memory at a time, because a whole stage with many channels would be too large.
 const STRIP: usize = 64;
 
 /// A network whose features are compared.
@@ -20,8 +20,7 @@ pub enum Network {
     Alex,
 }
 
-/// A convolution of the table: its number in the published network, channels in and out, side, step and
-/// padding `[px]`.
+/// A convolution: its number in the published network, input and output channels, side, step and padding `[px]`.
 pub(super) type Layer = (usize, [usize; 2], usize, usize, usize);
 
 const VGG: [&[Layer]; 5] = [
@@ -41,7 +40,7 @@ const ALEX: [&[Layer]; 5] = [
 ];
 
 impl Network {
-    /// Its name as published.
+    /// The published name.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
@@ -58,8 +57,7 @@ impl Network {
         }
     }
 
-    /// The pooling between two stages: the largest value of windows of this side, 2 apart; `None` after
-    /// stages that end without.
+    /// Side of the windows of the max pooling after a stage, which has stride 2; `None` for stages without pooling.
     pub(super) fn pooling(self, stage: usize) -> Option<usize> {
         match self {
             Self::Vgg => (stage < 4).then_some(2),
@@ -67,9 +65,9 @@ impl Network {
         }
     }
 
-    /// Smallest side of an image of which something is left after all stages `[px]`.
+    /// Smallest side of an image for which all stages have an output `[px]`.
     #[must_use]
-    pub fn least_side(self) -> usize {
+    pub(super) fn least_side(self) -> usize {
         match self {
             Self::Vgg => 16,
             // 31 → 7 → 3 → 1.
@@ -78,15 +76,14 @@ impl Network {
     }
 }
 
-/// Numbers per channel and pixel, for some rows of an image. Rows outside of the image are 0 to a
-/// convolution.
+/// Values per channel and pixel for some rows of an image. Rows outside the image are 0 in convolutions.
 #[derive(Debug)]
 pub(super) struct Activation {
     pub(super) channels: usize,
-    /// Rows of the whole that are here.
+    /// The rows of the whole image that are present.
     pub(super) rows: Range<usize>,
     pub(super) width: usize,
-    /// Shape: `[channels, rows, width]`.
+    /// Values. Shape: `[channels, rows, width]`.
     pub(super) values: Vec<f32>,
 }
 
@@ -103,23 +100,22 @@ impl Activation {
     }
 }
 
-/// A stage: convolutions, each followed by a rectifier, the weights of the features' differences, and how
-/// the next stage's input is made.
+/// A stage: convolutions with rectifiers, the weights of feature differences, and the pooling before the next stage.
 #[derive(Debug)]
 pub(super) struct Stage {
     pub(super) convolutions: Vec<Convolution>,
-    /// Shape: `[channels]`.
+    /// Weights of feature differences. Shape: `[channels]`.
     pub(super) weights: Vec<f32>,
-    /// Side of the windows whose largest value the next stage sees, 2 apart.
+    /// As [`Network::pooling`].
     pub(super) pooling: Option<usize>,
 }
 
 impl Stage {
-    /// The distance of two images by this stage's features, and what the next stage sees of them.
+    /// The distance of two images by this stage's features, and the inputs of the next stage.
     pub(super) fn run(&self, images: &[Activation; 2]) -> (f64, [Activation; 2]) {
         let [mut height, mut width] = [images[0].rows.end, images[0].width];
         for convolution in &self.convolutions {
-            [height, width] = [height, width].map(|side| convolution.side_of(side));
+            [height, width] = [height, width].map(|side| convolution.output_side(side));
         }
         let pooled = |side: usize| self.pooling.map_or(side, |window| (side - window) / 2 + 1);
         let channels = self.weights.len();
@@ -128,7 +124,7 @@ impl Stage {
         let mut sum = 0.0;
         for first in (0..height).step_by(STRIP) {
             let own = first..(first + STRIP).min(height);
-            // Windows reach into the next strip by what they are longer than their distance.
+            // Windows larger than the stride extend into the next strip.
             let beyond = self.pooling.map_or(0, |window| window - 2);
             let rows = first..(own.end + beyond).min(height);
             let features = images.each_ref().map(|image| self.features(image, rows.clone()));
@@ -140,26 +136,26 @@ impl Stage {
         (sum / (width * height) as f64, next)
     }
 
-    /// Some rows of the features of an image.
+    /// Computes some rows of the features of an image.
     fn features(&self, image: &Activation, rows: Range<usize>) -> Activation {
         let mut heights = vec![image.rows.end];
         for convolution in &self.convolutions {
-            heights.push(convolution.side_of(heights[heights.len() - 1]));
+            heights.push(convolution.output_side(heights[heights.len() - 1]));
         }
-        // What each convolution must see for the next one to have what it needs.
-        let mut wanted = vec![rows];
+        // The rows that each convolution must compute, from the last one backwards.
+        let mut needed = vec![rows];
         for (convolution, &height) in self.convolutions.iter().zip(&heights).rev() {
-            wanted.push(convolution.seen(&wanted[wanted.len() - 1], height));
+            needed.push(convolution.input_rows(&needed[needed.len() - 1], height));
         }
-        wanted.pop();
+        needed.pop();
         let mut features: Option<Activation> = None;
-        for (convolution, rows) in self.convolutions.iter().zip(wanted.into_iter().rev()) {
+        for (convolution, rows) in self.convolutions.iter().zip(needed.into_iter().rev()) {
             features = Some(convolution.run(features.as_ref().unwrap_or(image), rows));
         }
         features.expect("every stage has a convolution")
     }
 
-    /// Σ over the pixels of some rows of the weighed squared difference of unit features.
+    /// The sum of weighted squared differences of unit-length features over some rows.
     fn distance(&self, [a, b]: &[Activation; 2], rows: Range<usize>) -> f64 {
         let row = |row: usize| -> f64 {
             let mut sums = vec![[0.0_f32; 2]; a.width];
@@ -175,13 +171,13 @@ impl Stage {
                 sums.iter().map(|sums| sums.map(|sum| 1.0 / (sum.sqrt() + EPSILON))).collect();
             let mut distance = 0.0;
             for (channel, &weight) in self.weights.iter().enumerate() {
-                let mut of_channel = 0.0_f64;
+                let mut sum = 0.0_f64;
                 for (lengths, (a, b)) in
                     lengths.iter().zip(a.row(channel, row).iter().zip(b.row(channel, row)))
                 {
-                    of_channel += f64::from(a * lengths[0] - b * lengths[1]).powi(2);
+                    sum += f64::from(a * lengths[0] - b * lengths[1]).powi(2);
                 }
-                distance += f64::from(weight) * of_channel;
+                distance += f64::from(weight) * sum;
             }
             distance
         };
@@ -193,7 +189,7 @@ impl Stage {
         by_row.iter().sum()
     }
 
-    /// What the next stage sees of these rows.
+    /// Pools some rows of the features into the input of the next stage.
     fn pool(&self, features: &Activation, own: Range<usize>, next: &mut Activation) {
         let (width, height) = (next.width, next.rows.len());
         for channel in 0..features.channels {

@@ -1,4 +1,4 @@
-//! Tests of LPIPS, against values that ONNX Runtime 1.32.0 computed from the published description
+//! Tests of LPIPS against values that ONNX Runtime 1.32.0 computed from the published description
 //! (package `lpips` 0.1.4) with the same random weights and images.
 
 use std::collections::HashMap;
@@ -8,7 +8,7 @@ use safetensors::tensor::{Dtype, TensorView};
 use super::network::Network;
 use super::*;
 
-/// SplitMix64 of a counter, as a number in `[0, 1)` with 24 bits.
+/// SplitMix64 of a counter, as numbers in `[0, 1)` with 24 bits.
 fn unit(seed: u64, count: usize) -> impl Iterator<Item = f64> {
     (0..count as u64).map(move |i| {
         let x = (i + (seed << 32)).wrapping_add(0x9e37_79b9_7f4a_7c15);
@@ -18,10 +18,10 @@ fn unit(seed: u64, count: usize) -> impl Iterator<Item = f64> {
     })
 }
 
-/// The bytes of an array, and its shape, by name.
+/// Shapes and bytes of arrays by name.
 type Arrays = HashMap<String, (Vec<usize>, Vec<u8>)>;
 
-/// Random weights that keep the size of what passes through.
+/// Random weights that keep the magnitude of features.
 fn random(network: Network) -> Arrays {
     let mut arrays = Arrays::new();
     let mut seed = 0;
@@ -55,7 +55,7 @@ fn bytes(seed: u64, width: u32, height: u32) -> Vec<u8> {
     unit(seed, 3 * (width * height) as usize).map(|x| (x * 256.0) as u8).collect()
 }
 
-/// An image of noise, and the same changed by a quarter towards other noise.
+/// A noise image, and a blend of three quarters of it with one quarter of other noise.
 fn pair(width: u32, height: u32) -> (Vec<f32>, Image8) {
     let rgb = bytes(1000, width, height);
     let changed = rgb.iter().zip(bytes(1001, width, height));
@@ -65,7 +65,7 @@ fn pair(width: u32, height: u32) -> (Vec<f32>, Image8) {
 }
 
 #[test]
-fn values_are_those_of_another_implementation() {
+fn values_agree_with_another_implementation() {
     let cases = [
         (
             Network::Vgg,
@@ -105,7 +105,7 @@ fn masked_pixels_do_not_count_and_equal_images_have_no_distance() {
     target.mask = Some((0..40 * 36).map(half).collect());
     let masked = lpips.compare(&render, &target, [0.0; 3]).unwrap();
     assert!(masked > 0.0 && masked < whole, "{masked} of {whole}");
-    // What is masked may be anything.
+    // Masked pixels may have any value.
     for (i, pixel) in render.chunks_exact_mut(3).enumerate() {
         if half(i) == 0 {
             pixel.fill(f32::NAN);
@@ -128,7 +128,7 @@ fn masked_pixels_do_not_count_and_equal_images_have_no_distance() {
 }
 
 #[test]
-fn files_that_do_not_fit_are_refused_with_what_is_wrong() {
+fn unsuitable_files_are_refused_with_the_reason() {
     let good = random(Network::Alex);
     let refused = |change: &dyn Fn(&mut Arrays)| {
         let mut arrays = good.clone();
@@ -142,12 +142,12 @@ fn files_that_do_not_fit_are_refused_with_what_is_wrong() {
     let shape = refused(&|arrays| {
         arrays.get_mut("net.slice1.0.bias").unwrap().0 = vec![8, 8];
     });
-    assert!(shape.contains("`net.slice1.0.bias` is F32 [8, 8], and should be F32 [64]"), "{shape}");
+    assert!(shape.contains("`net.slice1.0.bias` is F32 [8, 8] instead of F32 [64]"), "{shape}");
     let nan = refused(&|arrays| {
         arrays.get_mut("net.slice1.0.bias").unwrap().1[..4]
             .copy_from_slice(&f32::NAN.to_le_bytes());
     });
-    assert!(nan.contains("not finite"), "{nan}");
+    assert!(nan.contains("non-finite"), "{nan}");
     let whole = file(&good);
     for length in [0, 7, 100, whole.len() / 2, whole.len() - 1] {
         let cut = Lpips::from_bytes(&whole[..length]).unwrap_err();

@@ -1,4 +1,4 @@
-//! The file of weights: a safetensors file of what the published package `lpips` loads.
+//! Reads the file of weights: a safetensors file with the arrays of the published package `lpips`.
 
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -11,12 +11,12 @@ use super::convolution::Convolution;
 use super::network::{Layer, Network, Stage};
 use densify_core::files;
 
-/// Most bytes of a file that are read; VGG-16 takes 59 MB.
+/// Largest file of weights `[bytes]`; VGG-16 takes 59 MB.
 const MOST_BYTES: u64 = 256 << 20;
-/// What to do about a file that does not fit.
-const REMEDY: &str = "write it as docs/metrics.md says";
+/// Remedy for unsuitable files.
+const REMEDY: &str = "create it as described in docs/metrics.md";
 
-/// Why weights cannot be used.
+/// Reason why weights cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum LpipsError {
     /// The file cannot be read.
@@ -24,25 +24,25 @@ pub enum LpipsError {
     Read {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// The cause.
         source: std::io::Error,
     },
-    /// It is not a file of such weights.
+    /// The file does not contain the expected weights.
     #[error("{}: {problem}; {REMEDY}", path.display())]
     Malformed {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// The fault.
         problem: String,
     },
 }
 
 impl Lpips {
-    /// Reads the weights of VGG-16 or AlexNet, whichever the file has.
+    /// Reads the weights of VGG-16 or AlexNet, whichever the file contains.
     ///
     /// # Errors
-    /// When the file cannot be read, is longer than 256 MiB, is no safetensors file, or has not the
-    /// arrays of one of the networks: names and shapes of the package `lpips`, 32-bit floats, finite.
+    /// When the file cannot be read, is longer than 256 MiB, is not a safetensors file, or lacks the arrays of both
+    /// networks, with names and shapes of the package `lpips` and finite 32-bit floats.
     pub fn open(path: &Path) -> Result<Self, LpipsError> {
         let read = |source| LpipsError::Read { path: path.to_owned(), source };
         let mut bytes = Vec::new();
@@ -64,7 +64,7 @@ impl Lpips {
         } else if has("net.slice2.3.weight") {
             Network::Alex
         } else {
-            return Err("it holds neither VGG-16 nor AlexNet".to_owned());
+            return Err("it contains neither VGG-16 nor AlexNet".to_owned());
         };
         let stages = network.stages().into_iter().enumerate().map(|(stage, layers)| {
             let convolutions = layers.iter().map(|layer| convolution(&file, stage, layer));
@@ -79,7 +79,7 @@ impl Lpips {
     }
 }
 
-/// A convolution of the file.
+/// Reads a convolution.
 fn convolution(
     file: &SafeTensors<'_>,
     stage: usize,
@@ -92,17 +92,17 @@ fn convolution(
     Ok(Convolution::new(channels, (side, step, padding), &weights, bias))
 }
 
-/// An array of the file.
+/// Reads an array.
 fn array(file: &SafeTensors<'_>, name: &str, shape: &[usize]) -> Result<Vec<f32>, String> {
     let found = file.tensor(name).map_err(|_| format!("`{name}` is missing"))?;
     if found.dtype() != Dtype::F32 || found.shape() != shape {
         let (kind, found) = (found.dtype(), found.shape());
-        return Err(format!("`{name}` is {kind:?} {found:?}, and should be F32 {shape:?}"));
+        return Err(format!("`{name}` is {kind:?} {found:?} instead of F32 {shape:?}"));
     }
     let values = found.data().as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes));
     let values: Vec<f32> = values.collect();
     if values.iter().any(|value| !value.is_finite()) {
-        return Err(format!("`{name}` has values that are not finite"));
+        return Err(format!("`{name}` has non-finite values"));
     }
     Ok(values)
 }

@@ -1,4 +1,4 @@
-//! The folder of a run: two runs are never mixed, and a run is replaced only as a whole.
+//! The folder of a run. Files of two runs are never mixed, and a run is only replaced as a whole.
 
 mod replacement;
 
@@ -15,7 +15,7 @@ use densify_core::files::disk::{Operation, attempt};
 use densify_core::files::{RUN_FOLDER_DEPTH, is_temporary, remove_incomplete};
 use replacement::{NEW, OLD, REPLACED, Stuck, hidden, recover, replace, suffix};
 
-/// Files and folders of a run. Everything else in its folder belongs to the user and is left alone.
+/// Files and folders of a run. Everything else in its folder belongs to the user and is not modified.
 const OWNED: [&str; 11] = [
     CHECKPOINTS,
     CONFIG_FILE,
@@ -29,6 +29,7 @@ const OWNED: [&str; 11] = [
     "geometry.json",
     "geometry_train.json",
 ];
+/// Name of the folder of models in a run's folder.
 const MODELS: &str = "point_cloud";
 /// Name of the folder of checkpoints in a run's folder.
 pub const CHECKPOINTS: &str = "checkpoints";
@@ -39,10 +40,10 @@ pub fn model_path(run: &Path, iteration: u32) -> PathBuf {
     run.join(MODELS).join(format!("iteration_{iteration}")).join("point_cloud.ply")
 }
 
-/// The iterations whose model a run has saved, in order.
+/// The iterations whose models a run has saved, in ascending order.
 ///
 /// # Errors
-/// [`FileError::Unfit`] when there is none.
+/// [`FileError::Unfit`] if there is none.
 pub fn saved_iterations(run: &Path) -> Result<Vec<u32>, FileError> {
     let iteration = |name: &OsStr| name.to_str()?.strip_prefix("iteration_")?.parse().ok();
     let entries = fs::read_dir(run.join(MODELS)).into_iter().flatten().flatten();
@@ -57,32 +58,32 @@ pub fn saved_iterations(run: &Path) -> Result<Vec<u32>, FileError> {
     Ok(saved)
 }
 
-/// Whether a process trains in a folder.
+/// Whether a process is training in a folder.
 #[must_use]
 pub fn is_in_use(run: &Path) -> bool {
     FolderLock::check(run).is_err()
 }
 
-/// The folder that a run writes to, locked against other processes for as long as this value lives.
+/// The folder that a run writes to, locked against other processes while this value lives.
 ///
-/// A new run writes in place. A run that replaces another writes to a hidden folder inside and takes
-/// its place in [`finish`](Self::finish); until then the old run is unchanged.
+/// A new run writes in place. A run that replaces another writes to a hidden folder inside it and replaces the old run in
+/// [`finish`](Self::finish); until then the old run is unchanged.
 #[derive(Debug)]
 pub struct RunFolder {
     target: PathBuf,
     /// Whether this run created the folder.
     is_new: bool,
-    /// Suffix of the hidden folder that is written to.
+    /// Suffix of the hidden folder of a run that replaces another.
     staged: Option<String>,
     lock: Rc<FolderLock>,
 }
 
-/// Tells whether the folder of a run is still its own.
+/// A handle to check during a run that the folder is still locked.
 #[derive(Debug, Clone)]
 pub struct Guard(Rc<FolderLock>);
 
 impl Guard {
-    /// Fails when the folder was moved or removed, or another process has it.
+    /// Checks that the folder was not moved, removed or taken by another process.
     ///
     /// # Errors
     /// [`FileError::Lost`].
@@ -92,14 +93,14 @@ impl Guard {
 }
 
 impl RunFolder {
-    /// Checks, without writing anything, that a run may go to `target`.
+    /// Checks, without writing anything, that a run may be written to `target`.
     ///
     /// # Errors
-    /// [`FileError::Unfit`] while a process trains there, when it is no folder, and when it holds
-    /// another run and `overwrite` is not set; [`FileError::Io`].
+    /// [`FileError::Unfit`] if a process is training there, if `target` is not a folder, and if it contains another run
+    /// and `overwrite` is not set; [`FileError::Io`].
     pub fn check(target: &Path, overwrite: bool) -> Result<(), FileError> {
         if !target.is_dir() {
-            // A dangling link is in the way, too.
+            // A dangling link also occupies the name.
             return match target.symlink_metadata() {
                 Ok(_) => {
                     let target = target.display();
@@ -123,7 +124,7 @@ impl RunFolder {
     pub fn create(target: &Path, overwrite: bool) -> Result<Self, FileError> {
         Self::check(target, overwrite)?;
         let mut folder = Self::lock(target)?;
-        // Another process may have trained there since.
+        // Another process may have trained there since the check.
         let occupied = !owned_entries(target)?.is_empty();
         if occupied && !overwrite {
             return Err(FileError::occupied(target));
@@ -136,18 +137,17 @@ impl RunFolder {
         Ok(folder)
     }
 
-    /// The folder of a run that continues, or that starts again (`anew`) because it has no checkpoint;
-    /// then its files are removed. Incomplete files of a killed process are removed in any case.
+    /// Opens the folder of a run that continues, or that starts again (`restart`) because it has no checkpoint; then its
+    /// files are removed. Incomplete files of a killed process are removed in any case.
     ///
     /// # Errors
-    /// [`FileError::Io`]; [`FileError::Unfit`] where there is no run, while a process trains there, and
-    /// when a run that starts again would remove models or checkpoints, or
-    /// files of something that is no run.
-    pub fn resume(target: &Path, anew: bool) -> Result<Self, FileError> {
+    /// [`FileError::Io`]; [`FileError::Unfit`] if a process is training there, and if a restart would remove models,
+    /// checkpoints, or files that do not belong to a run.
+    pub fn resume(target: &Path, restart: bool) -> Result<Self, FileError> {
         Self::check(target, true)?;
         let folder = Self::lock(target)?;
-        if anew {
-            // What the caller has seen may have changed until the folder was locked.
+        if restart {
+            // The folder may have changed between the caller's checks and the lock.
             let mut checkpoints =
                 fs::read_dir(target.join(CHECKPOINTS)).into_iter().flatten().flatten();
             let has_checkpoint = checkpoints.any(|entry| !is_temporary(&entry.file_name()));
@@ -156,14 +156,14 @@ impl RunFolder {
             if is_foreign || has_checkpoint || saved_iterations(target).is_ok() {
                 return Err(FileError::occupied(target));
             }
-            // Its description stays until it is replaced: a kill must not lose it.
+            // The configuration stays until it is replaced, so that it is not lost if the process is killed.
             remove_owned(target, |name| name != CONFIG_FILE);
         }
         remove_incomplete(target, RUN_FOLDER_DEPTH);
         Ok(folder)
     }
 
-    /// Creates and locks a folder, and ends a replacement in it that was interrupted.
+    /// Creates and locks a folder, and completes or undoes an interrupted replacement in it.
     fn lock(target: &Path) -> Result<Self, FileError> {
         let is_new = !target.exists();
         let fail = |e| FileError::io("create the folder", target)(e);
@@ -177,8 +177,7 @@ impl RunFolder {
         Ok(Self { target: target.to_owned(), is_new, staged: None, lock })
     }
 
-    /// Ends a replacement in `target` that a kill has interrupted, if there is one, so that the folder can
-    /// be looked at.
+    /// Completes or undoes an interrupted replacement in `target`, if there is one, so that the folder can be read.
     ///
     /// # Errors
     /// [`FileError::Unfit`], [`FileError::Io`].
@@ -190,13 +189,13 @@ impl RunFolder {
         recover(target)
     }
 
-    /// Tells during the run whether the folder is still its own.
+    /// A handle to check during the run that the folder is still locked.
     #[must_use]
     pub fn guard(&self) -> Guard {
         Guard(Rc::clone(&self.lock))
     }
 
-    /// Hidden folders in `target` of runs that were to replace the one there and were interrupted.
+    /// Hidden folders in `target` of interrupted runs that would have replaced the one there.
     #[must_use]
     pub fn staged(target: &Path) -> Vec<PathBuf> {
         let mut staged = hidden(target, NEW);
@@ -211,8 +210,8 @@ impl RunFolder {
         self.staged.as_ref().map_or_else(|| self.target.clone(), staged)
     }
 
-    /// Replaces the existing run, if there is one, and removes earlier ones that were to replace it and
-    /// were interrupted; returns the folder.
+    /// Replaces the existing run, if there is one, and removes interrupted runs that would have replaced it; returns the
+    /// folder.
     ///
     /// # Errors
     /// [`FileError::NotReplaced`] with the hidden folder of the new run; the old run stays.
@@ -233,14 +232,13 @@ impl RunFolder {
         }
     }
 
-    /// Ends a failed run: an existing run stays, and the files of the failed one are kept in the
-    /// returned folder.
+    /// Ends a failed run. An existing run stays, and the files of the failed one stay in the returned folder.
     #[must_use]
     pub fn abandon(self) -> PathBuf {
         self.path()
     }
 
-    /// Ends a run without results: removes its files. An existing run and other files stay.
+    /// Ends a run without results by removing its files. An existing run and other files stay.
     pub fn discard(self) {
         let Self { target, is_new, staged, lock } = self;
         match staged {
@@ -249,13 +247,13 @@ impl RunFolder {
         }
         drop(lock);
         if is_new {
-            // It stays if the user has put something there.
+            // This fails if the user has added files, which then stay.
             let _ = fs::remove_dir(&target);
         }
     }
 }
 
-/// Removes folders, as far as possible.
+/// Removes folders, ignoring errors.
 fn remove_all(folders: impl IntoIterator<Item = PathBuf>) {
     for folder in folders {
         let _ = fs::remove_dir_all(folder);
@@ -273,16 +271,16 @@ fn move_run(from: &Path, to: &Path) -> Result<(), FileError> {
     Ok(())
 }
 
-/// Removes those files of a run that are meant, as far as possible.
-fn remove_owned(folder: &Path, is_meant: impl Fn(&OsStr) -> bool) {
+/// Removes the files of a run that match a condition, ignoring errors.
+fn remove_owned(folder: &Path, is_removed: impl Fn(&OsStr) -> bool) {
     let names = owned_entries(folder).unwrap_or_default();
-    for name in names.into_iter().filter(|name| is_meant(name)) {
+    for name in names.into_iter().filter(|name| is_removed(name)) {
         let path = folder.join(name);
         let _ = if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
     }
 }
 
-/// Names of the files of a run in `folder`.
+/// Names of the files and folders of a run in `folder`.
 fn owned_entries(folder: &Path) -> Result<Vec<std::ffi::OsString>, FileError> {
     let mut owned = Vec::new();
     for entry in fs::read_dir(folder).map_err(FileError::io("read the folder", folder))? {

@@ -1,5 +1,5 @@
-//! How a run takes the place of another: by renaming within the folder, so that a kill at any moment leaves
-//! enough to end or undo it.
+//! Replaces one run by another by renaming files within the folder, so that an interruption at any time can be completed
+//! or undone.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -8,27 +8,27 @@ use super::{attempt, move_run, remove_all};
 use densify_core::files::FileError;
 use densify_core::files::disk::Operation;
 
-/// Hidden folder of a run that is to replace another, with a suffix of its own.
+/// Prefix of the hidden folder of a run that will replace another; a unique suffix follows.
 pub(super) const NEW: &str = ".densify-new-";
-/// Hidden folder to which the old run goes out of the way; of the same suffix. While it is there, the old
-/// run is the one that counts.
+/// Prefix of the hidden folder to which the old run is moved, with the same suffix. While it exists, the old run is the
+/// valid one.
 pub(super) const OLD: &str = ".densify-old-";
-/// What [`OLD`] is called once all of the old run is in it: from then on the new run counts.
+/// New prefix of [`OLD`] when all of the old run has been moved; from then on the new run is the valid one.
 pub(super) const REPLACED: &str = ".densify-replaced-";
 
-/// Why a run could not take the place of another.
+/// Reason why a run could not replace another.
 pub(super) struct Stuck {
     pub(super) source: FileError,
-    /// Where (part of) the old run lies, if it could not be moved back either.
+    /// Folder of (a part of) the old run, if it could not be moved back either.
     pub(super) aside: Option<PathBuf>,
 }
 
-/// Replaces the run in `target` by that in the hidden folder of this suffix, or leaves both unchanged as
-/// far as possible. Killed or stuck within, it is ended by [`recover`].
+/// Replaces the run in `target` by the one in the hidden folder with this suffix, or leaves both unchanged as far as
+/// possible. [`recover`] completes or undoes an interrupted replacement.
 pub(super) fn replace(target: &Path, suffix: &str) -> Result<(), Stuck> {
     let [new, old, replaced] =
         [NEW, OLD, REPLACED].map(|prefix| target.join(format!("{prefix}{suffix}")));
-    // What cannot be moved back stays where it is, for `recover`.
+    // Files that cannot be moved back stay where they are, for `recover`.
     let stuck = |source, aside: &Path, moved_back: Result<(), FileError>| {
         if moved_back.is_ok() {
             let _ = fs::remove_dir(aside);
@@ -51,8 +51,8 @@ pub(super) fn replace(target: &Path, suffix: &str) -> Result<(), Stuck> {
     Ok(())
 }
 
-/// Ends replacements that a kill has interrupted: one whose old run was still moving out is undone,
-/// one whose new run was moving in is completed.
+/// Ends interrupted replacements: if the old run was being moved away, the replacement is undone; if the new run was being
+/// moved in, it is completed.
 pub(super) fn recover(target: &Path) -> Result<(), FileError> {
     for old in hidden(target, OLD) {
         move_run(&old, target)?;
@@ -69,13 +69,13 @@ pub(super) fn recover(target: &Path) -> Result<(), FileError> {
     Ok(())
 }
 
-/// Folders in `target` whose names begin so.
+/// Folders in `target` whose names have a prefix.
 pub(super) fn hidden(target: &Path, prefix: &str) -> Vec<PathBuf> {
     let entries = fs::read_dir(target).into_iter().flatten().flatten().map(|entry| entry.path());
     entries.filter(|path| suffix(path, prefix).is_some() && path.is_dir()).collect()
 }
 
-/// What follows the prefix in the name of a folder.
+/// The rest of a folder's name after a prefix.
 pub(super) fn suffix(path: &Path, prefix: &str) -> Option<String> {
     Some(path.file_name()?.to_str()?.strip_prefix(prefix)?.to_owned())
 }

@@ -1,4 +1,4 @@
-//! Runs that begin, end, fail, replace each other, and are killed while they do.
+//! Tests of run folders: runs that start, end, fail, replace each other, and are interrupted.
 
 use super::*;
 use crate::output::lock::LOCK;
@@ -57,7 +57,7 @@ fn replacing_touches_only_what_a_run_owns_and_only_at_the_end() {
 #[test]
 fn a_run_that_cannot_take_its_place_leaves_the_old_one_there() {
     let root = tempfile::tempdir().unwrap();
-    // The first cannot go out of the way, the second cannot come in.
+    // A file of the old run cannot be moved away; a file of the new run cannot be moved in.
     for file in ["config.toml", "results.json"] {
         for name in ["config.toml", "cameras.json", "stats/old.jsonl"] {
             write(&root.path().join(name), "old");
@@ -83,11 +83,10 @@ fn a_run_that_cannot_take_its_place_leaves_the_old_one_there() {
     }
 }
 
-/// Whatever fails, and moving back with it: it is said where the files lie, and they are all there for the
-/// next run.
+/// If moving fails, and moving back too, the message names the folders of all files, and the next run recovers them.
 #[test]
-fn a_run_that_is_stuck_on_its_way_is_said_to_be_there() {
-    // An operation fails from the so many-th on; whether the old run lies aside; which run counts then.
+fn a_stuck_replacement_is_reported_and_recovered() {
+    // The operation that fails after a number of successes, the prefix of the old run's folder, and the valid run.
     for (operation, file, spared, aside, counts) in [
         (Operation::Create, "", 0, None, "old"),
         (Operation::Rename, "", 1, Some(OLD), "old"),
@@ -106,8 +105,9 @@ fn a_run_that_is_stuck_on_its_way_is_said_to_be_there() {
         let fault = Fault { operation, file, spared, kind: std::io::ErrorKind::Other };
         let error = with_fault(Some(fault), || run.finish()).0.unwrap_err().to_string();
         let what = format!("{operation:?} {spared}: {error}");
-        let lies =
-            tree(root.path()).into_iter().find(|name| aside.is_some_and(|it| name.starts_with(it)));
+        let lies = tree(root.path())
+            .into_iter()
+            .find(|name| aside.is_some_and(|aside| name.starts_with(aside)));
         assert_eq!(lies.is_some(), aside.is_some(), "{what}");
         assert_eq!(error.contains("is unchanged"), aside.is_none(), "{what}");
         assert!(lies.is_none_or(|name| error.contains(&name)), "{what}");
@@ -118,7 +118,7 @@ fn a_run_that_is_stuck_on_its_way_is_said_to_be_there() {
 }
 
 #[test]
-fn a_run_that_goes_on_finds_nothing_half_written() {
+fn a_resumed_run_has_no_incomplete_files() {
     let root = tempfile::tempdir().unwrap();
     for name in ["config.toml", "stats/train.jsonl", "point_cloud/iteration_1/point_cloud.ply"] {
         write(&root.path().join(name), "old");
@@ -133,12 +133,12 @@ fn a_run_that_goes_on_finds_nothing_half_written() {
     assert_eq!(tree(&root.path().join("stats")), ["train.jsonl"]);
     assert_eq!(tree(&root.path().join("point_cloud/iteration_1")), ["point_cloud.ply"]);
     assert_eq!(RunFolder::staged(root.path()), [root.path().join(".densify-new-x")]);
-    // To start again would remove a model.
+    // A restart would remove a model.
     assert!(RunFolder::resume(root.path(), true).unwrap_err().to_string().contains("another run"));
     fs::remove_dir_all(root.path().join("point_cloud")).unwrap();
     drop(RunFolder::resume(root.path(), true).unwrap());
     assert_eq!(tree(root.path()), [".densify-new-x", "config.toml"]);
-    // Without a description it is no run.
+    // Without a configuration the files do not belong to a run.
     fs::rename(root.path().join("config.toml"), root.path().join("stats")).unwrap();
     assert!(RunFolder::resume(root.path(), true).unwrap_err().to_string().contains("another run"));
     fs::rename(root.path().join("stats"), root.path().join("config.toml")).unwrap();
@@ -149,10 +149,10 @@ fn a_run_that_goes_on_finds_nothing_half_written() {
 }
 
 #[test]
-fn a_replacement_that_is_killed_is_ended_by_the_next_run() {
+fn an_interrupted_replacement_is_ended_by_the_next_run() {
     const OLD_RUN: [&str; 2] = ["cameras.json", "config.toml"];
     const NEW_RUN: [&str; 2] = ["config.toml", "results.json"];
-    // What has moved when the kill comes: of the old run, then of the new one.
+    // Numbers of files of the old and of the new run that had been moved before the interruption.
     for (out, moved_in) in
         [(0, None), (1, None), (2, None), (2, Some(0)), (2, Some(1)), (2, Some(2))]
     {
@@ -168,7 +168,7 @@ fn a_replacement_that_is_killed_is_ended_by_the_next_run() {
             write(&root.path().join(folder + name), "new");
         }
         RunFolder::settle(root.path()).unwrap();
-        // What was not yet replacing anything goes when the next run begins.
+        // A replacement that had not started is discarded when the next run starts.
         drop(RunFolder::resume(root.path(), false).unwrap());
         let (names, text) = match moved_in {
             None => (OLD_RUN, "old"),
@@ -204,7 +204,7 @@ fn a_folder_in_use_is_neither_replaced_nor_resumed() {
 
 #[cfg(unix)]
 #[test]
-fn a_run_whose_folder_is_moved_knows_it() {
+fn a_moved_folder_is_detected() {
     let root = tempfile::tempdir().unwrap();
     let target = root.path().join("run");
     let run = RunFolder::create(&target, false).unwrap();
@@ -229,7 +229,7 @@ fn an_abandoned_run_is_kept_beside_the_old_one() {
 }
 
 #[test]
-fn a_discarded_run_leaves_what_was_there() {
+fn a_discarded_run_leaves_other_files() {
     let root = tempfile::tempdir().unwrap();
     let target = root.path().join("run");
     let discard = |overwrite| {

@@ -1,31 +1,31 @@
-//! Measures the probes at the end of an interval, and removes the rows that hardly change them.
+//! Measures the probe views at the end of an interval, and removes rows that hardly affect them.
 
 use densify_policies::policy::Signal;
 
-use super::{HIDDEN_LOGIT, MAX_TENTHS, Removal, allowed_loss, interval_steps, signals};
-use crate::trainer::probe::mean;
+use super::probe_views::mean;
+use super::{HIDDEN_LOGIT, MAX_TENTHS, Removal, allowed_loss, growth_signals, interval_steps};
 use crate::trainer::{EditEvent, TrainError, Trainer};
 use densify_core::gaussians::ModelArray;
 use densify_core::pieces::pieces;
 use densify_data::views::ViewSource;
 
 impl<V: ViewSource> Trainer<V> {
-    /// Most rows that a plan may lead to now; at least as many as there are, so that a model that starts
-    /// with more is not cut.
+    /// Largest number of rows that a plan may result in; at least the current number, so that a model that starts with more
+    /// is not reduced.
     pub(in crate::trainer) fn row_limit(&self) -> usize {
         let budget = self.backend.budget();
         let limit = self.auto_budget.as_ref().map_or(budget, |auto| auto.limit.min(budget));
         limit.max(self.backend.rows())
     }
 
-    /// At the end of an interval: measures the probes, then raises the limit or removes rows.
+    /// At the end of an interval, measures the probe views and then raises the limit or removes rows.
     pub(in crate::trainer) fn update_auto_budget(
         &mut self,
         step: u32,
     ) -> Result<Option<EditEvent>, TrainError> {
         let iterations = self.options.iterations;
         let is_due = step.is_multiple_of(interval_steps(iterations)) && step <= iterations;
-        let auto = self.auto_budget.clone().filter(|_| is_due && !self.probes.is_empty());
+        let auto = self.auto_budget.clone().filter(|_| is_due && !self.probe_views.is_empty());
         let Some(mut auto) = auto else {
             return Ok(None);
         };
@@ -35,7 +35,7 @@ impl<V: ViewSource> Trainer<V> {
         if !grows && !removes {
             return Ok(None);
         }
-        let psnr = mean(&self.probe(step, self.sh_degree(step))?);
+        let psnr = mean(&self.probe_psnr(step, self.sh_degree(step))?);
         let settled = auto.record(step, rows, psnr);
         if settled && grows {
             auto.update_limit(self.backend.budget());
@@ -62,11 +62,11 @@ impl<V: ViewSource> Trainer<V> {
         Ok(event)
     }
 
-    /// The rows to remove, and the change of the probes' PSNR without them, relative to `psnr` with all
-    /// rows `[dB]`; if none can be removed, the change without a tenth of them.
+    /// The rows to remove, and the change of the probe views' PSNR without them, relative to `psnr` with all rows `[dB]`; if
+    /// none can be removed, the change without a tenth of them.
     fn least_important(&mut self, step: u32, psnr: f64) -> Result<(Vec<u32>, f64), TrainError> {
         let signals =
-            self.backend.take_signals(signals()).map_err(|e| self.backend_error(step, e))?;
+            self.backend.take_signals(growth_signals()).map_err(|e| self.backend_error(step, e))?;
         let weights = signals.get(Signal::WeightMax).unwrap_or_default();
         let mut rows: Vec<u32> = (0..weights.len() as u32).collect();
         rows.sort_by(|&a, &b| weights[a as usize].total_cmp(&weights[b as usize]));
@@ -79,8 +79,8 @@ impl<V: ViewSource> Trainer<V> {
         Ok((rows, change))
     }
 
-    /// Hides one tenth of the rows after another, in the given order, until the PSNR falls too much.
-    /// Returns how many rows can be removed, and the change of the PSNR without them.
+    /// Hides one tenth of the rows after another, in the given order, until the PSNR falls too much. Returns the number of
+    /// rows that can be removed, and the change of the PSNR without them.
     fn hide_tenths(
         &mut self,
         step: u32,
@@ -95,7 +95,7 @@ impl<V: ViewSource> Trainer<V> {
                 logits[row as usize] = HIDDEN_LOGIT;
             }
             self.set_opacity_logits(step, &logits)?;
-            let without = mean(&self.probe(step, degree)?) - psnr;
+            let without = mean(&self.probe_psnr(step, degree)?) - psnr;
             let is_too_much = -without >= allowed_loss(tenth);
             if !is_too_much || count == 0 {
                 change = without;

@@ -1,62 +1,62 @@
-//! The row limit of `--budget auto`: it rises while more rows improve the images, and falls while rows
+//! The automatic budget: a limit on the number of rows that rises while more rows improve the images, and falls while rows
 //! can be removed without loss.
 //!
-//! The run is divided into intervals. At the end of each, before the policy's edit, the PSNR of a few
-//! training views (the probes) is measured. In the first half of the run the limit then rises by half
-//! a doubling, up to the budget. Policies receive the limit as their budget, and plans enforce it as
-//! such, so policies need not know about it. The gain of a doubling is the slope of the PSNR over
-//! log2(rows), fitted to the last three intervals. It includes what training alone brings in the
-//! meantime, so growth stops too late rather than too early: after the gain has been below [`MIN_GAIN`]
-//! twice in a row.
+//! The run is divided into intervals. At the end of each, before the policy's edit, the PSNR of a few training views (the
+//! probe views) is measured. In the first half of the run the limit then rises by half a doubling, up to the budget.
+//! Policies receive the limit as their budget, and plans enforce it, so policies need not know about it. The gain of a
+//! doubling is the slope of the PSNR over log2(rows), fitted to the last three intervals. It includes the improvement by
+//! training alone, so growth stops too late rather than too early: after the gain has been below [`MIN_GAIN`] twice in a
+//! row.
 //!
-//! Policies also do things that reduce the PSNR for a while, such as inserting rows or resetting
-//! opacities. If it is more than [`MAX_DROP`] below the best of the last [`RECENT`] intervals, nothing
-//! is concluded: the interval has no gain, the limit stays, and no row is removed.
+//! Some edits reduce the PSNR for a while, such as inserting rows or resetting opacities. If it is more than [`MAX_DROP`]
+//! below the best of the last [`RECENT`] intervals, the interval is not evaluated: the limit stays the same, and no row is
+//! removed.
 //!
-//! After growth, low-weight Gaussians are pruned. At the end of each later interval the rows are ordered
-//! by their largest blend weight in any view. Tenths of them are hidden one after another, and those are
-//! removed without which the PSNR falls by less than [`MIN_GAIN`] per halving. The comparison is on the
-//! same model at the same step, so it has no noise; it overestimates the loss, as the other rows adapt.
+//! After growth, rows with low weights are pruned. At the end of each later interval the rows are sorted by their largest
+//! blend weight in any view. Tenths of them are hidden one after another and removed as long as the PSNR falls by less
+//! than [`MIN_GAIN`] per halving. The comparison uses the same model at the same step, so it has no noise; it
+//! overestimates the loss, because the other rows will adapt.
 //!
-//! Measuring leaves the model and all that its future depends on unchanged, to the bit: rows are hidden
-//! by their opacity logits only, and these are written back as they were read.
+//! Measuring does not change a bit of the model or of any other state: rows are hidden by their opacity logits only, and
+//! these are restored.
 
 mod measure;
+mod probe_views;
 
 use densify_policies::policy::{Signal, SignalSet};
 use serde::{Deserialize, Serialize};
 
 use crate::schedule::scaled;
+pub(super) use probe_views::probe_views;
 
 /// PSNR that a doubling of rows must gain `[dB]`.
 pub const MIN_GAIN: f64 = 0.10;
-/// A PSNR this far below the recent best means that an edit is still being recovered from `[dB]`. The
-/// probes are always the same views; with views drawn at random the noise would be larger than this.
+/// Drop of the PSNR below the recent best from which on the model counts as recovering from an edit `[dB]`. The probe views
+/// are always the same; with random views the noise would be larger than this.
 const MAX_DROP: f64 = 0.5;
-/// Intervals after which a loss counts as permanent. The insertions of `diet` take a sixth of a run, which
-/// is four intervals.
+/// Number of intervals after which a loss counts as permanent. The insertions of `diet` take a sixth of a run, which is
+/// four intervals.
 const RECENT: usize = 6;
-/// Steps of an interval in a run of 30,000: ten intervals, or five doublings, until most policies stop
-/// growing.
+/// Steps of an interval in a run of 30,000. That gives ten intervals, or five doublings, until most policies stop growing.
 const INTERVAL: u32 = 1_500;
-/// Intervals are multiples of this: policies are due every 100 steps at most.
+/// Intervals are multiples of this number of steps, because policies are due every 100 steps at most.
 const INTERVAL_UNIT: u32 = 100;
-/// The limit grows by this factor in each interval.
+/// Growth of the limit per interval.
 const FACTOR: f64 = std::f64::consts::SQRT_2;
-/// The limit starts at this at least.
+/// Smallest initial limit.
 const MIN_LIMIT: usize = 1_000;
-/// Intervals to which the slope is fitted.
+/// Number of intervals to which the slope is fitted.
 const FITTED: usize = 3;
-/// The share of the run after which no rows are removed, so that the others can adapt.
+/// Share of the run after which no rows are removed, so that the others can adapt.
 const LAST_REMOVAL: f64 = 0.8;
-/// Most tenths of the rows that are removed at once.
+/// Largest number of tenths of the rows that are removed at once.
 const MAX_TENTHS: usize = 5;
-/// The logit of an opacity of 1e-6, which no pixel shows.
+/// The logit of an opacity of 1e-6, which is invisible.
 const HIDDEN_LOGIT: f32 = -13.8;
 
-/// The signals that the row limit needs from a backend, in addition to the policy's.
+/// The signals that the automatic budget needs from a backend, in addition to the policy's.
 #[must_use]
-pub fn signals() -> SignalSet {
+pub fn growth_signals() -> SignalSet {
     SignalSet::from([Signal::WeightMax])
 }
 
@@ -64,15 +64,15 @@ pub fn signals() -> SignalSet {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct AutoBudget {
-    /// Most rows now.
+    /// Largest number of rows now.
     pub limit: usize,
-    /// The step at which growth was stopped, if it was.
+    /// The step at which growth stopped, if it has.
     pub stopped: Option<u32>,
-    /// The measured intervals so far, during growth and after it.
+    /// The intervals measured so far.
     pub intervals: Vec<Interval>,
     /// Attempts to remove rows.
     pub removals: Vec<Removal>,
-    /// Number of intervals in a row with a gain below [`MIN_GAIN`].
+    /// Number of consecutive intervals with a gain below [`MIN_GAIN`].
     pub idle: u32,
 }
 
@@ -82,14 +82,14 @@ pub struct AutoBudget {
 pub struct Interval {
     /// Iteration.
     pub step: u32,
-    /// Rows, before the policy's edit.
+    /// Number of rows before the policy's edit.
     pub rows: usize,
-    /// Mean PSNR of the probes `[dB]`.
+    /// Mean PSNR of the probe views `[dB]`.
     pub psnr: f64,
-    /// Whether the PSNR is near its recent best; otherwise nothing is concluded.
+    /// Whether the PSNR is near its recent best; otherwise the interval is not evaluated.
     pub settled: bool,
-    /// Gain over this settled interval and the two before, including the effect of training
-    /// `[dB per doubling]`; `None` if there are fewer, if rows did not increase, or after growth.
+    /// Gain over this settled interval and the two before, including the effect of training `[dB per doubling]`; `None` if
+    /// there are fewer, if rows did not increase, or after growth.
     pub gain: Option<f64>,
 }
 
@@ -101,9 +101,9 @@ pub struct Removal {
     pub step: u32,
     /// Rows before.
     pub before: usize,
-    /// Rows after; as before if removing a tenth would cost too much.
+    /// Rows after; the same as before if removing a tenth would cost too much.
     pub after: usize,
-    /// Immediate change of the probes' PSNR `[dB]`; that of removing a tenth, if none was removed.
+    /// Immediate change of the probe views' PSNR `[dB]`; if none was removed, the change for a tenth.
     pub change: f64,
 }
 
@@ -112,7 +112,7 @@ impl AutoBudget {
         Self { limit: rows.max(MIN_LIMIT).min(budget), ..Self::default() }
     }
 
-    /// Records the end of an interval. Returns whether it is settled.
+    /// Records the end of an interval; returns whether it is settled.
     fn record(&mut self, step: u32, rows: usize, psnr: f64) -> bool {
         let recent = self.intervals.iter().rev().take(RECENT);
         let best = recent.map(|interval| interval.psnr).fold(f64::NEG_INFINITY, f64::max);
@@ -128,7 +128,7 @@ impl AutoBudget {
         let Some(interval) = self.intervals.last_mut() else { return };
         interval.gain = gain;
         let Interval { step, rows, .. } = *interval;
-        // Rows far below the limit say nothing about a higher limit.
+        // If the number of rows is far below the limit, a higher limit would have no effect.
         let is_full = rows as f64 * FACTOR.sqrt() >= self.limit as f64;
         let is_idle = is_full && gain.is_some_and(|gain| gain < MIN_GAIN);
         self.idle = if is_idle { self.idle + 1 } else { 0 };
@@ -155,12 +155,12 @@ fn slope(intervals: &[Interval]) -> Option<f64> {
     let y = intervals.iter().map(|interval| interval.psnr).sum::<f64>() / count;
     let variance: f64 = intervals.iter().map(|i| (doublings(i) - x).powi(2)).sum();
     let covariance: f64 = intervals.iter().map(|i| (doublings(i) - x) * (i.psnr - y)).sum();
-    // At least that of a quarter of a doubling from first to last.
+    // The variance must be at least that of a quarter of a doubling from first to last.
     let is_enough = intervals.len() == FITTED && variance > 2.0 * 0.125_f64.powi(2);
     is_enough.then(|| covariance / variance)
 }
 
-/// PSNR that removing this many tenths of the rows may cost `[dB]`.
+/// Loss of PSNR that is accepted for removing this many tenths of the rows `[dB]`.
 fn allowed_loss(tenths: usize) -> f64 {
     MIN_GAIN * (10.0 / (10.0 - tenths as f64)).log2()
 }

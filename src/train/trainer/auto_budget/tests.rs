@@ -1,15 +1,15 @@
-//! Tests of the row limit on made-up measurements: where growth stops, and when rows may be removed.
+//! Tests of the automatic budget with synthetic measurements: the end of growth, and the removal of rows.
 
 use super::*;
 
 const LENGTH: u32 = 100;
 const BUDGET: usize = 200_000;
-/// PSNR of a model of this many rows: each doubling gains half as much as the one before.
+/// PSNR of a model by number of rows: each doubling gains half as much as the one before.
 fn psnr_of_rows(rows: usize) -> f64 {
     38.0 - 1.6 * (4_000.0 / rows as f64)
 }
 
-/// Runs the limit through intervals, each of which gains `training` dB by training alone.
+/// Simulates intervals, each of which gains `training` dB by training alone.
 fn grow(first: usize, training: f64) -> AutoBudget {
     let mut auto = AutoBudget::new(first, BUDGET);
     let mut rows = first;
@@ -31,7 +31,7 @@ fn growth_stops_when_the_gain_is_too_low_twice_in_a_row() {
     let gains: Vec<Option<f64>> = auto.intervals.iter().map(|interval| interval.gain).collect();
     assert_eq!(gains[..2], [None, None], "two points are no slope");
     let gains: Vec<f64> = gains.into_iter().flatten().collect();
-    // Three points at equal distances: what is between the outer two, a doubling apart.
+    // For three equally spaced points the slope is the difference of the outer two, which are a doubling apart.
     let [first, .., third] = [0, 1, 2].map(|i| auto.intervals[i].psnr);
     assert!((gains[0] - (third - first)).abs() < 1e-2, "{} for {}", gains[0], third - first);
     let (paid, idle) = gains.split_at(gains.len() - 2);
@@ -56,7 +56,7 @@ fn a_limit_that_is_not_reached_rises_to_the_budget_at_most() {
     }
     assert_eq!((auto.limit, auto.stopped), (BUDGET, None));
     assert!(auto.intervals.iter().all(|interval| interval.gain.is_none()), "{:?}", auto.intervals);
-    // The same with rows that increase far below the limit.
+    // The limit also rises if rows increase far below it.
     for end in 7..=12 {
         auto.record(end * LENGTH, 1_000 << (end - 7), 30.0);
         auto.update_limit(BUDGET);
@@ -68,7 +68,7 @@ fn a_limit_that_is_not_reached_rises_to_the_budget_at_most() {
 }
 
 #[test]
-fn nothing_is_concluded_until_the_psnr_has_recovered() {
+fn intervals_count_only_after_the_psnr_has_recovered() {
     let psnr = [30.0, 33.0, 35.0, 35.6, 35.2, 29.0, 35.0, 35.2, 36.0];
     let mut auto = AutoBudget::new(5_000, BUDGET);
     let settled: Vec<bool> = (1..).zip(psnr).map(|(end, psnr)| auto.record(end, 0, psnr)).collect();

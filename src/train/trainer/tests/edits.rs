@@ -15,7 +15,7 @@ fn edits_are_reported_and_the_budget_holds() {
 }
 
 #[test]
-fn frozen_rows_count_for_the_budget_and_policies_know_nothing_of_them() {
+fn frozen_rows_count_for_the_budget_and_are_hidden_from_policies() {
     let case = Case { rows: 5, aux_views: 1, ..CASE };
     let info = SceneInfo { budget: 7, initial_rows: 2, ..scene(&case, 3) };
     let options = TrainOptions { frozen: 3, ..OPTIONS };
@@ -27,7 +27,7 @@ fn frozen_rows_count_for_the_budget_and_policies_know_nothing_of_them() {
         events.iter().map(|e| (e.step, e.before, e.added, e.denied, e.after)).collect();
     assert_eq!(short, [(2, 5, 2, 0, 7), (4, 7, 3, 1, 10), (6, 10, 0, 7, 10), (8, 10, 0, 7, 10)]);
     assert!(log.lock().unwrap().iter().any(|call| call.starts_with("observe")));
-    // The audit removes others, and a frozen row that is unsound ends the run.
+    // A frozen row with non-finite values ends the run.
     let case = Case { unsound: 1, behaviour: Behaviour::Nothing, ..case };
     let info = SceneInfo { budget: 7, initial_rows: 2, ..scene(&case, 3) };
     let (mut trainer, ..) = build(&case, 3, info, options).unwrap();
@@ -40,7 +40,7 @@ fn a_plan_that_changes_nothing_is_not_an_event() {
     let (mut trainer, log, _) = trainer(&Case { behaviour: Behaviour::Nothing, ..CASE });
     assert!((0..9).all(|_| trainer.step().unwrap().events.is_empty()));
     assert!(trainer.events.is_empty());
-    // It may reset statistics and is executed all the same.
+    // Plans may reset statistics and are therefore executed in any case.
     assert!(log.lock().unwrap().contains(&"apply 2".to_owned()));
 }
 

@@ -1,4 +1,4 @@
-//! Tests of the training loop, with a backend that only counts rows and a scripted policy.
+//! Tests of the training loop with a backend that only counts rows, and a scripted policy.
 
 use std::sync::{Arc, Mutex};
 
@@ -149,14 +149,14 @@ impl Backend for CountingBackend {
     }
 }
 
-/// A policy that is due at the multiples of `every`, with one fixed behaviour.
+/// A policy that is due at multiples of `every`, with a fixed behaviour.
 struct ScriptedPolicy {
     every: u32,
     aux_views: u32,
     cadence: Cadence,
-    /// From step 7 on.
+    /// Terms from step 7 on.
     terms: (LossTerms, Option<NoiseTerm>),
-    /// Up to step 2.
+    /// Resolution up to step 2.
     resolution: f64,
     seen: Vec<f32>,
     behaviour: Behaviour,

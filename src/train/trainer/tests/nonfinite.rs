@@ -23,7 +23,7 @@ fn nonfinite_rows_are_removed_at_the_end() {
 
 #[test]
 fn many_nonfinite_rows_end_the_run() {
-    // One in a thousand may go, and one always.
+    // One in a thousand rows may be removed, and one always.
     for (rows, unsound, ends) in
         [(3, 1, false), (3, 2, true), (3000, 3, false), (3000, 4, true), (1, 1, true)]
     {

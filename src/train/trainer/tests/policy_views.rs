@@ -1,4 +1,4 @@
-//! Tests of the views rendered for a policy, and of near-duplicates among them.
+//! Tests of views rendered for a policy, and of near-duplicates.
 
 use super::*;
 
@@ -8,7 +8,7 @@ fn the_first_of_near_duplicates_is_kept() {
         let rotation = DMat3::from_rotation_y(degrees.to_radians());
         Camera::centred((64, 48), (fx, 50.0), rotation, DVec3::new(x, 0.0, 0.0))
     };
-    // Extent 10: within 0.1 and one degree of an earlier view that is kept.
+    // At extent 10, near-duplicates are within 0.1 and one degree of an earlier view that is kept.
     let cameras = vec![
         camera(0.0, 0.0, 50.0),
         camera(0.09, 0.9, 50.0),
@@ -24,12 +24,12 @@ fn the_first_of_near_duplicates_is_kept() {
 
 #[test]
 fn near_duplicates_are_not_scored() {
-    // Cameras one apart: with an extent of 150, the second is the first, and the third is not.
+    // Cameras are 1 apart: at extent 150 the second is a near-duplicate of the first, and the third is not.
     let case = Case { aux_views: 100, ..CASE };
     let info = SceneInfo { extent: 150.0, ..scene(&case, 3) };
     let (trainer, log, _) = build(&case, 3, info, OPTIONS).unwrap();
     let mut trainer =
-        trainer.requiring(AutoChoices { scored_views: true, ..AutoChoices::default() });
+        trainer.with_auto_choices(AutoChoices { scored_views: true, ..AutoChoices::default() });
     for _ in 0..9 {
         trainer.step().unwrap();
     }
@@ -58,7 +58,7 @@ fn auxiliary_views_are_shown_before_the_plan() {
     let saw: Vec<f32> = views.iter().map(|&view| view as f32).collect();
     assert_eq!(events[1].cause, format!("saw {saw:?}+scripted"));
     assert_eq!(events[2].cause, "scripted");
-    // All of them, where more are wanted than there are.
+    // If more views are requested than exist, all are rendered.
     let (mut trainer, ..) = self::trainer(&Case { aux_views: u32::MAX, ..CASE });
     (0..9).for_each(|_| drop(trainer.step().unwrap()));
     assert_eq!(trainer.extra_forwards(), 3);

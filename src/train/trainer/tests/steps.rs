@@ -1,4 +1,4 @@
-//! Tests of a step: the order of views, prefetching, the cadence, options, lost models and images.
+//! Tests of steps: the order of views, prefetching, cadence, options, and errors.
 
 use super::*;
 use crate::exposure::ExposureModel;
@@ -13,24 +13,24 @@ fn every_epoch_shows_every_view_once_and_prefetches() {
     let log = log.lock().unwrap();
     let epochs: Vec<usize> = (0..log.len()).filter(|&i| log[i] == "epoch").collect();
     assert_eq!(epochs, [0, 4, 8]);
-    // The right pixels reached the backend.
+    // The backend received the right images.
     let steps: Vec<String> =
         shown.iter().enumerate().map(|(i, view)| format!("step {} view {view}", i + 1)).collect();
     assert_eq!(log.iter().filter(|d| *d != "epoch").cloned().collect::<Vec<_>>(), steps);
-    // Each announcement is of what comes next, and nothing beyond the end of the run.
+    // The next views are announced, but none beyond the end of the run.
     for (i, said) in prefetched.lock().unwrap().iter().enumerate() {
         assert_eq!(*said, format!("{:?}", &shown[i + 1..(i + 3).min(9)]));
     }
 }
 
-/// Each view has its own, which its own steps change, and a checkpoint holds them.
+/// Each view has its own exposure, which its own steps change and which checkpoints contain.
 #[test]
-fn exposures_go_with_their_views() {
+fn exposures_belong_to_views() {
     let gains = [[1.0, 0.5, 1.0], [1.0; 3], [1.0, 1.5, 1.0]];
     let first = |_| Exposures::new(ExposureModel::Channels, &gains);
     let case = Case { every: 100, ..CASE };
     let (new, log, _) = trainer(&case);
-    let mut new = new.exposing(Some(first(())));
+    let mut new = new.with_exposures(Some(first(())));
     let shown: Vec<usize> = (0..6).map(|_| new.step().unwrap().view).collect();
     let log = log.lock().unwrap().clone();
     let noted: Vec<f32> = log
@@ -41,12 +41,12 @@ fn exposures_go_with_their_views() {
     for (gain, view) in noted.iter().zip(&shown) {
         assert!((gain - gains[*view][1]).abs() < 0.05, "view {view}: {gain}");
     }
-    // A step makes a factor smaller, and the mean stays, so that the others become larger.
+    // A step reduces the view's factor; the mean is constant, so that the others increase.
     assert!(noted[1..3].iter().zip(&shown[1..]).all(|(gain, view)| *gain > gains[*view][1]));
     let state = new.state().unwrap();
     assert_eq!(state.exposures.as_ref(), new.exposures());
     let (same, ..) = trainer(&case);
-    let mut same = same.exposing(Some(first(())));
+    let mut same = same.with_exposures(Some(first(())));
     same.resume(state.clone()).unwrap();
     assert_eq!(same.exposures(), new.exposures());
     let (mut without, ..) = trainer(&case);
@@ -123,7 +123,7 @@ fn errors_name_the_view() {
     assert!(!calls.contains(&"apply 4".to_owned()), "{calls:?}");
     let (message, ..) = failure(&Case { unreadable: Some(1), ..CASE });
     assert!(message.contains("view `b.png`: file is gone"), "{message}");
-    // Nothing has begun that a checkpoint of the step before would have to know of, not even an epoch.
+    // The backend's state is still that of the previous step, even at the start of an epoch.
     let first = schedule::view_order(3, 7, 0)[0];
     let (_, _, calls) = failure(&Case { unreadable: Some(first), ..CASE });
     assert_eq!(calls, [""; 0]);

@@ -1,4 +1,4 @@
-//! Renders built-in scenes in memory, or takes them from the cache.
+//! Renders built-in scenes in memory, or reads them from the cache.
 
 mod scene_cache;
 
@@ -20,13 +20,13 @@ use crate::dataset::{self, Dataset, DatasetError, LoadOptions, PointCloud, View}
 use densify_core::camera::Camera;
 use densify_core::image::Image8;
 use scene_cache::Entry;
-pub use scene_cache::folder;
+pub use scene_cache::cache_folder;
 
-/// Bytes of a scene's surface while its tree is built, for each byte of it in the end or in a file: a
-/// triangle takes 86 bytes in the file, up to 200 while its tree is built, and 100 in the end.
-const BUILDING: u64 = 4;
+/// Peak memory while the tree of a surface is built, as a multiple of the finished surface or its file: a triangle takes
+/// 86 bytes in the file, up to 200 while the tree is built, and 100 afterwards.
+const BUILD_FACTOR: u64 = 4;
 
-/// A built-in scene as it was rendered.
+/// A rendered built-in scene.
 #[derive(Debug, PartialEq)]
 struct Rendered {
     about: About,
@@ -35,7 +35,7 @@ struct Rendered {
     points: InitPoints,
 }
 
-/// What there is to know of a scene without building it.
+/// Metadata of a scene, available without building it.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 struct About {
     views: Vec<RenderedView>,
@@ -44,7 +44,7 @@ struct About {
     surface_bytes: u64,
 }
 
-/// Renders a built-in scene, or takes it from the cache.
+/// Renders a built-in scene, or reads it from the cache.
 ///
 /// # Errors
 /// When there is no such scene, or the options leave no view to train on.
@@ -54,18 +54,18 @@ pub(in crate::dataset) fn load(
     options: &LoadOptions,
 ) -> Result<Dataset, DatasetError> {
     let (source, parameters) = (Source::Preset(name.to_owned()), Options::default());
-    // Of an unknown one no file is named.
+    // The name is checked before it becomes part of a file name.
     let asked: PresetSpec = name.parse()?;
     let entry = options.cache.as_deref();
-    let entry = entry.and_then(|folder| Entry::of(folder, &asked.to_string(), &parameters));
+    let entry = entry.and_then(|folder| Entry::new(folder, &asked.to_string(), &parameters));
     let kept = entry.as_ref().and_then(Entry::read);
-    // A scene has as many images as views, unless somebody else has made the entry.
+    // Another program may have written an entry with another number of images.
     if let Some(kept) = kept.filter(|kept| kept.frames.len() == kept.about.views.len()) {
         return dataset(path, kept, options);
     }
     let scene = Scene::prepare(&source, &parameters)?;
     let (frames, points) = render(&scene);
-    let surface_bytes = BUILDING * scene.surface.bytes() as u64;
+    let surface_bytes = BUILD_FACTOR * scene.surface.bytes() as u64;
     let about = About { views: scene.views, notes: scene.model.notes, surface_bytes };
     let rendered = Rendered { about, frames, points };
     if let Some(entry) = entry {
@@ -74,7 +74,7 @@ pub(in crate::dataset) fn load(
     dataset(path, rendered, options)
 }
 
-/// The images of all views, without the depths and normals that only the points need.
+/// Renders all views and collects points; depths and normals, which only the points need, are dropped.
 fn render(scene: &Scene) -> (Vec<Frame>, InitPoints) {
     let mut collector = scene.point_collector();
     let mut frames = Vec::with_capacity(scene.views.len());
@@ -91,11 +91,11 @@ fn render(scene: &Scene) -> (Vec<Frame>, InitPoints) {
 }
 
 impl Dataset {
-    /// The geometry that the images were rendered from, in the dataset's own coordinates. Known for
-    /// built-in scenes and for folders that `densify scenegen` wrote.
+    /// The surface that the images were rendered from, in the dataset's own coordinates. It is known for
+    /// built-in scenes and for folders written by `densify scenegen`.
     ///
     /// # Errors
-    /// When it exists but cannot be read.
+    /// When the surface exists but cannot be read.
     pub fn ground_truth(&self) -> Result<Option<GroundTruth>, DatasetError> {
         if let Some(unpacked) = &self.unpacked {
             let found = GroundTruth::open(unpacked.folder());
@@ -107,10 +107,10 @@ impl Dataset {
     }
 }
 
-/// What the surface in a folder takes at most while it is read `[bytes]`; `None` where there is none.
+/// Peak memory for reading the surface in a folder `[bytes]`; `None` if there is none.
 pub(in crate::dataset) fn surface_bytes(root: &Path) -> Option<u64> {
     let mesh = std::fs::metadata(root.join("mesh.ply"));
-    GroundTruth::is_in(root).then(|| BUILDING * mesh.map_or(0, |mesh| mesh.len()))
+    GroundTruth::is_in(root).then(|| BUILD_FACTOR * mesh.map_or(0, |mesh| mesh.len()))
 }
 
 impl From<densify_scenegen::Error> for DatasetError {
@@ -119,7 +119,7 @@ impl From<densify_scenegen::Error> for DatasetError {
     }
 }
 
-/// A rendered scene as a dataset named `path`.
+/// Turns a rendered scene into the dataset named `path`.
 ///
 /// # Errors
 /// When the options leave no view to train on.
@@ -141,8 +141,8 @@ fn dataset(
     let name = |photograph: &Photograph| photograph.views[0].name.clone();
     photographs.sort_by_cached_key(name);
     let mut sampler = TrackSampler::new();
-    let found = points.positions.iter().zip(&points.colours);
-    for ((&position, &colour), seen_by) in found.zip(&points.seen_by) {
+    let coloured = points.positions.iter().zip(&points.colours);
+    for ((&position, &colour), seen_by) in coloured.zip(&points.seen_by) {
         if options.tracks && sampler.wants(seen_by.len() as u64) {
             sampler.add(position, colour, seen_by.iter().copied());
         }
@@ -158,7 +158,7 @@ fn dataset(
     assemble(path, photographs, read, options)
 }
 
-/// The trainer's camera of a rendered view.
+/// Converts the camera of a rendered view.
 fn camera(from: &densify_scenegen::Camera) -> Camera {
     let rotation = from.world_from_camera.transpose();
     Camera {

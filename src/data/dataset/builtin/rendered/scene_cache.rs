@@ -1,5 +1,5 @@
-//! Keeps built-in scenes as they were rendered, in the user's cache folder: ray tracing takes longer than
-//! many a run. An entry is of one program file and one set of parameters, so that a new build renders anew.
+//! Caches rendered built-in scenes in the user's cache folder, because ray tracing takes longer than many runs.
+//! The key contains a checksum of the program, so that a new build renders the scenes again.
 
 use std::collections::HashMap;
 use std::fs::{self, File};
@@ -16,38 +16,38 @@ use safetensors::tensor::{Dtype, TensorView};
 use super::{About, Rendered};
 use densify_core::files::write_atomically;
 
-/// Most bytes of all entries. The longest unused go first.
+/// Largest size of all entries together `[bytes]`; the least recently used are removed first.
 const MOST_BYTES: u64 = 1 << 30;
 const ENDING: &str = "safetensors";
 const CHECKSUM: &str = "crc32c";
 
-/// The folder for entries in the user's cache folder, if there is one.
-pub fn folder() -> Option<PathBuf> {
+/// The folder of cached scenes, if the user has a cache folder.
+pub fn cache_folder() -> Option<PathBuf> {
     let base = etcetera::choose_base_strategy().ok()?;
     Some(base.cache_dir().join("densify").join("scenes"))
 }
 
-/// The place of a scene in the cache.
+/// The cache entry of a scene.
 pub(super) struct Entry {
     path: PathBuf,
 }
 
 impl Entry {
-    /// The entry of a built-in scene of this name; `None` where this program's file cannot be read.
-    pub(super) fn of(folder: &Path, name: &str, options: &Options) -> Option<Self> {
+    /// The entry of the built-in scene `name`; `None` if the program's own file cannot be read.
+    pub(super) fn new(folder: &Path, name: &str, options: &Options) -> Option<Self> {
         let program = fingerprint(&std::env::current_exe().ok()?).ok()?;
         let parameters = crc32c::crc32c(format!("{options:?}").as_bytes());
-        // Some systems keep the colon of `town:4` out of names.
+        // Some systems do not allow the colon of `town:4` in file names.
         let name = name.replace(':', "-");
         let name = format!("{name}-{program:08x}-{parameters:08x}.{ENDING}");
         Some(Self { path: folder.join(name) })
     }
 
-    /// The scene, if it is there and whole.
+    /// Reads the scene, if the entry exists and is undamaged.
     pub(super) fn read(&self) -> Option<Rendered> {
         let mut bytes = Vec::new();
         File::open(&self.path).ok()?.take(MOST_BYTES).read_to_end(&mut bytes).ok()?;
-        // It has been used just now. A cache that others share may be read only.
+        // Mark the entry as used. This may fail in a shared, read-only cache.
         let file = File::options().write(true).open(&self.path);
         let _ = file.and_then(|file| file.set_modified(SystemTime::now()));
         let (_, metadata) = SafeTensors::read_metadata(&bytes).ok()?;
@@ -56,10 +56,10 @@ impl Entry {
         (*checksum == checksum_of(tensors.tensors())).then(|| decode(&tensors))?
     }
 
-    /// Writes it. A cache that cannot be written is none; the run goes on.
+    /// Writes the scene. Errors are ignored, as the cache only saves time.
     pub(super) fn write(&self, scene: &Rendered) {
         if let Err(error) = self.try_write(scene) {
-            tracing::debug!(%error, "the scene is not kept");
+            tracing::debug!(%error, "the scene is not cached");
         }
     }
 
@@ -98,7 +98,7 @@ fn image_name(index: usize) -> String {
     format!("image_{index:05}")
 }
 
-/// Of all values, in the order of their names.
+/// The checksum of all tensors, in the order of their names.
 fn checksum_of(mut tensors: Vec<(String, TensorView<'_>)>) -> String {
     tensors.sort_by(|(a, _), (b, _)| a.cmp(b));
     let sum = tensors.iter().fold(0, |sum, (name, tensor)| {
@@ -108,7 +108,7 @@ fn checksum_of(mut tensors: Vec<(String, TensorView<'_>)>) -> String {
     format!("{sum:08x}")
 }
 
-/// The contents of an entry whose checksum is right.
+/// Decodes an entry whose checksum is correct.
 fn decode(tensors: &SafeTensors<'_>) -> Option<Rendered> {
     let frames = (0..).map_while(|index| tensors.tensor(&image_name(index)).ok());
     let frames: Option<Vec<Frame>> = frames.map(|image| frame(&image)).collect();
@@ -124,7 +124,7 @@ fn decode(tensors: &SafeTensors<'_>) -> Option<Rendered> {
     let mut seen = u32s("seen_by")?.into_iter();
     let views = u32s("views")?.into_iter();
     let seen_by = views.map(|count| seen.by_ref().take(count as usize).collect()).collect();
-    // A dataset tells neither where points were found nor how many outliers there are.
+    // The other fields of the points are not used by datasets.
     let points = InitPoints { positions, colours, seen_by, ..InitPoints::default() };
     let about: About = serde_json::from_slice(bytes("about")?).ok()?;
     Some(Rendered { about, frames: frames?, points })
@@ -144,7 +144,7 @@ fn frame(image: &TensorView<'_>) -> Option<Frame> {
     })
 }
 
-/// The checksum of a file.
+/// The checksum of a file's contents.
 fn fingerprint(path: &Path) -> io::Result<u32> {
     let mut file = File::open(path)?;
     let mut buffer = vec![0; 1 << 16];
@@ -157,13 +157,13 @@ fn fingerprint(path: &Path) -> io::Result<u32> {
     }
 }
 
-/// Removes the longest unused entries until all together have at most `most` bytes.
+/// Removes the least recently used entries until all together have at most `most` bytes.
 fn bound(folder: &Path, most: u64) -> io::Result<()> {
     let mut entries = Vec::new();
     for entry in fs::read_dir(folder)? {
         let entry = entry?;
         let known = entry.metadata()?;
-        // What a killed process has left of writing is as good as an entry that nobody uses.
+        // Incomplete files of killed processes count as unused entries.
         let is_entry = entry.path().extension().is_some_and(|ending| ending == ENDING);
         if is_entry || entry.file_name().as_encoded_bytes().starts_with(b".densify-") {
             entries.push((known.modified()?, known.len(), entry.path()));
@@ -220,21 +220,21 @@ mod tests {
     }
 
     #[test]
-    fn what_is_kept_is_read_back_and_nothing_else() {
+    fn only_intact_entries_of_the_same_scene_are_read_back() {
         let folder = tempfile::tempdir().unwrap();
-        let entry = |options: &Options| Entry::of(folder.path(), "spheres", options).unwrap();
+        let entry = |options: &Options| Entry::new(folder.path(), "spheres", options).unwrap();
         let default = entry(&Options::default());
         assert!(default.read().is_none());
         default.write(&sample());
         assert!(same(default.read()));
         // Other parameters are another scene.
         assert!(entry(&Options { seed: 9, ..Options::default() }).read().is_none());
-        // So is one of another size.
-        let sized = |name| Entry::of(folder.path(), name, &Options::default()).unwrap();
+        // So is another size.
+        let sized = |name| Entry::new(folder.path(), name, &Options::default()).unwrap();
         let [town, larger] = ["town", "town:4"].map(sized);
         town.write(&sample());
         assert!(same(town.read()) && larger.read().is_none() && !has_colon(&larger.path));
-        // A damaged entry is none.
+        // A damaged entry counts as missing.
         let whole = fs::read(&default.path).unwrap();
         for at in (0..whole.len()).step_by(7) {
             let mut damaged = whole.clone();
@@ -248,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn the_longest_unused_entries_go_first() {
+    fn the_least_recently_used_entries_are_removed_first() {
         let folder = tempfile::tempdir().unwrap();
         for (name, age) in [("a", 30), ("b", 10), ("c", 20)] {
             let path = folder.path().join(name).with_extension(ENDING);

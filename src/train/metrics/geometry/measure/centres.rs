@@ -1,11 +1,11 @@
-//! Distances from centres to the mesh and back.
+//! Distances between centres and mesh, in both directions.
 
 use rayon::prelude::*;
 
 use super::rows::{Finder, Rows};
 use super::visibility::Visibility;
 use super::{CentreErrors, KnownScene, ratio};
-use crate::evaluate::EvaluateError;
+use crate::metrics::EvaluateError;
 
 pub(super) fn errors(
     rows: &Rows,
@@ -14,29 +14,29 @@ pub(super) fn errors(
 ) -> Result<CentreErrors, EvaluateError> {
     let diagonal = ground.diagonal();
     let finder = Finder::new(rows)?;
-    let back: Vec<f64> =
+    let to_centres: Vec<f64> =
         visibility.samples.par_iter().map(|&sample| finder.distance(sample) / diagonal).collect();
-    let forth: Vec<(f64, f64)> = rows
+    let to_mesh: Vec<(f64, f64)> = rows
         .distances
         .iter()
         .zip(&visibility.weights)
         .filter(|&(_, &weight)| weight > 0.0)
         .map(|(&distance, &weight)| (distance / diagonal, weight))
         .collect();
-    let total: f64 = forth.iter().map(|&(_, weight)| weight).sum();
-    let accuracy = ratio(forth.iter().map(|(distance, weight)| distance * weight).sum(), total);
-    let completeness = ratio(back.iter().sum(), back.len() as f64);
+    let total: f64 = to_mesh.iter().map(|&(_, weight)| weight).sum();
+    let accuracy = ratio(to_mesh.iter().map(|(distance, weight)| distance * weight).sum(), total);
+    let completeness = ratio(to_centres.iter().sum(), to_centres.len() as f64);
     let f_score = |limit: f64| {
-        let within = forth.iter().filter(|&&(distance, _)| distance <= limit);
+        let within = to_mesh.iter().filter(|&&(distance, _)| distance <= limit);
         let precision = ratio(within.map(|&(_, weight)| weight).sum(), total);
-        let reached = back.iter().filter(|&&distance| distance <= limit).count();
-        let recall = ratio(reached as f64, back.len() as f64);
+        let reached = to_centres.iter().filter(|&&distance| distance <= limit).count();
+        let recall = ratio(reached as f64, to_centres.len() as f64);
         let sum = precision + recall;
         if sum > 0.0 { 2.0 * precision * recall / sum } else { sum }
     };
     Ok(CentreErrors {
         accuracy,
-        accuracy_p95: percentile(forth.clone(), 0.95),
+        accuracy_p95: percentile(to_mesh.clone(), 0.95),
         completeness,
         chamfer: accuracy + completeness,
         f_score_half_percent: f_score(0.005),

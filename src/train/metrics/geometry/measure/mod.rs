@@ -1,4 +1,4 @@
-//! The measurements of a model against the surface, from weights and visibility in the training views.
+//! Measures a model against the surface, with weights and visibility from the training views.
 
 mod centres;
 mod pixels;
@@ -10,7 +10,7 @@ use densify_scenegen::GBuffer;
 use super::{
     CentreErrors, DepthErrors, Floaters, Geometry, KnownScene, Redundancy, ThinRecall, needs,
 };
-use crate::evaluate::EvaluateError;
+use crate::metrics::EvaluateError;
 use densify_core::camera::Camera;
 use densify_data::views::ViewSource;
 use densify_render::Backend;
@@ -18,8 +18,11 @@ use pixels::Pixels;
 use rows::Rows;
 use visibility::Visibility;
 
-/// Measures the model in `backend`, which was made for [`needs`]: weights and visibility in the views
-/// trained on; depth, normals and thin structures in `views`.
+/// Measures the model in `backend`, which was made for [`needs`]: weights and visibility in the training views; depth,
+/// normals and thin structures in `views`.
+///
+/// # Errors
+/// When a view cannot be read or rendered, and when the caller stops.
 pub fn measure(
     backend: &mut dyn Backend,
     ground: &KnownScene<'_>,
@@ -48,7 +51,7 @@ impl KnownScene<'_> {
         self.truth.surface().diagonal()
     }
 
-    /// A view's camera in world coordinates, for projecting and for casting rays.
+    /// A view's camera in world coordinates, for projection and for ray casting.
     fn cameras(&self, scene: &Camera) -> (Camera, densify_scenegen::Camera) {
         let world = self.normalisation.world_from_scene_camera(scene);
         let caster = densify_scenegen::Camera {
@@ -65,7 +68,7 @@ impl KnownScene<'_> {
         (world, caster)
     }
 
-    /// What a view sees, once per view; also where measuring stops if it shall.
+    /// Depth and normals of the surface in a view. Called once per view, and stops if the caller asks for it.
     fn g_buffer(
         &self,
         name: &str,

@@ -1,4 +1,4 @@
-//! Measures depth, normals and thin structures in every pixel of the views.
+//! Measures depth, normals and thin structures in the pixels of the views.
 
 use std::collections::BTreeMap;
 
@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use super::rows::{Finder, Rows};
 use super::{DepthErrors, KnownScene, ThinRecall, ratio};
-use crate::evaluate::EvaluateError;
+use crate::metrics::EvaluateError;
 use densify_core::image::Image8;
 use densify_data::views::ViewSource;
 use densify_render::{Backend, Rendering};
@@ -30,9 +30,9 @@ pub(super) struct Pixels<'a> {
     covered: usize,
     squares: f64,
     relative: f64,
-    /// `[degrees]`
+    /// Angles between normals `[degrees]`.
     angles: Vec<f64>,
-    /// Pixels, and pixels found, by the base-2 logarithm of the width.
+    /// Numbers of pixels and of found pixels, by the base-2 logarithm of the width.
     thin: BTreeMap<i32, (usize, usize)>,
 }
 
@@ -127,7 +127,7 @@ impl<'a> Pixels<'a> {
         }
     }
 
-    /// The (upper) median.
+    /// The upper median of the angles.
     pub(super) fn normal_error(&self) -> f64 {
         let mut angles = self.angles.clone();
         angles.sort_by(f64::total_cmp);

@@ -7,22 +7,23 @@ use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rayon::prelude::*;
 
 use super::KnownScene;
-use crate::evaluate::EvaluateError;
+use crate::metrics::EvaluateError;
 use densify_core::gaussians::{Gaussians, sigmoid};
 
 /// Opacity above which a row counts as part of the surface.
 const SOLID: f32 = 0.1;
-/// Nearest centres among which the row at a surface point is chosen.
+/// Number of nearest centres among which the row at a surface point is chosen.
 const NEIGHBOURS: usize = 8;
 
-/// Rows, structure of arrays. Shape of each: `[rows]`.
+/// Rows as a structure of arrays, each of shape `[rows]`.
 pub(super) struct Rows {
     /// Means `[world units]`.
     pub(super) centres: Vec<DVec3>,
     /// Standard deviations `[world units]`.
     pub(super) scales: Vec<DVec3>,
-    /// Orientations: columns are the axes that the scales belong to.
+    /// Orientations, whose columns are the axes of the scales.
     pub(super) axes: Vec<DMat3>,
+    /// Opacities.
     pub(super) opacities: Vec<f32>,
     /// Distance from centre to surface `[world units]`.
     pub(super) distances: Vec<f64>,
@@ -90,8 +91,8 @@ impl Finder {
     pub(super) fn normal(&self, rows: &Rows, place: DVec3) -> Option<DVec3> {
         let tree = self.tree.as_ref()?;
         let query = place.to_array();
-        let wanted = NonZeroUsize::new(NEIGHBOURS.min(self.rows.len()))?;
-        let found = tree.query(&query).nearest_n::<SquaredEuclidean<f64>>(wanted).execute();
+        let count = NonZeroUsize::new(NEIGHBOURS.min(self.rows.len()))?;
+        let found = tree.query(&query).nearest_n::<SquaredEuclidean<f64>>(count).execute();
         let exponent = |row: usize| {
             let local = rows.axes[row].transpose() * (place - rows.centres[row]) / rows.scales[row];
             f64::from(rows.opacities[row]).ln() - 0.5 * local.length_squared()

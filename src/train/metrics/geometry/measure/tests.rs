@@ -1,4 +1,4 @@
-//! Every number against a case that is computed by hand: rows on, before and behind a square.
+//! Tests of the measurements against values computed by hand: rows on, before and behind a square.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -16,10 +16,10 @@ use densify_render::cpu::CpuBackend;
 
 const WORLD: Normalisation = Normalisation { centre: DVec3::new(40.0, -7.0, 2.0), scale: 0.375 };
 const DISTANCE: f64 = 3.0;
-/// Of the square that all tests stand before.
+/// Diagonal of the square that the cameras look at.
 const DIAGONAL: f64 = 2.0 * std::f64::consts::SQRT_2;
 
-/// Grey pictures of 64 px, taken from z = −3 towards +z, half a unit left and right of the axis.
+/// Two views with grey images of 64 px, from z = −3 towards +z, left and right of the axis.
 struct Pair {
     cameras: Vec<Camera>,
     image: SharedImage,
@@ -84,7 +84,7 @@ fn cuboid(low: DVec3, high: DVec3) -> Vec<[DVec3; 3]> {
     all
 }
 
-/// A ground truth of these triangles, those from `thin` on thin ones.
+/// A ground truth of triangles; those from index `thin` on are thin structures.
 fn truth(triangles: &[[DVec3; 3]], thin: usize) -> GroundTruth {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("scene.json"), r#"{"generator": "densify-scenegen"}"#)
@@ -122,7 +122,7 @@ fn push(model: &mut Gaussians, place: DVec3, scale: DVec3, opacity: f32) {
     model.sh.extend([rgb_to_dc(128.0 / 255.0); 3]);
 }
 
-/// Flat rows at z, a row per 0.05 along each side of the square.
+/// Flat rows at z, spaced by 0.05 along both sides of the square.
 fn carpet(z: f64) -> Gaussians {
     let mut model = Gaussians::default();
     for i in 0..1600 {
@@ -152,7 +152,7 @@ fn close(value: f64, expected: f64, tolerance: f64) {
 }
 
 #[test]
-fn rows_on_the_surface_are_there() {
+fn rows_on_the_surface_have_no_error() {
     let g = measured(&truth(&square(), 2), &carpet(0.0));
     close(g.depth.rmse, 0.0, 1e-6);
     close(g.depth.abs_rel, 0.0, 1e-6);
@@ -164,7 +164,7 @@ fn rows_on_the_surface_are_there() {
     let mean = 0.05 * (2f64.sqrt() + 1f64.asinh()) / 6.0 / DIAGONAL;
     close(g.centres.completeness, mean, 0.01 * mean);
     close(g.centres.chamfer, g.centres.completeness, 1e-6);
-    // Within 0.5 % of the diagonal of a centre lies a disc of every cell.
+    // In every cell, a disc lies within 0.5 % of the diagonal from the centre.
     let recall = std::f64::consts::PI * (0.005 * DIAGONAL / 0.05).powi(2);
     close(g.centres.f_score_half_percent, 2.0 * recall / (1.0 + recall), 0.01);
     assert_eq!((g.floaters.count, g.floaters.of_weight), (0, 0.0));
@@ -172,7 +172,7 @@ fn rows_on_the_surface_are_there() {
 }
 
 #[test]
-fn an_offset_is_that_offset() {
+fn an_offset_of_all_rows_is_measured() {
     let truth = truth(&square(), 2);
     let g = measured(&truth, &carpet(0.1));
     close(g.depth.rmse, 0.1 / DIAGONAL, 1e-6);
@@ -182,7 +182,7 @@ fn an_offset_is_that_offset() {
     assert_eq!(g.centres.f_score_one_percent, 0.0);
     // Behind the surface no view sees them.
     assert_eq!(g.floaters.count, 0);
-    // As far before it all are in empty space: 0.1 > 0.01 · 2.83 and > 2 · 0.03.
+    // At the same distance in front of the surface all are in empty space: 0.1 > 0.01 · 2.83 and > 2 · 0.03.
     let g = measured(&truth, &carpet(-0.1));
     assert_eq!((g.floaters.count, g.floaters.of_rows), (1600, 1.0));
     close(g.floaters.of_weight, 1.0, 1e-12);
@@ -190,7 +190,7 @@ fn an_offset_is_that_offset() {
 }
 
 #[test]
-fn what_no_view_sees_does_not_count() {
+fn invisible_rows_and_surfaces_do_not_count() {
     // Rows behind the carpet weigh next to nothing.
     let (mut model, hidden) = (carpet(0.0), carpet(0.5));
     for row in 0..hidden.len() {
@@ -199,7 +199,7 @@ fn what_no_view_sees_does_not_count() {
     }
     let accuracy = measured(&truth(&square(), 2), &model).centres.accuracy;
     assert!(accuracy > 0.0 && accuracy < 0.05 * 0.5 / DIAGONAL, "{accuracy}");
-    // Nor does the mesh behind the mesh need any: both cameras' views of it are blocked.
+    // A surface behind the surface needs no rows, because it is hidden from both cameras.
     let mut triangles = square();
     triangles.extend(square().into_iter().map(|t| t.map(|p| p + DVec3::Z)));
     let g = measured(&truth(&triangles, 4), &carpet(0.0));
@@ -208,7 +208,7 @@ fn what_no_view_sees_does_not_count() {
 }
 
 #[test]
-fn normals_are_turned_by_what_they_are_turned() {
+fn a_tilt_of_normals_is_measured() {
     let mut model = carpet(0.0);
     let tilt = DQuat::from_rotation_x(20f64.to_radians());
     model.quats.fill([tilt.w, tilt.x, tilt.y, tilt.z].map(|v| v as f32));
@@ -226,8 +226,8 @@ fn floaters_are_found_and_others_are_not() {
     };
     let floater = with(DVec3::new(0.0, 0.0, -1.0), small, 0.9);
     assert_eq!((floater.count, floater.of_rows), (1, 1.0 / 1601.0));
-    // It covers what 2π σ² at distance 2 cover: 2π (0.02 · 32)² px of 2 views, nearly opaque; the
-    // carpet all of its square, 2 · (64 · 2 / 3)².
+    // The nearly opaque floater covers 2π σ² at distance 2, which is 2π (0.02 · 32)² px in each of 2 views; the other
+    // rows cover the square, 2 · (64 · 2 / 3)² px.
     assert!((5e-4..3e-3).contains(&floater.of_weight), "{}", floater.of_weight);
     let cases = [
         ("within the wall", DVec3::new(0.0, 0.0, 1.0), small, 0.9),
@@ -240,7 +240,7 @@ fn floaters_are_found_and_others_are_not() {
     for (what, place, scale, opacity) in cases {
         assert_eq!(with(place, scale, opacity).count, 0, "{what}");
     }
-    // Beside the square the views see nothing at all: that is empty too.
+    // Beside the square the views see the background, so space is empty there too.
     assert_eq!(with(DVec3::new(0.0, 1.2, 0.0), small, 0.9).count, 1);
 }
 
@@ -268,8 +268,7 @@ fn wires_are_found_or_not() {
     let missed = measured(&truth, &model).thin;
     assert_eq!(missed.len(), 1);
     assert_eq!((missed[0].width, missed[0].recall), (4.0, 0.0));
-    // Front sides are 3.2 px x 57.6 px in both views, and beyond the front corner a strip of the
-    // side shows.
+    // The front is 3.2 px x 57.6 px in both views, and a strip of the side is visible.
     assert!((300..=460).contains(&missed[0].pixels), "{}", missed[0].pixels);
     for i in 0..90 {
         let place = DVec3::new(0.0, -0.89 + 0.02 * f64::from(i), -1.0);
@@ -278,7 +277,7 @@ fn wires_are_found_or_not() {
     let found = measured(&truth, &model).thin;
     assert_eq!(found[0].pixels, missed[0].pixels);
     assert!(found[0].recall > 0.95, "{found:?}");
-    // In another colour they are not what the picture shows.
+    // Rows of another colour do not match the image.
     for value in &mut model.sh[3 * 1600..] {
         *value = rgb_to_dc(0.9);
     }
@@ -286,7 +285,7 @@ fn wires_are_found_or_not() {
 }
 
 #[test]
-fn nothing_is_nothing_and_not_zero() {
+fn measurements_without_data_are_nan() {
     let g = measured(&truth(&square(), 2), &Gaussians::default());
     assert_eq!((g.depth.coverage, g.floaters.count), (0.0, 0));
     assert!(g.depth.rmse.is_nan() && g.centres.accuracy.is_nan() && g.normal_error.is_nan());

@@ -1,4 +1,4 @@
-//! Measures rows in the training views: their weight, and whether their place is empty.
+//! Measures the weights of rows in the training views, and whether their positions are empty.
 
 use densify_policies::policy::{AuxColumn, AuxRequest};
 use densify_scenegen::{Camera as RayCamera, GBuffer};
@@ -9,20 +9,20 @@ use rayon::prelude::*;
 
 use super::rows::Rows;
 use super::{Floaters, KnownScene, Redundancy, needs, ratio};
-use crate::evaluate::EvaluateError;
+use crate::metrics::EvaluateError;
 use densify_core::camera::Camera;
 use densify_core::image::Image8;
 use densify_data::views::ViewSource;
 use densify_render::{AuxInput, Backend};
 
-/// Number of points on the mesh.
+/// Number of samples on the mesh.
 const SAMPLES: usize = 20_000;
 const SEED: u64 = 0x6d65_7368;
 /// Smallest opacity of a floater.
 const MIN_OPACITY: f32 = 0.05;
 /// Smallest distance of a floater from the mesh `[diagonals]`.
 const MIN_DISTANCE: f64 = 0.01;
-/// Largest blend weight of a row with negligible effect.
+/// Blend weight below which a row has a negligible effect.
 const NEGLIGIBLE: f32 = 0.01;
 /// Number of views that must agree.
 const MIN_VIEWS: u32 = 2;
@@ -33,11 +33,11 @@ pub(super) struct Visibility {
     pub(super) weights: Vec<f64>,
     /// Largest α·T of each row.
     peaks: Vec<f32>,
-    /// Number of views in which each row's place is empty.
+    /// Number of views in which each row's position is empty.
     empty: Vec<u32>,
-    /// Number of (row, pixel) pairs blended, and of pixels.
+    /// Numbers of blended (row, pixel) pairs and of pixels.
     blended: (f64, f64),
-    /// Points on the mesh that enough views show.
+    /// Samples of the mesh that enough views show.
     pub(super) samples: Vec<DVec3>,
 }
 
@@ -92,7 +92,7 @@ impl Visibility {
         request: &AuxRequest,
     ) -> Result<(), densify_render::BackendError> {
         let pixels = camera.width as usize * camera.height as usize;
-        // The weights, which are all that is requested, do not depend on it.
+        // The requested weights do not depend on the target.
         let target = Image8 {
             width: camera.width,
             height: camera.height,
@@ -129,7 +129,7 @@ impl Visibility {
         Ok(())
     }
 
-    /// Whether rows are floaters, by the definition of [`Floaters`].
+    /// Whether a row is a floater, by the definition of [`Floaters`].
     fn is_floater(&self, rows: &Rows, row: usize, diagonal: f64) -> bool {
         let clear = (MIN_DISTANCE * diagonal).max(2.0 * rows.scales[row].max_element());
         rows.opacities[row] > MIN_OPACITY
@@ -157,7 +157,7 @@ impl Visibility {
     }
 }
 
-/// Whether a view shows a surface behind a point, or none.
+/// Whether a view sees through a point, to a surface behind it or to the background.
 fn sees_through(camera: &Camera, g_buffer: &GBuffer, place: DVec3) -> bool {
     let (pixel, depth) = camera.project(place);
     let (width, height) = (f64::from(g_buffer.width), f64::from(g_buffer.height));
@@ -174,7 +174,7 @@ fn in_image(camera: &RayCamera, place: DVec3) -> bool {
     depth > 0.0 && camera.contains(pixel)
 }
 
-/// Points of uniform density on the triangles, in their order.
+/// Samples of uniform density on the triangles, in the order of the triangles.
 fn sample(triangles: &[[DVec3; 3]]) -> Vec<DVec3> {
     let area = |[a, b, c]: &[DVec3; 3]| 0.5 * (*b - *a).cross(*c - *a).length();
     let total: f64 = triangles.iter().map(area).sum();
@@ -203,8 +203,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn samples_lie_on_the_triangles_as_densely_everywhere() {
-        // A triangle of area 3 in z = 0, and one of area 1 in z = 1; one without area between.
+    fn samples_lie_on_the_triangles_with_uniform_density() {
+        // A triangle of area 3 in z = 0 and one of area 1 in z = 1, with one of area 0 between.
         let first = [DVec3::ZERO, 3.0 * DVec3::X, 2.0 * DVec3::Y];
         let line = [DVec3::ZERO, DVec3::X, 2.0 * DVec3::X];
         let second = [DVec3::Z, DVec3::Z + DVec3::X, DVec3::Z + 2.0 * DVec3::Y];

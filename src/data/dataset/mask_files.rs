@@ -1,7 +1,7 @@
-//! Finds the files of masks by the names that programs give them.
+//! Finds mask files by the names that programs give them.
 //!
-//! In `masks/` and folders of similar names: COLMAP's and nerfstudio's names. Beside the photograph: the layers of RealityCapture, and the dynamic
-//! masks of instant-ngp.
+//! COLMAP's and nerfstudio's masks are in `masks/` and folders with similar names; RealityCapture's mask layers and
+//! instant-ngp's dynamic masks are beside the photographs.
 
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
@@ -10,24 +10,25 @@ use super::DatasetError;
 use super::folders::{Folders, ImageFile};
 use super::paths::{DataPath, Root};
 
-/// How the name of a mask ends that is a layer of RealityCapture, and how that of instant-ngp begins.
+/// Suffix of RealityCapture's mask layers.
 const LAYER: &str = ".mask.png";
+/// Prefix of instant-ngp's dynamic masks.
 const DYNAMIC: &str = "dynamic_mask_";
 
-/// Folders of the dataset that hold masks; the first of them that has one of an image counts.
+/// Folders of masks in the dataset, in order of precedence.
 const FOLDERS: [&str; 4] = ["masks", "mask", "segmentation", "dynamic_masks"];
 
 /// The file of a mask.
 #[derive(Debug, Clone)]
 pub(super) struct MaskFile {
     pub(super) path: PathBuf,
-    /// Whether every value but 0 hides a pixel, instead of 0 alone doing it wholly.
+    /// Whether all values but 0 hide a pixel; otherwise 0 hides it, and other values in part.
     pub(super) hides_all_but_black: bool,
 }
 
 impl MaskFile {
-    /// A mask that hides where it is black.
-    pub(super) fn of(path: PathBuf) -> Self {
+    /// A mask whose black pixels hide those of the photograph.
+    pub(super) fn black_hides(path: PathBuf) -> Self {
         Self { path, hides_all_but_black: false }
     }
 }
@@ -37,7 +38,7 @@ pub(super) fn is_mask(name: &OsStr) -> bool {
     name.to_str().is_some_and(|name| name.ends_with(LAYER) || name.starts_with(DYNAMIC))
 }
 
-/// What is said where there is a folder for masks and no photograph has one.
+/// Note about a folder of masks, for datasets in which no photograph has a mask.
 pub(super) fn unused_masks_note(dataset: &Path) -> Option<String> {
     let holds_files = |folder: &PathBuf| {
         folder.read_dir().is_ok_and(|mut entries| entries.any(|entry| entry.is_ok()))
@@ -45,21 +46,21 @@ pub(super) fn unused_masks_note(dataset: &Path) -> Option<String> {
     let all = FOLDERS.map(|name| dataset.join(name));
     let folder = all.into_iter().chain([dataset.join("images/masks")]).find(holds_files)?;
     Some(format!(
-        "{} holds the mask of no photograph: masks lie in `masks/` of the dataset, each NAME.EXT.png or NAME.png \
-         after its photograph, below the same folders",
+        "{} contains the mask of no photograph: masks belong in the dataset's folder `masks/`, in the same subfolders as \
+         the photographs and named after them as NAME.EXT.png or NAME.png",
         folder.display()
     ))
 }
 
 impl Folders {
-    /// The mask of an image, if there is one. What lies in `masks/` precedes what lies beside the image.
+    /// The mask of an image, if there is one. Masks in `masks/` take precedence over those beside the image.
     pub(super) fn mask(
         &self,
         image: &ImageFile,
         named: DataPath<'_>,
     ) -> Result<Option<MaskFile>, DatasetError> {
         let at = |root: &Root, value: String| root.existing(DataPath { value: &value, ..named });
-        // With the ending of the file, which the listed name may lack.
+        // The name of the file has an extension, which the listed name may lack.
         let listed = self.inside_images(&image.name);
         let file = image.path.file_name().and_then(OsStr::to_str).unwrap_or_default();
         let (inside, stem) = (with_file_name(&listed, file), stem(file));
@@ -76,11 +77,11 @@ impl Folders {
         for folder in FOLDERS.iter().filter(|folder| self.root.path().join(folder).is_dir()) {
             for name in &names {
                 if let Some(path) = at(&self.root, format!("{folder}/{name}"))? {
-                    return Ok(Some(MaskFile::of(path)));
+                    return Ok(Some(MaskFile::black_hides(path)));
                 }
             }
         }
-        let (root, places) = self.beside(image);
+        let (root, places) = self.image_places(image);
         for place in places {
             for value in [
                 format!("{file}{LAYER}"),
@@ -97,8 +98,8 @@ impl Folders {
         Ok(None)
     }
 
-    /// The folder that holds an image, and where below it the image lies, and would lie at its full size.
-    fn beside(&self, image: &ImageFile) -> (&Root, Vec<String>) {
+    /// The root folder of an image, and below it the paths of the image and of its full-size original.
+    fn image_places(&self, image: &ImageFile) -> (&Root, Vec<String>) {
         let root = self.chosen.as_ref().unwrap_or(&self.root);
         let path = image.path.strip_prefix(root.path()).unwrap_or(&image.path);
         let path = path.to_string_lossy().replace(std::path::MAIN_SEPARATOR, "/");
@@ -110,7 +111,7 @@ impl Folders {
     }
 }
 
-/// The path with another name of the file.
+/// Replaces the file name of a path.
 fn with_file_name(path: &str, file: &str) -> String {
     match path.rsplit_once('/') {
         Some((folder, _)) => format!("{folder}/{file}"),

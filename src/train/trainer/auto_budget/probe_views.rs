@@ -1,45 +1,46 @@
-//! The probes: a few training views whose PSNR is measured during a run, for `--budget auto`.
+//! Probe views: a few training views whose PSNR is measured during a run.
 
-use super::{TrainError, Trainer};
 use crate::metrics::psnr;
 use crate::schedule;
+use crate::trainer::{TrainError, Trainer};
 use densify_data::views::ViewSource;
 
-/// One in this many training views is a probe.
+/// One in this many training views is a probe view.
 const ONE_IN: usize = 20;
-/// Smallest and largest number of probes.
+/// Smallest number of probe views.
 const MIN_PROBES: usize = 4;
+/// Largest number of probe views.
 const MAX_PROBES: usize = 16;
-/// With fewer training views there are no probes.
+/// Smallest number of training views for probe views.
 const MIN_VIEWS: usize = 2 * MIN_PROBES;
-/// Largest PSNR, as that of two equal images is infinite `[dB]`.
+/// Upper bound of a measured PSNR, which would be infinite for equal images `[dB]`.
 const MAX_PSNR: f64 = 99.0;
 
-/// The probes, ascending, drawn from the seed; none if there are too few views.
-pub(super) fn probes(views: usize, seed: u64) -> Vec<usize> {
+/// The probe views in ascending order, chosen by the seed; empty if there are too few views.
+pub(in crate::trainer) fn probe_views(views: usize, seed: u64) -> Vec<usize> {
     if views < MIN_VIEWS {
         return Vec::new();
     }
-    // Step 0, at which no policy draws views.
+    // No policy samples views at step 0.
     let mut chosen =
         schedule::fresh_views(views, views.div_ceil(ONE_IN).clamp(MIN_PROBES, MAX_PROBES), seed, 0);
     chosen.sort_unstable();
     chosen
 }
 
-/// The mean; 0 for no values.
+/// The mean; 0 without values.
 pub(super) fn mean(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len().max(1) as f64
 }
 
 impl<V: ViewSource> Trainer<V> {
-    /// The PSNR of each probe with the current model `[dB]`.
-    pub(super) fn probe(&mut self, step: u32, sh_degree: u8) -> Result<Vec<f64>, TrainError> {
+    /// The PSNR of each probe view with the current model `[dB]`.
+    pub(super) fn probe_psnr(&mut self, step: u32, sh_degree: u8) -> Result<Vec<f64>, TrainError> {
         let background = self.options.background.fixed();
-        let mut measured = Vec::with_capacity(self.probes.len());
-        for view in self.probes.clone() {
+        let mut measured = Vec::with_capacity(self.probe_views.len());
+        for view in self.probe_views.clone() {
             let image = self.image(step, view)?;
-            let exposure = self.exposures.as_ref().map(|exposures| exposures.of(view));
+            let exposure = self.exposures.as_ref().map(|exposures| exposures.transform(view));
             let behind = exposure.map_or(background, |exposure| exposure.behind(background));
             let rendering = self.backend.render(self.views.camera(view), behind, sh_degree);
             let mut rendering = rendering.map_err(|source| self.backend_error(step, source))?;
@@ -64,9 +65,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_twentieth_of_the_views_are_probes() {
+    fn a_twentieth_of_the_views_are_probe_views() {
         for (views, count) in [(1, 0), (7, 0), (8, 4), (60, 4), (200, 10), (5_000, 16)] {
-            let chosen = probes(views, 3);
+            let chosen = probe_views(views, 3);
             assert_eq!(chosen.len(), count, "{views}");
             assert!(chosen.windows(2).all(|pair| pair[0] < pair[1]), "{chosen:?}");
             assert!(chosen.iter().all(|view| *view < views));

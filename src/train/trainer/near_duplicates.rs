@@ -1,15 +1,14 @@
-//! Chooses the training views that a policy's scores are measured in, without near-duplicates.
+//! Finds near-duplicates among the training views, which are not rendered for a policy's scores.
 //!
-//! A view that nearly repeats another, such as the next frame of a film, adds nothing to a score but
-//! costs as much. Such views are left out of scores only: all are trained on, and all test views are
-//! measured.
+//! A view that nearly repeats another, such as the next frame of a video, costs as much as any other and adds nothing to a
+//! score. All views are trained on nevertheless, and all test views are evaluated.
 
 use densify_core::camera::Camera;
 use densify_data::views::ViewSource;
 
-/// Largest distance of the cameras of near-duplicates `[fraction of the scene extent]`.
+/// Largest distance between the cameras of near-duplicates `[fraction of the scene extent]`.
 const MAX_DISTANCE: f64 = 0.01;
-/// Smallest cosine of the angle between them: that of one degree.
+/// Smallest cosine of the angle between their orientations: that of one degree.
 const MIN_COSINE: f64 = 0.999_847_7;
 /// Largest difference of focal lengths and principal points `[fraction of the image's width]`.
 const MAX_LENS_DIFFERENCE: f64 = 0.01;
@@ -27,13 +26,13 @@ pub(super) fn distinct_views(views: &impl ViewSource, extent: f32) -> Vec<usize>
     chosen
 }
 
-/// Whether two cameras have the same lens and nearly the same place and orientation.
+/// Whether two cameras have the same lens, and nearly the same position and orientation.
 fn are_near_duplicates(a: &Camera, b: &Camera, near: f64) -> bool {
     let lengths = |camera: &Camera| [camera.fx, camera.fy, camera.cx, camera.cy];
     let apart = lengths(a).into_iter().zip(lengths(b)).map(|(a, b)| (a - b).abs());
     let is_same_lens = (a.width, a.height) == (b.width, b.height)
         && apart.fold(0.0, f64::max) <= MAX_LENS_DIFFERENCE * f64::from(a.width);
-    // trace(AᵀB) = 1 + 2 cos of the angle between them.
+    // trace(AᵀB) = 1 + 2 cos(angle between A and B).
     let turn = (a.rotation.transpose() * b.rotation).to_cols_array();
     let cosine = (turn[0] + turn[4] + turn[8] - 1.0) / 2.0;
     a.centre().distance(b.centre()) <= near && cosine >= MIN_COSINE && is_same_lens

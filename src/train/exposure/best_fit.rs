@@ -1,15 +1,14 @@
-//! The rendering of a view exposed as its photograph was: the best factor and offset per channel, by least
-//! squares. Test views have exposures of their own, which nothing in the model can know; measured after this
-//! fit, a model is not blamed for them.
+//! Fits the exposure of a rendering to its photograph by least squares: a factor and an offset per channel. Test views
+//! have exposures that the model cannot know; scores after this fit do not penalise the model for them.
 
 use densify_core::image::Image8;
 
-/// `rendered` with the factor and the offset per channel that bring it nearest to `target` composited on
-/// `background`. Pixels count as far as the target's mask says; a channel without any contrast is moved by
-/// an offset alone. Shape: `[height, width, 3]`.
+/// Applies the factor and offset per channel that bring `rendered` closest to `target` composited on `background`. The
+/// target's mask weights the pixels; in a channel without contrast only the offset is fitted. Shape:
+/// `[height, width, 3]`.
 ///
 /// # Panics
-/// When the sizes differ: callers compare the two first.
+/// When the sizes differ; callers compare them first.
 #[must_use]
 pub fn fitted(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Vec<f32> {
     let width = target.width as usize;
@@ -35,7 +34,7 @@ pub fn fitted(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Vec<f3
     out
 }
 
-/// Weighted sums of pairs of a rendering's value x and a photograph's y.
+/// Weighted sums over pairs of a rendering's value x and a photograph's value y.
 #[derive(Debug, Clone, Copy, Default)]
 struct Sums {
     weight: f64,
@@ -54,19 +53,17 @@ impl Sums {
         self.xy += weight * x * y;
     }
 
-    /// Factor and offset.
+    /// The factor and offset of the regression line.
     fn line(&self) -> [f64; 2] {
         let Self { weight, x, y, xx, xy } = *self;
         let variance = xx * weight - x * x;
-        // Below a ten-thousandth of a step of eight bits, squared, it is rounding.
-        let factor = match variance > weight * weight * 1.5e-13 {
-            true => (xy * weight - x * y) / variance,
-            false => 1.0,
+        // A variance below (1e-4 / 255)² is rounding.
+        let factor = if variance > weight * weight * 1.5e-13 {
+            (xy * weight - x * y) / variance
+        } else {
+            1.0
         };
-        match weight > 0.0 {
-            true => [factor, (y - factor * x) / weight],
-            false => [1.0, 0.0],
-        }
+        if weight > 0.0 { [factor, (y - factor * x) / weight] } else { [1.0, 0.0] }
     }
 }
 
@@ -74,7 +71,7 @@ impl Sums {
 mod tests {
     use super::*;
 
-    /// Pixels of many colours, rendered as 0.8·y + 0.1 of what the photograph shows.
+    /// A photograph of many colours y, and its rendering 0.8·y + 0.1.
     fn pair(mask: Option<Vec<u8>>) -> (Vec<f32>, Image8) {
         let rgb: Vec<u8> = (0..3 * 48).map(|i| (i * 53 % 251) as u8).collect();
         let rendered = rgb.iter().map(|&y| 0.8 * f32::from(y) / 255.0 + 0.1).collect();
@@ -103,7 +100,7 @@ mod tests {
     }
 
     #[test]
-    fn one_colour_is_moved_and_no_pixel_leaves_all_as_it_was() {
+    fn flat_images_are_shifted_and_fully_masked_ones_unchanged() {
         let rgb = vec![51; 3 * 4];
         let mut target = Image8 { width: 2, height: 2, rgb, alpha: None, mask: None };
         let found = fitted(&[0.5; 12], &target, [0.0; 3]);

@@ -1,20 +1,20 @@
-//! The table of lens models: by which names files call them, and what their parameters are.
+//! The table of lens models: their names in files and their parameters.
 
 use std::path::Path;
 
 use super::{Distortion, Plane};
 use crate::dataset::DatasetError;
 
-/// A parameter after focal lengths and principal point.
+/// A parameter that follows the focal lengths and the principal point.
 #[derive(Debug, Clone, Copy)]
-pub(in crate::dataset) enum Term {
-    /// Coefficient of r², r⁴, r⁶, r⁸ in the numerator of the radial factor, by place.
+pub(crate) enum Term {
+    /// Coefficient of r², r⁴, r⁶ or r⁸ in the numerator of the radial factor, by index.
     Radial(usize),
-    /// The same of r², r⁴, r⁶ in the denominator.
+    /// Coefficient of r², r⁴ or r⁶ in the denominator, by index.
     Denominator(usize),
-    /// p1, p2.
+    /// p1 or p2.
     Tangential(usize),
-    /// The shifts of a thin prism along x and y.
+    /// Shift of the thin prism along x or y.
     Prism(usize),
     /// The angle ω of the FOV model `[rad]`.
     Omega,
@@ -22,13 +22,13 @@ pub(in crate::dataset) enum Term {
 
 /// A lens model.
 #[derive(Debug)]
-pub(in crate::dataset) struct LensModel {
-    pub(in crate::dataset) name: &'static str,
+pub(crate) struct LensModel {
+    pub(crate) name: &'static str,
     /// Number of focal lengths, 1 or 2.
-    pub(in crate::dataset) focals: usize,
-    pub(in crate::dataset) plane: Plane,
-    /// Its terms in the order of COLMAP's files.
-    pub(in crate::dataset) terms: &'static [Term],
+    pub(crate) focals: usize,
+    pub(crate) plane: Plane,
+    /// Terms in the order of COLMAP's files.
+    pub(crate) terms: &'static [Term],
 }
 
 use Plane::{Equidistant, Perspective};
@@ -43,8 +43,8 @@ const fn model(
     LensModel { name, focals, plane, terms }
 }
 
-/// The models that can be read, by COLMAP's number (COLMAP, `sensor/models.h`).
-pub(in crate::dataset) const MODELS: [LensModel; 11] = [
+/// The supported models; the index is COLMAP's model number (COLMAP, `sensor/models.h`).
+pub(crate) const MODELS: [LensModel; 11] = [
     model("SIMPLE_PINHOLE", 1, Perspective, &[]),
     model("PINHOLE", 2, Perspective, &[]),
     model("SIMPLE_RADIAL", 1, Perspective, &[A(0)]),
@@ -58,8 +58,8 @@ pub(in crate::dataset) const MODELS: [LensModel; 11] = [
     model("THIN_PRISM_FISHEYE", 2, Equidistant, &[A(0), A(1), P(0), P(1), A(2), A(3), S(0), S(1)]),
 ];
 
-/// The fields of nerfstudio's and instant-ngp's files for a pinhole: OpenCV's terms under OpenCV's names.
-pub(in crate::dataset) const OPENCV_FIELDS: [(&str, Term); 8] = [
+/// Distortion fields of nerfstudio's and instant-ngp's pinholes: OpenCV's terms under OpenCV's names.
+pub(crate) const OPENCV_FIELDS: [(&str, Term); 8] = [
     ("k1", A(0)),
     ("k2", A(1)),
     ("p1", P(0)),
@@ -69,13 +69,13 @@ pub(in crate::dataset) const OPENCV_FIELDS: [(&str, Term); 8] = [
     ("k5", B(1)),
     ("k6", B(2)),
 ];
-/// The same for a fisheye.
-pub(in crate::dataset) const FISHEYE_FIELDS: [(&str, Term); 4] =
+/// Distortion fields of nerfstudio's and instant-ngp's fisheyes.
+pub(crate) const FISHEYE_FIELDS: [(&str, Term); 4] =
     [("k1", A(0)), ("k2", A(1)), ("k3", A(2)), ("k4", A(3))];
 
 impl LensModel {
-    /// The model of this name in COLMAP's files.
-    pub(in crate::dataset) fn named(
+    /// The model with a name of COLMAP's text files.
+    pub(crate) fn named(
         file: &Path,
         camera: &str,
         name: &str,
@@ -87,8 +87,8 @@ impl LensModel {
         })
     }
 
-    /// The model of this number in COLMAP's files.
-    pub(in crate::dataset) fn numbered(
+    /// The model with a number of COLMAP's binary files.
+    pub(crate) fn numbered(
         file: &Path,
         camera: &str,
         number: i32,
@@ -102,14 +102,14 @@ impl LensModel {
 }
 
 impl Distortion {
-    /// Sets one of its terms.
-    pub(in crate::dataset) fn set(&mut self, term: Term, value: f64) {
+    /// Sets the coefficient of a term.
+    pub(crate) fn set(&mut self, term: Term, value: f64) {
         match term {
             A(place) => self.radial[place] = value,
             B(place) => self.denominator[place] = value,
             P(place) => self.tangential[place] = value,
             S(place) => self.prism[place] = value,
-            // At 0 the model is a pinhole.
+            // For ω = 0 the model is a pinhole.
             Omega if value == 0.0 => {}
             Omega => self.plane = Plane::Fov(value),
         }

@@ -1,53 +1,51 @@
-//! Which pinholes see what a lens saw: one, or faces of a cube around the camera where the field of view is
-//! too wide for one.
+//! Replaces a lens by pinhole cameras: one, or the faces of a cube around the camera if the field of view is too wide.
 //!
-//! By default each is the largest axis-aligned rectangle in which every pixel was seen; with `keep` it holds
-//! all that was seen, and what was not is masked.
+//! By default each image is the largest axis-aligned rectangle that the lens saw completely. With `keep_fov` it contains
+//! everything that the lens saw, and the rest is masked.
 
 use glam::{DMat3, DVec2, DVec3};
 
 use super::{Lens, Plane, Unseen};
 use crate::dataset::undistort::{Pinhole, Undistortion};
 
-/// The pinholes of a lens.
+/// The pinhole cameras that replace a lens.
 #[derive(Debug, Clone, PartialEq)]
-pub(in crate::dataset) struct Cut {
-    /// Each with its name, which is empty if there is one only.
-    pub(in crate::dataset) faces: Vec<(&'static str, Undistortion)>,
+pub(crate) struct Pinholes {
+    /// Name and resampling of each; a single one has an empty name.
+    pub(crate) faces: Vec<(&'static str, Undistortion)>,
     /// Share of the photograph that none of them shows.
-    pub(in crate::dataset) cropped: f64,
+    pub(crate) cropped: f64,
 }
 
-/// Why a lens has no pinhole.
+/// Reason why no pinhole camera can replace a lens.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
-pub(in crate::dataset) enum CutFault {
-    /// The distortion has no inverse in some of the image.
+pub(crate) enum PinholeError {
+    /// The distortion has no inverse in a part of the image; the usable field of view `[degrees]`.
     #[error(
         "the distortion folds over within the image and cannot be inverted there: the largest usable field of \
          view is {0:.1} degrees"
     )]
     Folds(f64),
-    /// No pinhole of a sensible size sees any of the image.
-    #[error("the lens images nothing that a pinhole could show")]
+    /// No pinhole image of a useful size shows a part of the photograph.
+    #[error("no part of the photograph can be shown by a pinhole camera")]
     Nothing,
 }
 
-/// Samples along a side of the photograph. The error of a smooth border between samples is (1/64)²/8 of its
-/// bend: below 0.01 px for a bend of 100 px.
+/// Samples along a side of the photograph. Between samples, a smooth border that bends by 100 px is off by less than
+/// 100 px · (1/64)²/8, or 0.01 px.
 const SAMPLES: u32 = 64;
-/// Cells along each side of a face that are asked whether they were seen.
+/// Cells along each side of a face that are tested for visibility.
 const CELLS: usize = 128;
-/// Steepest ray of a single pinhole, x/z: 65 degrees of a fisheye; 80 of a lens that is a pinhole but for its
-/// distortion. So steep, faces beside the front are as good in narrow views, but cost 4 dB in wide ones; docs/data.md
-/// has the figures.
+/// Steepest ray of a single pinhole, x/z: 65 degrees for a fisheye, 80 degrees for a distorted pinhole. At these angles
+/// cube faces are as good in narrow views but cost 4 dB in wide ones; docs/data.md has the measurements.
 const STEEPEST: f64 = 2.15;
 const STEEPEST_PERSPECTIVE: f64 = 5.67;
-/// Least side of a face that is worth a view, x/z.
-const LEAST_SIDE: f64 = 0.2;
-/// Most pixels of a face, in photographs.
-const MOST_PIXELS: f64 = 4.0;
+/// Smallest side of a face that becomes a view, x/z.
+const MIN_SIDE: f64 = 0.2;
+/// Largest number of pixels of a face, relative to the photograph.
+const MAX_PIXELS: f64 = 4.0;
 
-/// A rectangle on a pinhole's plane, in x/z and y/z.
+/// A rectangle on the image plane of a pinhole, in x/z and y/z.
 #[derive(Debug, Clone, Copy)]
 struct Rectangle {
     low: DVec2,
@@ -60,21 +58,21 @@ impl Rectangle {
     }
 }
 
-impl Cut {
-    /// Cuts a lens into pinholes.
+impl Pinholes {
+    /// The pinhole cameras that cover the field of view of a lens.
     ///
     /// # Errors
-    /// Without `keep`, where the distortion folds over within the image; where nothing is left.
-    pub(in crate::dataset) fn of(lens: &Lens, keep: bool) -> Result<Self, CutFault> {
+    /// When the distortion folds over within the image, unless `keep_fov` is set; when nothing is left.
+    pub(crate) fn covering(lens: &Lens, keep_fov: bool) -> Result<Self, PinholeError> {
         let seen = grid(lens);
-        if !keep && seen.iter().any(|(_, ray)| *ray == Err(Unseen::Folds)) {
-            return Err(CutFault::Folds(lens.usable_field()));
+        if !keep_fov && seen.iter().any(|(_, ray)| *ray == Err(Unseen::Folds)) {
+            return Err(PinholeError::Folds(lens.usable_field()));
         }
         let rays = || seen.iter().filter_map(|(_, ray)| ray.ok());
         let is_whole = rays().count() == seen.len();
         let perspective = lens.distortion.plane == Plane::Perspective;
         let most = if perspective { STEEPEST_PERSPECTIVE } else { STEEPEST };
-        // Cosine of the widest angle that a plane is followed to.
+        // Cosine of the largest supported angle of planes that are infinite at 90 degrees.
         let is_forward = rays().all(|ray| ray.z > 0.08 * ray.length());
         let flat = |ray: DVec3| ray.truncate() / ray.z;
         let all = rays().fold(None, |all: Option<Rectangle>, ray| {
@@ -82,21 +80,24 @@ impl Cut {
             let all = all.unwrap_or(Rectangle { low: at, high: at });
             Some(Rectangle { low: all.low.min(at), high: all.high.max(at) })
         });
-        let all = all.ok_or(CutFault::Nothing)?;
-        let inner = if is_forward && is_whole && !keep { inscribed(&seen, flat) } else { None };
+        let all = all.ok_or(PinholeError::Nothing)?;
+        let inner = if is_forward && is_whole && !keep_fov { inscribed(&seen, flat) } else { None };
         let faces = if let Some(inner) = inner.filter(|inner| inner.is_within(most)) {
-            // A lens near to a pinhole keeps its size.
+            // A distorted pinhole keeps its image size.
             let size = perspective.then_some((lens.width, lens.height));
             vec![("", face(lens, DMat3::IDENTITY, inner, size, false))]
         } else if is_forward && all.is_within(most) {
-            scan(lens, DMat3::IDENTITY, all, keep).map(|face| ("", face)).into_iter().collect()
+            visible_part(lens, DMat3::IDENTITY, all, keep_fov)
+                .map(|face| ("", face))
+                .into_iter()
+                .collect()
         } else {
             let whole = Rectangle { low: DVec2::NEG_ONE, high: DVec2::ONE };
-            let face = |(name, turn)| Some((name, scan(lens, turn, whole, keep)?));
+            let face = |(name, turn)| Some((name, visible_part(lens, turn, whole, keep_fov)?));
             cube().into_iter().filter_map(face).collect::<Vec<_>>()
         };
         if faces.is_empty() {
-            return Err(CutFault::Nothing);
+            return Err(PinholeError::Nothing);
         }
         let shown = |ray: DVec3| faces.iter().any(|(_, face)| face.shows(ray));
         let lost = seen.iter().filter(|(_, ray)| !ray.is_ok_and(shown)).count();
@@ -105,7 +106,7 @@ impl Cut {
     }
 }
 
-/// The faces of a cube, as rotations `lens_from_face`: those beside the front touch it along its edges.
+/// The faces of a cube as rotations `lens_from_face`; the others share the edges of the front face.
 fn cube() -> [(&'static str, DMat3); 5] {
     let turned = |x, y, z| DMat3::from_cols(x, y, z);
     let (x, y, z) = (DVec3::X, DVec3::Y, DVec3::Z);
@@ -118,7 +119,7 @@ fn cube() -> [(&'static str, DMat3); 5] {
     ]
 }
 
-/// Places over the photograph, its border included, row by row, and their rays.
+/// Points on a grid over the photograph, including its border, row by row, and their rays.
 fn grid(lens: &Lens) -> Vec<(DVec2, Result<DVec3, Unseen>)> {
     let side = f64::from(SAMPLES);
     let places = (0..=SAMPLES).flat_map(|y| (0..=SAMPLES).map(move |x| (x, y)));
@@ -126,7 +127,7 @@ fn grid(lens: &Lens) -> Vec<(DVec2, Result<DVec3, Unseen>)> {
     places.map(|place| (place, lens.unproject(place))).collect()
 }
 
-/// The rectangle between the innermost points of the four borders; `None` if it does not hold the axis.
+/// The rectangle between the innermost points of the four borders; `None` if it does not contain the axis.
 fn inscribed(
     seen: &[(DVec2, Result<DVec3, Unseen>)],
     flat: impl Fn(DVec3) -> DVec2,
@@ -144,14 +145,19 @@ fn inscribed(
     holds.then_some(Rectangle { low, high })
 }
 
-/// The pinhole that looks along the third column of `turn` at what was seen within a rectangle; `None` if
-/// that is not worth a view.
-fn scan(lens: &Lens, turn: DMat3, within: Rectangle, keep: bool) -> Option<Undistortion> {
+/// The pinhole that looks along the third column of `turn` at the part of a rectangle that the lens saw; `None` if
+/// that part is too small.
+fn visible_part(
+    lens: &Lens,
+    turn: DMat3,
+    within: Rectangle,
+    keep_fov: bool,
+) -> Option<Undistortion> {
     let step = (within.high - within.low) / CELLS as f64;
     let at = |x: usize, y: usize| within.low + step * DVec2::new(x as f64, y as f64);
     let is_seen = |x, y| {
         let place = lens.project(turn * at(x, y).extend(1.0));
-        // A border pixel's ray comes back within rounding.
+        // The ray of a border pixel is projected back to the border up to rounding.
         let inside = |p: DVec2| (p.cmpge(DVec2::splat(-1e-6)) & p.cmple(lens.size() + 1e-6)).all();
         place.is_some_and(inside)
     };
@@ -164,21 +170,21 @@ fn scan(lens: &Lens, turn: DMat3, within: Rectangle, keep: bool) -> Option<Undis
         })
         .collect();
     let whole: Vec<bool> = cells.iter().map(|cell| *cell == [true; 4]).collect();
-    let ([x0, y0], [x1, y1]) = if keep {
+    let ([x0, y0], [x1, y1]) = if keep_fov {
         let any: Vec<bool> = cells.iter().map(|cell| cell.contains(&true)).collect();
         bounding(&any)?
     } else {
         largest(&whole)?
     };
     let rectangle = Rectangle { low: at(x0, y0), high: at(x1, y1) };
-    let is_worth = keep
+    let is_useful = keep_fov
         || (rectangle.high - rectangle.low).min_element()
-            >= LEAST_SIDE.min(step.min_element() * 32.0);
+            >= MIN_SIDE.min(step.min_element() * 32.0);
     let masked = (y0..y1).any(|y| whole[y * CELLS + x0..y * CELLS + x1].contains(&false));
-    is_worth.then(|| face(lens, turn, rectangle, None, masked))
+    is_useful.then(|| face(lens, turn, rectangle, None, masked))
 }
 
-/// The pinhole that sees a rectangle, of this size or with the lens's pixels per radian on its axis.
+/// The pinhole that shows a rectangle, at a given size or with as many pixels per radian on the axis as the lens.
 fn face(
     lens: &Lens,
     turn: DMat3,
@@ -188,7 +194,7 @@ fn face(
 ) -> Undistortion {
     let (width, height) = size.unwrap_or_else(|| {
         let side = lens.focal * lens.distortion.plane.slope() * (high - low);
-        let pixels = lens.size().element_product() * MOST_PIXELS / side.element_product();
+        let pixels = lens.size().element_product() * MAX_PIXELS / side.element_product();
         let side = (side * pixels.min(1.0).sqrt()).round();
         (side.x.max(1.0) as u32, side.y.max(1.0) as u32)
     });
@@ -197,8 +203,7 @@ fn face(
     Undistortion::new(*lens, to, turn, masked)
 }
 
-/// The smallest rectangle of cells that holds all that are set: first column and row, and those after the
-/// last.
+/// The smallest rectangle that contains all set cells: first column and row, and last column and row plus 1.
 fn bounding(set: &[bool]) -> Option<([usize; 2], [usize; 2])> {
     let places = || (0..set.len()).filter(|&i| set[i]).map(|i| [i % CELLS, i / CELLS]);
     let low = [0, 1].map(|axis| places().map(|place| place[axis]).min());
@@ -206,9 +211,9 @@ fn bounding(set: &[bool]) -> Option<([usize; 2], [usize; 2])> {
     Some(([low[0]?, low[1]?], [high[0]?, high[1]?]))
 }
 
-/// The largest rectangle of cells that are all set, the same way.
+/// The largest rectangle in which all cells are set, in the form of [`bounding`].
 fn largest(set: &[bool]) -> Option<([usize; 2], [usize; 2])> {
-    // Set cells above and with each of a row.
+    // Number of consecutive set cells that end in this row, for each column.
     let mut heights = [0; CELLS];
     let mut best = (0, None);
     for bottom in 0..CELLS {

@@ -1,53 +1,53 @@
-//! When each row was made and last edited: for whoever looks at a run, and for nothing else. The optimiser's ages say
-//! the second only, and not where a plan keeps them.
+//! Records when each row was created and last edited, for display only. (The ages of the optimiser do not tell creation
+//! from edits, and plans may keep them.)
 
 use densify_policies::plan::{ParentFate, RowOps};
 
-/// The steps in which the rows were made and last edited; 0 for those that were there in the beginning.
+/// The steps in which rows were created and last edited; 0 for initial rows.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct RowHistory {
-    made: Vec<u32>,
+    created: Vec<u32>,
     edited: Vec<u32>,
 }
 
 impl RowHistory {
-    /// Bytes per row of the budget.
+    /// Memory per row of the budget `[bytes]`.
     pub const BYTES: u64 = 2 * size_of::<u32>() as u64;
 
-    /// Of rows of which only the last edits are known, for at most `budget` rows.
+    /// The history of rows whose creation is unknown, which counts as their last edit; for at most `budget` rows.
     #[must_use]
-    pub fn of(edited: &[u32], budget: usize) -> Self {
+    pub fn from_edits(edited: &[u32], budget: usize) -> Self {
         let with_room = || {
             let mut steps = Vec::with_capacity(budget);
             steps.extend_from_slice(edited);
             steps
         };
-        Self { made: with_room(), edited: with_room() }
+        Self { created: with_room(), edited: with_room() }
     }
 
-    /// The step in which each row was made. Shape: `[rows]`.
+    /// The step in which each row was created. Shape: `[rows]`.
     #[must_use]
-    pub fn made(&self) -> &[u32] {
-        &self.made
+    pub fn created(&self) -> &[u32] {
+        &self.created
     }
 
-    /// The step in which each row was made, rewritten or updated last. What happens to all rows at once is no edit of
-    /// any. Shape: `[rows]`.
+    /// The step in which each row was created, rewritten or updated last. Changes of all rows at once do not count.
+    /// Shape: `[rows]`.
     #[must_use]
     pub fn edited(&self) -> &[u32] {
         &self.edited
     }
 
-    /// Follows an edit after `step`, in the order that [`RowOps`] says.
+    /// Records an edit after `step`, in the order of operations that [`RowOps`] defines.
     ///
     /// # Panics
-    /// When the plan is for another number of rows: a bug in the caller.
-    pub fn follow(&mut self, ops: &RowOps, step: u32) {
-        assert_eq!(ops.rows_before, self.made.len(), "a plan for other rows");
+    /// When the plan is for another number of rows, which is a bug in the caller.
+    pub fn record(&mut self, ops: &RowOps, step: u32) {
+        assert_eq!(ops.rows_before, self.created.len(), "a plan for other rows");
         let seeded = ops.seeds.iter().map(|(slot, _)| *slot);
         let new = || ops.child_slots.iter().copied().chain(seeded.clone());
         let slots = new().max().map_or(0, |slot| slot as usize + 1).max(ops.rows_before);
-        for steps in [&mut self.made, &mut self.edited] {
+        for steps in [&mut self.created, &mut self.edited] {
             steps.resize(slots.max(ops.rows_after), step);
             new().for_each(|slot| steps[slot as usize] = step);
             for family in &ops.families {
@@ -60,7 +60,7 @@ impl RowHistory {
             self.edited[*row as usize] = step;
         }
         let order = ops.order();
-        for steps in [&mut self.made, &mut self.edited] {
+        for steps in [&mut self.created, &mut self.edited] {
             for &(from, to) in &ops.moves {
                 steps[to as usize] = steps[from as usize];
             }

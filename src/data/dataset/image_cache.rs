@@ -1,9 +1,9 @@
-//! A cache of decoded images with a limit in bytes, filled ahead of use by background threads.
+//! A cache of decoded images with a size limit, filled ahead of use by background threads.
 //!
 //! Training visits every view once per epoch, in a new order each time. The next use of a view just
 //! seen is therefore the furthest away on average, so that the most recently used image is evicted
 //! first, but never one that was announced. (Least-recently-used eviction would always miss as soon
-//! as the images do not all fit.) One piece with its tests, which are half of it.
+//! as the images do not all fit.)
 
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -11,9 +11,9 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
 use super::DatasetError;
-pub use super::images::{Image8, ImageSource, SharedImage};
+use super::images::{Image8, ImageSource, SharedImage};
 
-/// Decoded images on demand. Caching changes only the time to wait, never a pixel.
+/// Decodes images on demand. Caching affects waiting times only, never pixels.
 #[derive(Debug)]
 pub struct ImageCache {
     shared: Arc<Shared>,
@@ -25,7 +25,7 @@ struct Shared {
     sources: Vec<ImageSource>,
     capacity: u64,
     state: Mutex<State>,
-    /// Signalled when something was queued, room was made, or the threads are to end.
+    /// Signalled when an image was queued, memory became available, or the threads shall end.
     work: Condvar,
     /// Signalled when an image was loaded.
     loaded: Condvar,
@@ -34,9 +34,9 @@ struct Shared {
 #[derive(Debug, Default)]
 struct State {
     slots: Vec<Slot>,
-    /// Announced images whose loading has not begun.
+    /// Announced images that are not being loaded yet.
     queue: VecDeque<usize>,
-    /// Bytes held and being loaded.
+    /// Size of the images that are cached or being loaded `[bytes]`.
     bytes: u64,
     clock: u64,
     end: bool,
@@ -45,9 +45,9 @@ struct State {
 #[derive(Debug, Default)]
 struct Slot {
     content: Content,
-    /// Announced, and not fetched since.
-    wanted: bool,
-    /// Clock at the last use.
+    /// Whether the image was announced and not fetched since.
+    is_announced: bool,
+    /// Value of the clock at the last use.
     used: u64,
 }
 
@@ -65,8 +65,8 @@ impl ImageCache {
     /// `threads` decode the images announced by [`Self::prefetch`]; with 0 threads, all images are
     /// decoded on demand.
     #[must_use]
-    pub fn new(sources: Vec<ImageSource>, cache_bytes: u64, threads: usize) -> Self {
-        let capacity = ImageDemand::of(sources.iter()).capacity(cache_bytes);
+    pub(crate) fn new(sources: Vec<ImageSource>, cache_bytes: u64, threads: usize) -> Self {
+        let capacity = ImageDemand::total(sources.iter()).capacity(cache_bytes);
         let slots = sources.iter().map(|_| Slot::default()).collect();
         let state = Mutex::new(State { slots, ..State::default() });
         let shared = Arc::new(Shared {
@@ -79,7 +79,7 @@ impl ImageCache {
         let threads = (0..threads)
             .map_while(|index| {
                 let shared = Arc::clone(&shared);
-                // Without the thread images are decoded on demand.
+                // If the thread cannot be started, images are decoded on demand.
                 std::thread::Builder::new()
                     .name(format!("prefetch-{index}"))
                     .spawn(move || shared.serve())
@@ -89,18 +89,18 @@ impl ImageCache {
         Self { shared, threads }
     }
 
-    /// Announces the images needed next, in order; replaces what was announced before.
+    /// Announces the images needed next, in order, instead of those announced before.
     pub fn prefetch(&self, upcoming: &[usize]) {
         let mut state = self.shared.lock();
         state.queue.clear();
         for slot in &mut state.slots {
-            slot.wanted = false;
+            slot.is_announced = false;
         }
         for &index in upcoming {
             let Some(slot) = state.slots.get_mut(index) else {
                 continue;
             };
-            let first = !std::mem::replace(&mut slot.wanted, true);
+            let first = !std::mem::replace(&mut slot.is_announced, true);
             if first && matches!(slot.content, Content::Empty) && !self.threads.is_empty() {
                 state.queue.push_back(index);
             }
@@ -109,7 +109,7 @@ impl ImageCache {
         self.shared.work.notify_all();
     }
 
-    /// The image at `index` of the sources; waits for its decoding, or decodes it.
+    /// The image of source `index`; decodes it, or waits while a background thread does.
     ///
     /// # Errors
     /// When the file cannot be loaded. The next call tries again.
@@ -119,7 +119,7 @@ impl ImageCache {
     pub fn get(&self, index: usize) -> Result<SharedImage, DatasetError> {
         let source = &self.shared.sources[index];
         let mut state = self.shared.lock();
-        state.slots[index].wanted = false;
+        state.slots[index].is_announced = false;
         loop {
             state.clock += 1;
             let clock = state.clock;
@@ -128,7 +128,7 @@ impl ImageCache {
             match std::mem::take(&mut slot.content) {
                 Content::Ready(image) => {
                     slot.content = Content::Ready(Arc::clone(&image));
-                    // The image may now be evicted, and a thread may be waiting for room.
+                    // The image may now be evicted, which a thread may be waiting for.
                     self.shared.work.notify_all();
                     return Ok(image);
                 }
@@ -151,7 +151,7 @@ impl ImageCache {
             let mut state = self.shared.lock();
             state.finish(&self.shared, index, result.clone());
             if result.is_err() {
-                // The caller has the error, and may try again.
+                // The caller gets the error and may try again.
                 state.slots[index].content = Content::Empty;
             }
             drop(state);
@@ -167,7 +167,7 @@ impl Drop for ImageCache {
         self.shared.lock().end = true;
         self.shared.work.notify_all();
         for thread in self.threads.drain(..) {
-            // Decoder panics are caught inside; there is nothing to pass on.
+            // Panics of decoders are caught inside the thread.
             let _ = thread.join();
         }
     }
@@ -199,13 +199,13 @@ impl Shared {
 }
 
 impl State {
-    /// Reserves room for an image, evicting the most recently used ones that are not announced.
+    /// Reserves memory for an image by evicting the most recently used images that are not announced.
     fn make_room(&mut self, shared: &Shared, index: usize) -> bool {
         let needed = shared.sources[index].loaded_bytes();
         while self.bytes + needed > shared.capacity {
             let victim = (self.slots.iter().enumerate())
                 .filter(|(i, slot)| {
-                    *i != index && !slot.wanted && matches!(slot.content, Content::Ready(_))
+                    *i != index && !slot.is_announced && matches!(slot.content, Content::Ready(_))
                 })
                 .max_by_key(|(_, slot)| slot.used)
                 .map(|(i, _)| i);
@@ -217,7 +217,7 @@ impl State {
         true
     }
 
-    /// Stores the result of a load for which [`Self::make_room`] reserved memory.
+    /// Stores the result of loading an image for which [`Self::make_room`] reserved memory.
     fn finish(&mut self, shared: &Shared, index: usize, result: Result<SharedImage, DatasetError>) {
         if result.is_err() {
             self.bytes -= shared.sources[index].loaded_bytes();
@@ -229,21 +229,21 @@ impl State {
     }
 }
 
-/// How much memory a set of images takes.
+/// Memory needed by a set of images.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ImageDemand {
-    /// Bytes of all images decoded.
+    /// All decoded images together `[bytes]`.
     pub all: u64,
-    /// Bytes of the largest one.
+    /// The largest decoded image `[bytes]`.
     pub largest: u64,
-    /// Most additional bytes used while one is loaded.
+    /// Largest additional memory while an image is loaded `[bytes]`.
     pub working: u64,
 }
 
 impl ImageDemand {
     /// The demand of these images.
     #[must_use]
-    pub fn of<'a>(sources: impl Iterator<Item = &'a ImageSource>) -> Self {
+    pub fn total<'a>(sources: impl Iterator<Item = &'a ImageSource>) -> Self {
         sources.fold(Self { all: 0, largest: 0, working: 0 }, |sum, source| {
             let loaded = source.loaded_bytes();
             Self {
@@ -254,14 +254,14 @@ impl ImageDemand {
         })
     }
 
-    /// Most bytes of decoded images with a cache of `cache_bytes`, including one image that is in use
-    /// but no longer in the cache.
+    /// Peak memory of decoded images with a cache of `cache_bytes`, including one image that is in use
+    /// but no longer cached `[bytes]`.
     #[must_use]
     pub fn held(&self, cache_bytes: u64) -> u64 {
         self.all.min(self.capacity(cache_bytes).saturating_add(self.largest))
     }
 
-    /// Most bytes used for decoding by so many threads: one image per thread, and one on demand.
+    /// Peak memory for decoding: one image per thread, and one on demand `[bytes]`.
     #[must_use]
     pub fn decoding(&self, threads: usize) -> u64 {
         (threads as u64 + 1) * self.working + self.largest
@@ -272,7 +272,7 @@ impl ImageDemand {
     }
 }
 
-/// Loads an image; a panic of the decoder becomes an error.
+/// Loads an image, turning a panic of the decoder into an error.
 fn load(source: &ImageSource) -> Result<Image8, DatasetError> {
     catch_unwind(AssertUnwindSafe(|| source.load()))
         .unwrap_or_else(|_| Err(DatasetError::image(&source.file.path, "the decoder failed")))
@@ -282,7 +282,7 @@ fn load(source: &ImageSource) -> Result<Image8, DatasetError> {
 mod tests {
     use super::*;
 
-    /// `count` images of 16x16 px, told apart by their colour; 768 bytes each.
+    /// `count` images of 16x16 px with different colours, 768 bytes each.
     fn sources(folder: &std::path::Path, count: u8) -> Vec<ImageSource> {
         (0..count)
             .map(|i| {
@@ -382,7 +382,7 @@ mod tests {
     #[test]
     fn the_accounting_covers_what_is_held() {
         let folder = tempfile::tempdir().unwrap();
-        let demand = |count| ImageDemand::of(sources(folder.path(), count).iter());
+        let demand = |count| ImageDemand::total(sources(folder.path(), count).iter());
         assert_eq!(demand(4).held(1 << 30), 4 * 768, "all images, not the cache's size");
         assert_eq!(demand(9).held(3 * 768), 4 * 768);
         assert_eq!(demand(9).held(0), 3 * 768, "two, and one handed out");

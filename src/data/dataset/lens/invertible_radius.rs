@@ -1,26 +1,26 @@
-//! How far from the centre a distortion provably has an inverse.
+//! The radius up to which a distortion is provably invertible.
 //!
-//! A map whose Jacobian has a positive definite symmetric part all over a disc never takes two points of it
-//! to one: along the way from one to the other, what the map gains in that direction grows. The radial part
-//! has the eigenvalues q and (r·q)′ on a circle of radius r, q being its factor; the tangential and the
-//! thin-prism terms take at most 6|p|·r and 2|s|·r from them. So the distortion is invertible up to the first
-//! radius where the smaller of the two no longer exceeds that.
+//! A map is injective on a disc if the symmetric part of its Jacobian is positive definite there: on the segment from
+//! one point to another, the image moves strictly in the direction of the segment. On a circle of radius r the radial
+//! part has the eigenvalues q and (r·q)′, where q is its factor; the tangential and thin-prism terms reduce them by at
+//! most 6|p|·r and 2|s|·r. So the distortion is invertible up to the first radius at which the smaller eigenvalue no
+//! longer exceeds that reduction t.
 //!
-//! With q = N/M, polynomials in s = r², this says that M, N − t·M and (N + 2sN′)·M − 2s·N·M′ − t·M² are
-//! positive. Each is bounded from below on whole intervals, so that nothing between samples is missed: after
-//! a shift to the interval's start a polynomial is at least its first coefficient and all negative terms at
-//! the interval's end.
+//! With q = N/M, polynomials in s = r², the condition is that M, N − t·M and (N + 2sN′)·M − 2s·N·M′ − t·M² are
+//! positive. Each is bounded from below on whole intervals, so that no point between samples is missed: after a shift
+//! to the start of the interval, a polynomial is at least its constant coefficient plus all negative terms at the
+//! end of the interval.
 
 use super::Distortion;
 
-/// Least eigenvalue accepted: where a lens shrinks its image a thousand times, nothing is seen.
-const LEAST: f64 = 1e-3;
-/// Smallest step of the search, as a fraction of its range: a thousandth of a pixel where an image spans it.
-const FINEST: f64 = 1e-8;
+/// Smallest accepted eigenvalue: a lens that shrinks its image a thousandfold shows nothing there.
+const MIN_EIGENVALUE: f64 = 1e-3;
+/// Smallest step of the search, as a fraction of its range: a thousandth of a pixel if the image spans the range.
+const MIN_STEP: f64 = 1e-8;
 
 impl Distortion {
-    /// Radius on the plane, at most `limit`, up to which the distortion provably has an inverse.
-    pub(super) fn reach(&self, limit: f64) -> f64 {
+    /// Radius on the plane, at most `limit`, up to which the distortion is provably invertible.
+    pub(super) fn invertible_radius(&self, limit: f64) -> f64 {
         let end = limit * limit;
         let (mut from, mut step) = (0.0, end);
         while from < end {
@@ -28,7 +28,7 @@ impl Distortion {
             if self.is_monotone(from, to) {
                 from = to;
                 step *= 2.0;
-            } else if step > FINEST * end {
+            } else if step > MIN_STEP * end {
                 step *= 0.5;
             } else {
                 break;
@@ -40,13 +40,14 @@ impl Distortion {
     /// Whether the distortion is monotone where r² is between `from` and `to`.
     fn is_monotone(&self, from: f64, to: f64) -> bool {
         let length = |[a, b]: [f64; 2]| a.hypot(b);
-        let taken = (6.0 * length(self.tangential) + 2.0 * length(self.prism)) * to.sqrt() + LEAST;
+        let reduction =
+            (6.0 * length(self.tangential) + 2.0 * length(self.prism)) * to.sqrt() + MIN_EIGENVALUE;
         let with_one = |terms: &[f64]| std::iter::once(1.0).chain(terms.iter().copied()).collect();
         let (n, m): (Vec<f64>, Vec<f64>) = (with_one(&self.radial), with_one(&self.denominator));
         let less = |mut a: Vec<f64>, b: &[f64]| -> Vec<f64> {
             a.resize(a.len().max(b.len()), 0.0);
             for (sum, value) in a.iter_mut().zip(b) {
-                *sum -= taken * value;
+                *sum -= reduction * value;
             }
             a
         };
@@ -87,7 +88,7 @@ fn lowest(polynomial: &[f64], from: f64, to: f64) -> f64 {
     let length = to - from;
     let (mut bound, mut power) = (0.0, 1.0);
     for (place, &coefficient) in shifted.iter().enumerate() {
-        // The first counts whatever its sign; `min` would hide NaN.
+        // The constant counts whatever its sign; `min` would hide NaN.
         let least = if place > 0 && coefficient > 0.0 { 0.0 } else { coefficient };
         bound += least * power;
         power *= length;
@@ -116,30 +117,29 @@ mod tests {
     }
 
     #[test]
-    fn the_reach_is_where_the_radial_part_turns_round() {
-        let reach = |radial: [f64; 4], denominator: [f64; 3]| {
-            let plain = Distortion::of(Plane::Perspective);
-            Distortion { radial, denominator, ..plain }.reach(10.0)
+    fn the_radius_ends_where_the_radial_part_folds_over() {
+        let radius = |radial: [f64; 4], denominator: [f64; 3]| {
+            let plain = Distortion::none(Plane::Perspective);
+            Distortion { radial, denominator, ..plain }.invertible_radius(10.0)
         };
-        assert!((reach([0.0; 4], [0.0; 3]) - 10.0).abs() < 1e-12);
-        assert!((reach([0.3, 0.1, 0.0, 0.0], [0.2, 0.0, 0.0]) - 10.0).abs() < 1e-12);
-        // r + k r³ turns round at r² = −1/(3k).
-        let turns = reach([-0.2, 0.0, 0.0, 0.0], [0.0; 3]);
-        assert!((turns - (1.0 / 0.6_f64).sqrt()).abs() < 2e-3, "{turns}");
-        // r / (1 + k r²) turns round at r² = 1/k; a pole ends it too.
-        let turns = reach([0.0; 4], [0.5, 0.0, 0.0]);
-        assert!((turns - 2.0_f64.sqrt()).abs() < 5e-3, "{turns}");
-        let pole = reach([0.0; 4], [-0.25, 0.0, 0.0]);
+        assert!((radius([0.0; 4], [0.0; 3]) - 10.0).abs() < 1e-12);
+        assert!((radius([0.3, 0.1, 0.0, 0.0], [0.2, 0.0, 0.0]) - 10.0).abs() < 1e-12);
+        // r + k r³ folds over at r² = −1/(3k).
+        let fold = radius([-0.2, 0.0, 0.0, 0.0], [0.0; 3]);
+        assert!((fold - (1.0 / 0.6_f64).sqrt()).abs() < 2e-3, "{fold}");
+        // r / (1 + k r²) folds over at r² = 1/k; a pole ends it too.
+        let fold = radius([0.0; 4], [0.5, 0.0, 0.0]);
+        assert!((fold - 2.0_f64.sqrt()).abs() < 5e-3, "{fold}");
+        let pole = radius([0.0; 4], [-0.25, 0.0, 0.0]);
         assert!(pole < 2.0 && pole > 1.99, "{pole}");
         for bad in [f64::NAN, f64::INFINITY, -f64::MAX] {
-            assert!(reach([bad, 0.0, 0.0, 0.0], [0.0; 3]) < 0.01, "{bad}");
+            assert!(radius([bad, 0.0, 0.0, 0.0], [0.0; 3]) < 0.01, "{bad}");
         }
     }
 
-    /// Within the reach the Jacobian has a positive definite symmetric part everywhere.
     #[test]
-    fn what_is_proven_holds() {
-        let plain = Distortion::of(Plane::Perspective);
+    fn within_the_radius_the_symmetric_part_of_the_jacobian_is_positive_definite() {
+        let plain = Distortion::none(Plane::Perspective);
         let tangential = Distortion { tangential: [0.03, -0.02], prism: [0.01, 0.04], ..plain };
         for distortion in [
             tangential,
@@ -150,10 +150,10 @@ mod tests {
                 ..tangential
             },
         ] {
-            let reach = distortion.reach(3.0);
-            assert!(reach > 0.5, "{distortion:?}: {reach}");
+            let radius = distortion.invertible_radius(3.0);
+            assert!(radius > 0.5, "{distortion:?}: {radius}");
             for (i, j) in (0..=60).flat_map(|i| (0..72).map(move |j| (i, j))) {
-                let (r, turn) = (reach * f64::from(i) / 60.0, f64::from(j) / 72.0);
+                let (r, turn) = (radius * f64::from(i) / 60.0, f64::from(j) / 72.0);
                 let p = r * glam::DVec2::from_angle(std::f64::consts::TAU * turn);
                 let j = distortion.jacobian(p);
                 let (a, b, c) = (j.x_axis.x, 0.5 * (j.x_axis.y + j.y_axis.x), j.y_axis.y);
