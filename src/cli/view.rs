@@ -12,7 +12,7 @@ use super::threads::open_machine;
 use densify_core::numbers::grouped;
 use densify_run::failure::Failure;
 use densify_view as view;
-use densify_view::{FIRST_PORT, Looked, Place, Server};
+use densify_view::{FIRST_PORT, ListenAddress, Server, ViewOptions};
 
 /// Shows a model, or a scene, in the browser.
 ///
@@ -63,21 +63,22 @@ pub(super) fn run(args: &ViewArgs, matches: &ArgMatches, console: &Console) -> R
     if view::is_run(&args.what) {
         refuse_options_of_a_file(matches)?;
     }
-    // The port first: it is known at once, and a model may take long to read.
-    let server = Server::open(Place { host: args.host, port: args.port, has_secret: false })?;
+    // Bind the port first: that fails at once if at all, and a model may take long to read.
+    let address = ListenAddress { host: args.host, port: args.port, needs_token: false };
+    let server = Server::open(address)?;
     let RenderingArgs { near, device, data } = &args.rendering;
     let machine = open_machine(device, console)?;
-    let looked = Looked {
-        what: &args.what,
+    let options = ViewOptions {
+        path: &args.what,
         other: args.other.as_deref(),
-        scene: args.scene.clone(),
+        dataset: args.scene.clone(),
         iteration: args.iteration,
         near: near.0,
         data: data.clone(),
     };
-    let stage = view::open(looked, machine, console)?;
-    for (name, rows) in stage.models() {
-        console.say(format_args!("model    {name}: {} rows", grouped(rows)));
+    let scene = view::open(options, machine, console)?;
+    for (name, rows) in scene.models() {
+        console.say(format_args!("model    {name}: {} Gaussians", grouped(rows)));
     }
     // From here on a signal ends the page, not the process in the midst of it.
     let interrupts = Interrupts::listen();
@@ -89,5 +90,5 @@ pub(super) fn run(args: &ViewArgs, matches: &ArgMatches, console: &Console) -> R
         );
     }
     console.say("         Ctrl-C ends it");
-    server.serve(stage, &|| interrupts.received().is_some())
+    server.serve(scene, &|| interrupts.received().is_some())
 }

@@ -8,8 +8,8 @@
 //! coordinate_check, resolved, finished, session.
 
 mod companion;
-mod device;
 pub mod coordinate_check;
+mod device;
 pub mod failure;
 pub mod finished;
 mod host;

@@ -7,15 +7,15 @@ use crate::console::Console;
 use densify_run::failure::Failure;
 use densify_run::{Occupied, Run};
 pub(super) use densify_view::COMPANION;
-use densify_view::{Place, Server};
+use densify_view::{ListenAddress, Server};
 
-/// Takes the port; 0 is the first that is free.
+/// Binds the port; 0 stands for the first free one.
 pub(super) fn open(port: u16) -> Result<Server, Failure> {
     let port = (port != 0).then_some(port);
-    Server::open(Place { host: Ipv4Addr::LOCALHOST.into(), port, has_secret: true })
+    Server::open(ListenAddress { host: Ipv4Addr::LOCALHOST.into(), port, needs_token: true })
 }
 
-/// Trains the run, and serves its page meanwhile.
+/// Trains the run and serves its page meanwhile.
 pub(super) fn train(
     page: &Server,
     run: Run,
@@ -23,7 +23,7 @@ pub(super) fn train(
     follower: &Follower<'_>,
     console: &Console,
 ) -> Result<(), Failure> {
-    // Without its address the page is of no use, so a quiet run says it too.
+    // The page is useless without its address, so a quiet run prints it too.
     console.result(format_args!("page     {}", page.url()));
     page.follow(run, follower, |run, observer| run.train(occupied, observer).map(drop))
 }

@@ -17,13 +17,13 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DVec2, DVec3};
 
 use super::folders::Folders;
+use super::formats::DatasetFormat;
 use super::images::{self, ImageHeader};
 use super::lens::models::Term;
 use super::lens::{Distortion, Lens, Plane};
 use super::paths::{DataPath, Root, relative};
 use super::pose::{check_lens, checked_pose};
 use super::transforms::usual_points;
-use super::formats::DatasetFormat;
 use super::{DatasetError, Frame, LoadOptions, Scene};
 use densify_core::files;
 

@@ -12,6 +12,7 @@ use glam::{DMat3, DVec2, DVec3};
 use serde_json::{Map, Value};
 
 use super::folders::{Folders, ImageFile};
+use super::formats::DatasetFormat;
 use super::images::{self, ImageHeader};
 use super::json;
 use super::lens::models::{FISHEYE_FIELDS, OPENCV_FIELDS};
@@ -19,7 +20,6 @@ use super::lens::{Distortion, Lens, Plane};
 use super::mask_files::MaskFile;
 use super::paths::{DataPath, Root, is_absolute, relative};
 use super::pose::{check_lens, checked_pose};
-use super::formats::DatasetFormat;
 use super::{DatasetError, Frame, LoadOptions, Scene, colmap};
 
 /// The pair of files that defines its own test split.

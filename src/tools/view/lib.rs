@@ -1,112 +1,111 @@
-//! `densify view`: a page in the browser whose pictures are rendered here, by the backend that trains.
+//! `densify view`: a web page with pictures of a model, rendered on this machine by the training backend.
 //!
-//! One thread has the models, of a run in training ([`live`]) the one that trains. Connections bring wishes to its
-//! [`desk`], which keeps the newest of each page; that thread renders them ([`negative`]), and another makes pictures
-//! of what is rendered ([`darkroom`]). Everything that a browser sends is checked before ([`door`], [`asked`]); no path
-//! of the disk is served. Prints nothing.
+//! One thread owns the models; for a run in training ([`live`]) it is the training thread. HTTP connections put picture
+//! requests into the [`render_queue`], which keeps only the newest request of each page. The model thread renders them
+//! ([`render`]); a second thread turns the renderings into JPEGs ([`encoder`]). Every request is validated first
+//! ([`listener`], [`picture_request`]), and no file is ever served from the disk. Prints nothing.
 
-mod asked;
-mod board;
-mod darkroom;
-mod describe;
-mod desk;
-mod door;
+mod colour_map;
+mod description;
+mod encoder;
 mod http;
-mod kinds;
+mod listener;
 mod live;
-mod measured;
-mod negative;
-pub mod open;
-mod paint;
-mod ramp;
+mod open;
+mod picture_kind;
+mod picture_request;
+mod render;
+mod render_queue;
 mod routes;
-mod stage;
+mod row_colours;
+mod row_measurements;
+mod run_status;
+mod scene;
 
 use std::thread;
 
-use desk::{Closing, Desk};
-use door::Door;
-pub use door::{FIRST_PORT, Place};
+use listener::Listener;
+pub use listener::{FIRST_PORT, ListenAddress};
 pub use live::COMPANION;
-use negative::Brush;
-pub use open::{Looked, is_run, open};
+pub use open::{ViewOptions, is_run, open};
+use render::ModelCache;
+use render_queue::{CloseOnDrop, RenderQueue};
 use routes::Routes;
-pub(crate) use stage::Exhibition;
+use scene::LoadedScene;
 
 use densify_run::failure::{Failure, OTHER};
 
-/// Pictures in the making at a time: while one is encoded, the next is rendered.
-const AT_ONCE: usize = 2;
+/// Pictures in progress at a time: one is rendered while another is encoded.
+const MAX_ACTIVE: usize = 2;
 
-/// A page that can be opened.
+/// An HTTP server for one page, bound to its port.
 pub struct Server {
-    door: Door,
+    listener: Listener,
 }
 
 impl Server {
-    /// Takes the port.
+    /// Binds the port.
     ///
     /// # Errors
-    /// When it is another program's, or the address is not this machine's.
-    pub fn open(place: Place) -> Result<Self, Failure> {
-        Ok(Self { door: Door::open(place)? })
+    /// If the port is in use or the address does not belong to this machine.
+    pub fn open(address: ListenAddress) -> Result<Self, Failure> {
+        Ok(Self { listener: Listener::open(address)? })
     }
 
-    /// What to type into a browser on this machine.
+    /// The page's address for a browser on this machine.
     pub fn url(&self) -> String {
-        self.door.url()
+        self.listener.url()
     }
 
-    /// Whether other machines reach the page.
+    /// True if other machines can reach the page.
     pub fn is_public(&self) -> bool {
-        self.door.is_public()
+        self.listener.is_public()
     }
 
-    /// Serves the page until `is_over`.
+    /// Serves the page until `is_over` returns true.
     ///
     /// # Errors
-    /// When the network fails, or what renders.
-    pub fn serve(&self, exhibition: Exhibition, is_over: &dyn Fn() -> bool) -> Result<(), Failure> {
-        let Exhibition { mut stage, mut backends } = exhibition;
-        let desk = Desk::new(None, AT_ONCE);
+    /// If the network or the renderer fails.
+    pub fn serve(&self, loaded: LoadedScene, is_over: &dyn Fn() -> bool) -> Result<(), Failure> {
+        let LoadedScene { mut scene, mut backends } = loaded;
+        let queue = RenderQueue::new(None, MAX_ACTIVE);
         let routes = Routes {
-            door: &self.door,
-            desk: &desk,
-            extent: stage.extent(),
-            description: describe::describe(&mut stage),
-            board: None,
+            listener: &self.listener,
+            queue: &queue,
+            limits: scene.limits(),
+            description: description::describe(&mut scene),
+            run_status: None,
         };
         let failed = |message: String| Failure::new(OTHER, message);
         thread::scope(|scope| {
-            let (desk, stage) = (&desk, &stage);
-            let develops = darkroom::open(scope, desk, stage)
-                .map_err(|error| failed(format!("the system gives no thread: {error}")))?;
-            let renders = scope.spawn(move || {
-                let _closing = Closing(desk);
-                let mut brushes: Vec<Brush> = backends.iter().map(|_| Brush::default()).collect();
-                while let Some(ticket) = desk.next() {
-                    let (wanted, model) = (&ticket.wanted, ticket.wanted.model);
-                    let made =
-                        negative::expose(stage, &mut *backends[model], &mut brushes[model], wanted);
-                    desk.expose(ticket, made);
+            let (queue, scene) = (&queue, &scene);
+            let encoder = encoder::start(scope, queue, scene)
+                .map_err(|error| failed(format!("the system cannot start a thread: {error}")))?;
+            let renderer = scope.spawn(move || {
+                let _close = CloseOnDrop(queue);
+                let mut caches: Vec<ModelCache> =
+                    backends.iter().map(|_| ModelCache::default()).collect();
+                while let Some(job) = queue.next() {
+                    let (request, model) = (&job.request, job.request.model);
+                    let backend = &mut *backends[model];
+                    let rendered = render::render(scene, backend, &mut caches[model], request);
+                    queue.finish_rendering(job, rendered);
                 }
             });
-            let answer = |request: &http::Request| routes.answer(request);
-            let is_over = || is_over() || renders.is_finished();
-            // Wishes that wait are told that it is over, or their connections would not end.
-            let ends = || {
-                let ends = is_over();
-                if ends {
-                    desk.close();
+            let respond = |request: &http::Request| routes.respond(request);
+            // Closing the queue answers the waiting requests; their connections would stay open otherwise.
+            let stops = || {
+                let stops = is_over() || renderer.is_finished();
+                if stops {
+                    queue.close();
                 }
-                ends
+                stops
             };
-            let served = http::serve(&self.door.listener, &answer, &ends);
-            desk.close();
-            let rendered = renders.join().and(develops.join());
-            served
-                .map_err(|error| failed(format!("the page cannot be served any more: {error}")))?;
-            rendered.map_err(|_| failed("what makes the pictures has failed; this is a bug".into()))
+            let served = http::serve(&self.listener.socket, &respond, &stops);
+            queue.close();
+            let rendered = renderer.join().and(encoder.join());
+            served.map_err(|error| failed(format!("the page can no longer be served: {error}")))?;
+            rendered.map_err(|_| failed("rendering for the page failed; this is a bug".into()))
         })
     }
 }

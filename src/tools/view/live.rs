@@ -1,6 +1,6 @@
-//! `train --view`: the page of a run in training. It is rendered between two steps, by the thread that trains and with
-//! its model, so that training needs no second copy of it, and waits for nothing else; while nobody asks, a step costs
-//! a look at an empty desk.
+//! `train --view`: the page of a run in training. The training thread renders its own model between two steps, so no
+//! second copy is needed, and training waits for nothing else. Without requests, a step costs one look at an empty
+//! queue.
 
 use std::cell::Cell;
 use std::fmt;
@@ -9,15 +9,15 @@ use std::time::Duration;
 
 use densify_policies::policy::SignalSet;
 
-use super::asked::MOST_PIXELS;
-use super::board::{self, Board, Next};
-use super::desk::{Closing, Desk};
 use super::http;
-use super::negative;
-use super::paint::Known;
+use super::picture_request::MAX_PIXELS;
+use super::render;
+use super::render_queue::{CloseOnDrop, RenderQueue};
 use super::routes::Routes;
-use super::stage::Stage;
-use super::{Server, darkroom, describe};
+use super::row_colours::RowData;
+use super::run_status::{self, Action, RunStatus};
+use super::scene::Scene;
+use super::{Server, description, encoder};
 use densify_core::memory::{Ledger, Section};
 use densify_render::{Backend, Device};
 use densify_run::failure::{Failure, OTHER};
@@ -27,32 +27,31 @@ use densify_train::metrics::scratch_bytes;
 use densify_train::output::StepRecord;
 use densify_train::trainer::{EditEvent, RowHistory};
 
-/// Most pictures that are waited for.
-const MOST_WISHES: usize = 8;
-/// Pictures in the making at a time: what they take is promised.
-const AT_ONCE: usize = 1;
-/// What a connection takes: what its thread touches of its stack and keeps of its buffers, and its request
-/// `[bytes]`.
-const SEAT: u64 = 80 << 10;
-/// What a view takes: its name, path and camera thrice, and what is said of it `[bytes]`.
-const VIEW: u64 = 4 << 10;
-/// Bytes of the stack of the thread that waits for the end.
+/// Most waiting requests.
+const MAX_WAITING: usize = 8;
+/// Pictures in progress at a time; their memory is part of the plan.
+const MAX_ACTIVE: usize = 1;
+/// Memory of a connection: the used part of its thread's stack, its buffers and its request `[bytes]`.
+const CONNECTION_BYTES: u64 = 80 << 10;
+/// Memory of a view: name, path and camera three times each, and its description `[bytes]`.
+const VIEW_BYTES: u64 = 4 << 10;
+/// Stack of the HTTP server's thread `[bytes]`.
 const STACK: usize = 256 << 10;
-/// How often a paused run looks for orders.
-const PULSE: Duration = Duration::from_millis(20);
-/// How a run ends that the page has stopped: as by a signal.
+/// Interval at which a paused run checks for commands.
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
+/// The interrupt of a run that the page stops; the exit code is that of a signal.
 const STOPPED: Interrupt = Interrupt { name: "the page", exit_code: 130 };
 
-/// What is said of the points that are drawn `[bytes]`.
-const POINTS: u64 = (POINTS_TO_LOOK_AT * describe::POINT) as u64;
-/// Numbers per row while it is painted: what it is painted by, for its scale once more, and its colour; and on the host
-/// of a GPU the lengths of its axes, and colours of its own.
-const PAINT: u64 = 5;
-const PAINT_ON_GPU: usize = 12;
+/// Memory of the points in the description `[bytes]`.
+const POINTS_BYTES: u64 = (MAX_POINTS * description::MAX_POINT_BYTES) as u64;
+/// Numbers per Gaussian while it is coloured: its value, a copy to find the ends of the scale, and its colour.
+const COLOURING_NUMBERS: u64 = 5;
+/// Further numbers per Gaussian on the host of a GPU: the lengths of its axes, and colours for the upload.
+const COLOURING_NUMBERS_ON_GPU: usize = 12;
 
-/// What the page takes throughout: connections, answers on their way, what it says of the run and remembers of so many
-/// rows, and the making of a picture, which may be at any time: the rendering, the photograph as it is, flattened,
-/// half-way to the picture's size and at it, their difference with what measuring it takes, and the picture `[bytes]`.
+/// Memory of the page during the whole run `[bytes]`: connections, responses, run status, history of the Gaussians, and
+/// the encoder, which may be active at any time. A picture needs the rendering, the photograph (as decoded, flattened,
+/// half resized and resized), their difference with the buffers of the metric, and the encoded picture.
 fn lasting_bytes(
     largest_image: (u32, u32),
     photograph: u64,
@@ -61,31 +60,32 @@ fn lasting_bytes(
     threads: usize,
 ) -> u64 {
     let pixels = pixels(largest_image);
-    // JPEG at the best quality that is used takes under 3 bytes of a pixel, noise included.
-    let frame = pixels * 3;
-    let (seats, wishes) = (http::SEATS as u64, MOST_WISHES as u64);
+    // JPEG at the highest quality used here takes under 3 bytes per pixel, even for noise.
+    let picture = pixels * 3;
     let float = size_of::<f32>() as u64;
     let pixel = 5 * float + size_of::<f64>() as u64 + 4 * 3;
     let whole = u64::from(largest_image.0) * u64::from(largest_image.1);
-    // While it is made smaller its colours and alpha are floats.
-    let smaller = whole * (3 + 4 * float);
-    let making = pixels * pixel + smaller + photograph + scratch_bytes(largest_image.0, threads);
-    let said = board::BYTES + POINTS + views as u64 * VIEW;
-    let darkroom = darkroom::STACK as u64 + AT_ONCE as u64 * making;
-    seats * SEAT + wishes * frame + said + rows * RowHistory::BYTES + darkroom
+    // Resizing converts colours and alpha to floats.
+    let resizing = whole * (3 + 4 * float);
+    let encoding = pixels * pixel + resizing + photograph + scratch_bytes(largest_image.0, threads);
+    let connections = http::MAX_CONNECTIONS as u64 * CONNECTION_BYTES;
+    let responses = MAX_WAITING as u64 * picture;
+    let status = run_status::BYTES + POINTS_BYTES + views as u64 * VIEW_BYTES;
+    let encoder = encoder::STACK as u64 + MAX_ACTIVE as u64 * encoding;
+    connections + responses + status + rows * RowHistory::BYTES + encoder
 }
 
-/// What painting so many rows takes, between two steps `[bytes]`.
+/// Memory for colouring this many Gaussians between two steps `[bytes]`.
 fn passing_bytes(rows: u64, device: &Device) -> u64 {
-    let numbers = PAINT + device.columns_on_host(PAINT_ON_GPU) as u64;
+    let numbers = COLOURING_NUMBERS + device.columns_on_host(COLOURING_NUMBERS_ON_GPU) as u64;
     rows * numbers * size_of::<f32>() as u64
 }
 
-/// Most of the dataset's points that the page draws: more hide what they are on.
-pub(crate) const POINTS_TO_LOOK_AT: usize = 4000;
+/// Most of the dataset's points that the page draws; more would hide the scene.
+pub(crate) const MAX_POINTS: usize = 4000;
 
-/// The page as a run that is to train beside it knows it.
-pub const COMPANION: Companion = Companion { reserve, points: POINTS_TO_LOOK_AT };
+/// The page's memory, for the ledger of a run that trains beside it.
+pub const COMPANION: Companion = Companion { reserve, points: MAX_POINTS };
 
 fn reserve(size: &CompanionSize<'_>, ledger: &mut Ledger) {
     let CompanionSize { budget, device, largest_image, photograph, views, threads } = *size;
@@ -95,147 +95,148 @@ fn reserve(size: &CompanionSize<'_>, ledger: &mut Ledger) {
 }
 
 fn pixels((width, height): (u32, u32)) -> u64 {
-    (u64::from(width) * u64::from(height)).min(MOST_PIXELS)
+    (u64::from(width) * u64::from(height)).min(MAX_PIXELS)
 }
 
 impl Server {
-    /// Trains a run, and serves its page until it ends.
+    /// Trains a run and serves its page until training ends.
     ///
     /// # Errors
-    /// Those of training; a page that fails does not end it.
+    /// Errors of training; a failing page does not stop it.
     pub fn follow<T>(
         &self,
         mut run: Run,
         observer: &dyn Observer,
         train: impl FnOnce(Run, &dyn Observer) -> Result<T, Failure>,
     ) -> Result<T, Failure> {
-        let mut stage = Stage::of_run(&mut run);
+        let mut scene = Scene::of_run(&mut run);
         let (rows, signals) = (run.trainer().rows(), run.trainer().signals());
-        let (desk, board) = (Desk::new(Some(MOST_WISHES), AT_ONCE), Board::default());
+        let queue = RenderQueue::new(Some(MAX_WAITING), MAX_ACTIVE);
+        let run_status = RunStatus::default();
         let routes = Routes {
-            door: &self.door,
-            desk: &desk,
-            extent: stage.extent(),
-            description: describe::describe(&mut stage),
-            board: Some(&board),
+            listener: &self.listener,
+            queue: &queue,
+            limits: scene.limits(),
+            description: description::describe(&mut scene),
+            run_status: Some(&run_status),
         };
         thread::scope(|scope| {
-            let _closing = Closing(&desk);
-            let (desk, routes) = (&desk, &routes);
+            let _close = CloseOnDrop(&queue);
+            let (queue, routes) = (&queue, &routes);
             let no_thread = |error| {
                 Failure::new(
                     OTHER,
-                    format!("--view: the system gives no thread for the page: {error}"),
+                    format!("--view: the system cannot start a thread for the page: {error}"),
                 )
             };
-            let develops = darkroom::open(scope, desk, &stage).map_err(no_thread)?;
-            let serves = thread::Builder::new().stack_size(STACK).spawn_scoped(scope, move || {
-                let _closing = Closing(desk);
-                let answer = |request: &http::Request| routes.answer(request);
-                let served = http::serve(&routes.door.listener, &answer, &|| desk.is_over());
+            let encoder = encoder::start(scope, queue, &scene).map_err(no_thread)?;
+            let server = thread::Builder::new().stack_size(STACK).spawn_scoped(scope, move || {
+                let _close = CloseOnDrop(queue);
+                let respond = |request: &http::Request| routes.respond(request);
+                let served = http::serve(&routes.listener.socket, &respond, &|| queue.is_closed());
                 if let Err(error) = served {
                     tracing::error!(
-                        "the page cannot be served any more, training goes on: {error}"
+                        "the page can no longer be served, training continues: {error}"
                     );
                 }
             });
-            serves.map_err(no_thread)?;
-            let (board, stage, step) = (&board, &stage, Cell::new(0));
-            let live = Live { observer, desk, board, stage, rows, signals, step };
+            server.map_err(no_thread)?;
+            let (run_status, scene, step) = (&run_status, &scene, Cell::new(0));
+            let live = LiveObserver { observer, queue, run_status, scene, rows, signals, step };
             let trained = train(run, &live);
-            desk.close();
-            // If it has failed it has said so, and training needs none of it.
-            let _ = develops.join();
+            queue.close();
+            // A failed encoder has logged its error, and does not concern training.
+            let _ = encoder.join();
             trained
         })
     }
 }
 
-/// Follows a run, and shows it.
-struct Live<'a> {
+/// The observer of a run that shows it on the page.
+struct LiveObserver<'a> {
     observer: &'a dyn Observer,
-    desk: &'a Desk,
-    board: &'a Board,
-    stage: &'a Stage,
-    /// At the beginning.
+    queue: &'a RenderQueue,
+    run_status: &'a RunStatus,
+    scene: &'a Scene,
+    /// Number of Gaussians at the beginning.
     rows: usize,
-    /// Those that training accumulates.
+    /// Signals that training accumulates.
     signals: SignalSet,
-    /// The last that was taken.
+    /// The last completed step.
     step: Cell<u32>,
 }
 
-impl Live<'_> {
-    /// Renders a picture that is waited for, or waits so long for one to be wanted.
-    fn draw(&self, model: &mut dyn Backend, rows: Option<&RowHistory>, patience: Duration) {
-        if let Some(ticket) = self.desk.next_within(patience) {
+impl LiveObserver<'_> {
+    /// Renders the next requested picture, waiting for a request at most this long.
+    fn render_next(&self, model: &mut dyn Backend, rows: Option<&RowHistory>, timeout: Duration) {
+        if let Some(job) = self.queue.next_within(timeout) {
             let history = rows.map(|rows| (rows, self.step.get()));
-            let known = Known { signals: self.signals, history, measured: None };
-            let made = negative::expose_live(self.stage, model, known, &ticket.wanted);
-            self.desk.expose(ticket, made);
+            let row_data = RowData { signals: self.signals, history, measurements: None };
+            let rendered = render::render_live(self.scene, model, row_data, &job.request);
+            self.queue.finish_rendering(job, rendered);
         }
     }
 }
 
-impl Observer for Live<'_> {
+impl Observer for LiveObserver<'_> {
     fn say(&self, line: fmt::Arguments<'_>) {
         self.observer.say(line);
     }
 
     fn begin(&self, done: u32, last: u32, budget: usize) {
         self.step.set(done);
-        self.board.begin(done, last, budget, self.rows);
+        self.run_status.begin(done, last, budget, self.rows);
         self.observer.begin(done, last, budget);
     }
 
     fn step(&self, step: u32, loss: f32, rows: usize) {
         self.step.set(step);
-        self.board.step(step, rows);
+        self.run_status.step(step, rows);
         self.observer.step(step, loss, rows);
     }
 
     fn recorded(&self, record: &StepRecord) {
-        self.board.record(record);
+        self.run_status.record(record);
         self.observer.recorded(record);
     }
 
     fn edited(&self, event: &EditEvent) {
-        self.board.edit(event);
+        self.run_status.record_edit(event);
         self.observer.edited(event);
     }
 
     fn tested(&self, step: u32, mean: &Mean) {
-        self.board.tested(step, mean);
+        self.run_status.record_test(step, mean);
         self.observer.tested(step, mean);
     }
 
     fn kept(&self, step: u32, trouble: Option<&str>) {
-        self.board.kept(step, trouble);
+        self.run_status.record_checkpoint(step, trouble);
         self.observer.kept(step, trouble);
     }
 
     fn end(&self) {
-        self.board.end();
+        self.run_status.end();
         self.observer.end();
     }
 
     fn between(&self, model: &mut dyn Backend, rows: Option<&RowHistory>) -> Between {
-        self.draw(model, rows, Duration::ZERO);
+        self.render_next(model, rows, Duration::ZERO);
         loop {
-            match self.board.next() {
-                Next::Checkpoint => return Between::Checkpoint,
-                Next::Step | Next::Stop => return Between::Step,
-                // Without a page nobody can let it go on.
-                Next::Wait if self.observer.interrupt().is_some() || self.desk.is_over() => {
+            match self.run_status.next_action() {
+                Action::Checkpoint => return Between::Checkpoint,
+                Action::Step | Action::Stop => return Between::Step,
+                // A closed page cannot send the command to continue.
+                Action::Wait if self.observer.interrupt().is_some() || self.queue.is_closed() => {
                     return Between::Step;
                 }
-                Next::Wait => self.draw(model, rows, PULSE),
+                Action::Wait => self.render_next(model, rows, POLL_INTERVAL),
             }
         }
     }
 
     fn interrupt(&self) -> Option<Interrupt> {
-        let stopped = || self.board.stops().then_some(STOPPED);
+        let stopped = || self.run_status.is_stopped().then_some(STOPPED);
         self.observer.interrupt().or_else(stopped)
     }
 }
@@ -243,24 +244,24 @@ impl Observer for Live<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::board::Order;
-    use crate::open::stage_of_one_view;
+    use crate::open::scene_of_one_view;
+    use crate::run_status::Command;
     use densify_core::gaussians::Gaussians;
     use densify_render::{Device, Setup};
     use densify_run::Silent;
 
     #[test]
-    fn a_run_that_is_paused_goes_on_when_its_page_is_gone() {
-        let (_folder, stage) = stage_of_one_view();
-        let (desk, board) = (Desk::new(Some(1), 1), Board::default());
-        board.begin(0, 10, 1, 1);
-        board.order(Order::Pause);
+    fn a_paused_run_continues_when_its_page_closes() {
+        let (_folder, scene) = scene_of_one_view();
+        let (queue, run_status) = (RenderQueue::new(Some(1), 1), RunStatus::default());
+        run_status.begin(0, 10, 1, 1);
+        run_status.command(Command::Pause);
         let (signals, step) = (SignalSet::default(), Cell::new(0));
-        let live = Live {
+        let live = LiveObserver {
             observer: &Silent,
-            desk: &desk,
-            board: &board,
-            stage: &stage,
+            queue: &queue,
+            run_status: &run_status,
+            scene: &scene,
             rows: 1,
             signals,
             step,
@@ -269,13 +270,13 @@ mod tests {
         let mut backend = Device::default().backend(&model, &Setup::new(1)).expect("a backend");
         thread::scope(|scope| {
             let waits = scope.spawn(|| {
-                thread::sleep(5 * PULSE);
-                let is_paused = matches!(board.next(), Next::Wait);
-                desk.close();
+                thread::sleep(5 * POLL_INTERVAL);
+                let is_paused = matches!(run_status.next_action(), Action::Wait);
+                queue.close();
                 is_paused
             });
             assert_eq!(live.between(&mut *backend, None), Between::Step);
-            assert!(desk.is_over() && waits.join().expect("it ends"), "it has not waited");
+            assert!(queue.is_closed() && waits.join().expect("it ends"), "the run was not paused");
         });
     }
 }

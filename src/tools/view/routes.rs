@@ -1,67 +1,67 @@
-//! Which request gets what. No path names a file: what is served is built in, or made on request.
+//! Routes requests to responses. No path names a file: everything served is built in or rendered on request.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use serde::Deserialize;
 
-use super::asked::{self, Wanted};
-use super::board::{Board, Order};
-use super::darkroom::Frame;
-use super::desk::{Desk, Unmade};
-use super::door::Door;
-use super::http::{Answer, Method, Request};
-use super::stage::Extent;
+use super::encoder::EncodedPicture;
+use super::http::{Method, Request, Response};
+use super::listener::Listener;
+use super::picture_request::{self, PictureRequest};
+use super::render_queue::{RenderError, RenderQueue};
+use super::run_status::{Command, RunStatus};
+use super::scene::RequestLimits;
 
 const PAGE: &str = include_str!("page/index.html");
 const STYLE: &str = concat!(include_str!("../html/palette.css"), include_str!("page/view.css"));
 const SCRIPT: &str = include_str!("page/view.js");
 const LIVE_SCRIPT: &str = include_str!("page/live.js");
 
-/// What answers need.
+/// Everything that responses are made from.
 pub(super) struct Routes<'a> {
-    pub(super) door: &'a Door,
-    pub(super) desk: &'a Desk,
-    pub(super) extent: Extent,
-    /// The [description](super::describe) of what is shown, as JSON.
+    pub(super) listener: &'a Listener,
+    pub(super) queue: &'a RenderQueue,
+    pub(super) limits: RequestLimits,
+    /// The scene's [description](super::description), as JSON.
     pub(super) description: Arc<[u8]>,
-    /// What is said of a run in training, and asked of it.
-    pub(super) board: Option<&'a Board>,
+    /// The status of the run, if one is in training.
+    pub(super) run_status: Option<&'a RunStatus>,
 }
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Asked {
-    order: Order,
+struct CommandBody {
+    order: Command,
 }
 
 impl Routes<'_> {
-    /// The answer to a request.
-    pub(super) fn answer(&self, request: &Request) -> Answer {
-        let path = match self.door.admit(request) {
+    /// The response to a request.
+    pub(super) fn respond(&self, request: &Request) -> Response {
+        let path = match self.listener.authorise(request) {
             Ok(path) => path,
-            Err(refusal) => return refusal,
+            Err(response) => return response,
         };
-        let text = |kind, text: &'static str| Answer::of(kind, text.as_bytes());
-        let json = |text: String| Answer::of("application/json", text.into_bytes());
-        let known = ["", "view.css", "view.js", "live.js", "scene", "frame"];
-        let known_of_training = ["progress", "order"];
+        let text = |kind, text: &'static str| Response::ok(kind, text.as_bytes());
+        let json = |text: String| Response::ok("application/json", text.into_bytes());
+        let paths = ["", "view.css", "view.js", "live.js", "scene", "frame"];
+        let training_paths = ["progress", "order"];
         match (request.method, path) {
-            (Method::Post, "order") if let Some(board) = self.board => {
+            (Method::Post, "order") if let Some(run_status) = self.run_status => {
                 match serde_json::from_slice(&request.body) {
-                    Ok(Asked { order }) => {
-                        board.order(order);
+                    Ok(CommandBody { order }) => {
+                        run_status.command(order);
                         json("{}".to_owned())
                     }
-                    Err(error) => Answer::refusal(400, format_args!("this is no order: {error}")),
+                    Err(error) => Response::error(400, format_args!("this is no command: {error}")),
                 }
             }
-            (Method::Get | Method::Head, "progress") if let Some(board) = self.board => {
-                json(board.json())
+            (Method::Get | Method::Head, "progress") if let Some(run_status) = self.run_status => {
+                json(run_status.json())
             }
-            (Method::Post, "frame") => match asked::read(&request.body, &self.extent) {
-                Ok(wanted) => self.frame(wanted),
-                Err(refusal) => refusal,
+            (Method::Post, "frame") => match picture_request::parse(&request.body, &self.limits) {
+                Ok(request) => self.render(request),
+                Err(response) => response,
             },
             (Method::Get | Method::Head, "") => text("text/html; charset=utf-8", PAGE),
             (Method::Get | Method::Head, "view.css") => text("text/css; charset=utf-8", STYLE),
@@ -72,55 +72,64 @@ impl Routes<'_> {
                 text("text/javascript; charset=utf-8", LIVE_SCRIPT)
             }
             (Method::Get | Method::Head, "scene") => {
-                Answer::of("application/json", self.description.clone())
+                Response::ok("application/json", self.description.clone())
             }
             (_, path)
-                if known.contains(&path)
-                    || self.board.is_some() && known_of_training.contains(&path) =>
+                if paths.contains(&path)
+                    || self.run_status.is_some() && training_paths.contains(&path) =>
             {
-                Answer::refusal(405, "this is asked for in another way")
+                Response::error(405, "this path needs another HTTP method")
             }
-            _ => Answer::refusal(404, "there is nothing here"),
+            _ => Response::error(404, "there is nothing here"),
         }
     }
 
-    fn frame(&self, wanted: Wanted) -> Answer {
+    fn render(&self, request: PictureRequest) -> Response {
         let begun = Instant::now();
-        match self.desk.ask(wanted) {
-            Ok(frame) => sent(frame, begun.elapsed()),
-            Err(Unmade::Superseded) => {
-                Answer::refusal(409, "a newer picture was asked for meanwhile")
+        match self.queue.submit(request) {
+            Ok(picture) => picture_response(picture, begun.elapsed()),
+            Err(RenderError::Superseded) => {
+                Response::error(409, "a newer picture was requested meanwhile")
             }
-            Err(Unmade::Crowded) => Answer::refusal(503, "too many pages look at once; close some"),
-            Err(Unmade::Failed(why)) => Answer::refusal(500, why),
-            Err(Unmade::Over) => Answer::refusal(
+            Err(RenderError::QueueFull) => {
+                Response::error(503, "too many pages are open; close some")
+            }
+            Err(RenderError::Failed(message)) => Response::error(500, message),
+            Err(RenderError::Closed) => Response::error(
                 503,
-                "no more pictures are made; start densify again when it has ended",
+                "no more pictures are rendered; start densify again when it has ended",
             ),
         }
     }
 }
 
-/// A picture, with what is known of it in the head: how long it took here too, waiting included, so that the page can
-/// tell that from the way to it.
-fn sent(frame: Frame, held: Duration) -> Answer {
-    let Frame { jpeg, size: (width, height), range, mean, distance, measured, milliseconds } =
-        frame;
-    let mut answer = Answer::of("image/jpeg", jpeg)
-        .with("X-Size", format!("{width}x{height}"))
-        .with("X-Milliseconds", format!("{milliseconds:.1}"))
-        .with("X-Held", format!("{:.1}", 1e3 * held.as_secs_f64()));
+/// The response with a picture, its data in the headers. `held` is the time from request to response here, waiting
+/// included, so that the page can tell it from the latency of the network.
+fn picture_response(picture: EncodedPicture, held: Duration) -> Response {
+    let EncodedPicture {
+        jpeg,
+        size: (width, height),
+        range,
+        mean,
+        distance,
+        measured_views,
+        milliseconds,
+    } = picture;
+    let mut response = Response::ok("image/jpeg", jpeg)
+        .with_header("X-Size", format!("{width}x{height}"))
+        .with_header("X-Milliseconds", format!("{milliseconds:.1}"))
+        .with_header("X-Held", format!("{:.1}", 1e3 * held.as_secs_f64()));
     if let Some(range) = range {
-        answer = answer.with("X-Range", format!("{} {}", range.start, range.end));
+        response = response.with_header("X-Range", format!("{} {}", range.start, range.end));
     }
-    if let Some([seen, all]) = measured {
-        answer = answer.with("X-Measured", format!("{seen} {all}"));
+    if let Some([seen, all]) = measured_views {
+        response = response.with_header("X-Measured", format!("{seen} {all}"));
     }
     let numbers = [("X-Mean", mean), ("X-Distance", distance)];
-    for (name, value) in numbers.into_iter().filter_map(|(name, it)| Some((name, it?))) {
-        answer = answer.with(name, value);
+    for (name, value) in numbers.into_iter().filter_map(|(name, value)| Some((name, value?))) {
+        response = response.with_header(name, value);
     }
-    answer
+    response
 }
 
 #[cfg(test)]
@@ -128,41 +137,41 @@ mod tests {
     use std::net::Ipv4Addr;
 
     use super::*;
-    use crate::door::Place;
-    use crate::stage::{Shown, Stage};
+    use crate::listener::ListenAddress;
+    use crate::scene::{ModelInfo, Scene};
     use densify_data::dataset::PointCloud;
     use densify_data::dataset::normalise::Normalisation;
     use densify_run::finished::Machine;
 
     #[test]
-    fn only_what_is_built_in_is_served() {
-        let door = Door::open(Place {
+    fn only_built_in_paths_are_served() {
+        let listener = Listener::open(ListenAddress {
             host: Ipv4Addr::LOCALHOST.into(),
             port: Some(0),
-            has_secret: false,
+            needs_token: false,
         })
         .unwrap();
         let none = || [Vec::new(), Vec::new()];
         let points = PointCloud::default();
-        let (machine, place) = (Machine::default(), Normalisation::IDENTITY);
-        let mut stage = Stage::new(machine, "a".into(), place, [0.0; 3], none(), points);
-        stage.models.push(Shown {
+        let (machine, normalisation) = (Machine::default(), Normalisation::IDENTITY);
+        let mut scene = Scene::new(machine, "a".into(), normalisation, [0.0; 3], none(), points);
+        scene.models.push(ModelInfo {
             name: "a".into(),
             rows: 1,
             sh_degree: 0,
             near: 0.1,
             checkpoint: None,
         });
-        let desk = Desk::new(None, 1);
-        desk.close();
+        let queue = RenderQueue::new(None, 1);
+        queue.close();
         let routes = Routes {
-            door: &door,
-            desk: &desk,
-            extent: stage.extent(),
+            listener: &listener,
+            queue: &queue,
+            limits: scene.limits(),
             description: Arc::from(*b"{}"),
-            board: None,
+            run_status: None,
         };
-        let status = |request: &Request| routes.answer(request).status();
+        let status = |request: &Request| routes.respond(request).status();
         let get = |path: &str| status(&Request::get(path, "localhost", None));
         for path in ["/", "/view.css", "/view.js", "/live.js", "/scene"] {
             assert_eq!(get(path), 200, "{path}");
@@ -193,20 +202,20 @@ mod tests {
         };
         assert_eq!(post("/scene", "{}"), 405);
         assert_eq!(post("/frame", "{}"), 400);
-        let wish = r#"{"page": "a", "kind": "render", "width": 9, "height": 9, "camera":
+        let picture = r#"{"page": "a", "kind": "render", "width": 9, "height": 9, "camera":
             {"camera_to_world": [1,0,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,1], "fov": 50}}"#;
-        assert_eq!(post("/frame", wish), 503);
-        // A run in training says more, and takes orders: those that there are.
-        let board = Board::default();
+        assert_eq!(post("/frame", picture), 503);
+        // A run in training also has progress, and takes commands.
+        let run_status = RunStatus::default();
         let live = Routes {
-            door: &door,
-            desk: &desk,
-            extent: stage.extent(),
+            listener: &listener,
+            queue: &queue,
+            limits: scene.limits(),
             description: Arc::from(*b"{}"),
-            board: Some(&board),
+            run_status: Some(&run_status),
         };
         let send = |body: &str| {
-            live.answer(&Request {
+            live.respond(&Request {
                 method: Method::Post,
                 content_type: Some("application/json".into()),
                 body: body.into(),
@@ -221,17 +230,17 @@ mod tests {
         ] {
             assert_eq!(send(body).status(), status, "{body}");
         }
-        assert!(!board.stops());
+        assert!(!run_status.is_stopped());
         assert_eq!(send(r#"{"order": "stop"}"#).status(), 200);
-        assert!(board.stops(), "the order is not taken");
-        let progress = live.answer(&Request::get("/progress", "localhost", None));
-        let said: serde_json::Value = serde_json::from_slice(progress.body()).unwrap();
-        assert_eq!(said["state"], "preparing");
-        assert_eq!(live.answer(&Request::get("/order", "localhost", None)).status(), 405);
+        assert!(run_status.is_stopped(), "the command is lost");
+        let progress = live.respond(&Request::get("/progress", "localhost", None));
+        let progress: serde_json::Value = serde_json::from_slice(progress.body()).unwrap();
+        assert_eq!(progress["state"], "preparing");
+        assert_eq!(live.respond(&Request::get("/order", "localhost", None)).status(), 405);
     }
 
     #[test]
-    fn the_page_loads_nothing_of_others() {
+    fn the_page_loads_nothing_from_elsewhere() {
         for text in [PAGE, STYLE, SCRIPT, LIVE_SCRIPT] {
             for word in ["http://", "https://", "//cdn", "@import", "eval("] {
                 let strange = text.replace("http://www.w3.org/", "");

@@ -35,9 +35,8 @@ pub fn all_scores(run: &Path) -> Result<BTreeMap<u32, Mean>, FileError> {
     let path = run.join("results.json");
     let score = |(name, entry): (String, Value)| {
         let iteration = name.strip_prefix("ours_").and_then(|number| number.parse().ok());
-        let iteration = iteration.ok_or_else(|| {
-            FileError::malformed(&path, format!("{name:?} is not an iteration"))
-        })?;
+        let iteration = iteration
+            .ok_or_else(|| FileError::malformed(&path, format!("{name:?} is not an iteration")))?;
         let mean = serde_json::from_value(entry).map_err(|e| FileError::malformed(&path, e))?;
         Ok((iteration, mean))
     };

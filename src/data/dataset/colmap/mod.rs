@@ -12,11 +12,11 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DVec3};
 
 use super::folders::Folders;
+use super::formats::DatasetFormat;
 use super::lens::Lens;
 use super::paths::{DataPath, Root, relative};
 use super::pose::{checked_pose, checked_quaternion};
 use super::tracks::{TrackSampler, Tracks};
-use super::formats::DatasetFormat;
 use super::{DatasetError, Frame, LoadOptions, PointCloud, Scene};
 
 pub(super) const FORMAT: DatasetFormat = DatasetFormat {

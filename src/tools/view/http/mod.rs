@@ -1,18 +1,18 @@
-//! A small HTTP/1.1 server for one page and the few browsers that show it.
+//! A small HTTP/1.1 server for one page and a few browsers.
 //!
-//! `httparse` reads heads; the rest is here, because a server for strangers' requests must bound everything:
-//! heads, bodies, connections, and the time that each may take. A connection has a thread with a small stack,
-//! and there are few of them: where all seats are taken, whoever has waited longest without asking for
-//! anything makes room. Knows nothing of what is served.
+//! `httparse` parses request heads. The rest is written here because requests from strangers must be bounded in every
+//! respect: head, body, number of connections, and the time each may take. Every connection has a thread with a small
+//! stack. When all permits are taken, the connection that has been idle longest is closed. This module does not know
+//! what is served.
 
-mod answer;
-mod connections;
-mod conversation;
-mod head;
+mod connection;
+mod request;
+mod response;
+mod server;
 
-pub(super) use answer::Answer;
-pub(super) use connections::{SEATS, serve};
-pub(super) use head::{Method, Request};
+pub(super) use request::{Method, Request};
+pub(super) use response::Response;
+pub(super) use server::{MAX_CONNECTIONS, serve};
 
 #[cfg(test)]
 mod tests;

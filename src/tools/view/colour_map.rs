@@ -1,11 +1,10 @@
-//! The scale of colours for numbers: from dark to light, so that it can be read without telling hues apart.
+//! The colour map for numbers. It runs from dark to light, so that it is readable without colour vision.
 
-/// Equally spaced, sRGB.
+/// Equally spaced stops, sRGB.
 pub(super) const STOPS: [[u8; 3]; 6] =
     [[22, 18, 56], [54, 52, 140], [34, 116, 170], [40, 168, 140], [150, 210, 90], [255, 244, 170]];
 
-/// The colour of a number, of which 0 and 1 are the ends; what is beyond has that of the end, and what is no
-/// number that of 0.
+/// The colour of a number in `[0, 1]`. Numbers outside are clamped; NaN counts as 0.
 pub(super) fn colour(value: f32) -> [f32; 3] {
     let place = value.clamp(0.0, 1.0).max(0.0) * (STOPS.len() - 1) as f32;
     let first = (place as usize).min(STOPS.len() - 2);

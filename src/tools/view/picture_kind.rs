@@ -1,54 +1,54 @@
-//! The kinds of pictures that there are.
+//! The kinds of pictures that the page shows.
 
 use serde::{Deserialize, Serialize};
 
-/// What a picture shows.
+/// The content of a picture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub(super) enum Kind {
+pub(super) enum PictureKind {
     /// The model, as `densify render` draws it.
     Render,
-    /// The photograph that was taken there.
+    /// The photograph of the view.
     Photograph,
-    /// The visible difference between the two, by FLIP.
+    /// The visible difference between render and photograph, by FLIP.
     Difference,
     /// The distance along the optical axis.
     Depth,
-    /// How opaque the model is.
+    /// The opacity of the model.
     Opacity,
-    /// How many rows are blended into each pixel.
+    /// Number of Gaussians blended into each pixel.
     Count,
-    /// Every row in a colour of its own.
+    /// Every Gaussian in a distinct colour.
     Rows,
-    /// Rows coloured by their opacity.
+    /// Gaussians coloured by opacity.
     RowOpacity,
-    /// Rows coloured by their longest axis.
+    /// Gaussians coloured by their longest axis.
     RowSize,
-    /// Rows coloured by how long they are for their width.
+    /// Gaussians coloured by elongation.
     RowShape,
-    /// Rows coloured by how strongly the photographs pull at their place.
+    /// Gaussians coloured by the mean gradient of their projected centre.
     RowGradient,
-    /// Rows coloured by their largest blend weight.
+    /// Gaussians coloured by their largest blend weight.
     RowWeight,
-    /// Rows coloured by the steps since they were made.
+    /// Gaussians coloured by the steps since their creation.
     RowAge,
-    /// Rows coloured by the steps since they were edited.
+    /// Gaussians coloured by the steps since their last edit.
     RowEdit,
 }
 
-/// How a kind is called and explained on the page.
+/// The name and explanation of a kind on the page.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub(super) struct Legend {
-    pub(super) kind: Kind,
+    pub(super) kind: PictureKind,
     pub(super) label: &'static str,
-    /// What is seen, in a sentence.
+    /// One sentence on what is seen.
     about: &'static str,
     needs_photograph: bool,
-    /// What the colours stand for, where they stand for numbers.
+    /// The unit of the numbers that the colours represent, if they do.
     unit: Option<&'static str>,
 }
 
-impl Kind {
+impl PictureKind {
     pub(super) const ALL: [Self; 14] = [
         Self::Render,
         Self::Photograph,
@@ -66,13 +66,13 @@ impl Kind {
         Self::RowEdit,
     ];
 
-    /// Whether it is there only where a photograph was taken.
+    /// True if the picture exists only at the camera of a photograph.
     pub(super) fn needs_photograph(self) -> bool {
         matches!(self, Self::Photograph | Self::Difference)
     }
 
-    /// Whether rows are in other colours than their own.
-    pub(super) fn paints(self) -> bool {
+    /// True if Gaussians are rendered in colours other than their own.
+    pub(super) fn colours_rows(self) -> bool {
         matches!(
             self,
             Self::Rows
@@ -88,12 +88,16 @@ impl Kind {
 
     pub(super) fn legend(self) -> Legend {
         let (label, about, unit) = match self {
-            Self::Render => {
-                ("Render", "The model, drawn as densify render and densify eval draw it.", None)
-            }
-            Self::Photograph => {
-                ("Photograph", "What the camera saw there, at the size that was trained on.", None)
-            }
+            Self::Render => (
+                "Render",
+                "The model, rendered exactly as by densify render and densify eval.",
+                None,
+            ),
+            Self::Photograph => (
+                "Photograph",
+                "The photograph from this camera, at the resolution used for training.",
+                None,
+            ),
             Self::Difference => (
                 "Difference (FLIP)",
                 "How visible the difference between render and photograph is.",
@@ -105,14 +109,14 @@ impl Kind {
                 Some("units"),
             ),
             Self::Opacity => {
-                ("Opacity", "How much of what lies behind the model it hides.", Some("opacity"))
+                ("Opacity", "How much of the background the model covers.", Some("opacity"))
             }
             Self::Count => (
                 "Gaussians per pixel",
-                "How many Gaussians are blended into a pixel: what a picture costs.",
+                "How many Gaussians are blended into a pixel, which determines the cost of a picture.",
                 Some("Gaussians"),
             ),
-            Self::Rows => ("Gaussians told apart", "Every Gaussian in a colour of its own.", None),
+            Self::Rows => ("Separate Gaussians", "Every Gaussian in a distinct colour.", None),
             Self::RowOpacity => {
                 ("Opacity of Gaussians", "Every Gaussian coloured by its opacity.", Some("opacity"))
             }
@@ -123,32 +127,32 @@ impl Kind {
             ),
             Self::RowShape => (
                 "Shape of Gaussians",
-                "Every Gaussian coloured by its longest axis over its middle one, on a logarithmic scale: \
-                 needles are bright.",
+                "Every Gaussian coloured by the ratio of its longest to its middle axis, on a logarithmic scale; \
+                needles are bright.",
                 Some("to 1"),
             ),
             Self::RowGradient => (
                 "Gradient of Gaussians",
-                "Every Gaussian coloured by how strongly the photographs pull at its place: the mean gradient of \
-                 its projected centre, on a logarithmic scale. Policies split or clone where it is large.",
+                "Every Gaussian coloured by the mean loss gradient of its projected centre, on a logarithmic \
+                scale. Policies split or clone Gaussians whose gradient is large.",
                 Some("per view"),
             ),
             Self::RowWeight => (
                 "Largest weight of Gaussians",
-                "Every Gaussian coloured by the largest weight that it has in any pixel of the training views: \
-                 what is dark hardly shows anywhere.",
+                "Every Gaussian coloured by its largest weight in any pixel of the training views; dark ones are \
+                hardly visible anywhere.",
                 Some("weight"),
             ),
             Self::RowAge => (
                 "Age of Gaussians",
-                "Every Gaussian coloured by the steps since it was made; if training was resumed meanwhile, at \
-                 least that many.",
+                "Every Gaussian coloured by the steps since its creation; a lower bound if training was resumed \
+                since.",
                 Some("steps"),
             ),
             Self::RowEdit => (
                 "Last edit of Gaussians",
-                "Every Gaussian coloured by the steps since the policy made or rewrote it, as far as is \
-                 known if training was resumed.",
+                "Every Gaussian coloured by the steps since the policy created or modified it, as far as known if \
+                training was resumed.",
                 Some("steps"),
             ),
         };

@@ -1,12 +1,12 @@
-//! Answers, with the lines that keep a browser from doing with them what is not meant.
+//! HTTP responses, with the headers that restrict what a browser may do with them.
 
 use std::fmt::Write as _;
 use std::io::{self, Write};
 use std::sync::Arc;
 
-/// Sent with every answer. Nothing is kept, nothing of others is loaded, and no other page may frame this one
-/// or use its pictures.
-const ALWAYS: &str = "Cache-Control: no-store\r\n\
+/// Sent with every response: nothing is cached or loaded from elsewhere, and no other page may embed this one or use
+/// its pictures.
+const COMMON_HEADERS: &str = "Cache-Control: no-store\r\n\
     Content-Security-Policy: default-src 'none'; script-src 'self'; style-src 'self'; \
     img-src 'self' blob: data:; connect-src 'self'; base-uri 'none'; form-action 'none'; \
     frame-ancestors 'none'\r\n\
@@ -14,32 +14,32 @@ const ALWAYS: &str = "Cache-Control: no-store\r\n\
     Referrer-Policy: no-referrer\r\n\
     X-Content-Type-Options: nosniff\r\n";
 
-/// What is sent back.
+/// A complete response.
 #[derive(Debug, Clone)]
-pub(crate) struct Answer {
+pub(crate) struct Response {
     status: u16,
     content_type: &'static str,
-    /// Lines of the head beyond those that every answer has.
-    lines: Vec<(&'static str, String)>,
-    /// Shared, so that what all ask for is there once.
+    /// Headers in addition to the common ones.
+    headers: Vec<(&'static str, String)>,
+    /// Shared, so that a body that every page requests exists once.
     body: Arc<[u8]>,
 }
 
-impl Answer {
-    /// What was asked for.
-    pub(crate) fn of(content_type: &'static str, body: impl Into<Arc<[u8]>>) -> Self {
-        Self { status: 200, content_type, lines: Vec::new(), body: body.into() }
+impl Response {
+    /// Status 200 with this body.
+    pub(crate) fn ok(content_type: &'static str, body: impl Into<Arc<[u8]>>) -> Self {
+        Self { status: 200, content_type, headers: Vec::new(), body: body.into() }
     }
 
-    /// A status with one sentence.
-    pub(crate) fn refusal(status: u16, why: impl std::fmt::Display) -> Self {
-        let body = format!("{why}\n").into_bytes();
-        Self { status, ..Self::of("text/plain; charset=utf-8", body) }
+    /// An error status with one sentence.
+    pub(crate) fn error(status: u16, message: impl std::fmt::Display) -> Self {
+        let body = format!("{message}\n").into_bytes();
+        Self { status, ..Self::ok("text/plain; charset=utf-8", body) }
     }
 
-    /// The same with another line in its head.
-    pub(crate) fn with(mut self, name: &'static str, value: impl ToString) -> Self {
-        self.lines.push((name, value.to_string()));
+    /// Adds a header.
+    pub(crate) fn with_header(mut self, name: &'static str, value: impl ToString) -> Self {
+        self.headers.push((name, value.to_string()));
         self
     }
 
@@ -53,23 +53,23 @@ impl Answer {
         &self.body
     }
 
-    /// Sends it; without its body to a request for the head alone.
+    /// Sends the response; `HEAD` requests get no body.
     pub(super) fn write(
         &self,
         mut out: impl Write,
         with_body: bool,
-        is_last: bool,
+        closes: bool,
     ) -> io::Result<()> {
         let mut head = String::new();
         let (status, reason) = (self.status, reason(self.status));
-        let after = if is_last { "close" } else { "keep-alive" };
+        let connection = if closes { "close" } else { "keep-alive" };
         let _ = write!(
             head,
-            "HTTP/1.1 {status} {reason}\r\nContent-Type: {}\r\nContent-Length: {}\r\nConnection: {after}\r\n{ALWAYS}",
+            "HTTP/1.1 {status} {reason}\r\nContent-Type: {}\r\nContent-Length: {}\r\nConnection: {connection}\r\n{COMMON_HEADERS}",
             self.content_type,
             self.body.len()
         );
-        for (name, value) in &self.lines {
+        for (name, value) in &self.headers {
             let _ = write!(head, "{name}: {value}\r\n");
         }
         head.push_str("\r\n");

@@ -1,41 +1,41 @@
-//! One connection: requests in, answers out, until it ends or takes too long.
+//! One connection: reads requests and writes responses until the client closes it or a time limit passes.
 
 use std::io::{self, Read};
 use std::net::{Shutdown, TcpStream};
 use std::time::{Duration, Instant};
 
-use super::connections::Seat;
-use super::head::{Head, parse};
-use super::{Answer, Method, Request};
+use super::request::{Head, parse};
+use super::server::Permit;
+use super::{Method, Request, Response};
 
-/// Longest time that a request may take to arrive, and an answer to be taken.
-const PATIENCE: Duration = Duration::from_secs(10);
-/// Longest wait for the next request.
+/// Time limit for a request to arrive completely, and for a response to be received.
+const TIMEOUT: Duration = Duration::from_secs(10);
+/// Time limit for the next request to begin.
 const IDLE: Duration = Duration::from_mins(2);
-/// Most bytes that are still read, and thrown away, of a request that was refused.
-const MOST_DRAINED: usize = 64 << 10;
+/// Most bytes of a refused request that are read and discarded.
+const MAX_DRAINED: usize = 64 << 10;
 
-/// Answers what comes.
-pub(super) fn converse(
+/// Answers the requests of a connection.
+pub(super) fn serve_connection(
     mut stream: &TcpStream,
-    seat: &Seat<'_>,
-    answer: &(dyn Fn(&Request) -> Answer + Sync),
+    permit: &Permit<'_>,
+    respond: &(dyn Fn(&Request) -> Response + Sync),
 ) -> io::Result<()> {
     stream.set_nodelay(true)?;
-    stream.set_write_timeout(Some(PATIENCE))?;
+    stream.set_write_timeout(Some(TIMEOUT))?;
     let mut bytes = Vec::new();
     loop {
-        seat.waits();
-        match next(stream, seat, &mut bytes)? {
+        permit.mark_idle();
+        match read_request(stream, permit, &mut bytes)? {
             Next::End => return Ok(()),
-            Next::Refused(refusal) => {
-                refusal.write(stream, true, true)?;
+            Next::Refused(response) => {
+                response.write(stream, true, true)?;
                 return drain(stream);
             }
             Next::Request(request) => {
                 let with_body = request.method != Method::Head;
-                answer(&request).write(&mut stream, with_body, request.is_last)?;
-                if request.is_last {
+                respond(&request).write(&mut stream, with_body, request.closes)?;
+                if request.closes {
                     return Ok(());
                 }
             }
@@ -45,20 +45,20 @@ pub(super) fn converse(
 
 enum Next {
     Request(Request),
-    Refused(Answer),
+    Refused(Response),
     End,
 }
 
-/// The next request; `bytes` has what has arrived of it, and then of the one after it.
-fn next(stream: &TcpStream, seat: &Seat<'_>, bytes: &mut Vec<u8>) -> io::Result<Next> {
+/// Reads the next request. `bytes` holds the bytes that have arrived but belong to no complete request yet.
+fn read_request(stream: &TcpStream, permit: &Permit<'_>, bytes: &mut Vec<u8>) -> io::Result<Next> {
     let mut deadline = None;
     loop {
         if !bytes.is_empty() {
             match parse(bytes) {
-                Err(refusal) => return Ok(Next::Refused(refusal)),
+                Err(response) => return Ok(Next::Refused(response)),
                 Ok(Some(head)) if bytes.len() >= head.length + head.body => {
                     let Head { mut request, length, body } = head;
-                    seat.works();
+                    permit.mark_busy();
                     request.body = bytes[length..length + body].to_vec();
                     bytes.drain(..length + body);
                     return Ok(Next::Request(request));
@@ -69,11 +69,11 @@ fn next(stream: &TcpStream, seat: &Seat<'_>, bytes: &mut Vec<u8>) -> io::Result<
         let wait = if bytes.is_empty() {
             IDLE
         } else {
-            let end = *deadline.get_or_insert_with(|| Instant::now() + PATIENCE);
+            let end = *deadline.get_or_insert_with(|| Instant::now() + TIMEOUT);
             end.saturating_duration_since(Instant::now())
         };
         if wait.is_zero() {
-            return Ok(Next::Refused(Answer::refusal(408, "the request took too long to arrive")));
+            return Ok(Next::Refused(Response::error(408, "the request took too long to arrive")));
         }
         stream.set_read_timeout(Some(wait))?;
         let mut piece = [0; 2048];
@@ -93,11 +93,11 @@ fn next(stream: &TcpStream, seat: &Seat<'_>, bytes: &mut Vec<u8>) -> io::Result<
     }
 }
 
-/// Reads on for a moment after a refusal: to close at once would take it from who is still sending.
+/// Keeps reading briefly after a refusal: closing at once would discard the response if the client is still sending.
 fn drain(mut stream: &TcpStream) -> io::Result<()> {
     stream.shutdown(Shutdown::Write)?;
     stream.set_read_timeout(Some(Duration::from_millis(200)))?;
-    let (mut piece, mut left) = ([0; 2048], MOST_DRAINED);
+    let (mut piece, mut left) = ([0; 2048], MAX_DRAINED);
     while left > 0 {
         let count = stream.read(&mut piece)?;
         if count == 0 {
