@@ -189,7 +189,7 @@ mod tests {
         let up = 2.0_f32.powf(1.0 / 2.4);
         let begun = Exposures::new(ExposureModel::Channels, &found.gains);
         for (view, gain) in [up, 1.0 / up, 1.0].into_iter().enumerate() {
-            let diagonal = begun.of(view).matrix[1][1];
+            let diagonal = begun.transform(view).matrix[1][1];
             assert!((diagonal / gain - 1.0).abs() < 1e-5, "{view}: {diagonal} {gain}");
         }
         let [note] = found.notes() else { panic!("{:?}", found.notes()) };

@@ -167,8 +167,8 @@ impl Backend for FaultyBackend {
     fn audit(&mut self) -> Result<Vec<NonFinite>, BackendError> {
         let mut found = self.inner.audit()?;
         if self.fault == Fault::Audit {
-            let (attribute, kept) = (Attribute::Mean, NumberKind::Parameter);
-            found.insert(0, NonFinite { row: 0, attribute, kept });
+            let (attribute, kind) = (Attribute::Mean, NumberKind::Parameter);
+            found.insert(0, NonFinite { row: 0, attribute, kind });
         }
         Ok(found)
     }
