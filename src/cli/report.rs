@@ -9,7 +9,7 @@ use super::export::check_output;
 use densify_core::files::OutputError;
 use densify_core::memory::Bytes;
 use densify_report as report;
-use densify_report::Wanted;
+use densify_report::ReportOptions;
 use densify_run::DeviceSpec;
 use densify_run::failure::Failure;
 
@@ -63,13 +63,13 @@ pub(super) fn run(args: &ReportArgs, console: &Console) -> Result<(), Failure> {
         )));
     }
     check_output(file, args.overwrite)?;
-    let wanted = Wanted {
+    let options = ReportOptions {
         runs: &args.runs,
         iteration: args.iteration,
-        scene: args.scene.as_deref(),
+        dataset: args.scene.as_deref(),
         device: &args.device,
     };
-    report::write(&wanted, file, console)?;
+    report::write(&options, file, console)?;
     let size = file.metadata().map_err(OutputError::io("read", file))?.len();
     console.result(format_args!("report   {} ({})", file.display(), Bytes(size)));
     Ok(())
