@@ -42,12 +42,12 @@ def check(browser: Browser, url: str, run: Path, folder: Path | None) -> None:
     seen = "document.dispatchEvent(new Event('visibilitychange'));"
     browser.run(hide + seen)
     browser.until("underway === 0", "a picture does not come")
-    before = browser.run("lookAgain(); return wishes")
+    before = browser.run("requestPicture(); return requests")
     time.sleep(0.5)
-    after = browser.run("return wishes")
+    after = browser.run("return requests")
     assert after == before, f"in the background it asks for {after - before} pictures"
     browser.run("delete document.hidden;" + seen)
-    browser.until(f"wishes > {before}", "seen again, it does not look")
+    browser.until(f"requests > {before}", "seen again, it does not look")
 
     click("pause")
     browser.until(f"{STATE}.state === 'paused'", "it is not paused")
@@ -62,7 +62,7 @@ def check(browser: Browser, url: str, run: Path, folder: Path | None) -> None:
     assert (run / f"checkpoints/iteration_{paused + 1}.safetensors").is_file(), "no checkpoint is there"
     browser.is_sharp()
     # The heading counts as the run does, whatever it said before.
-    browser.run("scene.models[0].rows = 1; sayModels()")
+    browser.run("scene.models[0].rows = 1; showModels()")
     counts = "document.getElementById('models').textContent.split(': ')[1].replace('Gaussians', 'of at most')"
     browser.until(f"document.getElementById('training-numbers').textContent.includes({counts})", "the heading keeps its count")
     # What only a run in training knows.
