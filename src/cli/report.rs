@@ -10,7 +10,7 @@ use super::threads;
 use densify_core::files::FileError;
 use densify_core::memory::Bytes;
 use densify_report as report;
-use densify_report::Wanted;
+use densify_report::ReportOptions;
 use densify_run::DeviceSpec;
 use densify_run::failure::Failure;
 
@@ -64,14 +64,14 @@ pub(super) fn run(args: &ReportArgs, console: &Console) -> Result<(), Failure> {
         )));
     }
     check_output(file, args.overwrite)?;
-    let wanted = Wanted {
+    let options = ReportOptions {
         runs: &args.runs,
         iteration: args.iteration,
-        scene: args.scene.as_deref(),
+        dataset: args.scene.as_deref(),
         device: &args.device,
     };
     threads::limit(args.device.threads);
-    report::write(&wanted, file, console)?;
+    report::write(&options, file, console)?;
     let size = file.metadata().map_err(FileError::io("read", file))?.len();
     console.result(format_args!("report   {} ({})", file.display(), Bytes(size)));
     Ok(())

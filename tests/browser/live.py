@@ -39,15 +39,15 @@ def check(browser: Browser, url: str, run: Path, folder: Path | None) -> None:
 
     # A hidden page requests no pictures, so it does not slow training down; shown again, it is updated.
     hide = "Object.defineProperty(document, 'hidden', { configurable: true, value: true });"
-    notify = "document.dispatchEvent(new Event('visibilitychange'));"
-    browser.run(hide + notify)
-    browser.wait_for("underway === 0", "a requested picture does not arrive")
-    before = browser.run("lookAgain(); return wishes")
+    seen = "document.dispatchEvent(new Event('visibilitychange'));"
+    browser.run(hide + seen)
+    browser.wait_for("underway === 0", "a picture does not come")
+    before = browser.run("requestPicture(); return requests")
     time.sleep(0.5)
-    after = browser.run("return wishes")
-    assert after == before, f"the hidden page requests {after - before} pictures"
-    browser.run("delete document.hidden;" + notify)
-    browser.wait_for(f"wishes > {before}", "shown again, the page requests no picture")
+    after = browser.run("return requests")
+    assert after == before, f"in the background it asks for {after - before} pictures"
+    browser.run("delete document.hidden;" + seen)
+    browser.wait_for(f"requests > {before}", "seen again, it does not look")
 
     click("pause")
     browser.wait_for(f"{STATE}.state === 'paused'", "the run is not paused")
@@ -58,11 +58,11 @@ def check(browser: Browser, url: str, run: Path, folder: Path | None) -> None:
     click("one-step")
     browser.wait_for(f"Number({STATE}.step) === {paused + 1}", "the run does not proceed by one step")
     click("checkpoint")
-    browser.wait_for("document.getElementById('training-numbers').textContent.includes('Checkpoint of step')", "the page does not mention the checkpoint")
-    assert (run / f"checkpoints/iteration_{paused + 1}.safetensors").is_file(), "no checkpoint is written"
+    browser.wait_for("document.getElementById('training-numbers').textContent.includes('Checkpoint of step')", "no checkpoint is shown")
+    assert (run / f"checkpoints/iteration_{paused + 1}.safetensors").is_file(), "no checkpoint is there"
     browser.wait_until_sharp()
-    # The heading's number of Gaussians is updated from the run.
-    browser.run("scene.models[0].rows = 1; sayModels()")
+    # The heading counts as the run does, whatever it said before.
+    browser.run("scene.models[0].rows = 1; showModels()")
     counts = "document.getElementById('models').textContent.split(': ')[1].replace('Gaussians', 'of at most')"
     browser.wait_for(f"document.getElementById('training-numbers').textContent.includes({counts})", "the heading's count is not updated")
     # Displays that exist only during training.

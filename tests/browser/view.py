@@ -124,12 +124,12 @@ const [milliseconds, took, alone] = arguments;
 pace([{ bitmap: { width: 1, height: 1 }, bytes: 1000, milliseconds, held: milliseconds, took }], performance.now() - took, true, 0.5);
 return coarse;
 """
-# Delays every reply by the given milliseconds, like a slow network; also finds the largest number of pending requests.
-DELAY = """
-const fetchAtOnce = window.fetch;
+# Every reply comes later by so many milliseconds, as over a network; also counts the requests that are under way at once.
+FAR = """
+const near = window.fetch;
 window.fetch = async (...request) => {
   window.atOnce = Math.max(window.atOnce ?? 0, underway);
-  const answer = await fetchAtOnce(...request);
+  const answer = await near(...request);
   await new Promise((resolve) => setTimeout(resolve, arguments[0]));
   return answer;
 };

@@ -1,8 +1,8 @@
-// Sliders of a report. Without this, all pictures are shown beside each other.
+// Sliders of a report. Without scripts, all pictures are side by side.
 "use strict";
 document.documentElement.classList.add("live");
 
-// Calls `move` with the place of a pointer across an element, from 0 to 1, while it is pressed there.
+// Calls `move` with the horizontal position of a pressed pointer within an element, from 0 to 1.
 const whilePressed = (element, move) => {
   const place = ({ clientX }) => {
     const { left, width } = element.getBoundingClientRect();
@@ -17,7 +17,7 @@ const whilePressed = (element, move) => {
   });
 };
 
-// Two of several pictures, with a border between them.
+// Two overlaid pictures with a movable border.
 for (const pair of document.querySelectorAll(".pair")) {
   const stack = pair.querySelector(".stack");
   const slider = pair.querySelector("input");
@@ -38,7 +38,7 @@ for (const pair of document.querySelectorAll(".pair")) {
   show();
 }
 
-// One of many pictures: a turn around the scene.
+// An orbit around the scene: one of many pictures.
 for (const turn of document.querySelectorAll(".turn")) {
   const slider = turn.querySelector("input");
   const pictures = [...turn.querySelectorAll("img")];

@@ -1,32 +1,33 @@
-//! Curves over iterations: loss, Gaussians, PSNR of the test views, memory against what was promised.
+//! Curves over iterations: loss, Gaussians, PSNR of the test views, and memory with its promised limit.
 
 use maud::{Markup, html};
 use plotters::style::RGBColor;
 
-use super::memory::promised_to_the_host;
-use super::runs::Told;
+use super::memory::promised_host_bytes;
+use super::runs::RunRecord;
 use densify_html::inline_svg;
 use densify_run::failure::Failure;
 use densify_study::panel::{COLOURS, Curve, PALETTE, Panel, svg};
 use densify_train::output::StepRecord;
 
-/// Size of a panel `[px]`: small, so that its text can be read on a phone.
+/// Size of a panel `[px]`: small, so that its text is readable on a phone.
 const SIZE: (u32, u32) = (460, 270);
-/// Most points of a curve: more than twice as many as can be told apart.
-const MOST: usize = 300;
+/// Most points of a curve, about twice the number that can be distinguished.
+const MAX_POINTS: usize = 300;
 const MIB: f64 = 1024.0 * 1024.0;
 
-/// All panels; nothing where no run has written a record yet.
-pub(super) fn all(runs: &[Told]) -> Result<Option<Markup>, Failure> {
+/// Draws all panels; `None` if no run has written a record yet.
+pub(super) fn draw(runs: &[RunRecord]) -> Result<Option<Markup>, Failure> {
     let records = |value: fn(&StepRecord) -> Option<f64>| {
-        move |run: &Told| {
+        move |run: &RunRecord| {
             let points =
                 run.steps.iter().filter_map(|step| Some((f64::from(step.step), value(step)?)));
-            thinned(&points.collect::<Vec<_>>())
+            thin(&points.collect::<Vec<_>>())
         }
     };
-    let tests =
-        |run: &Told| run.scores.iter().map(|(&step, mean)| (f64::from(step), mean.psnr)).collect();
+    let tests = |run: &RunRecord| {
+        run.scores.iter().map(|(&step, mean)| (f64::from(step), mean.psnr)).collect()
+    };
     let memory = records(|step| Some(step.resident_bytes? as f64 / MIB));
     let mut panels = vec![
         ("Loss", panel("loss", runs, records(|step| Some(f64::from(step.loss))))),
@@ -35,7 +36,7 @@ pub(super) fn all(runs: &[Told]) -> Result<Option<Markup>, Failure> {
     ];
     let mut memory = panel("resident memory (MiB)", runs, memory);
     memory.curves.extend(runs.iter().enumerate().filter_map(|(at, run)| {
-        let promised = promised_to_the_host(run)? as f64 / MIB;
+        let promised = promised_host_bytes(run)? as f64 / MIB;
         let last = f64::from(run.steps.last()?.step);
         let points = vec![(0.0, promised), (last, promised)];
         Some(Curve { name: run.name.clone(), points, colour: at % COLOURS, is_dashed: true })
@@ -47,31 +48,35 @@ pub(super) fn all(runs: &[Told]) -> Result<Option<Markup>, Failure> {
     }
     let figures = panels.iter().map(|(title, panel)| {
         let drawn = svg(std::slice::from_ref(panel), SIZE)?;
-        let what = format!("{title}, over iterations");
-        Ok(html! { figure.curve { h3 { (title) } (inline_svg(&drawn, SIZE, &what)) } })
+        let label = format!("{title}, over iterations");
+        Ok(html! { figure.curve { h3 { (title) } (inline_svg(&drawn, SIZE, &label)) } })
     });
     let figures = figures.collect::<Result<Vec<Markup>, Failure>>()?;
     Ok(Some(html! {
-        @if runs.len() > 1 { (names(runs)) }
+        @if runs.len() > 1 { (legend(runs)) }
         div.figures { @for figure in &figures { (figure) } }
     }))
 }
 
-fn panel(y: &'static str, runs: &[Told], points: impl Fn(&Told) -> Vec<(f64, f64)>) -> Panel {
-    let curve = |(at, run): (usize, &Told)| Curve {
+fn panel(
+    y: &'static str,
+    runs: &[RunRecord],
+    points: impl Fn(&RunRecord) -> Vec<(f64, f64)>,
+) -> Panel {
+    let curve = |(at, run): (usize, &RunRecord)| Curve {
         name: run.name.clone(),
-        // What is not finite cannot be drawn.
+        // Non-finite values cannot be drawn.
         points: points(run).into_iter().filter(|(_, y)| y.is_finite()).collect(),
         colour: at % COLOURS,
         is_dashed: false,
     };
     let curves = runs.iter().enumerate().map(curve).collect();
-    // Names stand above all panels, as text of the page.
+    // The legend is above all panels, as text of the page.
     Panel { title: String::new(), x: "iteration", y, log_x: false, has_legend: false, curves }
 }
 
-/// Which colour is which run.
-fn names(runs: &[Told]) -> Markup {
+/// The legend: the colour of each run.
+fn legend(runs: &[RunRecord]) -> Markup {
     let colour = |at: usize| {
         let RGBColor(r, g, b) = PALETTE[at % COLOURS];
         format!("#{r:02X}{g:02X}{b:02X}")
@@ -90,14 +95,14 @@ fn names(runs: &[Told]) -> Markup {
     }
 }
 
-/// Fewer points: means of neighbours.
-fn thinned(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
-    let together = points.len().div_ceil(MOST).max(1);
-    let mean = |some: &[(f64, f64)]| {
-        let (x, y) = some.iter().fold((0.0, 0.0), |sum, point| (sum.0 + point.0, sum.1 + point.1));
-        (x / some.len() as f64, y / some.len() as f64)
+/// Reduces the number of points by averaging neighbours.
+fn thin(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
+    let chunk = points.len().div_ceil(MAX_POINTS).max(1);
+    let mean = |chunk: &[(f64, f64)]| {
+        let (x, y) = chunk.iter().fold((0.0, 0.0), |sum, point| (sum.0 + point.0, sum.1 + point.1));
+        (x / chunk.len() as f64, y / chunk.len() as f64)
     };
-    points.chunks(together).map(mean).collect()
+    points.chunks(chunk).map(mean).collect()
 }
 
 #[cfg(test)]
@@ -105,13 +110,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn long_curves_are_thinned_to_means() {
+    fn long_curves_are_reduced_to_means() {
         let points: Vec<(f64, f64)> = (0..3000).map(|i| (f64::from(i), f64::from(i % 2))).collect();
-        let thin = thinned(&points);
-        assert_eq!(thin.len(), 300);
-        assert!(thin.iter().all(|(_, y)| (y - 0.5).abs() < 1e-9));
-        assert!((thin[0].0 - 4.5).abs() < 1e-9, "{:?}", thin[0]);
-        assert_eq!(thinned(&points[..7]), points[..7]);
-        assert_eq!(thinned(&[]), []);
+        let thinned = thin(&points);
+        assert_eq!(thinned.len(), 300);
+        assert!(thinned.iter().all(|(_, y)| (y - 0.5).abs() < 1e-9));
+        assert!((thinned[0].0 - 4.5).abs() < 1e-9, "{:?}", thinned[0]);
+        assert_eq!(thin(&points[..7]), points[..7]);
+        assert_eq!(thin(&[]), []);
     }
 }

@@ -1,48 +1,47 @@
-//! Which runs belong together: those of the same photographs, and among these those that differ by their seed
-//! alone.
+//! Groups runs by scene, and within a scene by settings, so that the runs of a group differ only in their seed.
 
 use std::path::{Path, PathBuf};
 
 use toml::Table;
 
-use super::options::flat;
-use super::runs::Told;
+use super::options::flatten;
+use super::runs::RunRecord;
 use densify_core::files;
 use densify_data::dataset::builtin;
 use densify_run::failure::Failure;
 use densify_run::finished::name_of;
 use densify_run::{DataSpec, OnResume, Partial, RunOption};
 
-/// Runs whose pictures can be laid over each other: of the same photographs, read the same way.
+/// Runs of the same photographs, read with the same options, so that their pictures are comparable.
 pub(super) struct Scene {
     pub(super) label: String,
-    /// Where it was when the first of its runs was started.
+    /// The dataset's path when the first of the runs was started.
     pub(super) path: PathBuf,
     pub(super) data: DataSpec,
     pub(super) groups: Vec<Group>,
 }
 
-/// Runs that differ by their seed alone.
+/// Runs that differ only in their seed.
 pub(super) struct Group {
-    /// What tells it from the others.
+    /// The settings that distinguish it from other groups.
     pub(super) label: String,
-    /// Their numbers, by seed.
+    /// Indices of the runs, ordered by seed.
     pub(super) runs: Vec<usize>,
 }
 
-/// All runs, by scene and settings.
+/// All runs, grouped by scene and settings.
 pub(super) struct Groups {
     pub(super) scenes: Vec<Scene>,
 }
 
 impl Scene {
-    /// The runs that are shown for their groups: those of the smallest seeds.
-    pub(super) fn shown(&self) -> impl Iterator<Item = usize> {
+    /// The runs that represent their groups in pictures: those with the smallest seed.
+    pub(super) fn representatives(&self) -> impl Iterator<Item = usize> {
         self.groups.iter().filter_map(|group| group.runs.first().copied())
     }
 }
 
-/// The name of a scene without what lies above it.
+/// The name of a scene, without its parent folders.
 pub(super) fn scene_name(path: &Path) -> String {
     let name = match builtin::name(path) {
         Some(name) => name.to_owned(),
@@ -52,8 +51,8 @@ pub(super) fn scene_name(path: &Path) -> String {
 }
 
 impl Groups {
-    pub(super) fn of(runs: &[Told]) -> Result<Self, Failure> {
-        // Each with what its runs must agree in.
+    pub(super) fn new(runs: &[RunRecord]) -> Result<Self, Failure> {
+        // Each with the canonical path of its dataset, and the settings of its groups.
         let mut scenes: Vec<(Scene, PathBuf, Vec<Table>)> = Vec::new();
         for (number, run) in runs.iter().enumerate() {
             let path = run.config.scene_path();
@@ -98,8 +97,8 @@ impl Groups {
     }
 }
 
-/// What decides the result of a run, but for scene and seed.
-fn settings(run: &Told) -> Result<Table, Failure> {
+/// The settings that determine the result of a run, except scene and seed.
+fn settings(run: &RunRecord) -> Result<Table, Failure> {
     let mut all = Partial::all(&run.config.spec)?.into_table();
     let decides = |name: &str| {
         name != "seed"
@@ -113,10 +112,10 @@ fn settings(run: &Told) -> Result<Table, Failure> {
     Ok(all)
 }
 
-/// What tells groups apart, in words: the policy, and whatever else differs of the options that all have.
+/// Labels for groups: the policy, and those common options that differ between groups.
 fn labels(known: &[Table]) -> Vec<String> {
-    const MOST: usize = 3;
-    let all: Vec<_> = known.iter().map(flat).collect();
+    const MAX_OPTIONS: usize = 3;
+    let all: Vec<_> = known.iter().map(flatten).collect();
     let Some((first, others)) = all.split_first() else { return Vec::new() };
     let differs = |name: &&String| {
         name.as_str() != "policy"
@@ -126,10 +125,13 @@ fn labels(known: &[Table]) -> Vec<String> {
     let differing: Vec<&String> = first.keys().filter(differs).collect();
     let label = |(number, options): (usize, &std::collections::BTreeMap<String, String>)| {
         let policy = options.get("policy").cloned().unwrap_or_default();
-        let some = differing.iter().take(MOST);
+        let some = differing.iter().take(MAX_OPTIONS);
         let some = some.map(|name| format!(", {name} {}", options[*name])).collect::<String>();
-        let more =
-            if differing.len() > MOST { format!(" … ({})", number + 1) } else { String::new() };
+        let more = if differing.len() > MAX_OPTIONS {
+            format!(" … ({})", number + 1)
+        } else {
+            String::new()
+        };
         files::one_line(&format!("{policy}{some}{more}"))
     };
     all.iter().enumerate().map(label).collect()
@@ -140,7 +142,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn groups_are_called_by_what_differs() {
+    fn groups_are_labelled_by_their_differences() {
         let of = |tables: &[&str]| {
             labels(&tables.iter().map(|text| text.parse().unwrap()).collect::<Vec<Table>>())
         };
@@ -158,7 +160,7 @@ mod tests {
         );
         let many = |n: u32| format!("policy = 'a'\nb = {n}\nc = {n}\nd = {n}\ne = {n}");
         assert_eq!(of(&[&many(1), &many(2)])[1], "a, b 2, c 2, d 2 … (2)");
-        // What only one of them has is not what they differ in.
+        // An option that only one group has is not a difference.
         assert_eq!(of(&["policy = 'a'\np.x = 1", "policy = 'b'\np.y = 1"]), ["a", "b"]);
     }
 }

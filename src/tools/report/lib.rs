@@ -1,8 +1,8 @@
-//! `densify report`: what runs arrived at, as one HTML file that refers to nothing outside itself.
+//! `densify report`: the results of one or several runs as a self-contained HTML file.
 //!
-//! [`runs`] reads what the folders say, [`groups`] finds which runs belong together, [`views`] renders, and
-//! the rest writes a part of the page each. Equal runs give equal bytes: no clock and no path of this machine is
-//! in it. Prints nothing.
+//! [`runs`] reads the folders, [`groups`] finds runs of the same scene and settings, [`pictures`] renders, and each of
+//! the other modules writes a part of the page. The same runs give the same bytes: the page contains neither the time
+//! nor a path of this machine. Prints nothing.
 
 mod curves;
 mod edits;
@@ -10,9 +10,9 @@ mod groups;
 mod memory;
 mod options;
 mod page;
+mod pictures;
 mod runs;
 mod scores;
-mod views;
 
 use std::path::{Path, PathBuf};
 
@@ -21,40 +21,45 @@ use densify_run::failure::Failure;
 use densify_run::finished::Machine;
 use densify_run::{DeviceSpec, Observer};
 use groups::Groups;
-use runs::Told;
+use runs::RunRecord;
 
-/// What a report is wanted of.
-pub struct Wanted<'a> {
+/// The runs to report on, and how to render them.
+pub struct ReportOptions<'a> {
     /// Folders of runs.
     pub runs: &'a [PathBuf],
-    /// Which saved model of each; the last without.
+    /// Iteration of the saved models; by default the last of each run.
     pub iteration: Option<u32>,
-    /// Where the dataset is now.
-    pub scene: Option<&'a Path>,
+    /// The dataset, if it has moved since the runs.
+    pub dataset: Option<&'a Path>,
+    /// Device to render on.
     pub device: &'a DeviceSpec,
 }
 
 /// Writes the report.
 ///
 /// # Errors
-/// When a folder is no run, has no model or is damaged, two are the same, or the dataset cannot be read.
-pub fn write(wanted: &Wanted<'_>, file: &Path, observer: &dyn Observer) -> Result<(), Failure> {
-    let runs = Told::read_all(wanted, observer)?;
-    let groups = Groups::of(&runs)?;
-    if wanted.scene.is_some()
+/// If a folder is not a run, has no model, is damaged or is given twice, or the dataset cannot be read.
+pub fn write(
+    options: &ReportOptions<'_>,
+    file: &Path,
+    observer: &dyn Observer,
+) -> Result<(), Failure> {
+    let runs = RunRecord::read_all(options, observer)?;
+    let groups = Groups::new(&runs)?;
+    if options.dataset.is_some()
         && let [first, second, ..] = &groups.scenes[..]
     {
         let (first, second) = (&first.label, &second.label);
         return Err(Failure::input(format!(
-            "--scene is for runs of one scene, and these are of {first} and {second}; leave it out, or make a \
-             report of each scene"
+            "--scene is for runs of one scene, and these are of {first} and {second}; leave it out, or report on \
+             each scene separately"
         )));
     }
-    let machine = Machine::open(wanted.device, observer)?;
-    let mut shown = Vec::new();
+    let machine = Machine::open(options.device, observer)?;
+    let mut pictures = Vec::new();
     for scene in &groups.scenes {
-        shown.push(views::show(scene, &runs, wanted, &machine, observer)?);
+        pictures.push(pictures::render(scene, &runs, options, &machine, observer)?);
     }
-    let text = page::page(&runs, &groups, &shown)?;
+    let text = page::page(&runs, &groups, &pictures)?;
     Ok(write_atomically(file, |out| out.write_all(text.as_bytes()))?)
 }

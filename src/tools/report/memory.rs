@@ -1,14 +1,13 @@
-//! Memory: what was promised, what was taken, and the ledger behind it.
+//! Memory of a run: peak, promised limit, and the ledger.
 
 use maud::{Markup, html};
 
-use super::runs::Told;
+use super::runs::RunRecord;
 use densify_core::memory::{Bytes, LedgerLine};
-use densify_html::{Column, table};
+use densify_html::{Column, Table};
 
-/// What a run promised to take of the host's memory `[bytes]`; that of a device is not in what the system
-/// measures.
-pub(super) fn promised_to_the_host(run: &Told) -> Option<u64> {
+/// The host memory that a run promised not to exceed `[bytes]`. Measurements of the system do not include device memory.
+pub(super) fn promised_host_bytes(run: &RunRecord) -> Option<u64> {
     let summary = run.summary.as_ref()?;
     Some(match summary.ledger.on_device() {
         0 => summary.ledger_bytes,
@@ -16,23 +15,23 @@ pub(super) fn promised_to_the_host(run: &Told) -> Option<u64> {
     })
 }
 
-/// Peak, promise and ledger of a run; nothing while it trains.
-pub(super) fn of_run(run: &Told) -> Option<Markup> {
+/// Describes peak, promise and ledger of a run; `None` while it trains.
+pub(super) fn describe(run: &RunRecord) -> Option<Markup> {
     let summary = run.summary.as_ref()?;
-    let promise = promised_to_the_host(run)?;
+    let promise = promised_host_bytes(run)?;
     let device = summary.ledger.on_device();
     let mut lines: Vec<&LedgerLine> = summary.ledger.lines.iter().collect();
     lines.sort_by_key(|line| line.section);
-    let row = |line: &&LedgerLine| {
+    let mut ledger =
+        Table::new([Column::text("part"), Column::text("buffer"), Column::number("size")]);
+    for line in lines {
         let place = if line.on_device { " (on the device)" } else { "" };
-        vec![
+        ledger.row([
             line.section.name().to_owned(),
             format!("{}{place}", line.what),
             Bytes(line.bytes).to_string(),
-        ]
-    };
-    let rows: Vec<Vec<String>> = lines.iter().map(row).collect();
-    let columns = [Column::Text("part"), Column::Text("buffer"), Column::Number("size")];
+        ]);
+    }
     Some(html! {
         p {
             @match summary.peak_bytes {
@@ -41,15 +40,15 @@ pub(super) fn of_run(run: &Told) -> Option<Markup> {
                     @if peak <= promise { ", and the promise was kept." }
                     @else { ": " strong { "more than promised." } }
                 }
-                None => { "The process was to take at most " (Bytes(promise)) "; this system does not say what it took." }
+                None => { "The process promised to take at most " (Bytes(promise)) "; this system does not report its peak." }
             }
             @if device > 0 { " Of the device's memory it promised to take " (Bytes(device)) "." }
             @if let Some(limit) = summary.memory { " The limit was " (Bytes(limit)) "." }
         }
         details {
             summary { "The ledger: every buffer" }
-            (table(&columns, &rows))
-            p.note { "Not all are held at the same time." }
+            (ledger.to_html())
+            p.note { "Not all of them exist at the same time." }
         }
     })
 }

@@ -1,4 +1,4 @@
-//! The settings of runs: what differs from the defaults, what differs between runs, and everything.
+//! The options of runs: those that differ from the defaults or between runs, and all of them.
 
 use std::collections::BTreeMap;
 
@@ -6,21 +6,21 @@ use maud::{Markup, html};
 use toml::{Table, Value};
 
 use super::groups::scene_name;
-use super::runs::Told;
-use densify_html::{Column, table};
+use super::runs::RunRecord;
+use densify_html::{Column, Table as HtmlTable};
 use densify_run::failure::Failure;
 use densify_run::{Partial, RunSpec};
 
-/// Most rows of a table of differences: with more, nothing is compared any more.
-const MOST: usize = 60;
-/// Options that name places on the machine that trained. Of these only the last part is told.
-const PLACES: [&str; 5] = ["scene", "images", "views", "init", "freeze"];
+/// Most rows of the table of differences; more would not be readable.
+const MAX_DIFFERENCES: usize = 60;
+/// Options that are paths on the machine that trained; only their last component is published.
+const PATHS: [&str; 5] = ["scene", "images", "views", "init", "freeze"];
 
-/// All options with their whole names, such as `knob.alpha_min`, and their values as text.
-pub(super) fn flat(options: &Table) -> BTreeMap<String, String> {
-    fn walk(above: &str, options: &Table, found: &mut BTreeMap<String, String>) {
+/// All options with their full names, such as `knob.alpha_min`, and their values as text.
+pub(super) fn flatten(options: &Table) -> BTreeMap<String, String> {
+    fn walk(parent: &str, options: &Table, found: &mut BTreeMap<String, String>) {
         for (name, value) in options {
-            let name = if above.is_empty() { name.clone() } else { format!("{above}.{name}") };
+            let name = if parent.is_empty() { name.clone() } else { format!("{parent}.{name}") };
             match value {
                 Value::Table(inner) => walk(&name, inner, found),
                 Value::String(text) => _ = found.insert(name, text.clone()),
@@ -33,11 +33,11 @@ pub(super) fn flat(options: &Table) -> BTreeMap<String, String> {
     found
 }
 
-/// The options of a run, as they may be told to others.
-fn told(spec: &RunSpec) -> Result<Table, Failure> {
+/// The options of a run without private paths.
+fn published(spec: &RunSpec) -> Result<Table, Failure> {
     let mut all = Partial::all(spec)?.into_table();
     all.remove("output");
-    for name in PLACES {
+    for name in PATHS {
         if let Some(Value::String(text)) = all.get_mut(name) {
             *text = scene_name(text.as_ref());
         }
@@ -45,22 +45,23 @@ fn told(spec: &RunSpec) -> Result<Table, Failure> {
     Ok(all)
 }
 
-/// What a run was told: what is not the default, and below everything.
-pub(super) fn of_run(run: &Told) -> Result<Markup, Failure> {
-    let (all, usual) = (told(&run.config.spec)?, told(&RunSpec::default())?);
-    let (own, usual) = (flat(&all), flat(&usual));
-    // Parameters are complete in the file of a run, and those by default are not told apart there.
-    let is_own = |name: &str| {
-        all.get(name).is_some_and(|value| !value.is_table()) && own.get(name) != usual.get(name)
+/// Lists the options of a run that differ from the defaults, and below them all options.
+pub(super) fn list(run: &RunRecord) -> Result<Markup, Failure> {
+    let (all, defaults) = (published(&run.config.spec)?, published(&RunSpec::default())?);
+    let (own, defaults) = (flatten(&all), flatten(&defaults));
+    // Tables are left out: they hold all parameters of the policy, without marking the defaults.
+    let is_changed = |name: &str| {
+        all.get(name).is_some_and(|value| !value.is_table()) && own.get(name) != defaults.get(name)
     };
-    let rows: Vec<Vec<String>> = own
-        .iter()
-        .filter(|(name, _)| is_own(name) || *name == "policy" || *name == "iterations")
-        .map(|(name, value)| vec![name.clone(), value.clone()])
-        .collect();
+    let mut table = HtmlTable::new(["option", "value"].map(Column::text));
+    for (name, value) in &own {
+        if is_changed(name) || name == "policy" || name == "iterations" {
+            table.row([name.clone(), value.clone()]);
+        }
+    }
     let whole = toml::to_string(&all).map_err(Failure::input)?;
     Ok(html! {
-        div.settings { (table(&[Column::Text("option"), Column::Text("value")], &rows)) }
+        div.settings { (table.to_html()) }
         details {
             summary { "All options, parameters of the policy included" }
             pre tabindex="0" { code { (whole) } }
@@ -68,9 +69,9 @@ pub(super) fn of_run(run: &Told) -> Result<Markup, Failure> {
     })
 }
 
-/// What differs between runs, of the options that all have; nothing for one run, or where nothing differs.
-pub(super) fn differing(runs: &[Told]) -> Result<Option<Markup>, Failure> {
-    let options = runs.iter().map(|run| Ok(flat(&told(&run.config.spec)?)));
+/// Lists the common options that differ between runs; `None` if there are none.
+pub(super) fn list_differences(runs: &[RunRecord]) -> Result<Option<Markup>, Failure> {
+    let options = runs.iter().map(|run| Ok(flatten(&published(&run.config.spec)?)));
     let options: Vec<BTreeMap<String, String>> = options.collect::<Result<_, Failure>>()?;
     let names = options.first().into_iter().flat_map(|first| first.keys());
     let differs = |name: &&String| {
@@ -85,13 +86,14 @@ pub(super) fn differing(runs: &[Told]) -> Result<Option<Markup>, Failure> {
     if rows.is_empty() {
         return Ok(None);
     }
-    let left_out = rows.len().saturating_sub(MOST);
-    rows.truncate(MOST);
+    let left_out = rows.len().saturating_sub(MAX_DIFFERENCES);
+    rows.truncate(MAX_DIFFERENCES);
     let names = std::iter::once("option").chain(runs.iter().map(|run| &*run.name));
-    let columns: Vec<Column<'_>> = names.map(Column::Text).collect();
+    let mut table = HtmlTable::new(names.map(Column::text));
+    rows.into_iter().for_each(|row| table.row(row));
     Ok(Some(html! {
-        div.settings { (table(&columns, &rows)) }
-        @if left_out > 0 { p.note { (left_out) " more options differ; they stand below." } }
+        div.settings { (table.to_html()) }
+        @if left_out > 0 { p.note { (left_out) " more options differ; they are listed below." } }
     }))
 }
 
@@ -102,30 +104,30 @@ mod tests {
     use super::*;
     use densify_run::AbsolutePath;
 
-    /// What takes a file or a folder is a place.
+    /// Options whose value is a file or a folder are paths.
     #[test]
-    fn every_place_is_known() {
+    fn every_path_option_is_known() {
         let command = RunSpec::augment_args(clap::Command::new("train"));
-        let of = |arg: &clap::Arg| arg.get_value_names().unwrap_or_default().to_vec();
-        let places = command.get_arguments().filter(|arg| {
-            let names = of(arg);
+        let value_names = |arg: &clap::Arg| arg.get_value_names().unwrap_or_default().to_vec();
+        let paths = command.get_arguments().filter(|arg| {
+            let names = value_names(arg);
             ["DIR", "FILE", "MODEL", "SCENE"]
                 .iter()
                 .any(|known| names.iter().any(|name| name.contains(known)))
         });
-        let found: Vec<&str> = places.map(|arg| arg.get_id().as_str()).collect();
-        assert!(found.len() > PLACES.len(), "{found:?}");
-        // That one is an enumeration, and the output's folder is not told at all.
+        let found: Vec<&str> = paths.map(|arg| arg.get_id().as_str()).collect();
+        assert!(found.len() > PATHS.len(), "{found:?}");
+        // The former is an enumeration, and the output folder is not published at all.
         let others = ["exposure_model", "output"];
         let unknown: Vec<_> =
-            found.iter().filter(|name| !PLACES.contains(name) && !others.contains(name)).collect();
+            found.iter().filter(|name| !PATHS.contains(name) && !others.contains(name)).collect();
         assert!(unknown.is_empty(), "{unknown:?} may hold a path of this machine");
     }
 
     #[test]
-    fn options_have_whole_names_and_places_lose_what_lies_above() {
+    fn options_have_full_names_and_paths_lose_their_folders() {
         let options: Table = "a = 1\nb = 'x'\n[knob]\nalpha_min = '1/64'".parse().unwrap();
-        let flat = flat(&options);
+        let flat = flatten(&options);
         let flat: Vec<(&str, &str)> =
             flat.iter().map(|(name, value)| (&**name, &**value)).collect();
         assert_eq!(flat, [("a", "1"), ("b", "x"), ("knob.alpha_min", "1/64")]);
@@ -135,7 +137,7 @@ mod tests {
         spec.data.images = Some("/mnt/photographs".into());
         spec.data.views = Some(AbsolutePath("/mnt/views.txt".into()));
         spec.start.freeze = Some(AbsolutePath("/mnt/rest.ply".into()));
-        let text = toml::to_string(&told(&spec).unwrap()).unwrap();
+        let text = toml::to_string(&published(&spec).unwrap()).unwrap();
         assert!(text.contains("scene = \"garden\"") && text.contains("\"photographs\""), "{text}");
         assert!(!text.contains("somebody") && !text.contains("mnt"), "{text}");
     }

@@ -1,19 +1,23 @@
-//! The page: its parts in order, what matters most first.
+//! Composes the page from its parts, the most important first.
 
 use maud::{Markup, html};
 
 use super::groups::Groups;
-use super::runs::Told;
+use super::pictures::{NamedPicture, Orbit, ScenePictures, ViewComparison};
+use super::runs::RunRecord;
 use super::scores::{self, last_step};
-use super::views::{Named, Shown, Turn, View};
 use super::{curves, edits, memory, options};
 use densify_core::numbers::grouped;
 use densify_html::page as whole_page;
 use densify_run::failure::Failure;
 use densify_train::evaluate::Split;
 
-/// The whole report.
-pub(super) fn page(runs: &[Told], groups: &Groups, shown: &[Shown]) -> Result<String, Failure> {
+/// Composes the report.
+pub(super) fn page(
+    runs: &[RunRecord],
+    groups: &Groups,
+    pictures: &[ScenePictures],
+) -> Result<String, Failure> {
     let title = match (runs, &groups.scenes[..]) {
         ([run], _) => format!("{}: report of a run", run.name),
         (_, [scene]) => format!("{}: report of {} runs", scene.label, runs.len()),
@@ -23,31 +27,31 @@ pub(super) fn page(runs: &[Told], groups: &Groups, shown: &[Shown]) -> Result<St
         header {
             h1 { (title) }
             p { (introduction(groups)) }
-            @for run in runs { @if let Some(state) = unfinished(run) { p { strong { (state) } } } }
-            @if let [run] = runs { (scores::headline(run)) }
+            @for run in runs { @if let Some(note) = describe_unfinished(run) { p { strong { (note) } } } }
+            @if let [run] = runs { (scores::summarise(run)) }
         }
         section {
             h2 { "Scores" }
-            (scores::of_runs(runs, groups))
+            (scores::tabulate_runs(runs, groups))
             @if runs.iter().all(|run| run.score().is_none()) {
-                p.note { "No view was held out, or none was measured; train with --eval to have scores." }
+                p.note { "No view was held out, or none was evaluated; train with --eval to get scores." }
             } @else {
-                p.note { "Means over the views held out from training. Higher PSNR and SSIM are better, lower FLIP." }
+                p.note { "Means over the views held out from training. Higher PSNR and SSIM are better, as is lower FLIP." }
             }
-            @if let Some(means) = scores::of_groups(runs, groups) { (means) }
-            @if let Some(geometry) = scores::geometry(runs) { (geometry) }
-            @if let Some(differing) = options::differing(runs)? {
+            @if let Some(means) = scores::tabulate_means(runs, groups) { (means) }
+            @if let Some(geometry) = scores::tabulate_geometry(runs) { (geometry) }
+            @if let Some(differing) = options::list_differences(runs)? {
                 h3 { "What differs between the runs" }
                 (differing)
             }
         }
-        @for (scene, shown) in groups.scenes.iter().zip(shown) {
+        @for (scene, pictures) in groups.scenes.iter().zip(pictures) {
             section {
                 h2 { "Views" @if groups.scenes.len() > 1 { " of " (scene.label) } }
-                (views(shown))
+                (views(pictures))
             }
         }
-        @if let Some(curves) = curves::all(runs)? {
+        @if let Some(curves) = curves::draw(runs)? {
             section { h2 { "Over the iterations" } (curves) }
         }
         @for run in runs {
@@ -68,52 +72,52 @@ fn introduction(groups: &Groups) -> Markup {
     }
 }
 
-/// What is to be known of a run that has not come to its end.
-fn unfinished(run: &Told) -> Option<String> {
+/// A note on a run that is in training or was stopped.
+fn describe_unfinished(run: &RunRecord) -> Option<String> {
     let (step, last) = (grouped(last_step(run) as usize), grouped(run.config.last() as usize));
-    let shown = grouped(run.iteration as usize);
+    let iteration = grouped(run.iteration as usize);
     match &run.summary {
-        _ if run.trains => Some(format!(
-            "{} is being trained: it has come to iteration {step} of {last}, and what is shown is its model of \
-             iteration {shown}.",
+        _ if run.is_training => Some(format!(
+            "{} is being trained and has reached iteration {step} of {last}; this report is about its model of \
+             iteration {iteration}.",
             run.name
         )),
         Some(summary) if summary.finished => None,
         _ => Some(format!(
-            "{} was stopped after iteration {step} of {last}; what is shown is its model of iteration {shown}.",
+            "{} was stopped after iteration {step} of {last}; this report is about its model of iteration {iteration}.",
             run.name
         )),
     }
 }
 
-fn views(shown: &Shown) -> Markup {
-    let count = grouped(shown.count);
-    let runs = shown.turns.len();
+fn views(pictures: &ScenePictures) -> Markup {
+    let count = grouped(pictures.count);
+    let runs = pictures.orbits.len();
     html! {
         p {
-            @match shown.split {
+            @match pictures.split {
                 Split::Test => { "The worst and the best of " (count) " views held out, by PSNR" }
                 Split::Train => { "No view was held out: the worst and the best of " (count) " views trained on, by PSNR" }
             }
-            @if runs > 1 { " with " (shown.ranked_by) }
-            ". Move the border: the photograph is on the left of it, the render on the right."
+            @if runs > 1 { " with " (pictures.ranked_by) }
+            ". Drag the border: the photograph is on its left, the render on its right."
         }
-        div.figures { @for view in &shown.views { (pair(view)) } }
-        @if shown.turns.iter().any(|turn| !turn.frames.is_empty()) {
+        div.figures { @for view in &pictures.views { (comparison_figure(view)) } }
+        @if pictures.orbits.iter().any(|orbit| !orbit.frames.is_empty()) {
             h3 { "Around the scene" }
-            div.figures { @for turn in &shown.turns { (around(turn, runs > 1)) } }
+            div.figures { @for orbit in &pictures.orbits { (orbit_figure(orbit, runs > 1)) } }
         }
     }
 }
 
-/// A photograph and its renders, two of them over each other, and a window of each.
-fn pair(view: &View) -> Markup {
+/// A photograph and its renders, two of them overlaid with a slider, and a crop of each.
+fn comparison_figure(view: &ViewComparison) -> Markup {
     let (width, height) = view.pictures[0].picture.size;
     let several = view.pictures.len() > 2;
     html! {
         figure.pair {
-            div.stack style=(shape(width, height)) {
-                @for (at, Named { name, picture }) in view.pictures.iter().enumerate() {
+            div.stack style=(aspect_style(width, height)) {
+                @for (at, NamedPicture { name, picture }) in view.pictures.iter().enumerate() {
                     img src=(picture.uri) alt=(format!("{}: {name}", view.name)) width=(width) height=(height)
                         class=[["left", "right"].get(at)];
                 }
@@ -123,8 +127,8 @@ fn pair(view: &View) -> Markup {
                 aria-label=(format!("Border between the pictures of {}", view.name));
             @if several {
                 div.choices {
-                    (choice("left", "Left", 0, &view.pictures))
-                    (choice("right", "Right", 1, &view.pictures))
+                    (picture_choice("left", "Left", 0, &view.pictures))
+                    (picture_choice("right", "Right", 1, &view.pictures))
                 }
             }
             figcaption {
@@ -136,7 +140,7 @@ fn pair(view: &View) -> Markup {
                 }
             }
             div.crops {
-                @for Named { name, picture } in &view.crops {
+                @for NamedPicture { name, picture } in &view.crops {
                     @let (width, height) = picture.size;
                     div {
                         img src=(picture.uri) alt=(format!("{}, enlarged: {name}", view.name)) width=(width) height=(height);
@@ -148,17 +152,17 @@ fn pair(view: &View) -> Markup {
     }
 }
 
-/// What a stack of pictures of this size needs to be told, as they lie over each other.
-fn shape(width: u32, height: u32) -> String {
+/// The CSS for overlaid pictures of this size.
+fn aspect_style(width: u32, height: u32) -> String {
     let ratio = f64::from(width) / f64::from(height);
     format!("aspect-ratio: {width} / {height}; --ratio: {ratio:.4}")
 }
 
-fn choice(side: &str, label: &str, chosen: usize, pictures: &[Named]) -> Markup {
+fn picture_choice(side: &str, label: &str, chosen: usize, pictures: &[NamedPicture]) -> Markup {
     html! {
         label { (label) " "
             select class=(side) {
-                @for (at, Named { name, .. }) in pictures.iter().enumerate() {
+                @for (at, NamedPicture { name, .. }) in pictures.iter().enumerate() {
                     option value=(at) selected[at == chosen] { (name) }
                 }
             }
@@ -166,33 +170,33 @@ fn choice(side: &str, label: &str, chosen: usize, pictures: &[Named]) -> Markup 
     }
 }
 
-fn around(turn: &Turn, is_named: bool) -> Markup {
-    let Some(first) = turn.frames.first() else { return html! {} };
+fn orbit_figure(orbit: &Orbit, is_named: bool) -> Markup {
+    let Some(first) = orbit.frames.first() else { return html! {} };
     let (width, height) = first.size;
-    let last = turn.frames.len() - 1;
+    let last = orbit.frames.len() - 1;
     html! {
         figure.turn {
-            div.stack style=(shape(width, height)) {
-                @for (at, frame) in turn.frames.iter().enumerate() {
-                    img src=(frame.uri) alt=(format!("{}, turned by {}°", turn.name, 360 * at / (last + 1)))
+            div.stack style=(aspect_style(width, height)) {
+                @for (at, frame) in orbit.frames.iter().enumerate() {
+                    img src=(frame.uri) alt=(format!("{}, turned by {}°", orbit.name, 360 * at / (last + 1)))
                         width=(width) height=(height) hidden[at > 0];
                 }
             }
-            input type="range" min="0" max=(last) step="1" value="0" aria-label=(format!("Turn around {}", turn.name));
-            @if is_named { figcaption { strong { (turn.name) } } }
+            input type="range" min="0" max=(last) step="1" value="0" aria-label=(format!("Turn around {}", orbit.name));
+            @if is_named { figcaption { strong { (orbit.name) } } }
         }
     }
 }
 
-fn details(run: &Told) -> Result<Markup, Failure> {
+fn details(run: &RunRecord) -> Result<Markup, Failure> {
     Ok(html! {
-        @if let Some(memory) = memory::of_run(run) { h3 { "Memory" } (memory) }
+        @if let Some(memory) = memory::describe(run) { h3 { "Memory" } (memory) }
         h3 { "Edits" }
-        (edits::of_run(run))
+        (edits::tabulate(run))
         @if let Some(reductions) = &run.reductions {
-            h3 { "What was left out automatically" }
+            h3 { "Automatic reductions" }
             @if reductions.left_out.is_empty() {
-                p { "Nothing" @if reductions.full { ", as asked (--full)" } "." }
+                p { "Nothing" @if reductions.full { ", as requested (--full)" } "." }
             } @else {
                 ul { @for left in &reductions.left_out {
                     li { strong { (left.what) } ": " (left.evidence) "; " (left.loss) "." }
@@ -203,8 +207,8 @@ fn details(run: &Told) -> Result<Markup, Failure> {
         p.note {
             "densify " (run.config.densify) ", computed on "
             (run.config.resolved.adapter.as_deref().unwrap_or("the processor"))
-            ". Options that are not the default:"
+            ". Options that differ from the defaults:"
         }
-        (options::of_run(run)?)
+        (options::list(run)?)
     })
 }

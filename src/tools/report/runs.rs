@@ -1,9 +1,9 @@
-//! What the folder of a run says.
+//! Reads the folders of runs.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use super::Wanted;
+use super::ReportOptions;
 use densify_run::failure::Failure;
 use densify_run::finished::{is_model, iteration_so_far, names_of};
 use densify_run::{Observer, Reductions, RunConfig};
@@ -14,97 +14,97 @@ use densify_train::output::{
 };
 use densify_train::trainer::EditEvent;
 
-/// A run, as its folder tells it.
-pub(super) struct Told {
+/// The contents of a run's folder.
+pub(super) struct RunRecord {
     pub(super) folder: PathBuf,
-    /// The folder's name, with as much of what is above as tells it from others.
+    /// The folder's name, with parent folders where needed to make it unique.
     pub(super) name: String,
     pub(super) config: RunConfig,
-    /// Of the model that is shown.
+    /// Iteration of the model in the report.
     pub(super) iteration: u32,
-    /// Whether it is being trained.
-    pub(super) trains: bool,
-    /// What it says at its end; not while it trains, as it may be that of an earlier stop.
+    /// True while the run is in training.
+    pub(super) is_training: bool,
+    /// The summary at the end; `None` during training, when it may be that of an earlier stop.
     pub(super) summary: Option<Summary>,
     pub(super) steps: Vec<StepRecord>,
     pub(super) events: Vec<EditEvent>,
-    /// What was left out automatically, once the run has ended.
+    /// The automatic reductions, once the run has ended.
     pub(super) reductions: Option<Reductions>,
-    /// Mean scores on the test views by iteration.
+    /// Mean scores of the test views by iteration.
     pub(super) scores: BTreeMap<u32, Mean>,
-    /// PSNR of the test views with this model, by name `[dB]`.
+    /// PSNR of each test view for this model, by name `[dB]`.
     pub(super) by_view: BTreeMap<String, f64>,
     pub(super) geometry: Option<Geometry>,
 }
 
-impl Told {
-    /// Reads all runs, in the order in which they are named.
+impl RunRecord {
+    /// Reads all runs in the given order.
     pub(super) fn read_all(
-        wanted: &Wanted<'_>,
+        options: &ReportOptions<'_>,
         observer: &dyn Observer,
     ) -> Result<Vec<Self>, Failure> {
-        let mut whole: Vec<PathBuf> = Vec::new();
-        for run in wanted.runs {
+        let mut canonical: Vec<PathBuf> = Vec::new();
+        for run in options.runs {
             let place = run.canonicalize().unwrap_or_else(|_| run.clone());
-            if whole.contains(&place) {
+            if canonical.contains(&place) {
                 let run = run.display();
                 return Err(Failure::input(format!("{run} is named twice; name it once")));
             }
-            whole.push(place);
+            canonical.push(place);
         }
-        let names = names_of(&whole.iter().map(PathBuf::as_path).collect::<Vec<_>>());
-        let told = wanted.runs.iter().zip(names);
-        told.map(|(run, name)| Self::read(run, name, wanted.iteration, observer)).collect()
+        let names = names_of(&canonical.iter().map(PathBuf::as_path).collect::<Vec<_>>());
+        let named = options.runs.iter().zip(names);
+        named.map(|(run, name)| Self::read(run, name, options.iteration, observer)).collect()
     }
 
     fn read(
         folder: &Path,
         name: String,
-        asked: Option<u32>,
+        iteration: Option<u32>,
         observer: &dyn Observer,
     ) -> Result<Self, Failure> {
         if is_model(folder) {
             let folder = folder.display();
             return Err(Failure::input(format!(
-                "{folder} is a model; a report is of a run: name the folder that `densify train` wrote"
+                "{folder} is a model, and a report is about runs: name the folder that `densify train` wrote"
             )));
         }
         let config = RunConfig::read(folder)?;
-        let (iteration, trains) = iteration_so_far(folder, asked, observer)?;
+        let (iteration, is_training) = iteration_so_far(folder, iteration, observer)?;
         Ok(Self {
             folder: folder.to_owned(),
             name,
             config,
             iteration,
-            trains,
-            summary: if trains { None } else { summary_of(folder)? },
+            is_training,
+            summary: if is_training { None } else { summary_of(folder)? },
             steps: steps_of(folder)?,
             events: events_of(folder)?,
-            reductions: if trains { None } else { Reductions::read(folder)? },
+            reductions: if is_training { None } else { Reductions::read(folder)? },
             scores: all_scores(folder)?,
             by_view: psnr_by_view(folder, iteration)?,
             geometry: geometry_of(folder, iteration)?,
         })
     }
 
-    /// The scores of the model that is shown, where it was measured.
+    /// The scores of the model in the report, if it was evaluated.
     pub(super) fn score(&self) -> Option<Mean> {
         self.scores.get(&self.iteration).copied()
     }
 
-    /// Rows at the end, as far as it has come.
+    /// Number of Gaussians at the end, or so far.
     pub(super) fn rows(&self) -> Option<usize> {
         let so_far = self.steps.last().map(|step| step.rows);
         self.summary.as_ref().map(|summary| summary.rows).or(so_far)
     }
 
-    /// Most resident memory `[bytes]`, as far as is known.
+    /// Peak resident memory `[bytes]`, if known.
     pub(super) fn peak_bytes(&self) -> Option<u64> {
         let so_far = self.steps.iter().filter_map(|step| step.resident_bytes).max();
         self.summary.as_ref().and_then(|summary| summary.peak_bytes).or(so_far)
     }
 
-    /// Wall time of all steps `[s]`.
+    /// Wall time of all steps `[s]`, if known.
     pub(super) fn seconds(&self) -> Option<f64> {
         let so_far = self.steps.last().map(|step| step.seconds);
         self.summary.as_ref().map(|summary| summary.seconds).or(so_far)

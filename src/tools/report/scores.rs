@@ -1,18 +1,18 @@
-//! The scores: of every run, and their means over seeds with intervals and paired differences.
+//! Tables of scores: of every run, and means over seeds with intervals and paired differences.
 
 use maud::{Markup, html};
 
 use super::groups::{Group, Groups, Scene};
-use super::runs::Told;
+use super::runs::RunRecord;
 use densify_core::memory::Bytes;
 use densify_core::numbers::{duration, grouped, percent};
-use densify_html::{Column, table};
+use densify_html::{Column, Table};
 use densify_study::difference::{Difference, Pair};
 use densify_train::evaluate::Mean;
 
-const NOTHING: &str = "–";
+const DASH: &str = "–";
 
-/// A score and how many digits of it are told.
+/// Name, value and number of decimals of a score.
 type Score = (&'static str, fn(&Mean) -> f64, usize);
 
 const SCORES: [Score; 3] = [
@@ -21,8 +21,8 @@ const SCORES: [Score; 3] = [
     ("FLIP", |mean| mean.flip, 4),
 ];
 
-/// The numbers of a single run that matter most.
-pub(super) fn headline(run: &Told) -> Markup {
+/// Summarises a single run by its most important numbers.
+pub(super) fn summarise(run: &RunRecord) -> Markup {
     let score = run.score();
     let summary = run.summary.as_ref();
     let of_budget = format!("of at most {}", grouped(run.config.budget()));
@@ -48,8 +48,8 @@ pub(super) fn headline(run: &Told) -> Markup {
     }
 }
 
-/// The iteration that a run has come to.
-pub(super) fn last_step(run: &Told) -> u32 {
+/// The last completed iteration of a run.
+pub(super) fn last_step(run: &RunRecord) -> u32 {
     let so_far = run.steps.last().map_or(run.iteration, |step| step.step);
     run.summary.as_ref().map_or(so_far, |summary| summary.iterations)
 }
@@ -59,29 +59,29 @@ pub(super) fn time(seconds: f64) -> String {
 }
 
 fn number(value: f64, digits: usize) -> String {
-    if value.is_nan() { NOTHING.to_owned() } else { format!("{value:.digits$}") }
+    if value.is_nan() { DASH.to_owned() } else { format!("{value:.digits$}") }
 }
 
-/// Every run.
-pub(super) fn of_runs(runs: &[Told], groups: &Groups) -> Markup {
+/// Tabulates all runs.
+pub(super) fn tabulate_runs(runs: &[RunRecord], groups: &Groups) -> Markup {
     let has_lpips = runs.iter().any(|run| run.score().is_some_and(|mean| mean.lpips.is_some()));
-    let mut columns = vec![Column::Text("run")];
+    let mut columns = vec![Column::text("run")];
     if groups.scenes.len() > 1 {
-        columns.push(Column::Text("scene"));
+        columns.push(Column::text("scene"));
     }
-    columns.extend([Column::Text("policy"), Column::Number("seed"), Column::Number("iteration")]);
-    columns.extend(SCORES.map(|(name, ..)| Column::Number(name)));
+    columns.extend([Column::text("policy"), Column::number("seed"), Column::number("iteration")]);
+    columns.extend(SCORES.map(|(name, ..)| Column::number(name)));
     if has_lpips {
-        columns.push(Column::Number("LPIPS"));
+        columns.push(Column::number("LPIPS"));
     }
     let rest = ["Gaussians", "at the peak", "budget", "peak memory", "time"];
-    columns.extend(rest.map(Column::Number));
+    columns.extend(rest.map(Column::number));
     let scene_of = |number: usize| {
         let has = |scene: &&Scene| scene.groups.iter().any(|group| group.runs.contains(&number));
-        groups.scenes.iter().find(has).map_or(NOTHING.to_owned(), |scene| scene.label.clone())
+        groups.scenes.iter().find(has).map_or(DASH.to_owned(), |scene| scene.label.clone())
     };
-    let or_dash = |text: Option<String>| text.unwrap_or_else(|| NOTHING.to_owned());
-    let row = |(at, run): (usize, &Told)| {
+    let or_dash = |text: Option<String>| text.unwrap_or_else(|| DASH.to_owned());
+    let row = |(at, run): (usize, &RunRecord)| {
         let mut row = vec![run.name.clone()];
         if groups.scenes.len() > 1 {
             row.push(scene_of(at));
@@ -108,12 +108,13 @@ pub(super) fn of_runs(runs: &[Told], groups: &Groups) -> Markup {
         ]);
         row
     };
-    let rows: Vec<Vec<String>> = runs.iter().enumerate().map(row).collect();
-    table(&columns, &rows)
+    let mut table = Table::new(columns);
+    runs.iter().enumerate().for_each(|run| table.row(row(run)));
+    table.to_html()
 }
 
-/// Means over seeds, and differences from the first group of each scene; nothing where no scene has two runs.
-pub(super) fn of_groups(runs: &[Told], groups: &Groups) -> Option<Markup> {
+/// Tabulates means over seeds, and differences from the first group of each scene; `None` if no scene has two runs.
+pub(super) fn tabulate_means(runs: &[RunRecord], groups: &Groups) -> Option<Markup> {
     let several = groups.scenes.iter().filter(|scene| count(scene) > 1);
     let several: Vec<&Scene> = several.collect();
     if several.is_empty() {
@@ -123,12 +124,12 @@ pub(super) fn of_groups(runs: &[Told], groups: &Groups) -> Option<Markup> {
         h3 { "Means over seeds" }
         @for scene in several {
             @if groups.scenes.len() > 1 { p { strong { (scene.label) } } }
-            (of_scene(scene, runs))
+            (tabulate_scene(scene, runs))
         }
         p.note {
-            "Brackets are 95 % intervals of the mean by Student's t, from three seeds on."
+            "Brackets are 95 % intervals of the mean by Student's t, given from three seeds on."
             @if groups.scenes.iter().any(|scene| scene.groups.len() > 1) {
-                " Differences are taken between runs of the same seed."
+                " Differences are between runs of the same seed."
             }
         }
     })
@@ -138,13 +139,13 @@ fn count(scene: &Scene) -> usize {
     scene.groups.iter().map(|group| group.runs.len()).sum()
 }
 
-fn of_scene(scene: &Scene, runs: &[Told]) -> Markup {
+fn tabulate_scene(scene: &Scene, runs: &[RunRecord]) -> Markup {
     let first = &scene.groups[0];
     let against = format!("PSNR against {} [dB]", first.label);
-    let mut columns = vec![Column::Text("settings"), Column::Number("runs")];
-    columns.extend(SCORES.map(|(name, ..)| Column::Number(name)));
+    let mut columns = vec![Column::text("settings"), Column::number("runs")];
+    columns.extend(SCORES.map(|(name, ..)| Column::number(name)));
     if scene.groups.len() > 1 {
-        columns.push(Column::Number(&against));
+        columns.push(Column::number(&against));
     }
     let row = |group: &Group| {
         let mut row = vec![group.label.clone(), group.runs.len().to_string()];
@@ -154,19 +155,24 @@ fn of_scene(scene: &Scene, runs: &[Told]) -> Markup {
         }
         if scene.groups.len() > 1 {
             row.push(if std::ptr::eq(group, first) {
-                NOTHING.to_owned()
+                DASH.to_owned()
             } else {
                 against_first(group, first, runs)
             });
         }
         row
     };
-    let rows: Vec<Vec<String>> = scene.groups.iter().map(row).collect();
-    table(&columns, &rows)
+    let mut table = Table::new(columns);
+    scene.groups.iter().for_each(|group| table.row(row(group)));
+    table.to_html()
 }
 
-/// Values of the runs of a group, with their seeds.
-fn pairs(group: &Group, runs: &[Told], value: impl Fn(&Told) -> Option<f64>) -> Vec<Pair<'static>> {
+/// A value of each run of a group, with its seed.
+fn pairs(
+    group: &Group,
+    runs: &[RunRecord],
+    value: impl Fn(&RunRecord) -> Option<f64>,
+) -> Vec<Pair<'static>> {
     let pair = |&run: &usize| {
         let seed = runs[run].config.spec.schedule.seed as u32;
         Some(Pair { scene: "", seed, difference: value(&runs[run])? })
@@ -176,13 +182,13 @@ fn pairs(group: &Group, runs: &[Told], value: impl Fn(&Told) -> Option<f64>) -> 
 
 /// `30.12 [29.95, 30.29]`
 fn mean_of(values: &[Pair<'_>], digits: usize) -> String {
-    let Some(found) = Difference::new(values) else { return NOTHING.to_owned() };
+    let Some(found) = Difference::new(values) else { return DASH.to_owned() };
     let within = found.within(|[low, high]| format!("{low:.digits$}, {high:.digits$}"));
     format!("{:.digits$}{within}", found.mean)
 }
 
-fn against_first(group: &Group, first: &Group, runs: &[Told]) -> String {
-    let psnr = |run: &Told| run.score().map(|mean| mean.psnr);
+fn against_first(group: &Group, first: &Group, runs: &[RunRecord]) -> String {
+    let psnr = |run: &RunRecord| run.score().map(|mean| mean.psnr);
     let base = pairs(first, runs, psnr);
     let pair = |pair: Pair<'static>| {
         let other = base.iter().find(|other| other.seed == pair.seed)?;
@@ -190,30 +196,30 @@ fn against_first(group: &Group, first: &Group, runs: &[Told]) -> String {
     };
     let differences: Vec<Pair<'_>> =
         pairs(group, runs, psnr).into_iter().filter_map(pair).collect();
-    Difference::new(&differences).map_or_else(|| NOTHING.to_owned(), |found| found.show(2))
+    Difference::new(&differences).map_or_else(|| DASH.to_owned(), |found| found.show(2))
 }
 
-/// How the models sit on the known surface; nothing where none is known.
-pub(super) fn geometry(runs: &[Told]) -> Option<Markup> {
-    let row = |run: &Told| {
-        let it = run.geometry.as_ref()?;
-        Some(vec![
+/// Tabulates geometric errors against the known surface; `None` if it is not known.
+pub(super) fn tabulate_geometry(runs: &[RunRecord]) -> Option<Markup> {
+    let row = |run: &RunRecord| {
+        let geometry = run.geometry.as_ref()?;
+        Some([
             run.name.clone(),
-            percent(it.depth.rmse),
-            percent(it.centres.chamfer),
-            percent(it.centres.f_score_one_percent),
-            percent(it.floaters.of_rows),
+            percent(geometry.depth.rmse),
+            percent(geometry.centres.chamfer),
+            percent(geometry.centres.f_score_one_percent),
+            percent(geometry.floaters.of_rows),
         ])
     };
-    let rows: Vec<Vec<String>> = runs.iter().filter_map(row).collect();
     let numbers = ["depth RMSE", "Chamfer distance", "F-score at 1 %", "floaters, of all"];
-    let columns: Vec<Column<'_>> =
-        std::iter::once(Column::Text("run")).chain(numbers.map(Column::Number)).collect();
-    (!rows.is_empty()).then(|| {
+    let mut table =
+        Table::new(std::iter::once(Column::text("run")).chain(numbers.map(Column::number)));
+    runs.iter().filter_map(row).for_each(|row| table.row(row));
+    (!table.is_empty()).then(|| {
         html! {
             h3 { "Geometry" }
-            (table(&columns, &rows))
-            p.note { "Against the known surface; lengths as shares of the diagonal of its box." }
+            (table.to_html())
+            p.note { "Against the known surface; lengths as fractions of the diagonal of its bounding box." }
         }
     })
 }

@@ -47,6 +47,11 @@ impl fmt::Display for Columns {
     }
 }
 
+/// A number, or a dash where it was not measured.
+pub(super) fn number_or_dash(value: Option<f64>, digits: usize) -> String {
+    value.map_or_else(|| "–".to_owned(), |value| format!("{value:.digits$}"))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

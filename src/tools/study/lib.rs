@@ -12,7 +12,6 @@ mod compare;
 pub mod difference;
 mod engines;
 mod journal;
-mod markdown;
 pub mod panel;
 mod plot;
 mod record;
@@ -28,7 +27,7 @@ pub use trade::Trade;
 use cell::Cell;
 use densify_core::files::write_atomically;
 use densify_data::dataset::builtin;
-use densify_html as html;
+use densify_html::{Document, data_uri_of_file};
 use densify_run::Observer;
 use densify_run::failure::Failure;
 use journal::Journal;
@@ -117,11 +116,16 @@ impl<'a> Study<'a> {
         Ok(is_left)
     }
 
-    /// Writes the report, as `name`.md, and as `name`.html with its pictures in it.
-    fn finish(&self, name: &str, text: &str, summary: String) -> Result<Finished, Failure> {
+    /// Writes the report as `name`.md, and as `name`.html with embedded pictures.
+    fn finish(
+        &self,
+        name: &str,
+        document: &Document,
+        summary: String,
+    ) -> Result<Finished, Failure> {
         let report = self.output.join(name).with_extension("md");
-        write_atomically(&report, |out| out.write_all(text.as_bytes()))?;
-        let page = html::from_markdown(text, &|file| html::embed_file(&self.output.join(file)))?;
+        write_atomically(&report, |out| write!(out, "{document}"))?;
+        let page = document.to_html(|file| data_uri_of_file(&self.output.join(file)))?;
         write_atomically(&report.with_extension("html"), |out| out.write_all(page.as_bytes()))?;
         Ok(Finished { summary, report })
     }

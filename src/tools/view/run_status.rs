@@ -120,7 +120,7 @@ impl RunStatus {
             Command::Pause => pending.is_paused = true,
             Command::Continue => (pending.is_paused, pending.steps) = (false, 0),
             Command::Step => {
-                (pending.is_paused, pending.steps) = (true, pending.steps.saturating_add(1))
+                (pending.is_paused, pending.steps) = (true, pending.steps.saturating_add(1));
             }
             Command::Checkpoint => pending.checkpoint = true,
             Command::Stop => pending.stop = true,

@@ -337,7 +337,7 @@ fn a_run_that_is_being_trained_is_reported_as_last_saved() {
     assert!(said.contains("is being trained"), "{said}");
     let page = read_text(&file);
     assert!(
-        page.contains("is being trained: it has come to iteration 40 of 40"),
+        page.contains("is being trained and has reached iteration 40 of 40"),
         "the reader is not told"
     );
     assert!(page.contains("model of iteration 20."));

@@ -75,12 +75,16 @@ impl Buffers<'_> {
         };
         let bytes = self.view(view)?.get(accessor.byte_offset..).unwrap_or_default();
         let scale = |most: f32| if accessor.normalized { 1.0 / most } else { 1.0 };
+        // The smallest signed integer is one step below −1 when normalised (glTF 2.0, section 3.11).
+        let least = if accessor.normalized { -1.0 } else { f32::NEG_INFINITY };
         let (size, number): (usize, ReadNumber<'_>) = match accessor.component_type {
-            5120 => (1, Box::new(move |b| (f32::from(b[0] as i8) * scale(127.0)).max(-127.0))),
+            5120 => (1, Box::new(move |b| (f32::from(b[0] as i8) * scale(127.0)).max(least))),
             5121 => (1, Box::new(move |b| f32::from(b[0]) * scale(255.0))),
             5122 => (
                 2,
-                Box::new(move |b| f32::from(i16::from_le_bytes([b[0], b[1]])) * scale(32_767.0)),
+                Box::new(move |b| {
+                    (f32::from(i16::from_le_bytes([b[0], b[1]])) * scale(32_767.0)).max(least)
+                }),
             ),
             5123 => (
                 2,

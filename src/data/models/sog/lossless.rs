@@ -329,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn every_picture_encoded_length() {
+    fn every_picture_comes_back() {
         for (width, height) in [(1, 1), (4, 1), (1, 5), (3, 2), (520, 517), (64, 1040)] {
             for alpha in [255, 7] {
                 // One colour, two, a few, gradients along and across, waves, noise in all channels or one.

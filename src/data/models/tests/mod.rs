@@ -10,8 +10,8 @@ use std::ops::Range;
 
 use super::*;
 use densify_core::files::FileError;
-use densify_core::gaussians::Gaussians;
-use densify_core::gaussians::sh_coefficients;
+use densify_core::gaussians::{Gaussians, sh_coefficients};
+use densify_core::pieces::ROWS_AT_A_TIME;
 
 /// A model whose values all differ, so that a swapped column shows, with odd bits, so that a
 /// conversion shows.
@@ -19,7 +19,7 @@ pub(crate) fn model(rows: usize, sh_degree: u8) -> Gaussians {
     let mut next = 0u32;
     let mut value = || {
         next += 1;
-        f32::from_bits(0x3e80_0001 ^ ((next * 7919) & 0x007f_ffff) ^ ((next % 2) << 31))
+        f32::from_bits(0x3e80_0001 ^ (next.wrapping_mul(7919) & 0x007f_ffff) ^ ((next % 2) << 31))
     };
     let mut model = Gaussians { sh_degree, ..Gaussians::default() };
     for _ in 0..rows {
@@ -81,12 +81,13 @@ fn a_registered_format_is_found_and_given_every_row_once() {
     let format = find("call-log").unwrap();
     assert_eq!(find_by_extension(Path::new("a/model.LOG.txt")).unwrap().name, format.name);
     assert_eq!(format.held_bytes(Shape { rows: 7, sh_degree: 0 }), 7);
-    let (folder, whole) = (tempfile::tempdir().unwrap(), model(100, 1));
+    let rows = 2 * ROWS_AT_A_TIME + 4;
+    let (folder, whole) = (tempfile::tempdir().unwrap(), model(rows, 1));
     let path = folder.path().join("new/model.log.txt");
-    let shape = Shape { rows: 100, sh_degree: 1 };
+    let shape = Shape { rows, sh_degree: 1 };
     format.write_file(&path, shape, |rows| Ok::<_, FileError>(piece(&whole, rows))).unwrap();
-    // Pieces have 48 rows in tests.
-    assert_eq!(std::fs::read_to_string(&path).unwrap(), "begin 100 1;48;48;4;finish");
+    let expected = format!("begin {rows} 1;{ROWS_AT_A_TIME};{ROWS_AT_A_TIME};4;finish");
+    assert_eq!(std::fs::read_to_string(&path).unwrap(), expected);
 }
 
 /// `find` and `find_by_extension` offer only formats that can be written.
@@ -115,7 +116,7 @@ fn a_failed_source_leaves_the_old_file() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("model.ply");
     std::fs::write(&path, "old").unwrap();
-    let shape = Shape { rows: 100, sh_degree: 0 };
+    let shape = Shape { rows: ROWS_AT_A_TIME + 1, sh_degree: 0 };
     let lost = || FileError::Lost { path: "lost".into() };
     let written = PLY.write_file(&path, shape, |rows| match rows.start {
         0 => Ok(model(rows.len(), 0)),

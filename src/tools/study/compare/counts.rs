@@ -7,8 +7,8 @@ use super::{Outcome, scenes_and_budgets};
 use crate::columns::Columns;
 use crate::difference::mean;
 use crate::distinct;
-use crate::markdown::MarkdownTable;
 use densify_core::numbers::grouped;
+use densify_html::{Column, Document, Table};
 
 /// Rows at the end, in the mean of some runs; a dash without any.
 fn at_the_end(runs: &[&Outcome]) -> String {
@@ -30,12 +30,12 @@ fn budgets(outcomes: &[Outcome]) -> Vec<usize> {
     budgets
 }
 
-/// A table per budget: counts at the end in every scene, beside them the true peaks.
-pub(super) fn tables(outcomes: &[Outcome], policies: &[String]) -> String {
-    let mut text = String::from(
-        "\n## Gaussians at the end and at the true peak\n\nAt the end: means over seeds. True peak: the \
-         most at any instant of any seed. A policy that ends below its budget is compared at equal peak \
-         above, and by what it ends with here.\n",
+/// Adds a table per budget: counts at the end in every scene, beside them the true peaks.
+pub(super) fn add_tables(document: &mut Document, outcomes: &[Outcome], policies: &[String]) {
+    document.section("Gaussians at the end and at the true peak");
+    document.paragraph(
+        "At the end: means over seeds. True peak: the most at any instant of any seed. A policy that ends below its \
+         budget is compared at equal peak above, and by what it ends with here.",
     );
     for budget in budgets(outcomes) {
         let all = scenes_and_budgets(outcomes);
@@ -43,7 +43,8 @@ pub(super) fn tables(outcomes: &[Outcome], policies: &[String]) -> String {
         let scenes: Vec<&str> = scenes.collect();
         let titled = |what: &str| scenes.iter().map(|s| format!("{s}, {what}")).collect::<Vec<_>>();
         let titles = [titled("at the end"), titled("peak")].concat();
-        let mut table = MarkdownTable::new(&format!("policy | {}", titles.join(" | ")));
+        let titles = std::iter::once("policy").chain(titles.iter().map(String::as_str));
+        let mut table = Table::new(titles.map(Column::text));
         for policy in policies {
             let of = |scene: &&str| -> Vec<&Outcome> {
                 let is_of =
@@ -53,11 +54,11 @@ pub(super) fn tables(outcomes: &[Outcome], policies: &[String]) -> String {
             let runs: Vec<Vec<&Outcome>> = scenes.iter().map(of).collect();
             let counts = runs.iter().map(|runs| at_the_end(runs));
             let cells = counts.chain(runs.iter().map(|runs| peak(runs)));
-            table.row(&std::iter::once(policy.clone()).chain(cells).collect::<Vec<_>>());
+            table.row(std::iter::once(policy.clone()).chain(cells));
         }
-        text += &format!("\n### Budget of {}\n\n{table}", grouped(budget));
+        document.subsection(&format!("Budget of {}", grouped(budget)));
+        document.table(table);
     }
-    text
 }
 
 /// The same for the terminal, over all scenes of a budget.
@@ -109,7 +110,9 @@ mod tests {
             run("a", "room", 500, 0, [499, 500]),
         ];
         let policies = ["a", "b"].map(String::from);
-        let text = tables(&all, &policies);
+        let mut document = Document::new("");
+        add_tables(&mut document, &all, &policies);
+        let text = document.to_string();
         let expected = "
 ### Budget of 500
 

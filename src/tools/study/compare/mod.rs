@@ -129,17 +129,18 @@ impl Comparison {
         let cells = self.cells(&policies, train)?;
         let mut study = Study::open(&self.output, "compare", observer)?;
         let Some(outcomes) = study.run(&cells, &self.engine)? else { return Ok(None) };
-        let mut text = report::markdown(&outcomes, &policies);
-        text += "\n## Pictures\n";
+        let mut document = report::document(&outcomes, &policies);
+        document.section("Pictures");
         for picture in plots::draw(&self.output, &outcomes, &policies)? {
-            text += &format!("\n![{}]({})\n", picture.caption, picture.file);
+            document.picture(picture.file, picture.caption);
         }
         for picture in crops::draw(&self.output, &outcomes, observer)? {
-            let caption = picture.caption;
-            text += &format!("\n![{caption}]({})\n\n{caption}.\n", picture.file);
+            let text = format!("{}.", picture.caption);
+            document.picture(picture.file, picture.caption);
+            document.paragraph(text);
         }
-        text += &report::options(&outcomes)?;
-        study.finish("compare", &text, report::summary(&outcomes, &policies)).map(Some)
+        report::add_options(&mut document, &outcomes)?;
+        study.finish("compare", &document, report::summary(&outcomes, &policies)).map(Some)
     }
 
     /// All runs, in the order in which they run: seed after seed, so that an interrupted comparison is a

@@ -1,9 +1,9 @@
 //! Who did best: every policy against the first in each score, with ranks and intervals.
 
 use super::{Outcome, difference};
-use crate::columns::Columns;
+use crate::columns::{Columns, number_or_dash};
 use crate::difference::{Difference, mean};
-use crate::markdown::{MarkdownTable, number_or_dash};
+use densify_html::{Column, Table};
 
 /// A score of a run.
 struct Score {
@@ -69,9 +69,9 @@ impl Score {
 }
 
 /// Ranks and differences in every score, in the order in which the policies were named.
-pub(super) fn table(outcomes: &[Outcome], policies: &[String]) -> MarkdownTable {
-    let titles = SCORES.map(|score| format!("{} | better in | rank", score.title));
-    let mut table = MarkdownTable::new(&format!("policy | {}", titles.join(" | ")));
+pub(super) fn table(outcomes: &[Outcome], policies: &[String]) -> Table {
+    let titles = SCORES.iter().flat_map(|score| [score.title, "better in", "rank"]);
+    let mut table = Table::new(std::iter::once("policy").chain(titles).map(Column::text));
     let all = SCORES.map(|score| (score.standings(outcomes, policies), score));
     for (place, policy) in policies.iter().enumerate() {
         let mut cells = vec![policy.clone()];
@@ -87,7 +87,7 @@ pub(super) fn table(outcomes: &[Outcome], policies: &[String]) -> MarkdownTable 
             };
             cells.extend([shown, better, standing.rank()]);
         }
-        table.row(&cells);
+        table.row(cells);
     }
     table
 }

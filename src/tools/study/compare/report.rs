@@ -1,15 +1,15 @@
-//! The comparison as text: Markdown for the file, a few lines for the terminal.
+//! The report of a comparison: a document, and a few lines for the terminal.
 
 use std::collections::BTreeSet;
-use std::fmt::Write;
 
 use toml::{Table, Value};
 
 use super::{Outcome, at, counts, difference, ranking, scenes_and_budgets};
+use crate::columns::number_or_dash;
 use crate::difference::{INTERVALS, mean};
 use crate::distinct;
-use crate::markdown::{MarkdownTable, number_or_dash};
 use densify_core::numbers::grouped;
+use densify_html::{Column, Document, Table as ReportTable, Text};
 use densify_run::Partial;
 use densify_run::failure::Failure;
 use densify_train::metrics::geometry::Geometry;
@@ -19,45 +19,55 @@ fn mean_of(runs: &[&Outcome], value: impl Fn(&Outcome) -> Option<f64>) -> Option
     mean(runs.iter().map(|run| value(run)).collect::<Option<Vec<f64>>>()?)
 }
 
-/// The whole comparison.
-pub(super) fn markdown(outcomes: &[Outcome], policies: &[String]) -> String {
-    let mut text = String::from("# Comparison of density-control policies\n");
+/// The comparison as a document, without pictures and options.
+pub(super) fn document(outcomes: &[Outcome], policies: &[String]) -> Document {
+    let mut document = Document::new("Comparison of density-control policies");
     let (Some(first), Some(run)) = (policies.first(), outcomes.first()) else {
-        return text;
+        return document;
     };
     let seeds = distinct(outcomes.iter().map(|r| r.seed)).len();
-    let _ = write!(
-        text,
-        "\n{} iterations, {seeds} {}. Means over seeds; differences from `{first}` are paired by \
-         scene, budget and seed. {INTERVALS}. All options are at the end.\n",
+    let runs = format!(
+        "{} iterations, {seeds} {}. Means over seeds; differences from ",
         grouped(run.iterations as usize),
         if seeds == 1 { "seed" } else { "seeds" },
     );
+    let pairs =
+        format!(" are paired by scene, budget and seed. {INTERVALS}. All options are at the end.");
+    document.paragraph(Text::from(runs).code(first).plain(&pairs));
     if policies.len() > 1 {
-        let ranks = ranking::table(outcomes, policies);
-        let _ = write!(text, "\n## Over all scenes and budgets\n\n{ranks}");
+        document.section("Over all scenes and budgets");
+        document.table(ranking::table(outcomes, policies));
     }
-    text += &counts::tables(outcomes, policies);
+    counts::add_tables(&mut document, outcomes, policies);
     for (scene, budget) in scenes_and_budgets(outcomes) {
         let here = at(outcomes, scene, budget);
-        let _ = write!(text, "\n## {scene}, {} rows\n\n", grouped(budget));
-        let mut table = MarkdownTable::new(
-            "policy | PSNR | SSIM | FLIP | rows | true peak | peak memory [MiB] | time [s] | \
-             processor time [s] | extra passes",
-        );
+        document.section(&format!("{scene}, {} rows", grouped(budget)));
+        let columns = [
+            "policy",
+            "PSNR",
+            "SSIM",
+            "FLIP",
+            "rows",
+            "true peak",
+            "peak memory [MiB]",
+            "time [s]",
+            "processor time [s]",
+            "extra passes",
+        ];
+        let mut table = ReportTable::new(columns.map(Column::text));
         for policy in policies {
             if here.iter().any(|run| run.factor == *policy) {
-                table.row(&row(policy, first, &here, budget));
+                table.row(row(policy, first, &here, budget));
             }
         }
-        text += &table.to_string();
-        text += &geometry(&here, policies);
+        document.table(table);
+        add_geometry(&mut document, &here, policies);
     }
-    text
+    document
 }
 
-/// Every option that all runs had, those by default too, as a file for `--config` has them.
-pub(super) fn options(outcomes: &[Outcome]) -> Result<String, Failure> {
+/// Adds the options that all runs share, defaults included, in the format of `--config`.
+pub(super) fn add_options(document: &mut Document, outcomes: &[Outcome]) -> Result<(), Failure> {
     let mut shared: Option<Table> = None;
     for run in outcomes {
         let spec = Partial::new(run.spec.clone(), "options")?.describe()?;
@@ -70,11 +80,14 @@ pub(super) fn options(outcomes: &[Outcome]) -> Result<String, Failure> {
     let shared = toml::to_string(&shared.unwrap_or_default()).map_err(Failure::input)?;
     let versions: BTreeSet<&str> = outcomes.iter().map(|run| &*run.densify).collect();
     let versions = Vec::from_iter(versions).join(", ");
-    Ok(format!(
-        "\n## Options\n\nOf every run, with densify {versions}, defaults included; the tables above name what \
+    document.section("Options");
+    document.paragraph(format!(
+        "Of every run, with densify {versions}, defaults included; the tables above name what \
          differs. What is not here differs between runs or was chosen by each, and stands in its \
-         config.toml.\n\n```toml\n{shared}```\n"
-    ))
+         config.toml."
+    ));
+    document.code("toml", shared);
+    Ok(())
 }
 
 /// Keeps what another table has too.
@@ -89,7 +102,7 @@ fn keep_common(table: &mut Table, other: &Table) {
 }
 
 /// A policy's results among those of a scene and budget.
-fn row(policy: &str, first: &str, here: &[&Outcome], budget: usize) -> Vec<String> {
+fn row(policy: &str, first: &str, here: &[&Outcome], budget: usize) -> Vec<Text> {
     let runs: Vec<&Outcome> = here.iter().filter(|r| r.factor == policy).copied().collect();
     let score = |score: fn(&Outcome) -> f64, digits| {
         let mean = number_or_dash(mean_of(&runs, |r| Some(score(r))), digits);
@@ -100,30 +113,33 @@ fn row(policy: &str, first: &str, here: &[&Outcome], budget: usize) -> Vec<Strin
         }
     };
     let peak = runs.iter().map(|r| r.peak_rows).max().unwrap_or(0);
-    let marked = if peak > budget { " **over the budget: not ranked**" } else { "" };
+    let mut peak_cell = Text::from(grouped(peak));
+    if peak > budget {
+        peak_cell = peak_cell.plain(" ").bold("over the budget: not ranked");
+    }
     let mib = |r: &Outcome| r.peak_bytes.map(|bytes| bytes as f64 / f64::from(1 << 20));
     let rows = mean_of(&runs, |r| Some(r.rows as f64)).unwrap_or(0.0);
     vec![
-        policy.to_owned(),
-        score(|r| r.psnr, 2),
-        score(|r| r.ssim, 4),
-        score(|r| r.flip, 4),
-        grouped(rows.round() as usize),
-        format!("{}{marked}", grouped(peak)),
-        number_or_dash(mean_of(&runs, mib), 0),
-        number_or_dash(mean_of(&runs, |r| Some(r.seconds)), 1),
-        number_or_dash(mean_of(&runs, |r| r.cpu_seconds), 1),
-        number_or_dash(mean_of(&runs, |r| Some(r.extra_forwards as f64)), 0),
+        policy.into(),
+        score(|r| r.psnr, 2).into(),
+        score(|r| r.ssim, 4).into(),
+        score(|r| r.flip, 4).into(),
+        grouped(rows.round() as usize).into(),
+        peak_cell,
+        number_or_dash(mean_of(&runs, mib), 0).into(),
+        number_or_dash(mean_of(&runs, |r| Some(r.seconds)), 1).into(),
+        number_or_dash(mean_of(&runs, |r| r.cpu_seconds), 1).into(),
+        number_or_dash(mean_of(&runs, |r| Some(r.extra_forwards as f64)), 0).into(),
     ]
 }
 
 /// A number of those measured against the known surface.
 type Measure = fn(&Geometry) -> f64;
 
-/// The table of what was measured against the known surface; nothing where none is known.
-fn geometry(here: &[&Outcome], policies: &[String]) -> String {
+/// Adds the table of geometric errors, if the surface of the scene is known.
+fn add_geometry(document: &mut Document, here: &[&Outcome], policies: &[String]) {
     if here.iter().all(|r| r.geometry.is_none()) {
-        return String::new();
+        return;
     }
     let columns: [(Measure, usize); 4] = [
         (|g| g.depth.rmse, 3),
@@ -131,9 +147,9 @@ fn geometry(here: &[&Outcome], policies: &[String]) -> String {
         (|g| g.centres.f_score_one_percent, 1),
         (|g| g.floaters.of_rows, 2),
     ];
-    let mut table = MarkdownTable::new(
-        "policy | depth RMSE [%] | Chamfer [%] | F-score at 1 % [%] | floaters [% of rows]",
-    );
+    let titles =
+        ["policy", "depth RMSE [%]", "Chamfer [%]", "F-score at 1 % [%]", "floaters [% of rows]"];
+    let mut table = ReportTable::new(titles.map(Column::text));
     for policy in policies {
         let runs: Vec<&Outcome> = here.iter().filter(|r| r.factor == *policy).copied().collect();
         if runs.is_empty() {
@@ -146,10 +162,10 @@ fn geometry(here: &[&Outcome], policies: &[String]) -> String {
             };
             number_or_dash(mean_of(&runs, percent), digits)
         };
-        let cells = std::iter::once(policy.clone()).chain(columns.map(cell));
-        table.row(&cells.collect::<Vec<_>>());
+        table.row(std::iter::once(policy.clone()).chain(columns.map(cell)));
     }
-    format!("\nGeometry, lengths as % of the diagonal of the scene:\n\n{table}")
+    document.paragraph("Geometry, lengths as % of the diagonal of the scene:");
+    document.table(table);
 }
 
 /// For the terminal: who did best over everything, and with how many Gaussians.
@@ -181,11 +197,11 @@ mod tests {
             record("c", 1, 40.0, 1001),
         ];
         let policies = ["a", "b", "c"].map(String::from);
-        let text = markdown(&all, &policies);
+        let text = document(&all, &policies).to_string();
         assert!(text.contains("| b | +0.50, two runs | 2 of 2 | 1 |"), "{text}");
         assert!(text.contains("| b | 31.50 (+0.50, two runs) |"), "{text}");
         let more = [record("a", 2, 30.0, 1000), record("b", 2, 31.5, 1000)];
-        let text = markdown(&[&all[..], &more].concat(), &policies);
+        let text = document(&[&all[..], &more].concat(), &policies).to_string();
         // Student's t of two degrees of freedom, 4.303, times √(1/3)/√3.
         assert!(text.contains("| b | +0.83 [-0.60, +2.27] | 3 of 3 | 1 |"), "{text}");
         assert!(text.contains("| b | 900 | 1,000 |"), "{text}");
@@ -210,13 +226,18 @@ mod tests {
                 .expect("TOML"),
             ..record(policy, 0, 30.0, 1000)
         };
+        let options = |outcomes: &[Outcome]| {
+            let mut document = Document::new("");
+            add_options(&mut document, outcomes).expect("options");
+            document.to_string()
+        };
         let set = "policy_set.diet = { rho = 0.5 }";
-        let text = options(&[run("diet", set), run("mcmc", set)]).expect("options");
+        let text = options(&[run("diet", set), run("mcmc", set)]);
         for words in ["iterations = 9\n", "near = 0.04", "alpha_min = \"1/64\"", "rho = 0.5"] {
             assert!(text.contains(words), "{words}: {text}");
         }
         assert!(!text.contains("\npolicy = "), "{text}");
-        let text = options(&[run("diet", set), run("diet", "")]).expect("options");
+        let text = options(&[run("diet", set), run("diet", "")]);
         assert!(text.contains("policy = \"diet\"") && !text.contains("rho"), "{text}");
     }
 
@@ -240,7 +261,7 @@ mod tests {
             with("b", 0, Some(measured(0.5))),
             with("b", 1, None),
         ];
-        let text = markdown(&all, &["a", "b"].map(String::from));
+        let text = document(&all, &["a", "b"].map(String::from)).to_string();
         assert!(text.contains("| a | 2.500 | 1.500 | 75.0 | 1.00 |"), "{text}");
         assert!(text.contains("| b | – | – | – | – |"), "{text}");
     }

@@ -85,12 +85,12 @@ impl Trade {
         let mut study = Study::open(&self.output, "trade", observer)?;
         let Some(outcomes) = study.run(&cells, &self.engine)? else { return Ok(None) };
         let report = Report::new(self, &factors, outcomes);
-        let mut text = table::markdown(&report);
-        text += "\n## Plots\n";
+        let mut document = table::document(&report);
+        document.section("Plots");
         for picture in plots::draw(&self.output, &report)? {
-            text += &format!("\n![{}]({})\n", picture.caption, picture.file);
+            document.picture(picture.file, picture.caption);
         }
-        study.finish("trade", &text, table::summary(&report)).map(Some)
+        study.finish("trade", &document, table::summary(&report)).map(Some)
     }
 
     /// All runs in which at most one knob is changed, in the order in which they run: seed after seed, so

@@ -1,75 +1,89 @@
-//! The study as text: Markdown for the file, a few lines for the terminal.
+//! The report of the study: a document, and a few lines for the terminal.
 
 use std::fmt::Write;
 
 use super::Trade;
 use super::report::{Effect, PSNR, Report, SECONDS};
+use crate::columns::number_or_dash;
 use crate::difference::{Difference, INTERVALS};
-use crate::markdown::{MarkdownTable, number_or_dash};
 use densify_core::numbers::grouped;
+use densify_html::{Column, Document, Table, Text};
 
-/// The whole study.
-pub(super) fn markdown(report: &Report) -> String {
-    let mut text = String::from("# What each knob costs and buys\n\n");
+/// The study as a document, without plots.
+pub(super) fn document(report: &Report) -> Document {
+    let mut document = Document::new("What each knob costs and buys");
     let Trade { iterations, budget, seeds, train, .. } = &report.study;
-    let options = match train.join(" ") {
-        words if words.is_empty() => String::new(),
-        words => format!(" Options of every run: `{words}`."),
-    };
-    let _ = writeln!(
-        text,
-        "densify {}; scenes: {}; {} iterations, at most {} rows, {seeds} {} per level.{options} \
-         Differences are from `exact` with the same scene and seed; ratios are \
-         geometric means. {INTERVALS}. Scores are of views held out, rendered without any shortcut.",
+    let mut text = Text::from(format!(
+        "densify {}; scenes: {}; {} iterations, at most {} rows, {seeds} {} per level.",
         env!("CARGO_PKG_VERSION"),
         report.scenes.join(", "),
         grouped(*iterations as usize),
         grouped(*budget),
         if *seeds == 1 { "seed" } else { "seeds" },
+    ));
+    if !train.is_empty() {
+        text = text.plain(" Options of every run: ").code(&train.join(" ")).plain(".");
+    }
+    let differences = format!(
+        " with the same scene and seed; ratios are geometric means. {INTERVALS}. Scores are of views held out, \
+         rendered without any shortcut."
     );
-    text += &exact(report);
-    text += &outcomes(report);
-    text
+    document.paragraph(text.plain(" Differences are from ").code("exact").plain(&differences));
+    document.section("exact");
+    document.table(exact_table(report));
+    document.section("Outcome of training");
+    document.table(outcome_table(report));
+    document
 }
 
-/// What the differences are from.
-fn exact(report: &Report) -> String {
-    let mut table = MarkdownTable::new("scene | PSNR [dB] | time [s] | peak [MiB]");
+/// The runs with the preset `exact`, from which differences are taken.
+fn exact_table(report: &Report) -> Table {
+    let mut table = Table::new(["scene", "PSNR [dB]", "time [s]", "peak [MiB]"].map(Column::text));
     for scene in &report.scenes {
         let psnr = number_or_dash(report.mean(scene, "", "", PSNR), 2);
         let seconds = number_or_dash(report.mean(scene, "", "", SECONDS).map(f64::exp), 1);
         let peak = number_or_dash(report.peak_mib(scene, "", ""), 0);
-        table.row(&[scene.clone(), psnr, seconds, peak]);
+        table.row([scene.clone(), psnr, seconds, peak]);
     }
-    format!("\n## exact\n\n{table}")
+    table
 }
 
-fn outcomes(report: &Report) -> String {
-    let mut table = MarkdownTable::new(
-        "knob | level | ΔPSNR [dB] | ΔSSIM | time × | processor time × | peak × | same bits",
-    );
+fn outcome_table(report: &Report) -> Table {
+    let columns = [
+        "knob",
+        "level",
+        "ΔPSNR [dB]",
+        "ΔSSIM",
+        "time ×",
+        "processor time ×",
+        "peak ×",
+        "same bits",
+    ];
+    let mut table = Table::new(columns.map(Column::text));
     for effect in &report.effects {
-        table.row(&row(effect));
+        table.row(row(effect));
     }
-    format!("\n## Outcome of training\n\n{table}")
+    table
 }
 
-fn row(effect: &Effect) -> Vec<String> {
+fn row(effect: &Effect) -> Vec<Text> {
     let ratio = |d: &Difference| {
         let low_and_high = |[low, high]: [f64; 2]| format!("{:.3}, {:.3}", low.exp(), high.exp());
         format!("{:.3}{}", d.mean.exp(), d.within(low_and_high))
     };
-    let broken = effect.factor.is_exact && effect.same < effect.psnr.pairs;
-    let broken = if broken { ": **not exact**" } else { "" };
+    let mut same = Text::from(format!("{} of {}", effect.same, effect.psnr.pairs));
+    if effect.factor.is_exact && effect.same < effect.psnr.pairs {
+        same = same.plain(": ").bold("not exact");
+    }
     vec![
-        effect.factor.name.clone(),
-        effect.level.clone(),
-        effect.psnr.show(2),
-        effect.ssim.show(4),
-        ratio(&effect.seconds),
-        effect.cpu.as_ref().map_or_else(|| "–".to_owned(), ratio),
-        ratio(&effect.peak),
-        format!("{} of {}{broken}", effect.same, effect.psnr.pairs),
+        effect.factor.name.as_str().into(),
+        effect.level.as_str().into(),
+        effect.psnr.show(2).into(),
+        effect.ssim.show(4).into(),
+        ratio(&effect.seconds).into(),
+        effect.cpu.as_ref().map_or_else(|| "–".to_owned(), ratio).into(),
+        ratio(&effect.peak).into(),
+        same,
     ]
 }
 
@@ -97,7 +111,7 @@ mod tests {
     #[test]
     fn every_level_has_its_row() {
         let report = sample();
-        let text = markdown(&report);
+        let text = document(&report).to_string();
         for words in [
             "| room | 31.00 | 100.0 | 64 |",
             "| sh_degree | 0 | +0.20 [+0.20, +0.20] |",

@@ -1,12 +1,12 @@
-// The page of a run in training: how far it is, its curves and edits, and orders to it.
+// The page of a run in training: its progress, curves and edits, and commands to it.
 "use strict";
 
-/** How often the run is asked how it is [ms]. */
+/** Interval between requests of the progress [ms]. */
 const ASK_EVERY = 1000;
-/** Least time between two pictures of a model that changes [ms]. */
+/** Least time between two pictures of the changing model [ms]. */
 const LOOK_EVERY = 2000;
 
-/** Begins where the scene says that it is of a run in training. `look` asks for a new picture. */
+/** Follows the run of the scene. `look` requests a new picture. */
 function followTraining(look) {
   const section = byId("training");
   section.hidden = false;
@@ -26,7 +26,7 @@ function followTraining(look) {
   byId("one-step").addEventListener("click", () => order("step"));
   byId("checkpoint").addEventListener("click", () => order("checkpoint"));
   byId("stop").addEventListener("click", () => {
-    if (confirm("Stop training? It leaves a checkpoint, and densify train --resume goes on from there.")) order("stop");
+    if (confirm("Stop training? It writes a checkpoint, from which densify train --resume continues.")) order("stop");
   });
 
   async function ask() {
@@ -36,7 +36,7 @@ function followTraining(look) {
       if (!answer.ok) throw new Error(await answer.text());
       now = await answer.json();
     } catch {
-      byId("training-state").textContent = "Training has ended, or densify was stopped. The run’s folder has what came of it.";
+      byId("training-state").textContent = "Training has ended, or densify was stopped. The results are in the run’s folder.";
       for (const id of ["pause", "one-step", "checkpoint", "stop"]) byId(id).disabled = true;
       section.dataset.state = "gone";
       return false;
@@ -56,7 +56,7 @@ function followTraining(look) {
     section.dataset.state = state;
     section.dataset.step = step;
     scene.models[0].rows = rows;
-    sayModels();
+    showModels();
     byId("training-progress").max = last;
     byId("training-progress").value = step;
     const words = { preparing: "Preparing", training: "Training", paused: "Paused", stopping: "Stopping", ended: "Measuring and saving" };
@@ -88,13 +88,13 @@ function followTraining(look) {
     byId("no-edits").hidden = edits.length > 0;
   }
 
-  /** A number of seconds in words. */
+  /** Formats a duration. */
   function spoken(seconds) {
     if (seconds < 90) return `${Math.ceil(seconds)} s`;
     return seconds < 5400 ? `${Math.round(seconds / 60)} min` : `${(seconds / 3600).toFixed(1)} h`;
   }
 
-  /** Draws points over the whole length of the run, with the newest value in words. */
+  /** Draws a curve over the whole length of the run, and shows its newest value. */
   function curve(id, all, last, word) {
     const figure = byId(id), points = all.filter(([, y]) => Number.isFinite(y));
     figure.hidden = points.length === 0;

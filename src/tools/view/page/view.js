@@ -1,11 +1,11 @@
-// The page of densify view: it asks for pictures, shows them, and moves the camera. One file, so that nothing is
-// to be built; its parts, in order: small vectors, the camera, asking and showing, marks, moving, the panel.
+// The page of densify view: requests and shows pictures, and moves the camera. One file without a build step; its parts,
+// in order: vectors, the camera, requesting and showing pictures, marks, moving, the panel.
 "use strict";
 
 const byId = (id) => document.getElementById(id);
 const stage = byId("stage"), picture = byId("picture"), marks = byId("marks");
 
-// ---- Small vectors. A camera's axes are right, up and back, as in camera paths.
+// ---- Vectors. A camera's axes are right, up and back, as in camera paths.
 
 const add = (a, b, s = 1) => a.map((x, i) => x + s * b[i]);
 const scale = (a, s) => a.map((x) => x * s);
@@ -16,7 +16,7 @@ const unit = (a) => scale(a, 1 / (length(a) || 1));
 const radians = (degrees) => degrees * Math.PI / 180;
 const clamp = (x, least, most) => Math.min(Math.max(x, least), most);
 
-/** Turns a vector about an axis of length 1. */
+/** Rotates a vector about a unit axis. */
 function turned(v, axis, angle) {
   const c = Math.cos(angle), s = Math.sin(angle);
   return add(add(scale(v, c), cross(axis, v), s), axis, dot(axis, v) * (1 - c));
@@ -25,21 +25,21 @@ function turned(v, axis, angle) {
 // ---- The camera.
 
 let scene;
-/** Where we are: centre, axes, vertical field of view in degrees, and how far away what we turn about is. */
+/** The camera: centre, axes, vertical field of view in degrees, and distance to the pivot of orbiting. */
 const camera = { at: [0, 0, 0], right: [1, 0, 0], up: [0, 1, 0], back: [0, 0, 1], fov: 50, away: 1 };
-/** The view whose camera we are at, or nothing: { split, number }. */
+/** The view whose camera is used, or null: { split, number }. */
 let view = null;
-/** Counts changes of what is to be seen, and when the last was made. */
+/** Number of changes to the requested picture, and the time of the last one. */
 let version = 0, changedAt = 0;
 
-/** Takes over a pose from the scene's description or a camera path. */
+/** Sets the pose from the scene's description or a camera path. */
 function setPose({ camera_to_world: m, fov }) {
   [camera.right, camera.up, camera.back] = [0, 1, 2].map((i) => unit([m[i], m[4 + i], m[8 + i]]));
   camera.at = [m[3], m[7], m[11]];
   camera.fov = fov;
 }
 
-/** The camera as camera paths have it. */
+/** The camera in the format of camera paths. */
 function pose() {
   const { right: r, up: u, back: b, at } = camera;
   const m = [0, 1, 2].flatMap((i) => [r[i], u[i], b[i], at[i]]);
@@ -53,13 +53,13 @@ function changed() {
   wake();
 }
 
-/** Asks for a new picture of what has not moved: the model has changed. */
-function lookAgain() {
+/** Requests a new picture with the same camera, because the model has changed. */
+function requestPicture() {
   version += 1;
   wake();
 }
 
-/** Leaves the camera of a view, so that one may move: what is seen stays as large as it is. */
+/** Leaves the camera of a view, to move freely; the scene keeps its size on the screen. */
 function leaveView() {
   if (!view) return;
   const fitted = fit(shape(), area());
@@ -74,30 +74,30 @@ function turnAll(axis, angle) {
   for (const name of ["right", "up", "back"]) camera[name] = unit(turned(camera[name], axis, angle));
 }
 
-/** Turns about what is before us: by `x` about the scene's vertical, by `y` about our own horizontal. */
+/** Orbits about the pivot: by `x` about the scene's vertical axis, by `y` about the camera's horizontal axis. */
 function orbit(x, y) {
   leaveView();
   const pivot = add(camera.at, camera.back, -camera.away);
   turnAll(scene.up, -x);
-  // Not over the poles, where left and right would change places.
+  // Stop at the poles, beyond which left and right would swap.
   const height = Math.asin(clamp(dot(camera.back, scene.up), -1, 1));
-  const wished = clamp(height + y, -1.5, 1.5);
-  if (Math.abs(height) < 1.5 || Math.abs(wished) < Math.abs(height)) turnAll(camera.right, -(wished - height));
+  const target = clamp(height + y, -1.5, 1.5);
+  if (Math.abs(height) < 1.5 || Math.abs(target) < Math.abs(height)) turnAll(camera.right, -(target - height));
   camera.at = add(pivot, camera.back, camera.away);
   changed();
 }
 
-/** Turns the head. */
+/** Turns the camera in place. */
 function look(x, y) {
   leaveView();
   const height = Math.asin(clamp(-dot(camera.back, scene.up), -1, 1));
   turnAll(scene.up, x);
-  const wished = clamp(height + y, -1.5, 1.5);
-  if (Math.abs(height) < 1.5 || Math.abs(wished) < Math.abs(height)) turnAll(camera.right, wished - height);
+  const target = clamp(height + y, -1.5, 1.5);
+  if (Math.abs(height) < 1.5 || Math.abs(target) < Math.abs(height)) turnAll(camera.right, target - height);
   changed();
 }
 
-/** Shifts the scene by parts of the picture's height. */
+/** Shifts the scene by fractions of the picture's height. */
 function pan(x, y) {
   leaveView();
   const reach = 2 * Math.tan(radians(camera.fov) / 2) * camera.away;
@@ -105,40 +105,40 @@ function pan(x, y) {
   changed();
 }
 
-/** Goes nearer (below 1) to what is before us, or away from it. */
+/** Moves towards the pivot (factor below 1) or away from it. */
 function dolly(factor) {
   leaveView();
   const least = 0.02 * scene.radius;
   const away = clamp(camera.away * factor, least, 1e3 * scene.radius);
-  // Near to it we go on through it.
+  // Close to the pivot, move through it.
   const step = away > least ? camera.away - away : 0.1 * least;
   camera.at = add(camera.at, camera.back, -step);
   camera.away = away;
   changed();
 }
 
-// ---- Asking for pictures and showing them.
+// ---- Requesting and showing pictures.
 
-/** This page's name for itself: of each page only the newest wish is kept. */
+/** Identifier of this page: the server keeps only the newest request of each page and pane. */
 const page = Array.from(crypto.getRandomValues(new Uint8Array(12)), (x) => x.toString(16).padStart(2, "0")).join("");
-/** So long after the last change the picture is asked for in full [ms]. */
+/** Time from the last change to the request of the sharp picture [ms]. */
 const REST = 30;
-/** From picture to picture while we move [ms]. */
+/** Target time between pictures while moving [ms]. */
 const PACE = 45;
-/** The two pictures that are shown, each a bitmap with what is known of it, and what they show. */
+/** The two shown pictures: bitmaps with their data. */
 const shown = [null, null];
 let coarse = 0.5, complete = -1, border = 0.5, wakeUp = () => {}, paces = [];
-/** What a reply takes which nothing has to be made for, and what each byte adds to that [ms]. */
+/** Latency of a reply that needs no rendering, and time per byte of a reply [ms]. */
 let latency = 0, perByte = 0;
-/** Wishes on their way, how many there were, and which one is shown. */
-let underway = 0, wishes = 0, newest = 0;
-/** What was wished for last and when, and least time from there to the next wish [ms]. */
+/** Number of pending requests, number of all requests, and the one that is shown. */
+let underway = 0, requests = 0, newest = 0;
+/** The last request, and the least time from it to the next one [ms]. */
 let last = { version: -1, isMoving: true, begun: 0 }, spacing = 0;
 /** When a picture was shown last. */
 let shownAt = 0;
 
 const wake = () => wakeUp();
-/** Waits for a change, but no longer than this [ms]. */
+/** Waits for a change, at most this long [ms]. */
 const pause = (most) => new Promise((resolve) => {
   wakeUp = resolve;
   if (most < Infinity) setTimeout(resolve, most);
@@ -148,24 +148,24 @@ const choice = (value) => value ? { kind: value.split(":")[0], model: Number(val
 const kindOf = (name) => scene.kinds.find((kind) => kind.kind === name);
 const area = () => [stage.clientWidth, stage.clientHeight];
 
-/** Width and height of what the camera sees. */
+/** Width and height of the camera's picture. */
 function shape() {
   if (!view) return area();
   const { width, height } = scene.views[view.split][view.number];
   return [width, height];
 }
 
-/** The largest size of this shape in an area. */
+/** The largest size of this aspect ratio within an area. */
 function fit([width, height], within) {
   const s = Math.min(within[0] / width, within[1] / height);
   return [width * s, height * s];
 }
 
-/** How many pixels to ask for: this part of each side of the sharp picture. */
+/** The size to request: this fraction of each side of the sharp picture. */
 function wantedSize(part) {
   let [width, height] = fit(shape(), area()).map((side) => side * devicePixelRatio * byId("sharpness").value);
   const { side, pixels } = scene.limits;
-  // A photograph is no sharper than its own size, and what is compared with it is what is measured.
+  // Photographs are requested at their own size, as are renders compared with them: that is the evaluated size.
   if (sides().some((side) => side && kindOf(side.kind).needs_photograph)) {
     [width, height] = shape().map((own) => own * byId("sharpness").value);
   }
@@ -182,7 +182,7 @@ async function ask(place, { kind, model }, isMoving, part) {
     headers: { "Content-Type": "application/json" },
     body: JSON.stringify({ page, place, kind, model, width, height, moving: isMoving, ...from }),
   });
-  // A newer wish of this page has taken the place of this one.
+  // A newer request of this page has replaced this one.
   if (answer.status === 409) return null;
   if (!answer.ok) throw new Error(await answer.text());
   const number = (name) => answer.headers.has(name) ? Number(answer.headers.get(name)) : null;
@@ -195,24 +195,21 @@ async function ask(place, { kind, model }, isMoving, part) {
   };
 }
 
-/** How long until the next picture is to be asked for [ms]: for ever, where something has to happen first. */
+/** Time until the next request [ms]; infinite if something has to happen first. */
 function untilNext() {
-  // Nobody sees a page in the background; a run in training need not draw for it.
+  // A hidden page needs no pictures; a run in training should not render for it.
   if (document.hidden || complete === version || underway >= inFlight()) return Infinity;
   const now = performance.now(), rest = REST - (now - changedAt);
   const isNew = last.version !== version;
-  // While nothing new is wanted, the sharp picture waits for the hand to rest.
+  // Without a change, only the sharp picture is missing, which waits until the camera rests.
   if (!isNew && (!last.isMoving || isFlying())) return Infinity;
   return Math.max(last.begun + spacing - now, isNew ? 0 : rest);
 }
 
-/**
- * How many pictures are asked for before the first of them is here. Over a network most of the wait is no work: the
- * machine that renders would be idle through it.
- */
+/** Most pending requests: over a slow network, several keep the renderer busy. */
 const inFlight = () => clamp(1 + Math.round(latency / PACE), 1, 4);
 
-/** Asks for pictures as long as the page is open: coarse ones while something changes, then a sharp one. */
+/** Requests pictures while the page is open: coarse ones while something changes, then a sharp one. */
 async function keepAsking() {
   for (;;) {
     const wait = untilNext();
@@ -221,19 +218,19 @@ async function keepAsking() {
   }
 }
 
-/** Asks for a picture of what is to be seen now, and shows it. */
+/** Requests a picture of the current state and shows it. */
 async function follow() {
-  const begun = performance.now(), asked = version, wish = ++wishes;
+  const begun = performance.now(), asked = version, request = ++requests;
   const isMoving = begun - changedAt < REST || isFlying(), part = isMoving ? coarse : 1;
   const [left, right] = sides();
   last = { version, isMoving, begun };
   underway += 1;
   try {
     const frames = await Promise.all([ask(0, left, isMoving, part), right && ask(1, right, isMoving, part)]);
-    // A newer one has taken its place: before it was made, or on its way here.
-    const isLate = wish < newest || !frames[0] || (right && !frames[1]);
+    // A newer picture has replaced it, on the server or on the way.
+    const isLate = request < newest || !frames[0] || (right && !frames[1]);
     if (isLate) frames.forEach((frame) => frame?.bitmap.close());
-    else show(frames, { begun, asked, wish, isMoving, part });
+    else show(frames, { begun, asked, request, isMoving, part });
   } catch (error) {
     const isGone = error instanceof TypeError;
     const gone = scene.live ? "Training has ended, or densify was stopped." : "densify view does not answer; start it again, and this page goes on.";
@@ -247,9 +244,9 @@ async function follow() {
   wake();
 }
 
-/** Shows what has come of a wish. */
-function show(frames, { begun, asked, wish, isMoving, part }) {
-  newest = wish;
+/** Shows the pictures of a request. */
+function show(frames, { begun, asked, request, isMoving, part }) {
+  newest = request;
   for (const [i, frame] of frames.entries()) {
     shown[i]?.bitmap.close();
     shown[i] = frame;
@@ -261,30 +258,30 @@ function show(frames, { begun, asked, wish, isMoving, part }) {
   pace(frames, begun, isMoving, part);
   stage.dataset.pictures = Number(stage.dataset.pictures || 0) + 1;
   stage.dataset.size = `${bitmap.width}x${bitmap.height}`;
-  // What is measured in some of the views only is asked for again.
+  // Colours measured in only some of the views are requested again.
   const isPart = frames.some((frame) => frame?.measured && frame.measured[0] < frame.measured[1]);
   if (isPart && complete === version) complete = last.version = -1;
   stage.dataset.state = complete === version ? "sharp" : isPart ? "measuring" : "moving";
   if (complete !== version) return;
-  // What is in the middle is what one turns about next.
+  // The next orbit is about the centre of the picture.
   if (distance) camera.away = distance;
   stage.dataset.rested = rested();
-  listenToTheLine();
+  measureLatency();
 }
 
-/** Measures how long a reply takes which nothing has to be made for: while the picture rests, nothing else is on its way. */
-async function listenToTheLine() {
+/** Measures the latency while the picture rests and no other request is pending. */
+async function measureLatency() {
   const begun = performance.now();
   const answer = await fetch("", { method: "HEAD" }).catch(() => null);
   if (answer?.ok) latency = performance.now() - begun;
 }
 
-/** How long nothing has changed [ms]. */
+/** Time since the last change [ms]. */
 const rested = () => Math.round(performance.now() - changedAt);
 
 /**
- * Says what the picture took, and adapts the coarse size so that movement stays fluent: to what it takes to make and to
- * send a picture, as fewer pixels shorten neither the way to here nor what the browser does with any picture.
+ * Shows the time of the picture, and adapts the coarse size so that movement stays smooth. It adapts to the time for
+ * rendering and transfer only, as fewer pixels shorten neither the latency nor the work of the browser.
  */
 function pace(frames, begun, isMoving, part) {
   const all = frames.filter(Boolean), most = (of) => Math.max(...all.map(of));
@@ -295,10 +292,10 @@ function pace(frames, begun, isMoving, part) {
   const size = `${bitmap.width} × ${bitmap.height}`;
   const now = performance.now(), since = Math.max(begun, shownAt);
   shownAt = now;
-  // Wishes come no faster than they are done with.
+  // Requests come no faster than they are served.
   spacing = most((frame) => frame.held);
   if (isMoving) {
-    // With so many under way, each may take so long for one to come in time.
+    // The time that each of the pending requests may take to keep the pace.
     const may = clamp(inFlight() * PACE - latency, PACE / 2, PACE);
     coarse = clamp(part * clamp(Math.sqrt(may / (making + bytes * perByte)), 0.8, 1.1), 0.12, 1);
     paces = [...paces.slice(-11), now - since];
@@ -306,7 +303,7 @@ function pace(frames, begun, isMoving, part) {
     stage.dataset.rate = (1000 / mean).toFixed(1);
     byId("status").textContent = `${size} · ${Math.round(1000 / mean)} pictures/s · ${took.toFixed(0)} ms`;
   } else {
-    // The sharp picture is the largest: it tells best what bytes take.
+    // The sharp picture is the largest, which gives the best estimate of the time per byte.
     perByte = Math.max(0, away - latency) / bytes;
     const [seen, every] = frames.find((frame) => frame?.measured)?.measured ?? [0, 0];
     const how = seen < every ? `measured in ${seen} of ${every} training views` : `sharp after ${rested()} ms, drawn in ${milliseconds.toFixed(0)}`;
@@ -319,7 +316,7 @@ function trouble(message) {
   byId("trouble").textContent = message;
 }
 
-/** Puts the pictures on the stage, with marks over them. */
+/** Draws the pictures and the marks over them. */
 function draw() {
   const ratio = devicePixelRatio;
   const [width, height] = area();
@@ -363,7 +360,7 @@ function caption({ kind, model }) {
   return label + of;
 }
 
-/** What the colours mean: of the first picture whose colours stand for numbers. */
+/** Explains the colours of the first picture that represents numbers. */
 function describe() {
   const frame = shown.find((frame) => frame && frame.range) || shown[0];
   const { about, unit: name, label } = kindOf(frame.kind);
@@ -381,11 +378,11 @@ function describe() {
 
 // ---- Marks: cameras and points, drawn here over the picture.
 
-/** From the world to the stage: x and y in parts of the stage, and depth; on `marks`, in its pixels. */
+/** Returns a function that projects a point of the world to pixels of `marks`, and to depth. */
 function projector() {
   const [width, height] = fit(shape(), [marks.width, marks.height]);
   const focal = 1 / 2 / Math.tan(radians(camera.fov) / 2);
-  // A photograph's middle need not be that of its lens.
+  // The principal point of a photograph need not be its centre.
   const [fx, fy, cx, cy] = view ? scene.views[view.split][view.number].lens : [focal * height / width, focal, 0.5, 0.5];
   const [left, top] = [(marks.width - width) / 2, (marks.height - height) / 2];
   const { right, up, back, at } = camera;
@@ -396,7 +393,7 @@ function projector() {
   };
 }
 
-/** The corners of a camera's frustum after its centre, in the world. */
+/** The centre of a camera and the corners of its frustum, in the world. */
 function frustum({ camera_to_world: m, lens: [fx, fy, cx, cy] }) {
   const axis = (i) => [m[i], m[4 + i], m[8 + i]];
   const centre = axis(3), size = 0.06 * scene.radius;
@@ -427,7 +424,7 @@ function drawMarks(ratio) {
     out.strokeStyle = style.getPropertyValue(colour);
     out.beginPath();
     scene.views[split].forEach((at, number) => {
-      // From within one sees its own frame only.
+      // The current camera would only frame the picture.
       if (view && view.split === split && view.number === number) return;
       const corners = frustum(at).map(project);
       if (corners.some(([, , z]) => z < least)) return;
@@ -441,7 +438,7 @@ function drawMarks(ratio) {
   }
 }
 
-/** The drawn camera at a place of the stage, if there is one. */
+/** The drawn camera at this position on the screen, if any. */
 function cameraAt(x, y) {
   if (!byId("frusta").checked) return null;
   const project = projector(), ratio = devicePixelRatio;
@@ -458,16 +455,16 @@ function cameraAt(x, y) {
 
 // ---- Moving.
 
-/** What dragging does, and the arrow keys do: as chosen in the panel; with Shift, or another button, it shifts. */
+/** The effect of dragging and of the arrow keys: as chosen in the panel, or shifting with Shift or another button. */
 const modeOf = ({ shiftKey, buttons = 0 }) =>
   shiftKey || buttons & 6 ? "pan" : document.querySelector("input[name=drag]:checked").value;
 
-/** Pointers that were put on the stage, and where each was last, in pixels of the page. */
+/** Pressed pointers and their last positions, in pixels of the page. */
 const hands = new Map();
 let travelled = 0;
 
 marks.addEventListener("pointerdown", (event) => {
-  // The first finger, or the mouse, begins anew.
+  // A mouse or a first finger starts a new gesture.
   if (event.isPrimary) drop();
   marks.setPointerCapture(event.pointerId);
   hands.set(event.pointerId, [event.clientX, event.clientY]);
@@ -475,12 +472,11 @@ marks.addEventListener("pointerdown", (event) => {
   travelled = 0;
 });
 
-// Of the whole page, as not every browser keeps to the capture: whoever leaves the stage still drags, and lifts the
-// hand somewhere else.
+// Listens on the whole page, as not every browser honours the capture: dragging continues outside the picture.
 addEventListener("pointermove", (event) => {
   const before = hands.get(event.pointerId);
   if (!before) return;
-  // It was lifted where the page did not see it.
+  // The button was released outside the page.
   if (!event.buttons) return drop();
   const now = [event.clientX, event.clientY];
   const [dx, dy] = add(now, before, -1);
@@ -489,7 +485,7 @@ addEventListener("pointermove", (event) => {
   travelled += Math.hypot(dx, dy);
   if (travelled < 4 && hands.size === 1) return;
   if (hands.size === 2) {
-    // Two fingers: their middle shifts, their distance goes nearer.
+    // Two fingers: their centre shifts the scene, their distance moves the camera.
     const other = [...hands].find(([id]) => id !== event.pointerId)[1];
     const spread = (a) => Math.max(10, Math.hypot(a[0] - other[0], a[1] - other[1]));
     dolly(spread(before) / spread(now));
@@ -522,7 +518,7 @@ marks.addEventListener("wheel", (event) => {
   dolly(Math.exp(clamp(event.deltaY * (event.deltaMode ? 30 : 1), -300, 300) * 0.0015));
 }, { passive: false });
 
-/** Keys that are held: what each does to right, up and back. */
+/** Flying keys and their directions along right, up and back. */
 const FLIGHT = { w: [0, 0, -1], s: [0, 0, 1], a: [-1, 0, 0], d: [1, 0, 0], e: [0, 1, 0], q: [0, -1, 0] };
 const held = new Set();
 const isFlying = () => held.size > 0 || flight !== null;
@@ -545,7 +541,7 @@ const STEPS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowD
 document.addEventListener("keydown", (event) => {
   const { target, key } = event;
   if (!scene || event.ctrlKey || event.metaKey || event.altKey || byId("guide").open) return;
-  // Keys that a control needs itself are its own.
+  // A focused control keeps the keys that it uses itself.
   const needed = STEPS[key] ? "select, input:not([type=checkbox]), [role=slider]" : "select";
   if (target.matches(needed)) return;
   const low = key.toLowerCase();
@@ -596,7 +592,7 @@ divider.addEventListener("keydown", (event) => {
 
 // ---- Cameras of the photographs.
 
-/** All views in the order of the list. */
+/** All views in the order of the menu. */
 const allViews = () => ["test", "train"].flatMap((split) => scene.views[split].map((_, number) => ({ split, number })));
 
 function goTo(to) {
@@ -643,14 +639,14 @@ function showPath() {
   byId("play").textContent = flight ? "Stop" : "Fly along";
 }
 
-/** A turn as a quaternion (w, x, y, z). */
+/** The rotation as a quaternion (w, x, y, z). */
 function quaternion({ camera_to_world: m }) {
   const s = (a, b, c) => Math.sqrt(Math.max(0, 1 + a * m[0] + b * m[5] + c * m[10])) / 2;
   const sign = (x, of) => of < 0 ? -x : x;
   return [s(1, 1, 1), sign(s(1, -1, -1), m[9] - m[6]), sign(s(-1, 1, -1), m[2] - m[8]), sign(s(-1, -1, 1), m[4] - m[1])];
 }
 
-/** Sets the camera to a place on the path, in intervals from its first camera: a Catmull-Rom spline. */
+/** Sets the camera to a position on the path, a Catmull-Rom spline, in intervals from its first camera. */
 function setOnPath(place) {
   const loops = byId("loop").checked, count = keys.length;
   const first = Math.min(Math.floor(place), loops ? count - 1 : count - 2), t = place - first;
@@ -671,7 +667,7 @@ function setOnPath(place) {
   camera.fov = 2 * Math.atan(Math.exp(zoom)) * 180 / Math.PI;
 }
 
-/** From how many cameras of the path one goes on to the next. */
+/** Number of intervals between cameras of the path. */
 const intervals = () => keys.length - (byId("loop").checked ? 0 : 1);
 
 function play() {
@@ -682,7 +678,7 @@ function play() {
   showPath();
   const next = (now) => {
     if (flight === null) return;
-    // Two seconds from camera to camera.
+    // Two seconds per interval.
     const place = Math.max(0, now - flight) / 2000;
     if (place >= intervals()) flight = null;
     setOnPath(Math.min(place, intervals()));
@@ -712,7 +708,7 @@ function showControls() {
   byId("fov").value = Math.round(camera.fov);
   byId("fov-value").textContent = `${Math.round(camera.fov)}°`;
   byId("speed-value").textContent = `× ${Number(2 ** byId("speed").value).toPrecision(2)}`;
-  // Away from the photographs there is none to compare with.
+  // Pictures that need a photograph are available only at the camera of a view.
   for (const select of [byId("left"), byId("right")]) {
     for (const option of select.options) {
       if (option.value && kindOf(choice(option.value).kind).needs_photograph) option.disabled = !view;
@@ -721,8 +717,8 @@ function showControls() {
   }
 }
 
-/** Says how many Gaussians each model has. */
-function sayModels() {
+/** Shows the number of Gaussians of each model. */
+function showModels() {
   byId("models").replaceChildren(...scene.models.map(({ name, rows }) => {
     const item = document.createElement("li");
     item.textContent = `${name}: ${rows.toLocaleString("en")} Gaussians`;
@@ -733,7 +729,7 @@ function sayModels() {
 function fill() {
   document.title = `${scene.title} · densify view`;
   byId("title").textContent = scene.title;
-  sayModels();
+  showModels();
   const option = (value, text) => new Option(text, value);
   byId("right").append(option("", "nothing"));
   const isOfModel = (kind) => kind !== "photograph";
@@ -771,7 +767,7 @@ function fill() {
   byId("ramp").style.background = `linear-gradient(to right, ${scene.ramp.map((c) => `rgb(${c.join(" ")})`).join(", ")})`;
 }
 
-/** Opens the help at its beginning: where there is little room, its button has the focus far below. */
+/** Opens the help, scrolled to its beginning: on a small screen the focused button is far below. */
 function explain() {
   byId("guide").showModal();
   byId("guide").scrollTop = 0;
@@ -802,7 +798,7 @@ function listen() {
     byId("fold").setAttribute("aria-expanded", String(!isFolded));
   });
   on("guide", "close", () => {
-    try { localStorage.setItem("densify-view", "seen"); } catch { /* A browser that keeps nothing shows it again. */ }
+    try { localStorage.setItem("densify-view", "seen"); } catch { /* Without storage, the help is shown every time. */ }
     marks.focus();
   });
   document.addEventListener("visibilitychange", wake);
@@ -824,10 +820,10 @@ async function open() {
   showPath();
   listen();
   let isNew = true;
-  try { isNew = localStorage.getItem("densify-view") === null; } catch { /* Then it is new. */ }
+  try { isNew = localStorage.getItem("densify-view") === null; } catch { /* Without storage, show the help. */ }
   if (isNew) explain();
   keepAsking();
-  if (scene.live) followTraining(lookAgain);
+  if (scene.live) followTraining(requestPicture);
 }
 
 open();

@@ -1,26 +1,29 @@
-//! Pictures within a page, as `data:` URIs.
+//! Images embedded in a page as `data:` URIs.
 
 use std::path::Path;
 
-use image::codecs::jpeg::JpegEncoder;
-use image::codecs::webp::WebPEncoder;
-use image::{ExtendedColorType, ImageResult, RgbImage};
+use ::image::codecs::jpeg::JpegEncoder;
+use ::image::codecs::webp::WebPEncoder;
+use ::image::{ExtendedColorType, ImageResult, RgbImage};
 
 use base64::Engine as _;
 use base64::prelude::BASE64_STANDARD;
 use densify_run::failure::{Failure, OTHER};
 
-/// A picture that stands in a page.
+/// An image embedded in a page.
 #[derive(Debug, Clone)]
-pub struct Embedded {
-    /// Its `data:` URI.
+pub struct EmbeddedImage {
+    /// The `data:` URI.
     pub uri: String,
     /// Width and height `[px]`.
     pub size: (u32, u32),
 }
 
-impl Embedded {
-    /// As JPEG, for what is looked at as a whole.
+impl EmbeddedImage {
+    /// Encodes as JPEG.
+    ///
+    /// # Errors
+    /// If encoding fails.
     pub fn jpeg(image: &RgbImage, quality: u8) -> Result<Self, Failure> {
         Self::encoded(image, "image/jpeg", |out| {
             let (width, height) = image.dimensions();
@@ -33,7 +36,10 @@ impl Embedded {
         })
     }
 
-    /// As lossless WebP, for what is looked at closely.
+    /// Encodes as lossless WebP, for enlarged crops.
+    ///
+    /// # Errors
+    /// If encoding fails.
     pub fn lossless(image: &RgbImage) -> Result<Self, Failure> {
         Self::encoded(image, "image/webp", |out| {
             let (width, height) = image.dimensions();
@@ -43,30 +49,33 @@ impl Embedded {
 
     fn encoded(
         image: &RgbImage,
-        kind: &str,
+        mime_type: &str,
         encode: impl FnOnce(&mut Vec<u8>) -> ImageResult<()>,
     ) -> Result<Self, Failure> {
         let mut bytes = Vec::new();
         encode(&mut bytes).map_err(|error| {
-            Failure::new(OTHER, format!("a picture of the report cannot be encoded: {error}"))
+            Failure::new(OTHER, format!("an image of the report cannot be encoded: {error}"))
         })?;
-        Ok(Self { uri: uri(kind, &bytes), size: image.dimensions() })
+        Ok(Self { uri: data_uri(mime_type, &bytes), size: image.dimensions() })
     }
 }
 
-fn uri(kind: &str, bytes: &[u8]) -> String {
-    format!("data:{kind};base64,{}", BASE64_STANDARD.encode(bytes))
+fn data_uri(mime_type: &str, bytes: &[u8]) -> String {
+    format!("data:{mime_type};base64,{}", BASE64_STANDARD.encode(bytes))
 }
 
-/// The URI of a picture in a file, SVG or PNG.
-pub fn embed_file(path: &Path) -> Result<String, Failure> {
-    let failed = |why: &dyn std::fmt::Display| {
-        Failure::new(OTHER, format!("cannot read {}: {why}", path.display()))
+/// The `data:` URI of an SVG or PNG file.
+///
+/// # Errors
+/// If the file cannot be read or is of another type.
+pub fn data_uri_of_file(path: &Path) -> Result<String, Failure> {
+    let failed = |problem: &dyn std::fmt::Display| {
+        Failure::new(OTHER, format!("cannot read {}: {problem}", path.display()))
     };
     let bytes = std::fs::read(path).map_err(|error| failed(&error))?;
     match path.extension().and_then(|ending| ending.to_str()) {
-        Some("svg") => Ok(uri("image/svg+xml", &bytes)),
-        Some("png") => Ok(uri("image/png", &bytes)),
-        _ => Err(failed(&"it is neither SVG nor PNG")),
+        Some("svg") => Ok(data_uri("image/svg+xml", &bytes)),
+        Some("png") => Ok(data_uri("image/png", &bytes)),
+        _ => Err(failed(&"it is neither an SVG nor a PNG")),
     }
 }
