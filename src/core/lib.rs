@@ -12,7 +12,6 @@ pub mod image;
 pub mod memory;
 pub mod numbers;
 pub mod pieces;
-pub mod resample;
 pub mod sh;
 pub mod spelling;
 pub mod spline;

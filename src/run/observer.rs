@@ -36,6 +36,9 @@ pub trait Observer {
     /// A line of information for the user.
     fn say(&self, _line: fmt::Arguments<'_>) {}
 
+    /// Lines of detail, such as the table of memory: for users who ask for them.
+    fn detail(&self, _lines: fmt::Arguments<'_>) {}
+
     /// Training begins after `done` steps and goes to step `last`, with at most `budget` rows.
     fn begin(&self, _done: u32, _last: u32, _budget: usize) {}
 

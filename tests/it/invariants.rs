@@ -170,3 +170,123 @@ fn unsafe_code_is_forbidden_everywhere() {
         );
     }
 }
+
+/// The modules of the packages that are larger than a screen, lowest first. None names a later one.
+const MODULES: [(&str, &[&str]); 5] = [
+    (
+        "src/core",
+        &[
+            "budget",
+            "camera",
+            "colour",
+            "curve",
+            "files",
+            "image",
+            "numbers",
+            "memory",
+            "pieces",
+            "sh",
+            "gaussians",
+            "spelling",
+            "spline",
+            "camera_path",
+        ],
+    ),
+    ("src/data", &["error", "ply", "models", "points", "dataset", "track_colours", "views"]),
+    (
+        "src/render",
+        &[
+            "adapter",
+            "audit",
+            "candidates",
+            "error",
+            "inspect",
+            "pixel_map",
+            "signals",
+            "cpu",
+            "differentiable",
+            "gpu",
+            "choice",
+            "setup",
+            "state",
+            "without_gpu",
+        ],
+    ),
+    (
+        "src/train",
+        &[
+            "exposure",
+            "metrics",
+            "evaluate",
+            "importance",
+            "pictures",
+            "schedule",
+            "init",
+            "trainer",
+            "output",
+            "checkpoint",
+        ],
+    ),
+    (
+        "src/run",
+        &[
+            "companion",
+            "device",
+            "failure",
+            "observer",
+            "coordinate_check",
+            "models",
+            "process",
+            "host",
+            "spec",
+            "resolved",
+            "finished",
+            "session",
+        ],
+    ),
+];
+
+/// The top-level modules that a text names through `crate::`, groups in braces included.
+fn named_modules(code: &str) -> BTreeSet<String> {
+    let mut found = BTreeSet::new();
+    for rest in code.split("crate::").skip(1) {
+        let names = match rest.strip_prefix('{') {
+            None => rest,
+            Some(group) => group.split(';').next().unwrap_or_default(),
+        };
+        let parts = if rest.starts_with('{') { names.split(',').collect() } else { vec![names] };
+        for part in parts {
+            let part = part.trim_start();
+            let end = part.find(|c: char| !c.is_alphanumeric() && c != '_').unwrap_or(part.len());
+            found.insert(part[..end].to_owned());
+        }
+    }
+    found
+}
+
+#[test]
+fn modules_name_only_those_above_them_in_the_list() {
+    let mut checked = 0;
+    for (folder, order) in MODULES {
+        let place = |name: &str| order.iter().position(|module| *module == name);
+        for path in files(folder).into_iter().filter(|path| path.ends_with(".rs")) {
+            let inside = path.strip_prefix(folder).unwrap().trim_start_matches('/');
+            let module = inside.split('/').next().unwrap().trim_end_matches(".rs");
+            if ["lib", "tests"].contains(&module) || path.contains("/tests") {
+                continue;
+            }
+            let here = place(module).unwrap_or_else(|| panic!("{path}: `{module}` is not listed"));
+            let text = read(&root().join(&path));
+            let code = text.split("#[cfg(test)]\nmod tests {").next().unwrap_or_default();
+            let code: Vec<&str> =
+                code.lines().filter(|line| !line.trim_start().starts_with("//")).collect();
+            for name in named_modules(&code.join("\n")) {
+                if let Some(there) = place(&name) {
+                    assert!(there <= here, "{path} names {name}, which is above {module}");
+                    checked += usize::from(there < here);
+                }
+            }
+        }
+    }
+    assert!(checked > 100, "only {checked} uses were found");
+}

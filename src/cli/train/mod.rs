@@ -53,6 +53,9 @@ pub(super) struct TrainArgs {
         help_heading = "Output"
     )]
     pub(super) view: Option<u16>,
+    /// Also show the table of memory, buffer by buffer, as `densify plan` does
+    #[arg(short, long, help_heading = "Output", conflicts_with = "quiet")]
+    verbose: bool,
     /// Show nothing but errors
     #[arg(short, long, help_heading = "Output")]
     pub(super) quiet: bool,
@@ -100,7 +103,7 @@ pub(super) fn run(
     matches: &ArgMatches,
     console: &Console,
 ) -> Result<(), Failure> {
-    let follower = Follower::new(console);
+    let follower = Follower { verbose: args.verbose, ..Follower::new(console) };
     let (spec, resumed) = args.describe(matches, &follower)?;
     let occupied = match (args.resume, args.overwrite) {
         (true, _) => Occupied::Resume,
@@ -141,13 +144,20 @@ fn announce_preset(spec: &RunSpec, console: &Console) -> Result<(), Failure> {
 /// Follows a run on the console, and stops it at a signal.
 pub(super) struct Follower<'a> {
     console: &'a Console,
+    /// Details are shown too.
+    verbose: bool,
     progress: RefCell<Option<Progress<'a>>>,
     interrupts: RefCell<Option<Interrupts>>,
 }
 
 impl<'a> Follower<'a> {
     pub(super) fn new(console: &'a Console) -> Self {
-        Self { console, progress: RefCell::default(), interrupts: RefCell::default() }
+        Self {
+            console,
+            verbose: false,
+            progress: RefCell::default(),
+            interrupts: RefCell::default(),
+        }
     }
 
     /// From here on a signal stops the run in order.
@@ -159,6 +169,12 @@ impl<'a> Follower<'a> {
 impl Observer for Follower<'_> {
     fn say(&self, line: fmt::Arguments<'_>) {
         self.console.say(line);
+    }
+
+    fn detail(&self, lines: fmt::Arguments<'_>) {
+        if self.verbose {
+            self.console.say(lines);
+        }
     }
 
     fn begin(&self, done: u32, last: u32, budget: usize) {

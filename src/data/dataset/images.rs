@@ -19,8 +19,8 @@ pub use super::source_file::SourceFile;
 use super::undistort::Undistortion;
 use densify_core::files;
 use densify_core::image::Window;
+use densify_core::image::resample;
 pub use densify_core::image::{Image8, SharedImage};
-use densify_core::resample;
 
 /// Longest side accepted `[px]`.
 const MAX_SIDE: u32 = 16_384;

@@ -6,7 +6,7 @@ use super::DatasetError;
 use super::images::{ImageHeader, SourceFile, decode, decode_checked};
 use super::options::MaskMode;
 use densify_core::image::Image8;
-use densify_core::resample;
+use densify_core::image::resample;
 
 /// A mask: a greyscale image whose values become weights of pixels in the loss, or transparency.
 #[derive(Debug, Clone)]

@@ -4,7 +4,7 @@ use glam::{DMat3, DVec2, DVec3};
 
 use super::lens::Lens;
 use densify_core::image::Image8;
-use densify_core::resample::PixelMean;
+use densify_core::image::resample::PixelMean;
 use densify_core::spline::catmull_rom;
 
 /// The image of a camera without distortion. The upper left corner is (0, 0); pixel centres are at +0.5.

@@ -11,6 +11,7 @@ use crate::host::Host;
 use crate::observer::Observer;
 use crate::resolved::{DECODERS, Init, ResolvedRun, ResolvedTraining, RunConfig, TEST_DECODERS};
 use crate::spec::RunSpec;
+use densify_core::memory::Bytes;
 use densify_core::numbers::grouped;
 use densify_data::dataset::PointCloud;
 use densify_data::views::DatasetViews;
@@ -71,7 +72,9 @@ pub(super) fn prepare(
     let needs = case.backend_needs(training.declared.clone());
     let ledger = case.ledger(size, &needs);
     run.check_memory(&ledger)?;
-    observer.say(format_args!("{}", case.promise(&ledger, observer.spelling())));
+    let total = Bytes(ledger.total());
+    observer.say(format_args!("memory   {total} promised in all"));
+    observer.detail(format_args!("{}", case.promise(&ledger, observer.spelling())));
     let measuring = case.measuring(size, case.choices.threads);
     let mut backend = case.inputs.device.backend(&model, &case.backend_setup(size, needs))?;
     drop(model);

@@ -141,6 +141,6 @@ mod tests {
             assert!(page.contains(expected), "{expected} is not in {page}");
         }
         let failed = document.to_html(|_| Err(Failure::input("gone"))).unwrap_err();
-        assert_eq!(failed.message, "gone");
+        assert_eq!(failed.to_string(), "gone");
     }
 }

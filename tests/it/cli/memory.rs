@@ -53,7 +53,7 @@ fn plan_says_what_train_promises_and_writes_nothing() {
         let flags = format!("{flags} --iterations 2");
         let planned = plan(scene.path(), &format!("-o {} {flags}", text(&run))).ok();
         assert!(files(root.path()).is_empty(), "{flags}: {:?}", files(root.path()).keys());
-        let trained = train(scene.path(), &run, &flags).ok();
+        let trained = train(scene.path(), &run, &format!("{flags} -v")).ok();
         assert_eq!(ledger(&planned), ledger(&trained), "{flags}");
         let tenths = |line: &str| -> u64 {
             let size = line.trim_end().trim_end_matches(" MiB").rsplit(' ').next().expect("a size");

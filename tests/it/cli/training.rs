@@ -122,7 +122,7 @@ fn photographs_of_colmap_are_trained_on() {
             _ => 18.0,
         };
         let outcome = check(&scene, policy, "", least_psnr);
-        for said in ["memory promised", "360 rows", "test     PSNR", "300 points"] {
+        for said in ["promised in all", "360 rows", "test     PSNR", "300 points"] {
             assert!(outcome.stdout.contains(said), "{policy}: {said:?} in {}", outcome.stdout);
         }
         // An edit is one line of the log.

@@ -1,6 +1,6 @@
 //! The area filter that shrinks images, and means of pixels weighted by coverage.
 
-use crate::image::Image8;
+use super::Image8;
 
 /// A weighted mean of pixels. Colours are also weighted by alpha, as the colour of a transparent
 /// pixel must not bleed into its neighbours.

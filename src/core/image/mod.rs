@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use crate::resample;
+pub mod resample;
 
 /// A decoded image.
 #[derive(Debug, Clone, PartialEq, Eq)]
