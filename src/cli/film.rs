@@ -87,7 +87,9 @@ fn in_options(error: FilmError) -> Failure {
         FilmError::NoSize => {
             Failure::input(format!("--path: {error}; say it with --size WIDTHxHEIGHT"))
         }
-        FilmError::OutOfMemory { .. } => Failure::new(DEVICE, format!("{error}; give a smaller --size")),
+        FilmError::OutOfMemory { .. } => {
+            Failure::new(DEVICE, format!("{error}; give a smaller --size"))
+        }
         FilmError::TooLargeForWebP { .. } => {
             Failure::input(format!("--video {error}; give a smaller --size"))
         }

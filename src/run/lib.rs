@@ -8,7 +8,6 @@
 //! coordinate_check, resolved, finished, session.
 
 mod companion;
-mod device;
 pub mod coordinate_check;
 pub mod failure;
 pub mod finished;

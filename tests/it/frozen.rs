@@ -94,7 +94,9 @@ fn nothing_changes_them() {
                 plan.grow(1, split_by(1.6)).expect("there is room");
                 plan.decay(Decay { opacity: 0.01, scale: 0.1, seen_only: false }).expect("sound");
                 plan.clamp_opacity(0.02).expect("a sound bound");
-                backend.apply(&plan.compile().after_frozen(FROZEN), 5, 6).expect("a plan is applied");
+                backend
+                    .apply(&plan.compile().after_frozen(FROZEN), 5, 6)
+                    .expect("a plan is applied");
                 step(&mut *backend, 7, needs);
                 let after = backend.download().expect("a model");
                 assert_eq!(after.len(), ROWS - 2);

@@ -3,7 +3,7 @@
 //! [selftest](densify::selftest).
 
 use densify::core::gaussians::Gaussians;
-use densify::render::{Attribute, Backend, NumberKind, Storage, NonFinite, Values};
+use densify::render::{Attribute, Backend, NonFinite, NumberKind, Storage, Values};
 use densify::selftest::values::{POISON, SLOTS, remove, slot_mut};
 use densify::selftest::{Setup, Subject, scenes};
 use densify_policies::plan::EditPlan;

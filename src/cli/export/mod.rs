@@ -8,8 +8,8 @@ use std::path::{Path, PathBuf};
 use clap::{ArgMatches, Args};
 
 use super::console::Console;
-use super::threads::open_machine;
 use super::render::{RenderingArgs, refuse_options_of_a_file};
+use super::threads::open_machine;
 use densify_core::files::{FileError, write_atomically};
 use densify_core::gaussians::Gaussians;
 use densify_core::numbers::gaussians;

@@ -3,8 +3,8 @@
 use std::ops::Range;
 
 use densify_policies::plan::{
-    Decay, MIN_DECAYED_OPACITY, Offspring, OpacityRule, ParentFate, Placement, RowOps, ScaleRule, Seed,
-    NO_ROTATION,
+    Decay, MIN_DECAYED_OPACITY, NO_ROTATION, Offspring, OpacityRule, ParentFate, Placement, RowOps,
+    ScaleRule, Seed,
 };
 use densify_policies::policy::Signal;
 use densify_policies::rng::{PolicyRng, Purpose};

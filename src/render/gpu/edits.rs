@@ -332,7 +332,7 @@ impl GpuBackend {
 mod tests {
     use std::collections::HashSet;
 
-    use densify_policies::plan::{EditPlan, Offspring, NO_ROTATION};
+    use densify_policies::plan::{EditPlan, NO_ROTATION, Offspring};
     use rand::SeedableRng;
     use rand::seq::SliceRandom;
     use rand_chacha::ChaCha8Rng;

@@ -9,8 +9,8 @@ use std::fmt::Display;
 use std::path::Path;
 
 pub use problem::{
-    BackendRemedy, Difference, ModelProblem, OptionProblem, Problem, Remedy, ResumeProblem, SizeProblem,
-    TrainingProblem,
+    BackendRemedy, Difference, ModelProblem, OptionProblem, Problem, Remedy, ResumeProblem,
+    SizeProblem, TrainingProblem,
 };
 
 use densify_policies::policy::PolicyError;

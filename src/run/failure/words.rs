@@ -6,8 +6,8 @@ use densify_core::spelling::Spelling;
 use densify_render::Accumulation;
 
 use super::problem::{
-    BackendRemedy, Difference, ModelProblem, OptionProblem, Problem, Remedy, ResumeProblem, SizeProblem,
-    TrainingProblem,
+    BackendRemedy, Difference, ModelProblem, OptionProblem, Problem, Remedy, ResumeProblem,
+    SizeProblem, TrainingProblem,
 };
 
 impl Problem {

@@ -17,8 +17,8 @@ use densify_policies::plan::RowOps;
 use densify_policies::policy::{Candidate, SignalSet, Signals};
 use densify_render::cpu::{CpuBackend, ModelGradient};
 use densify_render::{
-    Attribute, AuxInput, AuxOutput, Backend, BackendError, Differentiable, ImageGradient, NumberKind,
-    Rendering, StateArray, StateError, StepInput, StepOutput, Tensor, NonFinite,
+    Attribute, AuxInput, AuxOutput, Backend, BackendError, Differentiable, ImageGradient,
+    NonFinite, NumberKind, Rendering, StateArray, StateError, StepInput, StepOutput, Tensor,
 };
 
 use super::{Subject, cases};

@@ -188,7 +188,9 @@ fn the_selftest_prints_its_figures_and_writes_them() {
     let (root, _) = scratch();
     let file = root.path().join("deep/figures.md");
     let outcome = call(&format!("selftest --backend cpu 1 16 --markdown {}", text(&file))).ok();
-    for words in ["on native", "no Gaussian", "ok", "depths one bit apart", "within their tolerances"] {
+    for words in
+        ["on native", "no Gaussian", "ok", "depths one bit apart", "within their tolerances"]
+    {
         assert!(outcome.stdout.contains(words), "{words}: {}", outcome.stdout);
     }
     let written = std::fs::read_to_string(&file).expect("it was written");

@@ -1,8 +1,8 @@
 //! Any calls of a plan, sensible or not.
 
 use densify_policies::plan::{
-    Decay, EditPlan, Offspring, OpacityRule, ParentFate, Placement, Reset, ScaleRule, Seed,
-    NO_ROTATION, Update,
+    Decay, EditPlan, NO_ROTATION, Offspring, OpacityRule, ParentFate, Placement, Reset, ScaleRule,
+    Seed, Update,
 };
 use densify_policies::policy::SignalSet;
 use proptest::prelude::*;

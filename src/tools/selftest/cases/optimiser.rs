@@ -70,7 +70,8 @@ pub(super) fn moments(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     }
     // The audit reports exactly the row whose moment overflows.
     let found = backend.audit()?;
-    let is_expected = |u: &densify_render::NonFinite| u.row == OVERFLOWING && u.kind == NumberKind::Moment;
+    let is_expected =
+        |u: &densify_render::NonFinite| u.row == OVERFLOWING && u.kind == NumberKind::Moment;
     let wrong = usize::from(found.is_empty()) + found.iter().filter(|u| !is_expected(u)).count();
     trial.count("gradient 1e30", "Gaussians missed or wrongly reported by the audit", wrong);
     let mut plan = EditPlan::new(backend.rows(), backend.budget());

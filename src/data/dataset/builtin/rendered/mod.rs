@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 pub use densify_scenegen::GroundTruth;
 use densify_scenegen::{
-    PresetSpec, Frame, InitPoints, Options, Scene, Source, Split, View as RenderedView,
+    Frame, InitPoints, Options, PresetSpec, Scene, Source, Split, View as RenderedView,
 };
 use serde::{Deserialize, Serialize};
 
