@@ -1,11 +1,10 @@
 //! Finished runs and bare models, opened to render or measure them.
 
-use crate::device::describe;
 use std::path::{Path, PathBuf};
 
 use densify_policies::policy::Needs;
 
-use crate::failure::{Failure, ModelProblem};
+use crate::failure::{Failure, ModelProblem, notes};
 pub use crate::models::{
     is_model, iteration, iteration_so_far, model_file, name_of, names_of, read_model,
 };
@@ -33,7 +32,7 @@ impl Machine {
     /// Opens the device that the options name.
     pub fn open(spec: &DeviceSpec, observer: &dyn Observer) -> Result<Self, Failure> {
         let device = Device::open_to_render(spec.backend, spec.gpu.as_deref())?;
-        observer.say(format_args!("device   {}", describe(&device)));
+        observer.say(format_args!("{}", notes::device(observer.spelling(), &device)));
         Ok(Self { threads: spec.threads.map(|threads| threads.0 as usize), device })
     }
 

@@ -5,7 +5,28 @@ use std::path::Path;
 use densify_core::memory::Bytes;
 use densify_core::numbers::grouped;
 use densify_core::spelling::Spelling;
-use densify_render::Accumulation;
+use densify_render::{Accumulation, AdapterKind, BackendKind, Device};
+
+/// The device, with a hint where another choice may be better.
+pub(crate) fn device(s: Spelling, device: &Device) -> String {
+    let device = match device {
+        Device::Processor if BackendKind::Gpu.is_built() => {
+            "processor (`densify devices` lists GPUs)".to_owned()
+        }
+        Device::Processor => "processor".to_owned(),
+        Device::Gpu(device) => {
+            let adapter = device.adapter();
+            let hint = match adapter.kind {
+                AdapterKind::Software => {
+                    format!(", a software driver: {} is faster", s.text("backend", "cpu"))
+                }
+                _ => String::new(),
+            };
+            format!("{} ({}){hint}", adapter.name, adapter.interface)
+        }
+    };
+    format!("device   {device}")
+}
 
 /// The order in which gradients are added up.
 pub(crate) fn accumulation(s: Spelling, taken: Accumulation) -> String {

@@ -1,6 +1,5 @@
 //! The inputs of a run, opened once: device, dataset, and the sizes of the models that it starts from.
 
-use crate::device::describe;
 use std::path::Path;
 
 use crate::companion::Companion;
@@ -152,7 +151,7 @@ pub(super) fn open_device(
         (false, given) => given,
     };
     let device = Device::open(spec.device.backend, spec.device.gpu.as_deref(), accumulation)?;
-    observer.say(format_args!("device   {}", describe(&device)));
+    observer.say(format_args!("{}", notes::device(observer.spelling(), &device)));
     check_knobs(knobs, device.kind())?;
     if let Some(taken) = device.accumulation() {
         knobs
