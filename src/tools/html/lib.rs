@@ -18,6 +18,8 @@ pub use text::Text;
 
 use densify_core::files;
 
+/// The colours of all pages, light and dark, as CSS variables.
+pub const PALETTE: &str = include_str!("palette.css");
 const STYLE: &str = concat!(include_str!("palette.css"), include_str!("page.css"));
 const SCRIPT: &str = include_str!("page.js");
 /// Content security policy: the browser loads nothing but the page, so that even unescaped text could not send data.

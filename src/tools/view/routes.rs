@@ -1,5 +1,6 @@
 //! Routes requests to responses. No path names a file: everything served is built in or rendered on request.
 
+use std::sync::LazyLock;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -14,7 +15,8 @@ use super::run_status::{Command, RunStatus};
 use super::scene::RequestLimits;
 
 const PAGE: &str = include_str!("page/index.html");
-const STYLE: &str = concat!(include_str!("../html/palette.css"), include_str!("page/view.css"));
+static STYLE: LazyLock<String> =
+    LazyLock::new(|| [densify_html::PALETTE, include_str!("page/view.css")].concat());
 const SCRIPT: &str = include_str!("page/view.js");
 const LIVE_SCRIPT: &str = include_str!("page/live.js");
 
@@ -64,7 +66,7 @@ impl Routes<'_> {
                 Err(response) => response,
             },
             (Method::Get | Method::Head, "") => text("text/html; charset=utf-8", PAGE),
-            (Method::Get | Method::Head, "view.css") => text("text/css; charset=utf-8", STYLE),
+            (Method::Get | Method::Head, "view.css") => text("text/css; charset=utf-8", &STYLE),
             (Method::Get | Method::Head, "view.js") => {
                 text("text/javascript; charset=utf-8", SCRIPT)
             }
@@ -241,7 +243,7 @@ mod tests {
 
     #[test]
     fn the_page_loads_nothing_from_elsewhere() {
-        for text in [PAGE, STYLE, SCRIPT, LIVE_SCRIPT] {
+        for text in [PAGE, &STYLE, SCRIPT, LIVE_SCRIPT] {
             for word in ["http://", "https://", "//cdn", "@import", "eval("] {
                 let strange = text.replace("http://www.w3.org/", "");
                 assert!(!strange.contains(word), "{word}");
