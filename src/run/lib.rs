@@ -9,7 +9,6 @@
 
 mod companion;
 pub mod coordinate_check;
-mod device;
 pub mod failure;
 pub mod finished;
 mod host;

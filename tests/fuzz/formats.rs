@@ -73,6 +73,7 @@ impl Target {
     ///
     /// # Panics
     /// When there is none.
+    #[allow(dead_code, reason = "the fuzzer uses it, the tests do not")]
     pub fn named(name: &str) -> Self {
         let target = targets().into_iter().find(|target| target.name == name);
         target.unwrap_or_else(|| panic!("no target is called {name:?}"))

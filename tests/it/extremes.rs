@@ -8,10 +8,10 @@
 //!
 //! | extreme | tested in |
 //! |---|---|
-//! | 1 no row | selftest; `src/init/tests.rs: impossible_requests_are_errors`; `src/data/models/ply/tests.rs: splats_make_the_round_trip_bit_for_bit`; `policies/src/conformance/tests.rs: every_registered_policy_conforms` |
-//! | 2 one row | selftest; `src/init/tests.rs: few_points` |
-//! | 3 duplicates | selftest; `src/init/tests.rs: duplicates_are_merged_and_counted_and_break_nothing` |
-//! | 4 a budget below the points | `src/init/tests.rs: the_budget_is_kept_by_a_seeded_subsample`; `tests/it/cli/training.rs: more_points_than_the_budget_are_subsampled_and_it_is_said`; `tests/it/cli/training.rs: a_budget_of_one_row_trains`; `tests/it/cli/faults.rs: flags_out_of_range_are_refused` |
+//! | 1 no row | selftest; `src/train/init/tests.rs: impossible_requests_are_errors`; `src/data/models/ply/tests.rs: splats_make_the_round_trip_bit_for_bit`; `policies/src/conformance/tests.rs: every_registered_policy_conforms` |
+//! | 2 one row | selftest; `src/train/init/tests.rs: few_points` |
+//! | 3 duplicates | selftest; `src/train/init/tests.rs: duplicates_are_merged_and_counted_and_break_nothing` |
+//! | 4 a budget below the points | `src/train/init/tests.rs: the_budget_is_kept_by_a_seeded_subsample`; `tests/it/cli/training.rs: more_points_than_the_budget_are_subsampled_and_it_is_said`; `tests/it/cli/training.rs: a_budget_of_one_row_trains`; `tests/it/cli/faults.rs: flags_out_of_range_are_refused` |
 //! | 5 log-scales | selftest; `src/data/models/ply/tests.rs: damaged_rows_are_dropped_up_to_one_percent` |
 //! | 6 quaternions | selftest; `src/data/models/ply/tests.rs: damaged_rows_are_dropped_up_to_one_percent` |
 //! | 7 needles | selftest |
@@ -25,19 +25,19 @@
 //! | 15 equal depths | selftest; `tests/it/sameness.rs: threads_change_nothing` |
 //! | 16 depths one bit apart | selftest |
 //! | 17 opacity logits | selftest |
-//! | 18 colours | selftest; `src/init/tests.rs: rows_are_as_the_original_starts_them` |
+//! | 18 colours | selftest; `src/train/init/tests.rs: rows_start_as_in_the_original_code` |
 //! | 19 a camera at a mean | selftest |
-//! | 20 far off, tiny, huge | selftest; `src/dataset/normalise.rs: powers_of_two_change_no_bit_of_the_scene`; `src/dataset/normalise.rs: models_go_to_the_world_and_back`; `src/dataset/tests/formats.rs: a_far_off_scene_keeps_its_precision` |
-//! | 21 image sizes | selftest; `src/dataset/images.rs: broken_and_oversized_files_are_errors_that_name_them` |
-//! | 22 lenses | selftest; `src/dataset/pose.rs: fields_of_view_that_no_pinhole_has_are_refused` |
-//! | 23 plain photographs | selftest; `src/dataset/images.rs: every_colour_type_packs_to_eight_bits`; `policies/src/taming/score.rs: terms_are_relative_to_the_median_of_the_positive`; `policies/src/conformance/tests.rs: every_registered_policy_conforms` |
-//! | 24 similarity | selftest; `src/metrics/ssim.rs: flat_images_a_hair_apart_stay_below_one`; `src/metrics/ssim.rs: agrees_with_the_textbook_pixel_by_pixel_at_every_size` |
+//! | 20 far off, tiny, huge | selftest; `src/data/dataset/normalise.rs: powers_of_two_change_no_bit_of_the_scene`; `src/data/dataset/normalise.rs: models_go_to_the_world_and_back`; `src/data/dataset/tests/formats.rs: a_far_off_scene_keeps_its_precision` |
+//! | 21 image sizes | selftest; `src/data/dataset/images.rs: broken_and_oversized_files_are_errors_that_name_them` |
+//! | 22 lenses | selftest; `src/data/dataset/pose.rs: fields_of_view_that_no_pinhole_has_are_refused` |
+//! | 23 plain photographs | selftest; `src/data/dataset/images.rs: every_colour_type_packs_to_eight_bits`; `policies/src/taming/score.rs: terms_are_relative_to_the_median_of_the_positive`; `policies/src/conformance/tests.rs: every_registered_policy_conforms` |
+//! | 24 similarity | selftest; `src/train/metrics/ssim.rs: flat_images_a_hair_apart_stay_below_one`; `src/train/metrics/ssim.rs: agrees_with_the_textbook_pixel_by_pixel_at_every_size` |
 //! | 25 the optimiser | selftest; `tests/it/declared.rs: a_step_takes_the_sum_of_the_gradients_since_the_last`; `tests/it/agreement.rs: steps_are_those_of_the_native_backend` |
-//! | 26 poisoned rows | selftest; `tests/it/quarantine.rs: every_number_that_is_none_is_found`; `src/trainer/tests/nonfinite.rs: nonfinite_rows_are_removed_before_the_policy_plans` |
-//! | 27 all faint, all prunable | selftest; `policies/src/adc.rs: one_row_is_spared`; `policies/src/conformance/tests.rs: every_registered_policy_conforms`; `policies/src/mcmc/tests.rs: without_the_living_nothing_is_done` |
-//! | 28 half precision | `src/backend/cpu/narrow/tests.rs: halves_are_what_the_standard_says`; `src/backend/cpu/narrow/tests.rs: rounding_is_fair_and_stays_between_the_neighbours`; `tests/it/quarantine.rs: every_number_that_is_none_is_found` |
-//! | 29 whole numbers | `src/backend/cpu/tiles.rs: bands_are_cut_without_overflow`; `src/backend/cpu/budget.rs: huge_budgets_are_refused_and_do_not_wrap`; `src/backend/gpu/adapter.rs: the_best_adapter_that_matches_is_taken`; `src/checkpoint/tests.rs: headers_that_promise_too_much_are_refused_without_allocation` |
-//! | 30 a long run | selftest, in full with `--long`; `src/trainer/edit.rs: slots_written_before_the_moves_count_for_the_peak`; `tests/it/edits/mod.rs: any_plans_do_to_the_backend_what_they_do_to_a_plain_vector` |
+//! | 26 poisoned rows | selftest; `tests/it/quarantine.rs: every_number_that_is_none_is_found`; `src/train/trainer/tests/nonfinite.rs: nonfinite_rows_are_removed_before_the_policy_plans` |
+//! | 27 all faint, all prunable | selftest; `policies/src/adc.rs: one_row_is_spared`; `policies/src/conformance/tests.rs: every_registered_policy_conforms`; `policies/src/mcmc/tests.rs: nothing_happens_if_no_row_is_alive` |
+//! | 28 half precision | `src/render/cpu/narrow/tests.rs: halves_are_what_the_standard_says`; `src/render/cpu/narrow/tests.rs: rounding_is_fair_and_stays_between_the_neighbours`; `tests/it/quarantine.rs: every_number_that_is_none_is_found` |
+//! | 29 whole numbers | `src/render/cpu/tiles.rs: bands_are_cut_without_overflow`; `src/render/cpu/budget.rs: huge_budgets_are_refused_and_do_not_wrap`; `src/render/gpu/adapter.rs: the_best_adapter_that_matches_is_taken`; `src/train/checkpoint/tests.rs: headers_that_promise_too_much_are_refused_without_allocation` |
+//! | 30 a long run | selftest, in full with `--long`; `src/train/trainer/edit.rs: slots_written_before_the_moves_count_for_the_peak`; `tests/it/edits/mod.rs: any_plans_do_to_the_backend_what_they_do_to_a_plain_vector` |
 
 use std::path::Path;
 

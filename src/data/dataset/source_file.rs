@@ -19,7 +19,7 @@ pub struct SourceFile {
     /// The archive that contains the file, if any.
     archive: Option<Arc<Unpacked>>,
     /// EXIF fields, if they have been read while loading.
-    exif: Option<Exif>,
+    exif: Option<Box<Exif>>,
 }
 
 impl SourceFile {
@@ -35,12 +35,12 @@ impl SourceFile {
     /// A placeholder for pixels in memory, which have no EXIF.
     #[must_use]
     pub(crate) fn rendered(path: PathBuf) -> Self {
-        Self { path, real: Path::new("").into(), archive: None, exif: Some(Exif::default()) }
+        Self { path, real: Path::new("").into(), archive: None, exif: Some(Box::default()) }
     }
 
     /// Keeps EXIF fields that have been read already.
     pub(super) fn with_exif(self, exif: Option<Exif>) -> Self {
-        Self { exif, ..self }
+        Self { exif: exif.map(Box::new), ..self }
     }
 
     /// The same file as a part of an archive, whose name messages show.
@@ -56,7 +56,7 @@ impl SourceFile {
     /// EXIF fields; read from the file only if that has not been done before.
     pub(super) fn exif(&self) -> Exif {
         match &self.exif {
-            Some(exif) => exif.clone(),
+            Some(exif) => Exif::clone(exif),
             None => self.open().map(Exif::read).unwrap_or_default(),
         }
     }

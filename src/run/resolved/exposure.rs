@@ -115,7 +115,7 @@ impl Exposure {
                 (true, _) => {
                     format!(
                         "exposure on, from the gains of points in several views{}",
-                        self.from_exif()
+                        self.exif_views()
                     )
                 }
                 (false, ExifUse::Views(views)) => {
@@ -132,7 +132,7 @@ impl Exposure {
                 found.stops,
                 found.with_gains,
                 found.alike,
-                self.from_exif(),
+                self.exif_views(),
             )),
             ExposureSource::Undecided => Some(format!(
                 "exposure {word} (auto): fewer than {MIN_TRACKS} points of a reconstruction are known in enough \
@@ -148,7 +148,7 @@ impl Exposure {
     }
 
     /// The number of views that begin from EXIF where the others begin from tracks.
-    fn from_exif(&self) -> String {
+    fn exif_views(&self) -> String {
         match self.believed {
             ExifUse::Views(views) => format!("; {} views begin from their EXIF", grouped(views)),
             ExifUse::Unused | ExifUse::Contradicted { .. } => String::new(),

@@ -52,7 +52,7 @@ mod as_table {
     }
 
     pub(super) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Partial, D::Error> {
-        Partial::new(Table::deserialize(from)?, "spec").map_err(|failure| D::Error::custom(failure))
+        Partial::new(Table::deserialize(from)?, "spec").map_err(D::Error::custom)
     }
 }
 

@@ -26,8 +26,11 @@ pub(super) fn mean(values: impl IntoIterator<Item = f64>) -> Option<f64> {
 /// A difference between two runs of the same scene and seed.
 #[derive(Debug, Clone, Copy)]
 pub struct Pair<'a> {
+    /// The scene of both runs.
     pub scene: &'a str,
+    /// The seed of both runs.
     pub seed: u32,
+    /// The second run's value less the first one's.
     pub difference: f64,
 }
 

@@ -44,6 +44,10 @@ pub struct StudyRun {
 }
 
 impl StudyRun {
+    /// Makes the run.
+    ///
+    /// # Errors
+    /// When the description of the run cannot be read, or the run fails.
     pub fn make(&self) -> Result<(), Failure> {
         Cell::read(&self.folder, &self.name)?.make(&self.folder)
     }

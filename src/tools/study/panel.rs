@@ -30,23 +30,29 @@ const FEW: usize = 16;
 
 /// A line through some points.
 pub struct Curve {
+    /// Name in the legend.
     pub name: String,
+    /// (x, y), in rising order of x.
     pub points: Vec<(f64, f64)>,
-    /// Which colour of the palette.
+    /// Index of the colour in the palette.
     pub colour: usize,
+    /// Drawn dashed.
     pub is_dashed: bool,
 }
 
 /// Curves over the same axes.
 pub struct Panel {
-    /// Nothing is written above where it is empty.
+    /// Title; may be empty.
     pub title: String,
+    /// Name of the x axis.
     pub x: &'static str,
+    /// Name of the y axis.
     pub y: &'static str,
-    /// Whether x is the logarithm of what the axis says.
+    /// The points hold the logarithm of the quantity on the x axis.
     pub log_x: bool,
-    /// Whether the curves are named in the panel.
+    /// The curves are named in the panel.
     pub has_legend: bool,
+    /// The curves, drawn in order.
     pub curves: Vec<Curve>,
 }
 

@@ -46,7 +46,6 @@ fn a_run_goes_on_from_any_model() {
     assert_eq!(rows(&again, 20), rows(&run, 150));
 
     // So does a file of another format.
-    #[cfg(feature = "formats")]
     {
         let spz = root.path().join("model.spz");
         call(&format!("export {} -o {}", text(&run), text(&spz))).ok();

@@ -85,13 +85,14 @@ pub struct Comparison {
     /// Options of `densify train` for every run
     #[arg(last = true, value_name = "TRAIN OPTIONS")]
     pub train: Vec<String>,
+    /// Where the runs are started.
     #[command(flatten)]
     pub engine: EngineArgs,
 }
 
 /// A budget for all scenes, or for one.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) struct SceneBudget {
+pub struct SceneBudget {
     /// The label of the only scene that it is for.
     pub scene: Option<String>,
     /// Most Gaussians.

@@ -68,6 +68,7 @@ pub struct Trade {
     /// Options of `densify train` for every run
     #[arg(last = true, value_name = "TRAIN OPTIONS")]
     pub train: Vec<String>,
+    /// Where the runs are started.
     #[command(flatten)]
     pub engine: EngineArgs,
 }
