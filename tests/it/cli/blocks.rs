@@ -182,7 +182,7 @@ fn what_cannot_be_planned_is_named_and_nothing_is_written() {
     };
     plan("--rows 400 --blocks 9x9 -- -i 20").refused("too many", &["of 9x9", "--blocks", "--rows"]);
     plan("--rows 50 --blocks 2").refused("too few rows", &["50 Gaussians", "--rows"]);
-    plan("--rows 400 --blocks 2 -- --view").refused("own", &["--view", "plan itself"]);
+    plan("--rows 400 --blocks 2 -- --view").refused("own", &["--view"]);
     plan("--rows 400 --blocks 2 -- --budget 9").refused("own", &["--budget", "plan itself"]);
     plan("--rows 400 --blocks 2 -- --sh-degree auto").refused("auto", &["--sh-degree auto"]);
     plan("--rows 400 --blocks 2 -- --exposure auto")

@@ -36,7 +36,7 @@ fn export_writes_the_model_of_a_run_or_a_file() {
         (Path::new("absent.ply"), &nowhere, "", &["absent.ply does not exist"]),
         (&run, Path::new("/dev/null"), "--format ply --overwrite", &["/dev/null", "device"]),
         (&run, &early, "--format all --overwrite", &["early.bin", "name a folder"]),
-        (&picture, &nowhere, "", &["PLY"]),
+        (&picture, &nowhere, "", &["ply", "convert it"]),
         (&run, &again, "", &["exists", "--overwrite"]),
         (&run, &run, "--format ply --overwrite", &["is a folder"]),
     ];

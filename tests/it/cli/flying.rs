@@ -46,7 +46,7 @@ fn a_flight_is_rendered_as_pictures_and_as_a_film() {
     for (more, words) in [
         ("--video a.avi --path spiral", [".mp4", ".webp"]),
         ("--path nowhere.json", ["--path", "nowhere.json"]),
-        ("--path orbit --side-by-side", ["--side-by-side", "flight"]),
+        ("--path orbit --side-by-side", ["--side-by-side", "camera path"]),
         ("--path orbit --size 0x5", ["--size", "640x480"]),
         ("--path orbit --frames 0", ["--frames", "1..="]),
     ] {

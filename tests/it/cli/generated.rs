@@ -83,7 +83,7 @@ fn written_scenes_are_measured_against_their_files() {
     let (root, run) = scratch();
     let folder = root.path().join("wires");
     wires(&folder);
-    let said = train(&folder, &run, 6, "--budget 400 --eval").ok().stdout;
+    let said = train(&folder, &run, 6, "--budget 400 --eval -v").ok().stdout;
     assert!(said.contains("geometry depth RMSE") && said.contains("measuring geometry"), "{said}");
     let peak = said.split("; peak ").nth(1).and_then(|rest| rest.split(" MiB").next());
     if let Some(peak) = peak {

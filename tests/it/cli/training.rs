@@ -189,7 +189,7 @@ fn view_dependent_colour_steps_as_often_as_the_policy_says() {
     let scene = Photographs::colmap_text();
     let trained = |flags: &str| {
         let (_root, run) = scratch();
-        let flags = format!("--budget 330 --policy taming {flags}");
+        let flags = format!("--budget 330 --policy taming -v {flags}");
         let outcome = train(scene.path(), &run, 20, &flags).ok();
         (model(&run, 20), outcome.stdout.contains("gradients summed between steps"))
     };
