@@ -124,14 +124,14 @@ mod tests {
 
     #[test]
     fn the_options_table_is_current() {
-        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/options.md");
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/options.md");
         if std::env::var_os("DENSIFY_WRITE_DOCS").is_some() {
             std::fs::write(&path, markdown()).unwrap();
         }
         let there = std::fs::read_to_string(&path).unwrap_or_default();
         assert!(
             there == markdown(),
-            "docs/options.md is out of date: DENSIFY_WRITE_DOCS=1 cargo test options_table"
+            "docs/options.md is out of date: DENSIFY_WRITE_DOCS=1 cargo t options_table"
         );
     }
 }

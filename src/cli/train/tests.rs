@@ -207,14 +207,18 @@ fn a_device_that_is_lost_leaves_what_the_run_goes_on_from() {
         case.train(&on_gpu).unwrap();
         let expected = case.model();
         let (mut before, mut after) = (0, 0);
-        for checks in [1, 40, 120, 240, 400] {
+        for checks in [1, 40, 80, 120, 160, 240] {
             case.clear();
             let (done, lost) = with_device_lost_after(checks, || case.train(&on_gpu));
             if !lost {
                 assert!(done.is_ok() && after > 0, "{driver}: {checks} checks are too many");
                 continue;
             }
-            let failure = done.unwrap_err();
+            let Err(failure) = done else {
+                // Lost while the last checkpoint was written: by then everything else is there.
+                assert!(case.model() == expected, "{driver}: {checks}");
+                continue;
+            };
             let (code, message) = (failure.code, failure.to_string());
             let what = format!("{driver}, {checks} checks: {message}");
             assert_eq!(code, DEVICE, "{what}");

@@ -216,7 +216,7 @@ impl Case<'_> {
         let views = train.iter().chain(test);
         let rendered = |view: &View| view.source.rendered.as_ref().map_or(0, |image| image.bytes());
         // A view's name and path, in the dataset and again for its images.
-        let view = |view: &View| (3 * size_of::<View>() + 488) as u64 + rendered(view);
+        let view = |view: &View| (3 * size_of::<View>() + 464) as u64 + rendered(view);
         let expected = PROGRAM + views.map(view).sum::<u64>() + points.len() as u64 * POINT;
         let program = match self.inputs.resident {
             Some(resident) if resident > expected => resident.next_multiple_of(PROGRAM_STEP),
