@@ -1,7 +1,7 @@
 //! Routes requests to responses. No path names a file: everything served is built in or rendered on request.
 
-use std::sync::LazyLock;
 use std::sync::Arc;
+use std::sync::LazyLock;
 use std::time::{Duration, Instant};
 
 use serde::Deserialize;
