@@ -1,7 +1,7 @@
 //! `densify` trains 3D Gaussian Splatting scenes under a hard memory budget.
 //!
 //! What decides where Gaussians are born and die is a plugin, a *policy* (see
-//! [`densify_policies`]). This crate is everything around it: data, renderer, trainer and the
+//! `densify_policies`). This crate is everything around it: data, renderer, trainer and the
 //! command line. All that `densify train` does can be done from code:
 //!
 //! ```no_run

@@ -51,7 +51,7 @@ impl Run {
         Self::prepare_on(spec, None, Host::default())
     }
 
-    /// Prepares a run on `host`. With `resumed` it goes on with the run that [`start`] has found.
+    /// Prepares a run on `host`. With `resumed` it goes on with the run that [`start`](crate::start) has found.
     ///
     /// # Errors
     /// As [`prepare`](Self::prepare), and when the result would differ from that of the run that goes on.

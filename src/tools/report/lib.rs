@@ -1,6 +1,6 @@
 //! `densify report`: the results of one or several runs as a self-contained HTML file.
 //!
-//! [`runs`] reads the folders, [`groups`] finds runs of the same scene and settings, [`pictures`] renders, and each of
+//! `runs` reads the folders, `groups` finds runs of the same scene and settings, `pictures` renders, and each of
 //! the other modules writes a part of the page. The same runs give the same bytes: the page contains neither the time
 //! nor a path of this machine. Prints nothing.
 

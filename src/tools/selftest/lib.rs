@@ -1,4 +1,4 @@
-//! Numerical checks of a backend: a [reference] renderer in `f64` that shares no arithmetic with the backends,
+//! Numerical checks of a backend: a [mod@reference] renderer in `f64` that shares no arithmetic with the backends,
 //! comparisons with tolerances, and the numerically hardest [`cases`].
 //!
 //! `densify selftest` runs the cases on the user's own machine and driver; the tests run them on every
