@@ -246,7 +246,7 @@ fn a_state_of_another_run_is_refused_by_name() {
     let mut less = options();
     less.needs.cadence = Cadence { all: 1, sh_rest: 4 };
     // The shapes are those of the first piece of rows.
-    refused(less, "`summed.gradients`: its shape is [48, 23]; this run needs [48, 9]");
+    refused(less, "`summed.gradients`: its shape is [16384, 23]; this run needs [16384, 9]");
     let mut fewer = options();
     fewer.needs.candidates = fewer.needs.candidates.map(|c| CandidateRequest { capacity: 3, ..c });
     refused(fewer, "`candidates`: it has 4 candidates; this run holds at most 3");
