@@ -18,15 +18,15 @@ use densify_render::Setup;
 use densify_render::cpu::CpuBackend;
 use densify_render::{Backend, StateArray, Tensor, Values};
 
-/// More rows than are written at a time.
-const ROWS: usize = ROWS_AT_A_TIME + 13;
+/// Few, so that every byte of a file can be damaged in turn.
+const ROWS: usize = 61;
 
 fn numbers(count: usize, seed: f32) -> Vec<f32> {
     (0..count).map(|i| ((i as f32 + seed) * 0.7131).sin()).collect()
 }
 
-fn gaussians() -> Gaussians {
-    let by = |n: usize, seed| numbers(n * ROWS, seed);
+fn gaussians(rows: usize) -> Gaussians {
+    let by = |n: usize, seed| numbers(n * rows, seed);
     Gaussians {
         sh_degree: 1,
         means: by(3, 1.0).as_chunks().0.to_vec(),
@@ -37,7 +37,7 @@ fn gaussians() -> Gaussians {
     }
 }
 
-fn options() -> Setup {
+fn options(rows: usize) -> Setup {
     let candidates = CandidateRequest {
         from: 0,
         until: 9,
@@ -54,12 +54,12 @@ fn options() -> Setup {
         cadence: Cadence { all: 2, sh_rest: 4 },
         ..Needs::default()
     };
-    Setup { needs, threads: Some(1), ..Setup::new(ROWS + 3) }
+    Setup { needs, threads: Some(1), ..Setup::new(rows + 3) }
 }
 
 /// A backend with arbitrary values in every array of its state, as during a run.
-fn backend() -> CpuBackend {
-    let mut backend = CpuBackend::new(&gaussians(), &options()).unwrap();
+fn backend(rows: usize) -> CpuBackend {
+    let mut backend = CpuBackend::new(&gaussians(rows), &options(rows)).unwrap();
     for (i, StateArray { name, .. }) in backend.state().into_iter().enumerate() {
         let Tensor { mut shape, values, .. } = backend.save(&name).unwrap();
         if name == "candidates" {
@@ -76,11 +76,11 @@ fn backend() -> CpuBackend {
     backend
 }
 
-fn header() -> Header {
+fn header(rows: usize) -> Header {
     let views = ViewsFingerprint { count: 3, names: 1, cameras: 2, images: 3 };
     Header {
         densify: "0.1.0".into(),
-        budget: ROWS + 3,
+        budget: rows + 3,
         sh_degree: 1,
         config: toml::toml! { near = 0.30000000000000004 seed = 2000000000 },
         dataset: Fingerprint {
@@ -96,7 +96,7 @@ fn header() -> Header {
             )),
             step: 17,
             initial_rows: 9,
-            peak_rows: ROWS,
+            peak_rows: rows,
             extra_forwards: 4,
             policy_time: Duration::from_nanos(1_234_567_891),
             views_time: Duration::ZERO,
@@ -109,9 +109,13 @@ fn header() -> Header {
 
 /// Writes a checkpoint to its own folder.
 fn written() -> (tempfile::TempDir, PathBuf) {
+    written_with(ROWS)
+}
+
+fn written_with(rows: usize) -> (tempfile::TempDir, PathBuf) {
     let root = tempfile::tempdir().unwrap();
     let path = checkpoint_path(root.path(), 17);
-    write(&path, &header(), &backend()).unwrap();
+    write(&path, &header(rows), &backend(rows)).unwrap();
     (root, path)
 }
 
@@ -119,7 +123,7 @@ fn written() -> (tempfile::TempDir, PathBuf) {
 fn ages_of_rows_are_read_on_their_own() {
     let (_root, path) = written();
     let ages = Checkpoint::open(&path).unwrap().ages().unwrap();
-    let signals = backend().take_signals(SignalSet::from([Signal::Age])).unwrap();
+    let signals = backend(ROWS).take_signals(SignalSet::from([Signal::Age])).unwrap();
     let counted: Vec<f32> = ages.iter().map(|&age| age as f32).collect();
     assert_eq!(signals.get(Signal::Age), Some(&*counted));
     assert!(ages.len() == ROWS && ages[1] > ages[0]);
@@ -131,17 +135,20 @@ fn problem(path: &Path) -> String {
 
 #[test]
 fn checkpoints_are_read_back_bit_for_bit() {
-    let (_root, path) = written();
-    let mut checkpoint = Checkpoint::open(&path).unwrap();
-    assert_eq!(*checkpoint.header(), header());
-    let blank = checkpoint.blank_model().unwrap();
-    let mut restored = CpuBackend::new(&blank, &options()).unwrap();
-    checkpoint.restore(&mut restored).unwrap();
-    assert_eq!(restored.download().unwrap(), gaussians());
-    let expected = backend();
-    assert_eq!(restored.state().len(), 10);
-    for StateArray { name, .. } in expected.state() {
-        assert_eq!(restored.save(&name).unwrap(), expected.save(&name).unwrap(), "{name}");
+    // The second is written in more than one piece.
+    for rows in [ROWS, ROWS_AT_A_TIME + 13] {
+        let (_root, path) = written_with(rows);
+        let mut checkpoint = Checkpoint::open(&path).unwrap();
+        assert_eq!(*checkpoint.header(), header(rows));
+        let blank = checkpoint.blank_model().unwrap();
+        let mut restored = CpuBackend::new(&blank, &options(rows)).unwrap();
+        checkpoint.restore(&mut restored).unwrap();
+        assert_eq!(restored.download().unwrap(), gaussians(rows));
+        let expected = backend(rows);
+        assert_eq!(restored.state().len(), 10);
+        for StateArray { name, .. } in expected.state() {
+            assert_eq!(restored.save(&name).unwrap(), expected.save(&name).unwrap(), "{name}");
+        }
     }
 }
 
@@ -159,7 +166,7 @@ fn other_programs_read_the_arrays() {
     let scales = file.tensor("model.log_scales").unwrap();
     assert_eq!(scales.shape(), [ROWS, 3]);
     let first = f32::from_le_bytes(scales.data()[..4].try_into().unwrap());
-    assert_eq!(first.to_bits(), gaussians().log_scales[0][0].to_bits());
+    assert_eq!(first.to_bits(), gaussians(ROWS).log_scales[0][0].to_bits());
     assert_eq!(file.tensor("moments.second").unwrap().shape(), [ROWS, 23]);
 }
 
@@ -234,32 +241,31 @@ fn a_state_of_another_run_is_refused_by_name() {
     let (_root, path) = written();
     let refused = |options: Setup, words: &str| {
         let mut checkpoint = Checkpoint::open(&path).unwrap();
-        let mut other = CpuBackend::new(&gaussians(), &options).unwrap();
+        let mut other = CpuBackend::new(&gaussians(ROWS), &options).unwrap();
         let problem = checkpoint.restore(&mut other).unwrap_err().to_string();
         assert!(problem.contains(words), "{problem}");
     };
-    let plain = Setup { needs: Needs::default(), ..options() };
+    let plain = Setup { needs: Needs::default(), ..options(ROWS) };
     refused(plain, "has a tensor `signals.MeanGradientX`, which this run does not have");
-    let mut more = options();
+    let mut more = options(ROWS);
     more.needs.signals = more.needs.signals.with(Signal::PixelCount);
     refused(more, "there is no tensor `signals.PixelCount`");
-    let mut less = options();
+    let mut less = options(ROWS);
     less.needs.cadence = Cadence { all: 1, sh_rest: 4 };
-    // The shapes are those of the first piece of rows.
-    refused(less, "`summed.gradients`: its shape is [16384, 23]; this run needs [16384, 9]");
-    let mut fewer = options();
+    refused(less, "`summed.gradients`: its shape is [61, 23]; this run needs [61, 9]");
+    let mut fewer = options(ROWS);
     fewer.needs.candidates = fewer.needs.candidates.map(|c| CandidateRequest { capacity: 3, ..c });
     refused(fewer, "`candidates`: it has 4 candidates; this run holds at most 3");
-    let mut small = CpuBackend::new(&Gaussians::zeros(3, 1), &options()).unwrap();
+    let mut small = CpuBackend::new(&Gaussians::zeros(3, 1), &options(ROWS)).unwrap();
     let problem = Checkpoint::open(&path).unwrap().restore(&mut small).unwrap_err().to_string();
     assert!(problem.contains("`model.means`: it is F32 of shape [61, 3]"), "{problem}");
     // A model larger than its own budget, or with an invalid degree.
     for (budget, sh_degree, words) in
         [(60, 1, "61 rows, but its budget is 60"), (64, 9, "at most 3")]
     {
-        let mut header = header();
+        let mut header = header(ROWS);
         (header.budget, header.sh_degree) = (budget, sh_degree);
-        write(&path, &header, &backend()).unwrap();
+        write(&path, &header, &backend(ROWS)).unwrap();
         let problem = Checkpoint::open(&path).unwrap().blank_model().unwrap_err().to_string();
         assert!(problem.contains(words), "{problem}");
     }
@@ -291,7 +297,7 @@ fn the_newest_sound_one_is_found_and_two_are_kept() {
 
 #[test]
 fn datasets_are_told_apart() {
-    let one = header().dataset;
+    let one = header(ROWS).dataset;
     assert_eq!(one.difference(&one), None);
     let with = |change: fn(&mut Fingerprint)| {
         let mut other = one.clone();
