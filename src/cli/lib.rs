@@ -5,12 +5,12 @@
 //! SIGTERM has ended, 1 for anything else. An error is one message that names file, field or flag and the
 //! remedy.
 //!
-//! A program that brings policies of its own is two lines:
+//! A program that adds policies of its own is two lines; there this package is called `densify::cli`:
 //!
 //! ```no_run
 //! // use my_policies as _;   // linked, therefore registered
 //! fn main() -> std::process::ExitCode {
-//!     densify::cli::run()
+//!     densify_cli::run()
 //! }
 //! ```
 
