@@ -125,11 +125,11 @@ pace([{ bitmap: { width: 1, height: 1 }, bytes: 1000, milliseconds, held: millis
 return coarse;
 """
 # Every reply comes later by so many milliseconds, as over a network; also counts the requests that are under way at once.
-FAR = """
-const near = window.fetch;
+DELAY = """
+const undelayed = window.fetch;
 window.fetch = async (...request) => {
   window.atOnce = Math.max(window.atOnce ?? 0, underway);
-  const answer = await near(...request);
+  const answer = await undelayed(...request);
   await new Promise((resolve) => setTimeout(resolve, arguments[0]));
   return answer;
 };
