@@ -1,4 +1,4 @@
-//! `densify blocks`: a scene in blocks, each a run of its own.
+//! `densify blocks`: a large scene in blocks, each of which is a run.
 
 use std::fmt::Write as _;
 use std::path::PathBuf;
@@ -23,9 +23,9 @@ use densify_run::{ByteCount, Fraction, Rows, Threads, Whole};
 
 /// Trains a large scene in blocks, on one machine or on a cluster, and merges them.
 ///
-/// The ground is divided into cells of equal work. A coarse run sees the whole scene; each block then starts from its
-/// part of the coarse model, with what else its views show frozen around it, and trains its share of the Gaussians. The
-/// merged model never has more than was asked for, and the memory of every task is known before it starts.
+/// The ground is divided into cells of equal work. A coarse run covers the whole scene; each block then starts from its
+/// part of the coarse model, with its surroundings frozen, and trains its share of the Gaussians. The
+/// merged model never exceeds the requested size, and the memory of every task is known before it starts.
 #[derive(Debug, Args)]
 pub(super) struct BlocksArgs {
     #[command(subcommand)]
@@ -41,9 +41,9 @@ enum Command {
     Merge(MergeArgs),
 }
 
-/// Divides a scene, and writes a folder with everything that the tasks need.
+/// Divides a scene into blocks, and writes a folder with everything that the tasks need.
 ///
-/// Prints what each task takes; DIR/plan.svg shows the blocks from above.
+/// Prints the size and memory of each task; DIR/plan.svg shows the blocks from above.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 struct PlanArgs {
@@ -53,28 +53,28 @@ struct PlanArgs {
     /// Folder to write the plan to
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
-    /// Most Gaussians of the merged model: 2M, 500k
+    /// Most Gaussians in the merged model, such as 2M or 500k
     #[arg(long, value_name = "N", required_unless_present = "bytes", conflicts_with = "bytes")]
     rows: Option<Rows>,
-    /// Most bytes of the merged model as PLY: 500MB
+    /// Largest PLY of the merged model, such as 500MB
     #[arg(long, value_name = "SIZE")]
     bytes: Option<ByteCount>,
-    /// Number of blocks: strips along the longer side of the ground (4), or strips and blocks in each (3x2); auto: as
-    /// few as fit --memory
+    /// Number of blocks: strips along the longer side of the ground (4), or strips and blocks per strip (3x2); auto:
+    /// as few as fit --memory
     #[arg(long, value_name = "auto|K|KxL", default_value = "auto")]
     blocks: Grid,
-    /// Most memory of a task: 8GiB
+    /// Most memory that a task may take, such as 8GiB
     #[arg(long, value_name = "SIZE", required_if_eq("blocks", "auto"))]
     memory: Option<ByteCount>,
     /// Budget of the coarse run `[default: two fifths of the merged model, at least 1,000, or half of what fits
     /// --memory]`
     #[arg(long, value_name = "N")]
     coarse_rows: Option<Rows>,
-    /// How far beyond its cell a block trains, as a share of a cell's usual width
+    /// Width of the margin around its cell that a block also trains, as a share of the usual width of a cell
     #[arg(long, value_name = "FRACTION", default_value = "0.1")]
     margin: Fraction,
-    /// Options of `densify train` for every run, after `--`; --iterations are those of one run over the whole scene, of
-    /// which each block trains the share that its views are of all
+    /// Options of `densify train` for every run, after `--`. --iterations is that of one run over the whole scene;
+    /// each block trains a share of it, in proportion to its views
     #[arg(last = true, value_name = "TRAIN OPTIONS")]
     train: Vec<String>,
 }
@@ -86,20 +86,20 @@ Examples:
   densify blocks submit city --engine slurm
   densify blocks status city";
 
-/// Starts the tasks of a plan that are not complete, here, or on a cluster whose machines share the folder.
+/// Starts the incomplete tasks of a plan, on this machine or on a cluster whose machines share the folder.
 #[derive(Debug, Args)]
 struct SubmitArgs {
     /// Folder of the plan
     #[arg(value_name = "DIR")]
     folder: PathBuf,
-    /// What starts them
+    /// Scheduler that runs the tasks
     #[arg(long, value_name = "ENGINE", default_value = "local")]
     engine: Engine,
     #[command(flatten)]
     more: SubmissionArgs,
 }
 
-/// Runs one task of a plan, or what is left of it: engines call this.
+/// Runs one task of a plan, or the rest of it. Schedulers call this.
 #[derive(Debug, Args)]
 struct RunArgs {
     /// Folder of the plan
@@ -113,7 +113,7 @@ struct RunArgs {
     threads: Option<Threads>,
 }
 
-/// Says how far each task is, from the folder alone.
+/// Prints the progress of each task, as recorded in the folder.
 #[derive(Debug, Args)]
 struct StatusArgs {
     /// Folder of the plan
@@ -121,16 +121,16 @@ struct StatusArgs {
     folder: PathBuf,
 }
 
-/// Merges the blocks into one model: of each the Gaussians in its cell.
+/// Merges the blocks into one model, which takes from each block the Gaussians inside its cell.
 #[derive(Debug, Args)]
 struct MergeArgs {
     /// Folder of the plan
     #[arg(value_name = "DIR")]
     folder: PathBuf,
-    /// File to write; its extension says in which format, as for `densify export`
+    /// File to write; its extension selects the format, as for `densify export`
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
-    /// Merge the blocks that are complete, and name the others
+    /// Merge only the complete blocks, and list the others
     #[arg(long)]
     partial: bool,
     /// Replace a file that exists
@@ -171,7 +171,7 @@ fn run_plan(args: &PlanArgs, console: &Console) -> Result<(), Failure> {
     Ok(())
 }
 
-/// What each task does and takes.
+/// Table of the tasks, with size, iterations and memory.
 fn table(blocks: &Blocks) -> String {
     let mut text = String::new();
     let mut row = |cells: [String; 7]| {

@@ -1,4 +1,4 @@
-//! `densify compress`.
+//! `densify compress`: a smaller model or file, at the least loss.
 
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -18,13 +18,13 @@ use densify_run::failure::Failure;
 use densify_run::finished::{is_model, model_file};
 use densify_run::{RunConfig, Whole};
 
-/// Makes a trained model smaller: as many Gaussians as asked, or a file no larger than asked.
+/// Reduces a trained model to a number of Gaussians, or to a file size.
 ///
-/// Prunes the Gaussians that show least in the training views, at most half of them at once, and trains the others on
-/// in between. For a file it tries the model's degree of colour and lower ones, and coarser colour where the format has
-/// it, which leave room for more Gaussians, and keeps what shows the training views best as the file has it. Views held
-/// out are measured too, and decide nothing. The table that it prints is the curve of size against quality: the whole
-/// model, what the file was after each pruning on the way, and what was tried at its size.
+/// Prunes the Gaussians that contribute least to the training views, at most half of them at a time, and trains the
+/// rest in between. For a file, it also tries lower degrees of colour and, where the format has it, coarser colour,
+/// which leave room for more Gaussians, and keeps the file that reproduces the training views best. Held-out views
+/// are measured too, but decide nothing. The printed table is the curve of size against quality: the whole model, the
+/// model after each pruning, and each attempt at the requested size.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct CompressArgs {
@@ -34,7 +34,7 @@ pub(super) struct CompressArgs {
     /// Most bytes of the file, such as 5MiB or 800kB, or a number of Gaussians, such as 20k
     #[arg(long, value_name = "SIZE|ROWS")]
     to: Size,
-    /// File to write; its extension says in which format, as for `densify export`
+    /// File to write; its extension selects the format, as for `densify export`
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     /// Format of the file, or any: the one that holds most Gaussians, whose extension is added to FILE
@@ -47,7 +47,7 @@ pub(super) struct CompressArgs {
     /// Training steps of each attempt
     #[arg(short, long, value_name = "N", default_value = "3000")]
     iterations: Whole<1, { u32::MAX }>,
-    /// Everything random follows from this number
+    /// Seed of all random choices
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
     seed: u64,
     /// Saved iteration of the run `[default: the last]`
@@ -69,10 +69,10 @@ Examples:
   densify compress output/garden-diet --to 20k -o small.ply
   densify compress others.ply --scene data/garden --to 800kB -o garden.spz";
 
-/// The name that stands for whichever format holds most.
+/// Name for the format that holds the most Gaussians.
 const ANY: &str = "any";
 
-/// What `--to` may be.
+/// Value of `--to`.
 #[derive(Debug, Clone, Copy)]
 struct Size(Target);
 
@@ -154,7 +154,7 @@ fn formats(args: &CompressArgs) -> Result<Vec<&'static Format>, Failure> {
     }
 }
 
-/// The curve of size against quality: the whole, what the file was on the way to its size, and what was tried at that.
+/// The curve of size against quality: the whole model, each intermediate size, and the attempts at the final size.
 fn table(compressed: &Compressed) -> String {
     let Compressed { whole, way, attempts, best, .. } = compressed;
     let mut text = format!(

@@ -14,7 +14,7 @@ use densify_core::spelling::Spelling;
 use densify_run::Observer;
 use densify_run::failure::{Failure, OTHER};
 
-/// Shown unless `RUST_LOG` says otherwise: what densify and its policies log.
+/// Default of `RUST_LOG`: the log of densify and its policies.
 const LOG_FILTER: &str = "warn,densify=info,densify_policies=info";
 
 /// Where a command writes.
@@ -22,7 +22,7 @@ const LOG_FILTER: &str = "warn,densify=info,densify_policies=info";
 pub(super) struct Console {
     quiet: bool,
     bars: MultiProgress,
-    /// The first error of standard output, if it is one.
+    /// The first failure to write to standard output.
     broken: RefCell<Option<io::Error>>,
 }
 
@@ -51,12 +51,12 @@ impl Console {
         Self { quiet, bars, broken: RefCell::new(None) }
     }
 
-    /// Whether only results and errors are shown.
+    /// True if only results and errors are shown.
     pub(super) fn is_quiet(&self) -> bool {
         self.quiet
     }
 
-    /// The bars that lines go above of.
+    /// The progress bars, above which lines are printed.
     pub(super) fn bars(&self) -> &MultiProgress {
         &self.bars
     }
@@ -75,7 +75,7 @@ impl Console {
             writeln!(out, "{}", files::lines(&line.to_string())).and_then(|()| out.flush())
         });
         match written {
-            // A reader that has gone away wants no more; that is no failure.
+            // A closed pipe is no failure: its reader has seen enough.
             Err(error) if error.kind() != io::ErrorKind::BrokenPipe => {
                 self.broken.borrow_mut().get_or_insert(error);
             }
@@ -83,7 +83,7 @@ impl Console {
         }
     }
 
-    /// Whether everything said could be written.
+    /// Fails if anything could not be written.
     pub(super) fn finish(&self) -> Result<(), Failure> {
         match self.broken.take() {
             None => Ok(()),
@@ -100,7 +100,7 @@ impl Console {
         }
     }
 
-    /// What goes wrong, on standard error.
+    /// An error message on standard error.
     pub(super) fn error(&self, failure: &Failure) {
         let message = files::lines(&failure.words(Spelling::Terminal));
         self.bars.suspend(|| {

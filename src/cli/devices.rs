@@ -1,4 +1,4 @@
-//! `densify devices`: the adapters, and what fits them.
+//! `densify devices`: the GPU adapters and their limits.
 
 use clap::Args;
 
@@ -12,9 +12,9 @@ use densify_run::failure::Failure;
 
 /// Lists the adapters that can train and render, with their limits.
 ///
-/// Choose one with `--gpu NAME`. The largest budget is what one buffer of the adapter can hold; how
-/// much memory there is in all, drivers do not say. `WGPU_BACKEND` (vulkan, metal, dx12) and, for
-/// Vulkan, `VK_DRIVER_FILES` decide which drivers are asked. Accumulation is how gradients are added up:
+/// Choose one with `--gpu NAME`. The largest budget is what one buffer of the adapter can hold; drivers do
+/// not report how much memory there is in all. `WGPU_BACKEND` (vulkan, metal, dx12) and, for
+/// Vulkan, `VK_DRIVER_FILES` select the drivers. Accumulation is the way gradients are added up:
 /// slots repeat, atomics and cas are faster (`train --knob accumulation=NAME`, `train --deterministic`).
 #[derive(Debug, Args)]
 pub(super) struct DevicesArgs {}

@@ -1,4 +1,4 @@
-//! `densify eval`.
+//! `densify eval`: scores of a model against photographs and known geometry.
 
 use std::fmt::Write as _;
 use std::ops::ControlFlow;
@@ -22,10 +22,10 @@ use densify_train::output::{write_geometry, write_scores};
 /// Measures a model against the photographs of its scene: PSNR, SSIM, FLIP, and LPIPS on request.
 ///
 /// Prints the scores of each view and their mean, and writes those of a run to results.json and
-/// per_view.json in its folder (results_train.json and per_view_train.json for the views trained on). Of a
-/// file of Gaussian splats it writes nothing, and measures every 8th photograph where neither the dataset nor
-/// an option says which. Where the geometry is known (built-in scenes, and those that `densify scenegen`
-/// wrote), also measures how the Gaussians sit on it: a second table, and geometry.json
+/// per_view.json in its folder (results_train.json and per_view_train.json for the views trained on). For a
+/// file of Gaussian splats it writes nothing, and measures every 8th photograph if neither the dataset nor
+/// an option selects the views. If the geometry is known (built-in scenes, and those that `densify scenegen`
+/// wrote), it also measures how far the Gaussians are from it: a second table, and geometry.json
 /// (geometry_train.json).
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
@@ -36,25 +36,25 @@ pub(super) struct EvalArgs {
     /// Saved iteration of the run `[default: the last]`
     #[arg(long, value_name = "N")]
     iteration: Option<u32>,
-    /// Which views to measure
+    /// Views to measure
     #[arg(long, value_enum, default_value_t = Split::Test)]
     split: Split,
     /// Folder or ZIP archive of the dataset: needed for a file, and for a run whose dataset has moved
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
     /// Also measure LPIPS, with the weights in this safetensors file (VGG-16 or AlexNet; they are not part
-    /// of densify, docs/metrics.md says how to write the file)
+    /// of densify; docs/metrics.md explains how to make the file)
     #[arg(long, value_name = "FILE")]
     lpips: Option<PathBuf>,
-    /// Measure each view a second time, with the factor and the offset per channel that fit its photograph best
-    /// (always where the run has learned exposures)
+    /// Measure each view a second time, with the factor and offset per channel that fit its photograph best
+    /// (always on if the run learned exposures)
     #[arg(long)]
     fit_exposure: bool,
-    /// Exit with code 4 where a value is smaller: psnr, ssim, flip, lpips, or the path of a number in
+    /// Exit with code 4 if a value is smaller: psnr, ssim, flip, lpips, or the path of a number in
     /// geometry.json, such as centres.f_score_one_percent; may be repeated
     #[arg(long, value_name = "KEY=VALUE")]
     fail_below: Vec<Limit>,
-    /// Exit with code 4 where a value is larger, such as flip or depth.rmse; may be repeated
+    /// Exit with code 4 if a value is larger, such as flip or depth.rmse; may be repeated
     #[arg(long, value_name = "KEY=VALUE")]
     fail_above: Vec<Limit>,
     #[command(flatten)]
@@ -74,7 +74,7 @@ Examples:
 pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> Result<(), Failure> {
     let model = &args.model;
     let limits = Limits { lowest: &args.fail_below, highest: &args.fail_above };
-    // A folder without config.toml is no run, whatever else it holds.
+    // A folder without config.toml is no run.
     let run = match is_model(model) {
         true => None,
         false => Some((RunConfig::read(model)?, iteration(model, args.iteration)?)),
@@ -124,7 +124,7 @@ pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> R
     limits.check(&measured_values(&mean, geometry.as_ref())).map_err(in_options)
 }
 
-/// The error in the words of the options.
+/// The error, with the options to change.
 fn in_options(error: LimitError) -> Failure {
     let code = match error {
         LimitError::Unknown { .. } => INPUT,

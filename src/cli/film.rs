@@ -10,26 +10,26 @@ use densify_core::camera_path::MAX_SIDE;
 use densify_inspect::{CameraRoute, Channels, Film, FilmError, FilmOptions, FilmSource};
 use densify_run::failure::{DEVICE, Failure, OTHER};
 
-/// Most frames of a film.
+/// Largest number of frames.
 const MOST_FRAMES: u32 = 100_000;
 
 /// Options of a camera path.
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Camera path")]
 pub(super) struct FilmArgs {
-    /// Render along a camera path instead of the dataset's views: orbit (once around what the cameras look at),
-    /// spiral (two turns before it), or a camera path as the page of `densify view` or nerfstudio's
-    /// viewer saves it (JSON). It must be in the dataset's coordinates, as the page's are; nerfstudio's
-    /// are where it trained with `--orientation-method none --center-method none --auto-scale-poses False`
+    /// Render along a camera path instead of the dataset's views: orbit (once around the centre of the cameras' view),
+    /// spiral (two turns in front of it), or a camera path saved by the page of `densify view` or by nerfstudio's
+    /// viewer (JSON). It must be in the dataset's coordinates. The page's paths are; nerfstudio's
+    /// are if it trained with `--orientation-method none --center-method none --auto-scale-poses False`
     #[arg(long, value_name = "orbit|spiral|FILE")]
     pub(super) path: Option<CameraRoute>,
-    /// Number of frames `[default: 120; of a file, its seconds times its fps, else one for each camera]`
+    /// Number of frames `[default: 120; for a file, its seconds times its fps, or one per camera]`
     #[arg(long, value_name = "N", requires = "path", value_parser = clap::value_parser!(u32).range(1..=i64::from(MOST_FRAMES)))]
     frames: Option<u32>,
-    /// Width and height of the frames, such as 640x480 `[default: those of the file, else of the first photograph]`
+    /// Width and height of the frames, such as 640x480 `[default: those of the file, or of the first photograph]`
     #[arg(long, value_name = "WxH", requires = "path")]
     size: Option<Size>,
-    /// Frames per second of the film `[default: those of the file, else 30]`
+    /// Frames per second of the film `[default: those of the file, or 30]`
     #[arg(long, value_name = "N", requires = "video", value_parser = clap::value_parser!(u32).range(1..=1000))]
     fps: Option<u32>,
     /// Also write a film: .mp4 (needs the program ffmpeg) or .webp (lossless, by densify itself)
@@ -80,7 +80,7 @@ pub(super) fn run(
     Ok(())
 }
 
-/// The error in the words of the options.
+/// The error, with the options to change.
 fn in_options(error: FilmError) -> Failure {
     match error {
         FilmError::Path(error) => Failure::input(format!("--path: {error}")),

@@ -9,10 +9,10 @@ use signal_hook::flag;
 
 use densify_run::Interrupt;
 
-/// What the shell adds to a signal's number for the exit code of a process that it has ended.
+/// Offset that shells add to a signal's number for the exit code of a process that the signal ended.
 const BY_SIGNAL: i32 = 128;
 
-/// What the process has been told so far; there is one for all runs of a process.
+/// The signals received so far; one value for all runs of a process.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Interrupts {
     /// The number of the last signal; 0 if none has come.
@@ -20,13 +20,13 @@ pub(super) struct Interrupts {
 }
 
 impl Interrupts {
-    /// From here on signals are listened to.
+    /// Installs the handlers.
     pub(super) fn listen() -> Self {
         static LAST: OnceLock<Arc<AtomicUsize>> = OnceLock::new();
         Self { last: LAST.get_or_init(register) }
     }
 
-    /// The signal that has come, if one has.
+    /// The signal received, if any.
     pub(super) fn received(self) -> Option<Interrupt> {
         let last = i32::try_from(self.last.load(Ordering::SeqCst)).unwrap_or_default();
         let name = match last {
@@ -41,8 +41,8 @@ impl Interrupts {
 fn register() -> Arc<AtomicUsize> {
     let (last, any) = (Arc::new(AtomicUsize::new(0)), Arc::new(AtomicBool::new(false)));
     for signal in [SIGINT, SIGTERM] {
-        // In this order: the first signal finds nothing set. Where a system cannot listen, a signal
-        // ends the process as it would have without us.
+        // In this order, because the first signal must find nothing set. If a handler cannot be installed, a
+        // signal ends the process as it would without it.
         let _ = flag::register_conditional_shutdown(signal, BY_SIGNAL + signal, any.clone());
         let _ = flag::register_usize(signal, last.clone(), signal.unsigned_abs() as usize);
         let _ = flag::register(signal, any.clone());

@@ -1,4 +1,4 @@
-//! `densify knobs`: what trades speed or memory for accuracy.
+//! `densify knobs`: the settings that trade accuracy for speed or memory.
 
 use clap::Args;
 
@@ -6,10 +6,10 @@ use super::console::Console;
 use densify_run::failure::Failure;
 use densify_run::knobs::{Class, KNOBS, Knob, Measured, PRESETS};
 
-/// Lists the knobs: every setting that trades speed or memory for accuracy.
+/// Lists the knobs: every setting that trades accuracy for speed or memory.
 ///
 /// Set one with `densify train --knob NAME=VALUE`. An exact knob changes no bit of the
-/// result, a bounded one makes a numerical error.
+/// result; a bounded one adds a numerical error with a known bound.
 #[derive(Debug, Args)]
 pub(super) struct KnobsArgs {}
 
@@ -35,7 +35,7 @@ pub(super) fn run(_: &KnobsArgs, console: &Console) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Default, domain, and which backend has it.
+/// Default, domain and backends of a knob.
 fn facts(knob: &Knob) -> String {
     let unit = if knob.unit.is_empty() { String::new() } else { format!(" {}", knob.unit) };
     let on =

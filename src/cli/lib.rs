@@ -76,23 +76,23 @@ Examples:
   densify train scene:spheres -i 2000                      train on a built-in scene: no file needed
   densify train data/garden --eval                         train, hold out every 8th photograph
   densify train data/garden --policy vanilla --budget 1M   another policy, at most a million Gaussians
-  densify plan data/garden --memory 512MiB                 how large a model that memory holds
+  densify plan data/garden --memory 512MiB                 the largest model that fits this memory
   densify eval output/garden-diet                          PSNR and SSIM of the photographs held out
   densify render output/garden-diet -o pictures            the same views as PNG files
   densify view output/garden-diet                          the model in the browser
   densify report output/garden-diet -o garden.html         scores, curves and pictures as one file
   densify export output/garden-diet -o garden.ply          the model as a file for other programs
   densify compress output/garden-diet --to 5MiB -o garden.sog
-                                                           a smaller file of it
+                                                           a smaller file of the model
   densify blocks plan data/city -o city --rows 2M --memory 8GiB
                                                            a scene too large for one machine
   densify compare data/garden --policies vanilla,diet --budget 200k
                                                            which policy does best here
   densify policies diet                                    what a policy does, and its parameters
   densify knobs                                            what trades speed or memory for accuracy
-  densify trade data/garden --knobs alpha_min,sh_degree    what these cost and buy here
+  densify trade data/garden --knobs alpha_min,sh_degree    what these cost and gain here
   densify scenegen mesh.glb -o data/mesh                   posed images of a mesh, with depth and normals
-  densify selftest                                         whether this machine computes what it should
+  densify selftest                                         check the arithmetic of this machine
 
 `densify COMMAND --help` explains every option of a command.";
 
@@ -105,10 +105,10 @@ Examples:
 enum Command {
     Train(Box<train::TrainArgs>),
     Blocks(Box<blocks::BlocksArgs>),
-    /// Says what a run would take in memory, without training.
+    /// Prints the memory that a run would take, without training.
     ///
-    /// Takes the options of `densify train` and prints what that would promise: the ledger, buffer by
-    /// buffer, and then how many Gaussians the same memory holds at each degree of colour and with
+    /// Takes the options of `densify train` and prints the memory that it would promise, buffer by
+    /// buffer, and then how many Gaussians fit the same memory at each degree of colour and with
     /// images of full, half and quarter size. Writes nothing.
     #[command(after_help = PLAN_EXAMPLES)]
     Plan(Box<train::TrainArgs>),
@@ -144,14 +144,14 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
     let (matches, arguments) = match parsed {
         Ok(parsed) => parsed,
         Err(help_or_error) => {
-            // A reader that has gone away is no reason to fail.
+            // A closed pipe is no failure.
             let _ = help_or_error.print();
             return u8::try_from(help_or_error.exit_code()).unwrap_or(failure::INPUT);
         }
     };
     let quiet = match &arguments.command {
         Command::Train(train) | Command::Plan(train) => train.quiet,
-        // Its runs are not the user's, and it names the device itself.
+        // Its runs are internal, and it names the device itself.
         Command::Selftest(_) => true,
         _ => false,
     };

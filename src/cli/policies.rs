@@ -1,4 +1,4 @@
-//! `densify policies`: what is registered, and the manual pages.
+//! `densify policies`: the registered policies and their manual pages.
 
 use clap::Args;
 use densify_policies::registry::{find, policies};
@@ -8,11 +8,11 @@ use densify_run::failure::Failure;
 
 /// Lists the density-control policies, or explains one.
 ///
-/// A policy decides where Gaussians are born and die while training. Choose one with
+/// A policy decides where Gaussians are added and removed during training. Choose one with
 /// `densify train --policy NAME`.
 #[derive(Debug, Args)]
 pub(super) struct PoliciesArgs {
-    /// Policy to explain: what it does, its source and its parameters
+    /// Policy to explain: its decisions, source and parameters
     name: Option<String>,
 }
 

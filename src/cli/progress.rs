@@ -1,4 +1,4 @@
-//! How far training is: a bar on a terminal, a line now and then elsewhere.
+//! Progress of training: a bar on a terminal, otherwise a line now and then.
 
 use std::fmt;
 use std::io::{IsTerminal, stderr};
@@ -20,7 +20,7 @@ const NEWEST: f32 = 0.05;
 pub(super) struct Progress<'a> {
     console: &'a Console,
     bar: Option<ProgressBar>,
-    /// Steps of processes before this one.
+    /// Steps done by earlier processes.
     done: u32,
     iterations: u32,
     budget: usize,

@@ -1,4 +1,4 @@
-//! `densify render`.
+//! `densify render`: pictures and films of a model.
 
 use std::path::{Path, PathBuf};
 
@@ -17,12 +17,12 @@ use densify_train::evaluate::Split;
 
 /// Renders a trained scene to PNG files.
 ///
-/// Renders the views held out, or those trained on, of a run or of any file of Gaussian splats
-/// (which needs --scene for the cameras); or with --path a flight through the scene, and a film of it.
+/// Renders the held-out views, or those trained on, of a run or of any file of Gaussian splats
+/// (which needs --scene for the cameras); or with --path a camera path through the scene, and a film of it.
 ///
-/// Depth is Σ α·T·z along each ray, in the dataset's own units: opaque surfaces show their
-/// distance along the optical axis. It is written in 16 bits, 65535 standing for the largest
-/// depth of the picture; depth.json says how much that is.
+/// Depth is Σ α·T·z along each ray, in the dataset's own units: for opaque surfaces, their
+/// distance along the optical axis. It is written in 16 bits, where 65535 stands for the largest
+/// depth of the picture, which depth.json records.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct RenderArgs {
@@ -36,19 +36,19 @@ pub(super) struct RenderArgs {
     /// Folder for the pictures
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
-    /// Which views to render
+    /// Views to render
     #[arg(long, value_enum, default_value_t = Split::Test)]
     split: Split,
     /// Saved iteration of the run `[default: the last]`
     #[arg(long, value_name = "N")]
     iteration: Option<u32>,
-    /// Also write how opaque each pixel is, as NAME.alpha.png
+    /// Also write the opacity of each pixel, as NAME.alpha.png
     #[arg(long)]
     alpha: bool,
     /// Also write depth, as NAME.depth.png
     #[arg(long)]
     depth: bool,
-    /// Also write photograph and rendering beside each other, as NAME.pair.png
+    /// Also write photograph and render side by side, as NAME.pair.png
     #[arg(long)]
     side_by_side: bool,
     #[command(flatten)]
@@ -57,10 +57,10 @@ pub(super) struct RenderArgs {
     rendering: RenderingArgs,
 }
 
-/// How a model is rendered, and with which dataset if it brings none.
+/// Options for rendering a model, and the dataset of a model without one.
 #[derive(Debug, Clone, Args)]
 pub(super) struct RenderingArgs {
-    /// Nearest distance to a camera at which anything of a file is drawn, as a fraction of the
+    /// Nearest distance to a camera at which Gaussians of a file are drawn, as a fraction of the
     /// scene's extent
     #[arg(long, value_name = "FRACTION", help_heading = "Scene")]
     pub(super) near: Fraction,
@@ -123,7 +123,7 @@ pub(super) fn run(
     Ok(())
 }
 
-/// Fails where an option was given that a run brings itself.
+/// Fails if an option is given that the run decides.
 pub(super) fn refuse_options_of_a_file(matches: &ArgMatches) -> Result<(), Failure> {
     let scene = DataSpec::augment_args(clap::Command::new("scene"));
     let names = scene.get_arguments().map(|argument| argument.get_id().as_str()).chain(["near"]);
@@ -139,7 +139,7 @@ pub(super) fn refuse_options_of_a_file(matches: &ArgMatches) -> Result<(), Failu
     }
 }
 
-/// What a command line names: a run, or a model with the dataset that it shows.
+/// A run, or a model with its dataset, as named on the command line.
 pub(super) struct Named<'a> {
     pub(super) model: &'a Path,
     pub(super) scene: Option<&'a Path>,
@@ -147,7 +147,7 @@ pub(super) struct Named<'a> {
 }
 
 impl Named<'_> {
-    /// Opens it, as the options of a file say where it is one.
+    /// Opens the run or model; a model is rendered with the given options.
     pub(super) fn open(
         &self,
         rendering: &RenderingArgs,

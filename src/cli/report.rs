@@ -1,4 +1,4 @@
-//! `densify report`.
+//! `densify report`: runs as one HTML file.
 
 use std::path::PathBuf;
 
@@ -14,13 +14,13 @@ use densify_report::ReportOptions;
 use densify_run::DeviceSpec;
 use densify_run::failure::Failure;
 
-/// Writes what a run, or several, arrived at as one HTML file.
+/// Writes the results of one or more runs as one HTML file.
 ///
-/// The file needs nothing beside it and loads nothing: it can be mailed, and opens in any browser. It holds the
-/// scores, the worst and the best views held out with a slider between photograph and render, a turn around the
-/// scene, curves of loss, Gaussians, PSNR and memory, the edits, what was left out, and the settings. Of several
-/// runs, those that differ by their seed alone are averaged, with 95 % intervals from three on; the first of each
-/// are shown, over each other where they are of the same scene.
+/// The file is self-contained and loads nothing: it can be mailed, and opens in any browser. It holds the
+/// scores, the worst and best held-out views with a slider between photograph and render, a turn around the
+/// scene, curves of loss, Gaussians, PSNR and memory, the edits, what was left out, and the settings. Runs that
+/// differ only by seed are averaged, with 95 % intervals from three on; the first of each group
+/// is shown, with a slider between runs of the same scene.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct ReportArgs {
@@ -36,7 +36,7 @@ pub(super) struct ReportArgs {
     /// Saved iteration of the runs `[default: the last of each]`
     #[arg(long, value_name = "N")]
     iteration: Option<u32>,
-    /// Folder or ZIP archive of the dataset, where it is no longer where it was
+    /// Folder or ZIP archive of the dataset, if it has moved
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
     #[command(flatten)]

@@ -1,4 +1,4 @@
-//! `densify scenegen`.
+//! `densify scenegen`: posed images of a mesh.
 
 use std::path::PathBuf;
 
@@ -21,7 +21,7 @@ use densify_train::pictures::write_png;
 /// INPUT is a .gltf, .glb or .obj file; --preset names a built-in scene instead. Writes images with
 /// alpha, depth and normals (EXR), cameras for NeRF-synthetic readers (transforms_train.json,
 /// transforms_test.json), for nerfstudio (transforms.json, with depth as .npy) and for COLMAP
-/// (sparse/0), initial points (points3d.ply), the mesh as traced (mesh.ply), and what was done
+/// (sparse/0), initial points (points3d.ply), the mesh as traced (mesh.ply), and a record of it all
 /// (scene.json). Built-in scenes can be trained on without any file: densify train scene:NAME.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
@@ -29,7 +29,7 @@ pub(super) struct ScenegenArgs {
     /// Mesh to render: .gltf, .glb or .obj
     #[arg(conflicts_with_all = ["preset", "list"], required_unless_present_any = ["preset", "list"])]
     input: Option<PathBuf>,
-    /// Render a built-in scene; of one that has a size, town:4 is a larger one
+    /// Render a built-in scene; some have sizes: town:4 is larger than town
     #[arg(long, value_name = "NAME", conflicts_with = "list")]
     preset: Option<String>,
     /// List the built-in scenes
@@ -38,14 +38,14 @@ pub(super) struct ScenegenArgs {
     /// Folder to write the scene to
     #[arg(short, long, value_name = "DIR", help_heading = "Output", required_unless_present_any = ["list", "contact_sheet"])]
     output: Option<PathBuf>,
-    /// Write one PNG of eight views, to look at
+    /// Write one PNG with eight views
     #[arg(long, value_name = "FILE", help_heading = "Output", conflicts_with = "list")]
     contact_sheet: Option<PathBuf>,
-    /// Replace the scene that is in the output folder, once this one is complete
+    /// Replace the scene in the output folder once this one is complete
     #[arg(long, help_heading = "Output")]
     overwrite: bool,
 
-    /// How the cameras stand [default: as the built-in scene says; dome for files]
+    /// Arrangement of the cameras [default: that of the built-in scene; dome for files]
     #[arg(long, value_enum, value_name = "RIG", help_heading = "Cameras")]
     rig: Option<RigArg>,
     /// Views to train on `[default: 60, or as the built-in scene says]`
@@ -65,60 +65,60 @@ pub(super) struct ScenegenArgs {
     #[arg(long, value_name = "FACTOR", help_heading = "Cameras")]
     radius: Option<f64>,
     /// Photograph training views through a lens, fisheye:K1[,K2,K3,K4] or radial:K1[,K2], with the coefficients of
-    /// COLMAP's OPENCV_FISHEYE and OPENCV. Test views stay as a pinhole sees them
+    /// COLMAP's OPENCV_FISHEYE and OPENCV. Test views keep the pinhole camera
     #[arg(long, value_name = "LENS", help_heading = "Cameras")]
     lens: Option<Lens>,
-    /// Let people walk through this share of the training views, each in another place, and mask them
+    /// Put people into this share of the training views, each in another place, and mask them
     #[arg(long, value_name = "SHARE", help_heading = "Cameras", default_value_t = 0.0)]
     passers_by: f64,
-    /// Scatter of the cameras' places, as a share of their distance
+    /// Random displacement of the cameras, as a share of their distance
     #[arg(long, value_name = "SHARE", help_heading = "Cameras")]
     jitter: Option<f64>,
 
     /// Samples along each side of a pixel: 4 makes 16
     #[arg(long, value_name = "N", help_heading = "Light", default_value_t = 4)]
     samples: u32,
-    /// Sample what is hidden from the sky, with this many rays per pixel
+    /// Ambient occlusion with this many rays per pixel
     #[arg(long, value_name = "RAYS", help_heading = "Light", value_parser = clap::value_parser!(u32).range(1..=65_536))]
     ao: Option<u32>,
-    /// Sample light that surfaces reflect onto each other once, with this many rays per pixel
+    /// One bounce of indirect light with this many rays per pixel
     #[arg(long, value_name = "RAYS", help_heading = "Light", conflicts_with = "ao", value_parser = clap::value_parser!(u32).range(1..=65_536))]
     bounce: Option<u32>,
-    /// Light from all around: an equirectangular .hdr or .exr image, +y up and +x in its middle, in
-    /// place of the built-in sky and sun. It is not seen: images stay transparent where nothing is
+    /// Environment light: an equirectangular .hdr or .exr image, +y up and +x in its middle, in
+    /// place of the built-in sky and sun. It lights the scene only: the background stays transparent
     #[arg(long, value_name = "FILE", help_heading = "Light")]
     sky: Option<PathBuf>,
-    /// Let lights shine through everything
+    /// Let light pass through surfaces: no shadows
     #[arg(long, help_heading = "Light")]
     no_shadows: bool,
-    /// Make all materials diffuse: what is seen does not depend on the side it is seen from
+    /// Make all materials diffuse, so that their look does not depend on the direction of view
     #[arg(long, help_heading = "Light")]
     lambert: bool,
-    /// Factor on all light [default: 1; chosen where the mesh file brings lights, and with --sky]
+    /// Factor on all light [default: 1; automatic with --sky and for meshes with lights of their own]
     #[arg(long, value_name = "FACTOR", help_heading = "Light")]
     exposure: Option<f32>,
-    /// Expose each training view differently: by up to so many stops, with a white balance of up to 10 %. Test
-    /// views and points are not changed; scene.json has the factors
+    /// Vary the exposure of training views by up to this many stops, and their white balance by up to 10 %. Test
+    /// views and points are unchanged; scene.json has the factors
     #[arg(long, value_name = "STOPS", help_heading = "Light", default_value_t = 0.0)]
     exposure_jitter: f32,
 
-    /// Initial points to make: on surfaces with detail that at least three views see
+    /// Number of initial points, on surfaces with detail that at least three views see
     #[arg(long, value_name = "N", help_heading = "Points", default_value_t = 5000)]
     points: usize,
     /// Standard deviation of their coordinates, as a share of the scene's diagonal
     #[arg(long, value_name = "SHARE", help_heading = "Points", default_value_t = 0.001)]
     point_noise: f64,
-    /// Share of them that lie just anywhere
+    /// Share of the points that are outliers
     #[arg(long, value_name = "SHARE", help_heading = "Points", default_value_t = 0.02)]
     outliers: f64,
-    /// Share of space, in patches of 2 % of the diagonal, without any
+    /// Share of space without points, in patches of 2 % of the diagonal
     #[arg(long, value_name = "SHARE", help_heading = "Points", default_value_t = 0.0)]
     dropout: f64,
-    /// Make none on thin structures
+    /// Put no points on thin structures
     #[arg(long, help_heading = "Points")]
     without_thin: bool,
 
-    /// Everything random follows from this number
+    /// Seed of all random choices
     #[arg(long, value_name = "N", default_value_t = 0)]
     seed: u64,
     /// Processor threads to use, 1 to 256; the result does not depend on it `[default: all]`
@@ -143,13 +143,13 @@ enum RigArg {
     Orbit,
     /// Evenly on the upper hemisphere
     Dome,
-    /// Inside, looking in all directions: for rooms
+    /// Inside, looking in all directions, for rooms
     Inside,
     /// On an ellipse as wide and deep as the scene
     Ellipse,
     /// In rows above the scene, looking obliquely down; in town also along the streets
     Survey,
-    /// At and around the file's own cameras
+    /// At and around the cameras in the file
     File,
 }
 

@@ -1,4 +1,4 @@
-//! `densify selftest`: whether this machine and its drivers compute what they should.
+//! `densify selftest`: checks the arithmetic of this machine and its drivers.
 
 use std::path::PathBuf;
 
@@ -13,12 +13,12 @@ use densify_run::DeviceSpec;
 use densify_run::failure::{Failure, OTHER};
 use densify_selftest::{Case, Finding, Subject, SubjectReport, cases, markdown, table};
 
-/// Holds this machine against a renderer in float64, where numbers are hardest.
+/// Compares this machine with a float64 renderer in the numerically hardest cases.
 ///
 /// Needles, thousands of layers, saturated opacities, images of one pixel, rows that hold NaN: images,
-/// gradients, losses and steps of the optimiser are compared with those of a second renderer, which
-/// shares no arithmetic with the first. Prints the largest error of each kind beside its tolerance, and
-/// where it is. A report of an error begins with this table.
+/// gradients, losses and optimiser steps are compared with those of a second renderer, which
+/// shares no arithmetic with the first. Prints the largest error of each kind, its place and its
+/// tolerance. Include this table in a bug report.
 ///
 /// The exit code is 1 if anything is beyond its tolerance.
 #[derive(Debug, Args)]
@@ -27,14 +27,14 @@ pub(super) struct SelftestArgs {
     /// Only these cases, by number
     #[arg(value_name = "CASE")]
     only: Vec<u8>,
-    /// Run cases in full that take minutes: half a million rows as large as the image, which takes
+    /// Also run the cases that take minutes: half a million rows as large as the image, which need
     /// some 800 MiB, and runs of 30,000 steps
     #[arg(long)]
     long: bool,
     /// Write the table as Markdown
     #[arg(long, value_name = "FILE")]
     markdown: Option<PathBuf>,
-    /// On every backend that there is: the processor, and all adapters, software drivers included
+    /// Test every backend: the processor and all adapters, including software drivers
     #[arg(long, conflicts_with_all = ["backend", "gpu"])]
     all: bool,
     #[command(flatten)]
@@ -49,7 +49,7 @@ Examples:
   densify selftest --all --long --markdown selftest.md
                                                 on all of them, in full, into a file";
 
-/// Some cases want the same bits twice, which no other sums of a GPU give.
+/// Some cases need equal bits twice, for which a GPU must accumulate deterministically.
 const SUMS: Option<Accumulation> = Some(Accumulation::Slots);
 
 pub(super) fn run(args: &SelftestArgs, console: &Console) -> Result<(), Failure> {
@@ -80,7 +80,7 @@ pub(super) fn run(args: &SelftestArgs, console: &Console) -> Result<(), Failure>
     Ok(())
 }
 
-/// The number of figures, if all are within their tolerances.
+/// Returns the number of figures if all are within their tolerances.
 fn verdict(tested: &[SubjectReport]) -> Result<usize, Failure> {
     let findings: Vec<&Finding> = tested.iter().flat_map(SubjectReport::findings).collect();
     let failed = findings.iter().filter(|finding| !finding.passes()).count();
@@ -97,7 +97,7 @@ fn verdict(tested: &[SubjectReport]) -> Result<usize, Failure> {
     ))
 }
 
-/// What is to be tested.
+/// The backends to test.
 fn subjects(args: &SelftestArgs) -> Result<Vec<Subject>, Failure> {
     let native = Subject::Native {
         instructions: InstructionSet::default(),
@@ -119,7 +119,7 @@ fn subjects(args: &SelftestArgs) -> Result<Vec<Subject>, Failure> {
     Ok(subjects)
 }
 
-/// The cases with these numbers, or all.
+/// The cases with these numbers; without numbers, all.
 fn chosen(only: &[u8]) -> Result<Vec<Case>, Failure> {
     let numbers: Vec<u8> = cases().iter().map(|case| case.number).collect();
     if let Some(unknown) = only.iter().find(|number| !numbers.contains(number)) {

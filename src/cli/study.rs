@@ -20,7 +20,7 @@ pub(super) fn run(args: &StudyRun, _: &Console) -> Result<(), Failure> {
     args.make()
 }
 
-/// Shows what has come out; nothing yet, where a scheduler has runs.
+/// Prints the results, unless a scheduler still has runs to do.
 fn finish(done: Option<Finished>, console: &Console) -> Result<(), Failure> {
     let Some(Finished { summary, report }) = done else { return Ok(()) };
     console.result(summary);

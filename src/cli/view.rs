@@ -1,4 +1,4 @@
-//! `densify view`.
+//! `densify view`: a model in the browser.
 
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::PathBuf;
@@ -16,14 +16,14 @@ use densify_view::{FIRST_PORT, ListenAddress, Server, ViewOptions};
 
 /// Shows a model, or a scene, in the browser.
 ///
-/// Serves a page on this machine, whose pictures are those of `densify render`: turn the model with mouse,
-/// fingers or keys, go to the cameras of the photographs, compare render and photograph, see depth, opacity,
-/// and Gaussians coloured by what training knows of each, and save a camera path for `densify render --path`.
+/// Serves a page on this machine, with the pictures that `densify render` makes: turn the model with mouse,
+/// fingers or keys, visit the photographs' cameras, compare render and photograph, see depth, opacity,
+/// and Gaussians coloured by their training statistics, and save a camera path for `densify render --path`.
 /// Two runs are shown with a slider between them. Ctrl-C ends it.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct ViewArgs {
-    /// Folder that `densify train` wrote, a file of Gaussian splats, or a dataset (or scene:NAME), of which the
+    /// Folder that `densify train` wrote, a file of Gaussian splats, or a dataset (or scene:NAME), whose
     /// points are shown
     #[arg(value_name = "RUN|MODEL|SCENE")]
     what: PathBuf,
@@ -63,7 +63,7 @@ pub(super) fn run(args: &ViewArgs, matches: &ArgMatches, console: &Console) -> R
     if view::is_run(&args.what) {
         refuse_options_of_a_file(matches)?;
     }
-    // Bind the port first: that fails at once if at all, and a model may take long to read.
+    // The port first: it fails immediately if at all, while a model may take long to read.
     let address = ListenAddress { host: args.host, port: args.port, needs_token: false };
     let server = Server::open(address)?;
     let RenderingArgs { near, device, data } = &args.rendering;
@@ -80,7 +80,7 @@ pub(super) fn run(args: &ViewArgs, matches: &ArgMatches, console: &Console) -> R
     for (name, rows) in scene.models() {
         console.say(format_args!("model    {name}: {} Gaussians", grouped(rows)));
     }
-    // From here on a signal ends the page, not the process in the midst of it.
+    // From here on, a signal stops the server in order instead of killing the process.
     let interrupts = Interrupts::listen();
     console.result(format_args!("page     {}", server.url()));
     if server.is_public() {

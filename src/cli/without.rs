@@ -1,4 +1,4 @@
-//! In place of the commands that need a feature which this program was built without: their refusals.
+//! Stands in for commands whose feature was not built: each is refused by name.
 
 use std::ffi::OsString;
 
@@ -7,7 +7,7 @@ use clap::Args;
 use super::console::Console;
 use densify_run::failure::Failure;
 
-/// Why `what` cannot be done.
+/// The refusal of `what`, with the name of the missing feature.
 pub(super) fn without(feature: &str, what: &str) -> String {
     format!(
         "{what}: this program was built without the feature `{feature}` of the crate densify; add it to the \
@@ -15,15 +15,15 @@ pub(super) fn without(feature: &str, what: &str) -> String {
     )
 }
 
-/// Not in this program, which was built without the feature that it needs.
+/// Not available: this program was built without the necessary feature.
 #[derive(Debug, Args)]
 pub(super) struct Absent {
-    /// Whatever is given
+    /// Ignored
     #[arg(hide = true, trailing_var_arg = true, allow_hyphen_values = true)]
     words: Vec<OsString>,
 }
 
-/// Defines what `cli` calls of a module whose commands need a feature.
+/// Defines the functions that `cli` calls in a module whose feature is missing.
 macro_rules! absent {
     ($module:ident, $feature:literal, $($run:ident($args:ident $(, $more:ty)*) $command:literal),*) => {
         #[cfg(not(feature = $feature))]

@@ -20,14 +20,14 @@ use densify_run::failure::{Failure, INPUT};
 use densify_run::finished::{model_file, read_model};
 use table::Line;
 
-/// The name that stands for every format.
+/// Name for all formats together.
 const ALL: &str = "all";
 
 /// Writes a trained model in another format, or in all.
 ///
 /// The model keeps the coordinates of the dataset. A file appears only when it is complete. With
-/// --format all, or --scene, prints what each format takes; with --scene also how near the pictures of
-/// each, read back, are to those of the model itself, over the views held out.
+/// --format all or --scene, prints the size of each format; with --scene also the PSNR between renders of
+/// each file, read back, and renders of the model itself, over the held-out views.
 #[derive(Debug, Args)]
 #[command(after_help = after_help())]
 pub(super) struct ExportArgs {
@@ -46,8 +46,8 @@ pub(super) struct ExportArgs {
     /// Replace files that exist
     #[arg(long)]
     overwrite: bool,
-    /// Folder or ZIP archive of the dataset whose held-out views to compare; every 8th photograph where
-    /// neither the dataset nor an option says which
+    /// Folder or ZIP archive of the dataset whose held-out views are compared; every 8th photograph if
+    /// neither the dataset nor an option selects them
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
     #[command(flatten)]
@@ -93,7 +93,7 @@ pub(super) fn run(
     for (format, path) in &files {
         match write(format, path, &model) {
             Ok(()) => {}
-            // The other formats may hold it.
+            // Other formats may hold the model.
             Err(failure) if failure.code == INPUT && files.len() > 1 => {
                 console.say(format_args!("note: not written: {failure}"));
                 unfit = unfit.or(Some(failure));
@@ -122,7 +122,7 @@ pub(super) fn run(
     Ok(())
 }
 
-/// The model itself, to compare what was written with.
+/// The model itself, with which the written files are compared.
 fn open_reference(
     args: &ExportArgs,
     is_run: bool,
@@ -167,7 +167,7 @@ fn files(args: &ExportArgs) -> Result<Vec<(&'static Format, PathBuf)>, Failure> 
     }
 }
 
-/// What the files of a model are called: as its run, or as its file without the extension.
+/// Name of a model's files: that of its run, or of its file without the extension.
 fn stem(model: &Path) -> String {
     let name = model.file_name().unwrap_or("model".as_ref()).to_string_lossy().into_owned();
     if model.is_dir() {
@@ -181,7 +181,7 @@ fn stem(model: &Path) -> String {
     if end == 0 { "model".to_owned() } else { name[..end].to_owned() }
 }
 
-/// The format that the name of an output says.
+/// The format that belongs to the extension of an output.
 pub(super) fn format_of(output: &Path) -> Result<&'static Format, Failure> {
     find_by_extension(output)
         .map_err(|error| Failure::input(format!("-o: {error}, and name it with --format NAME")))
@@ -189,7 +189,7 @@ pub(super) fn format_of(output: &Path) -> Result<&'static Format, Failure> {
 
 fn write(format: &Format, path: &Path, model: &Gaussians) -> Result<(), Failure> {
     write_atomically(path, |out| format.write(model, out)).map_err(|error| match error {
-        // What the format has no room for, not what the disk has none for.
+        // A limit of the format, not an error of the disk.
         FileError::Io { source, .. } if is_unfit(&source) => {
             Failure::input(format!("{}: {source}", path.display()))
         }
@@ -197,14 +197,14 @@ fn write(format: &Format, path: &Path, model: &Gaussians) -> Result<(), Failure>
     })
 }
 
-/// Fails where something is in the way of the output.
+/// Fails if the output exists and may not be replaced.
 pub(super) fn check_output(path: &Path, overwrite: bool) -> Result<(), Failure> {
     let path_text = path.display();
     match path.symlink_metadata() {
         Ok(_) if path.is_dir() => {
             Err(Failure::input(format!("-o: {path_text} is a folder; name a file")))
         }
-        // To replace a device or a pipe would be to take it from others.
+        // Replacing a device or a pipe would remove it for everyone else.
         Ok(_) if path.exists() && !path.is_file() => {
             Err(Failure::input(format!("-o: {path_text} is a device or a pipe; name a file")))
         }

@@ -22,7 +22,7 @@ impl Line {
     }
 }
 
-/// A line per format.
+/// The table as text, one line per format.
 pub(super) fn table(lines: &[Line], rows: usize) -> String {
     let of_ply = lines.iter().find(|line| line.name == PLY.name).map(|line| line.bytes);
     let width = lines.iter().map(|line| line.name.len()).max().unwrap_or(0).max("format".len());

@@ -1,4 +1,4 @@
-//! `densify train`.
+//! `densify train`: trains a scene.
 
 #[cfg(feature = "view")]
 mod page;
@@ -32,22 +32,22 @@ use densify_train::output::RunFolder;
 pub(super) struct TrainArgs {
     #[command(flatten)]
     run: RunSpec,
-    /// TOML file with any of these options, such as the config.toml of a run; flags win over it
+    /// TOML file with any of these options, such as the config.toml of a run; flags override it
     #[arg(long, value_name = "FILE", help_heading = "Scene")]
     config: Option<PathBuf>,
     /// Resume from the newest checkpoint in the output folder. Options are restored from the run; those that
-    /// do not change the result may be given anew, and --iterations may extend it. Without any checkpoint
-    /// the run begins at its start
+    /// do not change the result may be given again, and --iterations may extend it. Without a checkpoint
+    /// the run starts from the beginning
     #[arg(long, help_heading = "Output", conflicts_with = "overwrite")]
     pub(super) resume: bool,
-    /// Replace the run that is in the output folder, once this one is complete
+    /// Replace the run in the output folder once this one is complete
     #[arg(long, help_heading = "Output")]
     overwrite: bool,
     /// Show the run in the browser while it trains: serves a page on this machine alone, with the model,
-    /// curves and edits, that can pause, keep and stop the run (default port: the first free one from 8080
+    /// curves and edits, and buttons that pause, save and stop the run (default port: the first free one from 8080
     /// on). From another machine: ssh -L 8080:127.0.0.1:8080 NAME, then the whole printed address. Its pictures are
-    /// no larger than the largest photograph. The run is the same with it and without; of --memory the page takes
-    /// a part
+    /// no larger than the largest photograph. The page does not change the result, but its memory counts towards
+    /// --memory
     #[arg(
         long, value_name = "PORT", num_args = 0..=1, require_equals = true, default_missing_value = "0",
         help_heading = "Output"
@@ -74,7 +74,7 @@ Examples:
   densify train data/garden --view            and look at it meanwhile";
 
 impl TrainArgs {
-    /// What this call provides for the run: the page, if it is asked for, and who follows it.
+    /// The page of this run, if requested, and its observer.
     pub(super) fn host<'a>(&self, follower: &'a Follower<'_>) -> Host<'a> {
         Host { companion: self.view.map(|_| page::COMPANION), ..Host::new(follower) }
     }
@@ -113,7 +113,7 @@ pub(super) fn run(
     if occupied != Occupied::Resume {
         RunFolder::check(&spec.output_folder()?, args.overwrite)?;
     }
-    // The port first: it is known at once, and a scene may take long to read.
+    // The port first: it fails immediately if at all, while a scene may take long to read.
     let page = args.view.map(page::open).transpose()?;
     threads::limit(spec.device.threads);
     let run = Run::prepare_on(&spec, resumed, args.host(&follower))?;
@@ -127,7 +127,7 @@ pub(super) fn run(
     }
 }
 
-/// Says what the preset was measured to cost and gain, where the run is as long as it was then.
+/// Prints the measured cost and gain of the preset, if the run is as long as the measured ones.
 fn announce_preset(spec: &RunSpec, console: &Console) -> Result<(), Failure> {
     let name = spec.schedule.preset.as_deref().unwrap_or(densify_run::knobs::DEFAULT_PRESET);
     let preset = densify_run::knobs::preset(name).map_err(Failure::input)?;
@@ -141,10 +141,10 @@ fn announce_preset(spec: &RunSpec, console: &Console) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Follows a run on the console, and stops it at a signal.
+/// Prints a run's progress, and stops the run at a signal.
 pub(super) struct Follower<'a> {
     console: &'a Console,
-    /// Details are shown too.
+    /// True if details are printed too.
     verbose: bool,
     progress: RefCell<Option<Progress<'a>>>,
     interrupts: RefCell<Option<Interrupts>>,
@@ -160,7 +160,7 @@ impl<'a> Follower<'a> {
         }
     }
 
-    /// From here on a signal stops the run in order.
+    /// From here on, a signal stops the run in order.
     pub(crate) fn listen(&self) {
         *self.interrupts.borrow_mut() = Some(Interrupts::listen());
     }

@@ -1,4 +1,4 @@
-//! The page of a run in training.
+//! The browser page of a run in training.
 
 use std::net::Ipv4Addr;
 
@@ -15,7 +15,7 @@ pub(super) fn open(port: u16) -> Result<Server, Failure> {
     Server::open(ListenAddress { host: Ipv4Addr::LOCALHOST.into(), port, needs_token: true })
 }
 
-/// Trains the run and serves its page meanwhile.
+/// Trains the run while serving its page.
 pub(super) fn train(
     page: &Server,
     run: Run,

@@ -1,4 +1,4 @@
-//! Faults of the disk and of the device: `docs/errors.md` says what becomes of each, and these tests hold it to it.
+//! Faults of the disk and of the device have the consequences that `docs/errors.md` promises.
 
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -16,7 +16,7 @@ use densify_train::output::model_path;
 
 const OPERATIONS: [Operation; 5] =
     [Operation::Create, Operation::Write, Operation::Flush, Operation::Sync, Operation::Rename];
-/// A full disk, and one that is broken.
+/// A full disk and a broken one.
 const KINDS: [ErrorKind; 2] = [ErrorKind::StorageFull, ErrorKind::Other];
 
 struct Case {
@@ -47,7 +47,7 @@ impl Case {
         run(&TrainArgs::from_arg_matches(matches).unwrap(), matches, &Console::new(true))
     }
 
-    /// Trains with a fault; what came of it. Fails if the fault was never met.
+    /// Trains with a fault and returns the result; panics if the fault never occurred.
     fn fault(
         &self,
         operation: Operation,
@@ -182,7 +182,7 @@ fn what_stops_a_run_leaves_what_it_goes_on_from() {
     }
 }
 
-/// The software drivers among the adapters, which are there where the tests of the GPU are run.
+/// The adapters that are software drivers.
 #[expect(clippy::print_stderr, reason = "a skipped test must say so")]
 fn software_drivers() -> Vec<String> {
     let names: Vec<String> = adapters()
@@ -215,7 +215,7 @@ fn a_device_that_is_lost_leaves_what_the_run_goes_on_from() {
                 continue;
             }
             let Err(failure) = done else {
-                // Lost while the last checkpoint was written: by then everything else is there.
+                // Lost while the last checkpoint was written: everything else is there by then.
                 assert!(case.model() == expected, "{driver}: {checks}");
                 continue;
             };
