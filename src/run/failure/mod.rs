@@ -10,7 +10,7 @@ use std::path::Path;
 
 pub use problem::{
     BackendRemedy, Difference, ModelProblem, OptionProblem, Problem, Remedy, ResumeProblem,
-    SizeProblem, TrainingProblem,
+    SizeProblem, TrainRemedy, TrainingProblem,
 };
 
 use densify_policies::policy::PolicyError;
@@ -24,6 +24,7 @@ use densify_render::{Accumulation, BackendError, Fit};
 use densify_train::checkpoint::CheckpointError;
 use densify_train::evaluate::EvaluateError;
 use densify_train::init::InitError;
+use densify_train::output::FolderError;
 use densify_train::trainer::TrainError;
 
 /// Exit code of anything that has no code of its own.
@@ -161,7 +162,6 @@ pub trait BadInput: Display {}
 
 impl BadInput for LoadError {}
 impl BadInput for FormatError {}
-impl BadInput for InitError {}
 /// Before training: the policy's name or parameters are wrong.
 impl BadInput for PolicyError {}
 
@@ -181,9 +181,13 @@ impl Failure {
     /// A failure of a backend: the message, which ends with the error, and its remedy.
     fn of_backend(error: &BackendError, message: impl ToString) -> Self {
         let code = if is_input(error) { INPUT } else { DEVICE };
+        Self::with_remedy(code, message, BackendRemedy::of(error))
+    }
+
+    fn with_remedy(code: u8, message: impl ToString, remedy: impl Into<Problem>) -> Self {
         let mut failure = Self::new(code, message);
         failure.parts.push(Part::Text("; ".to_owned()));
-        failure.parts.push(Part::Problem(Box::new(BackendRemedy::of(error).into())));
+        failure.parts.push(Part::Problem(Box::new(remedy.into())));
         failure
     }
 }
@@ -239,13 +243,44 @@ impl From<BackendRemedy> for Problem {
 
 impl From<FileError> for Failure {
     fn from(error: FileError) -> Self {
-        match error {
-            FileError::Occupied { folder } => {
-                Self::with_code(INPUT, OptionProblem::FolderOccupied { folder })
+        let is_input = matches!(error, FileError::Malformed { .. });
+        Self::new(if is_input { INPUT } else { OTHER }, error)
+    }
+}
+
+impl From<TrainRemedy> for Problem {
+    fn from(remedy: TrainRemedy) -> Self {
+        Self::Train(remedy)
+    }
+}
+
+impl From<FolderError> for Failure {
+    fn from(error: FolderError) -> Self {
+        let remedy = match error {
+            FolderError::File(error) => return error.into(),
+            FolderError::NoRun { .. }
+            | FolderError::NotAModel { .. }
+            | FolderError::NotFound { .. } => return Self::input(error),
+            FolderError::Lost { .. } | FolderError::NotReplaced { .. } => {
+                return Self::new(OTHER, error);
             }
-            FileError::Unfit(_) => Self::input(error),
-            _ => Self::new(OTHER, error),
-        }
+            FolderError::Occupied { .. } => TrainRemedy::OtherFolderOrOverwrite,
+            FolderError::InUse { .. } => TrainRemedy::WaitOrOtherFolder,
+            FolderError::NotAFolder { .. } => TrainRemedy::OtherFolder,
+        };
+        Self::with_remedy(INPUT, error, remedy)
+    }
+}
+
+impl From<InitError> for Failure {
+    fn from(error: InitError) -> Self {
+        let remedy = match error {
+            InitError::TooManyPoints(_) => return Self::input(error),
+            InitError::NoBudget => TrainRemedy::Budget,
+            InitError::Degree(_) => TrainRemedy::Degree,
+            InitError::NoPoints => TrainRemedy::RandomStart,
+        };
+        Self::with_remedy(INPUT, error, remedy)
     }
 }
 
@@ -253,6 +288,9 @@ impl From<TrainError> for Failure {
     fn from(error: TrainError) -> Self {
         let code = match &error {
             TrainError::BadOption(_) | TrainError::View { .. } => INPUT,
+            TrainError::NoView => {
+                return Self::with_remedy(INPUT, error, TrainRemedy::MoreViews);
+            }
             TrainError::Backend { source, .. } => return Self::of_backend(source, &error),
             _ => OTHER,
         };
@@ -264,6 +302,7 @@ impl From<CheckpointError> for Failure {
     fn from(error: CheckpointError) -> Self {
         match error {
             CheckpointError::File(error) => error.into(),
+            CheckpointError::Folder(error) => error.into(),
             CheckpointError::Backend(error) => error.into(),
             CheckpointError::Policy { .. } => Self::new(OTHER, error),
             CheckpointError::Invalid { .. } => Self::input(error),
@@ -346,7 +385,7 @@ mod tests {
 
     #[test]
     fn an_occupied_folder_names_the_options_that_help() {
-        let failure = Failure::from(FileError::occupied("out".as_ref()));
+        let failure = Failure::from(FolderError::Occupied { folder: "out".into() });
         let expected =
             "out holds another run; choose another folder with -o, or replace it with --overwrite";
         assert_eq!((failure.code, &*failure.to_string()), (INPUT, expected));

@@ -41,8 +41,6 @@ pub enum OptionProblem {
     AutoBudgetWithFreeze,
     /// A number of random points for a start that is not random.
     UnusedInitPoints { points: usize },
-    /// The output folder holds another run.
-    FolderOccupied { folder: PathBuf },
     /// Test views are to be measured, and there is none.
     NothingToTest,
 }
@@ -156,6 +154,27 @@ pub enum Problem {
     Training(TrainingProblem),
     /// The remedy for an error of a backend, which stands before it.
     Backend(BackendRemedy),
+    /// The remedy for an error of training, which stands before it.
+    Train(TrainRemedy),
+}
+
+/// What helps against an error of training: of its folder, its first Gaussians or its views.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum TrainRemedy {
+    /// Another folder, or replacing the run in this one.
+    OtherFolderOrOverwrite,
+    /// The end of the process that trains in the folder, or another folder.
+    WaitOrOtherFolder,
+    /// Another folder.
+    OtherFolder,
+    /// A budget.
+    Budget,
+    /// A degree.
+    Degree,
+    /// A start from random points.
+    RandomStart,
+    /// More views to train on.
+    MoreViews,
 }
 
 /// What helps against an error of a backend.

@@ -7,7 +7,7 @@ use densify_render::Accumulation;
 
 use super::problem::{
     BackendRemedy, Difference, ModelProblem, OptionProblem, Problem, Remedy, ResumeProblem,
-    SizeProblem, TrainingProblem,
+    SizeProblem, TrainRemedy, TrainingProblem,
 };
 
 impl Problem {
@@ -21,6 +21,7 @@ impl Problem {
             Self::Resume(problem) => problem.words(spelling),
             Self::Training(problem) => problem.words(spelling),
             Self::Backend(remedy) => remedy.words(spelling),
+            Self::Train(remedy) => remedy.words(spelling),
         }
     }
 }
@@ -59,6 +60,30 @@ impl BackendRemedy {
     }
 }
 
+impl TrainRemedy {
+    fn words(self, s: Spelling) -> String {
+        let folder = output_option(s);
+        match self {
+            Self::OtherFolderOrOverwrite => {
+                let overwrite = s.switch("overwrite");
+                format!("choose another folder with {folder}, or replace it with {overwrite}")
+            }
+            Self::WaitOrOtherFolder => {
+                format!("wait for it, stop it, or choose another folder with {folder}")
+            }
+            Self::OtherFolder => format!("choose another one with {folder}"),
+            Self::Budget => format!("give {} at least 1", s.option("budget")),
+            Self::Degree => format!("choose {} accordingly", s.option("sh_degree")),
+            Self::RandomStart => {
+                format!("start from random points with {}", s.text("init", "random"))
+            }
+            Self::MoreViews => {
+                format!("use a larger {} or add images", s.option("test_every"))
+            }
+        }
+    }
+}
+
 impl OptionProblem {
     fn words(&self, s: Spelling) -> String {
         match self {
@@ -76,15 +101,6 @@ impl OptionProblem {
             Self::NotUtf8 { option, path } => format!(
                 "{}: the name {path:?} is not UTF-8, as config.toml must be; rename the folder, or name a link to it",
                 s.option(option)
-            ),
-            Self::FolderOccupied { folder } => format!(
-                "{} holds another run; choose another folder with {}, or replace it with {}",
-                folder.display(),
-                match s {
-                    Spelling::Terminal => "-o".to_owned(),
-                    Spelling::Keyword => s.option("output"),
-                },
-                s.switch("overwrite")
             ),
             Self::NoScene => "no scene is given; name a dataset's folder, or a built-in scene such as scene:spheres \
                               (in a file: scene = \"...\")"

@@ -16,7 +16,7 @@ use crate::spec::{
 use densify_core::files::{FileError, write_atomically};
 use densify_data::track_colours::Spread;
 use densify_data::track_colours::exposures::ExposureSpread;
-use densify_train::output::CONFIG_FILE;
+use densify_train::output::{CONFIG_FILE, FolderError};
 
 /// A resolved run as its `config.toml` has it.
 #[derive(Debug, Clone, PartialEq)]
@@ -207,7 +207,7 @@ impl RunConfig {
         let path = run.join(CONFIG_FILE);
         let text = densify_core::files::read_text(&path, densify_core::files::MAX_OPTIONS)
             .map_err(|error| match error.kind() {
-                std::io::ErrorKind::NotFound => FileError::no_run(run, CONFIG_FILE).into(),
+                std::io::ErrorKind::NotFound => FolderError::no_run(run, CONFIG_FILE).into(),
                 _ => Failure::input(format!("cannot read {}: {error}", path.display())),
             })?;
         let malformed = |problem: String| Failure::from(FileError::malformed(&path, problem));

@@ -34,6 +34,7 @@ use std::path::{Path, PathBuf};
 use densify_policies::policy::PolicyError;
 use serde::{Deserialize, Serialize};
 
+use crate::output::FolderError;
 use crate::trainer::TrainerState;
 use densify_core::files::FileError;
 use densify_render::{BackendError, StateError};
@@ -72,6 +73,9 @@ pub enum CheckpointError {
     /// The file cannot be read or written.
     #[error(transparent)]
     File(#[from] FileError),
+    /// The folder of the run cannot be written.
+    #[error(transparent)]
+    Folder(#[from] FolderError),
     /// The policy cannot save its state.
     #[error("the policy's state: {source}")]
     Policy {

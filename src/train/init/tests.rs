@@ -133,13 +133,12 @@ fn the_budget_is_kept_by_a_seeded_subsample() {
 fn impossible_requests_are_errors() {
     let points = scattered(10, 1);
     let none = PointCloud::default();
-    for (points, budget, degree, remedy) in [
-        (&points, 0, 0, "--budget"),
-        (&points, 1, 4, "--sh-degree"),
-        (&none, 1, 0, "--init random"),
+    for (points, budget, degree, error) in [
+        (&points, 0, 0, InitError::NoBudget),
+        (&points, 1, 4, InitError::Degree(4)),
+        (&none, 1, 0, InitError::NoPoints),
     ] {
-        let message = initialise(points, budget, degree, 0).unwrap_err().to_string();
-        assert!(message.contains(remedy), "{message}");
+        assert_eq!(initialise(points, budget, degree, 0).unwrap_err(), error);
     }
 }
 

@@ -19,7 +19,7 @@ impl<V: ViewSource> Trainer<V> {
         self.views_time = self.views_time.saturating_add(start.elapsed());
         let signals = self.backend.take_signals(self.needs.signals);
         let signals = signals.map_err(|e| self.backend_error(step, e))?;
-        let signals = signals.without_first(self.options.frozen);
+        let signals = signals.without_first(self.row_budget().frozen);
         let mut plan = self.new_plan().allowing(&self.needs);
         let scene = SceneInfo { budget: plan.budget(), ..self.scene.clone() };
         let candidates = self.backend.candidates();
@@ -37,9 +37,14 @@ impl<V: ViewSource> Trainer<V> {
         EditPlan::new(rows, budget)
     }
 
-    /// Rows as policies count them, who do not know of frozen ones: how many there are, and the most there may be.
+    /// The current limit of rows, with the frozen ones among them.
+    pub(super) fn row_budget(&self) -> RowBudget {
+        RowBudget { total: self.row_limit(), frozen: self.options.frozen }
+    }
+
+    /// Number and limit of rows as policies count, without frozen rows.
     pub(super) fn trained_rows_and_budget(&self) -> (usize, usize) {
-        let budget = RowBudget { total: self.row_limit(), frozen: self.options.frozen };
+        let budget = self.row_budget();
         (budget.trained(self.backend.rows()), budget.trainable())
     }
 
@@ -51,7 +56,7 @@ impl<V: ViewSource> Trainer<V> {
     ) -> Result<Option<EditEvent>, TrainError> {
         let mut ops = plan.compile();
         self.check_plan(step, &ops)?;
-        ops = ops.after_frozen(self.options.frozen);
+        ops = ops.after_frozen(self.row_budget().frozen);
         // The backend checks the budget, which the trainer's own limit may be below.
         ops.budget = self.backend.budget();
         self.backend

@@ -9,6 +9,9 @@ use densify_render::BackendError;
 /// [read](super::Trainer::model); only after [`Diverged`](Self::Diverged) it is unusable.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainError {
+    /// There is no view to train on.
+    #[error("there is no training view")]
+    NoView,
     /// An option is out of its range.
     #[error("{0}")]
     BadOption(String),

@@ -23,15 +23,18 @@ impl<V: ViewSource> Trainer<V> {
             tracing::warn!(step, row = row.row, "non-finite value: {row}");
         }
         let few = count as f64 <= (MAX_SHARE * rows as f64).max(1.0) && count < rows;
-        // Frozen rows never change, so that non-finite values in them mean an error elsewhere.
-        let frozen = self.options.frozen as u32;
-        let is_frozen = unsound.iter().any(|row| row.row < frozen);
-        if self.options.on_nan == OnNan::Stop || !few || is_frozen {
-            return Err(TrainError::NonFinite { step, count, rows, first: first.to_string() });
+        let budget = self.row_budget();
+        let trained: Option<Vec<u32>> =
+            unsound.iter().map(|row| budget.trained_row(row.row)).collect();
+        match trained.filter(|_| few && self.options.on_nan == OnNan::Prune) {
+            Some(trained) => {
+                let mut plan = self.new_plan();
+                plan.cause("not finite");
+                plan.prune_all(trained);
+                self.execute(step, plan)
+            }
+            // Frozen rows never change, so that non-finite values in them mean an error elsewhere.
+            None => Err(TrainError::NonFinite { step, count, rows, first: first.to_string() }),
         }
-        let mut plan = self.new_plan();
-        plan.cause("not finite");
-        plan.prune_all(unsound.into_iter().map(|row| row.row - frozen));
-        self.execute(step, plan)
     }
 }

@@ -18,7 +18,8 @@ impl<V: ViewSource> Trainer<V> {
         let Some(request) = self.needs.aux.clone().filter(|_| count > 0) else {
             return Ok(());
         };
-        let (options, degree) = (self.options, self.sh_degree(step));
+        let (options, degree, frozen) =
+            (self.options, self.sh_degree(step), self.row_budget().frozen);
         for view in self.draw_scored(count, step) {
             let image = self.image(step, view)?;
             let exposure = self.exposures.as_ref().map(|exposures| exposures.transform(view));
@@ -35,7 +36,7 @@ impl<V: ViewSource> Trainer<V> {
             });
             let mut measured = measured.map_err(|e| self.backend_error(step, e))?;
             for (_, column) in &mut measured.columns {
-                column.drain(..self.options.frozen);
+                column.drain(..frozen);
             }
             self.extra_forwards += 1;
             let (loss, columns, points) = (measured.loss, &measured.columns, &measured.points);

@@ -94,9 +94,9 @@ impl<V: ViewSource> Trainer<V> {
     /// When the ages cannot be read.
     pub fn record_history(&mut self) -> Result<(), BackendError> {
         let ages = self.backend.take_signals(SignalSet::from([Signal::Age]))?;
-        let step = self.step;
+        let (step, budget) = (self.step, self.row_budget());
         let edited = |(row, &age): (usize, &f32)| {
-            if row < self.options.frozen { 0 } else { step.saturating_sub(age as u32) }
+            if budget.is_frozen(row) { 0 } else { step.saturating_sub(age as u32) }
         };
         let known = ages.get(Signal::Age).unwrap_or_default().iter().enumerate();
         let edited: Vec<u32> = known.map(edited).collect();

@@ -138,7 +138,7 @@ fn options_that_disagree_are_refused() {
     };
     assert!(refused(0, |_, _| ()).contains("no training view"));
     assert!(refused(2, |_, _| ()).contains("2 views"));
-    assert!(refused(3, |_, o| o.iterations = 8).contains("--iterations"));
+    assert!(refused(3, |_, o| o.iterations = 8).contains("8 iterations"));
     assert!(refused(3, |s, _| s.extent = f32::NAN).contains("extent"));
     assert!(refused(3, |s, _| s.budget = 11).contains("budget 10 (scene: 11)"));
     assert!(refused(3, |_, o| o.rates.quat = 0.0).contains("`quat`"));
