@@ -17,7 +17,6 @@ pub struct Host<'a> {
 
 impl<'a> Host<'a> {
     /// A host that measures the process as the operating system reports it.
-    #[must_use]
     pub fn new(observer: &'a dyn Observer) -> Self {
         Self { observer, process: ProcessMemory::SYSTEM, companion: None }
     }

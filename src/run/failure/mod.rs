@@ -57,20 +57,17 @@ enum Part {
 
 impl Failure {
     /// A failure in words that name no option, or of a command.
-    #[must_use]
     #[expect(clippy::needless_pass_by_value, reason = "errors are passed as they come")]
     pub fn new(code: u8, message: impl ToString) -> Self {
         Self { code, parts: vec![Part::Text(message.to_string())] }
     }
 
     /// Bad input: a file, an option, a field.
-    #[must_use]
     pub fn input(message: impl ToString) -> Self {
         Self::new(INPUT, message)
     }
 
     /// The failure of a problem with this exit code.
-    #[must_use]
     pub fn with_code(code: u8, problem: impl Into<Problem>) -> Self {
         Self { code, parts: vec![Part::Problem(Box::new(problem.into()))] }
     }
@@ -114,7 +111,6 @@ impl Failure {
     }
 
     /// The whole message, with options as its reader spells them.
-    #[must_use]
     pub fn words(&self, spelling: Spelling) -> String {
         let words = |part: &Part| match part {
             Part::Text(text) => text.clone(),

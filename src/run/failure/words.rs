@@ -12,7 +12,6 @@ use super::problem::{
 
 impl Problem {
     /// A sentence that names what is wrong, and the remedy.
-    #[must_use]
     pub fn words(&self, spelling: Spelling) -> String {
         match self {
             Self::Options(problem) => problem.words(spelling),

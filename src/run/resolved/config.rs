@@ -218,25 +218,21 @@ impl RunConfig {
     }
 
     /// The most rows there may ever be.
-    #[must_use]
     pub fn budget(&self) -> usize {
         self.budget
     }
 
     /// The highest spherical-harmonic degree.
-    #[must_use]
     pub fn sh_degree(&self) -> u8 {
         self.sh_degree
     }
 
     /// The step at which the run ends.
-    #[must_use]
     pub fn last(&self) -> u32 {
         self.resolved.extended_to.unwrap_or(0).max(self.spec.schedule.iterations.0)
     }
 
     /// The dataset's folder: relative to the folder in which the run was started, if it exists there, or else as given.
-    #[must_use]
     pub fn scene_path(&self) -> PathBuf {
         let given = self.spec.start.scene.clone().unwrap_or_default();
         let from_there = self.resolved.working_directory.as_ref().map(|folder| folder.join(&given));

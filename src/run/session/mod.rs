@@ -355,7 +355,7 @@ impl<'a> Session<'a> {
         PLY.write_file(&path, shape, |piece| {
             Ok::<_, Failure>(to_world.world_from_model(backend.download_rows(piece)?))
         })?;
-        if let Some(exposures) = self.run.trainer.exposures() {
+        if let Some(exposures) = &self.run.trainer.progress().exposures {
             let names = self.run.dataset.train.iter().map(|view| &*view.name);
             let named = named_transforms(exposures, names);
             write_json(&path.with_file_name(EXPOSURES), &named)?;

@@ -67,7 +67,6 @@ pub struct LeftOut {
 
 impl Requirements {
     /// The report of a run that ended with `rows` rows.
-    #[must_use]
     pub fn new(
         config: &RunConfig,
         rows: usize,
@@ -94,7 +93,6 @@ impl Requirements {
     }
 
     /// The report in a few lines.
-    #[must_use]
     pub fn lines(&self, spelling: Spelling) -> Vec<String> {
         if self.left_out.is_empty() {
             let full = spelling.switch("full");

@@ -64,19 +64,16 @@ impl Run {
     }
 
     /// Bytes per buffer, as promised.
-    #[must_use]
     pub fn ledger(&self) -> &Ledger {
         &self.ledger
     }
 
     /// The run with everything decided.
-    #[must_use]
     pub fn config(&self) -> &RunConfig {
         &self.config
     }
 
     /// The dataset; of its points only those that a companion asks for.
-    #[must_use]
     pub fn dataset(&self) -> &Dataset {
         &self.dataset
     }

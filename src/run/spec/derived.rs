@@ -16,7 +16,6 @@ use densify_train::schedule::{InitRates, RateOptions};
 
 impl DataSpec {
     /// The options for reading the dataset, with or without tracks.
-    #[must_use]
     pub fn load_options(&self, tracks: bool) -> LoadOptions {
         LoadOptions {
             images: self.images.clone(),

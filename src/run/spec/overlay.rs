@@ -81,7 +81,6 @@ impl Partial {
     }
 
     /// A single option.
-    #[must_use]
     pub fn option(name: &str, value: impl Into<Value>) -> Self {
         Self([(name.to_owned(), value.into())].into_iter().collect())
     }
@@ -99,7 +98,6 @@ impl Partial {
     }
 
     /// An option, or else a knob, by name and with its value as text.
-    #[must_use]
     pub fn setting(name: &str, value: &str) -> Self {
         let value = parse_value(value);
         match RunOption::find(name) {
@@ -116,7 +114,6 @@ impl Partial {
     }
 
     /// The value of an option, if it is there.
-    #[must_use]
     pub fn get(&self, name: &str) -> Option<&Value> {
         self.0.get(name)
     }
@@ -132,13 +129,11 @@ impl Partial {
     }
 
     /// True if a file with this table describes the same options.
-    #[must_use]
     pub fn is_table(&self, table: &Table) -> bool {
         self.0 == *table
     }
 
     /// The options as the table of a file.
-    #[must_use]
     pub fn into_table(self) -> Table {
         self.0
     }

@@ -66,13 +66,11 @@ impl Checkpoint {
     }
 
     /// Path of the file.
-    #[must_use]
     pub fn path(&self) -> &Path {
         &self.path
     }
 
     /// Everything but the arrays.
-    #[must_use]
     pub fn header(&self) -> &Header {
         &self.header
     }

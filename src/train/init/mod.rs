@@ -121,7 +121,6 @@ pub fn initialise(
 }
 
 /// Number of Gaussians that [`initialise`] creates from these points without a budget.
-#[must_use]
 pub fn usable_points(points: &PointCloud) -> usize {
     let mut chosen = finite(points);
     drop_duplicates(&mut chosen, &points.positions);

@@ -16,7 +16,7 @@ impl<V: ViewSource> Trainer<V> {
     pub(super) fn edit(&mut self, step: u32) -> Result<Option<EditEvent>, TrainError> {
         let start = Instant::now();
         self.show_aux_views(step)?;
-        self.views_time = self.views_time.saturating_add(start.elapsed());
+        self.state.views_time = self.state.views_time.saturating_add(start.elapsed());
         let signals = self.backend.take_signals(self.needs.signals);
         let signals = signals.map_err(|e| self.backend_error(step, e))?;
         let signals = signals.without_first(self.row_budget().frozen);
@@ -65,7 +65,7 @@ impl<V: ViewSource> Trainer<V> {
         if let Some(history) = &mut self.history {
             history.record(&ops, step);
         }
-        self.peak_rows = self.peak_rows.max(peak_rows(&ops)).max(self.backend.rows());
+        self.state.peak_rows = self.state.peak_rows.max(peak_rows(&ops)).max(self.backend.rows());
         if !ops.edits_rows() && ops.counts.denied == 0 {
             return Ok(None);
         }
@@ -73,7 +73,7 @@ impl<V: ViewSource> Trainer<V> {
         let EditEvent { before, removed, added, updated, denied, after, .. } = event;
         let cause = &event.cause;
         tracing::info!(step, before, removed, added, updated, denied, after, %cause, "edit");
-        self.events.push(event.clone());
+        self.state.events.push(event.clone());
         Ok(Some(event))
     }
 

@@ -49,24 +49,16 @@ pub struct Trainer<V> {
     needs: Needs,
     scene: SceneInfo,
     options: TrainOptions,
-    step: u32,
+    state: TrainerState,
     /// Order of the views in this epoch.
     order: Vec<usize>,
     /// Order of the views in the next epoch.
     next_order: Vec<usize>,
-    peak_rows: usize,
-    extra_forwards: u64,
-    policy_time: Duration,
-    views_time: Duration,
     images_time: Duration,
-    events: Vec<EditEvent>,
     /// Training views that the policy's scores are measured in.
     scored: Vec<usize>,
     /// Training views in which the automatic budget measures the PSNR; empty without it.
     probe_views: Vec<usize>,
-    auto_budget: Option<AutoBudget>,
-    /// Exposures of the training views, if they are learned.
-    exposures: Option<Exposures>,
     /// History of the rows, if it is recorded.
     history: Option<RowHistory>,
 }
@@ -90,22 +82,19 @@ impl<V: ViewSource> Trainer<V> {
             policy_name: policy_name.to_owned(),
             order: Vec::new(),
             next_order: schedule::view_order(count, options.seed, 0),
-            peak_rows: backend.rows(),
-            extra_forwards: 0,
-            policy_time: Duration::ZERO,
-            views_time: Duration::ZERO,
+            state: TrainerState {
+                initial_rows: scene.initial_rows,
+                peak_rows: backend.rows(),
+                ..TrainerState::default()
+            },
             images_time: Duration::ZERO,
             views,
             backend,
             policy,
             scene,
             options,
-            step: 0,
-            events: Vec::new(),
             scored: (0..count).collect(),
             probe_views: Vec::new(),
-            auto_budget: None,
-            exposures: None,
             history: None,
         })
     }
@@ -121,7 +110,7 @@ impl<V: ViewSource> Trainer<V> {
             self.scored = distinct_views(&self.views, self.scene.extent);
         }
         let (rows, budget) = (self.backend.rows(), self.backend.budget());
-        self.auto_budget = choices.rows.then(|| AutoBudget::new(rows, budget));
+        self.state.auto_budget = choices.rows.then(|| AutoBudget::new(rows, budget));
         self
     }
 
@@ -133,7 +122,7 @@ impl<V: ViewSource> Trainer<V> {
     pub fn with_exposures(mut self, exposures: Option<Exposures>) -> Self {
         let count = exposures.as_ref().map_or(self.views.count(), Exposures::count);
         assert_eq!(count, self.views.count(), "exposures of other views");
-        self.exposures = exposures;
+        self.state.exposures = exposures;
         self
     }
 
@@ -144,12 +133,12 @@ impl<V: ViewSource> Trainer<V> {
     /// # Errors
     /// [`TrainError`]. The run cannot continue after an error, but the model can still be read.
     pub fn step(&mut self) -> Result<StepReport, TrainError> {
-        let step = self.step + 1;
+        let step = self.state.step + 1;
         let view = self.next_view();
         let start = Instant::now();
         // If the image cannot be read, the state is still that of the last checkpoint.
         let image = self.image(step, view)?;
-        if (self.step as usize).is_multiple_of(self.views.count()) {
+        if (self.state.step as usize).is_multiple_of(self.views.count()) {
             self.backend.begin_epoch();
         }
         self.images_time = self.images_time.saturating_add(start.elapsed());
@@ -157,7 +146,7 @@ impl<V: ViewSource> Trainer<V> {
         let (loss_terms, noise) = self.terms(step)?;
         let (camera, image) = self.at_resolution(step, view, image)?;
         let TrainOptions { iterations, seed, background, rates, .. } = self.options;
-        let exposure = self.exposures.as_ref().map(|exposures| exposures.transform(view));
+        let exposure = self.state.exposures.as_ref().map(|exposures| exposures.transform(view));
         let input = StepInput {
             step,
             view,
@@ -173,12 +162,12 @@ impl<V: ViewSource> Trainer<V> {
             seed,
         };
         let output = self.backend.train_step(&input).map_err(|e| self.backend_error(step, e))?;
-        self.step = step;
+        self.state.step = step;
         if !output.loss.is_finite() {
             let view = self.views.name(view).to_owned();
             return Err(TrainError::Diverged { step, view, loss: output.loss });
         }
-        if let Some((exposures, gradient)) = self.exposures.as_mut().zip(output.exposure) {
+        if let Some((exposures, gradient)) = self.state.exposures.as_mut().zip(output.exposure) {
             exposures.step(view, &gradient, f64::from(step) / f64::from(iterations));
         }
         let is_due =
@@ -192,7 +181,7 @@ impl<V: ViewSource> Trainer<V> {
         if is_due {
             events.extend(self.edit(step)?);
         }
-        self.policy_time = self.policy_time.saturating_add(start.elapsed());
+        self.state.policy_time = self.state.policy_time.saturating_add(start.elapsed());
         Ok(StepReport { step, view, output, rows: self.backend.rows(), events })
     }
 
@@ -239,14 +228,14 @@ impl<V: ViewSource> Trainer<V> {
     /// Returns the view of the next step, and prefetches those after it.
     fn next_view(&mut self) -> usize {
         let count = self.views.count();
-        let place = self.step as usize % count;
+        let place = self.state.step as usize % count;
         if place == 0 {
-            let epoch = self.step / count as u32;
+            let epoch = self.state.step / count as u32;
             self.order = std::mem::take(&mut self.next_order);
             self.next_order = schedule::view_order(count, self.options.seed, epoch + 1);
         }
         // Beyond the last iteration the number of remaining steps is unknown.
-        let left = self.options.iterations.checked_sub(self.step + 1);
+        let left = self.options.iterations.checked_sub(self.state.step + 1);
         let last = left.map_or(usize::MAX, |left| left as usize);
         let upcoming: Vec<usize> = self.order[place + 1..]
             .iter()

@@ -22,7 +22,7 @@ impl<V: ViewSource> Trainer<V> {
             (self.options, self.sh_degree(step), self.row_budget().frozen);
         for view in self.draw_scored(count, step) {
             let image = self.image(step, view)?;
-            let exposure = self.exposures.as_ref().map(|exposures| exposures.transform(view));
+            let exposure = self.state.exposures.as_ref().map(|exposures| exposures.transform(view));
             let measured = self.backend.observe(&AuxInput {
                 step,
                 view,
@@ -38,7 +38,7 @@ impl<V: ViewSource> Trainer<V> {
             for (_, column) in &mut measured.columns {
                 column.drain(..frozen);
             }
-            self.extra_forwards += 1;
+            self.state.extra_forwards += 1;
             let (loss, columns, points) = (measured.loss, &measured.columns, &measured.points);
             let view = AuxView { step, rows, loss, columns, points };
             let seen = call_policy(|| self.policy.observe(&view)).and_then(|done| done);

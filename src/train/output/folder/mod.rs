@@ -35,7 +35,6 @@ const MODELS: &str = "point_cloud";
 pub const CHECKPOINTS: &str = "checkpoints";
 
 /// Path of the model of an iteration.
-#[must_use]
 pub fn model_path(run: &Path, iteration: u32) -> PathBuf {
     run.join(MODELS).join(format!("iteration_{iteration}")).join("point_cloud.ply")
 }
@@ -59,7 +58,6 @@ pub fn saved_iterations(run: &Path) -> Result<Vec<u32>, FolderError> {
 }
 
 /// Whether a process is training in a folder.
-#[must_use]
 pub fn is_in_use(run: &Path) -> bool {
     FolderLock::check(run).is_err()
 }
@@ -186,13 +184,11 @@ impl RunFolder {
     }
 
     /// A handle to check during the run that the folder is still locked.
-    #[must_use]
     pub fn guard(&self) -> Guard {
         Guard(Rc::clone(&self.lock))
     }
 
     /// Hidden folders in `target` of interrupted runs that would have replaced the one there.
-    #[must_use]
     pub fn staged(target: &Path) -> Vec<PathBuf> {
         let mut staged = hidden(target, NEW);
         staged.retain(|path| FolderLock::check(path).is_ok());
@@ -200,7 +196,6 @@ impl RunFolder {
     }
 
     /// The folder to write to.
-    #[must_use]
     pub fn path(&self) -> PathBuf {
         let staged = |suffix: &String| self.target.join(format!("{NEW}{suffix}"));
         self.staged.as_ref().map_or_else(|| self.target.clone(), staged)
@@ -229,7 +224,6 @@ impl RunFolder {
     }
 
     /// Ends a failed run. An existing run stays, and the files of the failed one stay in the returned folder.
-    #[must_use]
     pub fn abandon(self) -> PathBuf {
         self.path()
     }

@@ -14,7 +14,7 @@ impl<V: ViewSource> Trainer<V> {
     /// is not reduced.
     pub(in crate::trainer) fn row_limit(&self) -> usize {
         let budget = self.backend.budget();
-        let limit = self.auto_budget.as_ref().map_or(budget, |auto| auto.limit.min(budget));
+        let limit = self.state.auto_budget.as_ref().map_or(budget, |auto| auto.limit.min(budget));
         limit.max(self.backend.rows())
     }
 
@@ -25,7 +25,8 @@ impl<V: ViewSource> Trainer<V> {
     ) -> Result<Option<EditEvent>, TrainError> {
         let iterations = self.options.iterations;
         let is_due = step.is_multiple_of(interval_steps(iterations)) && step <= iterations;
-        let auto = self.auto_budget.clone().filter(|_| is_due && !self.probe_views.is_empty());
+        let auto =
+            self.state.auto_budget.clone().filter(|_| is_due && !self.probe_views.is_empty());
         let Some(mut auto) = auto else {
             return Ok(None);
         };
@@ -58,7 +59,7 @@ impl<V: ViewSource> Trainer<V> {
                 event = self.execute(step, plan)?;
             }
         }
-        self.auto_budget = Some(auto);
+        self.state.auto_budget = Some(auto);
         Ok(event)
     }
 

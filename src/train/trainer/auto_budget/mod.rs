@@ -55,7 +55,6 @@ const MAX_TENTHS: usize = 5;
 const HIDDEN_LOGIT: f32 = -13.8;
 
 /// The signals that the automatic budget needs from a backend, in addition to the policy's.
-#[must_use]
 pub fn growth_signals() -> SignalSet {
     SignalSet::from([Signal::WeightMax])
 }
