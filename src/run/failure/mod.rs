@@ -122,34 +122,35 @@ impl Failure {
     }
 }
 
-macro_rules! bad_input {
+macro_rules! problems {
     ($($problem:ident: $kind:ident),*) => {$(
         impl From<$problem> for Problem {
             fn from(problem: $problem) -> Self {
                 Self::$kind(problem)
             }
         }
+    )*};
+}
 
-        impl From<$problem> for Failure {
-            fn from(problem: $problem) -> Self {
-                Self::with_code(INPUT, problem)
+problems!(OptionProblem: Options, SizeProblem: Size, ModelProblem: Model, ResumeProblem: Resume);
+problems!(TrainingProblem: Training, BackendRemedy: Backend, TrainRemedy: Train);
+
+macro_rules! bad_input {
+    ($($error:ident),*) => {$(
+        impl From<$error> for Failure {
+            fn from(error: $error) -> Self {
+                Self::with_code(INPUT, error)
             }
         }
     )*};
 }
 
-bad_input!(OptionProblem: Options, SizeProblem: Size, ModelProblem: Model, ResumeProblem: Resume);
+bad_input!(OptionProblem, SizeProblem, ModelProblem, ResumeProblem);
 
 impl OptionProblem {
     /// A wrong value of an option.
     pub(crate) fn value(option: &'static str, problem: impl Display) -> Self {
         Self::Value { option, problem: problem.to_string() }
-    }
-}
-
-impl From<TrainingProblem> for Problem {
-    fn from(problem: TrainingProblem) -> Self {
-        Self::Training(problem)
     }
 }
 
@@ -176,8 +177,8 @@ impl From<BackendError> for Failure {
 impl Failure {
     /// A failure of a backend: the message, which ends with the error, and its remedy.
     fn of_backend(error: &BackendError, message: impl ToString) -> Self {
-        let code = if is_input(error) { INPUT } else { DEVICE };
-        Self::with_remedy(code, message, BackendRemedy::of(error))
+        let (code, remedy) = BackendRemedy::of(error);
+        Self::with_remedy(code, message, remedy)
     }
 
     fn with_remedy(code: u8, message: impl ToString, remedy: impl Into<Problem>) -> Self {
@@ -188,52 +189,31 @@ impl Failure {
     }
 }
 
-/// True if other arguments would avoid the error.
-fn is_input(error: &BackendError) -> bool {
-    match error {
-        BackendError::ImageTooLarge { .. }
-        | BackendError::NoAdapter(_)
-        | BackendError::AdapterUnused
-        | BackendError::WithoutGpu
-        | BackendError::TooManyRows { .. }
-        | BackendError::BufferTooLarge { .. }
-        | BackendError::Unsupported(_) => true,
-        BackendError::OutOfMemory { .. }
-        | BackendError::Threads(_)
-        | BackendError::DeviceLost { .. }
-        | BackendError::Device { .. }
-        | BackendError::LoopCut { .. } => false,
-    }
-}
-
 impl BackendRemedy {
-    fn of(error: &BackendError) -> Self {
+    /// The remedy for an error, and the exit code: that of bad input if other arguments would avoid the error.
+    fn of(error: &BackendError) -> (u8, Self) {
         match error {
-            BackendError::OutOfMemory { .. } => Self::LessMemory,
-            BackendError::Threads(_) => Self::FewerThreads,
-            BackendError::ImageTooLarge { .. } => Self::SmallerImages,
-            BackendError::NoAdapter(_) => Self::ListAdapters,
-            BackendError::AdapterUnused => Self::NoAdapterOrGpu,
-            BackendError::WithoutGpu => Self::BuildWithGpu,
-            BackendError::TooManyRows { most, .. } => Self::Budget(*most),
+            BackendError::OutOfMemory { .. } => (DEVICE, Self::LessMemory),
+            BackendError::Threads(_) => (DEVICE, Self::FewerThreads),
+            BackendError::ImageTooLarge { .. } => (INPUT, Self::SmallerImages),
+            BackendError::NoAdapter(_) => (INPUT, Self::ListAdapters),
+            BackendError::AdapterUnused => (INPUT, Self::NoAdapterOrGpu),
+            BackendError::WithoutGpu => (INPUT, Self::BuildWithGpu),
+            BackendError::TooManyRows { most, .. } => (INPUT, Self::Budget(*most)),
             BackendError::BufferTooLarge { fit, .. } => match fit {
-                Fit::TileCap(pairs) => Self::TileCap(*pairs),
-                Fit::Budget(rows) => Self::Budget(*rows),
-                Fit::ImageSize => Self::SmallerImages,
+                Fit::TileCap(pairs) => (INPUT, Self::TileCap(*pairs)),
+                Fit::Budget(rows) => (INPUT, Self::Budget(*rows)),
+                Fit::ImageSize => (INPUT, Self::SmallerImages),
             },
-            BackendError::Unsupported(_) => Self::NativeBackend,
-            BackendError::DeviceLost { .. } => Self::StartAgain,
+            BackendError::Unsupported(_) => (INPUT, Self::NativeBackend),
+            BackendError::DeviceLost { .. } => (DEVICE, Self::StartAgain),
             BackendError::LoopCut { accumulation, .. } if *accumulation != Accumulation::Slots => {
-                Self::SlotsOrOtherDriver
+                (DEVICE, Self::SlotsOrOtherDriver)
             }
-            BackendError::Device { .. } | BackendError::LoopCut { .. } => Self::OtherDriver,
+            BackendError::Device { .. } | BackendError::LoopCut { .. } => {
+                (DEVICE, Self::OtherDriver)
+            }
         }
-    }
-}
-
-impl From<BackendRemedy> for Problem {
-    fn from(remedy: BackendRemedy) -> Self {
-        Self::Backend(remedy)
     }
 }
 
@@ -241,12 +221,6 @@ impl From<FileError> for Failure {
     fn from(error: FileError) -> Self {
         let is_input = matches!(error, FileError::Malformed { .. });
         Self::new(if is_input { INPUT } else { OTHER }, error)
-    }
-}
-
-impl From<TrainRemedy> for Problem {
-    fn from(remedy: TrainRemedy) -> Self {
-        Self::Train(remedy)
     }
 }
 

@@ -4,8 +4,7 @@ use super::ResolvedRun;
 use super::case::{Case, DECODERS, TEST_DECODERS};
 use super::fit::{Fit, IMAGES, PAIRS, RunSize, SizeRequest, fit, min_memory, most_within};
 use super::remedy::remedies;
-use crate::failure::notes::{self, BudgetReason};
-use crate::failure::{DEVICE, Failure, Remedy as Change, SizeProblem};
+use crate::failure::{DEVICE, Failure, Remedy, SizeProblem, notes};
 use crate::process::{MemoryLimit, ProcessMemory};
 use crate::spec::{Budget, ByteCount, ImageCache};
 use densify_core::memory::{Bytes, Ledger};
@@ -88,23 +87,11 @@ impl Size {
     /// The size and the reason for it, for the user.
     pub(super) fn lines(&self, case: &Case<'_>, spelling: Spelling) -> Vec<String> {
         let RunSize { rows, sh_degree, tile_cap, image_cache, .. } = self.setting;
-        let Some((memory, fit)) = &self.solved else {
-            let reason = match case.spec.size.budget {
-                None => BudgetReason::Default,
-                Some(Budget::Auto(_)) => BudgetReason::Automatic,
-                Some(Budget::Rows(_)) => BudgetReason::Given,
-            };
-            return vec![notes::budget(spelling, rows, &reason)];
-        };
-        let memory = *memory;
-        let reason = match case.asked_budget() {
-            Some(given) if fit.by_memory => BudgetReason::LessThanGiven { memory, given },
-            Some(_) => BudgetReason::AsGiven { memory },
-            None if fit.by_memory => BudgetReason::Memory { memory },
-            None => BudgetReason::Device,
-        };
-        let mut lines = vec![notes::budget(spelling, rows, &reason)];
-        let memory = Bytes(memory);
+        let solved = self.solved.as_ref();
+        let limit = solved.map(|(memory, fit)| (*memory, fit.by_memory));
+        let mut lines = vec![notes::budget(spelling, rows, case.spec.size.budget, limit)];
+        let Some((memory, fit)) = solved else { return lines };
+        let memory = Bytes(*memory);
         lines.push(format!(
             "memory   {memory} given: degree {sh_degree}, {} (Gaussian, tile) pairs, images {}",
             grouped(tile_cap),
@@ -176,7 +163,7 @@ impl ResolvedRun<'_> {
             Ok::<_, Failure>(bytes(case, &size)? <= memory)
         };
         let pairs = most_within(size.rows, size.tile_cap, fits)?.unwrap_or(size.rows);
-        let changes = [Change::NoImages, Change::TileCap(pairs)];
+        let changes = [Remedy::NoImages, Remedy::TileCap(pairs)];
         let remedies = remedies(case, case.spec, &changes, |case| {
             Ok(bytes(case, &Size::as_given(case)?.setting)? <= memory)
         });
@@ -210,18 +197,18 @@ impl ResolvedRun<'_> {
         let mut found = Vec::new();
         if !is_resumed && case.inputs.device.kind() == BackendKind::Cpu {
             // On a GPU it would limit the device's memory.
-            let less = Change::Memory(most / MIB);
+            let less = Remedy::Memory(most / MIB);
             base.size.memory = Some(ByteCount(most / MIB * MIB));
             let fits = case.with(&base).and_then(|case| on_host(&case)).unwrap_or(false);
             found = if fits {
                 vec![vec![less]]
             } else {
-                let mut found = remedies(case, &base, &Change::NEW, on_host);
+                let mut found = remedies(case, &base, &Remedy::NEW, on_host);
                 found.iter_mut().for_each(|changes| changes.insert(0, less));
                 found
             };
         } else if !is_resumed {
-            found = remedies(case, &base, &Change::NEW, on_host);
+            found = remedies(case, &base, &Remedy::NEW, on_host);
         }
         let needed = ledger.on_host();
         let problem =
@@ -304,12 +291,12 @@ fn too_little(case: &Case<'_>, request: &SizeRequest) -> Result<Failure, Failure
     let Some(least) = min_memory(request, MIB, |setting| bytes(case, setting))? else {
         return Ok(SizeProblem::NoSize { memory }.into());
     };
-    let mut remedies = remedies(case, case.spec, &Change::NEW, |case| Ok(solve(case)?.is_some()));
+    let mut remedies = remedies(case, case.spec, &Remedy::NEW, |case| Ok(solve(case)?.is_some()));
     let fewer = SizeRequest { least_rows: case.rows_for(1), ..request.clone() };
     if let Some(fewer) = fit(&fewer, |setting| bytes(case, setting))? {
-        remedies.push(vec![Change::Budget(fewer.setting.rows)]);
+        remedies.push(vec![Remedy::Budget(fewer.setting.rows)]);
     }
     let needed = least / MIB;
-    remedies.push(vec![Change::Memory(needed)]);
+    remedies.push(vec![Remedy::Memory(needed)]);
     Ok(SizeProblem::NoModelFits { memory, rows, sh_degree: degree, needed, remedies }.into())
 }
