@@ -27,8 +27,10 @@ pub struct RunConfig {
     pub spec: RunSpec,
     /// The findings that decided them.
     pub resolved: Findings,
-    pub(crate) budget: usize,
-    pub(crate) sh_degree: u8,
+    /// The most rows there may ever be.
+    pub budget: usize,
+    /// The highest spherical-harmonic degree.
+    pub sh_degree: u8,
 }
 
 /// Facts that were found when a run was prepared.
@@ -215,16 +217,6 @@ impl RunConfig {
             .parse()
             .map_err(|error: toml::de::Error| malformed(error.to_string().trim().into()))?;
         Self::from_table(table, &path.display().to_string())
-    }
-
-    /// The most rows there may ever be.
-    pub fn budget(&self) -> usize {
-        self.budget
-    }
-
-    /// The highest spherical-harmonic degree.
-    pub fn sh_degree(&self) -> u8 {
-        self.sh_degree
     }
 
     /// The step at which the run ends.

@@ -27,7 +27,7 @@ pub(crate) struct Exposure {
     /// Standard deviation of the exposures in EXIF `[stops]`.
     reported: f64,
     /// Problems with EXIF, for the user.
-    notes: Vec<String>,
+    pub(super) notes: Vec<String>,
 }
 
 impl Exposure {
@@ -94,10 +94,6 @@ impl Exposure {
             ));
         }
         found
-    }
-
-    pub(super) fn notes(&self) -> &[String] {
-        &self.notes
     }
 
     /// The exposures that the run begins with, if they are learned.
@@ -192,7 +188,7 @@ mod tests {
             let diagonal = begun.transform(view).matrix[1][1];
             assert!((diagonal / gain - 1.0).abs() < 1e-5, "{view}: {diagonal} {gain}");
         }
-        let [note] = found.notes() else { panic!("{:?}", found.notes()) };
+        let [note] = &found.notes[..] else { panic!("{:?}", found.notes) };
         assert!(
             note.contains("1 photographs have nonsense") && note.contains("c.jpg says"),
             "{note}"
@@ -204,7 +200,7 @@ mod tests {
             found.line(Spelling::Terminal).as_deref(),
             Some("exposure on, from one for all views")
         );
-        assert!(found.gains.is_empty() && found.notes().is_empty());
+        assert!(found.gains.is_empty() && found.notes.is_empty());
     }
 
     #[test]

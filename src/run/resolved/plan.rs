@@ -41,7 +41,7 @@ pub struct Alternatives {
 /// As preparing the run.
 pub fn plan(spec: &RunSpec, host: Host<'_>) -> Result<Plan, Failure> {
     let ResolvedRun { case, size, mut reasons, .. } = ResolvedRun::anew(spec, host)?;
-    let ledger = case.ledger(&size, &case.needs(size.rows)?);
+    let ledger = case.ledger_of(&size)?;
     reasons.push(case.promise(&ledger, host.observer.spelling()));
     let limited = case.inputs.device.limited_bytes(&ledger);
     let memory = case.memory().unwrap_or(limited.next_multiple_of(MIB));

@@ -27,7 +27,7 @@ fn described(options: &[(&str, toml::Value)]) -> RunSpec {
 /// Rows of a run, and its bytes that `--memory` limits.
 fn sized(case: &Case<'_>) -> (usize, u64) {
     let setting = size::solve(case).expect("it is solved").expect("it fits").setting;
-    let ledger = case.ledger(&setting, &case.needs(setting.rows).expect("needs"));
+    let ledger = case.ledger_of(&setting).expect("a ledger");
     (setting.rows, case.inputs.device.limited_bytes(&ledger))
 }
 
@@ -92,7 +92,7 @@ fn plain_ledger(made: &Made, exposure: &str) -> (Vec<(Section, String, u64)>, u6
     let host = Host { process: ProcessMemory::UNKNOWN, ..Host::default() };
     let case = Case::anew(&spec, host).expect("a scene");
     let setting = size::solve(&case).expect("it is solved").expect("it fits").setting;
-    let ledger = case.ledger(&setting, &case.needs(setting.rows).expect("needs"));
+    let ledger = case.ledger_of(&setting).expect("a ledger");
     let total = ledger.total();
     (ledger.lines.into_iter().map(|line| (line.section, line.what, line.bytes)).collect(), total)
 }

@@ -14,7 +14,6 @@ pub use requirements::{LeftOut, Reductions, Requirements};
 pub use resume::{Resumed, start};
 pub use run::Run;
 
-use std::collections::BTreeSet;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -58,14 +57,6 @@ struct Session<'a> {
     checkpoint: Option<u32>,
 }
 
-/// The steps after which models are saved, measured or kept.
-struct Duties {
-    saves: BTreeSet<u32>,
-    tests: BTreeSet<u32>,
-    checkpoint_every: u32,
-    last: u32,
-}
-
 /// The treatment of a run that is in the output folder already.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Occupied {
@@ -79,21 +70,14 @@ pub enum Occupied {
 
 /// Trains to the end and writes all files of the run; returns the folder.
 fn train(run: Run, occupied: Occupied, observer: &dyn Observer) -> Result<PathBuf, Failure> {
-    let last = run.last;
     // Nothing of a run that goes on is removed, even if it is only the description.
     let has_begun = run.session.is_some() || run.output.join(CONFIG_FILE).exists();
     let resumes = occupied == Occupied::Resume && has_begun;
     let folder = match occupied {
         Occupied::Resume => RunFolder::resume(&run.output, run.session.is_none())?,
-        Occupied::Refuse => RunFolder::create(&run.output, false)?,
-        Occupied::Replace => RunFolder::create(&run.output, true)?,
-    };
-    let output = &run.spec.output;
-    let duties = Duties {
-        saves: output.save_iterations.iter().copied().chain([last]).collect(),
-        tests: output.test_iterations.iter().copied().chain([last]).collect(),
-        checkpoint_every: output.checkpoint_every,
-        last,
+        Occupied::Refuse | Occupied::Replace => {
+            RunFolder::create(&run.output, occupied == Occupied::Replace)?
+        }
     };
     let mut session = match Session::start(run, &folder, observer) {
         Ok(session) => session,
@@ -104,7 +88,7 @@ fn train(run: Run, occupied: Occupied, observer: &dyn Observer) -> Result<PathBu
             return Err(error);
         }
     };
-    let done = session.go(&duties);
+    let done = session.go();
     let guard = folder.guard();
     let finished = done
         .and_then(|()| guard.check().map_err(Failure::from))
@@ -182,12 +166,12 @@ impl<'a> Session<'a> {
     }
 
     /// Does all remaining steps.
-    fn go(&mut self, duties: &Duties) -> Result<(), Failure> {
+    fn go(&mut self) -> Result<(), Failure> {
         let done = self.run.trainer.steps_done();
-        let (last, budget) = (duties.last, self.run.config.budget());
+        let (last, budget) = (self.run.last, self.run.config.budget);
         if done > 0 {
-            // A run may have been stopped before the duties of its last step.
-            self.after(done, duties, true)?;
+            // A run may have been stopped before its last step was saved, measured and kept.
+            self.after(done, true)?;
         }
         self.observer.begin(done, last, budget);
         let stepped = (done + 1..=last).try_for_each(|step| {
@@ -197,7 +181,7 @@ impl<'a> Session<'a> {
             }
             let report = self.step()?;
             self.observer.step(step, report.output.loss, report.rows);
-            self.after(step, duties, false)
+            self.after(step, false)
         });
         self.observer.end();
         stepped.and_then(|()| self.check_drawn())
@@ -237,18 +221,21 @@ impl<'a> Session<'a> {
 
     /// Saves and measures the model and writes a checkpoint if they are due after `step`; in a resumed run, only those
     /// that do not exist yet.
-    fn after(&mut self, step: u32, duties: &Duties, resumed: bool) -> Result<(), Failure> {
-        let every = duties.checkpoint_every;
-        let due = every > 0 && (step.is_multiple_of(every) || step == duties.last);
-        if due || duties.saves.contains(&step) || duties.tests.contains(&step) {
+    fn after(&mut self, step: u32, resumed: bool) -> Result<(), Failure> {
+        let (output, is_last) = (&self.run.spec.output, step == self.run.last);
+        let every = output.checkpoint_every;
+        let due = every > 0 && (step.is_multiple_of(every) || is_last);
+        let [saves, tests] = [&output.save_iterations, &output.test_iterations]
+            .map(|steps| is_last || steps.contains(&step));
+        if due || saves || tests {
             self.guard.check()?;
         }
         let there = |path: PathBuf| resumed && path.is_file();
-        if duties.saves.contains(&step) && !there(model_path(&self.folder, step)) {
+        if saves && !there(model_path(&self.folder, step)) {
             self.save(step)?;
         }
-        if duties.tests.contains(&step) && !(resumed && self.totals.tested.contains_key(&step)) {
-            self.test(step, step == duties.last)?;
+        if tests && !(resumed && self.totals.tested.contains_key(&step)) {
+            self.test(step, is_last)?;
         }
         if due && !there(checkpoint_path(&self.folder, step)) {
             self.keep_or_say();
@@ -266,8 +253,8 @@ impl<'a> Session<'a> {
         let trainer = self.run.trainer.state();
         let header = Header {
             densify: self.run.config.densify.clone(),
-            budget: self.run.config.budget(),
-            sh_degree: self.run.config.sh_degree(),
+            budget: self.run.config.budget,
+            sh_degree: self.run.config.sh_degree,
             config: self.config.clone(),
             dataset: self.run.fingerprint.clone(),
             trainer: trainer.map_err(|source| CheckpointError::Policy { source })?,
@@ -369,7 +356,7 @@ impl<'a> Session<'a> {
         if test.count() == 0 {
             return Ok(());
         }
-        let (background, degree) = (spec.data.background.fixed(), config.sh_degree());
+        let (background, degree) = (spec.data.background.fixed(), config.sh_degree);
         let observer = self.observer;
         let fits_exposure = config.resolved.has_exposures;
         let comparison = Comparison { lpips: None, fits_exposure };

@@ -30,7 +30,7 @@ impl Session<'_> {
             iterations: state.step,
             rows: trainer.rows(),
             peak_rows: state.peak_rows,
-            budget: config.budget(),
+            budget: config.budget,
             extra_forwards: state.extra_forwards,
             peak_bytes: self.totals.peak_bytes(self.run.process),
             memory: spec.size.memory.map(|bytes| bytes.0),
@@ -74,7 +74,7 @@ impl Session<'_> {
             "rows     {}, at most {} of {}",
             grouped(trainer.rows()),
             grouped(trainer.progress().peak_rows),
-            grouped(config.budget())
+            grouped(config.budget)
         ));
         let promised = Bytes(ledger.total());
         if let Some(peak) = self.totals.peak_bytes(self.run.process) {
