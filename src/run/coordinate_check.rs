@@ -182,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_elsewhere_is_refused_and_what_may_be_is_named() {
+    fn other_coordinates_are_refused_and_doubtful_ones_noted() {
         use std::sync::Mutex;
 
         #[derive(Default)]

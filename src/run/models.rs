@@ -122,7 +122,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn paths_are_called_by_as_little_as_tells_them_apart() {
+    fn names_have_as_many_parts_as_tell_them_apart() {
         let names = |paths: &[&str]| names_of(&paths.iter().map(Path::new).collect::<Vec<_>>());
         assert_eq!(names(&["/home/me/out/a", "/home/me/out/b"]), ["a", "b"]);
         assert_eq!(names(&["/x/one/run", "/x/two/run", "/x/b"]), ["one/run", "two/run", "b"]);

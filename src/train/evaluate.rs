@@ -114,7 +114,7 @@ impl Mean {
 pub struct Comparison<'a> {
     /// Network for LPIPS, which is measured only with one.
     pub lpips: Option<&'a Lpips>,
-    /// Whether renderings are also compared with the exposure that fits the photograph best.
+    /// Renderings are also compared with the exposure that fits the photograph best.
     pub fits_exposure: bool,
 }
 

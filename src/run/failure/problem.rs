@@ -133,8 +133,8 @@ pub enum TrainingProblem {
     CheckpointFailed { error: String },
     /// After an error of the policy, the model before it.
     ModelSaved { saved: Result<PathBuf, String> },
-    /// The run is complete, only measuring it has failed.
-    CompleteAllTheSame { run: PathBuf },
+    /// Measuring failed; the run itself is complete.
+    OnlyMeasuringFailed { run: PathBuf },
     /// The files of a run that failed, and the checkpoint to go on from.
     LeftBehind { run: PathBuf, checkpoint: Option<PathBuf>, scene: PathBuf },
 }
@@ -158,7 +158,7 @@ pub enum Problem {
     Train(TrainRemedy),
 }
 
-/// What helps against an error of training: of its folder, its first Gaussians or its views.
+/// The remedy for an error of training: of its folder, its first Gaussians or its views.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TrainRemedy {
     /// Another folder, or replacing the run in this one.
@@ -177,7 +177,7 @@ pub enum TrainRemedy {
     MoreViews,
 }
 
-/// What helps against an error of a backend.
+/// The remedy for an error of a backend.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum BackendRemedy {
     /// A smaller model, a lower degree or shorter tile lists.

@@ -352,7 +352,7 @@ impl TrainingProblem {
             Self::ModelSaved { saved: Err(error) } => {
                 format!("the model could not be saved: {error}")
             }
-            Self::CompleteAllTheSame { run } => {
+            Self::OnlyMeasuringFailed { run } => {
                 format!("the run is complete in {} all the same", run.display())
             }
             Self::LeftBehind { run, checkpoint: None, .. } => {

@@ -204,7 +204,7 @@ mod tests {
     }
 
     #[test]
-    fn exif_alone_switches_nothing_on_but_is_told_of() {
+    fn exif_alone_switches_nothing_on_but_is_reported() {
         let found = decided(ExposureChoice::Auto, &two_stops_apart());
         assert!(!found.is_on && found.gains.is_empty());
         let line = found.line(Spelling::Terminal).unwrap();

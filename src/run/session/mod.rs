@@ -81,14 +81,14 @@ fn train(run: Run, occupied: Occupied, observer: &dyn Observer) -> Result<PathBu
     };
     let mut session = match Session::start(run, &folder, observer) {
         Ok(session) => session,
-        // If nothing can be written, nothing is lost.
+        // What an earlier session has written must not be removed.
         Err(error) if resumes => return Err(error),
         Err(error) => {
             folder.discard();
             return Err(error);
         }
     };
-    let done = session.go();
+    let done = session.run_steps();
     let guard = folder.guard();
     let finished = done
         .and_then(|()| guard.check().map_err(Failure::from))
@@ -98,7 +98,7 @@ fn train(run: Run, occupied: Occupied, observer: &dyn Observer) -> Result<PathBu
             let path = folder.finish()?;
             session.report(&path);
             measure(session, &path).map_err(|failure| {
-                failure.with(TrainingProblem::CompleteAllTheSame { run: path.clone() })
+                failure.with(TrainingProblem::OnlyMeasuringFailed { run: path.clone() })
             })?;
             Ok(path)
         }
@@ -166,7 +166,7 @@ impl<'a> Session<'a> {
     }
 
     /// Does all remaining steps.
-    fn go(&mut self) -> Result<(), Failure> {
+    fn run_steps(&mut self) -> Result<(), Failure> {
         let done = self.run.trainer.steps_done();
         let (last, budget) = (self.run.last, self.run.config.budget);
         if done > 0 {
@@ -175,9 +175,9 @@ impl<'a> Session<'a> {
         }
         self.observer.begin(done, last, budget);
         let stepped = (done + 1..=last).try_for_each(|step| {
-            self.rest();
+            self.consult_observer();
             if let Some(interrupt) = self.observer.interrupt() {
-                return Err(self.interrupted(interrupt));
+                return Err(self.stopped_by(interrupt));
             }
             let report = self.step()?;
             self.observer.step(step, report.output.loss, report.rows);
@@ -188,11 +188,11 @@ impl<'a> Session<'a> {
     }
 
     /// Lets the observer render the model, and writes the checkpoints that it asks for.
-    fn rest(&mut self) {
+    fn consult_observer(&mut self) {
         loop {
             let (model, rows) = self.run.trainer.backend_and_history();
             match self.observer.between(model, rows) {
-                Between::Checkpoint => self.keep_or_say(),
+                Between::Checkpoint => self.try_checkpoint(),
                 Between::Step => return,
             }
         }
@@ -200,9 +200,9 @@ impl<'a> Session<'a> {
 
     /// Writes a checkpoint. If it cannot be written, training goes on: the run is worth more, and the previous checkpoint
     /// is still there.
-    fn keep_or_say(&mut self) {
+    fn try_checkpoint(&mut self) {
         let step = self.run.trainer.steps_done();
-        let trouble = self.keep().err().map(|error| {
+        let trouble = self.write_checkpoint().err().map(|error| {
             tracing::error!(step, "the checkpoint could not be written, training goes on: {error}");
             format!("the checkpoint of step {step} could not be written: {error}")
         });
@@ -230,21 +230,21 @@ impl<'a> Session<'a> {
         if due || saves || tests {
             self.guard.check()?;
         }
-        let there = |path: PathBuf| resumed && path.is_file();
-        if saves && !there(model_path(&self.folder, step)) {
+        let exists = |path: PathBuf| resumed && path.is_file();
+        if saves && !exists(model_path(&self.folder, step)) {
             self.save(step)?;
         }
         if tests && !(resumed && self.totals.tested.contains_key(&step)) {
             self.test(step, is_last)?;
         }
-        if due && !there(checkpoint_path(&self.folder, step)) {
-            self.keep_or_say();
+        if due && !exists(checkpoint_path(&self.folder, step)) {
+            self.try_checkpoint();
         }
         Ok(())
     }
 
     /// Writes a checkpoint.
-    fn keep(&mut self) -> Result<(), CheckpointError> {
+    fn write_checkpoint(&mut self) -> Result<(), CheckpointError> {
         let step = self.run.trainer.steps_done();
         if self.checkpoint == Some(step) {
             return Ok(());
@@ -267,15 +267,15 @@ impl<'a> Session<'a> {
     }
 
     /// Ends the run so that it can be resumed later.
-    fn interrupted(&mut self, Interrupt { name, exit_code }: Interrupt) -> Failure {
+    fn stopped_by(&mut self, Interrupt { name, exit_code }: Interrupt) -> Failure {
         let step = self.run.trainer.steps_done();
         let stopped = TrainingProblem::Stopped { by: name, step: Some(step) };
-        self.kept(Failure::with_code(exit_code, stopped))
+        self.with_checkpoint(Failure::with_code(exit_code, stopped))
     }
 
     /// Writes a checkpoint of a run that ends with `failure`.
-    fn kept(&mut self, failure: Failure) -> Failure {
-        match self.keep() {
+    fn with_checkpoint(&mut self, failure: Failure) -> Failure {
+        match self.write_checkpoint() {
             Ok(()) => failure,
             Err(error) => {
                 failure.with(TrainingProblem::CheckpointFailed { error: error.to_string() })
@@ -303,12 +303,12 @@ impl<'a> Session<'a> {
                 let saved = self.save(step).map_err(|failure| failure.to_string());
                 Err(Failure::from(error).with(TrainingProblem::ModelSaved { saved }))
             }
-            Err(error @ TrainError::NonFinite { .. }) => Err(self.kept(error.into())),
+            Err(error @ TrainError::NonFinite { .. }) => Err(self.with_checkpoint(error.into())),
             // The photograph could be read before. In the first epoch little is lost.
             Err(error @ TrainError::View { step, .. })
                 if step > self.run.trainer.steps_done() && step as usize > train_views =>
             {
-                Err(self.kept(error.into()))
+                Err(self.with_checkpoint(error.into()))
             }
             Err(error) => Err(error.into()),
         }
@@ -365,7 +365,7 @@ impl<'a> Session<'a> {
         });
         let scores = match (scores, self.observer.interrupt()) {
             (Err(EvaluateError::Stopped), Some(interrupt)) => {
-                return Err(self.interrupted(interrupt));
+                return Err(self.stopped_by(interrupt));
             }
             (scores, _) => scores?,
         };

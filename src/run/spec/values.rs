@@ -100,7 +100,7 @@ pub enum InitChoice {
 /// The word before an optional number: `auto`, `auto:50k`.
 const AUTO: &str = "auto";
 
-/// The text after `auto:`, or `None` inside for `auto` alone; outside `None` for other texts.
+/// The text after `auto:`: `Some(None)` for `auto` alone, `None` for other texts.
 fn after_auto(text: &str) -> Option<Option<&str>> {
     match text.strip_prefix(AUTO)? {
         "" => Some(None),

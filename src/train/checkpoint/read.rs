@@ -167,10 +167,10 @@ impl Checkpoint {
     /// # Errors
     /// [`CheckpointError::Invalid`] if the checkpoint has no ages, [`CheckpointError::File`].
     pub fn ages(&mut self) -> Result<Vec<u32>, CheckpointError> {
-        let missing = || self.invalid("it has no ages of rows");
-        let is_ages = |(_, record): &(u64, Record)| Tensor::has_ages(&record.name);
-        let place = self.places.iter().position(is_ages).ok_or_else(missing)?;
-        self.tensor(place)?.ages().ok_or_else(|| self.invalid("it has no ages of rows"))
+        let place = self.places.iter().position(|(_, record)| Tensor::has_ages(&record.name));
+        let tensor = place.map(|place| self.tensor(place)).transpose()?;
+        let ages = tensor.and_then(|tensor| tensor.ages());
+        ages.ok_or_else(|| self.invalid("it has no ages of rows"))
     }
 
     fn invalid(&self, problem: impl ToString) -> CheckpointError {

@@ -160,7 +160,7 @@ fn mean(views: &[ViewExposure]) -> [f64; PARAMETERS] {
     sums.map(|sum| sum / views.len().max(1) as f64)
 }
 
-/// Whether a parameter is learned: without mixing of channels, only the diagonal and the offsets are.
+/// True if a parameter is learned: without mixing of channels, only the diagonal and the offsets are.
 fn is_learned(model: ExposureModel, number: usize) -> bool {
     model == ExposureModel::Matrix || number >= 9 || number.is_multiple_of(4)
 }

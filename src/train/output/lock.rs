@@ -95,7 +95,7 @@ fn in_use(folder: &Path, mut file: File) -> FolderError {
     FolderError::InUse { folder: folder.to_owned(), process }
 }
 
-/// Whether an open file is the file at a path.
+/// True if an open file is the file at a path.
 #[cfg(unix)]
 fn is_at(file: &File, path: &Path) -> bool {
     use std::os::unix::fs::MetadataExt;

@@ -57,7 +57,7 @@ pub fn saved_iterations(run: &Path) -> Result<Vec<u32>, FolderError> {
     Ok(saved)
 }
 
-/// Whether a process is training in a folder.
+/// True if a process is training in a folder.
 pub fn is_in_use(run: &Path) -> bool {
     FolderLock::check(run).is_err()
 }
@@ -69,7 +69,7 @@ pub fn is_in_use(run: &Path) -> bool {
 #[derive(Debug)]
 pub struct RunFolder {
     target: PathBuf,
-    /// Whether this run created the folder.
+    /// This run created the folder.
     is_new: bool,
     /// Suffix of the hidden folder of a run that replaces another.
     staged: Option<String>,
