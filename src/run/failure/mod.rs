@@ -6,7 +6,6 @@ mod problem;
 mod words;
 
 use std::fmt::Display;
-use std::path::Path;
 
 pub use problem::{
     BackendRemedy, Difference, ModelProblem, OptionProblem, Problem, Remedy, ResumeProblem,
@@ -82,12 +81,6 @@ impl Failure {
     #[must_use]
     pub fn within_option(self, option: &'static str, value: Option<String>) -> Self {
         self.after([Part::Option(option, value), Part::Text(": ".to_owned())])
-    }
-
-    /// The same failure, in the file of options.
-    #[must_use]
-    pub(crate) fn within_config_file(self, path: &Path) -> Self {
-        self.within_option("config", Some(path.display().to_string()))
     }
 
     fn after<const COUNT: usize>(mut self, parts: [Part; COUNT]) -> Self {

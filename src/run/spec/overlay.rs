@@ -59,7 +59,7 @@ impl Partial {
             table.retain(|key, _| !FOUND_OUT.contains(&key));
             Self::checked(table)
         };
-        read().map_err(|failure| failure.within_config_file(path))
+        read().map_err(|failure| failure.within_option("config", Some(path.display().to_string())))
     }
 
     /// The options of a description for which `is_given` returns true.

@@ -7,7 +7,7 @@ use densify_policies::policy::{PolicyError, SceneInfo, Snapshot};
 use densify_policies::rng::PolicyRng;
 
 use super::policy_views::call_policy;
-use super::{EditEvent, TrainError, Trainer};
+use super::{AtStep, EditEvent, TrainError, Trainer};
 use densify_core::budget::RowBudget;
 use densify_data::views::ViewSource;
 
@@ -17,8 +17,7 @@ impl<V: ViewSource> Trainer<V> {
         let start = Instant::now();
         self.show_aux_views(step)?;
         self.state.views_time = self.state.views_time.saturating_add(start.elapsed());
-        let signals = self.backend.take_signals(self.needs.signals);
-        let signals = signals.map_err(|e| self.backend_error(step, e))?;
+        let signals = self.backend.take_signals(self.needs.signals).at(step)?;
         let signals = signals.without_first(self.row_budget().frozen);
         let mut plan = self.new_plan().allowing(&self.needs);
         let scene = SceneInfo { budget: plan.budget(), ..self.scene.clone() };
@@ -59,9 +58,7 @@ impl<V: ViewSource> Trainer<V> {
         ops = ops.after_frozen(self.row_budget().frozen);
         // The backend checks the budget, which the trainer's own limit may be below.
         ops.budget = self.backend.budget();
-        self.backend
-            .apply(&ops, self.options.seed, step)
-            .map_err(|e| self.backend_error(step, e))?;
+        self.backend.apply(&ops, self.options.seed, step).at(step)?;
         if let Some(history) = &mut self.history {
             history.record(&ops, step);
         }

@@ -72,3 +72,14 @@ pub enum TrainError {
         source: BackendError,
     },
 }
+
+/// Names the step in which a backend failed.
+pub(super) trait AtStep<T> {
+    fn at(self, step: u32) -> Result<T, TrainError>;
+}
+
+impl<T> AtStep<T> for Result<T, BackendError> {
+    fn at(self, step: u32) -> Result<T, TrainError> {
+        self.map_err(|source| TrainError::Backend { step, source })
+    }
+}

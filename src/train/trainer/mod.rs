@@ -29,7 +29,8 @@ use crate::schedule;
 pub use auto_budget::{AutoBudget, Interval, MIN_GAIN, Removal, growth_signals};
 use densify_core::image::SharedImage;
 use densify_data::views::ViewSource;
-use densify_render::{Backend, BackendError, StepInput};
+use densify_render::{Backend, StepInput};
+use error::AtStep;
 pub use error::TrainError;
 use near_duplicates::distinct_views;
 use nonfinite::AUDIT_EVERY;
@@ -161,7 +162,7 @@ impl<V: ViewSource> Trainer<V> {
             cadence,
             seed,
         };
-        let output = self.backend.train_step(&input).map_err(|e| self.backend_error(step, e))?;
+        let output = self.backend.train_step(&input).at(step)?;
         self.state.step = step;
         if !output.loss.is_finite() {
             let view = self.views.name(view).to_owned();
@@ -170,8 +171,7 @@ impl<V: ViewSource> Trainer<V> {
         if let Some((exposures, gradient)) = self.state.exposures.as_mut().zip(output.exposure) {
             exposures.step(view, &gradient, f64::from(step) / f64::from(iterations));
         }
-        let is_due =
-            call_policy(|| self.policy.is_due(step)).map_err(|e| self.policy_error(step, e))?;
+        let is_due = self.ask_policy(step, |policy| policy.is_due(step))?;
         let mut events = Vec::new();
         if is_due || step.is_multiple_of(AUDIT_EVERY) || step == iterations {
             events.extend(self.remove_nonfinite(step)?);
@@ -201,8 +201,7 @@ impl<V: ViewSource> Trainer<V> {
 
     /// The optimiser's cadence at this step, according to the policy.
     fn cadence(&self, step: u32) -> Result<Cadence, TrainError> {
-        let cadence =
-            call_policy(|| self.policy.cadence(step)).map_err(|e| self.policy_error(step, e))?;
+        let cadence = self.ask_policy(step, |policy| policy.cadence(step))?;
         let declared = self.needs.cadence;
         if cadence.is_within(declared) {
             return Ok(cadence);
@@ -214,11 +213,21 @@ impl<V: ViewSource> Trainer<V> {
     /// The policy's terms of the loss and noise of the means at this step.
     fn terms(&self, step: u32) -> Result<(LossTerms, Option<NoiseTerm>), TrainError> {
         let Needs { loss_terms, noise, .. } = self.needs;
-        let both = || (self.policy.loss_terms(step, loss_terms), self.policy.noise(step, noise));
-        let (terms, noise) = call_policy(both).map_err(|e| self.policy_error(step, e))?;
+        let (terms, noise) = self.ask_policy(step, |policy| {
+            (policy.loss_terms(step, loss_terms), policy.noise(step, noise))
+        })?;
         let checked = terms.check().and_then(|()| noise.map_or(Ok(()), |noise| noise.check()));
         checked.map_err(|error| self.policy_error(step, PolicyError::Other(error)))?;
         Ok((terms, noise))
+    }
+
+    /// Asks the policy a question that cannot fail, except by a panic.
+    fn ask_policy<T>(
+        &self,
+        step: u32,
+        question: impl FnOnce(&dyn DensityPolicy) -> T,
+    ) -> Result<T, TrainError> {
+        call_policy(|| question(&*self.policy)).map_err(|error| self.policy_error(step, error))
     }
 
     fn policy_error(&self, step: u32, source: PolicyError) -> TrainError {
@@ -251,10 +260,6 @@ impl<V: ViewSource> Trainer<V> {
     fn sh_degree(&self, step: u32) -> u8 {
         let TrainOptions { iterations, sh_degree, has_all_bands, .. } = self.options;
         if has_all_bands { sh_degree } else { schedule::sh_degree(step, iterations, sh_degree) }
-    }
-
-    fn backend_error(&self, step: u32, source: BackendError) -> TrainError {
-        TrainError::Backend { step, source }
     }
 }
 

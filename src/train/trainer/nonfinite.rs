@@ -1,6 +1,6 @@
 //! Removes rows with non-finite values; many of them end the run.
 
-use super::{EditEvent, OnNan, TrainError, Trainer};
+use super::{AtStep, EditEvent, OnNan, TrainError, Trainer};
 use densify_data::views::ViewSource;
 
 /// Number of steps between audits, in addition to those before the policy's edits.
@@ -14,7 +14,7 @@ const MAX_NAMED: usize = 10;
 impl<V: ViewSource> Trainer<V> {
     /// Removes the rows that have non-finite values after `step`, if there are any.
     pub(super) fn remove_nonfinite(&mut self, step: u32) -> Result<Option<EditEvent>, TrainError> {
-        let unsound = self.backend.audit().map_err(|e| self.backend_error(step, e))?;
+        let unsound = self.backend.audit().at(step)?;
         let Some(first) = unsound.first() else {
             return Ok(None);
         };

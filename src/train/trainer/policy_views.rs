@@ -5,7 +5,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use densify_policies::policy::{AuxView, PolicyError};
 
-use super::{TrainError, Trainer};
+use super::{AtStep, TrainError, Trainer};
 use densify_data::views::ViewSource;
 use densify_render::AuxInput;
 
@@ -13,8 +13,7 @@ impl<V: ViewSource> Trainer<V> {
     /// Renders the auxiliary views for the policy's edit after `step`, one by one.
     pub(super) fn show_aux_views(&mut self, step: u32) -> Result<(), TrainError> {
         let (rows, budget) = self.trained_rows_and_budget();
-        let count = call_policy(|| self.policy.aux_views(step, rows, budget));
-        let count = count.map_err(|e| self.policy_error(step, e))? as usize;
+        let count = self.ask_policy(step, |policy| policy.aux_views(step, rows, budget))? as usize;
         let Some(request) = self.needs.aux.clone().filter(|_| count > 0) else {
             return Ok(());
         };
@@ -34,7 +33,7 @@ impl<V: ViewSource> Trainer<V> {
                 sh_degree: degree,
                 request: &request,
             });
-            let mut measured = measured.map_err(|e| self.backend_error(step, e))?;
+            let mut measured = measured.at(step)?;
             for (_, column) in &mut measured.columns {
                 column.drain(..frozen);
             }

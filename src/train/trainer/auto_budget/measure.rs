@@ -4,7 +4,7 @@ use densify_policies::policy::Signal;
 
 use super::probe_views::mean;
 use super::{HIDDEN_LOGIT, MAX_TENTHS, Removal, allowed_loss, growth_signals, interval_steps};
-use crate::trainer::{EditEvent, TrainError, Trainer};
+use crate::trainer::{AtStep, EditEvent, TrainError, Trainer};
 use densify_core::gaussians::ModelArray;
 use densify_core::pieces::pieces;
 use densify_data::views::ViewSource;
@@ -66,8 +66,7 @@ impl<V: ViewSource> Trainer<V> {
     /// The rows to remove, and the change of the probe views' PSNR without them, relative to `psnr` with all rows `[dB]`; if
     /// none can be removed, the change without a tenth of them.
     fn least_important(&mut self, step: u32, psnr: f64) -> Result<(Vec<u32>, f64), TrainError> {
-        let signals =
-            self.backend.take_signals(growth_signals()).map_err(|e| self.backend_error(step, e))?;
+        let signals = self.backend.take_signals(growth_signals()).at(step)?;
         let weights = signals.get(Signal::WeightMax).unwrap_or_default();
         let mut rows: Vec<u32> = (0..weights.len() as u32).collect();
         rows.sort_by(|&a, &b| weights[a as usize].total_cmp(&weights[b as usize]));
@@ -112,8 +111,7 @@ impl<V: ViewSource> Trainer<V> {
     fn opacity_logits(&self, step: u32) -> Result<Vec<f32>, TrainError> {
         let mut logits = Vec::with_capacity(self.backend.rows());
         for rows in pieces(self.backend.rows()) {
-            let piece = self.backend.download_array(ModelArray::OpacityLogits, rows);
-            logits.extend(piece.map_err(|e| self.backend_error(step, e))?);
+            logits.extend(self.backend.download_array(ModelArray::OpacityLogits, rows).at(step)?);
         }
         Ok(logits)
     }
@@ -121,8 +119,7 @@ impl<V: ViewSource> Trainer<V> {
     fn set_opacity_logits(&mut self, step: u32, logits: &[f32]) -> Result<(), TrainError> {
         for rows in pieces(logits.len()) {
             let piece = &logits[rows.clone()];
-            let done = self.backend.upload_array(ModelArray::OpacityLogits, rows, piece);
-            done.map_err(|e| self.backend_error(step, e))?;
+            self.backend.upload_array(ModelArray::OpacityLogits, rows, piece).at(step)?;
         }
         Ok(())
     }

@@ -19,8 +19,8 @@ use densify_core::image::{Image8, SharedImage};
 use densify_core::memory::Ledger;
 use densify_data::views::ViewError;
 use densify_render::{
-    Attribute, AuxInput, AuxOutput, NonFinite, NumberKind, Rendering, StateArray, StateError,
-    StepOutput, Tensor,
+    Attribute, AuxInput, AuxOutput, BackendError, NonFinite, NumberKind, Rendering, StateArray,
+    StateError, StepOutput, Tensor,
 };
 
 mod edits;
