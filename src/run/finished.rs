@@ -100,7 +100,7 @@ pub struct Opened {
     pub backend: Box<dyn Backend>,
 }
 
-/// Adds a remedy to a failure if the dataset of a run is no longer at `path`, which the user did not name.
+/// Adds a remedy to a failure if the dataset of a run is no longer at `path`, a path that the user did not name.
 pub fn or_moved(failure: Failure, path: &Path) -> Failure {
     if path.exists() || builtin::name(path).is_some() {
         failure

@@ -11,7 +11,7 @@ pub struct Host<'a> {
     pub observer: &'a dyn Observer,
     /// Measures the memory of the process.
     pub process: ProcessMemory,
-    /// The part of the program that stays beside the run while it trains.
+    /// The part of the program that works alongside the run.
     pub companion: Option<Companion>,
 }
 

@@ -37,8 +37,7 @@ pub fn iteration(run: &Path, asked: Option<u32>) -> Result<u32, Failure> {
     }
 }
 
-/// The iteration asked for, or the last one saved, of a run that may be training. Returns, too, whether it is, and notes
-/// it.
+/// As [`iteration`], for a run that may still be training; also returns true if it is, and notes it.
 ///
 /// # Errors
 /// As [`iteration`].
@@ -66,7 +65,7 @@ pub fn name_of(path: &Path) -> String {
     names_of(&[path]).swap_remove(0)
 }
 
-/// Names of paths that are shown together: each has as many of its last parts as tell it from the others.
+/// Names for paths that are shown together: each is as short as it can be and still differ from the others.
 pub fn names_of(paths: &[&Path]) -> Vec<String> {
     let whole = |path: &&Path| path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
     let whole: Vec<PathBuf> = paths.iter().map(whole).collect();

@@ -50,12 +50,12 @@ enum Part {
     /// Words, such as those of another library.
     Text(String),
     Problem(Box<Problem>),
-    /// An option that what follows is about, perhaps with its value.
+    /// The option that the next part is about, with its value if there is one.
     Option(&'static str, Option<String>),
 }
 
 impl Failure {
-    /// A failure in words that name no option, or of a command.
+    /// A failure whose words name no option, or come from a command.
     #[expect(clippy::needless_pass_by_value, reason = "errors are passed as they come")]
     pub fn new(code: u8, message: impl ToString) -> Self {
         Self { code, parts: vec![Part::Text(message.to_string())] }
@@ -66,18 +66,18 @@ impl Failure {
         Self::new(INPUT, message)
     }
 
-    /// The failure of a problem with this exit code.
+    /// A problem as a failure with this exit code.
     pub fn with_code(code: u8, problem: impl Into<Problem>) -> Self {
         Self { code, parts: vec![Part::Problem(Box::new(problem.into()))] }
     }
 
-    /// The same failure, of `origin`.
+    /// The same failure, prefixed with its origin.
     #[must_use]
     pub fn within(self, origin: &str) -> Self {
         self.after([Part::Text(format!("{origin}: "))])
     }
 
-    /// The same failure, of an option, or of the value that it has.
+    /// The same failure, prefixed with an option, and with its value if there is one.
     #[must_use]
     pub fn within_option(self, option: &'static str, value: Option<String>) -> Self {
         self.after([Part::Option(option, value), Part::Text(": ".to_owned())])
@@ -88,14 +88,14 @@ impl Failure {
         self
     }
 
-    /// The same failure with another line.
+    /// The same failure, with one more line.
     #[must_use]
     pub fn and(mut self, more: &str) -> Self {
         self.parts.push(Part::Text(format!("\n{more}")));
         self
     }
 
-    /// The same failure, with another problem.
+    /// The same failure, with one more problem.
     #[must_use]
     pub fn with(mut self, more: impl Into<Problem>) -> Self {
         self.parts.push(Part::Text("\n".to_owned()));
@@ -147,7 +147,7 @@ impl OptionProblem {
     }
 }
 
-/// Errors that are always of bad input.
+/// Errors that are always caused by bad input.
 pub trait BadInput: Display {}
 
 impl BadInput for LoadError {}

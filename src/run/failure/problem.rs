@@ -1,4 +1,4 @@
-//! Everything that can be wrong with a run, as data: the option or file, what it holds, and what fits instead. Options are
+//! Everything that can be wrong with a run, as data: the option or file, its content, and what would fit. Options are
 //! named as [`OPTIONS`](crate::OPTIONS) names them.
 
 use std::path::PathBuf;

@@ -10,7 +10,7 @@ use super::case::Init;
 use super::{ResolvedRun, ResolvedTraining};
 use crate::failure::Failure;
 use crate::spec::{
-    Assignment, Budget, FOUND_OUT, ImageCache, InitChoice, Partial, Rows, RunSpec, ShDegree,
+    Assignment, Budget, ImageCache, InitChoice, NOT_OPTIONS, Partial, Rows, RunSpec, ShDegree,
     assignments,
 };
 use densify_core::files::{FileError, write_atomically};
@@ -177,7 +177,7 @@ impl RunConfig {
     /// Names the key, and what was expected.
     pub fn from_table(mut table: Table, origin: &str) -> Result<Self, Failure> {
         let fail = |problem: &str| Failure::input(problem).within(origin);
-        let [densify, resolved] = FOUND_OUT.map(|key| table.remove(key));
+        let [densify, resolved] = NOT_OPTIONS.map(|key| table.remove(key));
         let Some(Value::String(densify)) = densify else {
             return Err(fail("`densify` must be a string, the version that wrote the file"));
         };

@@ -31,7 +31,7 @@ pub(crate) struct Exposure {
 }
 
 impl Exposure {
-    /// A decision that was made before. What the run begins with, a checkpoint has.
+    /// A decision that was made before; a checkpoint has the exposures to begin with.
     pub(super) fn known(is_on: bool, source: ExposureSource) -> Self {
         Self {
             is_on,
@@ -50,10 +50,6 @@ impl Exposure {
         let Evidence { colours, reported, .. } = evidence;
         let colours = colours.as_ref();
         let measured = colours.map(ExposureSpread::measure);
-        let source = |found: Option<ExposureSpread>| match found {
-            Some(found) => ExposureSource::Tracks(found),
-            None => ExposureSource::Undecided,
-        };
         let decided = measured
             .as_ref()
             .and_then(|(found, gains)| Some((found.decides(gains.len())?, *found)));
@@ -61,7 +57,9 @@ impl Exposure {
             ExposureChoice::Off => (false, ExposureSource::Given),
             ExposureChoice::On => (true, ExposureSource::Given),
             ExposureChoice::Auto => {
-                (decided.is_some_and(|(differ, _)| differ), source(decided.map(|(_, found)| found)))
+                let source = decided.map(|(_, found)| ExposureSource::Tracks(found));
+                let is_on = decided.is_some_and(|(differ, _)| differ);
+                (is_on, source.unwrap_or(ExposureSource::Undecided))
             }
         };
         let stops = spread(reported.stops.iter().copied().flatten());

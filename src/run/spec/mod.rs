@@ -10,7 +10,7 @@ pub mod knobs;
 mod overlay;
 mod values;
 
-pub(crate) use overlay::FOUND_OUT;
+pub(crate) use overlay::NOT_OPTIONS;
 pub use overlay::Partial;
 pub(crate) use values::assignments;
 pub use values::{
@@ -95,8 +95,8 @@ macro_rules! run_spec {
             }
         )*
 
-        /// A run, completely described: plain data with a default for everything. What is `None` is decided
-        /// when the run is prepared.
+        /// A run, completely described: plain data with a default for everything. Fields that are `None` are
+        /// decided when the run is prepared.
         ///
         /// In a file all options stand side by side; the groups are those of the help.
         #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, Args)]

@@ -13,7 +13,7 @@ use densify_policies::parameters::{nearest, parse_value};
 use densify_policies::policy::RateOverrides;
 
 /// Keys of a run's `config.toml` that are not options: the version and the findings.
-pub(crate) const FOUND_OUT: [&str; 2] = ["densify", "resolved"];
+pub(crate) const NOT_OPTIONS: [&str; 2] = ["densify", "resolved"];
 
 /// Some options of a run by name, each with a value that is valid by itself.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -56,7 +56,7 @@ impl Partial {
             let mut table: Table = text
                 .parse()
                 .map_err(|error: toml::de::Error| Failure::input(error.to_string().trim()))?;
-            table.retain(|key, _| !FOUND_OUT.contains(&key));
+            table.retain(|key, _| !NOT_OPTIONS.contains(&key));
             Self::checked(table)
         };
         read().map_err(|failure| failure.within_option("config", Some(path.display().to_string())))

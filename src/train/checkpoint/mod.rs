@@ -37,7 +37,7 @@ use serde::{Deserialize, Serialize};
 use crate::output::FolderError;
 use crate::trainer::TrainerState;
 use densify_core::files::FileError;
-use densify_render::{BackendError, StateError};
+use densify_render::BackendError;
 
 /// A checkpoint without its arrays.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -90,11 +90,6 @@ pub enum CheckpointError {
 impl CheckpointError {
     fn invalid(path: &Path, problem: impl ToString) -> Self {
         Self::Invalid { path: path.to_owned(), problem: problem.to_string() }
-    }
-
-    fn state(path: &Path) -> impl Fn(StateError) -> Self + use<> {
-        let path = path.to_owned();
-        move |error| Self::Invalid { path: path.clone(), problem: error.to_string() }
     }
 }
 

@@ -13,7 +13,7 @@ use super::{CheckpointError, Header};
 use densify_core::files::FileError;
 use densify_core::gaussians::{Gaussians, MAX_SH_DEGREE, ModelArray};
 use densify_core::pieces::pieces;
-use densify_render::{Backend, BackendError, StateArray, Tensor, Values};
+use densify_render::{Backend, BackendError, StateArray, StateError, Tensor, Values};
 
 /// Longest header accepted `[bytes]`.
 const MAX_HEADER: u64 = 64 << 20;
@@ -133,7 +133,8 @@ impl Checkpoint {
                 self.invalid(format!("it has a tensor `{name}`, which this run does not have"))
             );
         }
-        let refused = CheckpointError::state(&self.path);
+        let path = self.path.clone();
+        let refused = |error: StateError| CheckpointError::invalid(&path, error);
         let (rows, sh_degree) = (backend.rows(), backend.sh_degree());
         for array in ModelArray::ALL {
             let place = self.place_in_model(array, rows, sh_degree)?;
