@@ -13,9 +13,9 @@
 //! spec.size.budget = Some(Budget::Rows(50_000));
 //! spec.density.policy_set = vec!["diet.rho=0.2".parse()?];
 //! let mut run = Run::prepare(&spec)?;
-//! println!("{}", run.ledger());
+//! println!("{}", run.ledger);
 //! // Step by step, with the model at hand ...
-//! for event in run.trainer().step()?.events {
+//! for event in run.trainer.step()?.events {
 //!     println!("step {}: {} Gaussians, {} denied", event.step, event.after, event.denied);
 //! }
 //! // ... or to the end, with everything that `densify train` writes.

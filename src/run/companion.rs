@@ -1,9 +1,9 @@
-//! A part of the program that stays beside a run while it trains, such as a page that shows it.
+//! A part of the program that works alongside a run, such as the page that shows it.
 
 use densify_core::memory::Ledger;
 use densify_render::Device;
 
-/// A part of the program that stays beside a run and takes memory of its own. The result of the run does not depend on it.
+/// A part of the program that works alongside a run, with memory of its own. The result of the run does not depend on it.
 #[derive(Debug, Clone, Copy)]
 pub struct Companion {
     /// Adds the bytes it needs to the ledger of a run of this size.

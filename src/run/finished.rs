@@ -55,14 +55,9 @@ impl Machine {
         needs: Needs,
     ) -> Result<Box<dyn Backend>, Failure> {
         let model = dataset.normalisation.model_from_world(model);
-        let options = Setup {
-            near,
-            threads: self.threads,
-            largest_image: dataset.largest_image(),
-            needs,
-            ..Setup::new(model.len().max(1))
-        };
-        Ok(self.device.backend(&model, &options)?)
+        let setup = self.setup(&model, near);
+        let setup = Setup { largest_image: dataset.largest_image(), needs, ..setup };
+        Ok(self.device.backend(&model, &setup)?)
     }
 
     /// A backend with a model in scene coordinates that can only render.
@@ -72,7 +67,7 @@ impl Machine {
         near: f32,
         largest_image: (u32, u32),
     ) -> Result<Box<dyn Backend>, BackendError> {
-        let setup = Setup { largest_image, only_renders: true, ..self.setup_in_scene(model, near) };
+        let setup = Setup { largest_image, only_renders: true, ..self.setup(model, near) };
         self.device.backend(model, &setup)
     }
 
@@ -85,10 +80,10 @@ impl Machine {
     ) -> Result<Box<dyn Backend>, BackendError> {
         // Moments are never used, so they may be small.
         let storage = Storage { moments: MomentStorage::Both8, ..Storage::default() };
-        self.device.backend(model, &Setup { needs, storage, ..self.setup_in_scene(model, near) })
+        self.device.backend(model, &Setup { needs, storage, ..self.setup(model, near) })
     }
 
-    fn setup_in_scene(&self, model: &Gaussians, near: f32) -> Setup {
+    fn setup(&self, model: &Gaussians, near: f32) -> Setup {
         Setup { near, threads: self.threads, ..Setup::new(model.len().max(1)) }
     }
 }
@@ -105,7 +100,7 @@ pub struct Opened {
     pub backend: Box<dyn Backend>,
 }
 
-/// Adds a remedy to a failure if the dataset of a run is no longer at `path`, which the user did not name.
+/// Adds a remedy to a failure if the dataset of a run is no longer at `path`, a path that the user did not name.
 pub fn or_moved(failure: Failure, path: &Path) -> Failure {
     if path.exists() || builtin::name(path).is_some() {
         failure
@@ -169,7 +164,7 @@ pub fn open_alone(
     let normalisation = Normalisation::fit_model(&model);
     let model = normalisation.model_from_world(model);
     let near = (near * EXTENT) as f32;
-    let backend = machine.device.backend(&model, &machine.setup_in_scene(&model, near))?;
+    let backend = machine.device.backend(&model, &machine.setup(&model, near))?;
     Ok((backend, normalisation, model.sh_degree))
 }
 

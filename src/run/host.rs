@@ -11,13 +11,12 @@ pub struct Host<'a> {
     pub observer: &'a dyn Observer,
     /// Measures the memory of the process.
     pub process: ProcessMemory,
-    /// The part of the program that stays beside the run while it trains.
+    /// The part of the program that works alongside the run.
     pub companion: Option<Companion>,
 }
 
 impl<'a> Host<'a> {
     /// A host that measures the process as the operating system reports it.
-    #[must_use]
     pub fn new(observer: &'a dyn Observer) -> Self {
         Self { observer, process: ProcessMemory::SYSTEM, companion: None }
     }

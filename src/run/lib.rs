@@ -1,8 +1,8 @@
 //! A run as data, in three stages: a description as it was asked for (`spec`), the same with everything decided
 //! (`resolved`), and the training of it (`session`).
 //!
-//! The crate knows no subcommand, prints nothing, and changes nothing of its process. Everything that it needs to know of
-//! its caller is in a [`Host`]; what there is to tell goes to an [`Observer`], and errors are data until somebody shows them.
+//! The crate knows no subcommand, prints nothing, and changes nothing of its process. Its caller provides a [`Host`];
+//! progress goes to an [`Observer`]; errors stay data until they are shown.
 //!
 //! From below, each module using only those before it: failure, spec, companion, observer, process, host, models,
 //! coordinate_check, resolved, finished, session.

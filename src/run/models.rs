@@ -37,8 +37,7 @@ pub fn iteration(run: &Path, asked: Option<u32>) -> Result<u32, Failure> {
     }
 }
 
-/// The iteration asked for, or the last one saved, of a run that may be training. Returns, too, whether it is, and notes
-/// it.
+/// As [`iteration`], for a run that may still be training; also returns true if it is, and notes it.
 ///
 /// # Errors
 /// As [`iteration`].
@@ -66,7 +65,7 @@ pub fn name_of(path: &Path) -> String {
     names_of(&[path]).swap_remove(0)
 }
 
-/// Names of paths that are shown together: each has as many of its last parts as tell it from the others.
+/// Names for paths that are shown together: each is as short as it can be and still differ from the others.
 pub fn names_of(paths: &[&Path]) -> Vec<String> {
     let whole = |path: &&Path| path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
     let whole: Vec<PathBuf> = paths.iter().map(whole).collect();
@@ -122,7 +121,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn paths_are_called_by_as_little_as_tells_them_apart() {
+    fn names_have_as_many_parts_as_tell_them_apart() {
         let names = |paths: &[&str]| names_of(&paths.iter().map(Path::new).collect::<Vec<_>>());
         assert_eq!(names(&["/home/me/out/a", "/home/me/out/b"]), ["a", "b"]);
         assert_eq!(names(&["/x/one/run", "/x/two/run", "/x/b"]), ["one/run", "two/run", "b"]);

@@ -40,7 +40,6 @@ pub struct MemoryLimit {
 
 /// The tightest limit that the system sets (Linux). Runs that need more are refused before they start, as a failed
 /// allocation would abort the process without a message.
-#[must_use]
 pub fn grant(threads: usize) -> Option<MemoryLimit> {
     let grants = [
         address_space(threads)

@@ -82,7 +82,6 @@ fn or_infinite<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
 
 impl Mean {
     /// Mean over the views; NaN without views.
-    #[must_use]
     pub fn over(views: &[ViewScore]) -> Self {
         let mean = |score: fn(&ViewScore) -> f64| {
             views.iter().map(score).sum::<f64>() / views.len() as f64
@@ -115,7 +114,7 @@ impl Mean {
 pub struct Comparison<'a> {
     /// Network for LPIPS, which is measured only with one.
     pub lpips: Option<&'a Lpips>,
-    /// Whether renderings are also compared with the exposure that fits the photograph best.
+    /// Renderings are also compared with the exposure that fits the photograph best.
     pub fits_exposure: bool,
 }
 

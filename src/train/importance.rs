@@ -8,7 +8,6 @@ use densify_data::views::ViewSource;
 use densify_render::{AuxInput, Backend, BackendError};
 
 /// The needs with which the backend for [`importance`] must be made.
-#[must_use]
 pub fn needs() -> Needs {
     Needs { aux: Some(request()), ..Needs::default() }
 }
@@ -18,7 +17,6 @@ fn request() -> AuxRequest {
 }
 
 /// Memory for [`importance`] in addition to the backend and an image `[bytes]`.
-#[must_use]
 pub fn bytes(rows: usize) -> u64 {
     // The column of a view, the sums, and the order of the rows.
     rows as u64 * (size_of::<f32>() + size_of::<f64>() + size_of::<usize>()) as u64
@@ -64,7 +62,6 @@ pub fn importance(
 
 /// A substitute for importance if there are no views: the logarithm of each row's largest possible contribution to an
 /// image, which is its opacity times its two longest axes. Shape: `[rows]`.
-#[must_use]
 pub fn footprints(model: &Gaussians) -> Vec<f64> {
     let footprint = |row: usize| {
         let mut log_scales = model.log_scales[row];
@@ -75,7 +72,6 @@ pub fn footprints(model: &Gaussians) -> Vec<f64> {
 }
 
 /// The `count` most important rows in ascending order; of equal ones the first.
-#[must_use]
 pub fn largest(importance: &[f64], count: usize) -> Vec<usize> {
     let mut rows: Vec<usize> = (0..importance.len()).collect();
     rows.sort_by(|&a, &b| importance[b].total_cmp(&importance[a]));

@@ -70,7 +70,7 @@ fn bits(backend: Box<dyn Backend>, dataset: &Dataset, measures: bool) -> (Gaussi
         trainer.step().expect("a small image is rendered");
     }
     if measures {
-        let growth = trainer.growth().expect("it measures");
+        let growth = trainer.progress().auto_budget.as_ref().expect("it measures");
         let removals: Vec<_> = growth.removals.iter().map(|s| (s.before, s.after)).collect();
         assert_eq!((growth.intervals.len(), &*removals), (2, &[(ROWS, ROWS)][..]), "{growth:?}");
     }

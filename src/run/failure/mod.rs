@@ -6,11 +6,10 @@ mod problem;
 mod words;
 
 use std::fmt::Display;
-use std::path::Path;
 
 pub use problem::{
     BackendRemedy, Difference, ModelProblem, OptionProblem, Problem, Remedy, ResumeProblem,
-    SizeProblem, TrainingProblem,
+    SizeProblem, TrainRemedy, TrainingProblem,
 };
 
 use densify_policies::policy::PolicyError;
@@ -24,6 +23,7 @@ use densify_render::{Accumulation, BackendError, Fit};
 use densify_train::checkpoint::CheckpointError;
 use densify_train::evaluate::EvaluateError;
 use densify_train::init::InitError;
+use densify_train::output::FolderError;
 use densify_train::trainer::TrainError;
 
 /// Exit code of anything that has no code of its own.
@@ -50,46 +50,37 @@ enum Part {
     /// Words, such as those of another library.
     Text(String),
     Problem(Box<Problem>),
-    /// An option that what follows is about, perhaps with its value.
+    /// The option that the next part is about, with its value if there is one.
     Option(&'static str, Option<String>),
 }
 
 impl Failure {
-    /// A failure in words that name no option, or of a command.
-    #[must_use]
+    /// A failure whose words name no option, or come from a command.
     #[expect(clippy::needless_pass_by_value, reason = "errors are passed as they come")]
     pub fn new(code: u8, message: impl ToString) -> Self {
         Self { code, parts: vec![Part::Text(message.to_string())] }
     }
 
     /// Bad input: a file, an option, a field.
-    #[must_use]
     pub fn input(message: impl ToString) -> Self {
         Self::new(INPUT, message)
     }
 
-    /// The failure of a problem with this exit code.
-    #[must_use]
+    /// A problem as a failure with this exit code.
     pub fn with_code(code: u8, problem: impl Into<Problem>) -> Self {
         Self { code, parts: vec![Part::Problem(Box::new(problem.into()))] }
     }
 
-    /// The same failure, of `origin`.
+    /// The same failure, prefixed with its origin.
     #[must_use]
     pub fn within(self, origin: &str) -> Self {
         self.after([Part::Text(format!("{origin}: "))])
     }
 
-    /// The same failure, of an option, or of the value that it has.
+    /// The same failure, prefixed with an option, and with its value if there is one.
     #[must_use]
     pub fn within_option(self, option: &'static str, value: Option<String>) -> Self {
         self.after([Part::Option(option, value), Part::Text(": ".to_owned())])
-    }
-
-    /// The same failure, in the file of options.
-    #[must_use]
-    pub(crate) fn within_config_file(self, path: &Path) -> Self {
-        self.within_option("config", Some(path.display().to_string()))
     }
 
     fn after<const COUNT: usize>(mut self, parts: [Part; COUNT]) -> Self {
@@ -97,14 +88,14 @@ impl Failure {
         self
     }
 
-    /// The same failure with another line.
+    /// The same failure, with one more line.
     #[must_use]
     pub fn and(mut self, more: &str) -> Self {
         self.parts.push(Part::Text(format!("\n{more}")));
         self
     }
 
-    /// The same failure, with another problem.
+    /// The same failure, with one more problem.
     #[must_use]
     pub fn with(mut self, more: impl Into<Problem>) -> Self {
         self.parts.push(Part::Text("\n".to_owned()));
@@ -113,7 +104,6 @@ impl Failure {
     }
 
     /// The whole message, with options as its reader spells them.
-    #[must_use]
     pub fn words(&self, spelling: Spelling) -> String {
         let words = |part: &Part| match part {
             Part::Text(text) => text.clone(),
@@ -125,23 +115,30 @@ impl Failure {
     }
 }
 
-macro_rules! bad_input {
+macro_rules! problems {
     ($($problem:ident: $kind:ident),*) => {$(
         impl From<$problem> for Problem {
             fn from(problem: $problem) -> Self {
                 Self::$kind(problem)
             }
         }
+    )*};
+}
 
-        impl From<$problem> for Failure {
-            fn from(problem: $problem) -> Self {
-                Self::with_code(INPUT, problem)
+problems!(OptionProblem: Options, SizeProblem: Size, ModelProblem: Model, ResumeProblem: Resume);
+problems!(TrainingProblem: Training, BackendRemedy: Backend, TrainRemedy: Train);
+
+macro_rules! bad_input {
+    ($($error:ident),*) => {$(
+        impl From<$error> for Failure {
+            fn from(error: $error) -> Self {
+                Self::with_code(INPUT, error)
             }
         }
     )*};
 }
 
-bad_input!(OptionProblem: Options, SizeProblem: Size, ModelProblem: Model, ResumeProblem: Resume);
+bad_input!(OptionProblem, SizeProblem, ModelProblem, ResumeProblem);
 
 impl OptionProblem {
     /// A wrong value of an option.
@@ -150,18 +147,11 @@ impl OptionProblem {
     }
 }
 
-impl From<TrainingProblem> for Problem {
-    fn from(problem: TrainingProblem) -> Self {
-        Self::Training(problem)
-    }
-}
-
-/// Errors that are always of bad input.
+/// Errors that are always caused by bad input.
 pub trait BadInput: Display {}
 
 impl BadInput for LoadError {}
 impl BadInput for FormatError {}
-impl BadInput for InitError {}
 /// Before training: the policy's name or parameters are wrong.
 impl BadInput for PolicyError {}
 
@@ -180,72 +170,80 @@ impl From<BackendError> for Failure {
 impl Failure {
     /// A failure of a backend: the message, which ends with the error, and its remedy.
     fn of_backend(error: &BackendError, message: impl ToString) -> Self {
-        let code = if is_input(error) { INPUT } else { DEVICE };
+        let (code, remedy) = BackendRemedy::of(error);
+        Self::with_remedy(code, message, remedy)
+    }
+
+    fn with_remedy(code: u8, message: impl ToString, remedy: impl Into<Problem>) -> Self {
         let mut failure = Self::new(code, message);
         failure.parts.push(Part::Text("; ".to_owned()));
-        failure.parts.push(Part::Problem(Box::new(BackendRemedy::of(error).into())));
+        failure.parts.push(Part::Problem(Box::new(remedy.into())));
         failure
     }
 }
 
-/// True if other arguments would avoid the error.
-fn is_input(error: &BackendError) -> bool {
-    match error {
-        BackendError::ImageTooLarge { .. }
-        | BackendError::NoAdapter(_)
-        | BackendError::AdapterUnused
-        | BackendError::WithoutGpu
-        | BackendError::TooManyRows { .. }
-        | BackendError::BufferTooLarge { .. }
-        | BackendError::Unsupported(_) => true,
-        BackendError::OutOfMemory { .. }
-        | BackendError::Threads(_)
-        | BackendError::DeviceLost { .. }
-        | BackendError::Device { .. }
-        | BackendError::LoopCut { .. } => false,
-    }
-}
-
 impl BackendRemedy {
-    fn of(error: &BackendError) -> Self {
+    /// The remedy for an error, and the exit code: that of bad input if other arguments would avoid the error.
+    fn of(error: &BackendError) -> (u8, Self) {
         match error {
-            BackendError::OutOfMemory { .. } => Self::LessMemory,
-            BackendError::Threads(_) => Self::FewerThreads,
-            BackendError::ImageTooLarge { .. } => Self::SmallerImages,
-            BackendError::NoAdapter(_) => Self::ListAdapters,
-            BackendError::AdapterUnused => Self::NoAdapterOrGpu,
-            BackendError::WithoutGpu => Self::BuildWithGpu,
-            BackendError::TooManyRows { most, .. } => Self::Budget(*most),
+            BackendError::OutOfMemory { .. } => (DEVICE, Self::LessMemory),
+            BackendError::Threads(_) => (DEVICE, Self::FewerThreads),
+            BackendError::ImageTooLarge { .. } => (INPUT, Self::SmallerImages),
+            BackendError::NoAdapter(_) => (INPUT, Self::ListAdapters),
+            BackendError::AdapterUnused => (INPUT, Self::NoAdapterOrGpu),
+            BackendError::WithoutGpu => (INPUT, Self::BuildWithGpu),
+            BackendError::TooManyRows { most, .. } => (INPUT, Self::Budget(*most)),
             BackendError::BufferTooLarge { fit, .. } => match fit {
-                Fit::TileCap(pairs) => Self::TileCap(*pairs),
-                Fit::Budget(rows) => Self::Budget(*rows),
-                Fit::ImageSize => Self::SmallerImages,
+                Fit::TileCap(pairs) => (INPUT, Self::TileCap(*pairs)),
+                Fit::Budget(rows) => (INPUT, Self::Budget(*rows)),
+                Fit::ImageSize => (INPUT, Self::SmallerImages),
             },
-            BackendError::Unsupported(_) => Self::NativeBackend,
-            BackendError::DeviceLost { .. } => Self::StartAgain,
+            BackendError::Unsupported(_) => (INPUT, Self::NativeBackend),
+            BackendError::DeviceLost { .. } => (DEVICE, Self::StartAgain),
             BackendError::LoopCut { accumulation, .. } if *accumulation != Accumulation::Slots => {
-                Self::SlotsOrOtherDriver
+                (DEVICE, Self::SlotsOrOtherDriver)
             }
-            BackendError::Device { .. } | BackendError::LoopCut { .. } => Self::OtherDriver,
+            BackendError::Device { .. } | BackendError::LoopCut { .. } => {
+                (DEVICE, Self::OtherDriver)
+            }
         }
-    }
-}
-
-impl From<BackendRemedy> for Problem {
-    fn from(remedy: BackendRemedy) -> Self {
-        Self::Backend(remedy)
     }
 }
 
 impl From<FileError> for Failure {
     fn from(error: FileError) -> Self {
-        match error {
-            FileError::Occupied { folder } => {
-                Self::with_code(INPUT, OptionProblem::FolderOccupied { folder })
+        let is_input = matches!(error, FileError::Malformed { .. });
+        Self::new(if is_input { INPUT } else { OTHER }, error)
+    }
+}
+
+impl From<FolderError> for Failure {
+    fn from(error: FolderError) -> Self {
+        let remedy = match error {
+            FolderError::File(error) => return error.into(),
+            FolderError::NoRun { .. }
+            | FolderError::NotAModel { .. }
+            | FolderError::NotFound { .. } => return Self::input(error),
+            FolderError::Lost { .. } | FolderError::NotReplaced { .. } => {
+                return Self::new(OTHER, error);
             }
-            FileError::Unfit(_) => Self::input(error),
-            _ => Self::new(OTHER, error),
-        }
+            FolderError::Occupied { .. } => TrainRemedy::OtherFolderOrOverwrite,
+            FolderError::InUse { .. } => TrainRemedy::WaitOrOtherFolder,
+            FolderError::NotAFolder { .. } => TrainRemedy::OtherFolder,
+        };
+        Self::with_remedy(INPUT, error, remedy)
+    }
+}
+
+impl From<InitError> for Failure {
+    fn from(error: InitError) -> Self {
+        let remedy = match error {
+            InitError::TooManyPoints(_) => return Self::input(error),
+            InitError::NoBudget => TrainRemedy::Budget,
+            InitError::Degree(_) => TrainRemedy::Degree,
+            InitError::NoPoints => TrainRemedy::RandomStart,
+        };
+        Self::with_remedy(INPUT, error, remedy)
     }
 }
 
@@ -253,6 +251,9 @@ impl From<TrainError> for Failure {
     fn from(error: TrainError) -> Self {
         let code = match &error {
             TrainError::BadOption(_) | TrainError::View { .. } => INPUT,
+            TrainError::NoView => {
+                return Self::with_remedy(INPUT, error, TrainRemedy::MoreViews);
+            }
             TrainError::Backend { source, .. } => return Self::of_backend(source, &error),
             _ => OTHER,
         };
@@ -264,6 +265,7 @@ impl From<CheckpointError> for Failure {
     fn from(error: CheckpointError) -> Self {
         match error {
             CheckpointError::File(error) => error.into(),
+            CheckpointError::Folder(error) => error.into(),
             CheckpointError::Backend(error) => error.into(),
             CheckpointError::Policy { .. } => Self::new(OTHER, error),
             CheckpointError::Invalid { .. } => Self::input(error),
@@ -346,7 +348,7 @@ mod tests {
 
     #[test]
     fn an_occupied_folder_names_the_options_that_help() {
-        let failure = Failure::from(FileError::occupied("out".as_ref()));
+        let failure = Failure::from(FolderError::Occupied { folder: "out".into() });
         let expected =
             "out holds another run; choose another folder with -o, or replace it with --overwrite";
         assert_eq!((failure.code, &*failure.to_string()), (INPUT, expected));

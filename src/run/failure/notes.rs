@@ -2,6 +2,8 @@
 
 use std::path::Path;
 
+use super::words::model_name;
+use crate::spec::Budget;
 use densify_core::memory::Bytes;
 use densify_core::numbers::grouped;
 use densify_core::spelling::Spelling;
@@ -56,8 +58,7 @@ pub(crate) fn other_coordinates(
     file: &Path,
     correlation: f64,
 ) -> String {
-    let file = file.display();
-    let model = option.map_or_else(|| file.to_string(), |option| s.text(option, &file));
+    let model = model_name(s, option, file);
     format!(
         "note: {model}: it shows little of the photographs (their correlation is {correlation:.2}); its coordinates \
          may not be those of the dataset (axes, scale, or origin)"
@@ -69,45 +70,29 @@ pub(crate) fn learn_exposures(s: Spelling) -> String {
     format!("{} learns exposures all the same", s.text("exposure", "on"))
 }
 
-/// The budget, and the reason for it.
-pub(crate) enum BudgetReason {
-    /// The default.
-    Default,
-    /// The most of an automatic budget.
-    Automatic,
-    /// The option.
-    Given,
-    /// The memory holds fewer than the budget that was given.
-    LessThanGiven { memory: u64, given: usize },
-    /// The memory holds the budget that was given.
-    AsGiven { memory: u64 },
-    /// The memory.
-    Memory { memory: u64 },
-    /// The device.
-    Device,
-}
-
-/// The budget and its reason.
-pub(crate) fn budget(s: Spelling, rows: usize, reason: &BudgetReason) -> String {
+/// The budget and the reason for it. `solved`: the memory given, and true if it limits the rows.
+pub(crate) fn budget(
+    s: Spelling,
+    rows: usize,
+    asked: Option<Budget>,
+    solved: Option<(u64, bool)>,
+) -> String {
     let rows = grouped(rows);
-    let memory = |bytes: u64| s.text("memory", Bytes(bytes));
-    let reason = match *reason {
-        BudgetReason::Default => {
+    let memory = solved.map_or_else(String::new, |(bytes, _)| s.text("memory", Bytes(bytes)));
+    let reason = match (solved, asked, asked.and_then(Budget::most)) {
+        (None, None, _) => {
             format!(" (default; choose with {} or {})", s.option("budget"), s.option("memory"))
         }
-        BudgetReason::Automatic => " at most (auto: as many as improve the model)".to_owned(),
-        BudgetReason::Given => String::new(),
-        BudgetReason::LessThanGiven { memory: bytes, given } => {
-            let given = s.text("budget", grouped(given));
-            format!(": {} holds fewer than {given}", memory(bytes))
+        (None, Some(Budget::Auto(_)), _) => {
+            " at most (auto: as many as improve the model)".to_owned()
         }
-        BudgetReason::AsGiven { memory: bytes } => {
-            format!(": {} would hold as many or more", memory(bytes))
+        (None, Some(Budget::Rows(_)), _) => String::new(),
+        (Some((_, true)), _, Some(given)) => {
+            format!(": {memory} holds fewer than {}", s.text("budget", grouped(given)))
         }
-        BudgetReason::Memory { memory: bytes } => {
-            format!(", as many as {} holds", memory(bytes))
-        }
-        BudgetReason::Device => ", as many as the device takes".to_owned(),
+        (Some((_, false)), _, Some(_)) => format!(": {memory} would hold as many or more"),
+        (Some((_, true)), _, None) => format!(", as many as {memory} holds"),
+        (Some((_, false)), _, None) => ", as many as the device takes".to_owned(),
     };
     format!("budget   {rows} rows{reason}")
 }

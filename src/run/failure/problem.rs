@@ -1,4 +1,4 @@
-//! Everything that can be wrong with a run, as data: the option or file, what it holds, and what fits instead. Options are
+//! Everything that can be wrong with a run, as data: the option or file, its content, and what would fit. Options are
 //! named as [`OPTIONS`](crate::OPTIONS) names them.
 
 use std::path::PathBuf;
@@ -41,8 +41,6 @@ pub enum OptionProblem {
     AutoBudgetWithFreeze,
     /// A number of random points for a start that is not random.
     UnusedInitPoints { points: usize },
-    /// The output folder holds another run.
-    FolderOccupied { folder: PathBuf },
     /// Test views are to be measured, and there is none.
     NothingToTest,
 }
@@ -135,8 +133,8 @@ pub enum TrainingProblem {
     CheckpointFailed { error: String },
     /// After an error of the policy, the model before it.
     ModelSaved { saved: Result<PathBuf, String> },
-    /// The run is complete, only measuring it has failed.
-    CompleteAllTheSame { run: PathBuf },
+    /// Measuring failed; the run itself is complete.
+    OnlyMeasuringFailed { run: PathBuf },
     /// The files of a run that failed, and the checkpoint to go on from.
     LeftBehind { run: PathBuf, checkpoint: Option<PathBuf>, scene: PathBuf },
 }
@@ -156,9 +154,30 @@ pub enum Problem {
     Training(TrainingProblem),
     /// The remedy for an error of a backend, which stands before it.
     Backend(BackendRemedy),
+    /// The remedy for an error of training, which stands before it.
+    Train(TrainRemedy),
 }
 
-/// What helps against an error of a backend.
+/// The remedy for an error of training: of its folder, its first Gaussians or its views.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum TrainRemedy {
+    /// Another folder, or replacing the run in this one.
+    OtherFolderOrOverwrite,
+    /// The end of the process that trains in the folder, or another folder.
+    WaitOrOtherFolder,
+    /// Another folder.
+    OtherFolder,
+    /// A budget.
+    Budget,
+    /// A degree.
+    Degree,
+    /// A start from random points.
+    RandomStart,
+    /// More views to train on.
+    MoreViews,
+}
+
+/// The remedy for an error of a backend.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum BackendRemedy {
     /// A smaller model, a lower degree or shorter tile lists.

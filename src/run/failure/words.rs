@@ -1,5 +1,7 @@
 //! The words of every [`Problem`], with options as their reader spells them. One piece, so that all can be compared.
 
+use std::path::Path;
+
 use densify_core::memory::Bytes;
 use densify_core::numbers::grouped;
 use densify_core::spelling::Spelling;
@@ -7,12 +9,14 @@ use densify_render::Accumulation;
 
 use super::problem::{
     BackendRemedy, Difference, ModelProblem, OptionProblem, Problem, Remedy, ResumeProblem,
-    SizeProblem, TrainingProblem,
+    SizeProblem, TrainRemedy, TrainingProblem,
 };
+
+/// The remedy for a model in other coordinates.
+const COORDINATES: &str = "export it untransformed, or transform it back";
 
 impl Problem {
     /// A sentence that names what is wrong, and the remedy.
-    #[must_use]
     pub fn words(&self, spelling: Spelling) -> String {
         match self {
             Self::Options(problem) => problem.words(spelling),
@@ -21,30 +25,28 @@ impl Problem {
             Self::Resume(problem) => problem.words(spelling),
             Self::Training(problem) => problem.words(spelling),
             Self::Backend(remedy) => remedy.words(spelling),
+            Self::Train(remedy) => remedy.words(spelling),
         }
     }
 }
 
 impl BackendRemedy {
     fn words(self, s: Spelling) -> String {
+        let [budget, sh_degree, tile_cap, threads, resolution, gpu] =
+            ["budget", "sh_degree", "tile_cap", "threads", "resolution", "gpu"]
+                .map(|name| s.option(name));
         let native = s.text("backend", "cpu");
         match self {
-            Self::LessMemory => format!(
-                "lower {}, {} or {}",
-                s.option("budget"),
-                s.option("sh_degree"),
-                s.option("tile_cap")
-            ),
-            Self::FewerThreads => format!("lower {}", s.option("threads")),
-            Self::SmallerImages => format!("shrink the images with {}", s.option("resolution")),
+            Self::LessMemory => format!("lower {budget}, {sh_degree} or {tile_cap}"),
+            Self::FewerThreads => format!("lower {threads}"),
+            Self::SmallerImages => format!("shrink the images with {resolution}"),
             Self::ListAdapters => {
                 format!("`densify devices` lists the adapters, and {native} needs none")
             }
-            Self::NoAdapterOrGpu => format!("leave out {} or {native}", s.option("gpu")),
+            Self::NoAdapterOrGpu => format!("leave out {gpu} or {native}"),
             Self::BuildWithGpu => format!(
-                "add it to the features of densify in Cargo.toml, or leave out {} and {}",
-                s.text("backend", "gpu"),
-                s.option("gpu")
+                "add it to the features of densify in Cargo.toml, or leave out {} and {gpu}",
+                s.text("backend", "gpu")
             ),
             Self::Budget(rows) => format!("use {}", s.set("budget", rows)),
             Self::TileCap(pairs) => format!("use {}", s.set("tile_cap", pairs)),
@@ -59,12 +61,35 @@ impl BackendRemedy {
     }
 }
 
+impl TrainRemedy {
+    fn words(self, s: Spelling) -> String {
+        let (folder, overwrite) = (output_option(s), s.switch("overwrite"));
+        match self {
+            Self::OtherFolderOrOverwrite => {
+                format!("choose another folder with {folder}, or replace it with {overwrite}")
+            }
+            Self::WaitOrOtherFolder => {
+                format!("wait for it, stop it, or choose another folder with {folder}")
+            }
+            Self::OtherFolder => format!("choose another one with {folder}"),
+            Self::Budget => format!("give {} at least 1", s.option("budget")),
+            Self::Degree => format!("choose {} accordingly", s.option("sh_degree")),
+            Self::RandomStart => {
+                format!("start from random points with {}", s.text("init", "random"))
+            }
+            Self::MoreViews => format!("use a larger {} or add images", s.option("test_every")),
+        }
+    }
+}
+
 impl OptionProblem {
     fn words(&self, s: Spelling) -> String {
+        let [budget, freeze, knob] = ["budget", "freeze", "knob"].map(|name| s.option(name));
+        let full = s.switch("full");
         match self {
             Self::UnknownOption { name, nearest } => {
-                let like =
-                    nearest.as_ref().map_or_else(String::new, |like| format!(" (did you mean `{like}`?)"));
+                let like = nearest.as_ref().map(|like| format!(" (did you mean `{like}`?)"));
+                let like = like.unwrap_or_default();
                 format!("no option is called `{name}`{like}; docs/options.md lists them all")
             }
             Self::Value { option, problem } => format!("{}: {problem}", s.option(option)),
@@ -77,22 +102,12 @@ impl OptionProblem {
                 "{}: the name {path:?} is not UTF-8, as config.toml must be; rename the folder, or name a link to it",
                 s.option(option)
             ),
-            Self::FolderOccupied { folder } => format!(
-                "{} holds another run; choose another folder with {}, or replace it with {}",
-                folder.display(),
-                match s {
-                    Spelling::Terminal => "-o".to_owned(),
-                    Spelling::Keyword => s.option("output"),
-                },
-                s.switch("overwrite")
-            ),
             Self::NoScene => "no scene is given; name a dataset's folder, or a built-in scene such as scene:spheres \
                               (in a file: scene = \"...\")"
                 .to_owned(),
-            Self::IterationOutOfRange { option, step, last } => format!(
-                "{} is out of range: the run has iterations 1 to {last}",
-                s.set(option, step)
-            ),
+            Self::IterationOutOfRange { option, step, last } => {
+                format!("{} is out of range: the run has iterations 1 to {last}", s.set(option, step))
+            }
             Self::Malformed { origin, problem } => format!("{origin}: {problem}"),
             Self::AccumulationConflict { given } => format!(
                 "{}, which takes accumulation={}, and {} contradict each other; give one of them",
@@ -100,30 +115,26 @@ impl OptionProblem {
                 Accumulation::Slots,
                 s.member("knob", "accumulation", given)
             ),
-            Self::KnobOfOtherBackend { knob, value, backend, only_on, default } => format!(
-                "{}: knob {knob}={value}: the {} backend does not have it; the nearest that works there is \
-                 {knob}={default}, or use {}",
-                s.option("knob"),
+            Self::KnobOfOtherBackend { knob: name, value, backend, only_on, default } => format!(
+                "{knob}: knob {name}={value}: the {} backend does not have it; the nearest that works there is \
+                 {name}={default}, or use {}",
                 backend.name(),
                 s.text("backend", only_on.choice().word())
             ),
             Self::AutomaticWithFull { option } => {
-                let full = s.switch("full");
+                let auto = s.text(option, "auto");
                 let other = match *option {
                     "budget" => "a number of Gaussians".to_owned(),
                     option => s.set(option, 3),
                 };
                 format!(
-                    "{full} disables automatic reductions, and {} is one; give one of the two, or {full} with {other}",
-                    s.text(option, "auto")
+                    "{full} disables automatic reductions, and {auto} is one; give one of the two, or {full} with {other}"
                 )
             }
             Self::AutoBudgetWithFreeze => format!(
-                "{} asks of all Gaussians what each is worth, and {} keeps some whatever it is; give {} a number of \
-                 Gaussians",
-                s.text("budget", "auto"),
-                s.option("freeze"),
-                s.option("budget")
+                "{} asks of all Gaussians what each is worth, and {freeze} keeps some whatever it is; give {budget} a \
+                 number of Gaussians",
+                s.text("budget", "auto")
             ),
             Self::UnusedInitPoints { points } => format!(
                 "{}: it is for a random start; leave it out, or use {}",
@@ -143,16 +154,15 @@ impl OptionProblem {
 impl SizeProblem {
     fn words(&self, s: Spelling) -> String {
         let memory = |bytes: &u64| s.text("memory", Bytes(*bytes));
+        let [budget, freeze, tile_cap, image_cache, threads] =
+            ["budget", "freeze", "tile_cap", "image_cache", "threads"].map(|name| s.option(name));
         match self {
             Self::TooManyViews => "the scene has more than 4 billion views".to_owned(),
-            Self::FreezeFillsBudget { frozen, budget } => format!(
-                "{}: its {} Gaussians leave no room in a budget of {}, which counts them too; give a larger {}, or {} \
-                 fewer",
-                s.option("freeze"),
+            Self::FreezeFillsBudget { frozen, budget: rows } => format!(
+                "{freeze}: its {} Gaussians leave no room in a budget of {}, which counts them too; give a larger \
+                 {budget}, or {freeze} fewer",
                 grouped(*frozen),
-                grouped(*budget),
-                s.option("budget"),
-                s.option("freeze")
+                grouped(*rows)
             ),
             Self::TileCapConflict { cap, pairs } => format!(
                 "{cap} and {} contradict each other; give one of them, such as {cap} with pairs_per_row=auto",
@@ -161,12 +171,7 @@ impl SizeProblem {
             ),
             Self::OverMemory { memory: given, needed, remedies } => {
                 let remedy = match &remedies[..] {
-                    [] => format!(
-                        "leave out {}, {} and {}",
-                        s.option("tile_cap"),
-                        s.option("image_cache"),
-                        s.option("threads")
-                    ),
+                    [] => format!("leave out {tile_cap}, {image_cache} and {threads}"),
                     remedies => format!("give {}", any_of(remedies, s)),
                 };
                 format!("{}: this run takes {}; {remedy}", memory(given), Bytes(*needed))
@@ -176,12 +181,10 @@ impl SizeProblem {
                     [] => "free memory, or raise that limit".to_owned(),
                     remedies => format!("give {}, or free memory", any_of(remedies, s)),
                 };
+                let [needed, resident, left] = [*needed, *resident, *left].map(Bytes);
                 format!(
-                    "this run takes {} of the host's memory, of which the process has {}; {limit} leaves it {}; \
-                     {remedy}",
-                    Bytes(*needed),
-                    Bytes(*resident),
-                    Bytes(*left)
+                    "this run takes {needed} of the host's memory, of which the process has {resident}; {limit} leaves \
+                     it {left}; {remedy}"
                 )
             }
             Self::NoSize { memory: given } => {
@@ -199,39 +202,39 @@ impl SizeProblem {
 
 impl ModelProblem {
     fn words(&self, s: Spelling) -> String {
+        let file = |option: &str, file: &Path| s.text(option, file.display());
+        let iterations = |numbers: &str| s.set("save_iterations", numbers);
         match self {
-            Self::EmptyModel { option, file } => format!(
+            Self::EmptyModel { option, file: model } => format!(
                 "{}: the model has no Gaussian; give another one, or leave {} out",
-                s.text(option, file.display()),
+                file(option, model),
                 s.option(option)
             ),
             Self::ModelOfRun { file } => format!("its model is {}", file.display()),
-            Self::InitOutOfView { file, seen, rows } => format!(
+            Self::InitOutOfView { file: model, seen, rows } => format!(
                 "{}: only {} of its {} Gaussians lie in any training view; it must be in the coordinates of the \
-                 dataset: export it untransformed, or transform it back",
-                s.text("init", file.display()),
+                 dataset: {COORDINATES}",
+                file("init", model),
                 grouped(*seen),
                 grouped(*rows)
             ),
-            Self::FreezeOutOfView { file, rows } => format!(
+            Self::FreezeOutOfView { file: model, rows } => format!(
                 "{}: none of its {} Gaussians lies in any training view; it must be in the coordinates of the dataset: \
-                 export it untransformed, or transform it back",
-                s.text("freeze", file.display()),
+                 {COORDINATES}",
+                file("freeze", model),
                 grouped(*rows)
             ),
-            Self::FreezeChanged { file, rows, expected } => format!(
+            Self::FreezeChanged { file: model, rows, expected } => format!(
                 "{}: it has {} Gaussians, but had {} before; begin a new run",
-                s.text("freeze", file.display()),
+                file("freeze", model),
                 grouped(*rows),
                 grouped(*expected)
             ),
-            Self::OtherCoordinates { option, file, correlation } => {
-                let file = file.display();
-                let model = option.map_or_else(|| file.to_string(), |option| s.text(option, &file));
+            Self::OtherCoordinates { option, file: model, correlation } => {
+                let model = model_name(s, *option, model);
                 format!(
                     "{model}: it shows nothing of the photographs (their correlation is {correlation:.2}); it must be \
-                     in the coordinates of the dataset (axes, scale and origin): export it untransformed, or \
-                     transform it back"
+                     in the coordinates of the dataset (axes, scale and origin): {COORDINATES}"
                 )
             }
             Self::NoTestViews => format!(
@@ -241,31 +244,28 @@ impl ModelProblem {
                 s.text("split", "train")
             ),
             Self::DatasetMoved => {
-                format!("if the dataset has moved, say where it is with {}", scene_of_run(s))
+                // That of the run itself is a positional argument.
+                let scene = short(s, "scene", "--scene");
+                format!("if the dataset has moved, say where it is with {scene}")
             }
             Self::NoModelYet { run, step } => {
-                let run = run.display();
+                let (run, earlier) = (run.display(), iterations("N"));
                 format!(
                     "{run} holds a run that was stopped before it saved a model, with a checkpoint of iteration \
                      {step}; `densify train --resume -o {run}` goes on from there, and saves its model at the end, or \
-                     earlier with {}",
-                    s.set("save_iterations", "N")
+                     earlier with {earlier}"
                 )
             }
             Self::NoSuchIteration { iteration, run, saved } => {
                 let saved: Vec<String> = saved.iter().map(u32::to_string).collect();
-                format!(
-                    "{}: {} has saved only {}",
-                    s.set("iteration", iteration),
-                    run.display(),
-                    saved.join(", ")
-                )
+                let (iteration, run) = (s.set("iteration", iteration), run.display());
+                format!("{iteration}: {run} has saved only {}", saved.join(", "))
             }
             Self::StillTraining { run } => format!(
                 "{} is being trained and has saved no model yet; wait until it has, or train with {} to look at it \
                  before its end",
                 run.display(),
-                s.set("save_iterations", "1000,2000")
+                iterations("1000,2000")
             ),
             Self::IterationOfFile => {
                 format!(
@@ -279,14 +279,14 @@ impl ModelProblem {
 
 impl ResumeProblem {
     fn words(&self, s: Spelling) -> String {
-        let resume = s.switch("resume");
+        let [resume, overwrite] = ["resume", "overwrite"].map(|name| s.switch(name));
+        let folder = output_option(s);
         match self {
             Self::InterruptedReplacement { output, staged } => format!(
                 "{resume}: {} holds a run that was to replace the one there and was interrupted: {}; go on with it by \
-                 naming that folder with {}, or remove it",
+                 naming that folder with {folder}, or remove it",
                 output.display(),
-                staged.display(),
-                output_option(s)
+                staged.display()
             ),
             Self::Shortened { asked, origin, length, done } => format!(
                 "{} contradicts {origin}: that run has {length} iterations, of which {done} are done; it can be \
@@ -301,17 +301,15 @@ impl ResumeProblem {
             Self::NoSoundCheckpoint { output, errors } => {
                 let errors: String = errors.iter().map(|error| format!("\n  {error}")).collect();
                 format!(
-                    "{resume}: no checkpoint in {} can be used:{errors}\nto begin anew, leave {resume} out and give {}",
-                    output.display(),
-                    s.switch("overwrite")
+                    "{resume}: no checkpoint in {} can be used:{errors}\nto begin anew, leave {resume} out and give \
+                     {overwrite}",
+                    output.display()
                 )
             }
             Self::NoCheckpoint { output } => format!(
                 "{resume}: {} holds a run, but no checkpoint to go on from; to begin anew, leave {resume} out and \
-                 give {}, or choose another folder with {}",
-                output.display(),
-                s.switch("overwrite"),
-                output_option(s)
+                 give {overwrite}, or choose another folder with {folder}",
+                output.display()
             ),
             Self::ResultWouldDiffer { origin, differences } => {
                 let shown = |value: &Option<String>| value.clone().unwrap_or("not set".to_owned());
@@ -347,16 +345,14 @@ impl TrainingProblem {
             ),
             Self::Stopped { by, step: None } => format!("stopped by {by}; nothing was written"),
             Self::Stopped { by, step: Some(step) } => format!("stopped by {by} after step {step}"),
-            Self::CheckpointFailed { error } => {
-                format!("no checkpoint could be written: {error}")
-            }
+            Self::CheckpointFailed { error } => format!("no checkpoint could be written: {error}"),
             Self::ModelSaved { saved: Ok(file) } => {
                 format!("the model as it was before is saved in {}", file.display())
             }
             Self::ModelSaved { saved: Err(error) } => {
                 format!("the model could not be saved: {error}")
             }
-            Self::CompleteAllTheSame { run } => {
+            Self::OnlyMeasuringFailed { run } => {
                 format!("the run is complete in {} all the same", run.display())
             }
             Self::LeftBehind { run, checkpoint: None, .. } => {
@@ -400,19 +396,22 @@ impl Remedy {
     }
 }
 
-/// The output folder, in its short form on a terminal.
-fn output_option(s: Spelling) -> String {
-    match s {
-        Spelling::Terminal => "-o".to_owned(),
-        Spelling::Keyword => s.option("output"),
-    }
+/// A model, by the option that names it if there is one.
+pub(super) fn model_name(s: Spelling, option: Option<&str>, file: &Path) -> String {
+    let file = file.display();
+    option.map_or_else(|| file.to_string(), |option| s.text(option, &file))
 }
 
-/// The option of commands that look at a run; that of the run itself is a positional argument.
-fn scene_of_run(s: Spelling) -> String {
+/// The output folder, in its short form on a terminal.
+fn output_option(s: Spelling) -> String {
+    short(s, "output", "-o")
+}
+
+/// An option that has another name on a terminal.
+fn short(s: Spelling, name: &str, flag: &str) -> String {
     match s {
-        Spelling::Terminal => "--scene".to_owned(),
-        Spelling::Keyword => s.option("scene"),
+        Spelling::Terminal => flag.to_owned(),
+        Spelling::Keyword => s.option(name),
     }
 }
 

@@ -9,6 +9,7 @@ use toml::Table;
 use super::config::{ModelSize, RunConfig};
 use super::degree::Degree;
 use super::exposure::Exposure;
+use super::fit::RunSize;
 use super::inputs::{Evidence, Inputs, Reading, open_device};
 use super::size::LEAST_ROWS;
 use crate::failure::{Failure, OptionProblem, SizeProblem};
@@ -16,6 +17,7 @@ use crate::host::Host;
 use crate::spec::knobs::Knobs;
 use crate::spec::{AbsolutePath, Budget, InitChoice, RunSpec, ShDegree};
 use densify_core::budget::RowBudget;
+use densify_core::memory::Ledger;
 use densify_core::spelling::Spelling;
 use densify_train::exposure::ExposureChoice;
 use densify_train::schedule::Background;
@@ -66,30 +68,6 @@ pub(crate) enum Init {
 }
 
 impl Choices {
-    fn new(
-        spec: &RunSpec,
-        (entry, parameters): (&'static PolicyEntry, Table),
-        knobs: Knobs,
-        degree: Degree,
-        exposure: Exposure,
-    ) -> Self {
-        Self {
-            entry,
-            parameters,
-            knobs,
-            degree,
-            exposure,
-            automatic: AutoChoices {
-                rows: spec.size.budget.is_some_and(Budget::is_auto),
-                scored_views: !spec.size.full,
-            },
-            threads: spec
-                .device
-                .threads
-                .map_or_else(rayon::current_num_threads, |threads| threads.0 as usize),
-        }
-    }
-
     /// Choices that the colours of the scene decided, for the user.
     pub(super) fn lines(&self, spelling: Spelling) -> impl Iterator<Item = String> {
         self.degree.line().into_iter().chain(self.exposure.line(spelling))
@@ -101,11 +79,10 @@ impl<'a> Case<'a> {
     pub(super) fn anew(spec: &'a RunSpec, host: Host<'_>) -> Result<Self, Failure> {
         let is_exposed = spec.schedule.exposure != ExposureChoice::Off;
         let reading = Reading {
-            models: None,
             tracks: spec.size.sh_degree == Some(ShDegree::Auto(None)) || is_exposed,
             colours: true,
             exif: is_exposed,
-            tolerance: 0,
+            ..Reading::default()
         };
         Self::open(spec, &reading, host, |evidence| {
             let degree = Degree::decide(spec, None, evidence);
@@ -148,13 +125,7 @@ impl<'a> Case<'a> {
         host: Host<'_>,
     ) -> Result<Self, Failure> {
         let has_exposures = spec.schedule.exposure != ExposureChoice::Off;
-        let reading = Reading {
-            models: Some(models),
-            tracks: has_exposures,
-            colours: false,
-            exif: false,
-            tolerance: 0,
-        };
+        let reading = Reading { models: Some(models), tracks: has_exposures, ..Reading::default() };
         Self::open(spec, &reading, host, |evidence| {
             let exposure = Exposure::known(has_exposures, super::ExposureSource::Given);
             (Degree::decide(spec, None, evidence), exposure)
@@ -167,17 +138,23 @@ impl<'a> Case<'a> {
         host: Host<'_>,
         decide: impl FnOnce(&Evidence) -> (Degree, Exposure),
     ) -> Result<Self, Failure> {
-        let policy = spec.policy()?;
+        let (entry, parameters) = spec.policy()?;
         let mut knobs = spec.knobs()?;
         check_automatic(spec)?;
         let device = open_device(spec, &mut knobs, host.observer)?;
         let (inputs, evidence) = Inputs::open(spec, device, reading, host)?;
         let (degree, exposure) = decide(&evidence);
         drop(evidence);
-        for note in exposure.notes() {
+        for note in &exposure.notes {
             host.observer.say(format_args!("note: {note}"));
         }
-        let choices = Choices::new(spec, policy, knobs, degree, exposure);
+        let automatic = AutoChoices {
+            rows: spec.size.budget.is_some_and(Budget::is_auto),
+            scored_views: !spec.size.full,
+        };
+        let threads = spec.device.threads.map(|threads| threads.0 as usize);
+        let threads = threads.unwrap_or_else(rayon::current_num_threads);
+        let choices = Choices { entry, parameters, knobs, degree, exposure, automatic, threads };
         let mut case = Self { spec, inputs: Cow::Owned(inputs), choices };
         let driver = case.driver_bytes(host)?;
         let inputs = case.inputs.to_mut();
@@ -282,6 +259,11 @@ impl<'a> Case<'a> {
             iterations: self.spec.schedule.iterations.0,
             white_background: self.spec.data.background == Background::White,
         })
+    }
+
+    /// The ledger of a run of this size.
+    pub(crate) fn ledger_of(&self, size: &RunSize) -> Result<Ledger, Failure> {
+        Ok(self.ledger(size, &self.needs(size.rows)?))
     }
 
     /// The needs of a run with this budget: the signals and terms that its backend computes.

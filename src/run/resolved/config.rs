@@ -10,13 +10,13 @@ use super::case::Init;
 use super::{ResolvedRun, ResolvedTraining};
 use crate::failure::Failure;
 use crate::spec::{
-    Assignment, Budget, FOUND_OUT, ImageCache, InitChoice, Partial, Rows, RunSpec, ShDegree,
+    Assignment, Budget, ImageCache, InitChoice, NOT_OPTIONS, Partial, Rows, RunSpec, ShDegree,
     assignments,
 };
 use densify_core::files::{FileError, write_atomically};
 use densify_data::track_colours::Spread;
 use densify_data::track_colours::exposures::ExposureSpread;
-use densify_train::output::CONFIG_FILE;
+use densify_train::output::{CONFIG_FILE, FolderError};
 
 /// A resolved run as its `config.toml` has it.
 #[derive(Debug, Clone, PartialEq)]
@@ -27,8 +27,10 @@ pub struct RunConfig {
     pub spec: RunSpec,
     /// The findings that decided them.
     pub resolved: Findings,
-    pub(crate) budget: usize,
-    pub(crate) sh_degree: u8,
+    /// The most rows there may ever be.
+    pub budget: usize,
+    /// The highest spherical-harmonic degree.
+    pub sh_degree: u8,
 }
 
 /// Facts that were found when a run was prepared.
@@ -175,7 +177,7 @@ impl RunConfig {
     /// Names the key, and what was expected.
     pub fn from_table(mut table: Table, origin: &str) -> Result<Self, Failure> {
         let fail = |problem: &str| Failure::input(problem).within(origin);
-        let [densify, resolved] = FOUND_OUT.map(|key| table.remove(key));
+        let [densify, resolved] = NOT_OPTIONS.map(|key| table.remove(key));
         let Some(Value::String(densify)) = densify else {
             return Err(fail("`densify` must be a string, the version that wrote the file"));
         };
@@ -207,7 +209,7 @@ impl RunConfig {
         let path = run.join(CONFIG_FILE);
         let text = densify_core::files::read_text(&path, densify_core::files::MAX_OPTIONS)
             .map_err(|error| match error.kind() {
-                std::io::ErrorKind::NotFound => FileError::no_run(run, CONFIG_FILE).into(),
+                std::io::ErrorKind::NotFound => FolderError::no_run(run, CONFIG_FILE).into(),
                 _ => Failure::input(format!("cannot read {}: {error}", path.display())),
             })?;
         let malformed = |problem: String| Failure::from(FileError::malformed(&path, problem));
@@ -217,26 +219,12 @@ impl RunConfig {
         Self::from_table(table, &path.display().to_string())
     }
 
-    /// The most rows there may ever be.
-    #[must_use]
-    pub fn budget(&self) -> usize {
-        self.budget
-    }
-
-    /// The highest spherical-harmonic degree.
-    #[must_use]
-    pub fn sh_degree(&self) -> u8 {
-        self.sh_degree
-    }
-
     /// The step at which the run ends.
-    #[must_use]
     pub fn last(&self) -> u32 {
         self.resolved.extended_to.unwrap_or(0).max(self.spec.schedule.iterations.0)
     }
 
     /// The dataset's folder: relative to the folder in which the run was started, if it exists there, or else as given.
-    #[must_use]
     pub fn scene_path(&self) -> PathBuf {
         let given = self.spec.start.scene.clone().unwrap_or_default();
         let from_there = self.resolved.working_directory.as_ref().map(|folder| folder.join(&given));

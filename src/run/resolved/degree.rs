@@ -22,8 +22,8 @@ impl Degree {
         *self.range.end()
     }
 
-    /// Decides the degree as the options say, or else from the colours of the dataset's tracks, if it has enough. A
-    /// number was decided by `source` in a run that goes on.
+    /// Decides the degree as the options say, or else from the colours of the dataset's tracks, if it has enough. In
+    /// a resumed run the degree is a number, which `source` had decided.
     pub(super) fn decide(
         spec: &RunSpec,
         source: Option<DegreeSource>,

@@ -17,7 +17,7 @@ pub fn estimate(
     host: Host<'_>,
 ) -> Result<(usize, Ledger), Failure> {
     let run = ResolvedRun::for_estimate(spec, models, host)?;
-    Ok((run.size.rows, run.ledger()?))
+    Ok((run.size.rows, run.case.ledger_of(&run.size)?))
 }
 
 /// Host memory of a run, at most `[bytes]`.
@@ -25,12 +25,6 @@ pub fn estimate(
 /// # Errors
 /// As preparing the run.
 pub fn host_bytes(spec: &RunSpec, host: Host<'_>) -> Result<u64, Failure> {
-    Ok(ResolvedRun::anew(spec, host)?.ledger()?.on_host())
-}
-
-impl ResolvedRun<'_> {
-    fn ledger(&self) -> Result<Ledger, Failure> {
-        let Self { case, size, .. } = self;
-        Ok(case.ledger(size, &case.needs(size.rows)?))
-    }
+    let run = ResolvedRun::anew(spec, host)?;
+    Ok(run.case.ledger_of(&run.size)?.on_host())
 }

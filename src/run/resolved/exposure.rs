@@ -27,11 +27,11 @@ pub(crate) struct Exposure {
     /// Standard deviation of the exposures in EXIF `[stops]`.
     reported: f64,
     /// Problems with EXIF, for the user.
-    notes: Vec<String>,
+    pub(super) notes: Vec<String>,
 }
 
 impl Exposure {
-    /// A decision that was made before. What the run begins with, a checkpoint has.
+    /// A decision that was made before; a checkpoint has the exposures to begin with.
     pub(super) fn known(is_on: bool, source: ExposureSource) -> Self {
         Self {
             is_on,
@@ -50,10 +50,6 @@ impl Exposure {
         let Evidence { colours, reported, .. } = evidence;
         let colours = colours.as_ref();
         let measured = colours.map(ExposureSpread::measure);
-        let source = |found: Option<ExposureSpread>| match found {
-            Some(found) => ExposureSource::Tracks(found),
-            None => ExposureSource::Undecided,
-        };
         let decided = measured
             .as_ref()
             .and_then(|(found, gains)| Some((found.decides(gains.len())?, *found)));
@@ -61,7 +57,9 @@ impl Exposure {
             ExposureChoice::Off => (false, ExposureSource::Given),
             ExposureChoice::On => (true, ExposureSource::Given),
             ExposureChoice::Auto => {
-                (decided.is_some_and(|(differ, _)| differ), source(decided.map(|(_, found)| found)))
+                let source = decided.map(|(_, found)| ExposureSource::Tracks(found));
+                let is_on = decided.is_some_and(|(differ, _)| differ);
+                (is_on, source.unwrap_or(ExposureSource::Undecided))
             }
         };
         let stops = spread(reported.stops.iter().copied().flatten());
@@ -94,10 +92,6 @@ impl Exposure {
             ));
         }
         found
-    }
-
-    pub(super) fn notes(&self) -> &[String] {
-        &self.notes
     }
 
     /// The exposures that the run begins with, if they are learned.
@@ -192,7 +186,7 @@ mod tests {
             let diagonal = begun.transform(view).matrix[1][1];
             assert!((diagonal / gain - 1.0).abs() < 1e-5, "{view}: {diagonal} {gain}");
         }
-        let [note] = found.notes() else { panic!("{:?}", found.notes()) };
+        let [note] = &found.notes[..] else { panic!("{:?}", found.notes) };
         assert!(
             note.contains("1 photographs have nonsense") && note.contains("c.jpg says"),
             "{note}"
@@ -204,11 +198,11 @@ mod tests {
             found.line(Spelling::Terminal).as_deref(),
             Some("exposure on, from one for all views")
         );
-        assert!(found.gains.is_empty() && found.notes().is_empty());
+        assert!(found.gains.is_empty() && found.notes.is_empty());
     }
 
     #[test]
-    fn exif_alone_switches_nothing_on_but_is_told_of() {
+    fn exif_alone_switches_nothing_on_but_is_reported() {
         let found = decided(ExposureChoice::Auto, &two_stops_apart());
         assert!(!found.is_on && found.gains.is_empty());
         let line = found.line(Spelling::Terminal).unwrap();

@@ -51,6 +51,7 @@ pub(super) struct Evidence {
 }
 
 /// The evidence that is read besides the dataset, and the source of the sizes of models.
+#[derive(Default)]
 pub(super) struct Reading {
     /// Sizes of the models of `--init` and `--freeze`; `None`: their files are read.
     pub(super) models: Option<[Option<ModelSize>; 2]>,
@@ -97,18 +98,13 @@ impl Inputs {
         let resident = (host.process.resident)().map(|now| now.saturating_sub(apart));
         let peak = (host.process.peak)();
         let tracks = std::mem::take(&mut dataset.tracks);
-        let colours = if reading.colours && tracks.count() >= MIN_TRACKS {
-            Some(TrackColours::read(&tracks, &dataset.train)?)
-        } else {
-            None
-        };
+        let has_colours = reading.colours && tracks.count() >= MIN_TRACKS;
+        let colours =
+            has_colours.then(|| TrackColours::read(&tracks, &dataset.train)).transpose()?;
         let track_bytes =
             if reading.tracks { tracks.bytes() + track_colours::bytes(&tracks) } else { 0 };
-        let reported = if reading.exif {
-            ReportedExposures::read(&dataset.train)
-        } else {
-            ReportedExposures::default()
-        };
+        let reported = reading.exif.then(|| ReportedExposures::read(&dataset.train));
+        let reported = reported.unwrap_or_default();
         let inputs = Self {
             images: image_demand(&dataset),
             device,

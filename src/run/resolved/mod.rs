@@ -45,7 +45,7 @@ pub(crate) struct ResolvedRun<'a> {
     pub(crate) init: Init,
     /// `--memory` made the degree lower than was wanted.
     pub(crate) degree_lowered: bool,
-    /// Why the run has this size, and what the colours of the scene decided: lines for the user.
+    /// Lines for the user: the reasons for the size, and the choices that the colours of the scene decided.
     pub(crate) reasons: Vec<String>,
 }
 

@@ -41,7 +41,7 @@ pub struct Alternatives {
 /// As preparing the run.
 pub fn plan(spec: &RunSpec, host: Host<'_>) -> Result<Plan, Failure> {
     let ResolvedRun { case, size, mut reasons, .. } = ResolvedRun::anew(spec, host)?;
-    let ledger = case.ledger(&size, &case.needs(size.rows)?);
+    let ledger = case.ledger_of(&size)?;
     reasons.push(case.promise(&ledger, host.observer.spelling()));
     let limited = case.inputs.device.limited_bytes(&ledger);
     let memory = case.memory().unwrap_or(limited.next_multiple_of(MIB));
@@ -58,18 +58,17 @@ fn alternatives(case: &Case<'_>, memory: u64, planned: usize) -> Result<Alternat
         Resolution::Width(_) => 0,
         Resolution::Divisor(divisor) => *divisor,
     });
-    let specs = resolutions.into_iter().map(|resolution| {
+    let spec = |resolution: Resolution| {
         let mut spec = case.spec.clone();
         spec.size.memory = Some(ByteCount(memory));
-        spec.data.resolution =
-            Some(resolution).filter(|_| resolution != own).or(spec.data.resolution);
+        let other = Some(resolution).filter(|_| resolution != own);
+        spec.data.resolution = other.or(spec.data.resolution);
         (resolution, spec)
-    });
-    let specs: Vec<(Resolution, RunSpec)> = specs.collect();
+    };
+    let specs: Vec<_> = resolutions.into_iter().map(spec).collect();
     // A size is left out if there are no images of it.
-    let at = |(resolution, spec)| Some((resolution, case.with(spec).ok()?));
-    let all: Vec<(&Resolution, Case<'_>)> =
-        specs.iter().filter_map(|(resolution, spec)| at((resolution, spec))).collect();
+    let cases = specs.iter().map(|(resolution, spec)| Some((*resolution, case.with(spec).ok()?)));
+    let all: Vec<(Resolution, Case<'_>)> = cases.flatten().collect();
     let rows_at = |degree| {
         let at = |(_, case): &(_, Case<'_>)| size::rows_at(case, memory, degree, planned);
         all.iter().map(at).collect()

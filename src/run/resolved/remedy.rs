@@ -59,8 +59,8 @@ fn with_preset(preset: &str, spec: &RunSpec) -> Option<RunSpec> {
     Partial::option("preset", preset).over(given).describe().ok()
 }
 
-/// The changes after which the run `fits`, each alone; or else the fewest of them together. Of smaller photographs only
-/// the largest that fit are named.
+/// The changes after which the run `fits`, each alone; or else the fewest of them together. Among smaller photographs
+/// only the largest that fit are named.
 pub(super) fn remedies(
     case: &Case<'_>,
     base: &RunSpec,

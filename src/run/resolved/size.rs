@@ -4,10 +4,10 @@ use super::ResolvedRun;
 use super::case::{Case, DECODERS, TEST_DECODERS};
 use super::fit::{Fit, IMAGES, PAIRS, RunSize, SizeRequest, fit, min_memory, most_within};
 use super::remedy::remedies;
-use crate::failure::notes::{self, BudgetReason};
-use crate::failure::{DEVICE, Failure, Remedy as Change, SizeProblem};
+use crate::failure::{DEVICE, Failure, Remedy, SizeProblem, notes};
 use crate::process::{MemoryLimit, ProcessMemory};
 use crate::spec::{Budget, ByteCount, ImageCache};
+use densify_core::budget::RowBudget;
 use densify_core::memory::{Bytes, Ledger};
 use densify_core::numbers::grouped;
 use densify_core::spelling::Spelling;
@@ -55,7 +55,7 @@ impl Size {
             Some(ImageCache::Bytes(bytes)) => bytes,
             // An eighth of the total, which includes the images.
             Some(ImageCache::Auto) => {
-                let rest = case.ledger(&setting, &case.needs(rows)?).on_host();
+                let rest = case.ledger_of(&setting)?.on_host();
                 (rest / (IMAGES - 1)).min(DEFAULT_IMAGE_CACHE).min(case.all_images())
             }
         };
@@ -69,15 +69,15 @@ impl Size {
     /// # Errors
     /// When nothing fits, with changes of the options after which it does.
     pub(super) fn choose(case: &Case<'_>) -> Result<Self, Failure> {
-        match (solve(case)?, case.memory()) {
-            (Some(size), _) if case.budget(size.setting.rows).trainable() == 0 => {
-                let budget = case.budget(size.setting.rows);
-                Err(SizeProblem::FreezeFillsBudget { frozen: budget.frozen, budget: budget.total }
-                    .into())
-            }
-            (Some(size), _) => Ok(size),
-            (None, memory) => Err(too_little(case, &request(case, memory.unwrap_or(0))?)?),
+        let Some(size) = solve(case)? else {
+            return Err(too_little(case, &request(case, case.memory().unwrap_or(0))?)?);
+        };
+        let budget = case.budget(size.setting.rows);
+        if budget.trainable() == 0 {
+            let RowBudget { total, frozen } = budget;
+            return Err(SizeProblem::FreezeFillsBudget { frozen, budget: total }.into());
         }
+        Ok(size)
     }
 
     /// True if memory made the degree lower than was wanted.
@@ -88,23 +88,11 @@ impl Size {
     /// The size and the reason for it, for the user.
     pub(super) fn lines(&self, case: &Case<'_>, spelling: Spelling) -> Vec<String> {
         let RunSize { rows, sh_degree, tile_cap, image_cache, .. } = self.setting;
-        let Some((memory, fit)) = &self.solved else {
-            let reason = match case.spec.size.budget {
-                None => BudgetReason::Default,
-                Some(Budget::Auto(_)) => BudgetReason::Automatic,
-                Some(Budget::Rows(_)) => BudgetReason::Given,
-            };
-            return vec![notes::budget(spelling, rows, &reason)];
-        };
-        let memory = *memory;
-        let reason = match case.asked_budget() {
-            Some(given) if fit.by_memory => BudgetReason::LessThanGiven { memory, given },
-            Some(_) => BudgetReason::AsGiven { memory },
-            None if fit.by_memory => BudgetReason::Memory { memory },
-            None => BudgetReason::Device,
-        };
-        let mut lines = vec![notes::budget(spelling, rows, &reason)];
-        let memory = Bytes(memory);
+        let solved = self.solved.as_ref();
+        let limit = solved.map(|(memory, fit)| (*memory, fit.by_memory));
+        let mut lines = vec![notes::budget(spelling, rows, case.spec.size.budget, limit)];
+        let Some((memory, fit)) = solved else { return lines };
+        let memory = Bytes(*memory);
         lines.push(format!(
             "memory   {memory} given: degree {sh_degree}, {} (Gaussian, tile) pairs, images {}",
             grouped(tile_cap),
@@ -176,7 +164,7 @@ impl ResolvedRun<'_> {
             Ok::<_, Failure>(bytes(case, &size)? <= memory)
         };
         let pairs = most_within(size.rows, size.tile_cap, fits)?.unwrap_or(size.rows);
-        let changes = [Change::NoImages, Change::TileCap(pairs)];
+        let changes = [Remedy::NoImages, Remedy::TileCap(pairs)];
         let remedies = remedies(case, case.spec, &changes, |case| {
             Ok(bytes(case, &Size::as_given(case)?.setting)? <= memory)
         });
@@ -190,7 +178,7 @@ impl ResolvedRun<'_> {
         is_resumed: bool,
     ) -> Result<(), Failure> {
         let Self { case, size, .. } = self;
-        let ledger = case.ledger(size, &case.needs(size.rows)?);
+        let ledger = case.ledger_of(size)?;
         let granted = (process.grant)(case.choices.threads + DECODERS + TEST_DECODERS);
         let (Some(MemoryLimit { left, by }), Some(now)) = (granted, (process.resident)()) else {
             return Ok(());
@@ -203,26 +191,24 @@ impl ResolvedRun<'_> {
         let most = (now + left) / 64 * 63;
         let on_host = |case: &Case<'_>| {
             let Some(Size { setting, .. }) = solve(case)? else { return Ok(false) };
-            let ledger = case.ledger(&setting, &case.needs(setting.rows)?);
-            Ok::<_, Failure>(ledger.on_host() <= most)
+            Ok::<_, Failure>(case.ledger_of(&setting)?.on_host() <= most)
         };
         let mut base = case.spec.clone();
-        let mut found = Vec::new();
-        if !is_resumed && case.inputs.device.kind() == BackendKind::Cpu {
-            // On a GPU it would limit the device's memory.
-            let less = Change::Memory(most / MIB);
+        // On a GPU it would limit the device's memory.
+        let less = (!is_resumed && case.inputs.device.kind() == BackendKind::Cpu).then(|| {
             base.size.memory = Some(ByteCount(most / MIB * MIB));
-            let fits = case.with(&base).and_then(|case| on_host(&case)).unwrap_or(false);
-            found = if fits {
-                vec![vec![less]]
-            } else {
-                let mut found = remedies(case, &base, &Change::NEW, on_host);
-                found.iter_mut().for_each(|changes| changes.insert(0, less));
-                found
-            };
-        } else if !is_resumed {
-            found = remedies(case, &base, &Change::NEW, on_host);
-        }
+            Remedy::Memory(most / MIB)
+        });
+        let mut found = if is_resumed {
+            Vec::new()
+        } else if less.is_some()
+            && case.with(&base).and_then(|case| on_host(&case)).unwrap_or(false)
+        {
+            vec![Vec::new()]
+        } else {
+            remedies(case, &base, &Remedy::NEW, on_host)
+        };
+        found.iter_mut().for_each(|changes| changes.splice(0..0, less).for_each(drop));
         let needed = ledger.on_host();
         let problem =
             SizeProblem::OverGrant { needed, resident: now, limit: by, left, remedies: found };
@@ -265,8 +251,7 @@ pub(super) fn rows_at(
 
 /// Bytes of a run of this size that `--memory` limits.
 fn bytes(case: &Case<'_>, setting: &RunSize) -> Result<u64, Failure> {
-    let needs = case.needs(setting.rows)?;
-    Ok(case.inputs.device.limited_bytes(&case.ledger(setting, &needs)))
+    Ok(case.inputs.device.limited_bytes(&case.ledger_of(setting)?))
 }
 
 fn request(case: &Case<'_>, memory: u64) -> Result<SizeRequest, Failure> {
@@ -304,12 +289,12 @@ fn too_little(case: &Case<'_>, request: &SizeRequest) -> Result<Failure, Failure
     let Some(least) = min_memory(request, MIB, |setting| bytes(case, setting))? else {
         return Ok(SizeProblem::NoSize { memory }.into());
     };
-    let mut remedies = remedies(case, case.spec, &Change::NEW, |case| Ok(solve(case)?.is_some()));
+    let mut remedies = remedies(case, case.spec, &Remedy::NEW, |case| Ok(solve(case)?.is_some()));
     let fewer = SizeRequest { least_rows: case.rows_for(1), ..request.clone() };
     if let Some(fewer) = fit(&fewer, |setting| bytes(case, setting))? {
-        remedies.push(vec![Change::Budget(fewer.setting.rows)]);
+        remedies.push(vec![Remedy::Budget(fewer.setting.rows)]);
     }
     let needed = least / MIB;
-    remedies.push(vec![Change::Memory(needed)]);
+    remedies.push(vec![Remedy::Memory(needed)]);
     Ok(SizeProblem::NoModelFits { memory, rows, sh_degree: degree, needed, remedies }.into())
 }

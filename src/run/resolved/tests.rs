@@ -27,7 +27,7 @@ fn described(options: &[(&str, toml::Value)]) -> RunSpec {
 /// Rows of a run, and its bytes that `--memory` limits.
 fn sized(case: &Case<'_>) -> (usize, u64) {
     let setting = size::solve(case).expect("it is solved").expect("it fits").setting;
-    let ledger = case.ledger(&setting, &case.needs(setting.rows).expect("needs"));
+    let ledger = case.ledger_of(&setting).expect("a ledger");
     (setting.rows, case.inputs.device.limited_bytes(&ledger))
 }
 
@@ -92,19 +92,18 @@ fn plain_ledger(made: &Made, exposure: &str) -> (Vec<(Section, String, u64)>, u6
     let host = Host { process: ProcessMemory::UNKNOWN, ..Host::default() };
     let case = Case::anew(&spec, host).expect("a scene");
     let setting = size::solve(&case).expect("it is solved").expect("it fits").setting;
-    let ledger = case.ledger(&setting, &case.needs(setting.rows).expect("needs"));
+    let ledger = case.ledger_of(&setting).expect("a ledger");
     let total = ledger.total();
     (ledger.lines.into_iter().map(|line| (line.section, line.what, line.bytes)).collect(), total)
 }
 
-/// The memory of a run without exposures, masks and lenses is a fixed number: nothing that these need is
-/// paid for without them, not a byte of a view.
+/// The memory of a run without exposures, masks and lenses is a fixed number: they take no byte where they are not used.
 #[cfg(all(unix, target_pointer_width = "64"))]
 #[test]
 fn what_is_not_used_of_photographs_takes_no_byte() {
     let made = Made::colmap_txt();
     let (plain, total) = plain_ledger(&made, "off");
-    // Whoever makes a run take more or less on purpose writes the new number here.
+    // A change that makes a run take more or less on purpose updates this number.
     assert_eq!(total, 34_785_170, "{plain:#?}");
     let differing = |other: &[(Section, String, u64)]| {
         let found = other.iter().filter(|line| !plain.contains(line));

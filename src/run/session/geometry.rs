@@ -25,7 +25,7 @@ pub(super) fn measure(session: Session<'_>, folder: &Path) -> Result<(), Failure
     if geometry_of(folder, iteration)?.is_some() || observer.interrupt().is_some() {
         return Ok(());
     }
-    let [host, device] = measuring.bytes(run.trainer.rows(), run.config.sh_degree());
+    let [host, device] = measuring.bytes(run.trainer.rows(), run.config.sh_degree);
     let process = run.ledger.lines.iter().filter(|line| line.section == Section::Process);
     let host = host + process.map(|line| line.bytes).sum::<u64>();
     drop(run.trainer);

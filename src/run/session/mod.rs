@@ -14,7 +14,6 @@ pub use requirements::{LeftOut, Reductions, Requirements};
 pub use resume::{Resumed, start};
 pub use run::Run;
 
-use std::collections::BTreeSet;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -58,14 +57,6 @@ struct Session<'a> {
     checkpoint: Option<u32>,
 }
 
-/// The steps after which models are saved, measured or kept.
-struct Duties {
-    saves: BTreeSet<u32>,
-    tests: BTreeSet<u32>,
-    checkpoint_every: u32,
-    last: u32,
-}
-
 /// The treatment of a run that is in the output folder already.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Occupied {
@@ -79,32 +70,25 @@ pub enum Occupied {
 
 /// Trains to the end and writes all files of the run; returns the folder.
 fn train(run: Run, occupied: Occupied, observer: &dyn Observer) -> Result<PathBuf, Failure> {
-    let last = run.last;
     // Nothing of a run that goes on is removed, even if it is only the description.
     let has_begun = run.session.is_some() || run.output.join(CONFIG_FILE).exists();
     let resumes = occupied == Occupied::Resume && has_begun;
     let folder = match occupied {
         Occupied::Resume => RunFolder::resume(&run.output, run.session.is_none())?,
-        Occupied::Refuse => RunFolder::create(&run.output, false)?,
-        Occupied::Replace => RunFolder::create(&run.output, true)?,
-    };
-    let output = &run.spec.output;
-    let duties = Duties {
-        saves: output.save_iterations.iter().copied().chain([last]).collect(),
-        tests: output.test_iterations.iter().copied().chain([last]).collect(),
-        checkpoint_every: output.checkpoint_every,
-        last,
+        Occupied::Refuse | Occupied::Replace => {
+            RunFolder::create(&run.output, occupied == Occupied::Replace)?
+        }
     };
     let mut session = match Session::start(run, &folder, observer) {
         Ok(session) => session,
-        // If nothing can be written, nothing is lost.
+        // What an earlier session has written must not be removed.
         Err(error) if resumes => return Err(error),
         Err(error) => {
             folder.discard();
             return Err(error);
         }
     };
-    let done = session.go(&duties);
+    let done = session.run_steps();
     let guard = folder.guard();
     let finished = done
         .and_then(|()| guard.check().map_err(Failure::from))
@@ -114,7 +98,7 @@ fn train(run: Run, occupied: Occupied, observer: &dyn Observer) -> Result<PathBu
             let path = folder.finish()?;
             session.report(&path);
             measure(session, &path).map_err(|failure| {
-                failure.with(TrainingProblem::CompleteAllTheSame { run: path.clone() })
+                failure.with(TrainingProblem::OnlyMeasuringFailed { run: path.clone() })
             })?;
             Ok(path)
         }
@@ -182,33 +166,33 @@ impl<'a> Session<'a> {
     }
 
     /// Does all remaining steps.
-    fn go(&mut self, duties: &Duties) -> Result<(), Failure> {
+    fn run_steps(&mut self) -> Result<(), Failure> {
         let done = self.run.trainer.steps_done();
-        let (last, budget) = (duties.last, self.run.config.budget());
+        let (last, budget) = (self.run.last, self.run.config.budget);
         if done > 0 {
-            // A run may have been stopped before the duties of its last step.
-            self.after(done, duties, true)?;
+            // A run may have been stopped before its last step was saved, measured and kept.
+            self.after(done, true)?;
         }
         self.observer.begin(done, last, budget);
         let stepped = (done + 1..=last).try_for_each(|step| {
-            self.rest();
+            self.consult_observer();
             if let Some(interrupt) = self.observer.interrupt() {
-                return Err(self.interrupted(interrupt));
+                return Err(self.stopped_by(interrupt));
             }
             let report = self.step()?;
             self.observer.step(step, report.output.loss, report.rows);
-            self.after(step, duties, false)
+            self.after(step, false)
         });
         self.observer.end();
         stepped.and_then(|()| self.check_drawn())
     }
 
     /// Lets the observer render the model, and writes the checkpoints that it asks for.
-    fn rest(&mut self) {
+    fn consult_observer(&mut self) {
         loop {
             let (model, rows) = self.run.trainer.backend_and_history();
             match self.observer.between(model, rows) {
-                Between::Checkpoint => self.keep_or_say(),
+                Between::Checkpoint => self.try_checkpoint(),
                 Between::Step => return,
             }
         }
@@ -216,9 +200,9 @@ impl<'a> Session<'a> {
 
     /// Writes a checkpoint. If it cannot be written, training goes on: the run is worth more, and the previous checkpoint
     /// is still there.
-    fn keep_or_say(&mut self) {
+    fn try_checkpoint(&mut self) {
         let step = self.run.trainer.steps_done();
-        let trouble = self.keep().err().map(|error| {
+        let trouble = self.write_checkpoint().err().map(|error| {
             tracing::error!(step, "the checkpoint could not be written, training goes on: {error}");
             format!("the checkpoint of step {step} could not be written: {error}")
         });
@@ -237,27 +221,30 @@ impl<'a> Session<'a> {
 
     /// Saves and measures the model and writes a checkpoint if they are due after `step`; in a resumed run, only those
     /// that do not exist yet.
-    fn after(&mut self, step: u32, duties: &Duties, resumed: bool) -> Result<(), Failure> {
-        let every = duties.checkpoint_every;
-        let due = every > 0 && (step.is_multiple_of(every) || step == duties.last);
-        if due || duties.saves.contains(&step) || duties.tests.contains(&step) {
+    fn after(&mut self, step: u32, resumed: bool) -> Result<(), Failure> {
+        let (output, is_last) = (&self.run.spec.output, step == self.run.last);
+        let every = output.checkpoint_every;
+        let due = every > 0 && (step.is_multiple_of(every) || is_last);
+        let [saves, tests] = [&output.save_iterations, &output.test_iterations]
+            .map(|steps| is_last || steps.contains(&step));
+        if due || saves || tests {
             self.guard.check()?;
         }
-        let there = |path: PathBuf| resumed && path.is_file();
-        if duties.saves.contains(&step) && !there(model_path(&self.folder, step)) {
+        let exists = |path: PathBuf| resumed && path.is_file();
+        if saves && !exists(model_path(&self.folder, step)) {
             self.save(step)?;
         }
-        if duties.tests.contains(&step) && !(resumed && self.totals.tested.contains_key(&step)) {
-            self.test(step, step == duties.last)?;
+        if tests && !(resumed && self.totals.tested.contains_key(&step)) {
+            self.test(step, is_last)?;
         }
-        if due && !there(checkpoint_path(&self.folder, step)) {
-            self.keep_or_say();
+        if due && !exists(checkpoint_path(&self.folder, step)) {
+            self.try_checkpoint();
         }
         Ok(())
     }
 
     /// Writes a checkpoint.
-    fn keep(&mut self) -> Result<(), CheckpointError> {
+    fn write_checkpoint(&mut self) -> Result<(), CheckpointError> {
         let step = self.run.trainer.steps_done();
         if self.checkpoint == Some(step) {
             return Ok(());
@@ -266,8 +253,8 @@ impl<'a> Session<'a> {
         let trainer = self.run.trainer.state();
         let header = Header {
             densify: self.run.config.densify.clone(),
-            budget: self.run.config.budget(),
-            sh_degree: self.run.config.sh_degree(),
+            budget: self.run.config.budget,
+            sh_degree: self.run.config.sh_degree,
             config: self.config.clone(),
             dataset: self.run.fingerprint.clone(),
             trainer: trainer.map_err(|source| CheckpointError::Policy { source })?,
@@ -280,15 +267,15 @@ impl<'a> Session<'a> {
     }
 
     /// Ends the run so that it can be resumed later.
-    fn interrupted(&mut self, Interrupt { name, exit_code }: Interrupt) -> Failure {
+    fn stopped_by(&mut self, Interrupt { name, exit_code }: Interrupt) -> Failure {
         let step = self.run.trainer.steps_done();
         let stopped = TrainingProblem::Stopped { by: name, step: Some(step) };
-        self.kept(Failure::with_code(exit_code, stopped))
+        self.with_checkpoint(Failure::with_code(exit_code, stopped))
     }
 
     /// Writes a checkpoint of a run that ends with `failure`.
-    fn kept(&mut self, failure: Failure) -> Failure {
-        match self.keep() {
+    fn with_checkpoint(&mut self, failure: Failure) -> Failure {
+        match self.write_checkpoint() {
             Ok(()) => failure,
             Err(error) => {
                 failure.with(TrainingProblem::CheckpointFailed { error: error.to_string() })
@@ -316,12 +303,12 @@ impl<'a> Session<'a> {
                 let saved = self.save(step).map_err(|failure| failure.to_string());
                 Err(Failure::from(error).with(TrainingProblem::ModelSaved { saved }))
             }
-            Err(error @ TrainError::NonFinite { .. }) => Err(self.kept(error.into())),
+            Err(error @ TrainError::NonFinite { .. }) => Err(self.with_checkpoint(error.into())),
             // The photograph could be read before. In the first epoch little is lost.
             Err(error @ TrainError::View { step, .. })
                 if step > self.run.trainer.steps_done() && step as usize > train_views =>
             {
-                Err(self.kept(error.into()))
+                Err(self.with_checkpoint(error.into()))
             }
             Err(error) => Err(error.into()),
         }
@@ -355,7 +342,7 @@ impl<'a> Session<'a> {
         PLY.write_file(&path, shape, |piece| {
             Ok::<_, Failure>(to_world.world_from_model(backend.download_rows(piece)?))
         })?;
-        if let Some(exposures) = self.run.trainer.exposures() {
+        if let Some(exposures) = &self.run.trainer.progress().exposures {
             let names = self.run.dataset.train.iter().map(|view| &*view.name);
             let named = named_transforms(exposures, names);
             write_json(&path.with_file_name(EXPOSURES), &named)?;
@@ -369,7 +356,7 @@ impl<'a> Session<'a> {
         if test.count() == 0 {
             return Ok(());
         }
-        let (background, degree) = (spec.data.background.fixed(), config.sh_degree());
+        let (background, degree) = (spec.data.background.fixed(), config.sh_degree);
         let observer = self.observer;
         let fits_exposure = config.resolved.has_exposures;
         let comparison = Comparison { lpips: None, fits_exposure };
@@ -378,7 +365,7 @@ impl<'a> Session<'a> {
         });
         let scores = match (scores, self.observer.interrupt()) {
             (Err(EvaluateError::Stopped), Some(interrupt)) => {
-                return Err(self.interrupted(interrupt));
+                return Err(self.stopped_by(interrupt));
             }
             (scores, _) => scores?,
         };

@@ -67,7 +67,6 @@ pub struct LeftOut {
 
 impl Requirements {
     /// The report of a run that ended with `rows` rows.
-    #[must_use]
     pub fn new(
         config: &RunConfig,
         rows: usize,
@@ -77,13 +76,13 @@ impl Requirements {
         let left_out = [
             degree_left_out(config),
             exposures_left_out(config),
-            auto_budget.and_then(|auto| rows_left_out(auto, rows, config.budget())),
+            auto_budget.and_then(|auto| rows_left_out(auto, rows, config.budget)),
             auto_budget.and_then(rows_removed),
             (unscored_views > 0).then(|| unscored(unscored_views)),
         ];
         Self {
             full: config.spec.size.full,
-            sh_degree: config.sh_degree(),
+            sh_degree: config.sh_degree,
             sh_degree_from: config.resolved.sh_degree_from,
             exposures: config.resolved.has_exposures,
             exposures_from: config.resolved.exposure_from,
@@ -94,7 +93,6 @@ impl Requirements {
     }
 
     /// The report in a few lines.
-    #[must_use]
     pub fn lines(&self, spelling: Spelling) -> Vec<String> {
         if self.left_out.is_empty() {
             let full = spelling.switch("full");
@@ -108,7 +106,7 @@ impl Requirements {
 }
 
 fn degree_left_out(config: &RunConfig) -> Option<LeftOut> {
-    let degree = config.sh_degree();
+    let degree = config.sh_degree;
     let what = match MAX_SH_DEGREE.checked_sub(degree)? {
         0 => return None,
         1 => format!("degree {MAX_SH_DEGREE} of colour"),

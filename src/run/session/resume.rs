@@ -6,13 +6,13 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use toml::{Table, Value};
+use toml::Value;
 
 use super::records::SavedSession;
 use crate::failure::{Difference, Failure, ResumeProblem, notes};
 use crate::observer::Observer;
 use crate::resolved::RunConfig;
-use crate::spec::{OnResume, Partial, RunOption, RunSpec};
+use crate::spec::{OnResume, Partial, RunOption, RunSpec, assignments};
 use densify_data::views::DatasetViews;
 use densify_train::checkpoint::{Checkpoint, CheckpointError, Fingerprint, newest};
 use densify_train::output::{CONFIG_FILE, RunFolder, saved_iterations};
@@ -71,7 +71,7 @@ pub fn start(
             RunConfig::from_table(checkpoint.header().config.clone(), &origin)?
         }
         None => {
-            nothing(&output, &rejected, observer)?;
+            check_restart(&output, &rejected, observer)?;
             if !output.join(CONFIG_FILE).exists() {
                 return Ok((described, None));
             }
@@ -137,8 +137,8 @@ fn overlay(mut given: Partial, saved: &RunConfig, origin: &str) -> Result<RunSpe
     given.over(lower).spec()
 }
 
-/// There is no sound checkpoint in the folder.
-fn nothing(
+/// Fails if the folder, which has no sound checkpoint, holds a run that cannot begin again.
+fn check_restart(
     output: &Path,
     rejected: &[CheckpointError],
     observer: &dyn Observer,
@@ -197,21 +197,13 @@ fn difference(key: &str, now: Option<&String>, then: Option<&String>) -> Differe
 
 /// Every setting that a resumed run must keep, by its path, as text.
 fn fixed(config: &RunConfig) -> Result<BTreeMap<String, String>, Failure> {
-    fn walk(prefix: &str, table: &Table, found: &mut BTreeMap<String, String>) {
-        for (key, value) in table {
-            let path = if prefix.is_empty() { key.clone() } else { format!("{prefix}.{key}") };
-            match value {
-                Value::Table(inner) => walk(&path, inner, found),
-                leaf => _ = found.insert(path, leaf.to_string()),
-            }
-        }
-    }
     let mut table = config.spec.table()?;
     table.retain(|name, _| {
         RunOption::find(name).is_some_and(|option| option.on_resume == OnResume::Fixed)
     });
-    let mut found = BTreeMap::new();
-    walk("", &table, &mut found);
+    let found =
+        assignments(&table).into_iter().map(|set| (set.path.join("."), set.value.to_string()));
+    let mut found: BTreeMap<_, _> = found.collect();
     found.retain(|key, _| !FREE_KNOBS.contains(&&**key));
     let resolved =
         [("adapter", &config.resolved.adapter), ("accumulation", &config.resolved.accumulation)];

@@ -13,24 +13,26 @@ use crate::resolved::{Measuring, RunConfig};
 use crate::spec::RunSpec;
 use densify_core::gaussians::Gaussians;
 use densify_core::memory::Ledger;
-use densify_data::dataset::{Dataset, PointCloud};
+use densify_data::dataset::Dataset;
 use densify_data::views::DatasetViews;
 use densify_train::checkpoint::Fingerprint;
 use densify_train::trainer::Trainer;
 
 /// A run, ready to train.
 pub struct Run {
-    /// As it was asked for.
+    /// The description, as it was asked for.
     pub(super) spec: RunSpec,
-    /// With everything decided, as `config.toml` has it.
-    pub(super) config: RunConfig,
+    /// The run with everything decided, as `config.toml` has it.
+    pub config: RunConfig,
     pub(super) output: PathBuf,
-    pub(super) trainer: Trainer<DatasetViews>,
+    /// The trainer.
+    pub trainer: Trainer<DatasetViews>,
     /// The test views.
     pub(super) test: DatasetViews,
     /// The dataset; of its points only those that a companion asks for.
-    pub(super) dataset: Dataset,
-    pub(super) ledger: Ledger,
+    pub dataset: Dataset,
+    /// Bytes per buffer, as promised.
+    pub ledger: Ledger,
     /// The measurement at the end, if the surface is known.
     pub(super) measuring: Option<Measuring>,
     /// Identifies the dataset in checkpoints.
@@ -61,34 +63,6 @@ impl Run {
         host: Host<'_>,
     ) -> Result<Self, Failure> {
         prepare::prepare(spec, resumed, host)
-    }
-
-    /// Bytes per buffer, as promised.
-    #[must_use]
-    pub fn ledger(&self) -> &Ledger {
-        &self.ledger
-    }
-
-    /// The run with everything decided.
-    #[must_use]
-    pub fn config(&self) -> &RunConfig {
-        &self.config
-    }
-
-    /// The dataset; of its points only those that a companion asks for.
-    #[must_use]
-    pub fn dataset(&self) -> &Dataset {
-        &self.dataset
-    }
-
-    /// The points of the dataset that a companion asks for.
-    pub fn take_points(&mut self) -> PointCloud {
-        std::mem::take(&mut self.dataset.points)
-    }
-
-    /// The trainer.
-    pub fn trainer(&mut self) -> &mut Trainer<DatasetViews> {
-        &mut self.trainer
     }
 
     /// Trains to the end, writes nothing, and returns the model in the dataset's own coordinates.

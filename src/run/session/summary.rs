@@ -14,9 +14,12 @@ use densify_train::output::{Mean, Summary, model_path, write_json};
 impl Session<'_> {
     pub(super) fn write_summary(&self, finished: bool) -> Result<(), FileError> {
         let Run { spec, config, trainer, test, ledger, .. } = &self.run;
-        let (events, views) = trainer.policy_times();
-        let images = trainer.images_time();
-        let more = [("policy events", events), ("policy views", views), ("images", images)];
+        let state = trainer.progress();
+        let more = [
+            ("policy events", state.policy_time.saturating_sub(state.views_time)),
+            ("policy views", state.views_time),
+            ("images", trainer.images_time()),
+        ];
         let more = more.map(|(stage, time)| (stage.to_owned(), time));
         let stages = self.totals.stages.clone().into_iter().chain(more);
         let stage_seconds = stages.map(|(stage, time)| (stage, time.as_secs_f64())).collect();
@@ -24,11 +27,11 @@ impl Session<'_> {
             densify: config.densify.clone(),
             policy: spec.density.policy.clone(),
             finished,
-            iterations: trainer.steps_done(),
+            iterations: state.step,
             rows: trainer.rows(),
-            peak_rows: trainer.peak_rows(),
-            budget: config.budget(),
-            extra_forwards: trainer.extra_forwards(),
+            peak_rows: state.peak_rows,
+            budget: config.budget,
+            extra_forwards: state.extra_forwards,
             peak_bytes: self.totals.peak_bytes(self.run.process),
             memory: spec.size.memory.map(|bytes| bytes.0),
             ledger_bytes: ledger.total(),
@@ -47,8 +50,8 @@ impl Session<'_> {
     /// The automatic reductions.
     fn requirements(&self) -> Requirements {
         let Run { config, trainer, .. } = &self.run;
-        let (growth, unscored) = (trainer.growth(), trainer.unscored_views());
-        Requirements::new(config, trainer.rows(), growth, unscored)
+        let growth = trainer.progress().auto_budget.as_ref();
+        Requirements::new(config, trainer.rows(), growth, trainer.unscored_views())
     }
 
     /// Tells the user the result in a few lines.
@@ -70,8 +73,8 @@ impl Session<'_> {
         self.observer.say(format_args!(
             "rows     {}, at most {} of {}",
             grouped(trainer.rows()),
-            grouped(trainer.peak_rows()),
-            grouped(config.budget())
+            grouped(trainer.progress().peak_rows),
+            grouped(config.budget)
         ));
         let promised = Bytes(ledger.total());
         if let Some(peak) = self.totals.peak_bytes(self.run.process) {

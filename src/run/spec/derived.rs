@@ -16,7 +16,6 @@ use densify_train::schedule::{InitRates, RateOptions};
 
 impl DataSpec {
     /// The options for reading the dataset, with or without tracks.
-    #[must_use]
     pub fn load_options(&self, tracks: bool) -> LoadOptions {
         LoadOptions {
             images: self.images.clone(),
@@ -73,12 +72,11 @@ impl RunSpec {
             return Ok(folder.clone());
         }
         let (scene, policy) = (self.scene()?, &self.density.policy);
-        if let Some(name) = builtin::label(scene) {
-            return Ok(Path::new("output").join(format!("{name}-{policy}")));
-        }
-        let full = scene.canonicalize().unwrap_or_else(|_| scene.to_owned());
-        let last = if full.is_file() { full.file_stem() } else { full.file_name() };
-        let name = last.map_or_else(|| "scene".into(), |name| name.to_string_lossy());
+        let name = builtin::label(scene).unwrap_or_else(|| {
+            let full = scene.canonicalize().unwrap_or_else(|_| scene.to_owned());
+            let last = if full.is_file() { full.file_stem() } else { full.file_name() };
+            last.map_or_else(|| "scene".to_owned(), |name| name.to_string_lossy().into_owned())
+        });
         Ok(Path::new("output").join(format!("{name}-{policy}")))
     }
 

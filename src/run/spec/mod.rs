@@ -10,7 +10,7 @@ pub mod knobs;
 mod overlay;
 mod values;
 
-pub(crate) use overlay::FOUND_OUT;
+pub(crate) use overlay::NOT_OPTIONS;
 pub use overlay::Partial;
 pub(crate) use values::assignments;
 pub use values::{
@@ -54,29 +54,38 @@ pub struct RunOption {
 
 impl RunOption {
     /// The option of this name.
-    #[must_use]
     pub fn find(name: &str) -> Option<&'static Self> {
         OPTIONS.iter().find(|option| option.name == name)
     }
 
     /// The flag, such as `--tile-cap`; `SCENE`, which has none.
-    #[must_use]
     pub fn flag(&self) -> String {
         Spelling::Terminal.option(self.name)
     }
 }
 
-/// Declares a struct per group, its defaults, [`RunSpec`] and the table of options from one list.
+/// Declares a struct per group, its defaults, [`RunSpec`] and the table of options from one list. A flag takes the value
+/// that is named; a switch stands alone, or has `=true` or `=false`.
 macro_rules! run_spec {
     ($($(#[$doc:meta])* $group:ident: $struct:ident, $heading:literal {
-        $($(#[$meta:meta])* $name:ident: $type:ty = $default:expr, $on_resume:ident;)*
+        $($(#[$meta:meta])* $name:ident: $type:ty = $default:expr, $on_resume:ident
+            $(, value $value:literal)? $(, switch $action:ident)?;)*
     })*) => {
         $(
             $(#[$doc])*
             #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Args)]
             #[serde(default)]
             pub struct $struct {
-                $(#[arg(help_heading = $heading)] $(#[$meta])* pub $name: $type,)*
+                $(
+                    #[arg(help_heading = $heading)]
+                    $(#[arg(long, value_name = $value)])?
+                    $(#[arg(
+                        long, value_name = "true|false", action = ArgAction::$action, num_args = 0..=1,
+                        require_equals = true, default_missing_value = "true", hide_possible_values = true
+                    )])?
+                    $(#[$meta])*
+                    pub $name: $type,
+                )*
             }
 
             impl Default for $struct {
@@ -86,8 +95,8 @@ macro_rules! run_spec {
             }
         )*
 
-        /// A run, completely described: plain data with a default for everything. What is `None` is decided
-        /// when the run is prepared.
+        /// A run, completely described: plain data with a default for everything. Fields that are `None` are
+        /// decided when the run is prepared.
         ///
         /// In a file all options stand side by side; the groups are those of the help.
         #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, Args)]
@@ -107,69 +116,47 @@ run_spec! {
     data: DataSpec, "Scene" {
         /// Hold out the dataset's own test views, or every 8th photograph by sorted name, for
         /// measuring
-        #[arg(
-            long, value_name = "true|false", action = ArgAction::Set, num_args = 0..=1,
-            require_equals = true, default_missing_value = "true", hide_possible_values = true,
-            conflicts_with = "test_every"
-        )]
-        eval: bool = false, Fixed;
+        #[arg(conflicts_with = "test_every")]
+        eval: bool = false, Fixed, switch Set;
 
         /// Hold out every K-th photograph by sorted name, the first included
-        #[arg(long, value_name = "K")]
-        test_every: Option<NonZeroU32> = None, Fixed;
+        test_every: Option<NonZeroU32> = None, Fixed, value "K";
 
         /// Folder of the photographs, if it is not the dataset's own (relative to the dataset)
-        #[arg(long, value_name = "DIR")]
-        images: Option<PathBuf> = None, Free;
+        images: Option<PathBuf> = None, Free, value "DIR";
 
         /// Use only the views that this file names, one per line. A tab and four numbers from 0 to 1 after a name
         /// (left, top, right, bottom) select a part of the view. Views are split into training and test views before
         /// the others are left out
-        #[arg(long, value_name = "FILE")]
-        views: Option<AbsolutePath> = None, Fixed;
+        views: Option<AbsolutePath> = None, Fixed, value "FILE";
 
         /// Treatment of views whose camera is more than 10 times as far from the others as usual, if they are at most
         /// one in 20: structure from motion misplaces some
-        #[arg(long, value_name = "WHAT")]
-        far_cameras: FarCameras = FarCameras::LeaveOut, Fixed;
+        far_cameras: FarCameras = FarCameras::LeaveOut, Fixed, value "WHAT";
 
         /// Keep the full field of view of a distorted lens, and mask pixels that it did not see; by default photographs
         /// are cropped to the largest rectangle without such pixels. Where the distortion folds over, the invertible
         /// part is kept
-        #[arg(
-            long, value_name = "true|false", action = ArgAction::Set, num_args = 0..=1,
-            require_equals = true, default_missing_value = "true", hide_possible_values = true
-        )]
-        keep_fov: bool = false, Fixed;
+        keep_fov: bool = false, Fixed, switch Set;
 
         /// Masks are white where photographs are to be ignored; by default black is ignored
-        #[arg(
-            long, value_name = "true|false", action = ArgAction::Set, num_args = 0..=1,
-            require_equals = true, default_missing_value = "true", hide_possible_values = true
-        )]
-        invert_masks: bool = false, Fixed;
+        invert_masks: bool = false, Fixed, switch Set;
 
         /// Meaning of masked pixels. To carve out an object, background needs a background colour that the object does
         /// not have, or --background random
-        #[arg(long, value_name = "MODE")]
-        mask_mode: MaskMode = MaskMode::Ignore, Fixed;
+        mask_mode: MaskMode = MaskMode::Ignore, Fixed, value "MODE";
 
         /// Render a built-in scene again, and do not keep it in the user's cache folder
-        #[arg(
-            long, value_name = "true|false", action = ArgAction::Set, num_args = 0..=1,
-            require_equals = true, default_missing_value = "true", hide_possible_values = true
-        )]
-        no_cache: bool = false, Free;
+        no_cache: bool = false, Free, switch Set;
 
         /// 1, 2, 4 or 8: photographs this many times smaller (uses images_2, images_4, images_8 if they exist); any
         /// larger number: their width in pixels
-        #[arg(short, long, value_name = "N")]
-        resolution: Option<Resolution> = None, Fixed;
+        #[arg(short)]
+        resolution: Option<Resolution> = None, Fixed, value "N";
 
         /// Background of the scene, and of transparent images: black, white, random (another colour at every step) or
         /// #rrggbb
-        #[arg(long, value_name = "COLOUR")]
-        background: Background = Background::Black, Fixed;
+        background: Background = Background::Black, Fixed, value "COLOUR";
     }
 
     /// The dataset, and the first Gaussians.
@@ -183,29 +170,24 @@ run_spec! {
         ///
         /// Of a model with more Gaussians than the budget, those that contribute most to the training views are kept.
         /// Its colours are cut or extended to --sh-degree
-        #[arg(long, value_name = "points|random|MODEL")]
-        init: Option<InitChoice> = None, Fixed;
+        init: Option<InitChoice> = None, Fixed, value "points|random|MODEL";
 
         /// Learning rates of a run from a model; --lr changes single ones
-        #[arg(long, value_name = "WHICH")]
-        init_rates: InitRates = InitRates::Fine, Fixed;
+        init_rates: InitRates = InitRates::Fine, Fixed, value "WHICH";
 
         /// A model in the dataset's coordinates, by any program, whose Gaussians are rendered but never change: they
         /// are neither trained, moved nor removed. The Gaussians of --init are trained beside them; the budget counts
         /// both
-        #[arg(long, value_name = "MODEL")]
-        freeze: Option<AbsolutePath> = None, Fixed;
+        freeze: Option<AbsolutePath> = None, Fixed, value "MODEL";
 
         /// Number of random points to start from (default: half the budget, at most 100k)
-        #[arg(long, value_name = "N")]
-        init_points: Option<Rows> = None, Fixed;
+        init_points: Option<Rows> = None, Fixed, value "N";
 
         /// Nearest distance to a camera at which anything is drawn, as a fraction of the scene's
         /// extent
         // The original's 0.2 for an extent of 5. Nearer Gaussians become fog before one camera: with
         // 0.01, test views lost up to 10 dB to it.
-        #[arg(long, value_name = "FRACTION")]
-        near: Fraction = Fraction(0.04), Fixed;
+        near: Fraction = Fraction(0.04), Fixed, value "FRACTION";
     }
 
     /// Limits of memory and quality.
@@ -216,8 +198,8 @@ run_spec! {
         /// auto: growth stops where twice as many Gaussians gain less than 0.10 dB on training
         /// views, and those with the least effect are then pruned. The default stays the limit;
         /// auto:50k sets another
-        #[arg(short, long, value_name = "ROWS")]
-        budget: Option<Budget> = None, Fixed;
+        #[arg(short)]
+        budget: Option<Budget> = None, Fixed, value "ROWS";
 
         /// Limit of all memory of the run: 512MiB, 1.5GiB, 800MB. On a GPU it limits the device's memory, else that of
         /// the process
@@ -227,134 +209,112 @@ run_spec! {
         /// unless fewer fit than the scene starts with, then it is lowered until they do; decoded
         /// photographs take at most an eighth, and those beyond it are decoded again; tile lists hold 4
         /// pairs per Gaussian, up to 16 where --budget leaves room. `densify plan` shows the result
-        #[arg(long, value_name = "BYTES")]
-        memory: Option<ByteCount> = None, Fixed;
+        memory: Option<ByteCount> = None, Fixed, value "BYTES";
 
         /// Most (Gaussian, tile) pairs held at a time; views with more are processed in bands, which
         /// is exact but slower (default: 16 per Gaussian of the budget, or chosen for --memory)
-        #[arg(long, value_name = "PAIRS")]
-        tile_cap: Option<Rows> = None, Free;
+        tile_cap: Option<Rows> = None, Free, value "PAIRS";
 
         /// Memory for decoded photographs, and as much of a GPU's own; others are decoded and uploaded again when they
         /// are needed. auto: an eighth of the memory of the run, and the rest of --memory; 1GiB if --memory limits a
         /// GPU (default: 1GiB, or as auto with --memory)
-        #[arg(long, value_name = "BYTES")]
-        image_cache: Option<ImageCache> = None, Free;
+        image_cache: Option<ImageCache> = None, Free, value "BYTES";
 
         /// Dependence of colours on the viewing direction: 0 none, 3 most; auto: as much as the scene requires
         /// (default: 3, or lower if --memory requires it)
         ///
         /// auto is decided before training, by how much the photographs disagree about the colours of the
         /// reconstruction's points. With too few points, it is 3
-        #[arg(long, value_name = "DEGREE")]
-        sh_degree: Option<ShDegree> = None, Fixed;
+        sh_degree: Option<ShDegree> = None, Fixed, value "DEGREE";
 
         /// Disable automatic reductions: degree 3 unless --sh-degree says otherwise, and all views
         /// scored
-        #[arg(
-            long, value_name = "true|false", action = ArgAction::Set, num_args = 0..=1,
-            require_equals = true, default_missing_value = "true", hide_possible_values = true
-        )]
-        full: bool = false, Fixed;
+        full: bool = false, Fixed, switch Set;
     }
 
     /// The policy of density control.
     density: PolicySpec, "Policy" {
         /// Policy that decides where Gaussians are added and removed; `densify policies` lists the choices
-        #[arg(short, long, value_name = "NAME")]
-        policy: String = "diet".to_owned(), Fixed;
+        #[arg(short)]
+        policy: String = "diet".to_owned(), Fixed, value "NAME";
 
         /// Set a parameter of the policy, such as diet.rho=0.2; may be repeated
-        #[arg(long, value_name = "POLICY.NAME=VALUE")]
         #[serde(with = "as_table")]
-        policy_set: Vec<Assignment> = Vec::new(), Fixed;
+        policy_set: Vec<Assignment> = Vec::new(), Fixed, value "POLICY.NAME=VALUE";
     }
 
     /// Training.
     schedule: ScheduleSpec, "Schedule" {
         /// Length of the run; every schedule scales with it
         // The default of a run that names no preset is that preset's.
-        #[arg(short, long, value_name = "N")]
-        iterations: Whole<1, { u32::MAX }> = Whole(REFERENCE_ITERATIONS), Longer;
+        #[arg(short)]
+        iterations: Whole<1, { u32::MAX }> = Whole(REFERENCE_ITERATIONS), Longer, value "N";
 
         /// Seed of everything random
-        #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
-        seed: u64 = 0, Fixed;
+        #[arg(value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
+        seed: u64 = 0, Fixed, value "N";
 
         /// Set a learning rate: mean_start, mean_end, log_scale, quat, opacity, sh_dc, sh_rest;
         /// of all but the means also NAME_end; fade: factor of opacity, sh_dc and sh_rest at the
         /// end, from the share fade_from of the run on; boost: factor of all at the start (1 for
         /// runs of 30,000); may be repeated
-        #[arg(long, value_name = "NAME=RATE")]
         #[serde(with = "as_table")]
-        lr: Vec<Assignment> = Vec::new(), Fixed;
+        lr: Vec<Assignment> = Vec::new(), Fixed, value "NAME=RATE";
 
         /// Settings that go together: exact, balanced, fast or tiny-memory. Options that are given
         /// win over it (default: balanced)
-        #[arg(long, value_name = "NAME")]
-        preset: Option<String> = None, Free;
+        preset: Option<String> = None, Free, value "NAME";
 
         /// Set a knob of the trade between speed, memory and accuracy, such as alpha_min=1/128;
         /// `densify knobs` lists them. May be repeated
-        #[arg(long, value_name = "NAME=VALUE")]
         #[serde(with = "as_table")]
-        knob: Vec<Assignment> = Vec::new(), Fixed;
+        knob: Vec<Assignment> = Vec::new(), Fixed, value "NAME=VALUE";
 
         /// Learn an exposure for each training photograph: a factor and an offset per colour channel. Test views are
         /// then measured as they are, and again after the best such fit. auto needs the tracks of a reconstruction
-        #[arg(long, value_name = "WHEN")]
-        exposure: ExposureChoice = ExposureChoice::Off, Fixed;
+        exposure: ExposureChoice = ExposureChoice::Off, Fixed, value "WHEN";
 
         /// Form of an exposure
-        #[arg(long, value_name = "MODEL")]
-        exposure_model: ExposureModel = ExposureModel::Channels, Fixed;
+        exposure_model: ExposureModel = ExposureModel::Channels, Fixed, value "MODEL";
 
         /// Treatment of Gaussians with a non-finite value; the model is checked at least every 100 iterations
-        #[arg(long, value_name = "ACTION")]
-        on_nan: OnNan = OnNan::Prune, Free;
+        on_nan: OnNan = OnNan::Prune, Free, value "ACTION";
 
         /// Make runs reproducible byte for byte. On the processor they always are; a GPU then adds up gradients in a
         /// fixed order, which is slower than its atomics (`densify devices`)
-        #[arg(
-            help_heading = "Backend", long, value_name = "true|false", action = ArgAction::Set, num_args = 0..=1,
-            require_equals = true, default_missing_value = "true", hide_possible_values = true
-        )]
-        deterministic: bool = false, Free;
+        #[arg(help_heading = "Backend")]
+        deterministic: bool = false, Free, switch Set;
     }
 
     /// The device.
     device: DeviceSpec, "Backend" {
         /// Where to compute
-        #[arg(long, value_name = "WHERE")]
-        backend: BackendChoice = BackendChoice::Auto, Free;
+        backend: BackendChoice = BackendChoice::Auto, Free, value "WHERE";
 
         /// The adapter to compute on, by part of its name; `densify devices` lists them
         /// (default: the best)
-        #[arg(long, value_name = "NAME")]
-        gpu: Option<String> = None, Free;
+        gpu: Option<String> = None, Free, value "NAME";
 
         /// Processor threads to use, 1 to 256; the result does not depend on it (default: all)
-        #[arg(long, value_name = "N")]
-        threads: Option<Threads> = None, Free;
+        threads: Option<Threads> = None, Free, value "N";
     }
 
     /// Output files.
     output: OutputSpec, "Output" {
         /// Folder to write to (default: output/SCENE-POLICY)
-        #[arg(short, long, value_name = "DIR")]
-        output: Option<PathBuf> = None, Free;
+        #[arg(short)]
+        output: Option<PathBuf> = None, Free, value "DIR";
 
         /// Iterations after which to save the model, besides the last
-        #[arg(long, value_name = "N", num_args = 1.., value_delimiter = ',')]
-        save_iterations: Vec<u32> = Vec::new(), Free;
+        #[arg(num_args = 1.., value_delimiter = ',')]
+        save_iterations: Vec<u32> = Vec::new(), Free, value "N";
 
         /// Iterations after which to measure the test views, besides the last
-        #[arg(long, value_name = "N", num_args = 1.., value_delimiter = ',')]
-        test_iterations: Vec<u32> = Vec::new(), Free;
+        #[arg(num_args = 1.., value_delimiter = ',')]
+        test_iterations: Vec<u32> = Vec::new(), Free, value "N";
 
         /// Steps between two checkpoints; one is also written at the end, and when SIGINT or SIGTERM
         /// stops the run. The two newest are kept. 0: only when stopped
-        #[arg(long, value_name = "N")]
-        checkpoint_every: u32 = 1_000, Free;
+        checkpoint_every: u32 = 1_000, Free, value "N";
     }
 }

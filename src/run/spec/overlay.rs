@@ -13,7 +13,7 @@ use densify_policies::parameters::{nearest, parse_value};
 use densify_policies::policy::RateOverrides;
 
 /// Keys of a run's `config.toml` that are not options: the version and the findings.
-pub(crate) const FOUND_OUT: [&str; 2] = ["densify", "resolved"];
+pub(crate) const NOT_OPTIONS: [&str; 2] = ["densify", "resolved"];
 
 /// Some options of a run by name, each with a value that is valid by itself.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -56,10 +56,10 @@ impl Partial {
             let mut table: Table = text
                 .parse()
                 .map_err(|error: toml::de::Error| Failure::input(error.to_string().trim()))?;
-            table.retain(|key, _| !FOUND_OUT.contains(&key));
+            table.retain(|key, _| !NOT_OPTIONS.contains(&key));
             Self::checked(table)
         };
-        read().map_err(|failure| failure.within_config_file(path))
+        read().map_err(|failure| failure.within_option("config", Some(path.display().to_string())))
     }
 
     /// The options of a description for which `is_given` returns true.
@@ -81,7 +81,6 @@ impl Partial {
     }
 
     /// A single option.
-    #[must_use]
     pub fn option(name: &str, value: impl Into<Value>) -> Self {
         Self([(name.to_owned(), value.into())].into_iter().collect())
     }
@@ -99,7 +98,6 @@ impl Partial {
     }
 
     /// An option, or else a knob, by name and with its value as text.
-    #[must_use]
     pub fn setting(name: &str, value: &str) -> Self {
         let value = parse_value(value);
         match RunOption::find(name) {
@@ -116,7 +114,6 @@ impl Partial {
     }
 
     /// The value of an option, if it is there.
-    #[must_use]
     pub fn get(&self, name: &str) -> Option<&Value> {
         self.0.get(name)
     }
@@ -132,13 +129,11 @@ impl Partial {
     }
 
     /// True if a file with this table describes the same options.
-    #[must_use]
     pub fn is_table(&self, table: &Table) -> bool {
         self.0 == *table
     }
 
     /// The options as the table of a file.
-    #[must_use]
     pub fn into_table(self) -> Table {
         self.0
     }

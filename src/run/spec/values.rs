@@ -50,7 +50,6 @@ pub enum Budget {
 
 impl Budget {
     /// The limit, if it is a number.
-    #[must_use]
     pub fn most(self) -> Option<usize> {
         match self {
             Self::Rows(rows) => Some(rows),
@@ -59,7 +58,6 @@ impl Budget {
     }
 
     /// True if Gaussians must improve the model to stay.
-    #[must_use]
     pub fn is_auto(self) -> bool {
         matches!(self, Self::Auto(_))
     }
@@ -102,7 +100,7 @@ pub enum InitChoice {
 /// The word before an optional number: `auto`, `auto:50k`.
 const AUTO: &str = "auto";
 
-/// The text after `auto:`, or `None` inside for `auto` alone; outside `None` for other texts.
+/// The text after `auto:`: `Some(None)` for `auto` alone, `None` for other texts.
 fn after_auto(text: &str) -> Option<Option<&str>> {
     match text.strip_prefix(AUTO)? {
         "" => Some(None),
@@ -188,7 +186,6 @@ impl FromStr for ShDegree {
 
 impl InitChoice {
     /// The file of a model.
-    #[must_use]
     pub fn file(&self) -> Option<&Path> {
         match self {
             Self::Model(file) => Some(&file.0),
@@ -330,7 +327,6 @@ pub(super) fn table(assignments: &[Assignment]) -> Result<Table, String> {
 }
 
 /// The assignments of a table.
-#[must_use]
 pub(crate) fn assignments(table: &Table) -> Vec<Assignment> {
     let mut all = Vec::new();
     for (name, value) in table {

@@ -25,7 +25,7 @@ const SCORES: [Score; 3] = [
 pub(super) fn summarise(run: &RunRecord) -> Markup {
     let score = run.score();
     let summary = run.summary.as_ref();
-    let of_budget = format!("of at most {}", grouped(run.config.budget()));
+    let of_budget = format!("of at most {}", grouped(run.config.budget));
     let promised = summary.map(|it| format!("{} promised", Bytes(it.ledger_bytes)));
     html! {
         dl.numbers {
@@ -102,7 +102,7 @@ pub(super) fn tabulate_runs(runs: &[RunRecord], groups: &Groups) -> Markup {
         row.extend([
             or_dash(run.rows().map(grouped)),
             or_dash(peak),
-            grouped(run.config.budget()),
+            grouped(run.config.budget),
             or_dash(run.peak_bytes().map(|bytes| Bytes(bytes).to_string())),
             or_dash(run.seconds().map(time)),
         ]);

@@ -110,7 +110,7 @@ impl Server {
         train: impl FnOnce(Run, &dyn Observer) -> Result<T, Failure>,
     ) -> Result<T, Failure> {
         let mut scene = Scene::of_run(&mut run);
-        let (rows, signals) = (run.trainer().rows(), run.trainer().signals());
+        let (rows, signals) = (run.trainer.rows(), run.trainer.signals());
         let queue = RenderQueue::new(Some(MAX_WAITING), MAX_ACTIVE);
         let run_status = RunStatus::default();
         let routes = Routes {

@@ -156,17 +156,17 @@ impl Scene {
 
     /// The scene of a run in training, which its own backend renders, in pictures no larger than its photographs.
     pub(super) fn of_run(run: &mut Run) -> Self {
-        let counts = counts_rows(run.trainer().backend());
-        let (rows, signals) = (run.trainer().rows(), run.trainer().signals());
-        let points = run.take_points();
-        let (config, dataset) = (run.config(), run.dataset());
+        let counts = counts_rows(run.trainer.backend());
+        let (rows, signals) = (run.trainer.rows(), run.trainer.signals());
+        let points = std::mem::take(&mut run.dataset.points);
+        let (config, dataset) = (&run.config, &run.dataset);
         let title = name_of(&config.scene_path());
         let background = config.spec.data.background.fixed();
         let policy = &config.spec.density.policy;
         let models = vec![ModelInfo {
             name: format!("{policy}, in training"),
             rows,
-            sh_degree: config.sh_degree(),
+            sh_degree: config.sh_degree,
             near: 0.0,
             checkpoint: None,
         }];

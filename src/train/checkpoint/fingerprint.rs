@@ -38,7 +38,6 @@ pub struct ViewsFingerprint {
 
 impl Fingerprint {
     /// The fingerprint of a dataset.
-    #[must_use]
     pub fn new(dataset: &Dataset) -> Self {
         Self {
             train: ViewsFingerprint::new(&dataset.train),
@@ -48,7 +47,6 @@ impl Fingerprint {
     }
 
     /// A description of the first difference from another dataset, if there is one.
-    #[must_use]
     pub fn difference(&self, other: &Self) -> Option<String> {
         let train = self.train.difference(&other.train, "views to train on");
         let test = || self.test.difference(&other.test, "views held out");

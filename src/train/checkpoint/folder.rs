@@ -11,7 +11,6 @@ use crate::output::CHECKPOINTS;
 const MAX_CHECKPOINTS: usize = 2;
 
 /// Path of the checkpoint of a step.
-#[must_use]
 pub fn checkpoint_path(run: &Path, step: u32) -> PathBuf {
     run.join(CHECKPOINTS).join(format!("iteration_{step}.safetensors"))
 }
@@ -30,13 +29,11 @@ fn list(run: &Path) -> Vec<(u32, PathBuf)> {
 }
 
 /// The step of the newest checkpoint of a run, which may be damaged.
-#[must_use]
 pub fn newest_step(run: &Path) -> Option<u32> {
     list(run).first().map(|(step, _)| *step)
 }
 
 /// The newest undamaged checkpoint of a run, if there is one, and the errors of newer ones, newest first.
-#[must_use]
 pub fn newest(run: &Path) -> (Option<Checkpoint>, Vec<CheckpointError>) {
     let mut rejected = Vec::new();
     for (_, path) in list(run) {

@@ -34,9 +34,10 @@ use std::path::{Path, PathBuf};
 use densify_policies::policy::PolicyError;
 use serde::{Deserialize, Serialize};
 
+use crate::output::FolderError;
 use crate::trainer::TrainerState;
 use densify_core::files::FileError;
-use densify_render::{BackendError, StateError};
+use densify_render::BackendError;
 
 /// A checkpoint without its arrays.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -72,6 +73,9 @@ pub enum CheckpointError {
     /// The file cannot be read or written.
     #[error(transparent)]
     File(#[from] FileError),
+    /// The folder of the run cannot be written.
+    #[error(transparent)]
+    Folder(#[from] FolderError),
     /// The policy cannot save its state.
     #[error("the policy's state: {source}")]
     Policy {
@@ -86,11 +90,6 @@ pub enum CheckpointError {
 impl CheckpointError {
     fn invalid(path: &Path, problem: impl ToString) -> Self {
         Self::Invalid { path: path.to_owned(), problem: problem.to_string() }
-    }
-
-    fn state(path: &Path) -> impl Fn(StateError) -> Self + use<> {
-        let path = path.to_owned();
-        move |error| Self::Invalid { path: path.clone(), problem: error.to_string() }
     }
 }
 

@@ -13,7 +13,7 @@ use super::{CheckpointError, Header};
 use densify_core::files::FileError;
 use densify_core::gaussians::{Gaussians, MAX_SH_DEGREE, ModelArray};
 use densify_core::pieces::pieces;
-use densify_render::{Backend, BackendError, StateArray, Tensor, Values};
+use densify_render::{Backend, BackendError, StateArray, StateError, Tensor, Values};
 
 /// Longest header accepted `[bytes]`.
 const MAX_HEADER: u64 = 64 << 20;
@@ -66,13 +66,11 @@ impl Checkpoint {
     }
 
     /// Path of the file.
-    #[must_use]
     pub fn path(&self) -> &Path {
         &self.path
     }
 
     /// Everything but the arrays.
-    #[must_use]
     pub fn header(&self) -> &Header {
         &self.header
     }
@@ -135,7 +133,8 @@ impl Checkpoint {
                 self.invalid(format!("it has a tensor `{name}`, which this run does not have"))
             );
         }
-        let refused = CheckpointError::state(&self.path);
+        let path = self.path.clone();
+        let refused = |error: StateError| CheckpointError::invalid(&path, error);
         let (rows, sh_degree) = (backend.rows(), backend.sh_degree());
         for array in ModelArray::ALL {
             let place = self.place_in_model(array, rows, sh_degree)?;
@@ -169,10 +168,10 @@ impl Checkpoint {
     /// # Errors
     /// [`CheckpointError::Invalid`] if the checkpoint has no ages, [`CheckpointError::File`].
     pub fn ages(&mut self) -> Result<Vec<u32>, CheckpointError> {
-        let missing = || self.invalid("it has no ages of rows");
-        let is_ages = |(_, record): &(u64, Record)| Tensor::has_ages(&record.name);
-        let place = self.places.iter().position(is_ages).ok_or_else(missing)?;
-        self.tensor(place)?.ages().ok_or_else(|| self.invalid("it has no ages of rows"))
+        let place = self.places.iter().position(|(_, record)| Tensor::has_ages(&record.name));
+        let tensor = place.map(|place| self.tensor(place)).transpose()?;
+        let ages = tensor.and_then(|tensor| tensor.ages());
+        ages.ok_or_else(|| self.invalid("it has no ages of rows"))
     }
 
     fn invalid(&self, problem: impl ToString) -> CheckpointError {

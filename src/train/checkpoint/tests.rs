@@ -89,7 +89,6 @@ fn header(rows: usize) -> Header {
             normalisation: Normalisation { centre: DVec3::new(0.1, 2e-300, 7.0), scale: 1.0 / 3.0 },
         },
         trainer: crate::trainer::TrainerState {
-            auto_budget: None,
             exposures: Some(crate::exposure::Exposures::new(
                 crate::exposure::ExposureModel::Matrix,
                 &[[0.1, 1.0 / 3.0, f32::MIN_POSITIVE]; 3],
@@ -99,9 +98,8 @@ fn header(rows: usize) -> Header {
             peak_rows: rows,
             extra_forwards: 4,
             policy_time: Duration::from_nanos(1_234_567_891),
-            views_time: Duration::ZERO,
-            events: Vec::new(),
             policy: serde_json::json!({ "seen": [0.1, 1.0 / 3.0, 5e-324, 1e308] }),
+            ..crate::trainer::TrainerState::default()
         },
         session: serde_json::json!({ "sum": 0.1_f32 + 0.2_f32 }),
     }

@@ -9,7 +9,6 @@ use densify_core::image::Image8;
 ///
 /// # Panics
 /// When the sizes differ; callers compare them first.
-#[must_use]
 pub fn fitted(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Vec<f32> {
     let width = target.width as usize;
     assert_eq!(rendered.len(), 3 * width * target.height as usize, "sizes differ");

@@ -59,7 +59,6 @@ struct ViewExposure {
 
 impl Exposures {
     /// Exposures that start with a gain per view and channel.
-    #[must_use]
     pub fn new(model: ExposureModel, gains: &[[f32; 3]]) -> Self {
         let view = |gains: &[f32; 3]| {
             let mut values = [0.0; PARAMETERS];
@@ -74,19 +73,16 @@ impl Exposures {
     }
 
     /// Memory on the host `[bytes]`.
-    #[must_use]
     pub fn bytes(views: usize) -> u64 {
         (views * size_of::<ViewExposure>()) as u64
     }
 
     /// Number of views.
-    #[must_use]
     pub fn count(&self) -> usize {
         self.views.len()
     }
 
     /// The exposure of a view.
-    #[must_use]
     pub fn transform(&self, view: usize) -> ColourTransform {
         let values = self.difference(view);
         let mut transform = ColourTransform::IDENTITY;
@@ -164,7 +160,7 @@ fn mean(views: &[ViewExposure]) -> [f64; PARAMETERS] {
     sums.map(|sum| sum / views.len().max(1) as f64)
 }
 
-/// Whether a parameter is learned: without mixing of channels, only the diagonal and the offsets are.
+/// True if a parameter is learned: without mixing of channels, only the diagonal and the offsets are.
 fn is_learned(model: ExposureModel, number: usize) -> bool {
     model == ExposureModel::Matrix || number >= 9 || number.is_multiple_of(4)
 }

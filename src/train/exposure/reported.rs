@@ -79,7 +79,6 @@ pub fn complete_gains(gains: &mut [[f32; 3]], known: &[bool], stops: &[Option<f6
 }
 
 /// Root mean square difference from the mean; 0 without values.
-#[must_use]
 pub fn spread(values: impl Iterator<Item = f64> + Clone) -> f64 {
     let middle = mean(values.clone());
     mean(values.map(|value| (value - middle).powi(2))).sqrt()

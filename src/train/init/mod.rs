@@ -47,10 +47,22 @@ pub struct InitReport {
     pub rows: usize,
 }
 
-/// Reason why Gaussians cannot be initialised, with the remedy.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{0}")]
-pub struct InitError(String);
+/// Reason why Gaussians cannot be initialised.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum InitError {
+    /// The budget has no room.
+    #[error("a budget of 0 Gaussians leaves no model")]
+    NoBudget,
+    /// There is no such degree.
+    #[error("spherical-harmonic degree {0} is not one of 0 to 3")]
+    Degree(u8),
+    /// No point has a finite position.
+    #[error("the scene has no usable initial points")]
+    NoPoints,
+    /// More points than the neighbour search supports.
+    #[error("{0} points are too many for the neighbour search; use fewer")]
+    TooManyPoints(usize),
+}
 
 /// Creates one Gaussian per point, in normalised coordinates. If there are more points than `budget`, the seed determines
 /// a random subset. Gaussians close in space are mostly close in order, too.
@@ -63,14 +75,11 @@ pub fn initialise(
     sh_degree: u8,
     seed: u64,
 ) -> Result<(Gaussians, InitReport), InitError> {
-    let bad = |reason: &str| Err(InitError(reason.to_owned()));
     if budget == 0 {
-        return bad("a budget of 0 Gaussians leaves no model; give --budget at least 1");
+        return Err(InitError::NoBudget);
     }
     if sh_degree > densify_core::gaussians::MAX_SH_DEGREE {
-        return bad(&format!(
-            "spherical-harmonic degree {sh_degree} is not one of 0 to 3; choose --sh-degree accordingly"
-        ));
+        return Err(InitError::Degree(sh_degree));
     }
     let mut report = InitReport { points: points.len(), ..InitReport::default() };
     let mut chosen = finite(points);
@@ -79,9 +88,7 @@ pub fn initialise(
     drop_duplicates(&mut chosen, &points.positions);
     report.duplicates = usable - chosen.len();
     if chosen.is_empty() {
-        return bad(
-            "the scene has no usable initial points; start from random points with --init random",
-        );
+        return Err(InitError::NoPoints);
     }
     if chosen.len() > budget {
         report.over_budget = chosen.len() - budget;
@@ -114,7 +121,6 @@ pub fn initialise(
 }
 
 /// Number of Gaussians that [`initialise`] creates from these points without a budget.
-#[must_use]
 pub fn usable_points(points: &PointCloud) -> usize {
     let mut chosen = finite(points);
     drop_duplicates(&mut chosen, &points.positions);
@@ -150,9 +156,7 @@ fn drop_duplicates(chosen: &mut Vec<usize>, positions: &[DVec3]) {
 /// Logarithms of the root mean square distances to the (up to) three nearest neighbours. The points are distinct.
 fn log_scales(positions: &[[f64; 3]]) -> Result<Vec<f32>, InitError> {
     if u32::try_from(positions.len()).is_err() {
-        let count = positions.len();
-        let reason = format!("{count} points are too many for the neighbour search; use fewer");
-        return Err(InitError(reason));
+        return Err(InitError::TooManyPoints(positions.len()));
     }
     if positions.len() == 1 {
         return Ok(vec![SINGLE_POINT_SCALE.ln() as f32]);

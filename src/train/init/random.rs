@@ -23,7 +23,6 @@ const COLOURS: (u8, u8) = (64, 128);
 /// every other point does; the rest are spread over the views, uniformly in image position and inverse depth. If the
 /// cameras have no common focus (a room from inside, a street), all points are spread over the views. Equal arguments
 /// give equal points.
-#[must_use]
 pub fn random_points(count: usize, cameras: &[Camera], background: bool, seed: u64) -> PointCloud {
     let focus = focus(cameras);
     let mut draw = Draw(ChaCha8Rng::seed_from_u64(seed));

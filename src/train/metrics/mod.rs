@@ -40,7 +40,6 @@ static THREADS: LazyLock<Option<ThreadPool>> = LazyLock::new(|| {
 
 /// Memory for scoring an image of this width with a number of threads `[bytes]`: that of [`flip()`], which needs the
 /// most.
-#[must_use]
 pub fn scratch_bytes(width: u32, threads: usize) -> u64 {
     flip::bytes_per_block(u64::from(width)) * threads.min(PARALLEL_BLOCKS) as u64
 }

@@ -22,7 +22,6 @@ pub fn psnr(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Result<f
 }
 
 /// PSNR `[dB]` of two renders of one view, both clamped to `[0, 1]`; infinite when they are equal.
-#[must_use]
 pub fn psnr_between(a: &[f32], b: &[f32]) -> f64 {
     assert_eq!(a.len(), b.len(), "renders of one view");
     let value = |v: f32| f64::from(v.clamp(0.0, 1.0));

@@ -4,8 +4,8 @@ use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{Read, Seek, Write};
 use std::path::{Path, PathBuf};
 
-use densify_core::files;
-use densify_core::files::FileError;
+use super::FolderError;
+use densify_core::files::{self, FileError};
 
 /// Name of the locked file, which contains the id of the training process.
 pub(super) const LOCK: &str = "densify.lock";
@@ -26,8 +26,8 @@ impl FolderLock {
     /// Locks a folder.
     ///
     /// # Errors
-    /// [`FileError::Unfit`] while another process has the lock; [`FileError::Io`].
-    pub(super) fn take(folder: &Path) -> Result<Self, FileError> {
+    /// [`FolderError::InUse`] while another process has the lock; [`FolderError::File`].
+    pub(super) fn take(folder: &Path) -> Result<Self, FolderError> {
         let path = folder.join(LOCK);
         if !cfg!(unix) {
             return Ok(Self { path, file: None });
@@ -57,8 +57,8 @@ impl FolderLock {
     /// Checks that no process holds the lock on a folder, without writing anything.
     ///
     /// # Errors
-    /// [`FileError::Unfit`].
-    pub(super) fn check(folder: &Path) -> Result<(), FileError> {
+    /// [`FolderError::InUse`].
+    pub(super) fn check(folder: &Path) -> Result<(), FolderError> {
         if cfg!(unix)
             && let Ok(file) = files::open(&folder.join(LOCK))
             && matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock))
@@ -71,12 +71,12 @@ impl FolderLock {
     /// Checks that this process still holds the lock: the folder or the locked file may have been moved or replaced.
     ///
     /// # Errors
-    /// [`FileError::Lost`].
-    pub(super) fn confirm(&self) -> Result<(), FileError> {
+    /// [`FolderError::Lost`].
+    pub(super) fn confirm(&self) -> Result<(), FolderError> {
         if self.file.as_ref().is_none_or(|file| is_at(file, &self.path)) {
             return Ok(());
         }
-        Err(FileError::Lost { path: self.path.parent().unwrap_or(&self.path).to_owned() })
+        Err(FolderError::Lost { folder: self.path.parent().unwrap_or(&self.path).to_owned() })
     }
 }
 
@@ -88,18 +88,14 @@ impl Drop for FolderLock {
     }
 }
 
-fn in_use(folder: &Path, mut file: File) -> FileError {
+fn in_use(folder: &Path, mut file: File) -> FolderError {
     let mut number = String::new();
     let read = file.rewind().and_then(|()| Read::take(&mut file, 32).read_to_string(&mut number));
     let process = read.ok().and_then(|_| number.parse::<u32>().ok());
-    let holder = process.map_or("another process".to_owned(), |number| format!("process {number}"));
-    let folder = folder.display();
-    FileError::Unfit(format!(
-        "{folder} is in use: {holder} is training there; wait for it, stop it, or choose another folder with -o"
-    ))
+    FolderError::InUse { folder: folder.to_owned(), process }
 }
 
-/// Whether an open file is the file at a path.
+/// True if an open file is the file at a path.
 #[cfg(unix)]
 fn is_at(file: &File, path: &Path) -> bool {
     use std::os::unix::fs::MetadataExt;

@@ -17,6 +17,7 @@
 //! the TensorBoard file grow by complete records.
 
 mod cameras;
+mod error;
 mod folder;
 mod lock;
 mod reading;
@@ -24,6 +25,7 @@ mod records;
 mod tensorboard;
 
 pub use cameras::cameras_json;
+pub use error::FolderError;
 pub use folder::{CHECKPOINTS, Guard, RunFolder, is_in_use, model_path, saved_iterations};
 pub use reading::{
     all_scores, events_of, geometry_of, psnr_by_view, read_stats, scores_of, steps_of, summary_of,

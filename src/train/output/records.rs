@@ -115,7 +115,7 @@ pub struct Summary {
     pub densify: String,
     /// The policy's name.
     pub policy: String,
-    /// Whether the run reached its last step.
+    /// The run reached its last step.
     pub finished: bool,
     /// Steps done.
     pub iterations: u32,

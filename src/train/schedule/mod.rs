@@ -60,27 +60,30 @@ pub struct RateOptions {
 
 impl Default for RateOptions {
     fn default() -> Self {
-        Self {
-            mean_start: 1.6e-4,
-            mean_end: 1.6e-6,
-            log_scale: 5e-3,
-            quat: 1e-3,
-            opacity: 0.025,
-            sh_dc: 2.5e-3,
-            sh_rest: 1.25e-4,
-            log_scale_end: None,
-            quat_end: None,
-            opacity_end: None,
-            sh_dc_end: None,
-            sh_rest_end: None,
-            fade: 1.0,
-            fade_from: 1.0,
-            boost: 1.0,
-        }
+        Self::PUBLISHED
     }
 }
 
 impl RateOptions {
+    /// The published step sizes.
+    pub const PUBLISHED: Self = Self {
+        mean_start: 1.6e-4,
+        mean_end: 1.6e-6,
+        log_scale: 5e-3,
+        quat: 1e-3,
+        opacity: 0.025,
+        sh_dc: 2.5e-3,
+        sh_rest: 1.25e-4,
+        log_scale_end: None,
+        quat_end: None,
+        opacity_end: None,
+        sh_dc_end: None,
+        sh_rest_end: None,
+        fade: 1.0,
+        fade_from: 1.0,
+        boost: 1.0,
+    };
+
     /// The default step sizes of a run. Runs of fewer than 30,000 iterations start with b = (30,000 / iterations)^0.6
     /// times the published step sizes, at most 5 times, and the step size of colour bands 1–3 keeps an additional factor
     /// of min(b, 2) to the end.
@@ -91,11 +94,10 @@ impl RateOptions {
     /// +0.39, +0.23 and +0.18 dB (cup, three seeds), +0.20 (office), +0.59 (beercan) and −0.04 (room256); four times gave
     /// less. It costs quality where colour does not depend on the view: −0.76 dB on the built-in `scene:room` (the
     /// published value of `sh_rest` is 1.25e-4).
-    #[must_use]
     pub fn for_run(iterations: u32) -> Self {
         let shortage = f64::from(REFERENCE_ITERATIONS) / f64::from(iterations.max(1));
         let boost = shortage.powf(0.6).clamp(1.0, 5.0);
-        let published = Self::default();
+        let published = Self::PUBLISHED;
         Self { boost, sh_rest: published.sh_rest * boost.min(2.0) as f32, ..published }
     }
 
@@ -147,7 +149,6 @@ impl RateOptions {
     }
 
     /// Step sizes of iteration `step` (1-based), in a scene with an extent in `[scene units]`.
-    #[must_use]
     pub fn at(&self, step: u32, iterations: u32, extent: f32) -> LearningRates {
         let t = f64::from(step.min(iterations)) / f64::from(iterations.max(1));
         let between = |start: f64, end: f64| ((1.0 - t) * start.ln() + t * end.ln()).exp();
@@ -171,7 +172,6 @@ impl RateOptions {
     }
 
     /// The name of the first step size that is not a positive finite number.
-    #[must_use]
     pub fn invalid(&self) -> Option<&'static str> {
         let end = |end: Option<f32>| f64::from(end.unwrap_or(1.0));
         [
@@ -208,7 +208,6 @@ pub enum InitRates {
 }
 
 /// Scales a number of steps for a run of [`REFERENCE_ITERATIONS`] to a run of `iterations`; at least 1.
-#[must_use]
 pub fn scaled(steps: u32, iterations: u32) -> u32 {
     let exact = u64::from(steps) * u64::from(iterations);
     let reference = u64::from(REFERENCE_ITERATIONS);
@@ -218,7 +217,6 @@ pub fn scaled(steps: u32, iterations: u32) -> u32 {
 
 /// Spherical-harmonic degree of iteration `step`: it starts at 0 and rises by one every 1,000 steps of a run of 30,000, up
 /// to `highest`.
-#[must_use]
 pub fn sh_degree(step: u32, iterations: u32, highest: u8) -> u8 {
     let reached = step / scaled(1_000, iterations);
     u8::try_from(reached).unwrap_or(u8::MAX).min(highest).min(MAX_SH_DEGREE)
@@ -239,7 +237,6 @@ pub enum Background {
 
 impl Background {
     /// The background of a training step.
-    #[must_use]
     pub fn at(self, seed: u64, step: u32) -> [f32; 3] {
         match self {
             Self::Random => {
@@ -252,7 +249,6 @@ impl Background {
     }
 
     /// The background for evaluation, which is black if training uses random ones.
-    #[must_use]
     pub fn fixed(self) -> [f32; 3] {
         match self {
             Self::Black | Self::Random => [0.0; 3],
@@ -307,7 +303,6 @@ impl Serialize for Background {
 }
 
 /// The order of training views in an epoch (0-based): a random permutation of `0..views` that depends on seed and epoch.
-#[must_use]
 pub fn view_order(views: usize, seed: u64, epoch: u32) -> Vec<usize> {
     let mut order: Vec<usize> = (0..views).collect();
     let mut draws = random_stream(seed, Purpose::Views, u64::from(epoch));
@@ -320,7 +315,6 @@ pub fn view_order(views: usize, seed: u64, epoch: u32) -> Vec<usize> {
 
 /// A random sample of `count` training views without replacement, or of all views if there are fewer, that depends on seed
 /// and step. Used for views that are rendered for decisions.
-#[must_use]
 pub fn fresh_views(views: usize, count: usize, seed: u64, step: u32) -> Vec<usize> {
     let mut chosen: Vec<usize> = (0..views).collect();
     let mut draws = random_stream(seed, Purpose::FreshViews, u64::from(step));

@@ -7,7 +7,7 @@ use densify_policies::policy::{PolicyError, SceneInfo, Snapshot};
 use densify_policies::rng::PolicyRng;
 
 use super::policy_views::call_policy;
-use super::{EditEvent, TrainError, Trainer};
+use super::{AtStep, EditEvent, TrainError, Trainer};
 use densify_core::budget::RowBudget;
 use densify_data::views::ViewSource;
 
@@ -16,10 +16,9 @@ impl<V: ViewSource> Trainer<V> {
     pub(super) fn edit(&mut self, step: u32) -> Result<Option<EditEvent>, TrainError> {
         let start = Instant::now();
         self.show_aux_views(step)?;
-        self.views_time = self.views_time.saturating_add(start.elapsed());
-        let signals = self.backend.take_signals(self.needs.signals);
-        let signals = signals.map_err(|e| self.backend_error(step, e))?;
-        let signals = signals.without_first(self.options.frozen);
+        self.state.views_time = self.state.views_time.saturating_add(start.elapsed());
+        let signals = self.backend.take_signals(self.needs.signals).at(step)?;
+        let signals = signals.without_first(self.row_budget().frozen);
         let mut plan = self.new_plan().allowing(&self.needs);
         let scene = SceneInfo { budget: plan.budget(), ..self.scene.clone() };
         let candidates = self.backend.candidates();
@@ -37,9 +36,14 @@ impl<V: ViewSource> Trainer<V> {
         EditPlan::new(rows, budget)
     }
 
-    /// Rows as policies count them, who do not know of frozen ones: how many there are, and the most there may be.
+    /// The current limit of rows, with the frozen ones among them.
+    pub(super) fn row_budget(&self) -> RowBudget {
+        RowBudget { total: self.row_limit(), frozen: self.options.frozen }
+    }
+
+    /// Number and limit of rows as policies count, without frozen rows.
     pub(super) fn trained_rows_and_budget(&self) -> (usize, usize) {
-        let budget = RowBudget { total: self.row_limit(), frozen: self.options.frozen };
+        let budget = self.row_budget();
         (budget.trained(self.backend.rows()), budget.trainable())
     }
 
@@ -51,16 +55,14 @@ impl<V: ViewSource> Trainer<V> {
     ) -> Result<Option<EditEvent>, TrainError> {
         let mut ops = plan.compile();
         self.check_plan(step, &ops)?;
-        ops = ops.after_frozen(self.options.frozen);
+        ops = ops.after_frozen(self.row_budget().frozen);
         // The backend checks the budget, which the trainer's own limit may be below.
         ops.budget = self.backend.budget();
-        self.backend
-            .apply(&ops, self.options.seed, step)
-            .map_err(|e| self.backend_error(step, e))?;
+        self.backend.apply(&ops, self.options.seed, step).at(step)?;
         if let Some(history) = &mut self.history {
             history.record(&ops, step);
         }
-        self.peak_rows = self.peak_rows.max(peak_rows(&ops)).max(self.backend.rows());
+        self.state.peak_rows = self.state.peak_rows.max(peak_rows(&ops)).max(self.backend.rows());
         if !ops.edits_rows() && ops.counts.denied == 0 {
             return Ok(None);
         }
@@ -68,7 +70,7 @@ impl<V: ViewSource> Trainer<V> {
         let EditEvent { before, removed, added, updated, denied, after, .. } = event;
         let cause = &event.cause;
         tracing::info!(step, before, removed, added, updated, denied, after, %cause, "edit");
-        self.events.push(event.clone());
+        self.state.events.push(event.clone());
         Ok(Some(event))
     }
 

@@ -9,6 +9,9 @@ use densify_render::BackendError;
 /// [read](super::Trainer::model); only after [`Diverged`](Self::Diverged) it is unusable.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainError {
+    /// There is no view to train on.
+    #[error("there is no training view")]
+    NoView,
     /// An option is out of its range.
     #[error("{0}")]
     BadOption(String),
@@ -68,4 +71,15 @@ pub enum TrainError {
         /// The backend's error.
         source: BackendError,
     },
+}
+
+/// Names the step in which a backend failed.
+pub(super) trait AtStep<T> {
+    fn at(self, step: u32) -> Result<T, TrainError>;
+}
+
+impl<T> AtStep<T> for Result<T, BackendError> {
+    fn at(self, step: u32) -> Result<T, TrainError> {
+        self.map_err(|source| TrainError::Backend { step, source })
+    }
 }

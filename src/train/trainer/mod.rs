@@ -29,7 +29,8 @@ use crate::schedule;
 pub use auto_budget::{AutoBudget, Interval, MIN_GAIN, Removal, growth_signals};
 use densify_core::image::SharedImage;
 use densify_data::views::ViewSource;
-use densify_render::{Backend, BackendError, StepInput};
+use densify_render::{Backend, StepInput};
+use error::AtStep;
 pub use error::TrainError;
 use near_duplicates::distinct_views;
 use nonfinite::AUDIT_EVERY;
@@ -49,24 +50,16 @@ pub struct Trainer<V> {
     needs: Needs,
     scene: SceneInfo,
     options: TrainOptions,
-    step: u32,
+    state: TrainerState,
     /// Order of the views in this epoch.
     order: Vec<usize>,
     /// Order of the views in the next epoch.
     next_order: Vec<usize>,
-    peak_rows: usize,
-    extra_forwards: u64,
-    policy_time: Duration,
-    views_time: Duration,
     images_time: Duration,
-    events: Vec<EditEvent>,
     /// Training views that the policy's scores are measured in.
     scored: Vec<usize>,
     /// Training views in which the automatic budget measures the PSNR; empty without it.
     probe_views: Vec<usize>,
-    auto_budget: Option<AutoBudget>,
-    /// Exposures of the training views, if they are learned.
-    exposures: Option<Exposures>,
     /// History of the rows, if it is recorded.
     history: Option<RowHistory>,
 }
@@ -90,22 +83,19 @@ impl<V: ViewSource> Trainer<V> {
             policy_name: policy_name.to_owned(),
             order: Vec::new(),
             next_order: schedule::view_order(count, options.seed, 0),
-            peak_rows: backend.rows(),
-            extra_forwards: 0,
-            policy_time: Duration::ZERO,
-            views_time: Duration::ZERO,
+            state: TrainerState {
+                initial_rows: scene.initial_rows,
+                peak_rows: backend.rows(),
+                ..TrainerState::default()
+            },
             images_time: Duration::ZERO,
             views,
             backend,
             policy,
             scene,
             options,
-            step: 0,
-            events: Vec::new(),
             scored: (0..count).collect(),
             probe_views: Vec::new(),
-            auto_budget: None,
-            exposures: None,
             history: None,
         })
     }
@@ -121,7 +111,7 @@ impl<V: ViewSource> Trainer<V> {
             self.scored = distinct_views(&self.views, self.scene.extent);
         }
         let (rows, budget) = (self.backend.rows(), self.backend.budget());
-        self.auto_budget = choices.rows.then(|| AutoBudget::new(rows, budget));
+        self.state.auto_budget = choices.rows.then(|| AutoBudget::new(rows, budget));
         self
     }
 
@@ -133,7 +123,7 @@ impl<V: ViewSource> Trainer<V> {
     pub fn with_exposures(mut self, exposures: Option<Exposures>) -> Self {
         let count = exposures.as_ref().map_or(self.views.count(), Exposures::count);
         assert_eq!(count, self.views.count(), "exposures of other views");
-        self.exposures = exposures;
+        self.state.exposures = exposures;
         self
     }
 
@@ -144,12 +134,12 @@ impl<V: ViewSource> Trainer<V> {
     /// # Errors
     /// [`TrainError`]. The run cannot continue after an error, but the model can still be read.
     pub fn step(&mut self) -> Result<StepReport, TrainError> {
-        let step = self.step + 1;
+        let step = self.state.step + 1;
         let view = self.next_view();
         let start = Instant::now();
         // If the image cannot be read, the state is still that of the last checkpoint.
         let image = self.image(step, view)?;
-        if (self.step as usize).is_multiple_of(self.views.count()) {
+        if (self.state.step as usize).is_multiple_of(self.views.count()) {
             self.backend.begin_epoch();
         }
         self.images_time = self.images_time.saturating_add(start.elapsed());
@@ -157,7 +147,7 @@ impl<V: ViewSource> Trainer<V> {
         let (loss_terms, noise) = self.terms(step)?;
         let (camera, image) = self.at_resolution(step, view, image)?;
         let TrainOptions { iterations, seed, background, rates, .. } = self.options;
-        let exposure = self.exposures.as_ref().map(|exposures| exposures.transform(view));
+        let exposure = self.state.exposures.as_ref().map(|exposures| exposures.transform(view));
         let input = StepInput {
             step,
             view,
@@ -172,17 +162,16 @@ impl<V: ViewSource> Trainer<V> {
             cadence,
             seed,
         };
-        let output = self.backend.train_step(&input).map_err(|e| self.backend_error(step, e))?;
-        self.step = step;
+        let output = self.backend.train_step(&input).at(step)?;
+        self.state.step = step;
         if !output.loss.is_finite() {
             let view = self.views.name(view).to_owned();
             return Err(TrainError::Diverged { step, view, loss: output.loss });
         }
-        if let Some((exposures, gradient)) = self.exposures.as_mut().zip(output.exposure) {
+        if let Some((exposures, gradient)) = self.state.exposures.as_mut().zip(output.exposure) {
             exposures.step(view, &gradient, f64::from(step) / f64::from(iterations));
         }
-        let is_due =
-            call_policy(|| self.policy.is_due(step)).map_err(|e| self.policy_error(step, e))?;
+        let is_due = self.ask_policy(step, |policy| policy.is_due(step))?;
         let mut events = Vec::new();
         if is_due || step.is_multiple_of(AUDIT_EVERY) || step == iterations {
             events.extend(self.remove_nonfinite(step)?);
@@ -192,7 +181,7 @@ impl<V: ViewSource> Trainer<V> {
         if is_due {
             events.extend(self.edit(step)?);
         }
-        self.policy_time = self.policy_time.saturating_add(start.elapsed());
+        self.state.policy_time = self.state.policy_time.saturating_add(start.elapsed());
         Ok(StepReport { step, view, output, rows: self.backend.rows(), events })
     }
 
@@ -212,8 +201,7 @@ impl<V: ViewSource> Trainer<V> {
 
     /// The optimiser's cadence at this step, according to the policy.
     fn cadence(&self, step: u32) -> Result<Cadence, TrainError> {
-        let cadence =
-            call_policy(|| self.policy.cadence(step)).map_err(|e| self.policy_error(step, e))?;
+        let cadence = self.ask_policy(step, |policy| policy.cadence(step))?;
         let declared = self.needs.cadence;
         if cadence.is_within(declared) {
             return Ok(cadence);
@@ -225,11 +213,21 @@ impl<V: ViewSource> Trainer<V> {
     /// The policy's terms of the loss and noise of the means at this step.
     fn terms(&self, step: u32) -> Result<(LossTerms, Option<NoiseTerm>), TrainError> {
         let Needs { loss_terms, noise, .. } = self.needs;
-        let both = || (self.policy.loss_terms(step, loss_terms), self.policy.noise(step, noise));
-        let (terms, noise) = call_policy(both).map_err(|e| self.policy_error(step, e))?;
+        let (terms, noise) = self.ask_policy(step, |policy| {
+            (policy.loss_terms(step, loss_terms), policy.noise(step, noise))
+        })?;
         let checked = terms.check().and_then(|()| noise.map_or(Ok(()), |noise| noise.check()));
         checked.map_err(|error| self.policy_error(step, PolicyError::Other(error)))?;
         Ok((terms, noise))
+    }
+
+    /// Asks the policy a question that cannot fail, except by a panic.
+    fn ask_policy<T>(
+        &self,
+        step: u32,
+        question: impl FnOnce(&dyn DensityPolicy) -> T,
+    ) -> Result<T, TrainError> {
+        call_policy(|| question(&*self.policy)).map_err(|error| self.policy_error(step, error))
     }
 
     fn policy_error(&self, step: u32, source: PolicyError) -> TrainError {
@@ -239,14 +237,14 @@ impl<V: ViewSource> Trainer<V> {
     /// Returns the view of the next step, and prefetches those after it.
     fn next_view(&mut self) -> usize {
         let count = self.views.count();
-        let place = self.step as usize % count;
+        let place = self.state.step as usize % count;
         if place == 0 {
-            let epoch = self.step / count as u32;
+            let epoch = self.state.step / count as u32;
             self.order = std::mem::take(&mut self.next_order);
             self.next_order = schedule::view_order(count, self.options.seed, epoch + 1);
         }
         // Beyond the last iteration the number of remaining steps is unknown.
-        let left = self.options.iterations.checked_sub(self.step + 1);
+        let left = self.options.iterations.checked_sub(self.state.step + 1);
         let last = left.map_or(usize::MAX, |left| left as usize);
         let upcoming: Vec<usize> = self.order[place + 1..]
             .iter()
@@ -262,10 +260,6 @@ impl<V: ViewSource> Trainer<V> {
     fn sh_degree(&self, step: u32) -> u8 {
         let TrainOptions { iterations, sh_degree, has_all_bands, .. } = self.options;
         if has_all_bands { sh_degree } else { schedule::sh_degree(step, iterations, sh_degree) }
-    }
-
-    fn backend_error(&self, step: u32, source: BackendError) -> TrainError {
-        TrainError::Backend { step, source }
     }
 }
 

@@ -26,7 +26,7 @@ pub(super) fn distinct_views(views: &impl ViewSource, extent: f32) -> Vec<usize>
     chosen
 }
 
-/// Whether two cameras have the same lens, and nearly the same position and orientation.
+/// True if two cameras have the same lens, and nearly the same position and orientation.
 fn are_near_duplicates(a: &Camera, b: &Camera, near: f64) -> bool {
     let lengths = |camera: &Camera| [camera.fx, camera.fy, camera.cx, camera.cy];
     let apart = lengths(a).into_iter().zip(lengths(b)).map(|(a, b)| (a - b).abs());

@@ -1,6 +1,6 @@
 //! Removes rows with non-finite values; many of them end the run.
 
-use super::{EditEvent, OnNan, TrainError, Trainer};
+use super::{AtStep, EditEvent, OnNan, TrainError, Trainer};
 use densify_data::views::ViewSource;
 
 /// Number of steps between audits, in addition to those before the policy's edits.
@@ -14,7 +14,7 @@ const MAX_NAMED: usize = 10;
 impl<V: ViewSource> Trainer<V> {
     /// Removes the rows that have non-finite values after `step`, if there are any.
     pub(super) fn remove_nonfinite(&mut self, step: u32) -> Result<Option<EditEvent>, TrainError> {
-        let unsound = self.backend.audit().map_err(|e| self.backend_error(step, e))?;
+        let unsound = self.backend.audit().at(step)?;
         let Some(first) = unsound.first() else {
             return Ok(None);
         };
@@ -23,15 +23,18 @@ impl<V: ViewSource> Trainer<V> {
             tracing::warn!(step, row = row.row, "non-finite value: {row}");
         }
         let few = count as f64 <= (MAX_SHARE * rows as f64).max(1.0) && count < rows;
-        // Frozen rows never change, so that non-finite values in them mean an error elsewhere.
-        let frozen = self.options.frozen as u32;
-        let is_frozen = unsound.iter().any(|row| row.row < frozen);
-        if self.options.on_nan == OnNan::Stop || !few || is_frozen {
-            return Err(TrainError::NonFinite { step, count, rows, first: first.to_string() });
+        let budget = self.row_budget();
+        let trained: Option<Vec<u32>> =
+            unsound.iter().map(|row| budget.trained_row(row.row)).collect();
+        match trained.filter(|_| few && self.options.on_nan == OnNan::Prune) {
+            Some(trained) => {
+                let mut plan = self.new_plan();
+                plan.cause("not finite");
+                plan.prune_all(trained);
+                self.execute(step, plan)
+            }
+            // Frozen rows never change, so that non-finite values in them mean an error elsewhere.
+            None => Err(TrainError::NonFinite { step, count, rows, first: first.to_string() }),
         }
-        let mut plan = self.new_plan();
-        plan.cause("not finite");
-        plan.prune_all(unsound.into_iter().map(|row| row.row - frozen));
-        self.execute(step, plan)
     }
 }

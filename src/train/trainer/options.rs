@@ -15,8 +15,7 @@ pub struct TrainOptions {
     pub sh_degree: u8,
     /// Number of rows at the front of the model that never change and are hidden from policies.
     pub frozen: usize,
-    /// Whether the degree is used from the first step on, as for models that are trained already; otherwise it rises from
-    /// 0.
+    /// The degree is used from the first step on, as for models that are trained already; otherwise it rises from 0.
     pub has_all_bands: bool,
     /// Background colour.
     pub background: Background,
@@ -31,9 +30,9 @@ pub struct TrainOptions {
 /// Automatic choices from measurements of the scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct AutoChoices {
-    /// Whether to choose the number of rows, up to the budget.
+    /// Choose the number of rows, up to the budget.
     pub rows: bool,
-    /// Whether to leave near-duplicate views out of the policy's scores.
+    /// Leave near-duplicate views out of the policy's scores.
     pub scored_views: bool,
 }
 

@@ -5,7 +5,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use densify_policies::policy::{AuxView, PolicyError};
 
-use super::{TrainError, Trainer};
+use super::{AtStep, TrainError, Trainer};
 use densify_data::views::ViewSource;
 use densify_render::AuxInput;
 
@@ -13,15 +13,15 @@ impl<V: ViewSource> Trainer<V> {
     /// Renders the auxiliary views for the policy's edit after `step`, one by one.
     pub(super) fn show_aux_views(&mut self, step: u32) -> Result<(), TrainError> {
         let (rows, budget) = self.trained_rows_and_budget();
-        let count = call_policy(|| self.policy.aux_views(step, rows, budget));
-        let count = count.map_err(|e| self.policy_error(step, e))? as usize;
+        let count = self.ask_policy(step, |policy| policy.aux_views(step, rows, budget))? as usize;
         let Some(request) = self.needs.aux.clone().filter(|_| count > 0) else {
             return Ok(());
         };
-        let (options, degree) = (self.options, self.sh_degree(step));
+        let (options, degree, frozen) =
+            (self.options, self.sh_degree(step), self.row_budget().frozen);
         for view in self.draw_scored(count, step) {
             let image = self.image(step, view)?;
-            let exposure = self.exposures.as_ref().map(|exposures| exposures.transform(view));
+            let exposure = self.state.exposures.as_ref().map(|exposures| exposures.transform(view));
             let measured = self.backend.observe(&AuxInput {
                 step,
                 view,
@@ -33,11 +33,11 @@ impl<V: ViewSource> Trainer<V> {
                 sh_degree: degree,
                 request: &request,
             });
-            let mut measured = measured.map_err(|e| self.backend_error(step, e))?;
+            let mut measured = measured.at(step)?;
             for (_, column) in &mut measured.columns {
-                column.drain(..self.options.frozen);
+                column.drain(..frozen);
             }
-            self.extra_forwards += 1;
+            self.state.extra_forwards += 1;
             let (loss, columns, points) = (measured.loss, &measured.columns, &measured.points);
             let view = AuxView { step, rows, loss, columns, points };
             let seen = call_policy(|| self.policy.observe(&view)).and_then(|done| done);

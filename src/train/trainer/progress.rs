@@ -4,71 +4,39 @@ use std::time::Duration;
 
 use densify_policies::policy::{Signal, SignalSet};
 
-use super::{AutoBudget, RowHistory, Trainer};
-use crate::exposure::Exposures;
+use super::{RowHistory, Trainer, TrainerState};
 use densify_core::gaussians::Gaussians;
 use densify_data::views::ViewSource;
 use densify_render::{Backend, BackendError};
 
 impl<V: ViewSource> Trainer<V> {
-    /// The automatic budget, if it is [enabled](super::AutoChoices::rows).
-    #[must_use]
-    pub fn growth(&self) -> Option<&AutoBudget> {
-        self.auto_budget.as_ref()
-    }
-
-    /// Exposures of the training views, if they are learned.
-    #[must_use]
-    pub fn exposures(&self) -> Option<&Exposures> {
-        self.exposures.as_ref()
+    /// The state so far, without that of the policy.
+    pub fn progress(&self) -> &TrainerState {
+        &self.state
     }
 
     /// Number of training views that are not rendered for the policy's scores because they are near-duplicates; 0 if the
     /// policy renders no views.
-    #[must_use]
     pub fn unscored_views(&self) -> usize {
         if self.needs.aux.is_some() { self.views.count() - self.scored.len() } else { 0 }
     }
 
     /// Number of steps done.
-    #[must_use]
     pub fn steps_done(&self) -> u32 {
-        self.step
+        self.state.step
     }
 
     /// Current number of rows.
-    #[must_use]
     pub fn rows(&self) -> usize {
         self.backend.rows()
     }
 
-    /// Largest number of rows so far, including those during edits.
-    #[must_use]
-    pub fn peak_rows(&self) -> usize {
-        self.peak_rows
-    }
-
-    /// Number of renderings in addition to one per step: views measured for the policy or the automatic budget.
-    #[must_use]
-    pub fn extra_forwards(&self) -> u64 {
-        self.extra_forwards
-    }
-
-    /// Wall time of all policy events so far (signals, plan and execution), and separately that of rendering views for
-    /// them.
-    #[must_use]
-    pub fn policy_times(&self) -> (Duration, Duration) {
-        (self.policy_time.saturating_sub(self.views_time), self.views_time)
-    }
-
     /// Wall time that steps have waited for images so far.
-    #[must_use]
     pub fn images_time(&self) -> Duration {
         self.images_time
     }
 
     /// The training views.
-    #[must_use]
     pub fn views(&self) -> &V {
         &self.views
     }
@@ -82,7 +50,6 @@ impl<V: ViewSource> Trainer<V> {
     }
 
     /// The signals that the policy reads.
-    #[must_use]
     pub fn signals(&self) -> SignalSet {
         self.needs.signals
     }
@@ -94,9 +61,9 @@ impl<V: ViewSource> Trainer<V> {
     /// When the ages cannot be read.
     pub fn record_history(&mut self) -> Result<(), BackendError> {
         let ages = self.backend.take_signals(SignalSet::from([Signal::Age]))?;
-        let step = self.step;
+        let (step, budget) = (self.state.step, self.row_budget());
         let edited = |(row, &age): (usize, &f32)| {
-            if row < self.options.frozen { 0 } else { step.saturating_sub(age as u32) }
+            if budget.is_frozen(row) { 0 } else { step.saturating_sub(age as u32) }
         };
         let known = ages.get(Signal::Age).unwrap_or_default().iter().enumerate();
         let edited: Vec<u32> = known.map(edited).collect();

@@ -7,7 +7,6 @@ use std::sync::Arc;
 
 use densify_policies::policy::PolicyError;
 
-use super::policy_views::call_policy;
 use super::{TrainError, Trainer};
 use densify_core::camera::Camera;
 use densify_core::image::SharedImage;
@@ -24,11 +23,9 @@ impl<V: ViewSource> Trainer<V> {
         view: usize,
         image: SharedImage,
     ) -> Result<(Camera, SharedImage), TrainError> {
-        let share = call_policy(|| self.policy.resolution(step)).and_then(|share| {
-            self.needs.check_resolution(share).map_err(PolicyError::Other)?;
-            Ok(share)
-        });
-        let share = share.map_err(|e| self.policy_error(step, e))?;
+        let share = self.ask_policy(step, |policy| policy.resolution(step))?;
+        let checked = self.needs.check_resolution(share).map_err(PolicyError::Other);
+        checked.map_err(|error| self.policy_error(step, error))?;
         let camera = *self.views.camera(view);
         let (width, height) = shrunk((camera.width, camera.height), share);
         if (width, height) == (camera.width, camera.height) {

@@ -15,7 +15,6 @@ impl RowHistory {
     pub const BYTES: u64 = 2 * size_of::<u32>() as u64;
 
     /// The history of rows whose creation is unknown, which counts as their last edit; for at most `budget` rows.
-    #[must_use]
     pub fn from_edits(edited: &[u32], budget: usize) -> Self {
         let with_room = || {
             let mut steps = Vec::with_capacity(budget);
@@ -26,14 +25,12 @@ impl RowHistory {
     }
 
     /// The step in which each row was created. Shape: `[rows]`.
-    #[must_use]
     pub fn created(&self) -> &[u32] {
         &self.created
     }
 
     /// The step in which each row was created, rewritten or updated last. Changes of all rows at once do not count.
     /// Shape: `[rows]`.
-    #[must_use]
     pub fn edited(&self) -> &[u32] {
         &self.edited
     }

@@ -14,18 +14,18 @@ use crate::schedule;
 use densify_data::views::ViewSource;
 
 /// The state of a [`Trainer`] between two steps, without that of the backend.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TrainerState {
     /// Number of steps done.
     pub step: u32,
-    /// Number of rows after initialisation.
+    /// Number of rows after initialisation, besides frozen ones.
     pub initial_rows: usize,
-    /// Largest number of rows so far.
+    /// Largest number of rows so far, including those during edits.
     pub peak_rows: usize,
-    /// Number of renderings so far in addition to one per step.
+    /// Number of renderings so far in addition to one per step: views measured for the policy or the automatic budget.
     pub extra_forwards: u64,
-    /// Wall time of all policy events so far.
+    /// Wall time of all policy events so far: signals, plan and execution.
     pub policy_time: Duration,
     /// The part of it that was spent on rendering views.
     pub views_time: Duration,
@@ -33,7 +33,7 @@ pub struct TrainerState {
     pub events: Vec<EditEvent>,
     /// The policy's state.
     pub policy: PolicyState,
-    /// State of the automatic budget.
+    /// State of the automatic budget, if it is [enabled](super::AutoChoices::rows).
     #[serde(default)]
     pub auto_budget: Option<AutoBudget>,
     /// Exposures of the training views, if they are learned.
@@ -47,18 +47,7 @@ impl<V: ViewSource> Trainer<V> {
     /// # Errors
     /// When the policy cannot save its state.
     pub fn state(&self) -> Result<TrainerState, PolicyError> {
-        Ok(TrainerState {
-            step: self.step,
-            initial_rows: self.scene.initial_rows,
-            peak_rows: self.peak_rows,
-            extra_forwards: self.extra_forwards,
-            policy_time: self.policy_time,
-            views_time: self.views_time,
-            events: self.events.clone(),
-            policy: call_policy(|| self.policy.save())?,
-            auto_budget: self.auto_budget.clone(),
-            exposures: self.exposures.clone(),
-        })
+        Ok(TrainerState { policy: call_policy(|| self.policy.save())?, ..self.state.clone() })
     }
 
     /// Continues a run from `state`. This trainer must be new, with the same options and views, and its backend must have
@@ -67,23 +56,17 @@ impl<V: ViewSource> Trainer<V> {
     /// # Errors
     /// [`PolicyError`] if the policy rejects its state, or if the exposures do not match; then the trainer must not be
     /// used.
-    pub fn resume(&mut self, state: TrainerState) -> Result<(), PolicyError> {
-        call_policy(|| self.policy.restore(state.policy)).and_then(|done| done)?;
-        let matches = match (&state.exposures, &self.exposures) {
+    pub fn resume(&mut self, mut state: TrainerState) -> Result<(), PolicyError> {
+        let policy = std::mem::take(&mut state.policy);
+        call_policy(|| self.policy.restore(policy)).and_then(|done| done)?;
+        let matches = match (&state.exposures, &self.state.exposures) {
             (Some(saved), Some(own)) => saved.check_matches(own),
             (None, None) => Ok(()),
             _ => Err("only one of the checkpoint and this run has exposures".to_owned()),
         };
         matches.map_err(PolicyError::Other)?;
-        self.exposures = state.exposures;
-        self.step = state.step;
         self.scene.initial_rows = state.initial_rows;
-        self.peak_rows = self.peak_rows.max(state.peak_rows);
-        self.extra_forwards = state.extra_forwards;
-        self.policy_time = state.policy_time;
-        self.views_time = state.views_time;
-        self.events = state.events;
-        self.auto_budget = state.auto_budget;
+        state.peak_rows = state.peak_rows.max(self.state.peak_rows);
         // As after `next_view`: at the end of an epoch only the next order exists, within one both orders do.
         let count = self.views.count();
         let (epoch, place) = (state.step / count as u32, state.step as usize % count);
@@ -91,6 +74,7 @@ impl<V: ViewSource> Trainer<V> {
         let ahead = if place == 0 { epoch } else { epoch.saturating_add(1) };
         (self.order, self.next_order) =
             (if place == 0 { Vec::new() } else { order(epoch) }, order(ahead));
+        self.state = state;
         Ok(())
     }
 }

@@ -15,14 +15,14 @@ pub(super) fn check_options(
 ) -> Result<(), TrainError> {
     let bad = |reason: String| Err(TrainError::BadOption(reason));
     if views == 0 {
-        return bad("there is no training view; use a larger --test-every or add images".into());
+        return Err(TrainError::NoView);
     }
     if u32::try_from(views) != Ok(scene.train_views) {
         return bad(format!("{views} views, but the scene has {}", scene.train_views));
     }
     if options.iterations == 0 || options.iterations != scene.iterations {
         let (here, there) = (options.iterations, scene.iterations);
-        return bad(format!("--iterations is {here} (scene: {there}); both must be equal, >= 1"));
+        return bad(format!("{here} iterations (scene: {there}); both must be equal, >= 1"));
     }
     if !(scene.extent.is_finite() && scene.extent > 0.0) {
         return bad(format!("the scene's extent is {}; it must be positive", scene.extent));

@@ -117,7 +117,7 @@ fn a_failed_source_leaves_the_old_file() {
     let path = folder.path().join("model.ply");
     std::fs::write(&path, "old").unwrap();
     let shape = Shape { rows: ROWS_AT_A_TIME + 1, sh_degree: 0 };
-    let lost = || FileError::Lost { path: "lost".into() };
+    let lost = || FileError::malformed(Path::new("lost"), "it is gone");
     let written = PLY.write_file(&path, shape, |rows| match rows.start {
         0 => Ok(model(rows.len(), 0)),
         _ => Err(lost()),

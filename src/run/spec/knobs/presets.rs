@@ -1,5 +1,5 @@
-//! Presets: knobs and options that go together, named by what they promise. Levels are chosen from what
-//! `densify trade` measures, and each says what that was.
+//! Presets: knobs and options that go together, named by what they promise. Levels follow from measurements by
+//! `densify trade`, which each preset quotes.
 
 use std::fmt;
 

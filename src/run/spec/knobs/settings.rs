@@ -81,7 +81,6 @@ impl Knobs {
     }
 
     /// All knobs by name, as files have them.
-    #[must_use]
     pub fn table(&self) -> Table {
         self.iter().map(|(knob, value)| (knob.name.to_owned(), value.into())).collect()
     }

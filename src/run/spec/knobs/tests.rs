@@ -98,7 +98,7 @@ fn presets_are_made_of_knobs_and_options() {
                 assert_eq!(knob.canonical(value).as_deref(), Ok(*value), "{}: {name}", preset.name);
             }
         }
-        // It says what it costs; the one that the others are measured against has nothing to say.
+        // Every preset but the reference states its cost.
         let said = preset.to_string();
         assert_eq!(preset.measured.is_none(), preset.name == EXACT, "{said}");
         assert_eq!(said.contains(" dB ["), preset.measured.is_some(), "{said}");

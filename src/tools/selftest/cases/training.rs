@@ -153,7 +153,7 @@ fn train(trial: &mut Trial<'_>, name: &str) -> Result<(), Box<dyn std::error::Er
     let (mut first, mut last) = (0.0, 0.0);
     for step in 1..=iterations {
         let report = trainer.step()?;
-        over_budget += usize::from(report.rows > BUDGET || trainer.peak_rows() > BUDGET);
+        over_budget += usize::from(report.rows > BUDGET || trainer.progress().peak_rows > BUDGET);
         broken += usize::from(!report.output.loss.is_finite());
         // Between two edits: after one, a number may be out of range until the next step.
         if step % 100 == 50 {

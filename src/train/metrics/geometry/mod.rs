@@ -127,7 +127,6 @@ pub struct KnownScene<'a> {
 }
 
 /// The needs with which the backend for [`measure`] must be made.
-#[must_use]
 pub fn needs() -> Needs {
     let columns = vec![AuxColumn::WeightSum, AuxColumn::WeightMax, AuxColumn::PixelCount];
     Needs { aux: Some(AuxRequest { columns, ..AuxRequest::default() }), ..Needs::default() }
@@ -136,7 +135,6 @@ pub fn needs() -> Needs {
 /// Peak memory for [`measure`] in addition to the backend and the surface `[bytes]`: per row, two copies of the model
 /// (while it is read or downloaded), position, axes, sums and two search trees; per pixel, the renders, and the surface's
 /// depth and normals and their files; samples and angles.
-#[must_use]
 pub fn bytes(rows: usize, sh_degree: u8, image: (u32, u32), views: usize) -> u64 {
     let row = 2 * 4 * (11 + 3 * densify_core::gaussians::sh_coefficients(sh_degree) as u64) + 512;
     let pixels = u64::from(image.0) * u64::from(image.1);

@@ -34,7 +34,6 @@ pub struct Lpips {
 
 impl Lpips {
     /// The network that the weights belong to.
-    #[must_use]
     pub fn network(&self) -> Network {
         self.network
     }

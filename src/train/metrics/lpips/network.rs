@@ -41,7 +41,6 @@ const ALEX: [&[Layer]; 5] = [
 
 impl Network {
     /// The published name.
-    #[must_use]
     pub fn name(self) -> &'static str {
         match self {
             Self::Vgg => "VGG-16",
@@ -66,7 +65,6 @@ impl Network {
     }
 
     /// Smallest side of an image for which all stages have an output `[px]`.
-    #[must_use]
     pub(super) fn least_side(self) -> usize {
         match self {
             Self::Vgg => 16,

@@ -7,9 +7,9 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
-use super::CONFIG_FILE;
 use super::lock::FolderLock;
 use super::tensorboard::PREFIX as EVENTS_PREFIX;
+use super::{CONFIG_FILE, FolderError};
 use densify_core::files::FileError;
 use densify_core::files::disk::{Operation, attempt};
 use densify_core::files::{RUN_FOLDER_DEPTH, is_temporary, remove_incomplete};
@@ -35,7 +35,6 @@ const MODELS: &str = "point_cloud";
 pub const CHECKPOINTS: &str = "checkpoints";
 
 /// Path of the model of an iteration.
-#[must_use]
 pub fn model_path(run: &Path, iteration: u32) -> PathBuf {
     run.join(MODELS).join(format!("iteration_{iteration}")).join("point_cloud.ply")
 }
@@ -43,8 +42,8 @@ pub fn model_path(run: &Path, iteration: u32) -> PathBuf {
 /// The iterations whose models a run has saved, in ascending order.
 ///
 /// # Errors
-/// [`FileError::Unfit`] if there is none.
-pub fn saved_iterations(run: &Path) -> Result<Vec<u32>, FileError> {
+/// [`FolderError::NoRun`] if there is none.
+pub fn saved_iterations(run: &Path) -> Result<Vec<u32>, FolderError> {
     let iteration = |name: &OsStr| name.to_str()?.strip_prefix("iteration_")?.parse().ok();
     let entries = fs::read_dir(run.join(MODELS)).into_iter().flatten().flatten();
     let mut saved: Vec<u32> = entries
@@ -53,13 +52,12 @@ pub fn saved_iterations(run: &Path) -> Result<Vec<u32>, FileError> {
         .collect();
     saved.sort_unstable();
     if saved.is_empty() {
-        return Err(FileError::no_run(run, "saved model"));
+        return Err(FolderError::no_run(run, "saved model"));
     }
     Ok(saved)
 }
 
-/// Whether a process is training in a folder.
-#[must_use]
+/// True if a process is training in a folder.
 pub fn is_in_use(run: &Path) -> bool {
     FolderLock::check(run).is_err()
 }
@@ -71,7 +69,7 @@ pub fn is_in_use(run: &Path) -> bool {
 #[derive(Debug)]
 pub struct RunFolder {
     target: PathBuf,
-    /// Whether this run created the folder.
+    /// This run created the folder.
     is_new: bool,
     /// Suffix of the hidden folder of a run that replaces another.
     staged: Option<String>,
@@ -86,8 +84,8 @@ impl Guard {
     /// Checks that the folder was not moved, removed or taken by another process.
     ///
     /// # Errors
-    /// [`FileError::Lost`].
-    pub fn check(&self) -> Result<(), FileError> {
+    /// [`FolderError::Lost`].
+    pub fn check(&self) -> Result<(), FolderError> {
         self.0.confirm()
     }
 }
@@ -96,23 +94,19 @@ impl RunFolder {
     /// Checks, without writing anything, that a run may be written to `target`.
     ///
     /// # Errors
-    /// [`FileError::Unfit`] if a process is training there, if `target` is not a folder, and if it contains another run
-    /// and `overwrite` is not set; [`FileError::Io`].
-    pub fn check(target: &Path, overwrite: bool) -> Result<(), FileError> {
+    /// [`FolderError`] if a process is training there, if `target` is not a folder, and if it contains another run and
+    /// `overwrite` is not set.
+    pub fn check(target: &Path, overwrite: bool) -> Result<(), FolderError> {
         if !target.is_dir() {
             // A dangling link also occupies the name.
             return match target.symlink_metadata() {
-                Ok(_) => {
-                    let target = target.display();
-                    let problem = format!("{target} is not a folder; choose another one with -o");
-                    Err(FileError::Unfit(problem))
-                }
+                Ok(_) => Err(FolderError::NotAFolder { path: target.to_owned() }),
                 Err(_) => Ok(()),
             };
         }
         FolderLock::check(target)?;
         if !overwrite && !owned_entries(target)?.is_empty() {
-            return Err(FileError::occupied(target));
+            return Err(FolderError::occupied(target));
         }
         Ok(())
     }
@@ -121,13 +115,13 @@ impl RunFolder {
     ///
     /// # Errors
     /// As [`check`](Self::check).
-    pub fn create(target: &Path, overwrite: bool) -> Result<Self, FileError> {
+    pub fn create(target: &Path, overwrite: bool) -> Result<Self, FolderError> {
         Self::check(target, overwrite)?;
         let mut folder = Self::lock(target)?;
         // Another process may have trained there since the check.
         let occupied = !owned_entries(target)?.is_empty();
         if occupied && !overwrite {
-            return Err(FileError::occupied(target));
+            return Err(FolderError::occupied(target));
         }
         if occupied {
             let staging = tempfile::Builder::new().prefix(NEW).tempdir_in(target);
@@ -141,9 +135,9 @@ impl RunFolder {
     /// files are removed. Incomplete files of a killed process are removed in any case.
     ///
     /// # Errors
-    /// [`FileError::Io`]; [`FileError::Unfit`] if a process is training there, and if a restart would remove models,
-    /// checkpoints, or files that do not belong to a run.
-    pub fn resume(target: &Path, restart: bool) -> Result<Self, FileError> {
+    /// [`FolderError`] if a process is training there, and if a restart would remove models, checkpoints, or files that do
+    /// not belong to a run.
+    pub fn resume(target: &Path, restart: bool) -> Result<Self, FolderError> {
         Self::check(target, true)?;
         let folder = Self::lock(target)?;
         if restart {
@@ -154,7 +148,7 @@ impl RunFolder {
             let is_foreign =
                 !target.join(CONFIG_FILE).exists() && !owned_entries(target)?.is_empty();
             if is_foreign || has_checkpoint || saved_iterations(target).is_ok() {
-                return Err(FileError::occupied(target));
+                return Err(FolderError::occupied(target));
             }
             // The configuration stays until it is replaced, so that it is not lost if the process is killed.
             remove_owned(target, |name| name != CONFIG_FILE);
@@ -164,7 +158,7 @@ impl RunFolder {
     }
 
     /// Creates and locks a folder, and completes or undoes an interrupted replacement in it.
-    fn lock(target: &Path) -> Result<Self, FileError> {
+    fn lock(target: &Path) -> Result<Self, FolderError> {
         let is_new = !target.exists();
         let fail = |e| FileError::io("create the folder", target)(e);
         attempt(Operation::Create, target).map_err(fail)?;
@@ -180,23 +174,21 @@ impl RunFolder {
     /// Completes or undoes an interrupted replacement in `target`, if there is one, so that the folder can be read.
     ///
     /// # Errors
-    /// [`FileError::Unfit`], [`FileError::Io`].
-    pub fn settle(target: &Path) -> Result<(), FileError> {
+    /// [`FolderError::InUse`], [`FolderError::File`].
+    pub fn settle(target: &Path) -> Result<(), FolderError> {
         if hidden(target, OLD).is_empty() && hidden(target, REPLACED).is_empty() {
             return Ok(());
         }
         let _lock = FolderLock::take(target)?;
-        recover(target)
+        Ok(recover(target)?)
     }
 
     /// A handle to check during the run that the folder is still locked.
-    #[must_use]
     pub fn guard(&self) -> Guard {
         Guard(Rc::clone(&self.lock))
     }
 
     /// Hidden folders in `target` of interrupted runs that would have replaced the one there.
-    #[must_use]
     pub fn staged(target: &Path) -> Vec<PathBuf> {
         let mut staged = hidden(target, NEW);
         staged.retain(|path| FolderLock::check(path).is_ok());
@@ -204,7 +196,6 @@ impl RunFolder {
     }
 
     /// The folder to write to.
-    #[must_use]
     pub fn path(&self) -> PathBuf {
         let staged = |suffix: &String| self.target.join(format!("{NEW}{suffix}"));
         self.staged.as_ref().map_or_else(|| self.target.clone(), staged)
@@ -214,8 +205,8 @@ impl RunFolder {
     /// folder.
     ///
     /// # Errors
-    /// [`FileError::NotReplaced`] with the hidden folder of the new run; the old run stays.
-    pub fn finish(self) -> Result<PathBuf, FileError> {
+    /// [`FolderError::NotReplaced`] with the hidden folder of the new run; the old run stays.
+    pub fn finish(self) -> Result<PathBuf, FolderError> {
         let Some(suffix) = &self.staged else {
             return Ok(self.target.clone());
         };
@@ -227,13 +218,12 @@ impl RunFolder {
             }
             Err(Stuck { source, aside }) => {
                 let source = Box::new(source);
-                Err(FileError::NotReplaced { staging: self.path(), aside, source })
+                Err(FolderError::NotReplaced { staging: self.path(), aside, source })
             }
         }
     }
 
     /// Ends a failed run. An existing run stays, and the files of the failed one stay in the returned folder.
-    #[must_use]
     pub fn abandon(self) -> PathBuf {
         self.path()
     }

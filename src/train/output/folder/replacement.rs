@@ -4,7 +4,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use super::{attempt, move_run, remove_all};
+use super::{FolderError, attempt, move_run, remove_all};
 use densify_core::files::FileError;
 use densify_core::files::disk::Operation;
 
@@ -18,7 +18,7 @@ pub(super) const REPLACED: &str = ".densify-replaced-";
 
 /// Reason why a run could not replace another.
 pub(super) struct Stuck {
-    pub(super) source: FileError,
+    pub(super) source: FolderError,
     /// Folder of (a part of) the old run, if it could not be moved back either.
     pub(super) aside: Option<PathBuf>,
 }
@@ -29,16 +29,16 @@ pub(super) fn replace(target: &Path, suffix: &str) -> Result<(), Stuck> {
     let [new, old, replaced] =
         [NEW, OLD, REPLACED].map(|prefix| target.join(format!("{prefix}{suffix}")));
     // Files that cannot be moved back stay where they are, for `recover`.
-    let stuck = |source, aside: &Path, moved_back: Result<(), FileError>| {
+    let stuck = |source: FileError, aside: &Path, moved_back: Result<(), FileError>| {
         if moved_back.is_ok() {
             let _ = fs::remove_dir(aside);
         }
-        Stuck { source, aside: moved_back.err().map(|_| aside.to_owned()) }
+        Stuck { source: source.into(), aside: moved_back.err().map(|_| aside.to_owned()) }
     };
     let created = attempt(Operation::Create, &old).and_then(|()| fs::create_dir(&old));
     created
         .map_err(FileError::io("create the folder", &old))
-        .map_err(|source| Stuck { source, aside: None })?;
+        .map_err(|source| Stuck { source: source.into(), aside: None })?;
     let rename = || attempt(Operation::Rename, &old).and_then(|()| fs::rename(&old, &replaced));
     move_run(target, &old)
         .and_then(|()| rename().map_err(FileError::io("rename", &old)))

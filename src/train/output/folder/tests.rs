@@ -28,7 +28,7 @@ fn a_new_run_writes_in_place_beside_foreign_files() {
     assert_eq!(run.finish().unwrap(), root.path());
     assert_eq!(tree(root.path()), ["config.toml", "notes.txt"]);
     let error = RunFolder::create(root.path(), false).unwrap_err();
-    assert!(matches!(error, FileError::Occupied { .. }), "{error}");
+    assert!(matches!(error, FolderError::Occupied { .. }), "{error}");
     assert!(error.to_string().contains("another run"), "{error}");
 }
 
@@ -198,7 +198,7 @@ fn a_folder_in_use_is_neither_replaced_nor_resumed() {
     assert!(RunFolder::check(root.path(), true).is_err());
     // The lock is tested again at the end.
     fs::remove_file(root.path().join(LOCK)).unwrap();
-    assert!(matches!(replacing.finish(), Err(FileError::NotReplaced { .. })));
+    assert!(matches!(replacing.finish(), Err(FolderError::NotReplaced { .. })));
     assert_eq!(fs::read(root.path().join("config.toml")).unwrap(), b"a");
 }
 
@@ -210,7 +210,7 @@ fn a_moved_folder_is_detected() {
     let run = RunFolder::create(&target, false).unwrap();
     run.guard().check().unwrap();
     fs::rename(&target, root.path().join("moved")).unwrap();
-    assert!(matches!(run.guard().check(), Err(FileError::Lost { .. })));
+    assert!(matches!(run.guard().check(), Err(FolderError::Lost { .. })));
     let other = RunFolder::create(&target, false).unwrap();
     assert!(run.guard().check().is_err() && other.guard().check().is_ok());
     drop(run);

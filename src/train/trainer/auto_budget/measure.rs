@@ -4,7 +4,7 @@ use densify_policies::policy::Signal;
 
 use super::probe_views::mean;
 use super::{HIDDEN_LOGIT, MAX_TENTHS, Removal, allowed_loss, growth_signals, interval_steps};
-use crate::trainer::{EditEvent, TrainError, Trainer};
+use crate::trainer::{AtStep, EditEvent, TrainError, Trainer};
 use densify_core::gaussians::ModelArray;
 use densify_core::pieces::pieces;
 use densify_data::views::ViewSource;
@@ -14,7 +14,7 @@ impl<V: ViewSource> Trainer<V> {
     /// is not reduced.
     pub(in crate::trainer) fn row_limit(&self) -> usize {
         let budget = self.backend.budget();
-        let limit = self.auto_budget.as_ref().map_or(budget, |auto| auto.limit.min(budget));
+        let limit = self.state.auto_budget.as_ref().map_or(budget, |auto| auto.limit.min(budget));
         limit.max(self.backend.rows())
     }
 
@@ -25,7 +25,8 @@ impl<V: ViewSource> Trainer<V> {
     ) -> Result<Option<EditEvent>, TrainError> {
         let iterations = self.options.iterations;
         let is_due = step.is_multiple_of(interval_steps(iterations)) && step <= iterations;
-        let auto = self.auto_budget.clone().filter(|_| is_due && !self.probe_views.is_empty());
+        let auto =
+            self.state.auto_budget.clone().filter(|_| is_due && !self.probe_views.is_empty());
         let Some(mut auto) = auto else {
             return Ok(None);
         };
@@ -58,15 +59,14 @@ impl<V: ViewSource> Trainer<V> {
                 event = self.execute(step, plan)?;
             }
         }
-        self.auto_budget = Some(auto);
+        self.state.auto_budget = Some(auto);
         Ok(event)
     }
 
     /// The rows to remove, and the change of the probe views' PSNR without them, relative to `psnr` with all rows `[dB]`; if
     /// none can be removed, the change without a tenth of them.
     fn least_important(&mut self, step: u32, psnr: f64) -> Result<(Vec<u32>, f64), TrainError> {
-        let signals =
-            self.backend.take_signals(growth_signals()).map_err(|e| self.backend_error(step, e))?;
+        let signals = self.backend.take_signals(growth_signals()).at(step)?;
         let weights = signals.get(Signal::WeightMax).unwrap_or_default();
         let mut rows: Vec<u32> = (0..weights.len() as u32).collect();
         rows.sort_by(|&a, &b| weights[a as usize].total_cmp(&weights[b as usize]));
@@ -111,8 +111,7 @@ impl<V: ViewSource> Trainer<V> {
     fn opacity_logits(&self, step: u32) -> Result<Vec<f32>, TrainError> {
         let mut logits = Vec::with_capacity(self.backend.rows());
         for rows in pieces(self.backend.rows()) {
-            let piece = self.backend.download_array(ModelArray::OpacityLogits, rows);
-            logits.extend(piece.map_err(|e| self.backend_error(step, e))?);
+            logits.extend(self.backend.download_array(ModelArray::OpacityLogits, rows).at(step)?);
         }
         Ok(logits)
     }
@@ -120,8 +119,7 @@ impl<V: ViewSource> Trainer<V> {
     fn set_opacity_logits(&mut self, step: u32, logits: &[f32]) -> Result<(), TrainError> {
         for rows in pieces(logits.len()) {
             let piece = &logits[rows.clone()];
-            let done = self.backend.upload_array(ModelArray::OpacityLogits, rows, piece);
-            done.map_err(|e| self.backend_error(step, e))?;
+            self.backend.upload_array(ModelArray::OpacityLogits, rows, piece).at(step)?;
         }
         Ok(())
     }

@@ -55,7 +55,6 @@ const MAX_TENTHS: usize = 5;
 const HIDDEN_LOGIT: f32 = -13.8;
 
 /// The signals that the automatic budget needs from a backend, in addition to the policy's.
-#[must_use]
 pub fn growth_signals() -> SignalSet {
     SignalSet::from([Signal::WeightMax])
 }
@@ -86,7 +85,7 @@ pub struct Interval {
     pub rows: usize,
     /// Mean PSNR of the probe views `[dB]`.
     pub psnr: f64,
-    /// Whether the PSNR is near its recent best; otherwise the interval is not evaluated.
+    /// The PSNR is near its recent best; otherwise the interval is not evaluated.
     pub settled: bool,
     /// Gain over this settled interval and the two before, including the effect of training `[dB per doubling]`; `None` if
     /// there are fewer, if rows did not increase, or after growth.
@@ -140,7 +139,7 @@ impl AutoBudget {
         }
     }
 
-    /// Whether rows may be removed at the end of an interval.
+    /// True if rows may be removed at the end of an interval.
     fn may_remove(&self, step: u32, iterations: u32) -> bool {
         let grown = self.stopped.is_some() || step > iterations / 2;
         grown && f64::from(step) <= LAST_REMOVAL * f64::from(iterations)

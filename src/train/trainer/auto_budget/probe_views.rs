@@ -2,7 +2,7 @@
 
 use crate::metrics::psnr;
 use crate::schedule;
-use crate::trainer::{TrainError, Trainer};
+use crate::trainer::{AtStep, TrainError, Trainer};
 use densify_data::views::ViewSource;
 
 /// One in this many training views is a probe view.
@@ -40,11 +40,11 @@ impl<V: ViewSource> Trainer<V> {
         let mut measured = Vec::with_capacity(self.probe_views.len());
         for view in self.probe_views.clone() {
             let image = self.image(step, view)?;
-            let exposure = self.exposures.as_ref().map(|exposures| exposures.transform(view));
+            let exposure = self.state.exposures.as_ref().map(|exposures| exposures.transform(view));
             let behind = exposure.map_or(background, |exposure| exposure.behind(background));
-            let rendering = self.backend.render(self.views.camera(view), behind, sh_degree);
-            let mut rendering = rendering.map_err(|source| self.backend_error(step, source))?;
-            self.extra_forwards += 1;
+            let mut rendering =
+                self.backend.render(self.views.camera(view), behind, sh_degree).at(step)?;
+            self.state.extra_forwards += 1;
             if let Some(exposure) = exposure {
                 for colour in rendering.rgb.as_chunks_mut::<3>().0 {
                     *colour = exposure.apply(*colour);

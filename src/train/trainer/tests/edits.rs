@@ -10,8 +10,8 @@ fn edits_are_reported_and_the_budget_holds() {
         events.iter().map(|e| (e.step, e.before, e.added, e.denied, e.after)).collect();
     assert_eq!(short, [(2, 3, 3, 0, 6), (4, 6, 4, 2, 10), (6, 10, 0, 10, 10), (8, 10, 0, 10, 10)]);
     assert_eq!((events[0].updated, events[0].removed, &*events[0].cause), (3, 0, "scripted"));
-    assert_eq!(trainer.events, events);
-    assert_eq!((trainer.peak_rows(), trainer.rows(), trainer.steps_done()), (10, 10, 9));
+    assert_eq!(trainer.state.events, events);
+    assert_eq!((trainer.progress().peak_rows, trainer.rows(), trainer.steps_done()), (10, 10, 9));
 }
 
 #[test]
@@ -39,7 +39,7 @@ fn frozen_rows_count_for_the_budget_and_are_hidden_from_policies() {
 fn a_plan_that_changes_nothing_is_not_an_event() {
     let (mut trainer, log, _) = trainer(&Case { behaviour: Behaviour::Nothing, ..CASE });
     assert!((0..9).all(|_| trainer.step().unwrap().events.is_empty()));
-    assert!(trainer.events.is_empty());
+    assert!(trainer.state.events.is_empty());
     // Plans may reset statistics and are therefore executed in any case.
     assert!(log.lock().unwrap().contains(&"apply 2".to_owned()));
 }
@@ -50,7 +50,7 @@ fn the_peak_outlives_a_prune() {
     for _ in 0..4 {
         trainer.step().unwrap();
     }
-    assert_eq!((trainer.rows(), trainer.peak_rows()), (2, 8));
+    assert_eq!((trainer.rows(), trainer.progress().peak_rows), (2, 8));
 }
 
 #[test]

@@ -19,8 +19,8 @@ use densify_core::image::{Image8, SharedImage};
 use densify_core::memory::Ledger;
 use densify_data::views::ViewError;
 use densify_render::{
-    Attribute, AuxInput, AuxOutput, NonFinite, NumberKind, Rendering, StateArray, StateError,
-    StepOutput, Tensor,
+    Attribute, AuxInput, AuxOutput, BackendError, NonFinite, NumberKind, Rendering, StateArray,
+    StateError, StepOutput, Tensor,
 };
 
 mod edits;
@@ -318,23 +318,7 @@ const OPTIONS: TrainOptions = TrainOptions {
     seed: 7,
     sh_degree: 3,
     background: Background::Black,
-    rates: RateOptions {
-        boost: 1.0,
-        mean_start: 1e-4,
-        mean_end: 1e-6,
-        log_scale: 1.0,
-        quat: 1.0,
-        opacity: 1.0,
-        sh_dc: 1.0,
-        sh_rest: 1.0,
-        log_scale_end: None,
-        quat_end: None,
-        opacity_end: None,
-        sh_dc_end: None,
-        sh_rest_end: None,
-        fade: 1.0,
-        fade_from: 1.0,
-    },
+    rates: RateOptions::PUBLISHED,
     prefetch: 2,
     frozen: 0,
     has_all_bands: false,

@@ -11,7 +11,7 @@ fn nonfinite_rows_are_removed_before_the_policy_plans() {
     let short: Vec<_> = events.iter().map(|e| (&*e.cause, e.before, e.removed)).collect();
     assert_eq!(short, [("not finite", 2000, 2), ("scripted", 1998, 999)]);
     assert_eq!(log.lock().unwrap().iter().filter(|d| *d == "apply 2").count(), 2);
-    assert_eq!(trainer.events, events);
+    assert_eq!(trainer.state.events, events);
 }
 
 #[test]

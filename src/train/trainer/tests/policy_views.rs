@@ -54,14 +54,14 @@ fn auxiliary_views_are_shown_before_the_plan() {
     let expected: Vec<String> = views.iter().map(shown).chain(["apply 4".to_owned()]).collect();
     assert_eq!(log[first..first + 3], expected);
     assert_eq!(log.iter().filter(|d| d.starts_with("observe")).count(), 2);
-    assert_eq!(trainer.extra_forwards(), 2);
+    assert_eq!(trainer.progress().extra_forwards, 2);
     let saw: Vec<f32> = views.iter().map(|&view| view as f32).collect();
     assert_eq!(events[1].cause, format!("saw {saw:?}+scripted"));
     assert_eq!(events[2].cause, "scripted");
     // If more views are requested than exist, all are rendered.
     let (mut trainer, ..) = self::trainer(&Case { aux_views: u32::MAX, ..CASE });
     (0..9).for_each(|_| drop(trainer.step().unwrap()));
-    assert_eq!(trainer.extra_forwards(), 3);
+    assert_eq!(trainer.progress().extra_forwards, 3);
 }
 
 #[test]

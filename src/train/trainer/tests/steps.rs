@@ -44,11 +44,11 @@ fn exposures_belong_to_views() {
     // A step reduces the view's factor; the mean is constant, so that the others increase.
     assert!(noted[1..3].iter().zip(&shown[1..]).all(|(gain, view)| *gain > gains[*view][1]));
     let state = new.state().unwrap();
-    assert_eq!(state.exposures.as_ref(), new.exposures());
+    assert_eq!(state.exposures, new.progress().exposures);
     let (same, ..) = trainer(&case);
     let mut same = same.with_exposures(Some(first(())));
     same.resume(state.clone()).unwrap();
-    assert_eq!(same.exposures(), new.exposures());
+    assert_eq!(same.progress().exposures, new.progress().exposures);
     let (mut without, ..) = trainer(&case);
     let refused = without.resume(state).unwrap_err().to_string();
     assert!(refused.contains("exposures"), "{refused}");
@@ -138,7 +138,7 @@ fn options_that_disagree_are_refused() {
     };
     assert!(refused(0, |_, _| ()).contains("no training view"));
     assert!(refused(2, |_, _| ()).contains("2 views"));
-    assert!(refused(3, |_, o| o.iterations = 8).contains("--iterations"));
+    assert!(refused(3, |_, o| o.iterations = 8).contains("8 iterations"));
     assert!(refused(3, |s, _| s.extent = f32::NAN).contains("extent"));
     assert!(refused(3, |s, _| s.budget = 11).contains("budget 10 (scene: 11)"));
     assert!(refused(3, |_, o| o.rates.quat = 0.0).contains("`quat`"));

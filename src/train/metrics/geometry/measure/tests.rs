@@ -66,18 +66,13 @@ fn cuboid(low: DVec3, high: DVec3) -> Vec<[DVec3; 3]> {
     for axis in 0..3 {
         let (u, v) = ((axis + 1) % 3, (axis + 2) % 3);
         for end in [low, high] {
-            let corner = |a: bool, b: bool| {
+            let corner = |a: DVec3, b: DVec3| {
                 let mut p = end;
-                p[u] = if a { high[u] } else { low[u] };
-                p[v] = if b { high[v] } else { low[v] };
+                (p[u], p[v]) = (a[u], b[v]);
                 p
             };
-            let (a, b, c, d) = (
-                corner(false, false),
-                corner(true, false),
-                corner(true, true),
-                corner(false, true),
-            );
+            let [a, b, c, d] =
+                [corner(low, low), corner(high, low), corner(high, high), corner(low, high)];
             all.extend([[a, b, c], [a, c, d]]);
         }
     }

@@ -129,7 +129,7 @@ impl Visibility {
         Ok(())
     }
 
-    /// Whether a row is a floater, by the definition of [`Floaters`].
+    /// True for a floater, by the definition of [`Floaters`].
     fn is_floater(&self, rows: &Rows, row: usize, diagonal: f64) -> bool {
         let clear = (MIN_DISTANCE * diagonal).max(2.0 * rows.scales[row].max_element());
         rows.opacities[row] > MIN_OPACITY
@@ -157,7 +157,7 @@ impl Visibility {
     }
 }
 
-/// Whether a view sees through a point, to a surface behind it or to the background.
+/// True if a view sees through a point, to a surface behind it or to the background.
 fn sees_through(camera: &Camera, g_buffer: &GBuffer, place: DVec3) -> bool {
     let (pixel, depth) = camera.project(place);
     let (width, height) = (f64::from(g_buffer.width), f64::from(g_buffer.height));
