@@ -79,8 +79,7 @@ impl TrainArgs {
         Host { companion: self.view.map(|_| page::COMPANION), ..Host::new(follower) }
     }
 
-    /// The run that this call describes, by file or by flag; with the checkpoint that it goes on from, if it
-    /// does.
+    /// The run that the file and flags of this call describe, with the checkpoint to continue from, if any.
     pub(super) fn describe(
         &self,
         matches: &ArgMatches,
@@ -89,10 +88,8 @@ impl TrainArgs {
         let flags = flags::given(matches, &self.run)?;
         let file = self.config.as_deref().map(Partial::read).transpose()?.unwrap_or_default();
         let given = flags.clone().over(file);
-        let (spec, resumed) = match self.resume {
-            true => run::start(given, follower)?,
-            false => (given.describe()?, None),
-        };
+        let (spec, resumed) =
+            if self.resume { run::start(given, follower)? } else { (given.describe()?, None) };
         flags::check_policy(&flags, &spec)?;
         Ok((spec, resumed))
     }
