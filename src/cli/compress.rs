@@ -81,9 +81,10 @@ impl FromStr for Size {
 
     fn from_str(text: &str) -> Result<Self, String> {
         let is_bytes = text.trim_end().ends_with(['b', 'B']);
-        let target = match is_bytes {
-            true => numbers::bytes(text).map(Target::Bytes),
-            false => numbers::rows(text).map(Target::Rows),
+        let target = if is_bytes {
+            numbers::bytes(text).map(Target::Bytes)
+        } else {
+            numbers::rows(text).map(Target::Rows)
         };
         let wrong = |error| {
             format!("{error}; give a size such as 5MiB, or a number of Gaussians such as 20k")
@@ -161,22 +162,22 @@ fn table(compressed: &Compressed) -> String {
         "\n{:<10} {:>10} {:>7} {:>14} {:>13} {:>11} {:>11}",
         "", "Gaussians", "degree", "format", "bytes", "train [dB]", "test [dB]"
     );
-    let mut line = |name: &str, it: &Attempt, of_whole: &str| {
-        let test = it.test.map_or_else(|| "–".to_owned(), |test| format!("{test:.2}"));
-        let bytes = grouped(usize::try_from(it.bytes).unwrap_or(usize::MAX));
+    let mut line = |name: &str, attempt: &Attempt, of_whole: &str| {
+        let test = attempt.test.map_or_else(|| "–".to_owned(), |test| format!("{test:.2}"));
+        let bytes = grouped(usize::try_from(attempt.bytes).unwrap_or(usize::MAX));
         text += &format!(
             "\n{name:<10} {:>10} {:>7} {:>14} {bytes:>13} {:>11.2} {test:>11}{of_whole}",
-            grouped(it.rows),
-            it.sh_degree,
-            it.format,
-            it.train
+            grouped(attempt.rows),
+            attempt.sh_degree,
+            attempt.format,
+            attempt.train
         );
     };
     line("whole PLY", whole, "");
-    let others = attempts.iter().enumerate().map(|(place, attempt)| match place == *best {
-        true => ("written", attempt),
-        false => ("tried", attempt),
-    });
+    let others = attempts
+        .iter()
+        .enumerate()
+        .map(|(place, attempt)| (if place == *best { "written" } else { "tried" }, attempt));
     for (name, attempt) in way.iter().map(|attempt| ("on the way", attempt)).chain(others) {
         let share = percent(attempt.bytes as f64 / whole.bytes as f64);
         line(name, attempt, &format!("  {share} of the PLY"));

@@ -26,7 +26,7 @@ pub(super) fn run(_: &DevicesArgs, console: &Console) -> Result<(), Failure> {
             AdapterKind::Discrete => "graphics card",
             AdapterKind::Integrated => "integrated GPU",
             AdapterKind::Virtual => "virtual GPU",
-            AdapterKind::Software => "software; taken only if asked for",
+            AdapterKind::Software => "software; used only on request",
             AdapterKind::Unknown => "of unknown kind",
         };
         console.result(format_args!("{}", adapter.name));
@@ -41,9 +41,10 @@ pub(super) fn run(_: &DevicesArgs, console: &Console) -> Result<(), Failure> {
         let own = adapter.accumulation();
         let others = adapter.accumulations.iter().filter(|way| **way != own);
         let others: Vec<_> = others.map(ToString::to_string).collect();
-        let note = match others.is_empty() {
-            true => String::new(),
-            false => format!("; if asked for, {}", others.join(", ")),
+        let note = if others.is_empty() {
+            String::new()
+        } else {
+            format!("; on request, {}", others.join(", "))
         };
         console.result(format_args!("  accumulation    {own}{note}"));
         for missing in &adapter.missing {

@@ -75,9 +75,10 @@ pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> R
     let model = &args.model;
     let limits = Limits { lowest: &args.fail_below, highest: &args.fail_above };
     // A folder without config.toml is no run.
-    let run = match is_model(model) {
-        true => None,
-        false => Some((RunConfig::read(model)?, iteration(model, args.iteration)?)),
+    let run = if is_model(model) {
+        None
+    } else {
+        Some((RunConfig::read(model)?, iteration(model, args.iteration)?))
     };
     let mut rendering = args.rendering.clone();
     rendering.data.eval |= rendering.data.test_every.is_none();
