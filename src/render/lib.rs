@@ -32,6 +32,7 @@ use densify_policies::policy::{
 pub use adapter::{AdapterChoice, AdapterKind, AdapterSummary};
 pub use audit::{Attribute, NonFinite, NumberKind};
 pub use choice::{BackendChoice, BackendKind, Device};
+use densify_core::budget::RowBudget;
 use densify_core::camera::Camera;
 use densify_core::colour::{ColourGradient, ColourTransform};
 use densify_core::gaussians::{Gaussians, ModelArray};
@@ -180,12 +181,12 @@ fn assert_same_size(camera: &Camera, image: &Image8) {
     assert_eq!(camera, image, "camera and image differ in size");
 }
 
-/// Panics unless a plan fits the rows, in release builds too: the memory promise depends on it.
-fn assert_fits(ops: &RowOps, frozen: usize, rows: usize, budget: usize) {
-    assert_eq!(ops.first_row, frozen, "a plan for another number of frozen rows");
+/// Panics unless a plan fits the rows, in release builds too: the memory plan depends on it.
+fn assert_fits(ops: &RowOps, rows: usize, budget: RowBudget) {
+    assert_eq!(ops.first_row, budget.frozen, "a plan for another number of frozen rows");
     assert_eq!(ops.rows_before, rows, "a plan for another number of rows");
-    assert_eq!(ops.budget, budget, "a plan for another budget");
-    assert!(ops.rows_after <= budget, "{} rows over the budget", ops.rows_after);
+    assert_eq!(ops.budget, budget.total, "a plan for another budget");
+    assert!(ops.rows_after <= budget.total, "{} rows over the budget", ops.rows_after);
     if let Err(broken) = ops.check() {
         panic!("an inconsistent plan: {broken}");
     }
@@ -202,7 +203,7 @@ pub trait Backend: Send {
     /// The largest number of rows; all buffers have this size from the start.
     fn budget(&self) -> usize;
 
-    /// The promised bytes of each buffer.
+    /// The planned bytes of each buffer.
     fn ledger(&self) -> &Ledger;
 
     /// Starts a new epoch; `WeightMax` is kept per epoch.

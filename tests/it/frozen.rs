@@ -1,6 +1,7 @@
 //! Frozen rows: whatever a step or a plan does to the others, these keep their bits, and they have no memory for
 //! what only training needs.
 
+use densify::core::budget::RowBudget;
 use densify::core::camera::Camera;
 use densify::core::gaussians::Gaussians;
 use densify::render::{Attribute, Backend, NonFinite, NumberKind, StepInput, Storage, Values};
@@ -32,7 +33,8 @@ fn model() -> Gaussians {
 }
 
 fn setup(frozen: usize, storage: Storage, needs: Needs) -> Setup {
-    Setup { budget: 2 * ROWS, frozen, storage, needs, ..Setup::default() }
+    let budget = RowBudget { total: 2 * ROWS, frozen };
+    Setup { budget, storage, needs, ..Setup::default() }
 }
 
 fn step(backend: &mut dyn Backend, number: u32, needs: &Needs) {

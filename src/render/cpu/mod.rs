@@ -57,6 +57,7 @@ use super::{
 };
 use adam::BiasCorrection;
 use blocks::{Blocks, planes};
+use densify_core::budget::RowBudget;
 use densify_core::camera::Camera;
 use densify_core::gaussians::{Gaussians, ModelArray};
 use densify_core::memory::Ledger;
@@ -92,9 +93,7 @@ pub struct CpuBackend {
     arch: Arch,
     threads: Arc<Threads>,
     ledger: Ledger,
-    budget: usize,
-    /// Number of frozen rows, which come first.
-    frozen: usize,
+    budget: RowBudget,
     rows: usize,
     sh_degree: u8,
     near: f32,
@@ -131,10 +130,10 @@ pub struct CpuBackend {
 }
 
 impl CpuBackend {
-    /// The ledger of a backend with these options for models of this degree, on `threads` threads, whatever
+    /// The bytes that a backend with these options allocates for models of this degree, on `threads` threads, whatever
     /// [`Setup::threads`] says.
     #[must_use]
-    pub fn promise(sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
+    pub fn memory_plan(sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
         budget::ledger(sh_degree, options, threads)
     }
 
@@ -146,8 +145,9 @@ impl CpuBackend {
     /// # Panics
     /// When the model has more rows than the budget: a bug in the caller, which must subsample.
     pub fn new(model: &Gaussians, options: &Setup) -> Result<Self, BackendError> {
-        let budget = options.budget.max(1);
-        assert!(model.len() <= budget, "{} rows over a budget of {budget}", model.len());
+        let budget = options.row_budget();
+        let rows = budget.total;
+        assert!(model.len() <= rows, "{} rows over a budget of {rows}", model.len());
         let threads = Threads::new(options.threads)?;
         let ledger = budget::ledger(model.sh_degree, options, threads.count());
         budget::reserve(&ledger)?;
@@ -157,14 +157,14 @@ impl CpuBackend {
         let (cap, record_cap) = (budget::tile_cap(options), budget::record_cap(options));
         let per_row = planes(model.sh_degree);
         let storage = options.storage;
-        let mut params = Parameters::zeros(budget, per_row, storage.parameters);
+        let mut params = Parameters::zeros(rows, per_row, storage.parameters);
         params.pack(model);
+        let counted = if counts_dominant(&options.needs) { rows } else { 0 };
         Ok(Self {
             arch: options.instructions.arch(),
             threads: Arc::new(threads),
             ledger,
             budget,
-            frozen: options.frozen,
             rows: model.len(),
             sh_degree: model.sh_degree,
             near: options.near,
@@ -177,14 +177,10 @@ impl CpuBackend {
             masks: Masks::new(trained, options.needs.mask),
             signals,
             candidates: Candidates::new(options.needs.candidates),
-            dominant: bytemuck::zeroed_vec(if counts_dominant(&options.needs) {
-                budget
-            } else {
-                0
-            }),
-            splats: vec![Splat::default(); budget],
-            visible: vec![0; budget.div_ceil(WIDTH)],
-            lists: TileLists::new(budget, cap),
+            dominant: bytemuck::zeroed_vec(counted),
+            splats: vec![Splat::default(); rows],
+            visible: vec![0; rows.div_ceil(WIDTH)],
+            lists: TileLists::new(rows, cap),
             canvas: Vec::new(),
             gradient: Vec::new(),
             loss: LossBuffers::new(),
@@ -253,7 +249,7 @@ impl Backend for CpuBackend {
     }
 
     fn budget(&self) -> usize {
-        self.budget
+        self.budget.total
     }
 
     fn ledger(&self) -> &Ledger {
@@ -294,7 +290,7 @@ impl Backend for CpuBackend {
     }
 
     fn apply(&mut self, ops: &RowOps, seed: u64, step: u32) -> Result<(), BackendError> {
-        assert_fits(ops, self.frozen, self.rows, self.budget);
+        assert_fits(ops, self.rows, self.budget);
         let mut model = apply::Model {
             params: &mut self.params,
             moments: &mut self.moments,

@@ -333,8 +333,9 @@ impl CpuBackend {
             threads, arch, params, moments, masks, ages, signals, sums, visible, bias, ..
         } = self;
         let dominant = &self.dominant[..self.rows.min(self.dominant.len())];
-        let (rows, frozen, arch) = (self.rows, self.frozen, *arch);
-        let terms = Terms::new(input.loss_terms, rows - frozen);
+        let (rows, frozen, arch) = (self.rows, self.budget.frozen, *arch);
+        let trained = self.budget.trained(rows);
+        let terms = Terms::new(input.loss_terms, trained);
         let noise = input.noise.map(|term| Noise::new(term, input));
         let due = self.summed.advance(input);
         let (planes, layout) = (signals.planes(), signals.layout());
@@ -349,7 +350,7 @@ impl CpuBackend {
         let parts = (
             params.tasks(rows).skip(first_row / ROWS_PER_TASK),
             moments.tasks(rows),
-            masks.tasks(rows, rows - frozen),
+            masks.tasks(rows, trained),
             ages.of_rows_mut(rows).par_chunks_mut(ROWS_PER_TASK),
             parts(signals.blocks.of_rows_mut(rows), per_task, tasks),
             sums.par_chunks(ROWS_PER_TASK * layout.stride()),

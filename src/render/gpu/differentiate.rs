@@ -66,7 +66,7 @@ impl Differentiable for GpuBackend {
         upstream: &ImageGradient,
     ) -> Result<(Rendering, ModelGradient), BackendError> {
         upstream.assert_size(camera);
-        assert_eq!(self.sizes.frozen, 0, "frozen rows have no gradients");
+        assert_eq!(self.sizes.budget.frozen, 0, "frozen rows have no gradients");
         if !self.sizes.alpha_and_depth {
             (self.sizes.alpha_and_depth, self.sizes.records) = (true, RecordLayout::ALL);
             self.rebuild()?;

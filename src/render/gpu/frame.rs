@@ -138,13 +138,18 @@ impl Frame {
         }
     }
 
-    /// Adds the values of an optimiser step.
-    pub(super) fn add_step(&mut self, input: &StepInput<'_>, due: u32, planes: &SignalPlanes) {
+    /// Adds the values of an optimiser step of `trained` rows.
+    pub(super) fn add_step(
+        &mut self,
+        input: &StepInput<'_>,
+        trained: f32,
+        due: u32,
+        planes: &SignalPlanes,
+    ) {
         let StepInput { rates, loss_terms: terms, noise, .. } = input;
-        let rows = (self.model[0] - self.frozen[0]).max(1) as f32;
         self.rates = [rates.mean, rates.log_scale, rates.quat, rates.opacity];
         self.more_rates =
-            [rates.sh_dc, rates.sh_rest, terms.opacity / rows, terms.scale / (3.0 * rows)];
+            [rates.sh_dc, rates.sh_rest, terms.opacity / trained, terms.scale / (3.0 * trained)];
         if let Some(noise) = noise {
             self.noise = [noise.strength * rates.noise, noise.sharpness, noise.opacity, 0.0];
         }

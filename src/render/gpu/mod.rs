@@ -90,7 +90,6 @@ pub struct GpuBackend {
     buffers: Buffers,
     launches: Launches,
     ledger: Ledger,
-    budget: usize,
     rows: usize,
     near: f32,
     shortcuts: Shortcuts,
@@ -118,7 +117,7 @@ impl GpuBackend {
         device: &GpuDevice,
     ) -> Result<Self, BackendError> {
         let shortcuts = options.shortcuts;
-        let budget = options.budget.max(1);
+        let budget = options.row_budget().total;
         assert!(model.len() <= budget, "{} rows over a budget of {budget}", model.len());
         let device = device.0.clone();
         let most = device.summary.largest_budget(model.sh_degree);
@@ -141,7 +140,6 @@ impl GpuBackend {
             sizes,
             buffers,
             launches,
-            budget,
             rows: model.len(),
             near: options.near,
             shortcuts,
@@ -203,10 +201,10 @@ impl GpuBackend {
 
     fn frame(&self, camera: &Camera, background: [f32; 3], sh_degree: u8) -> Frame {
         let degree = u32::from(sh_degree.min(self.sizes.sh_degree));
-        let Sizes { cap, frozen, .. } = self.sizes;
+        let Sizes { cap, budget, .. } = self.sizes;
         let model = [self.rows as u32, degree, cap as u32, self.sizes.trained() as u32];
         let mut frame = Frame::for_view(camera, background, self.near, model);
-        frame.frozen[0] = frozen as u32;
+        frame.frozen[0] = budget.frozen as u32;
         frame
     }
 }
@@ -234,7 +232,7 @@ impl Backend for GpuBackend {
     }
 
     fn budget(&self) -> usize {
-        self.budget
+        self.sizes.budget.total
     }
 
     fn ledger(&self) -> &Ledger {
@@ -286,7 +284,7 @@ impl Backend for GpuBackend {
     }
 
     fn apply(&mut self, ops: &RowOps, seed: u64, step: u32) -> Result<(), BackendError> {
-        assert_fits(ops, self.sizes.frozen as usize, self.rows, self.budget);
+        assert_fits(ops, self.rows, self.sizes.budget);
         self.edit(ops, seed, step);
         if ops.reset_candidates {
             self.candidates.clear();

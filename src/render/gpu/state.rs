@@ -87,7 +87,7 @@ impl GpuBackend {
             self.candidates.restore(tensor)?;
         } else if let Some(plane) = self.signal(&name) {
             let values = tensor.into_f32(&[rows.len()])?;
-            let (first, missing) = stored_rows(self.sizes.frozen, &rows);
+            let (first, missing) = stored_rows(self.sizes.budget.frozen as u64, &rows);
             let start = plane as u64 * self.sizes.trained() + first;
             self.write_at("signals", 4 * start, &values[missing..]);
         } else if let Some(array) = self.array(&name) {
@@ -102,7 +102,7 @@ impl GpuBackend {
                 self.write_at(array.name, at, &values[array.numbers * missing..]);
             }
         } else {
-            return Err(tensor.error("this run keeps nothing of that name"));
+            return Err(tensor.error("this run has no such array"));
         }
         Ok(())
     }

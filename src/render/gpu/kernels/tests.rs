@@ -112,7 +112,7 @@ fn largest_sizes(accumulation: Accumulation) -> Sizes {
         cadence: Cadence { all: 2, sh_rest: 2 },
         ..Needs::default()
     };
-    let mut sizes = Sizes::new(10, 100, 3, (32, 32), &needs, accumulation);
+    let mut sizes = Sizes::new(10.into(), 100, 3, (32, 32), &needs, accumulation);
     sizes.photographs = KeptPhotographs { count: 1, with_masks: true };
     sizes.exposures = true;
     sizes
