@@ -44,6 +44,17 @@ impl Scratch {
     pub(super) const ZERO: Self = Self([0.0; plane::MOST * WIDTH]);
 }
 
+/// An edit of whole rows, which every array of rows executes alike.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum RowEdit<'a> {
+    /// Sets a row to 0.
+    Clear(usize),
+    /// Copies the stored bits of a row to another: from, to.
+    Copy(usize, usize),
+    /// Moves row `order[i]` to row i.
+    Reorder(&'a [u32]),
+}
+
 /// Rows of `planes` numbers each, from a first row on; earlier rows have no numbers.
 #[derive(Debug, Clone)]
 pub(super) struct Blocks<T = f32> {
@@ -131,14 +142,19 @@ impl<T: Copy + Default> Blocks<T> {
         self.data[at] = value;
     }
 
-    pub(super) fn copy_row(&mut self, from: usize, to: usize) {
-        for plane in 0..self.planes {
-            self.set(to, plane, self.get(from, plane));
+    pub(super) fn edit(&mut self, edit: RowEdit<'_>) {
+        let planes = 0..self.planes;
+        match edit {
+            RowEdit::Clear(row) => planes.for_each(|plane| self.set(row, plane, T::default())),
+            RowEdit::Copy(from, to) => {
+                planes.for_each(|plane| self.set(to, plane, self.get(from, plane)));
+            }
+            RowEdit::Reorder(order) => self.reorder(order),
         }
     }
 
     /// Moves row `order[i]` to row i; rows before the first stay.
-    pub(super) fn reorder(&mut self, order: &[u32]) {
+    fn reorder(&mut self, order: &[u32]) {
         let order = order.get(self.first..).unwrap_or_default();
         let mut values = vec![T::default(); order.len()];
         // Plane by plane: rows mostly move by little, so that reads are mostly sequential.
@@ -149,12 +165,6 @@ impl<T: Copy + Default> Blocks<T> {
             for (row, &value) in (self.first..).zip(&values) {
                 self.set(row, plane, value);
             }
-        }
-    }
-
-    pub(super) fn clear_row(&mut self, row: usize) {
-        for plane in 0..self.planes {
-            self.set(row, plane, T::default());
         }
     }
 

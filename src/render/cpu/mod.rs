@@ -55,7 +55,7 @@ use super::{
     AuxInput, AuxOutput, Backend, BackendError, Inspect, NonFinite, Rendering, Setup, Shortcuts,
     StateArray, StateError, StepInput, StepOutput, Tensor, assert_fits, assert_same_size,
 };
-use adam::BiasCorrection;
+pub(crate) use adam::BiasCorrection;
 use blocks::{Blocks, planes};
 use densify_core::budget::RowBudget;
 use densify_core::camera::Camera;
@@ -79,9 +79,11 @@ use tiles::TileLists;
 pub use instructions::InstructionSet;
 pub use optimise::ModelGradient;
 pub use threads::StepTasks;
+#[cfg(feature = "gpu")]
+pub(crate) use {loss::SSIM_WEIGHT, project::FOLD, project::ViewParams};
 
 /// The largest side of an image `[px]`, at which every index of the stages still fits its type.
-const MAX_SIDE: u32 = 16_384;
+pub(crate) const MAX_SIDE: u32 = 16_384;
 /// Blocks per task: 128 rows, which have 100 kB of parameters and moments at degree 3. 50,000 rows give each of 64
 /// threads six tasks.
 const BLOCKS_PER_TASK: usize = 8;

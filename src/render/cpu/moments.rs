@@ -9,7 +9,7 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::blocks::{BlockTask, BlockView, Blocks, Scratch};
+use super::blocks::{BlockTask, BlockView, Blocks, RowEdit, Scratch};
 use super::narrow::{Draws, F8, Narrow, first_moment, first_moments, narrow, ratios, widen};
 use super::simd::WIDTH;
 use crate::{MomentStorage, StateError, Tensor};
@@ -65,23 +65,10 @@ impl Moments {
         self.ratios.planes() > 0
     }
 
-    pub(super) fn clear_row(&mut self, row: usize) {
-        self.wide.iter_mut().for_each(|blocks| blocks.clear_row(row));
-        self.ratios.clear_row(row);
-        self.seconds.clear_row(row);
-    }
-
-    /// Copies the stored bits.
-    pub(super) fn copy_row(&mut self, from: usize, to: usize) {
-        self.wide.iter_mut().for_each(|blocks| blocks.copy_row(from, to));
-        self.ratios.copy_row(from, to);
-        self.seconds.copy_row(from, to);
-    }
-
-    pub(super) fn reorder(&mut self, order: &[u32]) {
-        self.wide.iter_mut().for_each(|blocks| blocks.reorder(order));
-        self.ratios.reorder(order);
-        self.seconds.reorder(order);
+    pub(super) fn edit(&mut self, edit: RowEdit<'_>) {
+        self.wide.iter_mut().for_each(|blocks| blocks.edit(edit));
+        self.ratios.edit(edit);
+        self.seconds.edit(edit);
     }
 
     /// Resets the moments of one parameter.

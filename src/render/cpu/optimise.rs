@@ -114,7 +114,7 @@ impl WithSimd for Optimise<'_> {
                 was_zero = false;
             }
             if due.uses_sums() {
-                was_zero &= !summed.exchange(b, &mut gradient.params, trained, due);
+                was_zero &= !summed.take_gradient(b, &mut gradient.params, trained, due);
             }
             let lanes = b * WIDTH..(b + 1) * WIDTH;
             let [m, v] = moments.open(b, trained, &mut moment_scratch);

@@ -13,7 +13,7 @@ use std::ops::Range;
 use rayon::prelude::*;
 
 use super::BLOCKS_PER_TASK;
-use super::blocks::{BlockTask, BlockView, Blocks, Scratch, plane};
+use super::blocks::{BlockTask, BlockView, Blocks, RowEdit, Scratch, plane};
 use super::narrow::{Draws, F16, Narrow, fixed, narrow, narrow_fixed, widen, widen_fixed};
 use super::simd::WIDTH;
 use crate::ParameterStorage;
@@ -121,23 +121,10 @@ impl Parameters {
         }
     }
 
-    /// Copies the stored bits.
-    pub(super) fn copy_row(&mut self, from: usize, to: usize) {
-        self.wide.copy_row(from, to);
-        self.fixed.copy_row(from, to);
-        self.half.copy_row(from, to);
-    }
-
-    pub(super) fn reorder(&mut self, order: &[u32]) {
-        self.wide.reorder(order);
-        self.fixed.reorder(order);
-        self.half.reorder(order);
-    }
-
-    pub(super) fn clear_row(&mut self, row: usize) {
-        self.wide.clear_row(row);
-        self.fixed.clear_row(row);
-        self.half.clear_row(row);
+    pub(super) fn edit(&mut self, edit: RowEdit<'_>) {
+        self.wide.edit(edit);
+        self.fixed.edit(edit);
+        self.half.edit(edit);
     }
 
     /// Stores a host model; `self` must have room for its rows, and its number of planes.

@@ -11,7 +11,7 @@ use densify_policies::policy::Cadence;
 use rayon::prelude::*;
 
 use super::ROWS_PER_TASK;
-use super::blocks::{BlockTask, Blocks, parts, plane};
+use super::blocks::{BlockTask, Blocks, RowEdit, parts, plane};
 use super::simd::WIDTH;
 use crate::{StateError, StepInput, Tensor};
 
@@ -173,19 +173,9 @@ impl Summed {
         self.sums.planes()
     }
 
-    pub(super) fn clear_row(&mut self, row: usize) {
-        self.sums.clear_row(row);
-        self.rest_ages.clear_row(row);
-    }
-
-    pub(super) fn copy_row(&mut self, from: usize, to: usize) {
-        self.sums.copy_row(from, to);
-        self.rest_ages.copy_row(from, to);
-    }
-
-    pub(super) fn reorder(&mut self, order: &[u32]) {
-        self.sums.reorder(order);
-        self.rest_ages.reorder(order);
+    pub(super) fn edit(&mut self, edit: RowEdit<'_>) {
+        self.sums.edit(edit);
+        self.rest_ages.edit(edit);
     }
 
     /// Resets the sum of one parameter.
@@ -211,7 +201,7 @@ impl TaskSums<'_> {
 
     /// Adds the gradient of a block to the sums of the waiting groups, and the sums of the stepping groups to the
     /// gradient. Returns whether the gradient has changed.
-    pub(super) fn exchange(
+    pub(super) fn take_gradient(
         &mut self,
         block: usize,
         gradient: &mut [f32],

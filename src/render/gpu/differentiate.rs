@@ -2,8 +2,7 @@
 
 use super::GpuBackend;
 use super::frame::{Frame, State, grid};
-use super::observe::FOLD;
-use crate::cpu::ModelGradient;
+use crate::cpu::{FOLD, ModelGradient};
 use crate::signals::{Field, RecordLayout};
 use crate::{BackendError, Differentiable, ImageGradient, Rendering, StepOutput};
 use densify_core::camera::Camera;

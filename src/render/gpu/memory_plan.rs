@@ -7,11 +7,9 @@ use super::sizes::{MAX_ENTRIES, Sizes};
 use crate::Accumulation;
 use crate::Setup;
 use crate::candidates::Candidates;
+use crate::cpu::MAX_SIDE;
 use crate::signals::RecordLayout;
 use densify_core::memory::{Ledger, Section};
-
-/// Longest image side `[px]` at which every index of the stages fits its type.
-pub(super) const MAX_SIDE: u32 = 16_384;
 
 /// Largest number of (row, tile) pairs that this device can hold at a time, for a policy's needs.
 pub(super) fn max_pairs(device: &Device, needs: &Needs) -> u64 {

@@ -42,6 +42,7 @@ use densify_policies::plan::RowOps;
 use densify_policies::policy::{Cadence, Candidate, MaskTerm, SignalKind, SignalSet, Signals};
 
 use super::candidates::Candidates;
+use super::cpu::{BiasCorrection, MAX_SIDE};
 use super::signals::{ParameterSignal, SignalPlanes, as_read};
 use super::{
     AdapterSummary, AuxInput, AuxOutput, Backend, BackendError, Inspect, NonFinite, Rendering,
@@ -52,13 +53,12 @@ use densify_core::gaussians::{Gaussians, ModelArray, rgb_to_dc};
 use densify_core::memory::Ledger;
 
 pub use adapter::{adapters, may_be_present};
-use buffers::{Buffers, bias_table};
+use buffers::Buffers;
 use device::Device;
 pub use device::GpuDevice;
 pub use device::faults::with_device_lost_after;
 use frame::Frame;
 use launches::Launches;
-use memory_plan::MAX_SIDE;
 use pipelines::Variant;
 use sizes::Sizes;
 
@@ -153,7 +153,7 @@ impl GpuBackend {
             bands: 1,
             stage_times: Vec::new(),
         };
-        gpu.write("bias", bytemuck::cast_slice(&bias_table()));
+        gpu.write("bias", bytemuck::cast_slice(&BiasCorrection::new().table));
         gpu.upload(model);
         gpu.device.check()?;
         Ok(gpu)
@@ -330,7 +330,7 @@ impl Backend for GpuBackend {
         values: &[f32],
     ) -> Result<(), BackendError> {
         assert!(rows.end <= self.rows, "rows {rows:?} of {}", self.rows);
-        self.set_model_array(array, rows, values)
+        self.set_parameters(&array.parameters(self.sizes.sh_degree), rows, values)
     }
 
     fn state(&self) -> Vec<StateArray> {

@@ -12,11 +12,9 @@ use super::passes::{Search, Shape};
 use super::rows::GRADIENT;
 use super::sizes::OPS_BYTES;
 use crate::candidates::{Photograph, ranked};
+use crate::cpu::FOLD;
 use crate::pixel_map::{draw_pixels, pixel_map, radius_px};
 use crate::{AuxInput, AuxOutput, BackendError, assert_same_size};
-
-/// √(½·log₂ e): folded into the splats' factors.
-pub(super) const FOLD: f32 = 0.849_321_8;
 
 /// A rendered view, with its lists and its image on the device.
 pub(super) struct RenderedView<'a> {

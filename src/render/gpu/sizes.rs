@@ -8,6 +8,7 @@ use super::frame::{Frame, State, grid};
 use super::rows::{Content, RowArray, row_arrays};
 use crate::Accumulation;
 use crate::KeptPhotographs;
+use crate::cpu::BiasCorrection;
 use crate::signals::{Field, RecordLayout, SignalPlanes, counts_dominant};
 use densify_core::budget::RowBudget;
 use densify_core::gaussians::sh_coefficients;
@@ -19,8 +20,6 @@ pub(super) const OPS_BYTES: u64 = 1 << 18;
 pub(super) const READ_BYTES: u64 = 1 << 20;
 /// Items per group of the sums and sorts; see `shaders/tiles.wgsl`.
 pub(super) const BLOCK: u64 = 2048;
-/// Oldest age with a tabulated bias correction; beyond ln(2⁻²⁵)/ln(0.999) there is none.
-pub(super) const MATURE: usize = 17_400;
 /// Largest number of entries held at a time; sums saturate beyond it.
 pub(super) const MAX_ENTRIES: u64 = 1 << 28;
 
@@ -143,7 +142,7 @@ impl Sizes {
             let [_, rows] = self.places(&array);
             add(traits.section, traits.line, array.name, rows * array.row_bytes());
         }
-        add(Section::Model, Content::Ages.traits().line, "bias", 8 * (MATURE as u64 + 1));
+        add(Section::Model, Content::Ages.traits().line, "bias", BiasCorrection::bytes());
         for name in ["keys 0", "keys 1", "values 0", "values 1", "row of slot"] {
             add(Section::Tiles, "entries", name, 4 * cap);
         }

@@ -181,16 +181,6 @@ impl GpuBackend {
         Ok(())
     }
 
-    /// Writes rows of one of the model's arrays.
-    pub(super) fn set_model_array(
-        &self,
-        array: ModelArray,
-        rows: Range<usize>,
-        values: &[f32],
-    ) -> Result<(), BackendError> {
-        self.set_parameters(&array.parameters(self.sizes.sh_degree), rows, values)
-    }
-
     /// Writes parameters of rows, row after row: the inverse of [`parameters_of`](Self::parameters_of).
     pub(super) fn set_parameters(
         &self,

@@ -40,7 +40,7 @@ use window::{
 const C1: f32 = 0.01 * 0.01;
 const C2: f32 = 0.03 * 0.03;
 /// Weight of 1 − SSIM; L1 has the rest.
-const SSIM_WEIGHT: f32 = 0.2;
+pub(crate) const SSIM_WEIGHT: f32 = 0.2;
 /// The constant subtracted from y.
 const MIDDLE: f32 = 0.5;
 /// Rows per strip where tiles are written: a row of tiles.
