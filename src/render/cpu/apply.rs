@@ -159,7 +159,7 @@ impl Model<'_> {
     }
 
     fn decay(&mut self, decay: Decay, rows: Range<usize>) {
-        let seen = self.signals.planes().current(Signal::VisibleCount);
+        let seen = self.signals.planes.current(Signal::VisibleCount);
         let shrunk = (1.0 - decay.scale).ln();
         for row in rows {
             let was_seen = seen.is_some_and(|plane| self.signals.blocks.get(row, plane) > 0.0);

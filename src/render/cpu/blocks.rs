@@ -58,9 +58,10 @@ pub(super) enum RowEdit<'a> {
 /// Rows of `planes` numbers each, from a first row on; earlier rows have no numbers.
 #[derive(Debug, Clone)]
 pub(super) struct Blocks<T = f32> {
-    planes: usize,
+    /// Numbers per row.
+    pub(super) planes: usize,
     /// The first row, a multiple of [`ROWS_PER_TASK`], so that blocks and tasks are aligned with those of all rows.
-    first: usize,
+    pub(super) first: usize,
     data: Vec<T>,
 }
 
@@ -85,16 +86,6 @@ impl<T: Copy + Default> Blocks<T> {
     /// Numbers per block.
     pub(super) fn stride(&self) -> usize {
         self.planes * WIDTH
-    }
-
-    /// Numbers per row.
-    pub(super) fn planes(&self) -> usize {
-        self.planes
-    }
-
-    /// The first row with numbers.
-    pub(super) fn first(&self) -> usize {
-        self.first
     }
 
     /// Numbers in the blocks of the rows before `rows`.

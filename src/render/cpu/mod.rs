@@ -212,14 +212,13 @@ impl CpuBackend {
     fn step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
         let StepInput { camera, target, background, exposure, .. } = *input;
         let behind = exposure.map_or(background, |exposure| exposure.behind(background));
-        let frame = self.forward(camera, behind, input.sh_degree, Beside::Nothing)?;
+        let frame = self.forward(camera, behind, input.sh_degree, Beside::Nothing, None)?;
         if let Some(exposure) = exposure {
             self.expose(&frame.grid, exposure);
         }
         let picks = self.candidates.to_take(input.step, self.rows);
         let weights = picks.and_then(|(request, _)| error_weights(request.error));
-        let by_pixel =
-            self.signals.layout().has(Field::Error).then_some(self.signals.planes().score);
+        let by_pixel = self.signals.layout().has(Field::Error).then_some(self.signals.planes.score);
         let terms = ImageTerms { error: weights, by_pixel };
         let value = self.image_loss(&frame.grid, target, background, terms);
         let by_exposure =
@@ -288,7 +287,7 @@ impl Backend for CpuBackend {
     }
 
     fn candidates(&self) -> &[Candidate] {
-        self.candidates.list()
+        &self.candidates.list
     }
 
     fn apply(&mut self, ops: &RowOps, seed: u64, step: u32) -> Result<(), BackendError> {
@@ -305,7 +304,7 @@ impl Backend for CpuBackend {
         apply::apply(&mut model, ops, &PolicyRng::new(seed, step));
         self.rows = ops.rows_after;
         if ops.reset_candidates {
-            self.candidates.clear();
+            self.candidates.list.clear();
         }
         Ok(())
     }
@@ -320,7 +319,7 @@ impl Backend for CpuBackend {
         background: [f32; 3],
         sh_degree: u8,
     ) -> Result<Rendering, BackendError> {
-        let frame = self.forward(camera, background, sh_degree, Beside::Depth)?;
+        let frame = self.forward(camera, background, sh_degree, Beside::Depth, None)?;
         Ok(self.rendering(&frame))
     }
 
@@ -375,7 +374,7 @@ impl Inspect for CpuBackend {
         colours: &[[f32; 3]],
     ) -> Result<Rendering, BackendError> {
         assert_eq!(colours.len(), self.rows, "one colour per row");
-        let frame = self.forward_painted(camera, background, 0, Beside::Depth, Some(colours))?;
+        let frame = self.forward(camera, background, 0, Beside::Depth, Some(colours))?;
         Ok(self.rendering(&frame))
     }
 
@@ -384,7 +383,7 @@ impl Inspect for CpuBackend {
     }
 
     fn render_counts(&mut self, camera: &Camera) -> Result<Rendering, BackendError> {
-        let frame = self.forward(camera, [0.0; 3], 0, Beside::Count)?;
+        let frame = self.forward(camera, [0.0; 3], 0, Beside::Count, None)?;
         Ok(self.rendering(&frame))
     }
 }

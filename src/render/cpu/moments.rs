@@ -58,11 +58,11 @@ impl Moments {
 
     /// The first row with moments.
     pub(super) fn first(&self) -> usize {
-        self.ratios.first()
+        self.ratios.first
     }
 
     fn is_narrow(&self) -> bool {
-        self.ratios.planes() > 0
+        self.ratios.planes > 0
     }
 
     pub(super) fn edit(&mut self, edit: RowEdit<'_>) {
@@ -193,7 +193,8 @@ impl<'a> MomentView<'a> {
 /// The moments of a task's blocks.
 #[derive(Debug)]
 pub(super) struct MomentTask<'a> {
-    is_narrow: bool,
+    /// True if the stored format is not f32.
+    pub(super) is_narrow: bool,
     wide: [BlockTask<'a, f32>; 2],
     ratios: BlockTask<'a, i8>,
     seconds: BlockTask<'a, F8>,
@@ -234,12 +235,6 @@ impl MomentTask<'_> {
         let second = &mut self.seconds.block(block)[..used];
         narrow(&v.0[..used], second, of_v);
         ratios(&m.0[..used], second, &mut self.ratios.block(block)[..used], of_m);
-    }
-
-    /// Returns whether the stored format is not f32.
-    #[inline(always)]
-    pub(super) fn is_narrow(&self) -> bool {
-        self.is_narrow
     }
 }
 

@@ -77,11 +77,11 @@ impl Parameters {
 
     /// Numbers per row.
     pub(super) fn planes(&self) -> usize {
-        self.wide.planes() + self.fixed.planes() + self.half.planes()
+        self.wide.planes + self.fixed.planes + self.half.planes
     }
 
     fn is_narrow(&self) -> bool {
-        self.fixed.planes() > 0
+        self.fixed.planes > 0
     }
 
     fn is_wide(&self, plane: usize) -> bool {
@@ -184,7 +184,8 @@ impl Parameters {
 /// A read-only view of consecutive blocks.
 #[derive(Debug, Clone)]
 pub(super) struct ParameterView<'a> {
-    blocks: usize,
+    /// Number of blocks.
+    pub(super) blocks: usize,
     is_narrow: bool,
     wide: BlockView<'a, f32>,
     fixed: BlockView<'a, i16>,
@@ -203,10 +204,6 @@ impl<'a> ParameterView<'a> {
             fixed: self.fixed.part(part.clone()),
             half: self.half.part(part),
         }
-    }
-
-    pub(super) fn blocks(&self) -> usize {
-        self.blocks
     }
 
     /// A block as f32: at least the first `planes` planes.
@@ -232,19 +229,14 @@ impl<'a> ParameterView<'a> {
 /// The blocks of a task.
 #[derive(Debug)]
 pub(super) struct ParameterTask<'a> {
-    is_narrow: bool,
+    /// True if the stored format is not f32.
+    pub(super) is_narrow: bool,
     wide: BlockTask<'a, f32>,
     fixed: BlockTask<'a, i16>,
     half: BlockTask<'a, F16>,
 }
 
 impl ParameterTask<'_> {
-    /// Returns whether the stored format is not f32.
-    #[inline(always)]
-    pub(super) fn is_narrow(&self) -> bool {
-        self.is_narrow
-    }
-
     /// A block as f32: at least the first `planes` planes.
     #[inline(always)]
     pub(super) fn open<'b>(

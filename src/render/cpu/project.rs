@@ -306,7 +306,7 @@ impl WithSimd for Project<'_> {
         let degree = view.sh_degree;
         let grid = Grid::new(view.width, view.height);
         let mut scratch = Scratch::ZERO;
-        for b in 0..self.params.blocks() {
+        for b in 0..self.params.blocks {
             let block = self.params.open(b, planes(degree), &mut scratch);
             let mut out = [[0.0_f32; WIDTH]; SPLAT_FIELDS];
             let mut on_screen = [0.0_f32; WIDTH];

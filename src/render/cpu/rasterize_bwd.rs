@@ -144,12 +144,6 @@ pub(super) struct Blended {
     weight: [[f32; WIDTH]; PAIRS],
 }
 
-impl Blended {
-    pub(super) fn boxed() -> Box<Self> {
-        bytemuck::zeroed_box()
-    }
-}
-
 /// Sums of one entry, lane by lane.
 struct Sums<S: Simd> {
     base: [V<S>; BASE],

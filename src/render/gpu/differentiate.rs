@@ -18,7 +18,7 @@ impl GpuBackend {
         let sums = self.read("row sums", 0, 4 * RecordLayout::MOST as u64 * n)?;
         let splats = self.read("splats", 0, 48 * n)?;
         let depths = self.read("depths", 0, 4 * n)?;
-        let planes = self.sizes.sh_numbers();
+        let planes = 3 * sh_coefficients(self.sizes.sh_degree);
         let mut out = ModelGradient { sh: vec![0.0; planes * self.rows], ..Default::default() };
         let rows =
             gradient.as_chunks::<20>().0.iter().zip(sums.as_chunks::<{ RecordLayout::MOST }>().0);

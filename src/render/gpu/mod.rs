@@ -280,14 +280,14 @@ impl Backend for GpuBackend {
     }
 
     fn candidates(&self) -> &[Candidate] {
-        self.candidates.list()
+        &self.candidates.list
     }
 
     fn apply(&mut self, ops: &RowOps, seed: u64, step: u32) -> Result<(), BackendError> {
         assert_fits(ops, self.rows, self.sizes.budget);
         self.edit(ops, seed, step);
         if ops.reset_candidates {
-            self.candidates.clear();
+            self.candidates.list.clear();
         }
         self.device.check()
     }

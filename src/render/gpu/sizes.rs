@@ -11,7 +11,6 @@ use crate::KeptPhotographs;
 use crate::cpu::BiasCorrection;
 use crate::signals::{Field, RecordLayout, SignalPlanes, counts_dominant};
 use densify_core::budget::RowBudget;
-use densify_core::gaussians::sh_coefficients;
 use densify_core::memory::{Ledger, Section};
 
 /// Bytes of an edit's operations that are uploaded at a time.
@@ -210,10 +209,5 @@ impl Sizes {
             ledger.add_on_device(section, line, bytes);
         }
         ledger
-    }
-
-    /// SH coefficients per row, of all channels.
-    pub(super) fn sh_numbers(&self) -> usize {
-        3 * sh_coefficients(self.sh_degree)
     }
 }

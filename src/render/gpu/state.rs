@@ -39,7 +39,7 @@ impl GpuBackend {
         let signals = self.planes.kept().into_iter().map(|(name, _)| format!("{SIGNAL}{name}"));
         let mut arrays: Vec<StateArray> = buffers.chain(signals).map(StateArray::of_rows).collect();
         arrays.push(StateArray::small(WAITING));
-        if self.candidates.is_requested() {
+        if self.candidates.request.is_some() {
             arrays.push(StateArray::small(CANDIDATES));
         }
         arrays
@@ -85,7 +85,7 @@ impl GpuBackend {
             let waiting = tensor.into_u8(&[2])?;
             let [main, rest] = [0, 1].map(|i| waiting[i] != 0);
             self.waiting = Waiting { main, rest };
-        } else if name == CANDIDATES && self.candidates.is_requested() {
+        } else if name == CANDIDATES && self.candidates.request.is_some() {
             self.candidates.restore(tensor)?;
         } else if let Some(plane) = self.signal_plane(&name) {
             let values = tensor.into_f32(&[rows.len()])?;
