@@ -22,11 +22,8 @@ var<workgroup> reduced: array<mat4x4<f32>, ADDERS>;
 
 // The image with the photograph's exposure.
 @compute @workgroup_size(256)
-fn expose(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let at = group_of(id) * GROUP + lane;
+fn expose(@builtin(global_invocation_id) id: vec3<u32>) {
+    let at = index_of(id);
     if at >= frame.image.x * frame.image.y {
         return;
     }

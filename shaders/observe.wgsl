@@ -73,11 +73,8 @@ fn replay(
 
 // Sums a row's records in order; now.a: the band.
 @compute @workgroup_size(256)
-fn gather_columns(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let row = group_of(id) * GROUP + lane;
+fn gather_columns(@builtin(global_invocation_id) id: vec3<u32>) {
+    let row = index_of(id);
     if row >= frame.model.x {
         return;
     }

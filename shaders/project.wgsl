@@ -21,11 +21,8 @@ fn tile_of(x: f32, count: u32) -> u32 {
 }
 
 @compute @workgroup_size(256)
-fn project(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let i = group_of(id) * GROUP + lane;
+fn project(@builtin(global_invocation_id) id: vec3<u32>) {
+    let i = index_of(id);
     if i >= frame.model.x {
         return;
     }

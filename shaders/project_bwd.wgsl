@@ -10,11 +10,8 @@
 @group(0) @binding(8) var<storage, read_write> gradient: array<vec4<f32>>;
 
 @compute @workgroup_size(256)
-fn project_bwd(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let i = group_of(id) * GROUP + lane;
+fn project_bwd(@builtin(global_invocation_id) id: vec3<u32>) {
+    let i = index_of(id);
     if i < frame.frozen.x || i >= frame.model.x {
         return;
     }

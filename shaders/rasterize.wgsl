@@ -109,11 +109,8 @@ fn rasterize(
 }
 
 @compute @workgroup_size(256)
-fn clear_dominant(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let row = group_of(id) * GROUP + lane;
+fn clear_dominant(@builtin(global_invocation_id) id: vec3<u32>) {
+    let row = index_of(id);
     if row < frame.model.x {
         atomicStore(&dominant[row], 0u);
     }

@@ -84,8 +84,14 @@ override LOG2_REACH: f32 = 7.9943534;
 // constant because an indirect dispatch on DX12 does not provide the number.
 const ACROSS: u32 = 32768u;
 
+// The number of a workgroup; `id` is its workgroup_id.
 fn group_of(id: vec3<u32>) -> u32 {
     return id.x + id.y * ACROSS;
+}
+
+// The number of an invocation in a kernel of groups of GROUP; `id` is its global_invocation_id.
+fn index_of(id: vec3<u32>) -> u32 {
+    return id.x + id.y * ACROSS * GROUP;
 }
 
 // Where a tile begins in the image [px].
