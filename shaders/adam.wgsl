@@ -1,4 +1,4 @@
-// Stage 7: Adam with a bias correction by each row's age; src/backend/cpu/adam.rs.
+// Stage 7: Adam with a bias correction by each row's age; src/render/cpu/adam.rs.
 // The coefficients of colour come first: one kernel per band, one parameter per invocation, so that
 // reads are coalesced. Their gradient, the basis at the view direction times dL/dcolour, is computed
 // here and never stored. The geometry comes last, one row per invocation, together with the loss

@@ -1,4 +1,4 @@
-// Stage 9: executes a compiled plan in place, in chunks of operations; src/backend/cpu/apply.rs.
+// Stage 9: executes a compiled plan in place, in chunks of operations; src/render/cpu/apply.rs.
 // Pass 1 writes families, updates and seeds, no row twice; pass 2 moves rows from the end into holes
 // and sorts the rows. Each buffer is edited by itself; buffers without frozen rows start at the first
 // row that is not frozen.

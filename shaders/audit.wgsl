@@ -1,4 +1,4 @@
-// Finds rows with a number that is not finite; src/backend/audit.rs. Numbers are read as bits:
+// Finds rows with a number that is not finite; src/render/audit.rs. Numbers are read as bits:
 // WGSL may assume that there is no NaN. One row per invocation.
 
 // Per row: 0, or 1 + the index of its first number that is not finite.

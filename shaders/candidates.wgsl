@@ -1,5 +1,5 @@
 // The pixels of a view with the largest errors, and surface points of given pixels, one per invocation;
-// src/backend/cpu/candidates.rs.
+// src/render/cpu/candidates.rs.
 
 @group(0) @binding(1) var<storage, read> state: State;
 @group(0) @binding(2) var<storage, read> list: array<u32>;

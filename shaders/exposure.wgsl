@@ -1,5 +1,5 @@
 // Applies the exposure of the current photograph before the loss, and backpropagates through it;
-// src/backend/cpu/exposure.rs. A group handles 256 consecutive pixels, and an invocation of the
+// src/render/cpu/exposure.rs. A group handles 256 consecutive pixels, and an invocation of the
 // backward kernel four of them.
 
 // Three rows of a matrix, each followed by its channel's offset; then the background of the photograph.

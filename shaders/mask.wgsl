@@ -1,5 +1,5 @@
 // Learned masks: one logit per row, trained so that rows that matter little are masked out;
-// src/backend/cpu/mask.rs. One row per invocation, before the geometry steps.
+// src/render/cpu/mask.rs. One row per invocation, before the geometry steps.
 
 @group(0) @binding(1) var<storage, read> state: State;
 // The geometry: twelve numbers per row.

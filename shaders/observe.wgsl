@@ -1,5 +1,5 @@
 // Sums over the pixels into which a row is blended, front to back, for auxiliary views;
-// src/backend/cpu/observe.rs. One record per entry, as in rasterize_bwd.wgsl.
+// src/render/cpu/observe.rs. One record per entry, as in rasterize_bwd.wgsl.
 
 // The pixel map.
 @group(0) @binding(6) var<storage, read> map: array<f32>;

@@ -1,5 +1,5 @@
 // Stage 6: splat gradients to parameter gradients, one row per invocation;
-// src/backend/cpu/project_bwd.rs derives the formulas.
+// src/render/cpu/project_bwd.rs derives the formulas.
 
 // Sums of the records, one record per row.
 @group(0) @binding(6) var<storage, read> row_sums: array<f32>;
@@ -101,7 +101,7 @@ fn project_bwd(@builtin(global_invocation_id) id: vec3<u32>) {
     gradient[to + 4u] = vec4(d, 0.0);
 }
 
-// Σ_k (dc·sh_k) ∇Y_k(d); see src/sh.rs.
+// Σ_k (dc·sh_k) ∇Y_k(d); see src/core/sh.rs.
 fn direction_gradient(row: u32, degree: u32, d: vec3<f32>, dc: vec3<f32>) -> vec3<f32> {
     if degree == 0u {
         return vec3(0.0);

@@ -1,4 +1,4 @@
-// Stage 3: tile lists to pixels; src/backend/cpu/rasterize.rs. quads.wgsl assigns pixels to invocations.
+// Stage 3: tile lists to pixels; src/render/cpu/rasterize.rs. quads.wgsl assigns pixels to invocations.
 
 // Red, green, blue (background included), depth.
 @group(0) @binding(6) var<storage, read_write> canvas: array<vec4<f32>>;

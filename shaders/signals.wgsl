@@ -1,4 +1,4 @@
-// Stage 8: accumulates the requested signals over views; src/backend/cpu/signals.rs. One row per
+// Stage 8: accumulates the requested signals over views; src/render/cpu/signals.rs. One row per
 // invocation. Each requested signal has planes of accumulators, with a number per row that is not frozen.
 
 @group(0) @binding(1) var<storage, read> state: State;

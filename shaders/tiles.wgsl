@@ -1,4 +1,4 @@
-// Stage 2: splats to tile lists; src/backend/cpu/tiles.rs. The rows on screen are sorted by depth,
+// Stage 2: splats to tile lists; src/render/cpu/tiles.rs. The rows on screen are sorted by depth,
 // their entries emitted in that order, and the entries sorted by tile with a stable sort: each tile's
 // list is then sorted by depth, and by row where depths are equal. project.wgsl has stored each row's
 // footprint in integers, so counting entries and emitting them cannot disagree.

@@ -1,5 +1,5 @@
 //! Tests with the meshes of the shared data: valid files render, files that need unsupported extensions are
-//! refused by name, and each malformed file has the outcome listed here.
+//! refused by name, and each malformed file has the outcome listed in `malformed.tsv`.
 //!
 //! Most files with a validator's report have no scene, so each is read twice: unchanged, and with a
 //! scene of all its meshes (or, without any, of its accessors or buffer views as positions and

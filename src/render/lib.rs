@@ -30,7 +30,7 @@ use densify_policies::policy::{
 };
 
 pub use adapter::{AdapterChoice, AdapterKind, AdapterSummary};
-pub use audit::{Attribute, NonFinite, NumberKind};
+pub use audit::{NonFinite, NumberKind};
 pub use choice::{BackendChoice, BackendKind, Device};
 use densify_core::budget::RowBudget;
 use densify_core::camera::Camera;
@@ -45,8 +45,8 @@ pub use inspect::Inspect;
 pub use setup::{KeptPhotographs, MomentStorage, ParameterStorage, Setup, Shortcuts, Storage};
 pub use state::{StateArray, StateError, Tensor, Values};
 
-/// Learning rates of one iteration.
-#[derive(Debug, Clone, Copy, PartialEq)]
+/// Learning rates of one iteration. With the default, 0, the model is unchanged, while signals are still measured.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct LearningRates {
     /// Means `[scene units per step]`.
     pub mean: f32,
@@ -62,19 +62,6 @@ pub struct LearningRates {
     pub sh_dc: f32,
     /// Spherical-harmonic coefficients of bands 1–3.
     pub sh_rest: f32,
-}
-
-impl LearningRates {
-    /// All rates 0: the model is unchanged, while signals are still measured.
-    pub const STILL: Self = Self {
-        mean: 0.0,
-        noise: 0.0,
-        log_scale: 0.0,
-        quat: 0.0,
-        opacity: 0.0,
-        sh_dc: 0.0,
-        sh_rest: 0.0,
-    };
 }
 
 /// The input of a training step.
