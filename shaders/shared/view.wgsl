@@ -22,7 +22,7 @@ struct Frame {
     more_rates: vec4<f32>,
     // Strength times step size, sharpness, opacity.
     noise: vec4<f32>,
-    // How errors are combined into a score: exponent of a pixel's error, weight of edges, exponents of
+    // The combination of errors into a score: exponent of a pixel's error, weight of edges, exponents of
     // the sum of weights and of a view's score.
     score: vec4<f32>,
     // Seed, step, flags of the optimiser (see adam.wgsl), flags of the loss (see loss.wgsl).

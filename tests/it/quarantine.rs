@@ -10,10 +10,10 @@ use densify_policies::plan::EditPlan;
 
 use crate::subject::{make, make_with, on_each, repeatable, step_input, storages};
 
-/// The row that is poisoned where it is one.
+/// The row to poison in tests of a single row.
 const POISONED: usize = 11;
 
-/// What slot `slot` of a row is.
+/// The kind of the number in slot `slot` of a row that is not finite.
 fn unsound(row: usize, slot: usize) -> NonFinite {
     let array = match slot {
         0..3 => ModelArray::Means,
