@@ -1,4 +1,4 @@
-// Stage 7: Adam with a bias correction by each row's age; src/backend/cpu/adam.rs.
+// Stage 7: Adam with a bias correction by each row's age; src/render/cpu/adam.rs.
 // The coefficients of colour come first: one kernel per band, one parameter per invocation, so that
 // reads are coalesced. Their gradient, the basis at the view direction times dL/dcolour, is computed
 // here and never stored. The geometry comes last, one row per invocation, together with the loss
@@ -92,11 +92,8 @@ fn basis_of(k: u32, d: vec3<f32>) -> f32 {
 
 // One band; now.a: its first coefficient, now.b: its number of coefficients.
 @compute @workgroup_size(256)
-fn adam_band(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let at = group_of(id) * GROUP + lane;
+fn adam_band(@builtin(global_invocation_id) id: vec3<u32>) {
+    let at = index_of(id);
     let width = 3u * now.b;
     let row = at / width;
     if row < frame.frozen.x || row >= frame.model.x || state.short != 0u {
@@ -123,11 +120,8 @@ fn adam_band(
 
 // All parameters but colour; updates the ages.
 @compute @workgroup_size(256)
-fn adam_geometry(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let row = group_of(id) * GROUP + lane;
+fn adam_geometry(@builtin(global_invocation_id) id: vec3<u32>) {
+    let row = index_of(id);
     if row < frame.frozen.x || row >= frame.model.x || state.short != 0u {
         return;
     }

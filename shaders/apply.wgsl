@@ -1,4 +1,4 @@
-// Stage 9: executes a compiled plan in place, in chunks of operations; src/backend/cpu/apply.rs.
+// Stage 9: executes a compiled plan in place, in chunks of operations; src/render/cpu/apply.rs.
 // Pass 1 writes families, updates and seeds, no row twice; pass 2 moves rows from the end into holes
 // and sorts the rows. Each buffer is edited by itself; buffers without frozen rows start at the first
 // row that is not frozen.
@@ -19,8 +19,8 @@ const WORDS: u32 = 20u;
 
 // The operation of an invocation, and which of its row's numbers it works on. now.a: operations,
 // now.b: numbers per row, now.c: stride of rows, now.d: stride of the numbers of a row.
-fn operation_of(id: vec3<u32>, lane: u32) -> vec2<u32> {
-    let i = group_of(id) * GROUP + lane;
+fn operation_of(id: vec3<u32>) -> vec2<u32> {
+    let i = index_of(id);
     return vec2(i / now.b, i % now.b);
 }
 
@@ -30,8 +30,8 @@ fn place_of(row: u32, number: u32) -> u32 {
 
 // Operations (from, to): copies row `from` to `to`, or clears `to` if `from` is NONE.
 @compute @workgroup_size(256)
-fn copy_rows(@builtin(workgroup_id) id: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
-    let op = operation_of(id, lane);
+fn copy_rows(@builtin(global_invocation_id) id: vec3<u32>) {
+    let op = operation_of(id);
     if op.x >= now.a {
         return;
     }
@@ -46,8 +46,8 @@ fn copy_rows(@builtin(workgroup_id) id: vec3<u32>, @builtin(local_invocation_ind
 
 // Operations (a, b): swaps two rows; no row occurs twice.
 @compute @workgroup_size(256)
-fn swap_rows(@builtin(workgroup_id) id: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
-    let op = operation_of(id, lane);
+fn swap_rows(@builtin(global_invocation_id) id: vec3<u32>) {
+    let op = operation_of(id);
     if op.x >= now.a {
         return;
     }
@@ -159,11 +159,8 @@ fn put(row: u32, mean: vec3<f32>, log_scale: vec3<f32>, quat: vec4<f32>, logit: 
 // 3: along all axes) and three numbers for it; scale rule and three numbers; opacity rule and its
 // number; rotation ×4; unused.
 @compute @workgroup_size(256)
-fn breed(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let i = group_of(id) * GROUP + lane;
+fn breed(@builtin(global_invocation_id) id: vec3<u32>) {
+    let i = index_of(id);
     if i >= now.a {
         return;
     }
@@ -217,11 +214,8 @@ fn offset_of(op: u32, child: u32, parent: u32, log_scale: vec3<f32>, quat: vec4<
 // Updates; now.a: their number. Words of an operation: row; scale rule and three numbers; opacity rule
 // and its number; 1 if the mean is set; the mean; 1 if band 0 is set; its three coefficients; unused ×5.
 @compute @workgroup_size(256)
-fn rewrite(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let i = group_of(id) * GROUP + lane;
+fn rewrite(@builtin(global_invocation_id) id: vec3<u32>) {
+    let i = index_of(id);
     if i >= now.a {
         return;
     }
@@ -244,11 +238,8 @@ fn rewrite(
 // Seeds; now.a: their number. Words of an operation: row; mean; log-scales; quaternion; logit; three
 // coefficients of band 0; unused ×5. The other coefficients have been cleared.
 @compute @workgroup_size(256)
-fn sow(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let i = group_of(id) * GROUP + lane;
+fn sow(@builtin(global_invocation_id) id: vec3<u32>) {
+    let i = index_of(id);
     if i >= now.a {
         return;
     }
@@ -269,11 +260,8 @@ const OPACITY_LEAST: f32 = 2e-4;
 // now.c: bits of the logarithm of the factor of scales, now.d: start of the per-row counts of views in
 // `signals` if only rows seen by a view decay, or else NONE. ops[0]: the first row that is not frozen.
 @compute @workgroup_size(256)
-fn decay(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let row = group_of(id) * GROUP + lane;
+fn decay(@builtin(global_invocation_id) id: vec3<u32>) {
+    let row = index_of(id);
     if row < ops[0] || row >= now.a {
         return;
     }
@@ -297,11 +285,8 @@ fn decay(
 // Caps all opacities and clears their moments; now.a: rows, now.b: bits of the largest logit,
 // now.c: 1 if there are waiting gradients to clear. ops[0]: the first row that is not frozen.
 @compute @workgroup_size(256)
-fn clamp_opacity(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let row = group_of(id) * GROUP + lane;
+fn clamp_opacity(@builtin(global_invocation_id) id: vec3<u32>) {
+    let row = index_of(id);
     if row < ops[0] || row >= now.a {
         return;
     }

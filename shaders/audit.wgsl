@@ -1,4 +1,4 @@
-// Finds rows with a number that is not finite; src/backend/audit.rs. Numbers are read as bits:
+// Finds rows with a number that is not finite; src/render/audit.rs. Numbers are read as bits:
 // WGSL may assume that there is no NaN. One row per invocation.
 
 // Per row: 0, or 1 + the index of its first number that is not finite.
@@ -10,11 +10,8 @@ const NOT_FINITE: u32 = 0x7f800000u;
 // now.a: rows; now.b: numbers per row; now.c: index of the first number; now.d: the first row that has
 // numbers.
 @compute @workgroup_size(256)
-fn audit(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let own = group_of(id) * GROUP + lane;
+fn audit(@builtin(global_invocation_id) id: vec3<u32>) {
+    let own = index_of(id);
     let row = own + now.d;
     if row >= now.a || marks[row] != 0u {
         return;

@@ -1,5 +1,5 @@
 // The pixels of a view with the largest errors, and surface points of given pixels, one per invocation;
-// src/backend/cpu/candidates.rs.
+// src/render/cpu/candidates.rs.
 
 @group(0) @binding(1) var<storage, read> state: State;
 @group(0) @binding(2) var<storage, read> list: array<u32>;
@@ -16,11 +16,8 @@
 // now.a: the band, now.b: number of pixels, now.c: the surface is at the largest blend weight (0) or at
 // transmittance 1/2 (1), now.d: index of the first in `points`.
 @compute @workgroup_size(256)
-fn surface(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let i = group_of(id) * GROUP + lane;
+fn surface(@builtin(global_invocation_id) id: vec3<u32>) {
+    let i = index_of(id);
     if i >= now.b {
         return;
     }
@@ -176,11 +173,8 @@ fn narrow(@builtin(local_invocation_index) lane: u32) {
 
 // Writes every pixel whose error is at least the least selected one; now.b: capacity.
 @compute @workgroup_size(256)
-fn write_worst(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let pixel = group_of(id) * GROUP + lane;
+fn write_worst(@builtin(global_invocation_id) id: vec3<u32>) {
+    let pixel = index_of(id);
     let key = key_of(pixel);
     if key != 0u && key >= atomicLoad(&selection[0]) {
         let place = atomicAdd(&selection[2], 1u);

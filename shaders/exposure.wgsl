@@ -1,5 +1,5 @@
 // Applies the exposure of the current photograph before the loss, and backpropagates through it;
-// src/backend/cpu/exposure.rs. A group handles 256 consecutive pixels, and an invocation of the
+// src/render/cpu/exposure.rs. A group handles 256 consecutive pixels, and an invocation of the
 // backward kernel four of them.
 
 // Three rows of a matrix, each followed by its channel's offset; then the background of the photograph.
@@ -22,11 +22,8 @@ var<workgroup> reduced: array<mat4x4<f32>, ADDERS>;
 
 // The image with the photograph's exposure.
 @compute @workgroup_size(256)
-fn expose(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let at = group_of(id) * GROUP + lane;
+fn expose(@builtin(global_invocation_id) id: vec3<u32>) {
+    let at = index_of(id);
     if at >= frame.image.x * frame.image.y {
         return;
     }

@@ -1,4 +1,4 @@
-// Stage 4: 0.8·L1 + 0.2·(1 − SSIM) and its gradient, one tile per group; src/backend/cpu/loss/.
+// Stage 4: 0.8·L1 + 0.2·(1 − SSIM) and its gradient, one tile per group; src/render/cpu/loss/.
 // SSIM is rewritten, exactly, in terms of e = rendering − target and of the mean of x·y, which gives
 // both variances. The 11×11 window is separable; pixels outside the image are zero. An invocation sums
 // eight neighbouring windows at once, which together read 18 values instead of 8 × 11, since reading

@@ -1,5 +1,5 @@
 // Learned masks: one logit per row, trained so that rows that matter little are masked out;
-// src/backend/cpu/mask.rs. One row per invocation, before the geometry steps.
+// src/render/cpu/mask.rs. One row per invocation, before the geometry steps.
 
 @group(0) @binding(1) var<storage, read> state: State;
 // The geometry: twelve numbers per row.
@@ -15,11 +15,8 @@
 // Bits of: the initial logit of masks (now.a), the step size (now.b), the derivative of the loss term
 // with respect to a row's mask (now.c), the logit of the threshold (now.d).
 @compute @workgroup_size(256)
-fn step_masks(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let row = group_of(id) * GROUP + lane;
+fn step_masks(@builtin(global_invocation_id) id: vec3<u32>) {
+    let row = index_of(id);
     if row < frame.frozen.x || row >= frame.model.x || state.short != 0u {
         return;
     }

@@ -1,5 +1,5 @@
 // Sums over the pixels into which a row is blended, front to back, for auxiliary views;
-// src/backend/cpu/observe.rs. One record per entry, as in rasterize_bwd.wgsl.
+// src/render/cpu/observe.rs. One record per entry, as in rasterize_bwd.wgsl.
 
 // The pixel map.
 @group(0) @binding(6) var<storage, read> map: array<f32>;
@@ -73,11 +73,8 @@ fn replay(
 
 // Sums a row's records in order; now.a: the band.
 @compute @workgroup_size(256)
-fn gather_columns(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let row = group_of(id) * GROUP + lane;
+fn gather_columns(@builtin(global_invocation_id) id: vec3<u32>) {
+    let row = index_of(id);
     if row >= frame.model.x {
         return;
     }

@@ -1,4 +1,4 @@
-// Stage 1: rows to splats, one row per invocation; src/backend/cpu/project.rs.
+// Stage 1: rows to splats, one row per invocation; src/render/cpu/project.rs.
 
 // Three per row: mean and l1, shear | l3, log2 of the opacity, depth, unused | colour, unused.
 @group(0) @binding(6) var<storage, read_write> splats: array<vec4<f32>>;
@@ -8,7 +8,7 @@
 // Bits of the depth; NONE for rows that are not on screen.
 @group(0) @binding(8) var<storage, read_write> depths: array<u32>;
 
-// Slack for the bounds of an ellipse [px]; see src/backend/cpu/footprint.rs.
+// Slack for the bounds of an ellipse [px]; see src/render/cpu/footprint.rs.
 const SLACK: f32 = 0.02;
 
 // True if the splat's extent contains the centre of any pixel; these go from 1/2 to size − 1/2.
@@ -21,11 +21,8 @@ fn tile_of(x: f32, count: u32) -> u32 {
 }
 
 @compute @workgroup_size(256)
-fn project(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let i = group_of(id) * GROUP + lane;
+fn project(@builtin(global_invocation_id) id: vec3<u32>) {
+    let i = index_of(id);
     if i >= frame.model.x {
         return;
     }

@@ -1,5 +1,5 @@
 // Stage 6: splat gradients to parameter gradients, one row per invocation;
-// src/backend/cpu/project_bwd.rs derives the formulas.
+// src/render/cpu/project_bwd.rs derives the formulas.
 
 // Sums of the records, one record per row.
 @group(0) @binding(6) var<storage, read> row_sums: array<f32>;
@@ -10,11 +10,8 @@
 @group(0) @binding(8) var<storage, read_write> gradient: array<vec4<f32>>;
 
 @compute @workgroup_size(256)
-fn project_bwd(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let i = group_of(id) * GROUP + lane;
+fn project_bwd(@builtin(global_invocation_id) id: vec3<u32>) {
+    let i = index_of(id);
     if i < frame.frozen.x || i >= frame.model.x {
         return;
     }
@@ -104,7 +101,7 @@ fn project_bwd(
     gradient[to + 4u] = vec4(d, 0.0);
 }
 
-// Σ_k (dc·sh_k) ∇Y_k(d); see src/sh.rs.
+// Σ_k (dc·sh_k) ∇Y_k(d); see src/core/sh.rs.
 fn direction_gradient(row: u32, degree: u32, d: vec3<f32>, dc: vec3<f32>) -> vec3<f32> {
     if degree == 0u {
         return vec3(0.0);

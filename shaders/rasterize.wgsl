@@ -1,4 +1,4 @@
-// Stage 3: tile lists to pixels; src/backend/cpu/rasterize.rs. quads.wgsl assigns pixels to invocations.
+// Stage 3: tile lists to pixels; src/render/cpu/rasterize.rs. quads.wgsl assigns pixels to invocations.
 
 // Red, green, blue (background included), depth.
 @group(0) @binding(6) var<storage, read_write> canvas: array<vec4<f32>>;
@@ -109,11 +109,8 @@ fn rasterize(
 }
 
 @compute @workgroup_size(256)
-fn clear_dominant(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let row = group_of(id) * GROUP + lane;
+fn clear_dominant(@builtin(global_invocation_id) id: vec3<u32>) {
+    let row = index_of(id);
     if row < frame.model.x {
         atomicStore(&dominant[row], 0u);
     }

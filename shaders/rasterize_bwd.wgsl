@@ -89,11 +89,8 @@ fn rasterize_bwd(
 
 // Sums a row's records, which are contiguous, in order; now.a: the band.
 @compute @workgroup_size(256)
-fn gather(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let row = group_of(id) * GROUP + lane;
+fn gather(@builtin(global_invocation_id) id: vec3<u32>) {
+    let row = index_of(id);
     if row >= frame.model.x || depths[row] == NONE {
         return;
     }

@@ -63,11 +63,8 @@ fn rasterize_bwd_atomic(
 
 // Sets the sums of all rows to 0, before the first band; now.a: numbers per row.
 @compute @workgroup_size(256)
-fn clear_sums(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let row = group_of(id) * GROUP + lane;
+fn clear_sums(@builtin(global_invocation_id) id: vec3<u32>) {
+    let row = index_of(id);
     if row < frame.model.x {
         for (var f = 0u; f < now.a; f++) {
             clear(row * now.a + f);

@@ -1,4 +1,4 @@
-// Stage 8: accumulates the requested signals over views; src/backend/cpu/signals.rs. One row per
+// Stage 8: accumulates the requested signals over views; src/render/cpu/signals.rs. One row per
 // invocation. Each requested signal has planes of accumulators, with a number per row that is not frozen.
 
 @group(0) @binding(1) var<storage, read> state: State;
@@ -64,11 +64,8 @@ fn raise(signal: u32, row: u32, value: f32) {
 }
 
 @compute @workgroup_size(256)
-fn accumulate(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let row = group_of(id) * GROUP + lane;
+fn accumulate(@builtin(global_invocation_id) id: vec3<u32>) {
+    let row = index_of(id);
     if row < frame.frozen.x || row >= frame.model.x || state.short != 0u || depths[row] == NONE {
         return;
     }
@@ -164,11 +161,8 @@ fn norm3(v: vec3<f32>) -> f32 {
 // buffer; now.a: the signal, now.b: rows (`frame` may not be set yet), now.c: bits of the initial logit
 // of masks, now.d: frozen rows, which are skipped.
 @compute @workgroup_size(256)
-fn present(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let row = group_of(id) * GROUP + lane;
+fn present(@builtin(global_invocation_id) id: vec3<u32>) {
+    let row = index_of(id);
     if row < now.d || row >= now.b {
         return;
     }

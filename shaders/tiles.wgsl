@@ -1,4 +1,4 @@
-// Stage 2: splats to tile lists; src/backend/cpu/tiles.rs. The rows on screen are sorted by depth,
+// Stage 2: splats to tile lists; src/render/cpu/tiles.rs. The rows on screen are sorted by depth,
 // their entries emitted in that order, and the entries sorted by tile with a stable sort: each tile's
 // list is then sorted by depth, and by row where depths are equal. project.wgsl has stored each row's
 // footprint in integers, so counting entries and emitting them cannot disagree.
@@ -217,11 +217,8 @@ fn summed(i: u32) -> u32 {
 
 // Lists the rows on screen, in order, with their depths.
 @compute @workgroup_size(256)
-fn compact(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let row = group_of(id) * GROUP + lane;
+fn compact(@builtin(global_invocation_id) id: vec3<u32>) {
+    let row = index_of(id);
     if row < frame.model.x && depths[row] != NONE {
         let to = summed(row);
         keys_out[to] = depths[row];
@@ -262,11 +259,8 @@ fn band() -> vec2<u32> {
 
 // Counts the entries of each row, front to back.
 @compute @workgroup_size(256)
-fn count_entries(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let i = group_of(id) * GROUP + lane;
+fn count_entries(@builtin(global_invocation_id) id: vec3<u32>) {
+    let i = index_of(id);
     if i >= state.visible {
         return;
     }
@@ -290,11 +284,8 @@ fn count_entries(
 
 // Writes the entries: tile and row per slot, slots per row.
 @compute @workgroup_size(256)
-fn emit_entries(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let i = group_of(id) * GROUP + lane;
+fn emit_entries(@builtin(global_invocation_id) id: vec3<u32>) {
+    let i = index_of(id);
     // The lists stay empty if the entries do not fit.
     if i >= state.visible || state.held == 0u {
         if i < state.visible {
@@ -329,11 +320,8 @@ fn emit_entries(
 
 // Counts the entries of each tile of the whole image.
 @compute @workgroup_size(256)
-fn count_tiles(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let i = group_of(id) * GROUP + lane;
+fn count_tiles(@builtin(global_invocation_id) id: vec3<u32>) {
+    let i = index_of(id);
     if i >= state.visible {
         return;
     }
@@ -495,11 +483,8 @@ fn scatter(
 
 // The first entry of each tile, by binary search in the sorted keys; one more for the end.
 @compute @workgroup_size(256)
-fn find_tiles(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let tile = group_of(id) * GROUP + lane;
+fn find_tiles(@builtin(global_invocation_id) id: vec3<u32>) {
+    let tile = index_of(id);
     if tile > frame.image.w {
         return;
     }

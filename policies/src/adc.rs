@@ -148,12 +148,10 @@ pub fn clone_at(offset: [f32; 3]) -> Offspring {
 #[must_use]
 pub fn split_by(factor: f32) -> Offspring {
     Offspring {
-        children: 1,
         parent: ParentFate::BecomesChild,
         placement: Placement::Sampled,
         scale: ScaleRule::Uniform(1.0 / factor),
-        turn: NO_ROTATION,
-        opacity: OpacityRule::Same,
+        ..clone_at([0.0; 3])
     }
 }
 
@@ -165,12 +163,10 @@ pub fn split_by(factor: f32) -> Offspring {
 #[must_use]
 pub fn split_long_axis(share: f32, opacity: f32) -> Offspring {
     Offspring {
-        children: 1,
-        parent: ParentFate::BecomesChild,
         placement: Placement::LongAxis { sigmas: 3.0 * share },
         scale: ScaleRule::LongAxis { long: 1.0 - share, other: (1.0 - share * share).sqrt() },
-        turn: NO_ROTATION,
         opacity: OpacityRule::Scaled(opacity),
+        ..split_by(1.0)
     }
 }
 

@@ -251,10 +251,9 @@ impl Update {
         Self {
             opacity: OpacityRule::Set(opacity),
             scale: ScaleRule::Set(scale),
-            position: None,
-            colour: None,
             sh_degree: Some(0),
             keep_moments: false,
+            ..Self::NONE
         }
     }
 

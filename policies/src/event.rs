@@ -29,15 +29,6 @@ pub(crate) fn assert_conforms(name: &str, sets: &[&str]) {
     }
 }
 
-/// Asserts that the policy refuses each of these settings with an error that names the parameter.
-pub(crate) fn assert_refused(name: &str, settings: &[(&str, &str)]) {
-    for (set, parameter) in settings {
-        let built = find(name).unwrap().build(&set.parse().unwrap(), &Event::new(1, 1, 1).scene);
-        let error = built.map(drop).unwrap_err().to_string();
-        assert!(error.contains(parameter), "{set}: {error}");
-    }
-}
-
 /// Asserts that the policy has the parameters of `vanilla`, and plans like `vanilla` with the settings
 /// `defaults` at a growth step of four rows that `event` makes.
 pub(crate) fn assert_grows_like_vanilla(name: &str, event: Event, defaults: &str) {

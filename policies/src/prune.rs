@@ -54,7 +54,7 @@ impl OverViews {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Victims {
-    /// Those with the lowest measure.
+    /// The rows with the lowest measure.
     Lowest,
     /// The same number, drawn uniformly at random, as a control.
     Random,

@@ -1,5 +1,5 @@
 //! Tests with the meshes of the shared data: valid files render, files that need unsupported extensions are
-//! refused by name, and each malformed file has the outcome listed here.
+//! refused by name, and each malformed file has the outcome listed in `malformed.tsv`.
 //!
 //! Most files with a validator's report have no scene, so each is read twice: unchanged, and with a
 //! scene of all its meshes (or, without any, of its accessors or buffer views as positions and
@@ -87,187 +87,15 @@ fn shared_meshes_that_need_other_software_are_refused_by_name() {
 const LOADS: &str = "it loads";
 const EMPTY: &str = "no triangle to render";
 
-/// Unchanged files with an unusual outcome; others of the validator have no scene, and all others load.
-const UNCHANGED: &[(&str, &str)] = &[
-    (
-        "assimp/BoxWithInfinites-glTF-Binary/BoxWithInfinites.glb",
-        "mesh 0 primitive 0: vertex 0 is not finite",
-    ),
-    (
-        "assimp/IndexOutOfRange/AllIndicesOutOfRange.gltf",
-        "mesh 0 primitive 0: index 65535 of 24 vertices",
-    ),
-    ("assimp/IndexOutOfRange/IndexOutOfRange.gltf", "mesh 0 primitive 0: index 255 of 24 vertices"),
-    (
-        "assimp/MissingBin/BoxTextured.gltf",
-        "mesh 0 primitive 0, accessor 2, buffer view 1, buffer 0: there is no file BoxTextured0.bin",
-    ),
-    (
-        "assimp/RecursiveNodes/RecursiveNodes.gltf",
-        "node 0: it is its own ancestor or has two parents",
-    ),
-    ("assimp/TestNoRootNode/NoScene.gltf", "scene 0: there is no such scene"),
-    ("assimp/TestNoRootNode/SceneWithoutNodes.gltf", EMPTY),
-    ("assimp/empty.obj", EMPTY),
-    ("assimp/malformed.obj", "line 23: vertex index 12 of 8"),
-    ("gltf-validator/base/accessor/empty_object.gltf", "JSON: missing field `count`"),
-    ("gltf-validator/base/buffer_view/empty_object.gltf", "JSON: missing field `buffer`"),
-    ("gltf-validator/base/glb/bom.glb", "JSON: expected value"),
-    (
-        "gltf-validator/base/glb/chunk_too_big.glb",
-        "GLB chunk: it reaches beyond the end of the file",
-    ),
-    ("gltf-validator/base/glb/empty_file.glb", "JSON: EOF while parsing a value"),
-    ("gltf-validator/base/glb/empty_json_chunk.glb", "JSON: EOF while parsing a value"),
-    ("gltf-validator/base/glb/empty_json_object.glb", "JSON: missing field `asset`"),
-    ("gltf-validator/base/glb/invalid_json_chunk.glb", "JSON: key must be a string"),
-    ("gltf-validator/base/glb/invalid_magic.glb", "JSON: expected value"),
-    ("gltf-validator/base/glb/invalid_version.glb", "GLB header: version 0 is not 2"),
-    (
-        "gltf-validator/base/glb/length_mismatch.glb",
-        "GLB header: it says 49 bytes, the file has 48",
-    ),
-    ("gltf-validator/base/glb/no_header.glb", "JSON: expected value"),
-    ("gltf-validator/base/glb/only_bin_chunk.glb", "GLB chunk 0: it is not JSON"),
-    ("gltf-validator/base/glb/only_header.glb", "GLB: there is no JSON chunk"),
-    (
-        "gltf-validator/base/glb/truncated_chunk_data.glb",
-        "GLB header: it says 48 bytes, the file has 47",
-    ),
-    ("gltf-validator/base/glb/truncated_chunk_header.glb", "GLB header: the file ends within it"),
-    ("gltf-validator/base/glb/two_bin_chunks.glb", "GLB chunk 0: it is not JSON"),
-    ("gltf-validator/base/glb/two_empty_bin_chunks.glb", "GLB chunk 0: it is not JSON"),
-    ("gltf-validator/base/glb/two_empty_json_chunks.glb", "JSON: EOF while parsing a value"),
-    ("gltf-validator/base/glb/unknown_chunk.glb", "GLB chunk 0: it is not JSON"),
-    ("gltf-validator/base/glb/zero_chunk_header.glb", "GLB chunk 0: it is not JSON"),
-    ("gltf-validator/base/glb/zero_length.glb", "GLB header: it says 0 bytes, the file has 12"),
-    ("gltf-validator/base/json/bom.gltf", "JSON: expected value"),
-    ("gltf-validator/base/json/empty_file.gltf", "JSON: EOF while parsing a value"),
-    (
-        "gltf-validator/base/json/invalid_object.gltf",
-        "JSON: invalid length 0, expected struct Head with 2 elements",
-    ),
-    ("gltf-validator/base/json/invalid_syntax.gltf", "JSON: key must be a string"),
-    ("gltf-validator/base/mesh/empty_object.gltf", "JSON: missing field `primitives`"),
-    ("tinyobjloader/catmark_torus_creases0.obj", "line 62: normal index 1 of 0"),
-    (
-        "tinyobjloader/colorspace-issue-184.obj",
-        "colorspace-issue-184.mtl line 6: texture: there is no file diffuse.jpg",
-    ),
-    ("tinyobjloader/invalid-face-definition.obj", EMPTY),
-    ("tinyobjloader/invalid-relative-texture-index.obj", "line 2: vertex index 1 of 0"),
-    ("tinyobjloader/invalid-relative-vertex-index.obj", "line 1: vertex index -4 of 0"),
-    ("tinyobjloader/issue-140-zero-face-idx.obj", "line 16: vertex index 0 of 4"),
-    (
-        "tinyobjloader/issue-248-texres-texopt.obj",
-        "issue-248-texres-texopt.mtl line 5: texture: there is no file input.jpg",
-    ),
-    ("tinyobjloader/issue-356-leading-spaces-newmtl.obj", EMPTY),
-    ("tinyobjloader/issue-92.obj", "issue-92.mtl line 5: texture: there is no file tmp.png"),
-    ("tinyobjloader/line-prim.obj", EMPTY),
-    (
-        "tinyobjloader/mtllib-multiple-files-issue-112.obj",
-        "mtllib-multiple-files-issue-112.mtl line 5: texture: there is no file tmp.png",
-    ),
-    (
-        "tinyobjloader/norm-texopt.obj",
-        "norm-texopt.mtl line 6: texture: there is no file normalmap.jpg",
-    ),
-    (
-        "tinyobjloader/pbr-mat-ext.obj",
-        "pbr-mat-ext.mtl line 17: texture: there is no file emissive.tex",
-    ),
-    ("tinyobjloader/points-prim.obj", EMPTY),
-    ("tinyobjloader/smoothing-group-two-squares.obj", "line 21: normal index 1 of 0"),
-    ("tinyobjloader/test-nan.obj", "line 12: vertex 1 is not finite"),
-    (
-        "tinyobjloader/texture-filename-with-whitespace.obj",
-        "texture-filename-with-whitespace.mtl line 6: texture: there is no file texture 01.png",
-    ),
-    (
-        "tinyobjloader/texture-options-issue-85.obj",
-        "texture-options-issue-85.mtl line 7: texture: there is no file diffuse.jpg",
-    ),
-];
+/// The files with an unusual outcome, read unchanged and with a scene. Otherwise files of the validator, which have no
+/// scene, are empty when read unchanged, and all files load.
+const OUTCOMES: &str = include_str!("malformed.tsv");
 
-/// Files of the validator that do not load with a scene made of their contents.
-const WITH_A_SCENE: &[(&str, &str)] = &[
-    (
-        "gltf-validator/base/accessor/alignment.gltf",
-        "mesh 0 primitive 2, accessor 2: its elements lie beyond its buffer view",
-    ),
-    ("gltf-validator/base/accessor/custom_property.gltf", EMPTY),
-    ("gltf-validator/base/accessor/empty_array.gltf", EMPTY),
-    ("gltf-validator/base/accessor/empty_object.gltf", "JSON: missing field `count`"),
-    (
-        "gltf-validator/base/accessor/float_normalized.gltf",
-        "mesh 0 primitive 0 indices, accessor 0: indices must be unsigned scalars",
-    ),
-    (
-        "gltf-validator/base/accessor/invalid_sparse_count_and_stride.gltf",
-        "mesh 0 primitive 0 indices, accessor 0: indices must be unsigned scalars",
-    ),
-    (
-        "gltf-validator/base/accessor/matrix_alignment.gltf",
-        "mesh 0 primitive 0, accessor 0: matrices are not vertex attributes",
-    ),
-    (
-        "gltf-validator/base/accessor/small_stride.gltf",
-        "mesh 0 primitive 0, accessor 0: it has 4 components, not 3",
-    ),
-    (
-        "gltf-validator/base/accessor/unknown_type.gltf",
-        "mesh 0 primitive 0, accessor 0: its type or componentType is unknown",
-    ),
-    (
-        "gltf-validator/base/accessor/unresolved_bufferviews.gltf",
-        "mesh 0 primitive 0, accessor 0, buffer view 0: there is no such buffer view",
-    ),
-    ("gltf-validator/base/buffer_view/custom_property.gltf", EMPTY),
-    ("gltf-validator/base/buffer_view/empty_array.gltf", EMPTY),
-    ("gltf-validator/base/buffer_view/empty_object.gltf", "JSON: missing field `buffer`"),
-    (
-        "gltf-validator/base/buffer_view/invalid_length.gltf",
-        "mesh 0 primitive 0 indices, accessor 0, buffer view 0: bytes 0 to 0 + 5 lie beyond its buffer",
-    ),
-    ("gltf-validator/base/buffer_view/invalid_stride_multiple.gltf", EMPTY),
-    ("gltf-validator/base/buffer_view/invalid_stride_too_big.gltf", EMPTY),
-    ("gltf-validator/base/buffer_view/invalid_stride_wrong_target.gltf", EMPTY),
-    (
-        "gltf-validator/base/buffer_view/unresolved_buffer.gltf",
-        "mesh 0 primitive 0 indices, accessor 0, buffer view 0, buffer 1: there is no such buffer",
-    ),
-    ("gltf-validator/base/buffer_view/valid.gltf", EMPTY),
-    (
-        "gltf-validator/base/buffer_view/zero_bytelength.gltf",
-        "mesh 0 primitive 0 indices, accessor 0: its elements lie beyond its buffer view",
-    ),
-    (
-        "gltf-validator/base/mesh/accessor_unequal_count.gltf",
-        "mesh 0 primitive 0 Colors(0): accessor 1 has 4 elements, POSITION 3",
-    ),
-    ("gltf-validator/base/mesh/empty_array.gltf", EMPTY),
-    ("gltf-validator/base/mesh/empty_object.gltf", "JSON: missing field `primitives`"),
-    (
-        "gltf-validator/base/mesh/indices_invalid_format.gltf",
-        "mesh 0 primitive 0 indices, accessor 1: indices must be unsigned scalars",
-    ),
-    ("gltf-validator/base/mesh/invalid_tangent.gltf", EMPTY),
-    (
-        "gltf-validator/base/mesh/position_accessor_invalid_format.gltf",
-        "mesh 0 primitive 0, accessor 0: it has 4 components, not 3",
-    ),
-    ("gltf-validator/base/mesh/primitive_no_position.gltf", EMPTY),
-    (
-        "gltf-validator/base/mesh/unresolved_indices.gltf",
-        "mesh 0 primitive 0 indices, accessor 1: there is no such accessor",
-    ),
-    ("gltf-validator/base/mesh/unresolved_material.gltf", "material 0: there is no such material"),
-    (
-        "gltf-validator/base/mesh/unresolved_positions.gltf",
-        "mesh 0 primitive 0, accessor 0: there is no such accessor",
-    ),
-];
+/// The rows of [`OUTCOMES`] for files that are read in this way: file and outcome.
+fn outcomes(read: &str) -> Vec<(&'static str, &'static str)> {
+    let rows = OUTCOMES.lines().filter_map(|line| line.split_once('\t'));
+    rows.filter(|(kind, _)| *kind == read).filter_map(|(_, row)| row.split_once('\t')).collect()
+}
 
 /// A `.glb` of a file's JSON with a scene of all its contents and a buffer of zeros. `None` if the JSON is
 /// malformed or incomplete.
@@ -339,7 +167,8 @@ fn every_malformed_shared_file_has_the_listed_outcome() {
     let root = shared("malformed");
     let folder = tempfile::tempdir().expect("folder");
     let mut complaints = Vec::new();
-    let (mut unchanged, mut with_scene) = (UNCHANGED.to_vec(), WITH_A_SCENE.to_vec());
+    let [mut unchanged, mut with_scene] = ["unchanged", "with a scene"].map(outcomes);
+    assert!(unchanged.len() > 40 && with_scene.len() > 20, "rows are missing");
     for path in files(&root) {
         let name = path.strip_prefix(&root).expect("inside").to_string_lossy().replace('\\', "/");
         let others = if name.starts_with("gltf-validator") { EMPTY } else { LOADS };

@@ -1,5 +1,5 @@
 // The backward pass of a splat in a tile's pixels, for rasterize_bwd.wgsl and rasterize_bwd_atomic.wgsl.
-// src/backend/cpu/rasterize_bwd.rs derives the sums.
+// src/render/cpu/rasterize_bwd.rs derives the sums.
 
 @group(0) @binding(6) var<storage, read> finish: array<vec2<u32>>;
 // Planes of dL/dpixel: red, green, blue, and, if MORE is set, alpha and depth. If it is not, a plane of

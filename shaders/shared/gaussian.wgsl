@@ -1,5 +1,5 @@
 // A row's projection and colour, for the forward and the backward pass: the functions of
-// src/backend/cpu/project.rs, which derives the formulas.
+// src/render/cpu/project.rs, which derives the formulas.
 
 @group(0) @binding(1) var<storage, read> rows: array<vec4<f32>>;
 @group(0) @binding(2) var<storage, read> sh0: array<f32>;
@@ -139,7 +139,7 @@ const C32: f32 = -0.4570458;
 const C33: f32 = 0.37317633;
 const C35: f32 = 1.4453057;
 
-// Basis functions at the unit vector d; see src/sh.rs.
+// Basis functions at the unit vector d; see src/core/sh.rs.
 fn basis(degree: u32, d: vec3<f32>) -> array<f32, 16> {
     var y: array<f32, 16>;
     y[0] = C0;

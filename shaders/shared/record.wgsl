@@ -1,5 +1,5 @@
 // The layout of a gradient record: nine numbers for training, then optional ones for the requested
-// signals. src/backend/signals.rs has the table.
+// signals. policies/src/signals.rs has the table.
 
 // Numbers per record.
 override RECORD: u32;

@@ -22,7 +22,7 @@ struct Frame {
     more_rates: vec4<f32>,
     // Strength times step size, sharpness, opacity.
     noise: vec4<f32>,
-    // How errors are combined into a score: exponent of a pixel's error, weight of edges, exponents of
+    // The combination of errors into a score: exponent of a pixel's error, weight of edges, exponents of
     // the sum of weights and of a view's score.
     score: vec4<f32>,
     // Seed, step, flags of the optimiser (see adam.wgsl), flags of the loss (see loss.wgsl).
@@ -84,8 +84,14 @@ override LOG2_REACH: f32 = 7.9943534;
 // constant because an indirect dispatch on DX12 does not provide the number.
 const ACROSS: u32 = 32768u;
 
+// The number of a workgroup; `id` is its workgroup_id.
 fn group_of(id: vec3<u32>) -> u32 {
     return id.x + id.y * ACROSS;
+}
+
+// The number of an invocation in a kernel of groups of GROUP; `id` is its global_invocation_id.
+fn index_of(id: vec3<u32>) -> u32 {
+    return id.x + id.y * ACROSS * GROUP;
 }
 
 // Where a tile begins in the image [px].

@@ -12,6 +12,13 @@ pub struct RowBudget {
     pub frozen: usize,
 }
 
+impl From<usize> for RowBudget {
+    /// A budget without frozen rows.
+    fn from(total: usize) -> Self {
+        Self { total, frozen: 0 }
+    }
+}
+
 impl RowBudget {
     /// The budget that leaves room for `trainable` rows besides the frozen ones.
     #[must_use]

@@ -33,6 +33,13 @@ impl ModelArray {
     pub const ALL: [Self; 5] =
         [Self::Means, Self::LogScales, Self::Quats, Self::OpacityLogits, Self::Sh];
 
+    /// The array that holds a parameter of a row, by its index.
+    #[must_use]
+    pub fn of_parameter(index: usize) -> Self {
+        let holds = |array: &Self| array.parameters(MAX_SH_DEGREE).contains(&index);
+        Self::ALL.into_iter().find(holds).unwrap_or(Self::Sh)
+    }
+
     /// The array's part of a row's parameters at a degree.
     #[must_use]
     pub const fn parameters(self, sh_degree: u8) -> std::ops::Range<usize> {

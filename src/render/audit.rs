@@ -6,45 +6,7 @@
 
 use std::fmt;
 
-/// A class of parameters.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Attribute {
-    /// The mean.
-    Mean,
-    /// The log-scales.
-    LogScale,
-    /// The quaternion.
-    Quat,
-    /// The opacity logit.
-    Opacity,
-    /// The spherical-harmonic coefficients.
-    Sh,
-}
-
-impl Attribute {
-    /// The class of a row's parameter, by its index: mean, log-scales, quaternion, opacity logit, coefficients.
-    pub(super) fn of_parameter(index: usize) -> Self {
-        match index {
-            0..3 => Self::Mean,
-            3..6 => Self::LogScale,
-            6..10 => Self::Quat,
-            10 => Self::Opacity,
-            _ => Self::Sh,
-        }
-    }
-}
-
-impl fmt::Display for Attribute {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Mean => "mean",
-            Self::LogScale => "log-scale",
-            Self::Quat => "quaternion",
-            Self::Opacity => "opacity",
-            Self::Sh => "spherical-harmonic coefficients",
-        })
-    }
-}
+use densify_core::gaussians::ModelArray;
 
 /// The kind of a non-finite number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -60,20 +22,23 @@ pub enum NumberKind {
 pub struct NonFinite {
     /// The row.
     pub row: u32,
-    /// The class of the parameter.
-    pub attribute: Attribute,
+    /// The array that the parameter belongs to.
+    pub array: ModelArray,
     /// The kind of number.
     pub kind: NumberKind,
 }
 
 impl fmt::Display for NonFinite {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { row, attribute, kind } = self;
-        match kind {
-            NumberKind::Parameter => write!(f, "the {attribute} of row {row}"),
-            NumberKind::Moment => {
-                write!(f, "the optimiser's moment of the {attribute} of row {row}")
-            }
-        }
+        let Self { row, array, kind } = self;
+        let parameter = match array {
+            ModelArray::Means => "mean",
+            ModelArray::LogScales => "log-scale",
+            ModelArray::Quats => "quaternion",
+            ModelArray::OpacityLogits => "opacity",
+            ModelArray::Sh => "spherical-harmonic coefficients",
+        };
+        let moment = if *kind == NumberKind::Moment { "optimiser's moment of the " } else { "" };
+        write!(f, "the {moment}{parameter} of row {row}")
     }
 }

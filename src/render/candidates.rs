@@ -13,8 +13,8 @@ use densify_core::image::Image8;
 /// The candidates collected so far, and the request that selects them.
 #[derive(Debug)]
 pub(super) struct Candidates {
-    request: Option<CandidateRequest>,
-    list: Vec<Candidate>,
+    pub(super) request: Option<CandidateRequest>,
+    pub(super) list: Vec<Candidate>,
     ranking: Vec<Ranked>,
 }
 
@@ -56,23 +56,6 @@ impl Candidates {
     pub(super) fn bytes(request: Option<CandidateRequest>, pixels: usize) -> u64 {
         let ranking = pixels * size_of::<Ranked>();
         request.map_or(0, |r| (r.capacity * size_of::<Candidate>() + ranking) as u64)
-    }
-
-    pub(super) fn list(&self) -> &[Candidate] {
-        &self.list
-    }
-
-    pub(super) fn push(&mut self, candidate: Candidate) {
-        self.list.push(candidate);
-    }
-
-    pub(super) fn clear(&mut self) {
-        self.list.clear();
-    }
-
-    /// Returns whether the policy requests candidates.
-    pub(super) fn is_requested(&self) -> bool {
-        self.request.is_some()
     }
 
     /// The list as a state array.

@@ -1,4 +1,4 @@
-//! The choice of a backend: the one place that turns it into limits, a promise of memory, and a backend.
+//! The choice of a backend: the one place that turns it into limits, a memory plan, and a backend.
 
 use clap::ValueEnum;
 use densify_policies::policy::Needs;
@@ -156,12 +156,12 @@ impl Device {
         }
     }
 
-    /// The ledger of a backend with these options for models of this degree. Nothing is allocated.
+    /// The bytes that a backend with these options allocates for models of this degree. Nothing is allocated yet.
     /// `threads` takes precedence over [`Setup::threads`].
     #[must_use]
-    pub fn promise(&self, sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
+    pub fn memory_plan(&self, sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
         match self {
-            Self::Processor => CpuBackend::promise(sh_degree, options, threads),
+            Self::Processor => CpuBackend::memory_plan(sh_degree, options, threads),
             Self::Gpu(device) => device.memory_plan(sh_degree, options),
         }
     }
@@ -185,8 +185,8 @@ impl Device {
         }
     }
 
-    /// Compiles the GPU kernels for these needs and verifies their results on a small scene. Done before a promise,
-    /// which must include the memory that the driver takes.
+    /// Compiles the GPU kernels for these needs and verifies their results on a small scene. Done before memory is planned:
+    /// the plan must include the memory that the driver takes.
     ///
     /// # Errors
     /// When a kernel does not compile or its results are wrong.

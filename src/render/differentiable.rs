@@ -31,7 +31,7 @@ pub trait Differentiable: Backend {
     /// Renders a view and differentiates Σ rgb·upstream.rgb + Σ alpha·upstream.alpha +
     /// Σ depth·upstream.depth with respect to every parameter. The model is unchanged.
     ///
-    /// Uses every field of the gradient records, so it may allocate more than the ledger promises.
+    /// Uses every field of the gradient records, so it may allocate more than the ledger lists.
     ///
     /// # Errors
     /// See [`BackendError`].

@@ -6,7 +6,7 @@ use densify_shaders::Accumulation;
 /// An error that stops a backend, or keeps it from starting.
 #[derive(Debug, thiserror::Error)]
 pub enum BackendError {
-    /// A promised buffer cannot be allocated.
+    /// A planned buffer cannot be allocated.
     #[error("cannot allocate {bytes} bytes for {what}")]
     OutOfMemory {
         /// The buffer.

@@ -30,8 +30,9 @@ use densify_policies::policy::{
 };
 
 pub use adapter::{AdapterChoice, AdapterKind, AdapterSummary};
-pub use audit::{Attribute, NonFinite, NumberKind};
+pub use audit::{NonFinite, NumberKind};
 pub use choice::{BackendChoice, BackendKind, Device};
+use densify_core::budget::RowBudget;
 use densify_core::camera::Camera;
 use densify_core::colour::{ColourGradient, ColourTransform};
 use densify_core::gaussians::{Gaussians, ModelArray};
@@ -44,8 +45,8 @@ pub use inspect::Inspect;
 pub use setup::{KeptPhotographs, MomentStorage, ParameterStorage, Setup, Shortcuts, Storage};
 pub use state::{StateArray, StateError, Tensor, Values};
 
-/// Learning rates of one iteration.
-#[derive(Debug, Clone, Copy, PartialEq)]
+/// Learning rates of one iteration. With the default, 0, the model is unchanged, while signals are still measured.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct LearningRates {
     /// Means `[scene units per step]`.
     pub mean: f32,
@@ -61,19 +62,6 @@ pub struct LearningRates {
     pub sh_dc: f32,
     /// Spherical-harmonic coefficients of bands 1–3.
     pub sh_rest: f32,
-}
-
-impl LearningRates {
-    /// All rates 0: the model is unchanged, while signals are still measured.
-    pub const STILL: Self = Self {
-        mean: 0.0,
-        noise: 0.0,
-        log_scale: 0.0,
-        quat: 0.0,
-        opacity: 0.0,
-        sh_dc: 0.0,
-        sh_rest: 0.0,
-    };
 }
 
 /// The input of a training step.
@@ -180,12 +168,12 @@ fn assert_same_size(camera: &Camera, image: &Image8) {
     assert_eq!(camera, image, "camera and image differ in size");
 }
 
-/// Panics unless a plan fits the rows, in release builds too: the memory promise depends on it.
-fn assert_fits(ops: &RowOps, frozen: usize, rows: usize, budget: usize) {
-    assert_eq!(ops.first_row, frozen, "a plan for another number of frozen rows");
+/// Panics unless a plan fits the rows, in release builds too: the memory plan depends on it.
+fn assert_fits(ops: &RowOps, rows: usize, budget: RowBudget) {
+    assert_eq!(ops.first_row, budget.frozen, "a plan for another number of frozen rows");
     assert_eq!(ops.rows_before, rows, "a plan for another number of rows");
-    assert_eq!(ops.budget, budget, "a plan for another budget");
-    assert!(ops.rows_after <= budget, "{} rows over the budget", ops.rows_after);
+    assert_eq!(ops.budget, budget.total, "a plan for another budget");
+    assert!(ops.rows_after <= budget.total, "{} rows over the budget", ops.rows_after);
     if let Err(broken) = ops.check() {
         panic!("an inconsistent plan: {broken}");
     }
@@ -202,7 +190,7 @@ pub trait Backend: Send {
     /// The largest number of rows; all buffers have this size from the start.
     fn budget(&self) -> usize;
 
-    /// The promised bytes of each buffer.
+    /// The planned bytes of each buffer.
     fn ledger(&self) -> &Ledger;
 
     /// Starts a new epoch; `WeightMax` is kept per epoch.

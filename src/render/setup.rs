@@ -1,5 +1,6 @@
 //! The settings of a backend.
 
+use densify_core::budget::RowBudget;
 use densify_policies::policy::Needs;
 
 use super::cpu::InstructionSet;
@@ -7,10 +8,8 @@ use super::cpu::InstructionSet;
 /// The settings of a backend of either kind. The default has room for one row.
 #[derive(Debug, Clone)]
 pub struct Setup {
-    /// The largest number of rows, >= 1 and >= the model's.
-    pub budget: usize,
-    /// Number of frozen rows at the front: they are rendered but not trained, and have memory only for rendering.
-    pub frozen: usize,
+    /// The largest number of rows, >= 1 and >= the model's. Frozen rows have memory only for rendering.
+    pub budget: RowBudget,
     /// Near plane `[scene units]`, > 0: rows closer to the camera are not rendered.
     pub near: f32,
     /// The most (row, tile) pairs held at a time; an image with more is processed in bands. `None` means 16
@@ -25,7 +24,7 @@ pub struct Setup {
     /// Processor threads; `None` means one per core.
     pub threads: Option<usize>,
     /// The largest image to render (width, height) `[px]`. Larger ones work, but need more memory than the
-    /// ledger promises.
+    /// ledger lists.
     pub largest_image: (u32, u32),
     /// Photographs kept in GPU memory instead of being uploaded at every step.
     pub photographs: KeptPhotographs,
@@ -46,8 +45,7 @@ impl Setup {
     #[must_use]
     pub fn new(budget: usize) -> Self {
         Self {
-            budget,
-            frozen: 0,
+            budget: budget.into(),
             near: 0.01,
             tile_cap: None,
             record_cap: usize::MAX,
@@ -61,6 +59,11 @@ impl Setup {
             exposures: false,
             only_renders: false,
         }
+    }
+
+    /// The budget with room for at least one row, so that no buffer is empty.
+    pub(crate) fn row_budget(&self) -> RowBudget {
+        RowBudget { total: self.budget.total.max(1), ..self.budget }
     }
 }
 

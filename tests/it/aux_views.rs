@@ -61,7 +61,7 @@ fn backend(
     };
     let (tile_cap, record_cap) = (Some(cap), cap.div_ceil(2));
     let budget = scene.model.len() + 3;
-    let setup = Setup { budget, tile_cap, record_cap, needs, ..Setup::default() };
+    let setup = Setup { budget: budget.into(), tile_cap, record_cap, needs, ..Setup::default() };
     make_with(subject, &scene.model, setup)
 }
 

@@ -265,8 +265,11 @@ fn the_device_finds_the_pixels_that_the_host_would() {
                 CandidateRequest { rows_per_candidate: 1, capacity: 500, ..request(error, 0.3) };
             let needs = Needs { candidates: Some(request), ..Needs::default() };
             let [by_host, by_device] = [1, 2].map(|times| {
-                let setup =
-                    Setup { budget: times * model.len(), needs: needs.clone(), ..Setup::default() };
+                let setup = Setup {
+                    budget: (times * model.len()).into(),
+                    needs: needs.clone(),
+                    ..Setup::default()
+                };
                 let mut backend = make_with(&Subject::Gpu(device.clone()), &model, setup);
                 places(train(&mut *backend, &camera, 3).last().expect("three steps"))
             });

@@ -1,9 +1,10 @@
 //! Frozen rows: whatever a step or a plan does to the others, these keep their bits, and they have no memory for
 //! what only training needs.
 
+use densify::core::budget::RowBudget;
 use densify::core::camera::Camera;
-use densify::core::gaussians::Gaussians;
-use densify::render::{Attribute, Backend, NonFinite, NumberKind, StepInput, Storage, Values};
+use densify::core::gaussians::{Gaussians, ModelArray};
+use densify::render::{Backend, NonFinite, NumberKind, StepInput, Storage, Values};
 use densify::selftest::{Setup, Subject, scenes};
 use densify_policies::adc::split_by;
 use densify_policies::plan::{Decay, EditPlan};
@@ -32,7 +33,8 @@ fn model() -> Gaussians {
 }
 
 fn setup(frozen: usize, storage: Storage, needs: Needs) -> Setup {
-    Setup { budget: 2 * ROWS, frozen, storage, needs, ..Setup::default() }
+    let budget = RowBudget { total: 2 * ROWS, frozen };
+    Setup { budget, storage, needs, ..Setup::default() }
 }
 
 fn step(backend: &mut dyn Backend, number: u32, needs: &Needs) {
@@ -201,13 +203,13 @@ fn what_is_unsound_behind_them_is_found() {
         let Values::F32(values) = &mut moments.values else { panic!("{first} has no numbers") };
         values[(FROZEN + 7) * width] = f32::NAN;
         backend.restore(moments).expect("they are taken back");
-        let unsound = |row: usize, attribute, kind| NonFinite { row: row as u32, attribute, kind };
+        let unsound = |row: usize, array, kind| NonFinite { row: row as u32, array, kind };
         assert_eq!(
             backend.audit().expect("an audit"),
             [
-                unsound(5, Attribute::Opacity, NumberKind::Parameter),
-                unsound(FROZEN + 2, Attribute::Mean, NumberKind::Parameter),
-                unsound(FROZEN + 7, Attribute::Mean, NumberKind::Moment),
+                unsound(5, ModelArray::OpacityLogits, NumberKind::Parameter),
+                unsound(FROZEN + 2, ModelArray::Means, NumberKind::Parameter),
+                unsound(FROZEN + 7, ModelArray::Means, NumberKind::Moment),
             ]
         );
     });

@@ -14,7 +14,7 @@ fn rows_are_drawn_in_the_colours_given_and_keep_their_own() {
         let view = scenes::camera(33, 25, 71);
         let model = scenes::cloud(ROWS, DEGREE, &view, 72);
         let mut backend =
-            make_with(subject, &model, Setup { budget: ROWS + 3, ..Setup::default() });
+            make_with(subject, &model, Setup { budget: (ROWS + 3).into(), ..Setup::default() });
         let target = scenes::target(&view);
         backend.train_step(&step_input(1, &view, &target, DEGREE)).expect("a step");
         let (before, own) = (saved(&*backend), backend.render(&view, GREY, DEGREE));
@@ -27,7 +27,8 @@ fn rows_are_drawn_in_the_colours_given_and_keep_their_own() {
 
         let mut flat = before.0.clone().with_degree(0);
         flat.sh = colours.as_flattened().iter().copied().map(rgb_to_dc).collect();
-        let mut other = make_with(subject, &flat, Setup { budget: ROWS, ..Setup::default() });
+        let mut other =
+            make_with(subject, &flat, Setup { budget: ROWS.into(), ..Setup::default() });
         let expected = other.render(&view, GREY, 0).expect("a rendering");
         for (found, expected) in painted.rgb.iter().zip(&expected.rgb) {
             assert!((found - expected).abs() < 2e-6, "{found}, expected {expected}");

@@ -2,27 +2,27 @@
 //! notices. That a gradient which cannot be squared is found in a moment is in case 25 of the
 //! [selftest](densify::selftest).
 
-use densify::core::gaussians::Gaussians;
-use densify::render::{Attribute, Backend, NonFinite, NumberKind, Storage, Values};
+use densify::core::gaussians::{Gaussians, ModelArray};
+use densify::render::{Backend, NonFinite, NumberKind, Storage, Values};
 use densify::selftest::values::{POISON, SLOTS, remove, slot_mut};
 use densify::selftest::{Setup, Subject, scenes};
 use densify_policies::plan::EditPlan;
 
 use crate::subject::{make, make_with, on_each, repeatable, step_input, storages};
 
-/// The row that is poisoned where it is one.
+/// The row to poison in tests of a single row.
 const POISONED: usize = 11;
 
-/// What slot `slot` of a row is.
+/// The kind of the number in slot `slot` of a row that is not finite.
 fn unsound(row: usize, slot: usize) -> NonFinite {
-    let attribute = match slot {
-        0..3 => Attribute::Mean,
-        3..6 => Attribute::LogScale,
-        6..10 => Attribute::Quat,
-        10 => Attribute::Opacity,
-        _ => Attribute::Sh,
+    let array = match slot {
+        0..3 => ModelArray::Means,
+        3..6 => ModelArray::LogScales,
+        6..10 => ModelArray::Quats,
+        10 => ModelArray::OpacityLogits,
+        _ => ModelArray::Sh,
     };
-    NonFinite { row: row as u32, attribute, kind: NumberKind::Parameter }
+    NonFinite { row: row as u32, array, kind: NumberKind::Parameter }
 }
 
 /// Row i has its number i poisoned.

@@ -7,6 +7,7 @@ use densify_policies::policy::{
 };
 
 use crate::subject::{make, make_with, repeatable, saved, step_input, storages};
+use densify::core::budget::RowBudget;
 use densify::core::camera::Camera;
 use densify::core::gaussians::Gaussians;
 use densify::selftest::{Differentiable, Setup, Subject, scenes};
@@ -49,7 +50,8 @@ fn backend(
     (storage, frozen, needs): (Storage, usize, fn() -> Needs),
     model: &Gaussians,
 ) -> Box<dyn Differentiable> {
-    make_with(subject, model, Setup { storage, frozen, needs: needs(), ..Setup::default() })
+    let budget = RowBudget { total: model.len(), frozen };
+    make_with(subject, model, Setup { storage, budget, needs: needs(), ..Setup::default() })
 }
 
 fn step(backend: &mut dyn Backend, needs: &Needs, camera: &Camera, number: u32) {

@@ -161,7 +161,7 @@ fn collect_with(
     let mut backend = make_with(subject, &views.model, setup);
     for (v, (camera, target)) in views.cameras.iter().zip(&views.targets).enumerate() {
         let step = step_input(v as u32 + 1, camera, target, 2);
-        let input = StepInput { background: BACKGROUND, rates: LearningRates::STILL, ..step };
+        let input = StepInput { background: BACKGROUND, rates: LearningRates::default(), ..step };
         backend.train_step(&input).expect("a small image is rendered");
     }
     let signals = backend.take_signals(needs.signals).expect("signals can be taken");

@@ -169,7 +169,7 @@ fn rows_are_split_moved_and_painted_where_they_are() {
     on_each(repeatable(), |subject| {
         // Two splits are refused.
         let needs = spatial.needs(&scene_of(28));
-        let setup = Setup { budget: 28 + inside.len(), needs, ..Setup::default() };
+        let setup = Setup { budget: (28 + inside.len()).into(), needs, ..Setup::default() };
         let (after, denied) = trained(spatial, make_with(subject, &model, setup), &camera);
         assert_eq!((after.len(), denied), (28 + inside.len(), 2));
         // Where a row stands now: after the children of those before it.

@@ -34,7 +34,7 @@ fn what_is_not_declared_takes_no_bytes() {
         let setup = Setup { largest_image: (41, 33), needs, ..Setup::new(20) };
         let ledger = match device {
             Some(device) => device.memory_plan(1, &setup),
-            None => CpuBackend::promise(1, &setup, 2),
+            None => CpuBackend::memory_plan(1, &setup, 2),
         };
         ledger.total()
     };

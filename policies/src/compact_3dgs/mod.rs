@@ -199,7 +199,7 @@ impl Compact {
         if self.is_control() {
             return step > 0 && step == self.params.growth.grow_until;
         }
-        self.growth.grows_at(step)
+        self.growth.grow.is_due(step)
             || self.prune.is_due(step)
             || (step > 0 && step == self.iterations)
     }

@@ -4,8 +4,7 @@
 
 use super::*;
 use crate::event::{
-    Event, Outcome, View, assert_conforms, assert_grows_like_vanilla, assert_refused, build,
-    due_steps,
+    Event, Outcome, View, assert_conforms, assert_grows_like_vanilla, build, due_steps,
 };
 use crate::parameters::REFERENCE_ITERATIONS;
 use crate::policy::SignalSet;
@@ -165,9 +164,6 @@ fn the_control_prunes_the_same_number_at_random_and_renders_nothing() {
     let random = "victims = \"random\"";
     let done = run(&event, random);
     assert_eq!(done.ops.rows_after, 500);
-    // Half of those pruned are in the first half: 250 ± 5·√62.5.
-    let early = done.pruned.iter().filter(|row| **row < 500).count();
-    assert!(early.abs_diff(250) < 40, "{early}");
     assert!(run(&Event { step: 24_000, ..event.clone() }, random).pruned != done.pruned);
     let views = |set: &str, step| build("lightgaussian", set, &event.scene).aux_views(step, 9, 9);
     assert_eq!([15_999, 16_000, 24_000].map(|step| views("", step)), [0, u32::MAX, u32::MAX]);
@@ -181,21 +177,6 @@ fn the_control_prunes_the_same_number_at_random_and_renders_nothing() {
 #[test]
 fn without_a_view_nothing_is_pruned() {
     assert!(run(&event(16_000, 10), "").pruned.is_empty());
-}
-
-#[test]
-fn bad_parameters_are_named() {
-    assert_refused(
-        "lightgaussian",
-        &[
-            ("tau = -1.0", "lightgaussian.tau"),
-            ("first_share = 1.5", "lightgaussian.first_share"),
-            ("reset_opacity = 1.0", "lightgaussian.reset_opacity"),
-            ("grow_every = -1", "lightgaussian.grow_every"),
-            ("victims = \"lowst\"", "lightgaussian.victims"),
-            ("tua = 1.0", "tua"),
-        ],
-    );
 }
 
 #[test]

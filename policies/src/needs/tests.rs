@@ -9,8 +9,10 @@ fn numbers_out_of_range_are_refused() {
     let mask = MaskTerm { start: 1.0, rate: 0.01, weight: 5e-4, threshold: 0.01 };
     assert_eq!(Needs { mask: Some(mask), ..Needs::default() }.check(), Ok(()));
     let score = |error_score| Needs { error_score, ..Needs::default() };
+    let rates = |rates| Needs { rates, ..Needs::default() };
     let fade =
-        |from, to| RateOverrides { fade: Some(Fade { from, to }), ..RateOverrides::default() };
+        |from, to| rates(RateOverrides { fade: Some(Fade { from, to }), ..Default::default() });
+    let map = PixelMap { error: -1.0, edge: 0.0 };
     let wrong = [
         Needs { loss_terms: LossTerms { opacity: -1.0, scale: 0.0 }, ..Needs::default() },
         Needs { loss_terms: LossTerms { opacity: 0.0, scale: f32::NAN }, ..Needs::default() },
@@ -23,14 +25,8 @@ fn numbers_out_of_range_are_refused() {
         Needs { mask: Some(mask), cadence: Cadence { all: 2, sh_rest: 1 }, ..Needs::default() },
         Needs { cadence: Cadence { all: 0, sh_rest: 1 }, ..Needs::default() },
         Needs { cadence: Cadence { all: 1, sh_rest: 0 }, ..Needs::default() },
-        Needs {
-            rates: RateOverrides {
-                quat: Some(Rate { start: 1.0, end: 0.0 }),
-                ..RateOverrides::default()
-            },
-            ..Needs::default()
-        },
-        Needs { rates: fade(1.0, 0.5), ..Needs::default() },
+        rates(RateOverrides { quat: Some(Rate { start: 1.0, end: 0.0 }), ..Default::default() }),
+        fade(1.0, 0.5),
         score(ErrorScore { power: 0.0, ..ErrorScore::default() }),
         score(ErrorScore { edge: f32::NAN, ..ErrorScore::default() }),
         score(ErrorScore { footprint: 1.5, ..ErrorScore::default() }),
@@ -38,16 +34,10 @@ fn numbers_out_of_range_are_refused() {
         Needs { least_resolution: Some(0.0), ..Needs::default() },
         Needs { least_resolution: Some(1.5), ..Needs::default() },
         Needs { least_resolution: Some(f64::NAN), ..Needs::default() },
-        Needs { rates: fade(0.5, 0.0), ..Needs::default() },
+        fade(0.5, 0.0),
         Needs { start: StartRule { opacity: Some(1.0), scale: 1.0 }, ..Needs::default() },
         Needs { start: StartRule { opacity: None, scale: 0.0 }, ..Needs::default() },
-        Needs {
-            aux: Some(AuxRequest {
-                map: PixelMap { error: -1.0, edge: 0.0 },
-                ..AuxRequest::default()
-            }),
-            ..Needs::default()
-        },
+        Needs { aux: Some(AuxRequest { map, ..AuxRequest::default() }), ..Needs::default() },
     ];
     for needs in wrong {
         assert!(needs.check().is_err(), "{needs:?}");

@@ -172,7 +172,7 @@ impl Reduced {
         let ReducedParams { prune_every, prune_until, .. } = self.params;
         let is_due = prune_every > 0 && step <= prune_until && step.is_multiple_of(prune_every);
         // Right after a reset all opacities are similar.
-        is_due && step > 0 && !self.growth.resets_at(step)
+        is_due && step > 0 && !self.growth.resets.is_due(step)
     }
 
     /// Prunes redundant and faint rows, or the same number at random, among those without an edit.

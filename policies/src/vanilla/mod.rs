@@ -123,8 +123,8 @@ impl Default for VanillaParams {
 #[derive(Debug)]
 pub struct Vanilla {
     params: VanillaParams,
-    grow: Window,
-    resets: OpacityResets,
+    pub(crate) grow: Window,
+    pub(crate) resets: OpacityResets,
 }
 
 impl ConfiguredPolicy for Vanilla {
@@ -185,16 +185,6 @@ impl DensityPolicy for Vanilla {
 }
 
 impl Vanilla {
-    /// True if rows grow at `step` (1-based).
-    pub(crate) fn grows_at(&self, step: u32) -> bool {
-        self.grow.is_due(step)
-    }
-
-    /// True if opacities are reset at `step` (1-based).
-    pub(crate) fn resets_at(&self, step: u32) -> bool {
-        self.resets.is_due(step)
-    }
-
     /// Grows, then prunes. As in the original, pruning applies to the state after growth: a huge row that is
     /// split is judged by the size of its children.
     fn densify(&self, now: &Snapshot<'_>, plan: &mut EditPlan) -> PolicyResult {

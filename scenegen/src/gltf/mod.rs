@@ -6,7 +6,7 @@
 //!
 //! Errors that cannot change the result are ignored: alignments, bounds of accessors, targets of
 //! buffer views, names of attributes that are not read, morph targets, and objects that the scene
-//! does not use. `tests/shared.rs` lists the outcome for each test file of a validator.
+//! does not use. `tests/malformed.tsv` lists the outcome for each test file of a validator.
 //!
 //! Over 400 lines, as mesh, camera and light of a node are read in the same traversal.
 

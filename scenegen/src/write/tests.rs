@@ -33,12 +33,15 @@ fn written(options: Options) -> (tempfile::TempDir, [std::path::PathBuf; 2]) {
     (root, targets)
 }
 
+fn read(folder: &Path, name: &str) -> Vec<u8> {
+    fs::read(folder.join(name)).expect(name)
+}
+
 /// The files of training views have the lens in every format, and those of test views do not.
 #[test]
 fn a_lens_affects_training_views_only() {
     let lens = Some("fisheye:0.05,-0.01".parse().expect("a lens"));
     let (_root, [a, b]) = written(Options { lens, ..small().options });
-    let read = |folder: &Path, name: &str| fs::read(folder.join(name)).expect(name);
     assert!(read(&a, "images/test/r_001.png") == read(&b, "images/test/r_001.png"));
     assert!(read(&a, "images/train/r_001.png") != read(&b, "images/train/r_001.png"));
     let cameras = String::from_utf8(read(&b, "sparse/0/cameras.txt")).expect("text");
@@ -66,7 +69,6 @@ fn a_lens_affects_training_views_only() {
 #[test]
 fn passers_by_are_in_some_training_views_and_masked() {
     let (_root, [a, b]) = written(Options { passers_by: 0.5, ..small().options });
-    let read = |folder: &Path, name: &str| fs::read(folder.join(name)).expect(name);
     for name in
         ["images/test/r_001.png", "depth/train/r_001.exr", "points3d.ply", "sparse/0/points3D.txt"]
     {
@@ -115,16 +117,7 @@ fn names(folder: &Path) -> Vec<String> {
 /// Training views are exposed by the recorded factors; test views, depth and points are unchanged.
 #[test]
 fn exposures_vary_in_training_views_only() {
-    let plain = small();
-    let options = Options { exposure_jitter: 1.0, ..plain.options.clone() };
-    let scene = Scene::prepare(&Source::Preset("spheres".into()), &options).expect("preset");
-    let root = tempfile::tempdir().expect("folder");
-    let [a, b] = [(&plain, "plain"), (&scene, "exposed")].map(|(scene, name)| {
-        let target = root.path().join(name);
-        write(scene, &target, false, |_| ()).expect("write");
-        target
-    });
-    let read = |folder: &Path, name: &str| fs::read(folder.join(name)).expect(name);
+    let (_root, [a, b]) = written(Options { exposure_jitter: 1.0, ..small().options });
     for name in ["images/test/r_001.png", "depth/train/r_001.exr", "points3d.ply"] {
         assert!(read(&a, name) == read(&b, name), "{name}");
     }
@@ -211,8 +204,7 @@ fn everything_is_written_and_nothing_else_is_left() {
     for name in
         ["scene.json", "points3d.ply", "mesh.ply", "sparse/0/images.txt", "images/train/r_002.png"]
     {
-        let read = |folder: &Path| fs::read(folder.join(name)).expect(name);
-        assert!(read(&target) == read(&again), "{name}");
+        assert!(read(&target, name) == read(&again, name), "{name}");
     }
 }
 

@@ -27,12 +27,12 @@ const MATURE: usize = 17_400;
 
 /// 1/(1 − β₁^age) and √(1/(1 − β₂^age)), by age.
 #[derive(Debug)]
-pub(super) struct BiasCorrection {
-    table: Vec<[f32; 2]>,
+pub(crate) struct BiasCorrection {
+    pub(crate) table: Vec<[f32; 2]>,
 }
 
 impl BiasCorrection {
-    pub(super) fn new() -> Self {
+    pub(crate) fn new() -> Self {
         let table = (0..=MATURE as i32)
             .map(|age| {
                 let age = age.max(1);
@@ -44,7 +44,7 @@ impl BiasCorrection {
         Self { table }
     }
 
-    pub(super) fn bytes() -> u64 {
+    pub(crate) fn bytes() -> u64 {
         ((MATURE + 1) * size_of::<[f32; 2]>()) as u64
     }
 

@@ -9,7 +9,7 @@ use densify_policies::plan::{
 use densify_policies::policy::Signal;
 use densify_policies::rng::{PolicyRng, Purpose};
 
-use super::blocks::{Blocks, plane, planes};
+use super::blocks::{Blocks, RowEdit, plane, planes};
 use super::mask::Masks;
 use super::moments::Moments;
 use super::parameters::Parameters;
@@ -56,9 +56,9 @@ pub(super) fn apply(model: &mut Model<'_>, ops: &RowOps, rng: &PolicyRng) {
         model.insert(row as usize, &seed);
     }
     for &(from, to) in &ops.moves {
-        model.relocate(from as usize, to as usize);
+        model.edit_rows(RowEdit::Copy(from as usize, to as usize));
     }
-    model.reorder(&ops.order());
+    model.edit_rows(RowEdit::Reorder(&ops.order()));
     if let Some(decay) = ops.decay {
         model.decay(decay, ops.first_row..ops.rows_after);
     }
@@ -106,29 +106,28 @@ impl Model<'_> {
             };
             [0, 1, 2].map(|i| mean[i] + offset[i])
         };
-        for (i, &slot) in children.iter().enumerate() {
+        let rewrite = |model: &mut Self, slot: usize, child: u32| {
+            model.params.set_n(slot, plane::MEAN, position(child));
+            model.params.set_n(slot, plane::LOG_SCALE, scales);
+            model.params.set_n(slot, plane::QUAT, rotated);
+            model.set_opacity(slot, offspring.opacity, siblings);
+            model.reset_row(slot);
+        };
+        for (child, &slot) in (1..).zip(children) {
             let slot = slot as usize;
-            self.params.copy_row(parent, slot);
+            self.params.edit(RowEdit::Copy(parent, slot));
             self.masks.inherit(parent, slot);
-            self.params.set_n(slot, plane::MEAN, position(i as u32 + 1));
-            self.params.set_n(slot, plane::LOG_SCALE, scales);
-            self.params.set_n(slot, plane::QUAT, rotated);
-            self.set_opacity(slot, offspring.opacity, siblings);
-            self.reset_row(slot);
+            rewrite(self, slot, child);
         }
         if offspring.parent == ParentFate::BecomesChild {
-            self.params.set_n(parent, plane::MEAN, position(0));
-            self.params.set_n(parent, plane::LOG_SCALE, scales);
-            self.params.set_n(parent, plane::QUAT, rotated);
-            self.set_opacity(parent, offspring.opacity, siblings);
-            self.reset_row(parent);
+            rewrite(self, parent, 0);
         }
     }
 
     /// Writes a new row that has no parent.
     fn insert(&mut self, row: usize, seed: &Seed) {
-        self.params.clear_row(row);
-        self.masks.clear_row(row);
+        self.params.edit(RowEdit::Clear(row));
+        self.masks.edit(RowEdit::Clear(row));
         self.params.set_n(row, plane::MEAN, seed.position);
         self.params.set_n(row, plane::LOG_SCALE, seed.scales.map(f32::ln));
         self.params.set_n(row, plane::QUAT, rotated(NO_ROTATION, seed.orientation));
@@ -160,7 +159,7 @@ impl Model<'_> {
     }
 
     fn decay(&mut self, decay: Decay, rows: Range<usize>) {
-        let seen = self.signals.planes().current(Signal::VisibleCount);
+        let seen = self.signals.planes.current(Signal::VisibleCount);
         let shrunk = (1.0 - decay.scale).ln();
         for row in rows {
             let was_seen = seen.is_some_and(|plane| self.signals.blocks.get(row, plane) > 0.0);
@@ -185,29 +184,22 @@ impl Model<'_> {
 
     /// Resets moments, age, signals and summed gradients.
     fn reset_row(&mut self, row: usize) {
-        self.moments.clear_row(row);
         self.masks.reset_moments(row);
-        self.ages.clear_row(row);
-        self.signals.blocks.clear_row(row);
-        self.summed.clear_row(row);
+        self.edit_training_state(RowEdit::Clear(row));
     }
 
-    fn relocate(&mut self, from: usize, to: usize) {
-        self.params.copy_row(from, to);
-        self.moments.copy_row(from, to);
-        self.masks.copy_row(from, to);
-        self.ages.copy_row(from, to);
-        self.signals.blocks.copy_row(from, to);
-        self.summed.copy_row(from, to);
+    /// Edits rows of all arrays.
+    fn edit_rows(&mut self, edit: RowEdit<'_>) {
+        self.params.edit(edit);
+        self.masks.edit(edit);
+        self.edit_training_state(edit);
     }
 
-    fn reorder(&mut self, order: &[u32]) {
-        self.params.reorder(order);
-        self.moments.reorder(order);
-        self.masks.reorder(order);
-        self.ages.reorder(order);
-        self.signals.blocks.reorder(order);
-        self.summed.reorder(order);
+    fn edit_training_state(&mut self, edit: RowEdit<'_>) {
+        self.moments.edit(edit);
+        self.ages.edit(edit);
+        self.signals.blocks.edit(edit);
+        self.summed.edit(edit);
     }
 }
 

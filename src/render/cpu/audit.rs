@@ -3,7 +3,8 @@
 use super::blocks::{Scratch, planes};
 use super::simd::WIDTH;
 use super::{BLOCKS_PER_TASK, CpuBackend};
-use crate::{Attribute, NonFinite, NumberKind};
+use crate::{NonFinite, NumberKind};
+use densify_core::gaussians::ModelArray;
 
 impl CpuBackend {
     /// The rows with a non-finite number, in order.
@@ -15,11 +16,8 @@ impl CpuBackend {
         let find = |row: usize| {
             let first = |get: &dyn Fn(usize) -> f32, kind| {
                 let number = (0..planes).position(|plane| !get(plane).is_finite())?;
-                Some(NonFinite {
-                    row: row as u32,
-                    attribute: Attribute::of_parameter(number),
-                    kind,
-                })
+                let array = ModelArray::of_parameter(number);
+                Some(NonFinite { row: row as u32, array, kind })
             };
             let moment = |which: usize| {
                 let of_row = |plane| self.moments.get(row, plane)[which];

@@ -44,12 +44,24 @@ impl Scratch {
     pub(super) const ZERO: Self = Self([0.0; plane::MOST * WIDTH]);
 }
 
+/// An edit of whole rows, which every array of rows executes alike.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum RowEdit<'a> {
+    /// Sets a row to 0.
+    Clear(usize),
+    /// Copies the stored bits of a row to another: from, to.
+    Copy(usize, usize),
+    /// Moves row `order[i]` to row i.
+    Reorder(&'a [u32]),
+}
+
 /// Rows of `planes` numbers each, from a first row on; earlier rows have no numbers.
 #[derive(Debug, Clone)]
 pub(super) struct Blocks<T = f32> {
-    planes: usize,
+    /// Numbers per row.
+    pub(super) planes: usize,
     /// The first row, a multiple of [`ROWS_PER_TASK`], so that blocks and tasks are aligned with those of all rows.
-    first: usize,
+    pub(super) first: usize,
     data: Vec<T>,
 }
 
@@ -74,16 +86,6 @@ impl<T: Copy + Default> Blocks<T> {
     /// Numbers per block.
     pub(super) fn stride(&self) -> usize {
         self.planes * WIDTH
-    }
-
-    /// Numbers per row.
-    pub(super) fn planes(&self) -> usize {
-        self.planes
-    }
-
-    /// The first row with numbers.
-    pub(super) fn first(&self) -> usize {
-        self.first
     }
 
     /// Numbers in the blocks of the rows before `rows`.
@@ -131,14 +133,19 @@ impl<T: Copy + Default> Blocks<T> {
         self.data[at] = value;
     }
 
-    pub(super) fn copy_row(&mut self, from: usize, to: usize) {
-        for plane in 0..self.planes {
-            self.set(to, plane, self.get(from, plane));
+    pub(super) fn edit(&mut self, edit: RowEdit<'_>) {
+        let planes = 0..self.planes;
+        match edit {
+            RowEdit::Clear(row) => planes.for_each(|plane| self.set(row, plane, T::default())),
+            RowEdit::Copy(from, to) => {
+                planes.for_each(|plane| self.set(to, plane, self.get(from, plane)));
+            }
+            RowEdit::Reorder(order) => self.reorder(order),
         }
     }
 
     /// Moves row `order[i]` to row i; rows before the first stay.
-    pub(super) fn reorder(&mut self, order: &[u32]) {
+    fn reorder(&mut self, order: &[u32]) {
         let order = order.get(self.first..).unwrap_or_default();
         let mut values = vec![T::default(); order.len()];
         // Plane by plane: rows mostly move by little, so that reads are mostly sequential.
@@ -149,12 +156,6 @@ impl<T: Copy + Default> Blocks<T> {
             for (row, &value) in (self.first..).zip(&values) {
                 self.set(row, plane, value);
             }
-        }
-    }
-
-    pub(super) fn clear_row(&mut self, row: usize) {
-        for plane in 0..self.planes {
-            self.set(row, plane, T::default());
         }
     }
 

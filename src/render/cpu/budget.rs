@@ -20,12 +20,14 @@ use super::tiles::{Grid, TileLists};
 use crate::candidates::Candidates;
 use crate::signals::{Field, counts_dominant};
 use crate::{BackendError, Setup};
+use densify_core::budget::RowBudget;
 use densify_core::memory::{Ledger, Section};
 
 /// The most (row, tile) pairs held at a time; at least the budget, as one tile's list holds each row at most once.
 pub(super) fn tile_cap(options: &Setup) -> usize {
-    let cap = options.tile_cap.unwrap_or(options.budget.saturating_mul(16));
-    cap.max(options.budget).max(1).min(u32::MAX as usize)
+    let rows = options.budget.total;
+    let cap = options.tile_cap.unwrap_or(rows.saturating_mul(16));
+    cap.max(rows).max(1).min(u32::MAX as usize)
 }
 
 /// The most gradient records held at a time; no more than pairs.
@@ -38,18 +40,18 @@ pub(super) fn trained(options: &Setup) -> Range<usize> {
     if options.only_renders {
         return 0..0;
     }
-    let budget = options.budget.max(1);
-    options.frozen.min(budget) / ROWS_PER_TASK * ROWS_PER_TASK..budget
+    let RowBudget { total, frozen } = options.row_budget();
+    frozen.min(total) / ROWS_PER_TASK * ROWS_PER_TASK..total
 }
 
 /// Rows in the buffer of summed records, frozen ones included.
 pub(super) fn summed_rows(options: &Setup) -> usize {
-    if options.only_renders { 0 } else { options.budget.max(1).next_multiple_of(WIDTH) }
+    if options.only_renders { 0 } else { options.row_budget().total.next_multiple_of(WIDTH) }
 }
 
 /// The ledger of a backend with these options.
 pub(super) fn ledger(sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
-    let budget = options.budget.max(1);
+    let budget = options.row_budget().total;
     let cap = tile_cap(options) as u64;
     let needs = &options.needs;
     let signals = Accumulators::new(0..1, needs);
@@ -186,8 +188,8 @@ mod tests {
                 + size_of_val(&backend.records[..]);
             (bytes, backend.ledger.total(), backend.render(&camera, [0.1; 3], 0).unwrap())
         });
-        let [(trains, promised, expected), (bytes, less, found)] = made;
-        assert!(bytes < 64 && trains - bytes == (promised - less) as usize, "{bytes} of {trains}");
+        let [(trains, planned, expected), (bytes, less, found)] = made;
+        assert!(bytes < 64 && trains - bytes == (planned - less) as usize, "{bytes} of {trains}");
         assert!(found == expected);
     }
 

@@ -23,7 +23,7 @@ impl Differentiable for CpuBackend {
         if self.records.len() < records {
             self.records = bytemuck::zeroed_vec(records);
         }
-        let frame = self.forward(camera, background, sh_degree, Beside::Depth)?;
+        let frame = self.forward(camera, background, sh_degree, Beside::Depth, None)?;
         let rendering = self.rendering(&frame);
         for (tile, gradient) in self.gradient[..frame.grid.tiles()].iter_mut().enumerate() {
             gradient.planes = [DARK; 5];

@@ -7,7 +7,7 @@ use densify_policies::policy::MaskTerm;
 use rayon::prelude::*;
 
 use super::adam::{BETA1, BETA2, BiasCorrection, EPSILON, LOGIT_MAX};
-use super::blocks::{BlockTask, Blocks, plane};
+use super::blocks::{BlockTask, Blocks, RowEdit, plane};
 use super::simd::WIDTH;
 use crate::{StateError, Tensor};
 use densify_core::gaussians::{logit, sigmoid};
@@ -81,16 +81,8 @@ impl Masks {
         }
     }
 
-    pub(super) fn clear_row(&mut self, row: usize) {
-        self.blocks.clear_row(row);
-    }
-
-    pub(super) fn copy_row(&mut self, from: usize, to: usize) {
-        self.blocks.copy_row(from, to);
-    }
-
-    pub(super) fn reorder(&mut self, order: &[u32]) {
-        self.blocks.reorder(order);
+    pub(super) fn edit(&mut self, edit: RowEdit<'_>) {
+        self.blocks.edit(edit);
     }
 
     pub(super) fn tensor(&self, name: &str, rows: Range<usize>) -> Tensor {

@@ -55,8 +55,9 @@ use super::{
     AuxInput, AuxOutput, Backend, BackendError, Inspect, NonFinite, Rendering, Setup, Shortcuts,
     StateArray, StateError, StepInput, StepOutput, Tensor, assert_fits, assert_same_size,
 };
-use adam::BiasCorrection;
+pub(crate) use adam::BiasCorrection;
 use blocks::{Blocks, planes};
+use densify_core::budget::RowBudget;
 use densify_core::camera::Camera;
 use densify_core::gaussians::{Gaussians, ModelArray};
 use densify_core::memory::Ledger;
@@ -78,9 +79,11 @@ use tiles::TileLists;
 pub use instructions::InstructionSet;
 pub use optimise::ModelGradient;
 pub use threads::StepTasks;
+#[cfg(feature = "gpu")]
+pub(crate) use {loss::SSIM_WEIGHT, project::FOLD, project::ViewParams};
 
 /// The largest side of an image `[px]`, at which every index of the stages still fits its type.
-const MAX_SIDE: u32 = 16_384;
+pub(crate) const MAX_SIDE: u32 = 16_384;
 /// Blocks per task: 128 rows, which have 100 kB of parameters and moments at degree 3. 50,000 rows give each of 64
 /// threads six tasks.
 const BLOCKS_PER_TASK: usize = 8;
@@ -92,9 +95,7 @@ pub struct CpuBackend {
     arch: Arch,
     threads: Arc<Threads>,
     ledger: Ledger,
-    budget: usize,
-    /// Number of frozen rows, which come first.
-    frozen: usize,
+    budget: RowBudget,
     rows: usize,
     sh_degree: u8,
     near: f32,
@@ -131,10 +132,10 @@ pub struct CpuBackend {
 }
 
 impl CpuBackend {
-    /// The ledger of a backend with these options for models of this degree, on `threads` threads, whatever
+    /// The bytes that a backend with these options allocates for models of this degree, on `threads` threads, whatever
     /// [`Setup::threads`] says.
     #[must_use]
-    pub fn promise(sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
+    pub fn memory_plan(sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
         budget::ledger(sh_degree, options, threads)
     }
 
@@ -146,8 +147,9 @@ impl CpuBackend {
     /// # Panics
     /// When the model has more rows than the budget: a bug in the caller, which must subsample.
     pub fn new(model: &Gaussians, options: &Setup) -> Result<Self, BackendError> {
-        let budget = options.budget.max(1);
-        assert!(model.len() <= budget, "{} rows over a budget of {budget}", model.len());
+        let budget = options.row_budget();
+        let rows = budget.total;
+        assert!(model.len() <= rows, "{} rows over a budget of {rows}", model.len());
         let threads = Threads::new(options.threads)?;
         let ledger = budget::ledger(model.sh_degree, options, threads.count());
         budget::reserve(&ledger)?;
@@ -157,14 +159,14 @@ impl CpuBackend {
         let (cap, record_cap) = (budget::tile_cap(options), budget::record_cap(options));
         let per_row = planes(model.sh_degree);
         let storage = options.storage;
-        let mut params = Parameters::zeros(budget, per_row, storage.parameters);
+        let mut params = Parameters::zeros(rows, per_row, storage.parameters);
         params.pack(model);
+        let counted = if counts_dominant(&options.needs) { rows } else { 0 };
         Ok(Self {
             arch: options.instructions.arch(),
             threads: Arc::new(threads),
             ledger,
             budget,
-            frozen: options.frozen,
             rows: model.len(),
             sh_degree: model.sh_degree,
             near: options.near,
@@ -177,14 +179,10 @@ impl CpuBackend {
             masks: Masks::new(trained, options.needs.mask),
             signals,
             candidates: Candidates::new(options.needs.candidates),
-            dominant: bytemuck::zeroed_vec(if counts_dominant(&options.needs) {
-                budget
-            } else {
-                0
-            }),
-            splats: vec![Splat::default(); budget],
-            visible: vec![0; budget.div_ceil(WIDTH)],
-            lists: TileLists::new(budget, cap),
+            dominant: bytemuck::zeroed_vec(counted),
+            splats: vec![Splat::default(); rows],
+            visible: vec![0; rows.div_ceil(WIDTH)],
+            lists: TileLists::new(rows, cap),
             canvas: Vec::new(),
             gradient: Vec::new(),
             loss: LossBuffers::new(),
@@ -214,14 +212,13 @@ impl CpuBackend {
     fn step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
         let StepInput { camera, target, background, exposure, .. } = *input;
         let behind = exposure.map_or(background, |exposure| exposure.behind(background));
-        let frame = self.forward(camera, behind, input.sh_degree, Beside::Nothing)?;
+        let frame = self.forward(camera, behind, input.sh_degree, Beside::Nothing, None)?;
         if let Some(exposure) = exposure {
             self.expose(&frame.grid, exposure);
         }
         let picks = self.candidates.to_take(input.step, self.rows);
         let weights = picks.and_then(|(request, _)| error_weights(request.error));
-        let by_pixel =
-            self.signals.layout().has(Field::Error).then_some(self.signals.planes().score);
+        let by_pixel = self.signals.layout().has(Field::Error).then_some(self.signals.planes.score);
         let terms = ImageTerms { error: weights, by_pixel };
         let value = self.image_loss(&frame.grid, target, background, terms);
         let by_exposure =
@@ -253,7 +250,7 @@ impl Backend for CpuBackend {
     }
 
     fn budget(&self) -> usize {
-        self.budget
+        self.budget.total
     }
 
     fn ledger(&self) -> &Ledger {
@@ -290,11 +287,11 @@ impl Backend for CpuBackend {
     }
 
     fn candidates(&self) -> &[Candidate] {
-        self.candidates.list()
+        &self.candidates.list
     }
 
     fn apply(&mut self, ops: &RowOps, seed: u64, step: u32) -> Result<(), BackendError> {
-        assert_fits(ops, self.frozen, self.rows, self.budget);
+        assert_fits(ops, self.rows, self.budget);
         let mut model = apply::Model {
             params: &mut self.params,
             moments: &mut self.moments,
@@ -307,7 +304,7 @@ impl Backend for CpuBackend {
         apply::apply(&mut model, ops, &PolicyRng::new(seed, step));
         self.rows = ops.rows_after;
         if ops.reset_candidates {
-            self.candidates.clear();
+            self.candidates.list.clear();
         }
         Ok(())
     }
@@ -322,7 +319,7 @@ impl Backend for CpuBackend {
         background: [f32; 3],
         sh_degree: u8,
     ) -> Result<Rendering, BackendError> {
-        let frame = self.forward(camera, background, sh_degree, Beside::Depth)?;
+        let frame = self.forward(camera, background, sh_degree, Beside::Depth, None)?;
         Ok(self.rendering(&frame))
     }
 
@@ -377,7 +374,7 @@ impl Inspect for CpuBackend {
         colours: &[[f32; 3]],
     ) -> Result<Rendering, BackendError> {
         assert_eq!(colours.len(), self.rows, "one colour per row");
-        let frame = self.forward_painted(camera, background, 0, Beside::Depth, Some(colours))?;
+        let frame = self.forward(camera, background, 0, Beside::Depth, Some(colours))?;
         Ok(self.rendering(&frame))
     }
 
@@ -386,7 +383,7 @@ impl Inspect for CpuBackend {
     }
 
     fn render_counts(&mut self, camera: &Camera) -> Result<Rendering, BackendError> {
-        let frame = self.forward(camera, [0.0; 3], 0, Beside::Count)?;
+        let frame = self.forward(camera, [0.0; 3], 0, Beside::Count, None)?;
         Ok(self.rendering(&frame))
     }
 }

@@ -9,7 +9,7 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::blocks::{BlockTask, BlockView, Blocks, Scratch};
+use super::blocks::{BlockTask, BlockView, Blocks, RowEdit, Scratch};
 use super::narrow::{Draws, F8, Narrow, first_moment, first_moments, narrow, ratios, widen};
 use super::simd::WIDTH;
 use crate::{MomentStorage, StateError, Tensor};
@@ -58,30 +58,17 @@ impl Moments {
 
     /// The first row with moments.
     pub(super) fn first(&self) -> usize {
-        self.ratios.first()
+        self.ratios.first
     }
 
     fn is_narrow(&self) -> bool {
-        self.ratios.planes() > 0
+        self.ratios.planes > 0
     }
 
-    pub(super) fn clear_row(&mut self, row: usize) {
-        self.wide.iter_mut().for_each(|blocks| blocks.clear_row(row));
-        self.ratios.clear_row(row);
-        self.seconds.clear_row(row);
-    }
-
-    /// Copies the stored bits.
-    pub(super) fn copy_row(&mut self, from: usize, to: usize) {
-        self.wide.iter_mut().for_each(|blocks| blocks.copy_row(from, to));
-        self.ratios.copy_row(from, to);
-        self.seconds.copy_row(from, to);
-    }
-
-    pub(super) fn reorder(&mut self, order: &[u32]) {
-        self.wide.iter_mut().for_each(|blocks| blocks.reorder(order));
-        self.ratios.reorder(order);
-        self.seconds.reorder(order);
+    pub(super) fn edit(&mut self, edit: RowEdit<'_>) {
+        self.wide.iter_mut().for_each(|blocks| blocks.edit(edit));
+        self.ratios.edit(edit);
+        self.seconds.edit(edit);
     }
 
     /// Resets the moments of one parameter.
@@ -206,7 +193,8 @@ impl<'a> MomentView<'a> {
 /// The moments of a task's blocks.
 #[derive(Debug)]
 pub(super) struct MomentTask<'a> {
-    is_narrow: bool,
+    /// True if the stored format is not f32.
+    pub(super) is_narrow: bool,
     wide: [BlockTask<'a, f32>; 2],
     ratios: BlockTask<'a, i8>,
     seconds: BlockTask<'a, F8>,
@@ -247,12 +235,6 @@ impl MomentTask<'_> {
         let second = &mut self.seconds.block(block)[..used];
         narrow(&v.0[..used], second, of_v);
         ratios(&m.0[..used], second, &mut self.ratios.block(block)[..used], of_m);
-    }
-
-    /// Returns whether the stored format is not f32.
-    #[inline(always)]
-    pub(super) fn is_narrow(&self) -> bool {
-        self.is_narrow
     }
 }
 

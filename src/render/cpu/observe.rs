@@ -50,7 +50,7 @@ impl CpuBackend {
         assert_same_size(camera, target);
         // Stage times remain those of training.
         let clock = std::mem::take(&mut self.clock);
-        let frame = self.forward(camera, behind, input.sh_degree, Beside::Nothing);
+        let frame = self.forward(camera, behind, input.sh_degree, Beside::Nothing, None);
         let measured = frame.map(|frame| {
             if let Some(exposure) = exposure {
                 self.expose(&frame.grid, exposure);

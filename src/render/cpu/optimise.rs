@@ -75,8 +75,8 @@ impl WithSimd for Optimise<'_> {
         let mut gradient = BlockGradient::ZERO;
         let mut was_zero = true;
         let signal_stride = signals.len() / visible.len().max(1);
-        let slack = if stored.is_narrow() { NARROW_SLACK } else { 0.0 };
-        let is_narrow = stored.is_narrow() || moments.is_narrow();
+        let slack = if stored.is_narrow { NARROW_SLACK } else { 0.0 };
+        let is_narrow = stored.is_narrow || moments.is_narrow;
         let mut scratch = Scratch::ZERO;
         let mut moment_scratch = [Scratch::ZERO; 2];
         let mut kept = Scratch::ZERO;
@@ -114,7 +114,7 @@ impl WithSimd for Optimise<'_> {
                 was_zero = false;
             }
             if due.uses_sums() {
-                was_zero &= !summed.exchange(b, &mut gradient.params, trained, due);
+                was_zero &= !summed.take_gradient(b, &mut gradient.params, trained, due);
             }
             let lanes = b * WIDTH..(b + 1) * WIDTH;
             let [m, v] = moments.open(b, trained, &mut moment_scratch);
@@ -232,7 +232,7 @@ impl WithSimd for Differentiate<'_> {
         let mut g = BlockGradient::ZERO;
         let mut scratch = Scratch::ZERO;
         let trained = planes(view.sh_degree) - plane::SH;
-        for b in 0..params.blocks() {
+        for b in 0..params.blocks {
             let block = params.open(b, planes(view.sh_degree), &mut scratch);
             let sums = &sums[b * per_block..(b + 1) * per_block];
             g.compute(s, block, sums, RecordLayout::ALL, visible[b], view);

@@ -13,7 +13,7 @@ use std::ops::Range;
 use rayon::prelude::*;
 
 use super::BLOCKS_PER_TASK;
-use super::blocks::{BlockTask, BlockView, Blocks, Scratch, plane};
+use super::blocks::{BlockTask, BlockView, Blocks, RowEdit, Scratch, plane};
 use super::narrow::{Draws, F16, Narrow, fixed, narrow, narrow_fixed, widen, widen_fixed};
 use super::simd::WIDTH;
 use crate::ParameterStorage;
@@ -77,11 +77,11 @@ impl Parameters {
 
     /// Numbers per row.
     pub(super) fn planes(&self) -> usize {
-        self.wide.planes() + self.fixed.planes() + self.half.planes()
+        self.wide.planes + self.fixed.planes + self.half.planes
     }
 
     fn is_narrow(&self) -> bool {
-        self.fixed.planes() > 0
+        self.fixed.planes > 0
     }
 
     fn is_wide(&self, plane: usize) -> bool {
@@ -121,23 +121,10 @@ impl Parameters {
         }
     }
 
-    /// Copies the stored bits.
-    pub(super) fn copy_row(&mut self, from: usize, to: usize) {
-        self.wide.copy_row(from, to);
-        self.fixed.copy_row(from, to);
-        self.half.copy_row(from, to);
-    }
-
-    pub(super) fn reorder(&mut self, order: &[u32]) {
-        self.wide.reorder(order);
-        self.fixed.reorder(order);
-        self.half.reorder(order);
-    }
-
-    pub(super) fn clear_row(&mut self, row: usize) {
-        self.wide.clear_row(row);
-        self.fixed.clear_row(row);
-        self.half.clear_row(row);
+    pub(super) fn edit(&mut self, edit: RowEdit<'_>) {
+        self.wide.edit(edit);
+        self.fixed.edit(edit);
+        self.half.edit(edit);
     }
 
     /// Stores a host model; `self` must have room for its rows, and its number of planes.
@@ -197,7 +184,8 @@ impl Parameters {
 /// A read-only view of consecutive blocks.
 #[derive(Debug, Clone)]
 pub(super) struct ParameterView<'a> {
-    blocks: usize,
+    /// Number of blocks.
+    pub(super) blocks: usize,
     is_narrow: bool,
     wide: BlockView<'a, f32>,
     fixed: BlockView<'a, i16>,
@@ -216,10 +204,6 @@ impl<'a> ParameterView<'a> {
             fixed: self.fixed.part(part.clone()),
             half: self.half.part(part),
         }
-    }
-
-    pub(super) fn blocks(&self) -> usize {
-        self.blocks
     }
 
     /// A block as f32: at least the first `planes` planes.
@@ -245,19 +229,14 @@ impl<'a> ParameterView<'a> {
 /// The blocks of a task.
 #[derive(Debug)]
 pub(super) struct ParameterTask<'a> {
-    is_narrow: bool,
+    /// True if the stored format is not f32.
+    pub(super) is_narrow: bool,
     wide: BlockTask<'a, f32>,
     fixed: BlockTask<'a, i16>,
     half: BlockTask<'a, F16>,
 }
 
 impl ParameterTask<'_> {
-    /// Returns whether the stored format is not f32.
-    #[inline(always)]
-    pub(super) fn is_narrow(&self) -> bool {
-        self.is_narrow
-    }
-
     /// A block as f32: at least the first `planes` planes.
     #[inline(always)]
     pub(super) fn open<'b>(

@@ -17,7 +17,7 @@ use super::rasterize::{
     Beside, Blending, CANVAS_PLANES, DARK, DEPTH, Rasterize, TRANSMITTANCE, TileCanvas, TilePlace,
     in_plane,
 };
-use super::rasterize_bwd::{Blended, RasterizeBwd, TileGradient, gather};
+use super::rasterize_bwd::{RasterizeBwd, TileGradient, gather};
 use super::records::{Sums, parts as parts_of_records};
 use super::regularise::{Noise, Terms};
 use super::simd::WIDTH;
@@ -65,19 +65,9 @@ impl CpuBackend {
         value
     }
 
-    /// Stages 1–3. Afterwards the canvas holds the image and, if there is only one band, the lists hold its entries.
+    /// Stages 1–3, with `colours` instead of the rows' own, if given. Afterwards the canvas holds the image and, if there
+    /// is only one band, the lists hold its entries.
     pub(super) fn forward(
-        &mut self,
-        camera: &Camera,
-        background: [f32; 3],
-        sh_degree: u8,
-        beside: Beside,
-    ) -> Result<Frame, BackendError> {
-        self.forward_painted(camera, background, sh_degree, beside, None)
-    }
-
-    /// The same, with `colours` instead of the rows' own, if given.
-    pub(super) fn forward_painted(
         &mut self,
         camera: &Camera,
         background: [f32; 3],
@@ -194,21 +184,26 @@ impl CpuBackend {
                 let cap = records.len() / stride;
                 for part in parts_of_records(threads, lists, band.len(), cap) {
                     let tiles = part.tiles.clone();
-                    threads.each_with("rasterize_bwd", tiles, Blended::boxed, |blended, i| {
-                        let tile = band.start + i;
-                        arch.dispatch(RasterizeBwd {
-                            splats,
-                            list: lists.of_tile(i),
-                            place: TilePlace::new(grid, tile),
-                            background: *background,
-                            blending,
-                            canvas: &canvas[tile],
-                            upstream: &gradient[tile],
-                            layout,
-                            records: part.records(lists, i, records, stride),
-                            blended,
-                        });
-                    });
+                    threads.each_with(
+                        "rasterize_bwd",
+                        tiles,
+                        bytemuck::zeroed_box,
+                        |blended, i| {
+                            let tile = band.start + i;
+                            arch.dispatch(RasterizeBwd {
+                                splats,
+                                list: lists.of_tile(i),
+                                place: TilePlace::new(grid, tile),
+                                background: *background,
+                                blending,
+                                canvas: &canvas[tile],
+                                upstream: &gradient[tile],
+                                layout,
+                                records: part.records(lists, i, records, stride),
+                                blended,
+                            });
+                        },
+                    );
                     clock.lap("rasterize_bwd");
                     let add = |sum: &mut [f32], records: &[_]| gather(sum, layout, records);
                     let to = Sums { sums, stride, fresh, visible };
@@ -256,9 +251,8 @@ impl CpuBackend {
             threads.install(|| candidates::rank(threads, ranking, size, most, error))
         };
         let worst = candidates.worst_by(size, count, request.spaced, rank, error);
-        for candidate in self.surface_points(frame, photograph, &worst, request.depth) {
-            self.candidates.push(candidate);
-        }
+        let points = self.surface_points(frame, photograph, &worst, request.depth);
+        self.candidates.list.extend(points);
     }
 
     /// The surface points of pixels (x, y, error) of the view, in order, without pixels that show no surface.
@@ -333,11 +327,12 @@ impl CpuBackend {
             threads, arch, params, moments, masks, ages, signals, sums, visible, bias, ..
         } = self;
         let dominant = &self.dominant[..self.rows.min(self.dominant.len())];
-        let (rows, frozen, arch) = (self.rows, self.frozen, *arch);
-        let terms = Terms::new(input.loss_terms, rows - frozen);
+        let (rows, frozen, arch) = (self.rows, self.budget.frozen, *arch);
+        let trained = self.budget.trained(rows);
+        let terms = Terms::new(input.loss_terms, trained);
         let noise = input.noise.map(|term| Noise::new(term, input));
         let due = self.summed.advance(input);
-        let (planes, layout) = (signals.planes(), signals.layout());
+        let (planes, layout) = (signals.planes, signals.layout());
         let signal_stride = signals.blocks.stride();
         let storing = PolicyRng::new(input.seed, input.step);
         // Tasks of frozen rows only are skipped.
@@ -349,7 +344,7 @@ impl CpuBackend {
         let parts = (
             params.tasks(rows).skip(first_row / ROWS_PER_TASK),
             moments.tasks(rows),
-            masks.tasks(rows, rows - frozen),
+            masks.tasks(rows, trained),
             ages.of_rows_mut(rows).par_chunks_mut(ROWS_PER_TASK),
             parts(signals.blocks.of_rows_mut(rows), per_task, tasks),
             sums.par_chunks(ROWS_PER_TASK * layout.stride()),

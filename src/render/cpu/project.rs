@@ -31,28 +31,28 @@ const FOV_MARGIN: f64 = 0.15;
 /// Rows with a larger colour are broken and not drawn: added to a pixel, it would cancel all bits of the others.
 const COLOUR_MAX: f32 = 1e6;
 /// √(½·log₂ e): folded into the conic so that exp(−p) becomes 2^(−u² − z²).
-pub(super) const FOLD: f32 = 0.849_321_8;
+pub(crate) const FOLD: f32 = 0.849_321_8;
 
 /// A camera in the form that the kernels use.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct ViewParams {
+pub(crate) struct ViewParams {
     /// Rows of camera_from_world's rotation.
-    pub(super) rotation: [[f32; 3]; 3],
-    pub(super) translation: [f32; 3],
-    pub(super) centre: [f32; 3],
-    pub(super) focal: [f32; 2],
-    pub(super) principal: [f32; 2],
+    pub(crate) rotation: [[f32; 3]; 3],
+    pub(crate) translation: [f32; 3],
+    pub(crate) centre: [f32; 3],
+    pub(crate) focal: [f32; 2],
+    pub(crate) principal: [f32; 2],
     /// Bounds of x/z and y/z in J.
-    pub(super) ratio_min: [f32; 2],
-    pub(super) ratio_max: [f32; 2],
-    pub(super) width: u32,
-    pub(super) height: u32,
-    pub(super) near: f32,
-    pub(super) sh_degree: u8,
+    pub(crate) ratio_min: [f32; 2],
+    pub(crate) ratio_max: [f32; 2],
+    pub(crate) width: u32,
+    pub(crate) height: u32,
+    pub(crate) near: f32,
+    pub(crate) sh_degree: u8,
 }
 
 impl ViewParams {
-    pub(super) fn new(camera: &Camera, near: f32, sh_degree: u8) -> Self {
+    pub(crate) fn new(camera: &Camera, near: f32, sh_degree: u8) -> Self {
         let c = camera;
         let low = |p: f64, size: f64, f: f64| ((-FOV_MARGIN * size - p) / f) as f32;
         let high = |p: f64, size: f64, f: f64| (((1.0 + FOV_MARGIN) * size - p) / f) as f32;
@@ -306,7 +306,7 @@ impl WithSimd for Project<'_> {
         let degree = view.sh_degree;
         let grid = Grid::new(view.width, view.height);
         let mut scratch = Scratch::ZERO;
-        for b in 0..self.params.blocks() {
+        for b in 0..self.params.blocks {
             let block = self.params.open(b, planes(degree), &mut scratch);
             let mut out = [[0.0_f32; WIDTH]; SPLAT_FIELDS];
             let mut on_screen = [0.0_f32; WIDTH];

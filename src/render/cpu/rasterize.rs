@@ -170,19 +170,19 @@ impl WithSimd for Rasterize<'_> {
         // used features share one kernel.
         let with_more = self.beside != Beside::Nothing || !self.dominant.is_empty();
         match (with_more, matches!(S::F32_LANES, 4 | 8)) {
-            (true, true) => self.run::<S, true, 2>(s),
-            (true, false) => self.run::<S, true, 1>(s),
-            (false, true) => self.run::<S, false, 2>(s),
-            (false, false) => self.run::<S, false, 1>(s),
+            (true, true) => self.blend::<S, true, 2>(s),
+            (true, false) => self.blend::<S, true, 1>(s),
+            (false, true) => self.blend::<S, false, 2>(s),
+            (false, false) => self.blend::<S, false, 1>(s),
         }
     }
 }
 
 impl Rasterize<'_> {
-    /// Draws the tile, `N` vectors of a patch at a time.
+    /// Blends the list into the tile, `N` vectors of a patch at a time.
     #[inline(always)]
     #[expect(clippy::too_many_lines, reason = "a numeric kernel")]
-    fn run<S: Simd, const WITH_MORE: bool, const N: usize>(self, s: S) {
+    fn blend<S: Simd, const WITH_MORE: bool, const N: usize>(self, s: S) {
         let Self { splats, list, place, background, dominant, canvas, blending, beside } = self;
         let counts = beside == Beside::Count;
         let c = |x: f32| V::splat(s, x);
@@ -309,9 +309,9 @@ impl Rasterize<'_> {
             for at in (0..WIDTH).step_by(S::F32_LANES) {
                 let t = V::load(s, &light[p][at..]).max(V::load(s, &finished[p][at..]));
                 t.store(&mut finished[p][at..]);
-                blend(s, t, c(background[0]), &mut red[p][at..]);
-                blend(s, t, c(background[1]), &mut green[p][at..]);
-                blend(s, t, c(background[2]), &mut blue[p][at..]);
+                add_product(s, t, c(background[0]), &mut red[p][at..]);
+                add_product(s, t, c(background[1]), &mut green[p][at..]);
+                add_product(s, t, c(background[2]), &mut blue[p][at..]);
             }
         }
         if WITH_MORE && !dominant.is_empty() {
@@ -326,7 +326,7 @@ impl Rasterize<'_> {
 
 /// Adds w·x to a plane.
 #[inline(always)]
-fn blend<S: Simd>(s: S, w: V<S>, x: V<S>, plane: &mut [f32]) {
+fn add_product<S: Simd>(s: S, w: V<S>, x: V<S>, plane: &mut [f32]) {
     w.mul_add(x, V::load(s, plane)).store(plane);
 }
 

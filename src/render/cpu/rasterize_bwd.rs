@@ -94,9 +94,9 @@ impl WithSimd for RasterizeBwd<'_> {
         // program. Values that are not requested are not written.
         if const { S::F32_LANES == 1 } {
             if has(Field::Depth) {
-                self.run::<S, { extra::ALL }>(s);
+                self.backpropagate::<S, { extra::ALL }>(s);
             } else {
-                self.run::<S, { extra::ERROR_ABS }>(s);
+                self.backpropagate::<S, { extra::ERROR_ABS }>(s);
             }
             return;
         }
@@ -117,17 +117,17 @@ impl WithSimd for RasterizeBwd<'_> {
             extras = extra::ALL;
         }
         match extras {
-            0 => self.run::<S, 0>(s),
-            1 => self.run::<S, 1>(s),
-            2 => self.run::<S, 2>(s),
-            3 => self.run::<S, 3>(s),
-            4 => self.run::<S, 4>(s),
-            5 => self.run::<S, 5>(s),
-            6 => self.run::<S, 6>(s),
-            7 => self.run::<S, 7>(s),
-            extra::ERROR => self.run::<S, { extra::ERROR }>(s),
-            extra::ERROR_ABS => self.run::<S, { extra::ERROR_ABS }>(s),
-            _ => self.run::<S, { extra::ALL }>(s),
+            0 => self.backpropagate::<S, 0>(s),
+            1 => self.backpropagate::<S, 1>(s),
+            2 => self.backpropagate::<S, 2>(s),
+            3 => self.backpropagate::<S, 3>(s),
+            4 => self.backpropagate::<S, 4>(s),
+            5 => self.backpropagate::<S, 5>(s),
+            6 => self.backpropagate::<S, 6>(s),
+            7 => self.backpropagate::<S, 7>(s),
+            extra::ERROR => self.backpropagate::<S, { extra::ERROR }>(s),
+            extra::ERROR_ABS => self.backpropagate::<S, { extra::ERROR_ABS }>(s),
+            _ => self.backpropagate::<S, { extra::ALL }>(s),
         }
     }
 }
@@ -142,12 +142,6 @@ pub(super) struct Blended {
     alpha: [[f32; WIDTH]; PAIRS],
     /// α·Π(1 − α), the product over the splats of the batch in front.
     weight: [[f32; WIDTH]; PAIRS],
-}
-
-impl Blended {
-    pub(super) fn boxed() -> Box<Self> {
-        bytemuck::zeroed_box()
-    }
 }
 
 /// Sums of one entry, lane by lane.
@@ -213,7 +207,7 @@ impl RasterizeBwd<'_> {
 
     #[inline(always)]
     #[expect(clippy::too_many_lines, reason = "a numeric kernel")]
-    fn run<S: Simd, const EXTRAS: u8>(mut self, s: S) {
+    fn backpropagate<S: Simd, const EXTRAS: u8>(mut self, s: S) {
         let Self { splats, list, place, background, canvas, upstream, layout, records, .. } = self;
         let c = |x: f32| V::splat(s, x);
         let [gr, gg, gb, ga, map] = &upstream.planes;

@@ -21,7 +21,7 @@ use crate::signals::{Field, ParameterSignal, RecordLayout, SignalPlanes, as_read
 #[derive(Debug)]
 pub(super) struct Accumulators {
     requested: SignalSet,
-    planes: SignalPlanes,
+    pub(super) planes: SignalPlanes,
     pub(super) blocks: Blocks,
 }
 
@@ -138,10 +138,6 @@ impl Accumulators {
         Blocks::<f32>::bytes(rows, SignalPlanes::new(needs).count)
     }
 
-    pub(super) fn planes(&self) -> SignalPlanes {
-        self.planes
-    }
-
     /// The record layout of the requested signals.
     pub(super) fn layout(&self) -> RecordLayout {
         RecordLayout::new(self.requested)
@@ -209,7 +205,7 @@ impl Accumulators {
             let width = signal.width();
             let tasks = column.par_chunks_mut(ROWS_PER_TASK * width).enumerate();
             let of_task = |(task, column): (usize, &mut [f32])| {
-                if task < self.blocks.first() / ROWS_PER_TASK {
+                if task < self.blocks.first / ROWS_PER_TASK {
                     column.fill(0.0);
                     return;
                 }

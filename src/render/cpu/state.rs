@@ -6,7 +6,7 @@ use std::ops::Range;
 use super::CpuBackend;
 use super::blocks::planes;
 use super::signals::Accumulators;
-use super::summed::Summed;
+use super::summed::WAITING;
 use crate::{StateArray, StateError, Tensor};
 
 const MOMENTS: [&str; 2] = ["moments.first", "moments.second"];
@@ -23,17 +23,19 @@ impl CpuBackend {
         let of_rows = MOMENTS.into_iter().chain([AGES]).map(StateArray::of_rows);
         let mut arrays: Vec<StateArray> = of_rows.collect();
         arrays.extend(self.masks.is_declared().then(|| StateArray::of_rows(MASKS)));
-        let signals = self.signals.planes().kept();
+        let signals = self.signals.planes.kept();
         arrays.extend(
             signals.into_iter().map(|(name, _)| StateArray::of_rows(format!("{SIGNAL}{name}"))),
         );
-        if self.candidates.is_requested() {
+        if self.candidates.request.is_some() {
             arrays.push(StateArray::small(CANDIDATES));
         }
-        arrays.extend(self.summed.state().iter().map(|part| StateArray {
-            name: format!("{SUMMED}{part}"),
-            by_rows: Summed::is_by_rows(part),
-        }));
+        arrays.extend(
+            self.summed.state().iter().map(|part| StateArray {
+                name: format!("{SUMMED}{part}"),
+                by_rows: *part != WAITING,
+            }),
+        );
         arrays
     }
 
@@ -78,7 +80,7 @@ impl CpuBackend {
             self.ages.set_rows(rows, 0..1, &ages);
         } else if name == MASKS && self.masks.is_declared() {
             self.masks.restore(rows, tensor)?;
-        } else if name == CANDIDATES && self.candidates.is_requested() {
+        } else if name == CANDIDATES && self.candidates.request.is_some() {
             self.candidates.restore(tensor)?;
         } else if let Some(plane) = signal_plane(&self.signals, &name) {
             let values = tensor.into_f32(&[rows.len()])?;
@@ -94,5 +96,5 @@ impl CpuBackend {
 
 fn signal_plane(signals: &Accumulators, name: &str) -> Option<usize> {
     let name = name.strip_prefix(SIGNAL)?;
-    signals.planes().kept().into_iter().find(|(signal, _)| signal == name).map(|(_, plane)| plane)
+    signals.planes.kept().into_iter().find(|(signal, _)| signal == name).map(|(_, plane)| plane)
 }

@@ -11,7 +11,7 @@ use densify_policies::policy::Cadence;
 use rayon::prelude::*;
 
 use super::ROWS_PER_TASK;
-use super::blocks::{BlockTask, Blocks, parts, plane};
+use super::blocks::{BlockTask, Blocks, RowEdit, parts, plane};
 use super::simd::WIDTH;
 use crate::{StateError, StepInput, Tensor};
 
@@ -48,7 +48,7 @@ pub(super) struct TaskSums<'a> {
 
 /// Names of the state arrays.
 const GRADIENTS: &str = "gradients";
-const WAITING: &str = "waiting";
+pub(super) const WAITING: &str = "waiting";
 const REST_AGES: &str = "rest_ages";
 
 /// The first plane to sum for a cadence; `planes` if none is.
@@ -110,22 +110,17 @@ impl Summed {
     pub(super) fn state(&self) -> &'static [&'static str] {
         if !Self::is_needed(self.longest) {
             &[]
-        } else if self.rest_ages.planes() == 0 {
+        } else if self.rest_ages.planes == 0 {
             &[GRADIENTS, WAITING]
         } else {
             &[GRADIENTS, WAITING, REST_AGES]
         }
     }
 
-    /// Returns whether a state array is by rows.
-    pub(super) fn is_by_rows(part: &str) -> bool {
-        part != WAITING
-    }
-
     /// A state array: sums `[rows, summed planes]`, waiting groups `[2]`, or ages of bands 1–3
     /// `[rows]`.
     pub(super) fn tensor(&self, part: &str, rows: Range<usize>) -> Option<Tensor> {
-        let planes = self.planes();
+        let planes = self.sums.planes;
         let name = format!("summed.{part}");
         let part = self.state().iter().find(|known| **known == part)?;
         Some(match *part {
@@ -148,7 +143,7 @@ impl Summed {
         rows: Range<usize>,
         tensor: Tensor,
     ) -> Result<(), StateError> {
-        let planes = self.planes();
+        let planes = self.sums.planes;
         match self.state().iter().find(|known| **known == part) {
             None => return Err(tensor.error("this run has no such array")),
             Some(&GRADIENTS) => {
@@ -168,29 +163,14 @@ impl Summed {
         Ok(())
     }
 
-    /// Number of summed planes.
-    fn planes(&self) -> usize {
-        self.sums.planes()
-    }
-
-    pub(super) fn clear_row(&mut self, row: usize) {
-        self.sums.clear_row(row);
-        self.rest_ages.clear_row(row);
-    }
-
-    pub(super) fn copy_row(&mut self, from: usize, to: usize) {
-        self.sums.copy_row(from, to);
-        self.rest_ages.copy_row(from, to);
-    }
-
-    pub(super) fn reorder(&mut self, order: &[u32]) {
-        self.sums.reorder(order);
-        self.rest_ages.reorder(order);
+    pub(super) fn edit(&mut self, edit: RowEdit<'_>) {
+        self.sums.edit(edit);
+        self.rest_ages.edit(edit);
     }
 
     /// Resets the sum of one parameter.
     pub(super) fn reset(&mut self, row: usize, plane: usize) {
-        if let Some(summed) = plane.checked_sub(self.first).filter(|&p| p < self.planes()) {
+        if let Some(summed) = plane.checked_sub(self.first).filter(|&p| p < self.sums.planes) {
             self.sums.set(row, summed, 0.0);
         }
     }
@@ -211,7 +191,7 @@ impl TaskSums<'_> {
 
     /// Adds the gradient of a block to the sums of the waiting groups, and the sums of the stepping groups to the
     /// gradient. Returns whether the gradient has changed.
-    pub(super) fn exchange(
+    pub(super) fn take_gradient(
         &mut self,
         block: usize,
         gradient: &mut [f32],

@@ -3,7 +3,8 @@
 use super::GpuBackend;
 use super::launches::{Audit, MOMENTS};
 use super::passes::Recorder;
-use crate::{Attribute, BackendError, NonFinite, NumberKind};
+use crate::{BackendError, NonFinite, NumberKind};
+use densify_core::gaussians::ModelArray;
 
 impl GpuBackend {
     /// The rows with a number that is not finite, in order.
@@ -24,8 +25,8 @@ impl GpuBackend {
         let marked = (0..).zip(&marks).filter_map(|(row, mark)| {
             let place = mark.to_bits().checked_sub(1)?;
             let kind = if place < MOMENTS { NumberKind::Parameter } else { NumberKind::Moment };
-            let attribute = Attribute::of_parameter((place % MOMENTS) as usize);
-            Some(NonFinite { row, attribute, kind })
+            let array = ModelArray::of_parameter((place % MOMENTS) as usize);
+            Some(NonFinite { row, array, kind })
         });
         Ok(marked.collect())
     }

@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use wgpu::{Buffer, BufferDescriptor};
 
 use super::device::Device;
-use super::sizes::{MATURE, Planned, Sizes};
+use super::sizes::{Planned, Sizes};
 use crate::{BackendError, Fit};
 
 /// The buffers, by name.
@@ -93,16 +93,4 @@ fn check_sizes(device: &Device, planned: &[Planned], sizes: &Sizes) -> Result<()
         most,
         fit,
     })
-}
-
-/// Adam's bias corrections by age: 1/(1 − β₁^age) and √(1/(1 − β₂^age)).
-pub(super) fn bias_table() -> Vec<[f32; 2]> {
-    (0..=MATURE as i32)
-        .map(|age| {
-            let age = age.max(1);
-            let first = 1.0 / (1.0 - f64::from(0.9_f32).powi(age));
-            let second = 1.0 / (1.0 - f64::from(0.999_f32).powi(age));
-            [first as f32, second.sqrt() as f32]
-        })
-        .collect()
 }

@@ -2,8 +2,7 @@
 
 use super::GpuBackend;
 use super::frame::{Frame, State, grid};
-use super::observe::FOLD;
-use crate::cpu::ModelGradient;
+use crate::cpu::{FOLD, ModelGradient};
 use crate::signals::{Field, RecordLayout};
 use crate::{BackendError, Differentiable, ImageGradient, Rendering, StepOutput};
 use densify_core::camera::Camera;
@@ -19,7 +18,7 @@ impl GpuBackend {
         let sums = self.read("row sums", 0, 4 * RecordLayout::MOST as u64 * n)?;
         let splats = self.read("splats", 0, 48 * n)?;
         let depths = self.read("depths", 0, 4 * n)?;
-        let planes = self.sizes.sh_numbers();
+        let planes = 3 * sh_coefficients(self.sizes.sh_degree);
         let mut out = ModelGradient { sh: vec![0.0; planes * self.rows], ..Default::default() };
         let rows =
             gradient.as_chunks::<20>().0.iter().zip(sums.as_chunks::<{ RecordLayout::MOST }>().0);
@@ -66,7 +65,7 @@ impl Differentiable for GpuBackend {
         upstream: &ImageGradient,
     ) -> Result<(Rendering, ModelGradient), BackendError> {
         upstream.assert_size(camera);
-        assert_eq!(self.sizes.frozen, 0, "frozen rows have no gradients");
+        assert_eq!(self.sizes.budget.frozen, 0, "frozen rows have no gradients");
         if !self.sizes.alpha_and_depth {
             (self.sizes.alpha_and_depth, self.sizes.records) = (true, RecordLayout::ALL);
             self.rebuild()?;

@@ -4,16 +4,13 @@
 use bytemuck::{Pod, Zeroable};
 use densify_policies::policy::{ErrorScore, Signal};
 
+use crate::cpu::{SSIM_WEIGHT, ViewParams};
 use crate::signals::SignalPlanes;
 use crate::{StepInput, StepOutput};
 use densify_core::camera::Camera;
 
 /// Side of a tile `[px]`.
 pub(super) const TILE: u32 = 16;
-/// Margin around the image beyond which the direction in the Jacobian is clamped, as a fraction of the image's size.
-const FOV_MARGIN: f64 = 0.15;
-/// Weight of 1 − SSIM in the loss; L1 has the rest.
-const SSIM_WEIGHT: f32 = 0.2;
 
 /// See `Frame` in `shaders/shared/view.wgsl`.
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
@@ -110,41 +107,39 @@ impl Frame {
         near: f32,
         [rows, sh_degree, cap, trained]: [u32; 4],
     ) -> Self {
-        let c = camera;
-        let low = |p: f64, size: f64, f: f64| ((-FOV_MARGIN * size - p) / f) as f32;
-        let high = |p: f64, size: f64, f: f64| (((1.0 + FOV_MARGIN) * size - p) / f) as f32;
-        let (w, h) = (f64::from(c.width), f64::from(c.height));
+        let view = ViewParams::new(camera, near, sh_degree as u8);
         let row = |i: usize| {
-            let [x, y, z] = c.rotation.row(i).as_vec3().to_array();
-            [x, y, z, c.translation[i] as f32]
+            let [x, y, z] = view.rotation[i];
+            [x, y, z, view.translation[i]]
         };
-        let [x, y, z] = c.centre().as_vec3().to_array();
-        let [columns, tiles] = grid(c.width, c.height);
+        let pairs = |[a, b]: [f32; 2], [c, d]: [f32; 2]| [a, b, c, d];
+        let [x, y, z] = view.centre;
+        let [columns, tiles] = grid(camera.width, camera.height);
         let [r, g, b] = background;
         Self {
             rotation: [row(0), row(1), row(2)],
             centre: [x, y, z, near],
-            lens: [c.fx as f32, c.fy as f32, c.cx as f32, c.cy as f32],
-            ratio: [
-                low(c.cx, w, c.fx),
-                low(c.cy, h, c.fy),
-                high(c.cx, w, c.fx),
-                high(c.cy, h, c.fy),
-            ],
+            lens: pairs(view.focal, view.principal),
+            ratio: pairs(view.ratio_min, view.ratio_max),
             background: [r, g, b, 0.0],
-            image: [c.width, c.height, columns, tiles],
+            image: [camera.width, camera.height, columns, tiles],
             model: [rows, sh_degree, cap, trained],
             ..Self::zeroed()
         }
     }
 
-    /// Adds the values of an optimiser step.
-    pub(super) fn add_step(&mut self, input: &StepInput<'_>, due: u32, planes: &SignalPlanes) {
+    /// Adds the values of an optimiser step of `trained` rows.
+    pub(super) fn add_step(
+        &mut self,
+        input: &StepInput<'_>,
+        trained: f32,
+        due: u32,
+        planes: &SignalPlanes,
+    ) {
         let StepInput { rates, loss_terms: terms, noise, .. } = input;
-        let rows = (self.model[0] - self.frozen[0]).max(1) as f32;
         self.rates = [rates.mean, rates.log_scale, rates.quat, rates.opacity];
         self.more_rates =
-            [rates.sh_dc, rates.sh_rest, terms.opacity / rows, terms.scale / (3.0 * rows)];
+            [rates.sh_dc, rates.sh_rest, terms.opacity / trained, terms.scale / (3.0 * trained)];
         if let Some(noise) = noise {
             self.noise = [noise.strength * rates.noise, noise.sharpness, noise.opacity, 0.0];
         }

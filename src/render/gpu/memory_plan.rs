@@ -7,11 +7,9 @@ use super::sizes::{MAX_ENTRIES, Sizes};
 use crate::Accumulation;
 use crate::Setup;
 use crate::candidates::Candidates;
+use crate::cpu::MAX_SIDE;
 use crate::signals::RecordLayout;
 use densify_core::memory::{Ledger, Section};
-
-/// Longest image side `[px]` at which every index of the stages fits its type.
-pub(super) const MAX_SIDE: u32 = 16_384;
 
 /// Largest number of (row, tile) pairs that this device can hold at a time, for a policy's needs.
 pub(super) fn max_pairs(device: &Device, needs: &Needs) -> u64 {
@@ -25,17 +23,17 @@ pub(super) fn max_pairs(device: &Device, needs: &Needs) -> u64 {
 
 /// Sizes of all buffers.
 pub(super) fn sizes(device: &Device, sh_degree: u8, options: &Setup) -> Sizes {
-    let budget = options.budget.max(1);
+    let budget = options.row_budget();
+    let rows = budget.total as u64;
     let cap = match options.tile_cap {
         Some(cap) => cap as u64,
-        None => (16 * budget as u64).min(max_pairs(device, &options.needs)),
+        None => (16 * rows).min(max_pairs(device, &options.needs)),
     };
     let (width, height) = options.largest_image;
     let image = (width.clamp(1, MAX_SIDE), height.clamp(1, MAX_SIDE));
     // An adapter supports fewer rows than MAX_ENTRIES.
-    let cap = cap.min(MAX_ENTRIES).max(budget as u64);
+    let cap = cap.min(MAX_ENTRIES).max(rows);
     let mut sizes = Sizes::new(budget, cap, sh_degree, image, &options.needs, device.accumulation);
-    sizes.frozen = options.frozen as u64;
     sizes.photographs = options.photographs;
     sizes.exposures = options.exposures;
     // They lie in one buffer, which is only copied from and to.

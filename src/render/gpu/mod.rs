@@ -42,6 +42,7 @@ use densify_policies::plan::RowOps;
 use densify_policies::policy::{Cadence, Candidate, MaskTerm, SignalKind, SignalSet, Signals};
 
 use super::candidates::Candidates;
+use super::cpu::{BiasCorrection, MAX_SIDE};
 use super::signals::{ParameterSignal, SignalPlanes, as_read};
 use super::{
     AdapterSummary, AuxInput, AuxOutput, Backend, BackendError, Inspect, NonFinite, Rendering,
@@ -52,13 +53,12 @@ use densify_core::gaussians::{Gaussians, ModelArray, rgb_to_dc};
 use densify_core::memory::Ledger;
 
 pub use adapter::{adapters, may_be_present};
-use buffers::{Buffers, bias_table};
+use buffers::Buffers;
 use device::Device;
 pub use device::GpuDevice;
 pub use device::faults::with_device_lost_after;
 use frame::Frame;
 use launches::Launches;
-use memory_plan::MAX_SIDE;
 use pipelines::Variant;
 use sizes::Sizes;
 
@@ -90,7 +90,6 @@ pub struct GpuBackend {
     buffers: Buffers,
     launches: Launches,
     ledger: Ledger,
-    budget: usize,
     rows: usize,
     near: f32,
     shortcuts: Shortcuts,
@@ -118,7 +117,7 @@ impl GpuBackend {
         device: &GpuDevice,
     ) -> Result<Self, BackendError> {
         let shortcuts = options.shortcuts;
-        let budget = options.budget.max(1);
+        let budget = options.row_budget().total;
         assert!(model.len() <= budget, "{} rows over a budget of {budget}", model.len());
         let device = device.0.clone();
         let most = device.summary.largest_budget(model.sh_degree);
@@ -141,7 +140,6 @@ impl GpuBackend {
             sizes,
             buffers,
             launches,
-            budget,
             rows: model.len(),
             near: options.near,
             shortcuts,
@@ -155,7 +153,7 @@ impl GpuBackend {
             bands: 1,
             stage_times: Vec::new(),
         };
-        gpu.write("bias", bytemuck::cast_slice(&bias_table()));
+        gpu.write("bias", bytemuck::cast_slice(&BiasCorrection::new().table));
         gpu.upload(model);
         gpu.device.check()?;
         Ok(gpu)
@@ -203,10 +201,10 @@ impl GpuBackend {
 
     fn frame(&self, camera: &Camera, background: [f32; 3], sh_degree: u8) -> Frame {
         let degree = u32::from(sh_degree.min(self.sizes.sh_degree));
-        let Sizes { cap, frozen, .. } = self.sizes;
+        let Sizes { cap, budget, .. } = self.sizes;
         let model = [self.rows as u32, degree, cap as u32, self.sizes.trained() as u32];
         let mut frame = Frame::for_view(camera, background, self.near, model);
-        frame.frozen[0] = frozen as u32;
+        frame.frozen[0] = budget.frozen as u32;
         frame
     }
 }
@@ -234,7 +232,7 @@ impl Backend for GpuBackend {
     }
 
     fn budget(&self) -> usize {
-        self.budget
+        self.sizes.budget.total
     }
 
     fn ledger(&self) -> &Ledger {
@@ -282,14 +280,14 @@ impl Backend for GpuBackend {
     }
 
     fn candidates(&self) -> &[Candidate] {
-        self.candidates.list()
+        &self.candidates.list
     }
 
     fn apply(&mut self, ops: &RowOps, seed: u64, step: u32) -> Result<(), BackendError> {
-        assert_fits(ops, self.sizes.frozen as usize, self.rows, self.budget);
+        assert_fits(ops, self.rows, self.sizes.budget);
         self.edit(ops, seed, step);
         if ops.reset_candidates {
-            self.candidates.clear();
+            self.candidates.list.clear();
         }
         self.device.check()
     }
@@ -332,7 +330,7 @@ impl Backend for GpuBackend {
         values: &[f32],
     ) -> Result<(), BackendError> {
         assert!(rows.end <= self.rows, "rows {rows:?} of {}", self.rows);
-        self.set_model_array(array, rows, values)
+        self.set_parameters(&array.parameters(self.sizes.sh_degree), rows, values)
     }
 
     fn state(&self) -> Vec<StateArray> {

@@ -12,11 +12,9 @@ use super::passes::{Search, Shape};
 use super::rows::GRADIENT;
 use super::sizes::OPS_BYTES;
 use crate::candidates::{Photograph, ranked};
+use crate::cpu::FOLD;
 use crate::pixel_map::{draw_pixels, pixel_map, radius_px};
 use crate::{AuxInput, AuxOutput, BackendError, assert_same_size};
-
-/// √(½·log₂ e): folded into the splats' factors.
-pub(super) const FOLD: f32 = 0.849_321_8;
 
 /// A rendered view, with its lists and its image on the device.
 pub(super) struct RenderedView<'a> {
@@ -33,7 +31,8 @@ impl GpuBackend {
         count: usize,
         [width, height, ..]: [u32; 4],
     ) -> Option<Search> {
-        let room = self.search_room();
+        // The result, after its length, borrows the gradients of the rows.
+        let room = (GRADIENT / 2 * self.sizes.trained() as usize - 1).min(u32::MAX as usize);
         let wanted = ranked(count, request.spaced);
         (wanted <= room).then_some(Search {
             pixels: width * height,
@@ -42,11 +41,6 @@ impl GpuBackend {
             min_alpha: request.min_alpha,
             of_gradient: request.error == ErrorMode::Gradient,
         })
-    }
-
-    /// Number of pixels that fit the gradients of the rows, beside their number.
-    fn search_room(&self) -> usize {
-        (GRADIENT / 2 * self.sizes.trained() as usize - 1).min(u32::MAX as usize)
     }
 
     /// Adds the pixels with the largest errors to the candidates. `search` is the search that the device has done, if any.
@@ -68,9 +62,8 @@ impl GpuBackend {
             }
             None => self.worst_of_all(rendered, request, count)?,
         };
-        for candidate in self.surface_points(rendered, &worst, request.depth)? {
-            self.candidates.push(candidate);
-        }
+        let points = self.surface_points(rendered, &worst, request.depth)?;
+        self.candidates.list.extend(points);
         Ok(())
     }
 

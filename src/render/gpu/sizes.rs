@@ -8,8 +8,9 @@ use super::frame::{Frame, State, grid};
 use super::rows::{Content, RowArray, row_arrays};
 use crate::Accumulation;
 use crate::KeptPhotographs;
+use crate::cpu::BiasCorrection;
 use crate::signals::{Field, RecordLayout, SignalPlanes, counts_dominant};
-use densify_core::gaussians::sh_coefficients;
+use densify_core::budget::RowBudget;
 use densify_core::memory::{Ledger, Section};
 
 /// Bytes of an edit's operations that are uploaded at a time.
@@ -18,17 +19,13 @@ pub(super) const OPS_BYTES: u64 = 1 << 18;
 pub(super) const READ_BYTES: u64 = 1 << 20;
 /// Items per group of the sums and sorts; see `shaders/tiles.wgsl`.
 pub(super) const BLOCK: u64 = 2048;
-/// Oldest age with a tabulated bias correction; beyond ln(2⁻²⁵)/ln(0.999) there is none.
-pub(super) const MATURE: usize = 17_400;
 /// Largest number of entries held at a time; sums saturate beyond it.
 pub(super) const MAX_ENTRIES: u64 = 1 << 28;
 
 /// The quantities that determine all sizes.
 #[derive(Debug, Clone)]
 pub(super) struct Sizes {
-    pub(super) budget: u64,
-    /// Frozen rows at the front.
-    pub(super) frozen: u64,
+    pub(super) budget: RowBudget,
     /// Largest number of (row, tile) pairs held at a time.
     pub(super) cap: u64,
     pub(super) sh_degree: u8,
@@ -69,7 +66,7 @@ pub(super) struct Planned {
 
 impl Sizes {
     pub(super) fn new(
-        budget: usize,
+        budget: RowBudget,
         cap: u64,
         sh_degree: u8,
         image: (u32, u32),
@@ -78,8 +75,7 @@ impl Sizes {
     ) -> Self {
         let records = RecordLayout::new(needs.signals);
         Self {
-            budget: budget as u64,
-            frozen: 0,
+            budget,
             cap,
             sh_degree,
             image,
@@ -105,15 +101,15 @@ impl Sizes {
 
     /// Largest number of rows that are not frozen, >= 1.
     pub(super) fn trained(&self) -> u64 {
-        self.budget.saturating_sub(self.frozen).max(1)
+        self.budget.trainable().max(1) as u64
     }
 
     /// First row that is stored in an array, and the largest number of stored rows.
     pub(super) fn places(&self, array: &RowArray) -> [u64; 2] {
         if array.content.traits().is_for_training {
-            [self.frozen, self.trained()]
+            [self.budget.frozen as u64, self.trained()]
         } else {
-            [0, self.budget]
+            [0, self.budget.total as u64]
         }
     }
 
@@ -139,13 +135,13 @@ impl Sizes {
             let bytes = bytes.max(16).next_multiple_of(16);
             all.push(Planned { name, section, line, bytes, usage: storage });
         };
-        let (b, cap) = (self.budget, self.cap);
+        let cap = self.cap;
         for array in self.row_arrays() {
             let traits = array.content.traits();
             let [_, rows] = self.places(&array);
             add(traits.section, traits.line, array.name, rows * array.row_bytes());
         }
-        add(Section::Model, Content::Ages.traits().line, "bias", 8 * (MATURE as u64 + 1));
+        add(Section::Model, Content::Ages.traits().line, "bias", BiasCorrection::bytes());
         for name in ["keys 0", "keys 1", "values 0", "values 1", "row of slot"] {
             add(Section::Tiles, "entries", name, 4 * cap);
         }
@@ -153,7 +149,7 @@ impl Sizes {
             let bytes = 4 * self.records.stride() as u64 * cap;
             add(Section::Tiles, "gradients per entry", "records", bytes);
         }
-        let sums = b.max(16 * cap.div_ceil(BLOCK));
+        let sums = (self.budget.total as u64).max(16 * cap.div_ceil(BLOCK));
         add(Section::Tiles, "sums", "sums", 4 * sums);
         add(Section::Tiles, "sums", "block sums", 4 * sums.div_ceil(BLOCK));
         let (width, height) = self.image;
@@ -213,10 +209,5 @@ impl Sizes {
             ledger.add_on_device(section, line, bytes);
         }
         ledger
-    }
-
-    /// SH coefficients per row, of all channels.
-    pub(super) fn sh_numbers(&self) -> usize {
-        3 * sh_coefficients(self.sh_degree)
     }
 }

@@ -1,21 +1,21 @@
 //! Saves and restores the GPU backend's state as named arrays: its buffers row by row, with zeros for frozen rows
 //! that are not stored.
 //!
-//! The names begin with `device`, so that the native backend, whose sums have another order, does not resume from
-//! them by accident.
+//! The names begin with `device`, as the native backend must not resume from them: its sums have another order.
 
 use std::ops::Range;
 
-use super::GpuBackend;
 use super::rows::{Content, RowArray};
 use super::transfer::stored_rows;
+use super::{GpuBackend, Waiting};
 use crate::{BackendError, StateArray, StateError, Tensor};
 
-/// Prefix of a buffer's name.
+/// Prefix of an array that is a whole buffer.
 const BUFFER: &str = "device.";
-/// Prefix of a signal's name.
+/// Prefix of a signal's array.
 const SIGNAL: &str = "device.signals.";
-const WAITS: &str = "device.waits";
+/// Array of the parameter groups whose gradients wait for an optimiser step.
+const WAITING: &str = "device.waits";
 const CANDIDATES: &str = "candidates";
 
 impl GpuBackend {
@@ -24,12 +24,12 @@ impl GpuBackend {
         self.sizes.row_arrays().into_iter().filter(|array| array.content.traits().is_saved)
     }
 
-    fn array(&self, name: &str) -> Option<RowArray> {
+    fn saved_array(&self, name: &str) -> Option<RowArray> {
         let name = name.strip_prefix(BUFFER)?;
         self.saved_arrays().find(|array| array.name == name)
     }
 
-    fn signal(&self, name: &str) -> Option<usize> {
+    fn signal_plane(&self, name: &str) -> Option<usize> {
         let name = name.strip_prefix(SIGNAL)?;
         self.planes.kept().into_iter().find(|(known, _)| known == name).map(|(_, plane)| plane)
     }
@@ -38,35 +38,37 @@ impl GpuBackend {
         let buffers = self.saved_arrays().map(|array| format!("{BUFFER}{}", array.name));
         let signals = self.planes.kept().into_iter().map(|(name, _)| format!("{SIGNAL}{name}"));
         let mut arrays: Vec<StateArray> = buffers.chain(signals).map(StateArray::of_rows).collect();
-        arrays.push(StateArray::small(WAITS));
-        if self.candidates.is_requested() {
+        arrays.push(StateArray::small(WAITING));
+        if self.candidates.request.is_some() {
             arrays.push(StateArray::small(CANDIDATES));
         }
         arrays
     }
 
+    /// Copies some rows of an array.
+    ///
     /// # Panics
-    /// When there is no such array: a bug in the caller.
+    /// When the array does not exist: a bug in the caller.
     pub(super) fn state_tensor(
         &self,
         name: &str,
         rows: Range<usize>,
     ) -> Result<Tensor, BackendError> {
-        if name == WAITS {
-            let waits = [self.waiting.main, self.waiting.rest].map(u8::from);
-            return Ok(Tensor::u8(name, &[2], waits.to_vec()));
+        if name == WAITING {
+            let waiting = [self.waiting.main, self.waiting.rest].map(u8::from);
+            return Ok(Tensor::u8(name, &[2], waiting.to_vec()));
         }
         if name == CANDIDATES {
             return Ok(self.candidates.tensor(name));
         }
-        if let Some(plane) = self.signal(name) {
+        if let Some(plane) = self.signal_plane(name) {
             return Ok(Tensor::f32(name, &[rows.len()], self.column(plane, rows)?));
         }
-        let array = self.array(name);
-        let array = array.unwrap_or_else(|| panic!("there is no `{name}` in this backend's state"));
+        let array = self.saved_array(name);
+        let array = array.unwrap_or_else(|| panic!("this backend has no state array `{name}`"));
         let values = self.read_rows(&array, rows.clone())?;
         if array.content == Content::Ages {
-            // Whole numbers of four bytes each.
+            // Not floats: their bits are kept as bytes.
             let bytes = bytemuck::cast_slice(&values).to_vec();
             return Ok(Tensor::u8(name, &[rows.len(), 4], bytes));
         }
@@ -79,18 +81,18 @@ impl GpuBackend {
         rows: Range<usize>,
     ) -> Result<(), StateError> {
         let name = tensor.name.clone();
-        if name == WAITS {
-            let waits = tensor.into_u8(&[2])?;
-            let [main, rest] = [0, 1].map(|i| waits[i] != 0);
-            self.waiting = super::Waiting { main, rest };
-        } else if name == CANDIDATES && self.candidates.is_requested() {
+        if name == WAITING {
+            let waiting = tensor.into_u8(&[2])?;
+            let [main, rest] = [0, 1].map(|i| waiting[i] != 0);
+            self.waiting = Waiting { main, rest };
+        } else if name == CANDIDATES && self.candidates.request.is_some() {
             self.candidates.restore(tensor)?;
-        } else if let Some(plane) = self.signal(&name) {
+        } else if let Some(plane) = self.signal_plane(&name) {
             let values = tensor.into_f32(&[rows.len()])?;
-            let (first, missing) = stored_rows(self.sizes.frozen, &rows);
+            let (first, missing) = stored_rows(self.sizes.budget.frozen as u64, &rows);
             let start = plane as u64 * self.sizes.trained() + first;
             self.write_at("signals", 4 * start, &values[missing..]);
-        } else if let Some(array) = self.array(&name) {
+        } else if let Some(array) = self.saved_array(&name) {
             let [first_row, _] = self.sizes.places(&array);
             let (first, missing) = stored_rows(first_row, &rows);
             let at = array.row_bytes() * first;
@@ -102,7 +104,7 @@ impl GpuBackend {
                 self.write_at(array.name, at, &values[array.numbers * missing..]);
             }
         } else {
-            return Err(tensor.error("this run keeps nothing of that name"));
+            return Err(tensor.error("this run has no such array"));
         }
         Ok(())
     }

@@ -40,7 +40,8 @@ impl GpuBackend {
         let mut frame = self.frame(camera, background, input.sh_degree);
         frame.draw[3] = self.load_photograph(input.view, target);
         self.load_exposure(&mut frame, exposure);
-        frame.add_step(input, due, &self.planes);
+        let trained = self.sizes.budget.trained(self.rows).max(1) as f32;
+        frame.add_step(input, trained, due, &self.planes);
         if self.sizes.records.has(Field::Error) {
             frame.draw[3] |= target_flags::BY_PIXEL;
             let score = &self.planes.score;
@@ -51,7 +52,6 @@ impl GpuBackend {
             }
         }
         let (degree, signals) = (frame.model[1] as u8, self.planes.count > 0);
-        let trained = (self.rows - self.sizes.frozen as usize).max(1) as f32;
         let mask = self.mask.map(|mask| MaskTerm { weight: mask.weight / trained, ..mask });
         let pixels = camera.width * camera.height;
         let signal_weights = self.planes.score.map.weights();

@@ -9,6 +9,7 @@ use super::rows::{Content, RowArray};
 use super::{GpuBackend, ResidentPhotograph, readback};
 use crate::signals::ParameterSignal;
 use crate::{BackendError, Rendering};
+use densify_core::budget::RowBudget;
 use densify_core::gaussians::{Gaussians, ModelArray};
 use densify_core::image::Image8;
 use densify_core::pieces::pieces;
@@ -180,16 +181,6 @@ impl GpuBackend {
         Ok(())
     }
 
-    /// Writes rows of one of the model's arrays.
-    pub(super) fn set_model_array(
-        &self,
-        array: ModelArray,
-        rows: Range<usize>,
-        values: &[f32],
-    ) -> Result<(), BackendError> {
-        self.set_parameters(&array.parameters(self.sizes.sh_degree), rows, values)
-    }
-
     /// Writes parameters of rows, row after row: the inverse of [`parameters_of`](Self::parameters_of).
     pub(super) fn set_parameters(
         &self,
@@ -220,7 +211,7 @@ impl GpuBackend {
         plane: usize,
         rows: Range<usize>,
     ) -> Result<Vec<f32>, BackendError> {
-        let (first, missing) = stored_rows(self.sizes.frozen, &rows);
+        let (first, missing) = stored_rows(self.sizes.budget.frozen as u64, &rows);
         let start = plane as u64 * self.sizes.trained() + first;
         let mut values = vec![0.0; missing];
         values.extend(self.read("signals", 4 * start, 4 * (rows.len() - missing) as u64)?);
@@ -231,11 +222,11 @@ impl GpuBackend {
     pub(super) fn present(&self, signal: Signal) -> Result<Vec<f32>, BackendError> {
         let (rows, launch) = (self.rows as u32, self.launches.get("present"));
         let start = self.mask.map_or(0.0, |mask| mask.start);
-        let frozen = self.sizes.frozen as usize;
+        let RowBudget { frozen, .. } = self.sizes.budget;
         let immediates = [signal as u32, rows, start.to_bits(), frozen as u32];
         self.submit(|to| to.run(launch, immediates, rows.div_ceil(256)));
         let mut values = vec![0.0; frozen];
-        values.extend(self.read("sums", 0, 4 * (self.rows - frozen) as u64)?);
+        values.extend(self.read("sums", 0, 4 * self.sizes.budget.trained(self.rows) as u64)?);
         Ok(values)
     }
 }

@@ -48,7 +48,7 @@ impl Case<'_> {
     /// The backend of a size.
     pub(crate) fn backend_setup(&self, size: &RunSize, needs: Needs) -> Setup {
         Setup {
-            frozen: self.budget(size.rows).frozen,
+            budget: self.budget(size.rows),
             near: (self.spec.start.near.0 * self.inputs.dataset.extent()) as f32,
             tile_cap: Some(size.tile_cap),
             record_cap: self.record_cap(size),
@@ -59,7 +59,7 @@ impl Case<'_> {
             shortcuts: self.choices.knobs.shortcuts,
             needs,
             exposures: self.choices.exposure.is_on,
-            ..Setup::new(size.rows)
+            ..Setup::default()
         }
     }
 
@@ -86,7 +86,7 @@ impl Case<'_> {
         let threads = self.choices.threads.max(THREADS);
         let degree = size.sh_degree;
         let options = self.backend_setup(size, needs.clone());
-        let mut ledger = self.inputs.device.promise(degree, &options, threads);
+        let mut ledger = self.inputs.device.memory_plan(degree, &options, threads);
         let [train, test] = self.inputs.images;
         let held = train.held(size.image_cache);
         ledger.add_to(Section::Images, "decoded training views", held);

@@ -1,5 +1,6 @@
 //! Measuring the finished model against a known surface: the backend that does it, and the memory that it takes.
 
+use densify_core::budget::RowBudget;
 use densify_core::memory::{Ledger, Section};
 use densify_render::{Device, Setup};
 use densify_train::metrics::geometry;
@@ -32,9 +33,9 @@ impl Measuring {
     /// Memory of measuring besides the process, on the host and on the device `[bytes]`.
     pub(crate) fn bytes(&self, rows: usize, sh_degree: u8) -> [u64; 2] {
         let options = self.for_rows(rows);
-        let promise = self.device.promise(sh_degree, &options, self.threads);
+        let plan = self.device.memory_plan(sh_degree, &options, self.threads);
         let geometry = geometry::bytes(rows, sh_degree, options.largest_image, self.views);
-        [promise.on_host() + geometry + self.surface, promise.on_device()]
+        [plan.on_host() + geometry + self.surface, plan.on_device()]
     }
 
     /// The backend for a model of this many rows.
@@ -44,7 +45,7 @@ impl Measuring {
         let pairs = rows.saturating_mul(3).min(self.device.most_pairs(&self.options.needs));
         let cap = self.options.tile_cap.map_or(pairs, |cap| cap.min(pairs));
         Setup {
-            budget: rows,
+            budget: RowBudget { total: rows, ..self.options.budget },
             tile_cap: Some(cap.max(rows)),
             // Nothing is differentiated.
             record_cap: rows,

@@ -70,7 +70,7 @@ pub(super) fn first_bytes(
         return reading;
     }
     let setup = measuring_setup(model.rows, case, size);
-    let backend = case.inputs.device.promise(model.sh_degree, &setup, threads).on_host();
+    let backend = case.inputs.device.memory_plan(model.sh_degree, &setup, threads).on_host();
     let [train, _] = case.inputs.images;
     let image = train.held(0) + train.decoding(1);
     // The model beside its copy in the backend, then beside the rows that are kept.
@@ -82,8 +82,7 @@ pub(crate) fn measuring_setup(rows: usize, case: &Case<'_>, size: &RunSize) -> S
     let needs = needs();
     let pairs = rows.saturating_mul(PAIRS_PER_ROW).min(case.inputs.device.most_pairs(&needs));
     Setup {
-        budget: rows,
-        frozen: 0,
+        budget: rows.into(),
         tile_cap: Some(pairs.max(rows)),
         // Nothing is differentiated, and no moment matters.
         record_cap: rows,

@@ -17,8 +17,8 @@ use densify_policies::plan::RowOps;
 use densify_policies::policy::{Candidate, SignalSet, Signals};
 use densify_render::cpu::{CpuBackend, ModelGradient};
 use densify_render::{
-    Attribute, AuxInput, AuxOutput, Backend, BackendError, Differentiable, ImageGradient,
-    NonFinite, NumberKind, Rendering, StateArray, StateError, StepInput, StepOutput, Tensor,
+    AuxInput, AuxOutput, Backend, BackendError, Differentiable, ImageGradient, NonFinite,
+    NumberKind, Rendering, StateArray, StateError, StepInput, StepOutput, Tensor,
 };
 
 use super::{Subject, cases};
@@ -167,8 +167,8 @@ impl Backend for FaultyBackend {
     fn audit(&mut self) -> Result<Vec<NonFinite>, BackendError> {
         let mut found = self.inner.audit()?;
         if self.fault == Fault::Audit {
-            let (attribute, kind) = (Attribute::Mean, NumberKind::Parameter);
-            found.insert(0, NonFinite { row: 0, attribute, kind });
+            let (array, kind) = (ModelArray::Means, NumberKind::Parameter);
+            found.insert(0, NonFinite { row: 0, array, kind });
         }
         Ok(found)
     }

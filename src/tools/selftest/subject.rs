@@ -59,7 +59,7 @@ impl Subject {
         model: &Gaussians,
         mut setup: Setup,
     ) -> Result<Box<dyn Differentiable>, BackendError> {
-        setup.budget = setup.budget.max(model.len());
+        setup.budget.total = setup.budget.total.max(model.len());
         match self {
             Self::Native { instructions, threads } => {
                 (setup.instructions, setup.threads) = (*instructions, *threads);

@@ -86,7 +86,7 @@ impl RowMeasurements {
                 background: scene.background,
                 exposure: None,
                 sh_degree,
-                rates: LearningRates::STILL,
+                rates: LearningRates::default(),
                 loss_terms: LossTerms::default(),
                 noise: None,
                 cadence: Cadence::default(),

@@ -59,7 +59,7 @@ fn step(backend: &mut dyn Backend, camera: &Camera, step: u32) -> usize {
 /// A backend with a past: moments, signals, and rows of different ages.
 fn trained(subject: &Subject, budget: usize) -> Box<dyn Differentiable> {
     let model = scenes::cloud(ROWS, 1, &view(), 72);
-    let setup = Setup { budget, needs: needs(), ..Setup::default() };
+    let setup = Setup { budget: budget.into(), needs: needs(), ..Setup::default() };
     let mut backend = make_with(subject, &model, setup);
     step(&mut *backend, &view(), 1);
     step(&mut *backend, &view(), 2);

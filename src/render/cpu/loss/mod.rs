@@ -40,7 +40,7 @@ use window::{
 const C1: f32 = 0.01 * 0.01;
 const C2: f32 = 0.03 * 0.03;
 /// Weight of 1 − SSIM; L1 has the rest.
-const SSIM_WEIGHT: f32 = 0.2;
+pub(crate) const SSIM_WEIGHT: f32 = 0.2;
 /// The constant subtracted from y.
 const MIDDLE: f32 = 0.5;
 /// Rows per strip where tiles are written: a row of tiles.
@@ -289,7 +289,7 @@ impl WithSimd for Lines<'_> {
     fn with_simd<S: Simd>(self, _: S) {
         let Self { source, segments, first, scratch, e: to_e, y: to_y } = self;
         let Source { grid, canvas, target, background, channel } = source;
-        let (width, stride, length) = (grid.width, segments.stride(), segments.length());
+        let (width, stride, length) = (grid.width, segments.stride(), segments.length);
         let pitch = segments.pitch();
         scratch.resize(2 * stride, 0.0);
         let (e, y) = scratch.split_at_mut(stride);
@@ -330,7 +330,7 @@ fn scratch_lines<const A: usize, const B: usize>(
     scratch: &mut Vec<[f32; WIDTH]>,
     segments: Segments,
 ) -> ([&mut Line; A], [LinePerRow<'_>; B]) {
-    let (length, padded) = (segments.length(), segments.padded());
+    let (length, padded) = (segments.length, segments.padded());
     scratch.resize(A * length + B * TOGETHER * padded, [0.0; WIDTH]);
     let (lines, per_row) = scratch.split_at_mut(A * length);
     let mut lines = lines.chunks_exact_mut(length);
@@ -369,7 +369,7 @@ impl WithSimd for Similarity<'_> {
         let Self { width, segments, first, scratch, e, y, derivatives, .. } = self;
         let Self { mut errors, error_weights, first_channel, .. } = self;
         let [p1, p2, p3] = derivatives;
-        let (length, pitch) = (segments.length(), segments.pitch());
+        let (length, pitch) = (segments.length, segments.pitch());
         let rows = p1.len() / pitch;
         let ([no_e, no_y], [mut of_e, mut of_y, mut of_ee, mut of_xy]) =
             scratch_lines::<2, CONVOLVED>(scratch, segments);

@@ -36,8 +36,8 @@ const RUN: usize = 4;
 /// The arrangement of a line's pixels: lane l of vector i is pixel i of segment l.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Segments {
-    /// Pixels of a segment.
-    length: usize,
+    /// Pixels per segment, which is also the number of vectors per line.
+    pub(super) length: usize,
 }
 
 impl Segments {
@@ -46,11 +46,6 @@ impl Segments {
     pub(super) const fn new(width: usize) -> Self {
         let length = width.div_ceil(WIDTH).next_multiple_of(RUN);
         Self { length: if length < 2 * RUN { 2 * RUN } else { length } }
-    }
-
-    /// Pixels per segment, which is also the number of vectors per line.
-    pub(super) const fn length(self) -> usize {
-        self.length
     }
 
     /// Numbers of a line.
@@ -300,11 +295,11 @@ mod tests {
         for width in [1, 17, 64, 100, 128, 200, 256, 257, 1000] {
             let segments = Segments::new(width);
             let stride = segments.stride();
-            assert!(stride >= width.next_multiple_of(WIDTH) && segments.length() > REACH);
+            assert!(stride >= width.next_multiple_of(WIDTH) && segments.length > REACH);
             let pixels: Vec<f32> = (0..stride).map(|i| i as f32).collect();
             let mut line = vec![[-1.0; WIDTH]; segments.padded()];
-            segments.arrange(&pixels, &mut line[REACH..][..segments.length()]);
-            let inner = line[REACH..][..segments.length()].to_vec();
+            segments.arrange(&pixels, &mut line[REACH..][..segments.length]);
+            let inner = line[REACH..][..segments.length].to_vec();
             for (x, &pixel) in pixels.iter().enumerate() {
                 let [vector, lane] = segments.place(x);
                 assert_eq!(inner[vector][lane], pixel);

@@ -33,25 +33,31 @@ fn capabilities(accumulation: Accumulation) -> Capabilities {
     .fold(Capabilities::IMMEDIATES, |all, (_, capability)| all | capability)
 }
 
+/// The shader modules of devices with this accumulation, with their texts.
+fn modules(accumulation: Accumulation) -> impl Iterator<Item = (&'static Stage, String, Module)> {
+    let texts = STAGES.iter().filter_map(move |stage| Some((stage, stage.text(accumulation)?)));
+    texts.map(|(stage, text)| {
+        let module = parse(stage, &text);
+        (stage, text, module)
+    })
+}
+
 #[test]
 fn every_shader_is_valid_and_within_the_portable_limits() {
     let mut seen = BTreeSet::new();
     for accumulation in Accumulation::ALL {
-        for stage in STAGES {
-            if let Some(text) = stage.text(accumulation) {
-                check_stage(stage, &text, capabilities(accumulation));
-                seen.insert(stage.name);
-            }
+        for (stage, text, module) in modules(accumulation) {
+            check_stage(stage, &text, &module, capabilities(accumulation));
+            seen.insert(stage.name);
         }
     }
     assert_eq!(seen.len(), STAGES.len(), "stages that no device has");
 }
 
 /// Checks the limits that every WebGPU device has.
-fn check_stage(stage: &Stage, text: &str, capabilities: Capabilities) {
-    let module = parse(stage, text);
+fn check_stage(stage: &Stage, text: &str, module: &Module, capabilities: Capabilities) {
     let info = Validator::new(ValidationFlags::all(), capabilities)
-        .validate(&module)
+        .validate(module)
         .unwrap_or_else(|e| panic!("{}: {}", stage.name, e.emit_to_string(text)));
     for (i, entry) in module.entry_points.iter().enumerate() {
         let uses = info.get_entry_point(i);
@@ -84,12 +90,8 @@ fn every_override_has_a_value_and_every_signal_a_number() {
     let constants: BTreeSet<String> =
         variant.constants().into_iter().map(|(name, _)| name).collect();
     let mut declared = BTreeSet::new();
-    for stage in STAGES {
-        for accumulation in Accumulation::ALL {
-            let Some(text) = stage.text(accumulation) else { continue };
-            let module = parse(stage, &text);
-            declared.extend(module.overrides.iter().filter_map(|(_, o)| o.name.clone()));
-        }
+    for (_, _, module) in Accumulation::ALL.into_iter().flat_map(modules) {
+        declared.extend(module.overrides.iter().filter_map(|(_, o)| o.name.clone()));
     }
     assert_eq!(declared, constants);
 }
@@ -112,7 +114,7 @@ fn largest_sizes(accumulation: Accumulation) -> Sizes {
         cadence: Cadence { all: 2, sh_rest: 2 },
         ..Needs::default()
     };
-    let mut sizes = Sizes::new(10, 100, 3, (32, 32), &needs, accumulation);
+    let mut sizes = Sizes::new(10.into(), 100, 3, (32, 32), &needs, accumulation);
     sizes.photographs = KeptPhotographs { count: 1, with_masks: true };
     sizes.exposures = true;
     sizes
@@ -122,9 +124,8 @@ fn largest_sizes(accumulation: Accumulation) -> Sizes {
 #[test]
 fn every_kernel_is_dispatched_by_its_name() {
     let mut found_kernels = BTreeSet::new();
-    for (stage, accumulation) in STAGES.iter().flat_map(|s| Accumulation::ALL.map(|a| (s, a))) {
-        let Some(text) = stage.text(accumulation) else { continue };
-        let found = kernels(stage, &text, &parse(stage, &text));
+    for (stage, text, module) in Accumulation::ALL.into_iter().flat_map(modules) {
+        let found = kernels(stage, &text, &module);
         found_kernels.extend(found.into_iter().map(|kernel| base_name(&kernel.entry).to_owned()));
     }
     for kernel in rebound().keys() {
@@ -152,9 +153,8 @@ fn every_kernel_is_dispatched_by_its_name() {
 fn every_variable_has_a_buffer() {
     for accumulation in Accumulation::ALL {
         let mut found_kernels = BTreeMap::new();
-        for stage in STAGES {
-            let Some(text) = stage.text(accumulation) else { continue };
-            for Kernel { entry, bindings } in kernels(stage, &text, &parse(stage, &text)) {
+        for (stage, text, module) in modules(accumulation) {
+            for Kernel { entry, bindings } in kernels(stage, &text, &module) {
                 assert!(
                     found_kernels.insert(entry.clone(), bindings).is_none(),
                     "two kernels `{entry}`"

@@ -23,7 +23,7 @@ pub(super) fn no_row(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = scenes::camera(21, 13, 1);
     let model = Gaussians { sh_degree: 2, ..Gaussians::default() };
     let mut backend =
-        trial.subject.backend_with(&model, Setup { budget: 3, ..Setup::default() })?;
+        trial.subject.backend_with(&model, Setup { budget: 3.into(), ..Setup::default() })?;
     let upstream = scenes::narrowed(&scenes::upstream(&camera, 1));
     let (image, gradient) = backend.differentiate(&camera, BACKGROUND, 2, &upstream)?;
     trial.count("0 Gaussians", "pixels other than the background", count_drawn(&image));

@@ -146,7 +146,7 @@ fn train(trial: &mut Trial<'_>, name: &str) -> Result<(), Box<dyn std::error::Er
     };
     let policy = find(name)?.build(&toml::Table::new(), &scene)?;
     let needs = policy.needs(&scene);
-    let setup = Setup { budget: BUDGET, needs, ..Setup::default() };
+    let setup = Setup { budget: BUDGET.into(), needs, ..Setup::default() };
     let backend = trial.subject.backend_with(&model, setup)?;
     let mut trainer = Trainer::new(photographs()?, backend, (name, policy), scene, options)?;
     let (mut over_budget, mut broken, mut checks) = (0, 0, 0);

@@ -19,8 +19,8 @@ use densify_core::image::{Image8, SharedImage};
 use densify_core::memory::Ledger;
 use densify_data::views::ViewError;
 use densify_render::{
-    Attribute, AuxInput, AuxOutput, BackendError, NonFinite, NumberKind, Rendering, StateArray,
-    StateError, StepOutput, Tensor,
+    AuxInput, AuxOutput, BackendError, NonFinite, NumberKind, Rendering, StateArray, StateError,
+    StepOutput, Tensor,
 };
 
 mod edits;
@@ -105,7 +105,7 @@ impl Backend for CountingBackend {
     }
     fn audit(&mut self) -> Result<Vec<NonFinite>, BackendError> {
         let unsound =
-            |row| NonFinite { row, attribute: Attribute::Opacity, kind: NumberKind::Moment };
+            |row| NonFinite { row, array: ModelArray::OpacityLogits, kind: NumberKind::Moment };
         Ok((0..self.unsound).map(unsound).collect())
     }
     fn render(
