@@ -117,7 +117,7 @@ impl Element {
     ) -> Result<usize, LoadError> {
         self.find(&[property]).ok_or_else(|| {
             let path = path.display();
-            LoadError(format!("{path}: the vertices have no property {property}; {remedy}"))
+            LoadError::Data(format!("{path}: the vertices have no property {property}; {remedy}"))
         })
     }
 

@@ -1,6 +1,7 @@
 //! The colours of tracks in their views, and the gains of the views that best explain the differences.
 
-use crate::dataset::{DatasetError, MIN_VIEWS, Tracks, View};
+use crate::dataset::{MIN_VIEWS, Tracks, View};
+use crate::error::LoadError;
 use densify_core::image::Image8;
 
 /// Rounds of alternately fitting gains and colours of tracks.
@@ -56,7 +57,7 @@ impl TrackColours {
     ///
     /// # Errors
     /// When an image cannot be read.
-    pub fn read(tracks: &Tracks, views: &[View]) -> Result<Self, DatasetError> {
+    pub fn read(tracks: &Tracks, views: &[View]) -> Result<Self, LoadError> {
         let mut tracks_in = vec![Vec::new(); views.len()];
         for (track, seen_by) in tracks.views.iter().enumerate() {
             for &view in seen_by {

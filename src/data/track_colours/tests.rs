@@ -9,14 +9,15 @@ use super::exposures::ExposureSpread;
 use super::*;
 use crate::dataset::builtin::PREFIX;
 use crate::dataset::images::{ImageHeader, ImageSource, SourceFile};
-use crate::dataset::{Dataset, DatasetError, LoadOptions, View};
+use crate::dataset::{Dataset, LoadOptions, View};
+use crate::error::LoadError;
 use densify_core::camera::Camera;
 use densify_core::image::Image8;
 
 const SIZE: u32 = 60;
 const VIEWS: usize = 8;
 
-fn measured(tracks: &Tracks, views: &[View]) -> Result<Spread, DatasetError> {
+fn measured(tracks: &Tracks, views: &[View]) -> Result<Spread, LoadError> {
     Ok(measure(tracks, &TrackColours::read(tracks, views)?))
 }
 

@@ -141,7 +141,13 @@ macro_rules! bad_input {
     )*};
 }
 
-bad_input!(OptionProblem: Options, SizeProblem: Size, ModelProblem: Model, ResumeProblem: Resume);
+bad_input!(
+    OptionProblem: Options,
+    SizeProblem: Size,
+    ModelProblem: Model,
+    ResumeProblem: Resume,
+    LoadError: Load
+);
 
 impl OptionProblem {
     /// A wrong value of an option.
@@ -159,7 +165,6 @@ impl From<TrainingProblem> for Problem {
 /// Errors that are always of bad input.
 pub trait BadInput: Display {}
 
-impl BadInput for LoadError {}
 impl BadInput for FormatError {}
 impl BadInput for InitError {}
 /// Before training: the policy's name or parameters are wrong.

@@ -3,6 +3,7 @@
 
 use std::path::PathBuf;
 
+use densify_data::LoadError;
 use densify_render::{Accumulation, BackendKind};
 
 /// A problem with options: with one by itself, or with several that contradict each other.
@@ -156,6 +157,8 @@ pub enum Problem {
     Training(TrainingProblem),
     /// The remedy for an error of a backend, which stands before it.
     Backend(BackendRemedy),
+    /// A dataset or model that cannot be loaded.
+    Load(LoadError),
 }
 
 /// What helps against an error of a backend.

@@ -3,6 +3,7 @@
 use densify_core::memory::Bytes;
 use densify_core::numbers::grouped;
 use densify_core::spelling::Spelling;
+use densify_data::{LoadError, LoadRemedy};
 use densify_render::Accumulation;
 
 use super::problem::{
@@ -21,7 +22,68 @@ impl Problem {
             Self::Resume(problem) => problem.words(spelling),
             Self::Training(problem) => problem.words(spelling),
             Self::Backend(remedy) => remedy.words(spelling),
+            Self::Load(error) => load_error(error, spelling),
         }
+    }
+}
+
+fn load_error(error: &LoadError, s: Spelling) -> String {
+    match error {
+        LoadError::Data(problem) => problem.clone(),
+        LoadError::Remedied { problem, remedy } => {
+            format!("{problem}; {}", load_remedy(*remedy, s))
+        }
+        LoadError::ViewList { file, problem } => {
+            format!("{}: {problem}", s.text("views", file.display()))
+        }
+        LoadError::NoMasks { listing, inverted } => {
+            let option = if *inverted {
+                s.switch("invert_masks")
+            } else {
+                s.text("mask_mode", "background")
+            };
+            let kind = match s {
+                Spelling::Terminal => "flag",
+                Spelling::Keyword => "argument",
+            };
+            format!(
+                "{}: {option}: no photograph has a mask; put masks into `masks/`, named after their photographs as \
+                 NAME.png, or leave the {kind} out",
+                listing.display()
+            )
+        }
+    }
+}
+
+fn load_remedy(remedy: LoadRemedy, s: Spelling) -> String {
+    let images = s.option("images");
+    match remedy {
+        LoadRemedy::RestoreOrImagesFolder => {
+            format!("restore it, or name the folder that holds the images with {images}")
+        }
+        LoadRemedy::AddOrImagesFolder => {
+            format!("put the images there, or name their folder with {images}")
+        }
+        LoadRemedy::OtherImagesFolder => format!(
+            "only paths below the dataset's folder are followed (another folder of images can be given with {images})"
+        ),
+        LoadRemedy::ImagesFolderOfBoth => format!(
+            "give with {images} a folder that contains both at their original paths, or remove one of the two"
+        ),
+        LoadRemedy::InvertMasks(true) => {
+            format!("give {}, or remove the masks", s.switch("invert_masks"))
+        }
+        LoadRemedy::InvertMasks(false) => {
+            format!("leave {} out, or remove the masks", s.switch("invert_masks"))
+        }
+        LoadRemedy::LargerTestEvery => {
+            format!("use a larger {}, or leave it out", s.option("test_every"))
+        }
+        LoadRemedy::KeepFieldOfView => format!(
+            "train on that field alone with {}, or calibrate again with fewer terms, or undistort the images first, \
+             e.g. with `colmap image_undistorter`",
+            s.switch("keep_fov")
+        ),
     }
 }
 
@@ -420,6 +482,44 @@ fn scene_of_run(s: Spelling) -> String {
 mod tests {
     use super::*;
     use crate::failure::{Failure, INPUT};
+
+    /// Datasets' errors and remedies, as on a terminal.
+    #[test]
+    fn errors_of_datasets_name_options() {
+        let remedied = |remedy| LoadError::Remedied { problem: "a.txt: b".to_owned(), remedy };
+        let no_masks = |inverted| LoadError::NoMasks { listing: "a.txt".into(), inverted };
+        let views = LoadError::ViewList { file: "v.txt".into(), problem: "line 2".to_owned() };
+        for (error, words) in [
+            (
+                remedied(LoadRemedy::RestoreOrImagesFolder),
+                "a.txt: b; restore it, or name the folder that holds the images with --images",
+            ),
+            (
+                remedied(LoadRemedy::InvertMasks(true)),
+                "a.txt: b; give --invert-masks, or remove the masks",
+            ),
+            (
+                remedied(LoadRemedy::InvertMasks(false)),
+                "a.txt: b; leave --invert-masks out, or remove the masks",
+            ),
+            (
+                remedied(LoadRemedy::LargerTestEvery),
+                "a.txt: b; use a larger --test-every, or leave it out",
+            ),
+            (
+                no_masks(true),
+                "a.txt: --invert-masks: no photograph has a mask; put masks into `masks/`, named after their photographs as NAME.png, or leave the flag out",
+            ),
+            (
+                no_masks(false),
+                "a.txt: --mask-mode background: no photograph has a mask; put masks into `masks/`, named after their photographs as NAME.png, or leave the flag out",
+            ),
+            (views, "--views v.txt: line 2"),
+        ] {
+            let failure = Failure::from(error);
+            assert_eq!((failure.code, &*failure.to_string()), (INPUT, words));
+        }
+    }
 
     #[test]
     fn options_are_spelled_as_their_reader_writes_them() {

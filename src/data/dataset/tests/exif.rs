@@ -180,7 +180,7 @@ fn a_photograph_that_lies_on_its_side_for_its_camera_is_turned() {
         assert_eq!((image.width, image.height), SIZE);
         assert_eq!(image.rgb[..3], left, "{orientation}");
         assert_ne!(image.rgb[57..60], left, "{orientation}");
-        let said = |note: &String| note.contains("1 photographs lie on") && note.contains("b.png");
+        let said = |note: &Note| note.contains("1 photographs lie on") && note.contains("b.png");
         assert!(data.notes.iter().any(said), "{:?}", data.notes);
         // Turning takes the picture twice.
         let bytes = view.source.working_bytes();
@@ -246,7 +246,7 @@ fn an_ambiguous_orientation_is_noted() {
     ] {
         write_exif(&made.file("images/b.png"), turned(6));
         let data = Dataset::load(made.path(), &LoadOptions::default()).unwrap();
-        let said = |note: &String| note.contains("1 photographs have an EXIF orientation");
+        let said = |note: &Note| note.contains("1 photographs have an EXIF orientation");
         assert_eq!(data.notes.iter().any(said), is_named, "{:?}", data.notes);
     }
 }

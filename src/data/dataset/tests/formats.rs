@@ -174,7 +174,7 @@ fn masks_are_found() {
             .save(made.file(mask))
             .unwrap();
         let data = load(&made);
-        let said = |note: &String| note.contains("1 of 3 photographs have a mask");
+        let said = |note: &Note| note.contains("1 of 3 photographs have a mask");
         assert!(data.notes.iter().any(said), "{mask}: {:?}", data.notes);
         assert_eq!(data.train[0].source.load().unwrap().mask, None, "{mask}");
         let found = data.train[1].source.load().unwrap().mask.unwrap();
@@ -201,7 +201,7 @@ fn masks_of_no_photograph_are_named() {
         let folder = file.rsplit_once('/').unwrap().0;
         let notes = load(&made).notes;
         let said =
-            |note: &String| note.contains(folder) && note.contains("the mask of no photograph");
+            |note: &Note| note.contains(folder) && note.contains("the mask of no photograph");
         assert!(notes.iter().any(said), "{file}: {notes:?}");
     }
     assert!(!load(&Made::colmap_txt()).notes.iter().any(|note| note.contains("mask")));

@@ -3,6 +3,7 @@
 use glam::DVec3;
 
 use super::super::*;
+use super::refused;
 use densify_fixtures::{Made, NAMES, SIZE};
 
 const PINHOLE: &str = "PINHOLE 20 12 15 16 10 6";
@@ -135,8 +136,16 @@ fn cropping_is_noted_and_can_be_avoided() {
     let made = colmap("SIMPLE_RADIAL 20 12 15 10 6 -0.2");
     let [cropped, kept] = [false, true]
         .map(|keep_fov| load(&made, &LoadOptions { keep_fov, ..LoadOptions::default() }));
-    assert!(cropped.notes.iter().any(|note| note.contains("--keep-fov")), "{:?}", cropped.notes);
-    assert!(!kept.notes.iter().any(|note| note.contains("crop")), "{:?}", kept.notes);
+    assert!(
+        cropped.notes.iter().any(|note| matches!(note, Note::Cropped { .. })),
+        "{:?}",
+        cropped.notes
+    );
+    assert!(
+        !kept.notes.iter().any(|note| matches!(note, Note::Cropped { .. })),
+        "{:?}",
+        kept.notes
+    );
     let [small, large] = [&cropped, &kept].map(|data| data.train[0].source.load().unwrap());
     assert_eq!((small.width, small.height, small.mask), (SIZE.0, SIZE.1, None));
     let mask = large.mask.unwrap();
@@ -182,8 +191,7 @@ fn views_that_a_mask_hides_are_named_and_left_out() {
     for name in ["b.png", "c.png"] {
         grey(&made, name, |_| 0);
     }
-    let message = Dataset::load(made.path(), &options).unwrap_err().to_string();
-    assert!(message.contains("all 3") && message.contains("give --invert-masks"), "{message}");
+    refused("all hidden", &made, &options, "all 3, InvertMasks(true)");
     let inverted = LoadOptions { invert_masks: true, ..options.clone() };
     assert_eq!(load(&made, &inverted).train.len(), 1);
     // One face of a wide photograph is hidden by masking its left half.

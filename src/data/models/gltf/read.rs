@@ -167,7 +167,7 @@ fn read(
         }
     }
     if primitives == 0 {
-        return Err(LoadError(format!(
+        return Err(LoadError::Data(format!(
             "{} holds no Gaussian splats ({SPLATS}); a mesh is rendered by `densify scenegen`",
             path.display()
         )));

@@ -14,9 +14,9 @@ use serde::{Deserialize, Serialize};
 use super::PREFIX;
 use crate::dataset::images::{ImageHeader, ImageSource, SourceFile};
 use crate::dataset::photographs::{Photograph, target_size};
-use crate::dataset::prepare::assemble;
+use crate::dataset::prepare::{assemble, texts};
 use crate::dataset::tracks::TrackSampler;
-use crate::dataset::{self, Dataset, DatasetError, LoadOptions, PointCloud, View};
+use crate::dataset::{self, Dataset, LoadError, LoadOptions, PointCloud, View};
 use densify_core::camera::Camera;
 use densify_core::image::Image8;
 use scene_cache::Entry;
@@ -52,7 +52,7 @@ pub(in crate::dataset) fn load(
     path: &Path,
     name: &str,
     options: &LoadOptions,
-) -> Result<Dataset, DatasetError> {
+) -> Result<Dataset, LoadError> {
     let (source, parameters) = (Source::Preset(name.to_owned()), Options::default());
     // The name is checked before it becomes part of a file name.
     let asked: PresetSpec = name.parse()?;
@@ -96,10 +96,10 @@ impl Dataset {
     ///
     /// # Errors
     /// When the surface exists but cannot be read.
-    pub fn ground_truth(&self) -> Result<Option<GroundTruth>, DatasetError> {
+    pub fn ground_truth(&self) -> Result<Option<GroundTruth>, LoadError> {
         if let Some(unpacked) = &self.unpacked {
             let found = GroundTruth::open(unpacked.folder());
-            return found.map_err(|error| DatasetError(unpacked.named(&error.to_string())));
+            return found.map_err(|error| LoadError::Data(unpacked.named(&error.to_string())));
         }
         let Some(name) = super::name(&self.root) else { return Ok(GroundTruth::open(&self.root)?) };
         let scene = Scene::prepare(&Source::Preset(name.to_owned()), &Options::default())?;
@@ -113,9 +113,9 @@ pub(in crate::dataset) fn surface_bytes(root: &Path) -> Option<u64> {
     GroundTruth::is_in(root).then(|| BUILD_FACTOR * mesh.map_or(0, |mesh| mesh.len()))
 }
 
-impl From<densify_scenegen::Error> for DatasetError {
+impl From<densify_scenegen::Error> for LoadError {
     fn from(error: densify_scenegen::Error) -> Self {
-        Self(error.to_string())
+        Self::Data(error.to_string())
     }
 }
 
@@ -127,7 +127,7 @@ fn dataset(
     path: &Path,
     Rendered { about, frames, points }: Rendered,
     options: &LoadOptions,
-) -> Result<Dataset, DatasetError> {
+) -> Result<Dataset, LoadError> {
     let mut photographs: Vec<Photograph> = (0..)
         .zip(&about.views)
         .zip(frames)
@@ -152,10 +152,9 @@ fn dataset(
         tracks: sampler.finish(),
         own_split: true,
         surface_bytes: Some(about.surface_bytes),
-        notes: about.notes,
         ..dataset::Scene::default()
     };
-    assemble(path, photographs, read, options)
+    assemble(path, photographs, read, texts(about.notes), options)
 }
 
 /// Converts the camera of a rendered view.
