@@ -234,10 +234,10 @@ fn photograph(
             focal: lens.focal,
             principal: lens.principal,
         };
-        let pinhole = undistortion.as_ref().map_or(whole, |undistortion| *undistortion.pinhole());
+        let pinhole = undistortion.as_ref().map_or(whole, |undistortion| undistortion.to);
         // Multiplying by an identity matrix could still change the last bits.
         let turn =
-            undistortion.as_ref().map(|undistortion| undistortion.lens_from_pinhole().transpose());
+            undistortion.as_ref().map(|undistortion| undistortion.lens_from_pinhole.transpose());
         let (rotation, translation) = match turn.filter(|turn| *turn != DMat3::IDENTITY) {
             Some(turn) => (turn * frame.rotation, turn * frame.translation),
             None => (frame.rotation, frame.translation),

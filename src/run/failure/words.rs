@@ -56,35 +56,33 @@ fn load_error(error: &LoadError, s: Spelling) -> String {
 }
 
 fn load_remedy(remedy: LoadRemedy, s: Spelling) -> String {
-    let images = s.option("images");
-    match remedy {
+    let (words, option) = match remedy {
         LoadRemedy::RestoreOrImagesFolder => {
-            format!("restore it, or name the folder that holds the images with {images}")
+            ("restore it, or name the folder that holds the images with {}", s.option("images"))
         }
         LoadRemedy::AddOrImagesFolder => {
-            format!("put the images there, or name their folder with {images}")
+            ("put the images there, or name their folder with {}", s.option("images"))
         }
-        LoadRemedy::OtherImagesFolder => format!(
-            "only paths below the dataset's folder are followed (another folder of images can be given with {images})"
+        LoadRemedy::OtherImagesFolder => (
+            "only paths below the dataset's folder are followed (another folder of images can be given with {})",
+            s.option("images"),
         ),
-        LoadRemedy::ImagesFolderOfBoth => format!(
-            "give with {images} a folder that contains both at their original paths, or remove one of the two"
+        LoadRemedy::ImagesFolderOfBoth => (
+            "give with {} a folder that contains both at their original paths, or remove one of the two",
+            s.option("images"),
         ),
-        LoadRemedy::InvertMasks(true) => {
-            format!("give {}, or remove the masks", s.switch("invert_masks"))
-        }
+        LoadRemedy::InvertMasks(true) => ("give {}, or remove the masks", s.switch("invert_masks")),
         LoadRemedy::InvertMasks(false) => {
-            format!("leave {} out, or remove the masks", s.switch("invert_masks"))
+            ("leave {} out, or remove the masks", s.switch("invert_masks"))
         }
-        LoadRemedy::LargerTestEvery => {
-            format!("use a larger {}, or leave it out", s.option("test_every"))
-        }
-        LoadRemedy::KeepFieldOfView => format!(
+        LoadRemedy::LargerTestEvery => ("use a larger {}, or leave it out", s.option("test_every")),
+        LoadRemedy::KeepFieldOfView => (
             "train on that field alone with {}, or calibrate again with fewer terms, or undistort the images first, \
              e.g. with `colmap image_undistorter`",
-            s.switch("keep_fov")
+            s.switch("keep_fov"),
         ),
-    }
+    };
+    words.replace("{}", &option)
 }
 
 impl BackendRemedy {
@@ -483,42 +481,20 @@ mod tests {
     use super::*;
     use crate::failure::{Failure, INPUT};
 
-    /// Datasets' errors and remedies, as on a terminal.
     #[test]
     fn errors_of_datasets_name_options() {
-        let remedied = |remedy| LoadError::Remedied { problem: "a.txt: b".to_owned(), remedy };
-        let no_masks = |inverted| LoadError::NoMasks { listing: "a.txt".into(), inverted };
+        let (listing, remedy) = ("a.txt".into(), LoadRemedy::InvertMasks(false));
+        let remedied = LoadError::Remedied { problem: "none left".to_owned(), remedy };
+        let no_masks = LoadError::NoMasks { listing, inverted: false };
         let views = LoadError::ViewList { file: "v.txt".into(), problem: "line 2".to_owned() };
-        for (error, words) in [
-            (
-                remedied(LoadRemedy::RestoreOrImagesFolder),
-                "a.txt: b; restore it, or name the folder that holds the images with --images",
-            ),
-            (
-                remedied(LoadRemedy::InvertMasks(true)),
-                "a.txt: b; give --invert-masks, or remove the masks",
-            ),
-            (
-                remedied(LoadRemedy::InvertMasks(false)),
-                "a.txt: b; leave --invert-masks out, or remove the masks",
-            ),
-            (
-                remedied(LoadRemedy::LargerTestEvery),
-                "a.txt: b; use a larger --test-every, or leave it out",
-            ),
-            (
-                no_masks(true),
-                "a.txt: --invert-masks: no photograph has a mask; put masks into `masks/`, named after their photographs as NAME.png, or leave the flag out",
-            ),
-            (
-                no_masks(false),
-                "a.txt: --mask-mode background: no photograph has a mask; put masks into `masks/`, named after their photographs as NAME.png, or leave the flag out",
-            ),
-            (views, "--views v.txt: line 2"),
-        ] {
-            let failure = Failure::from(error);
-            assert_eq!((failure.code, &*failure.to_string()), (INPUT, words));
-        }
+        let words = [remedied, no_masks, views].map(|error| Failure::from(error).to_string());
+        assert_eq!(words[0], "none left; leave --invert-masks out, or remove the masks");
+        assert_eq!(
+            words[1],
+            "a.txt: --mask-mode background: no photograph has a mask; put masks into `masks/`, named after their \
+             photographs as NAME.png, or leave the flag out"
+        );
+        assert_eq!(words[2], "--views v.txt: line 2");
     }
 
     #[test]

@@ -114,7 +114,7 @@ impl Server {
         let queue = RenderQueue::new(Some(MAX_WAITING), MAX_ACTIVE);
         let run_status = RunStatus::default();
         let routes = Routes {
-            listener: &self.listener,
+            listener: self,
             queue: &queue,
             limits: scene.limits(),
             description: description::describe(&mut scene),

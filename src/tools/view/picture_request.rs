@@ -67,6 +67,15 @@ pub(super) struct PictureRequest {
     pub(super) camera: Viewpoint,
 }
 
+#[cfg(test)]
+impl PictureRequest {
+    /// A request for the picture of a training view.
+    pub(super) fn of_view(page: &str, kind: PictureKind, size: (u32, u32), number: usize) -> Self {
+        let (pane, camera) = ((page.to_owned(), 0), Viewpoint::View(Split::Train, number));
+        Self { pane, kind, model: 0, size, is_moving: false, camera }
+    }
+}
+
 /// The camera of a picture.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Viewpoint {
@@ -165,7 +174,7 @@ mod tests {
             }
         }
         parse(body.to_string().as_bytes(), &limits()).map_err(|response| {
-            format!("{} {}", response.status(), String::from_utf8_lossy(response.body()))
+            format!("{} {}", response.status, String::from_utf8_lossy(&response.body))
         })
     }
 
@@ -234,7 +243,7 @@ mod tests {
             assert!(parse_changed(changes).unwrap_err().contains("fov"), "{fov}");
         }
         for body in [&b""[..], b"{", b"[]", b"\xff", b"{\"width\": 1e999}", &[b'['; 4096]] {
-            assert_eq!(parse(body, &limits()).unwrap_err().status(), 400);
+            assert_eq!(parse(body, &limits()).unwrap_err().status, 400);
         }
     }
 }

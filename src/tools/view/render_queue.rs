@@ -210,18 +210,9 @@ impl Drop for CloseOnDrop<'_> {
 mod tests {
     use super::*;
     use crate::picture_kind::PictureKind;
-    use crate::picture_request::Viewpoint;
-    use densify_train::evaluate::Split;
 
     fn picture_request(page: &str, number: usize) -> PictureRequest {
-        PictureRequest {
-            pane: (page.to_owned(), 0),
-            kind: PictureKind::Render,
-            model: 0,
-            size: (8, 8),
-            is_moving: true,
-            camera: Viewpoint::View(Split::Test, number),
-        }
+        PictureRequest::of_view(page, PictureKind::Render, (8, 8), number)
     }
 
     #[test]
@@ -249,15 +240,7 @@ mod tests {
     #[test]
     fn active_jobs_are_limited_until_their_pictures_are_encoded() {
         let queue = RenderQueue::new(None, 1);
-        let picture = EncodedPicture {
-            jpeg: vec![3],
-            size: (1, 1),
-            range: None,
-            mean: None,
-            distance: None,
-            measured_views: None,
-            milliseconds: 0.0,
-        };
+        let picture = EncodedPicture { jpeg: vec![3], ..EncodedPicture::default() };
         thread::scope(|scope| {
             let replies = ["a", "b"].map(|page| {
                 let queue = &queue;

@@ -47,8 +47,7 @@ impl RowMeasurements {
     ) -> Result<Self, Failure> {
         let needs = Needs { signals: SIGNALS.into(), ..Needs::default() };
         let gaussians = backend.download()?;
-        let backend = scene.machine.backend_to_measure(&gaussians, model.near, needs);
-        let mut backend = backend?;
+        let mut backend = scene.machine.backend_to_measure(&gaussians, model.near, needs)?;
         backend.begin_epoch();
         let (views, rows) = (scene.photographs(Split::Train).count(), gaussians.len());
         Ok(Self {
@@ -98,8 +97,7 @@ impl RowMeasurements {
                 break;
             }
         }
-        let taken = backend.take_signals(SignalSet::from(SIGNALS));
-        let taken = taken?;
+        let taken = backend.take_signals(SignalSet::from(SIGNALS))?;
         let get = |signal| taken.get(signal).unwrap_or_default();
         self.gradient = mean_over_views(get(Signal::ScreenGradient), get(Signal::VisibleCount));
         self.weight = get(Signal::WeightMax).to_vec();

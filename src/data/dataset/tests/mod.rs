@@ -19,6 +19,14 @@ impl Note {
     }
 }
 
+fn load(made: &Made) -> Dataset {
+    load_with(made, &LoadOptions::default())
+}
+
+fn load_with(made: &Made, options: &LoadOptions) -> Dataset {
+    Dataset::load(made.path(), options).unwrap_or_else(|e| panic!("{e}"))
+}
+
 /// Loads a broken dataset; the message or the remedy must contain all of `words`, which are separated by commas.
 fn refused(case: &str, made: &Made, options: &LoadOptions, words: &str) {
     let Err(error) = Dataset::load(made.path(), options) else { panic!("{case}: it loaded") };

@@ -3,12 +3,8 @@
 use serde_json::{Value, json};
 
 use super::super::*;
-use super::refused;
+use super::{load, load_with, refused};
 use densify_fixtures::{Made, image};
-
-fn load(made: &Made) -> Dataset {
-    Dataset::load(made.path(), &LoadOptions::default()).unwrap_or_else(|e| panic!("{e}"))
-}
 
 /// Renames the photographs, moves intrinsics into the frames, and adds the fields of an app.
 fn exported(names: [&str; 3], points: &str, edit: impl Fn(&mut Value)) -> Made {
@@ -159,7 +155,7 @@ fn paths_of_another_machine_are_found_in_the_folder_that_is_named() {
     image(&made.file("masks/1/a.png"), (20, 12), 255);
     let options = LoadOptions { images: Some("moved".into()), ..LoadOptions::default() };
     let names = |made: &Made| {
-        let data = Dataset::load(made.path(), &options).unwrap_or_else(|e| panic!("{e}"));
+        let data = load_with(made, &options);
         let name = |view: &View| (view.name.clone(), view.source.mask.is_some());
         [data.train.iter().map(name).collect::<Vec<_>>(), data.test.iter().map(name).collect()]
     };
@@ -195,7 +191,7 @@ fn paths_of_any_system_are_found_by_suffix() {
     ] {
         let made = Made::transforms(|json| json["frames"][1]["file_path"] = written.into());
         std::fs::rename(made.file("images"), made.file("moved")).unwrap();
-        let data = Dataset::load(made.path(), &with_images()).unwrap_or_else(|e| panic!("{e}"));
+        let data = load_with(&made, &with_images());
         let names: Vec<&str> = data.train.iter().map(|view| &*view.name).collect();
         let mut expected: Vec<&str> =
             found.into_iter().chain(["images/a.png", "images/c.png"]).collect();
@@ -220,7 +216,7 @@ fn paths_of_any_system_are_found_by_suffix() {
     for (made, folder) in [(colmap, ""), (table, "images/")] {
         refused("phones", &made, &LoadOptions::default(), "C:, is absolute, OtherImagesFolder");
         std::fs::rename(made.file("images"), made.file("moved")).unwrap();
-        let data = Dataset::load(made.path(), &with_images()).unwrap_or_else(|e| panic!("{e}"));
+        let data = load_with(&made, &with_images());
         let names: Vec<&str> = data.train.iter().map(|view| &*view.name).collect();
         let [a, c] = ["a.png", "c.png"].map(|name| format!("{folder}{name}"));
         let mut expected = ["b.png", &*a, &*c];
@@ -258,7 +254,7 @@ fn two_paths_to_one_photograph_are_refused() {
     for path in ["moved/train/r_0.png", "moved/test/r_0.png"] {
         image(&made.file(path), (20, 12), 9);
     }
-    let data = Dataset::load(made.path(), &options).unwrap_or_else(|e| panic!("{e}"));
+    let data = load_with(&made, &options);
     assert_eq!((data.train.len(), &*data.test[0].name), (2, "test/r_0.png"));
 }
 
@@ -275,7 +271,7 @@ fn masks_and_points_of_another_machine_are_found_too() {
         std::fs::rename(made.file("images"), made.file("moved")).unwrap();
         made
     };
-    let load = |made: &Made| Dataset::load(made.path(), &options).unwrap_or_else(|e| panic!("{e}"));
+    let load = |made: &Made| load_with(&made, &options);
     let place = |data: &Dataset| data.test[0].source.mask.clone().unwrap().file.path;
     let found = made();
     for path in ["masks/hidden.png", "masks/b.png", "hidden.png"] {

@@ -3,12 +3,8 @@
 use glam::DVec3;
 
 use super::super::*;
-use super::refused;
+use super::{load, refused};
 use densify_fixtures::{Made, SIZE, image};
-
-fn load(made: &Made) -> Dataset {
-    Dataset::load(made.path(), &LoadOptions::default()).unwrap_or_else(|e| panic!("{e}"))
-}
 
 const TABLE: &str = "cameras.csv";
 

@@ -2,18 +2,12 @@
 //!
 //! The files are the fuzz corpora: `ply/twelve.ply` has twelve Gaussians of degree 1, and the others were made from it.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
+use super::saved;
 use crate::models::read_model;
 use densify_core::gaussians::{Gaussians, sigmoid};
 use densify_fixtures::{corpus, corpus_files};
-
-fn saved(name: &str, contents: impl AsRef<[u8]>) -> (tempfile::TempDir, PathBuf) {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join(name);
-    std::fs::write(&path, contents).unwrap();
-    (folder, path)
-}
 
 fn read(path: &Path) -> Gaussians {
     let file = read_model(path).unwrap_or_else(|error| panic!("{error}"));

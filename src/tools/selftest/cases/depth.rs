@@ -22,12 +22,7 @@ pub(super) fn near_plane(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let scale = [0.3, 0.2, 0.1].map(|s: f32| s * (z.abs() as f32).clamp(1e-3, 3.0));
         scenes::push(&mut model, mean, scale, [0.8, 0.2, -0.5, 0.1], 0.3, colour);
     }
-    let cloud = scenes::cloud(20, 1, &camera, 7);
-    model.means.extend(cloud.means);
-    model.log_scales.extend(cloud.log_scales);
-    model.quats.extend(cloud.quats);
-    model.opacity_logits.extend(cloud.opacity_logits);
-    model.sh.extend(cloud.sh);
+    model.append(scenes::cloud(20, 1, &camera, 7));
     trial.check("behind and near", &model, &camera, GREY, 1)?;
 
     // One bit to either side of the plane; without rotation, camera z equals the mean's z exactly.
@@ -52,11 +47,7 @@ pub(super) fn camera_inside(trial: &mut Trial<'_>) -> Result<(), BackendError> {
             scenes::push(&mut model, [0.0, 0.1 * z, z], [times * z; 3], UPRIGHT, -1.0, shade);
         }
         let mut back = scenes::cloud(10, 0, &camera, 34);
-        back.means.extend(&model.means);
-        back.log_scales.extend(&model.log_scales);
-        back.quats.extend(&model.quats);
-        back.opacity_logits.extend(&model.opacity_logits);
-        back.sh.extend(&model.sh);
+        back.append(model);
         let label = format!("{times} times as wide as distant");
         trial.check(&label, &back, &camera, GREY, 0)?;
     }
