@@ -4,7 +4,8 @@
 
 use std::fs::File;
 use std::io::{BufReader, Cursor, Read, Seek};
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use image::error::ImageFormatHint;
 use image::metadata::Orientation;
@@ -76,12 +77,27 @@ pub struct ImageHeader {
 impl ImageSource {
     /// An image file without further processing.
     #[cfg(test)]
-    pub(super) fn whole(path: std::path::PathBuf) -> Self {
+    pub(super) fn whole(path: PathBuf) -> Self {
         let header = read_header(&path).expect("an image");
         let (width, height) = (header.width, header.height);
         let (mask, undistortion, rendered) = (None, None, None);
         let file = SourceFile::found(path).expect("an image");
         Self { file, mask, width, height, undistortion, header, rendered, window: None }
+    }
+
+    /// Pixels in memory, which messages call `name`, shrunk to this size on load.
+    pub(crate) fn rendered(name: PathBuf, image: Image8, (width, height): (u32, u32)) -> Self {
+        let header = ImageHeader {
+            width: image.width,
+            height: image.height,
+            has_alpha: image.alpha.is_some(),
+            turn: None,
+            decoded_bytes: image.bytes(),
+            file_bytes: 0,
+        };
+        let (file, rendered) = (SourceFile::rendered(name), Some(Arc::new(image)));
+        let (mask, undistortion, window) = (None, None, None);
+        Self { file, mask, width, height, undistortion, header, rendered, window }
     }
 
     /// Largest size of the loaded image `[bytes]`.

@@ -165,7 +165,7 @@ fn masks_note(frames: &[Frame]) -> Option<String> {
 
 /// The error for a lens that no pinhole camera can replace, with the remedy.
 fn lens_error(frame: &Frame, lens: &Lens, error: PinholeError) -> LoadError {
-    let problem = format!("{error} ({})", lens.distortion());
+    let problem = format!("{error} ({})", lens.distortion);
     let (image, origin) = (&frame.image, &frame.origin);
     if matches!(error, PinholeError::Folds(degrees) if degrees > 1.0) {
         return LoadError::remedied(image, origin, problem, LoadRemedy::KeepFieldOfView);

@@ -82,19 +82,19 @@ pub(super) fn check_lens(file: &Path, camera: &str, lens: &Lens) -> Result<(), L
     if !lens.is_finite() {
         return fault("the principal point or the distortion is not finite".into());
     }
-    if let Plane::Fov(omega) = lens.distortion().plane
+    if let Plane::Fov(omega) = lens.distortion.plane
         && omega.abs() > MAX_OMEGA
     {
         return fault(format!("omega = {omega} is not within {MAX_OMEGA} of 0"));
     }
     for (name, focal, side) in [("fx", lens.focal.x, size.x), ("fy", lens.focal.y, size.y)] {
-        let (half, most) = match lens.distortion().plane {
+        let (half, most) = match lens.distortion.plane {
             Plane::Perspective => ((0.5 * side / focal).atan(), *FIELD_OF_VIEW.end()),
             Plane::Equidistant | Plane::Fov(_) => (0.5 * side / focal, WIDEST_FISHEYE),
         };
         let degrees = 2.0 * half.to_degrees();
         if !(*FIELD_OF_VIEW.start()..=most).contains(&degrees) {
-            let wide = if degrees > most && lens.distortion().plane == Plane::Perspective {
+            let wide = if degrees > most && lens.distortion.plane == Plane::Perspective {
                 "; a lens this wide is a fisheye: use a fisheye model, or undistort its images to a pinhole"
             } else {
                 ""

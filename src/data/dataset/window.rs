@@ -92,6 +92,7 @@ impl View {
 #[allow(clippy::float_cmp, reason = "exact values")]
 mod tests {
     use super::*;
+    use crate::dataset::images::ImageSource;
     use crate::dataset::{Dataset, LoadOptions};
     use densify_core::image::Image8;
     use densify_fixtures::Made;
@@ -124,9 +125,7 @@ mod tests {
         let pixels = Image8 { width, height, rgb, alpha: None, mask: None };
         let mut view = dataset.train[0].clone();
         view.camera = view.camera.resized(width, height);
-        (view.source.width, view.source.height) = (width, height);
-        (view.source.header.width, view.source.header.height) = (width, height);
-        view.source.rendered = Some(std::sync::Arc::new(pixels));
+        view.source = ImageSource::rendered("made".into(), pixels, (width, height));
         let view = &view;
         let part = Part { left: 0.3, top: 0.0, right: 0.9, bottom: 1.0 };
         let cut = view.clone().windowed(&part);

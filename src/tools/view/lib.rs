@@ -45,13 +45,9 @@ impl Server {
     pub fn serve(&self, loaded: LoadedScene, is_over: &dyn Fn() -> bool) -> Result<(), Failure> {
         let LoadedScene { mut scene, mut backends } = loaded;
         let queue = RenderQueue::new(None, MAX_ACTIVE);
-        let routes = Routes {
-            listener: self,
-            queue: &queue,
-            limits: scene.limits(),
-            description: description::describe(&mut scene),
-            run_status: None,
-        };
+        let description = description::describe(&mut scene);
+        let routes =
+            Routes { listener: self, queue: &queue, scene: &scene, description, run_status: None };
         let failed = |message: String| Failure::new(OTHER, message);
         thread::scope(|scope| {
             let (queue, scene) = (&queue, &scene);

@@ -70,10 +70,6 @@ impl RenderQueue {
         self.jobs.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn wait<'a>(&self, jobs: MutexGuard<'a, Jobs>) -> MutexGuard<'a, Jobs> {
-        self.changed.wait(jobs).unwrap_or_else(PoisonError::into_inner)
-    }
-
     /// Queues a request and waits for its picture.
     pub(super) fn submit(&self, request: PictureRequest) -> Result<EncodedPicture, RenderError> {
         let (reply, result) = sync_channel(1);
@@ -109,18 +105,22 @@ impl RenderQueue {
         Some(jobs.waiting.remove(0))
     }
 
+    /// Waits until `take` returns something; `None` once the queue is closed.
+    fn wait_for<T>(&self, take: impl Fn(&mut Jobs) -> Option<T>) -> Option<T> {
+        let mut jobs = self.lock();
+        while !jobs.is_closed {
+            let taken = take(&mut jobs);
+            if taken.is_some() {
+                return taken;
+            }
+            jobs = self.changed.wait(jobs).unwrap_or_else(PoisonError::into_inner);
+        }
+        None
+    }
+
     /// Waits for the next job to render; `None` once the queue is closed.
     pub(super) fn next(&self) -> Option<Job> {
-        let mut jobs = self.lock();
-        loop {
-            if jobs.is_closed {
-                return None;
-            }
-            if let Some(job) = self.take(&mut jobs) {
-                return Some(job);
-            }
-            jobs = self.wait(jobs);
-        }
+        self.wait_for(|jobs| self.take(jobs))
     }
 
     /// The next job to render, waiting for it at most this long.
@@ -154,16 +154,7 @@ impl RenderQueue {
 
     /// Waits for the next rendering to encode; `None` once the queue is closed.
     pub(super) fn next_rendered(&self) -> Option<(Job, RenderedPicture)> {
-        let mut jobs = self.lock();
-        loop {
-            if jobs.is_closed {
-                return None;
-            }
-            if !jobs.rendered.is_empty() {
-                return Some(jobs.rendered.remove(0));
-            }
-            jobs = self.wait(jobs);
-        }
+        self.wait_for(|jobs| (!jobs.rendered.is_empty()).then(|| jobs.rendered.remove(0)))
     }
 
     /// Answers an active job.

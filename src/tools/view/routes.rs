@@ -12,7 +12,7 @@ use super::listener::Server;
 use super::picture_request::{self, PictureRequest};
 use super::render_queue::{RenderError, RenderQueue};
 use super::run_status::{Command, RunStatus};
-use super::scene::RequestLimits;
+use super::scene::Scene;
 
 const PAGE: &str = include_str!("page/index.html");
 static STYLE: LazyLock<String> =
@@ -24,7 +24,7 @@ const LIVE_SCRIPT: &str = include_str!("page/live.js");
 pub(super) struct Routes<'a> {
     pub(super) listener: &'a Server,
     pub(super) queue: &'a RenderQueue,
-    pub(super) limits: RequestLimits,
+    pub(super) scene: &'a Scene,
     /// The scene's [description](super::description), as JSON.
     pub(super) description: Arc<[u8]>,
     /// The status of the run, if one is in training.
@@ -61,7 +61,7 @@ impl Routes<'_> {
             (Method::Get | Method::Head, "progress") if let Some(run_status) = self.run_status => {
                 json(run_status.json())
             }
-            (Method::Post, "frame") => match picture_request::parse(&request.body, &self.limits) {
+            (Method::Post, "frame") => match picture_request::parse(&request.body, self.scene) {
                 Ok(request) => self.render(request),
                 Err(response) => response,
             },
@@ -140,7 +140,7 @@ mod tests {
 
     use super::*;
     use crate::listener::ListenAddress;
-    use crate::scene::{ModelInfo, Scene};
+    use crate::scene::ModelInfo;
     use densify_data::dataset::PointCloud;
     use densify_data::dataset::normalise::Normalisation;
     use densify_run::finished::Machine;
@@ -166,7 +166,7 @@ mod tests {
         let routes = |run_status| Routes {
             listener: &listener,
             queue: &queue,
-            limits: scene.limits(),
+            scene: &scene,
             description: Arc::from(*b"{}"),
             run_status,
         };

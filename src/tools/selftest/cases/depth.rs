@@ -1,10 +1,8 @@
 //! Rows at the camera, around the near plane, and at equal or nearly equal depths.
 
 use super::{GREY, UPRIGHT, flat_colour, straight};
-use crate::compare::class;
-use crate::reference::CLASSES;
 use crate::scenes;
-use crate::trial::{Trial, bits, count_broken, count_different};
+use crate::trial::{Trial, bits, count_different};
 use densify_core::gaussians::Gaussians;
 use densify_render::BackendError;
 
@@ -64,17 +62,10 @@ pub(super) fn camera_at_mean(trial: &mut Trial<'_>) -> Result<(), BackendError> 
             model.means[row] = direction.map(|d: f32| d * offset);
             model.log_scales[row] = [0.7, 0.0, 2.0];
         }
-        let mut backend = trial.subject.backend(&model)?;
-        let upstream = scenes::narrowed(&scenes::upstream(&camera, 5));
-        let (image, gradient) = backend.differentiate(&camera, GREY, 2, &upstream)?;
-        let gradients = CLASSES.map(|name| class(&gradient, name));
-        let mut broken = count_broken(&[&image.rgb, &image.alpha, &image.depth]);
-        broken += count_broken(&gradients);
         let label = format!("{label} from the camera");
-        trial.count(&label, "NaN or infinity", broken);
+        let gradient = trial.check_finite(&label, &model, &camera, GREY, 2)?;
         let pulled = gradient.sh[..3 * 27].iter().filter(|g| **g != 0.0).count();
         trial.count(&label, "gradients of SH without a direction", pulled);
-        trial.train(&label, &mut *backend, &camera, GREY, 2)?;
     }
     Ok(())
 }

@@ -2,8 +2,7 @@
 
 mod scene_cache;
 
-use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::path::Path;
 
 pub use densify_scenegen::GroundTruth;
 use densify_scenegen::{
@@ -12,7 +11,7 @@ use densify_scenegen::{
 use serde::{Deserialize, Serialize};
 
 use super::PREFIX;
-use crate::dataset::images::{ImageHeader, ImageSource, SourceFile};
+use crate::dataset::images::ImageSource;
 use crate::dataset::photographs::{Photograph, target_size};
 use crate::dataset::prepare::{assemble, texts};
 use crate::dataset::tracks::TrackSampler;
@@ -176,37 +175,14 @@ fn dataset_view(name: &str, camera: Camera, frame: Frame, options: &LoadOptions)
     let pixels = frame.rgba.chunks_exact(4);
     let rgb = pixels.clone().flat_map(|pixel| [pixel[0], pixel[1], pixel[2]]).collect();
     let alpha: Vec<u8> = pixels.map(|pixel| pixel[3]).collect();
-    let has_alpha = alpha.iter().any(|&a| a < 255);
-    let image = Image8 {
-        width: frame.width,
-        height: frame.height,
-        rgb,
-        alpha: has_alpha.then_some(alpha),
-        mask: None,
-    };
-    let header = ImageHeader {
-        width: frame.width,
-        height: frame.height,
-        has_alpha,
-        turn: None,
-        decoded_bytes: image.bytes(),
-        file_bytes: 0,
-    };
-    let (width, height) =
-        target_size((header.width, header.height), header.width, options.resolution, false);
+    let alpha = alpha.iter().any(|&a| a < 255).then_some(alpha);
+    let (width, height) = (frame.width, frame.height);
+    let image = Image8 { width, height, rgb, alpha, mask: None };
+    let (width, height) = target_size((width, height), width, options.resolution, false);
     View {
         name: format!("{name}.png"),
         camera: camera.resized(width, height),
-        source: ImageSource {
-            file: SourceFile::rendered(PathBuf::from(format!("{PREFIX}{name}"))),
-            mask: None,
-            width,
-            height,
-            undistortion: None,
-            header,
-            rendered: Some(Arc::new(image)),
-            window: None,
-        },
+        source: ImageSource::rendered(format!("{PREFIX}{name}").into(), image, (width, height)),
     }
 }
 
