@@ -256,12 +256,8 @@ fn broken(path: &Path, error: &ZipError) -> LoadError {
 fn bomb(path: &Path, most: u64) -> LoadError {
     let problem =
         format!("it unpacks to more than {}, which is implausible for photographs", Bytes(most));
-    LoadError::malformed(
-        path,
-        "archive",
-        problem,
-        "unpack it yourself if you trust it, and name the folder",
-    )
+    let remedy = "unpack it yourself if you trust it, and name the folder";
+    LoadError::malformed(path, "archive", problem, remedy)
 }
 
 fn no_room(path: &Path, place: &Path, bytes: u64, error: &io::Error) -> LoadError {

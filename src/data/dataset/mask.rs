@@ -173,11 +173,8 @@ mod tests {
             GrayImage::from_pixel(4, 4, [colour].into()).save(&mask).unwrap();
             let mask = Some(mask_of(mask.clone(), hides));
             let source = ImageSource { mask, ..ImageSource::whole(path.clone()) };
-            let message = source.load().unwrap_err().to_string();
-            assert!(
-                message.contains("m.png") && message.contains("hides every pixel"),
-                "{message}"
-            );
+            let error = source.load().unwrap_err().to_string();
+            assert!(error.contains("m.png") && error.contains("hides every pixel"), "{error}");
         }
     }
 }

@@ -92,28 +92,20 @@ fn find(root: &Root) -> Result<Option<PathBuf>, LoadError> {
 /// When a line is damaged or a camera is impossible.
 fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> {
     let Some(path) = &find(root)? else { return Ok(None) };
+    let fault =
+        |place: &str, problem: &str| Err(LoadError::malformed(path, place, problem, REMEDY));
     let [first, second] = [true, false].map(|within| Folders::new(root, options, within));
     let (first, second) = (first?, second?);
     let text = files::read_text(path, MAX_BYTES).map_err(LoadError::io(path))?;
     let mut lines = (1..).zip(text.lines()).filter(|(_, line)| !line.trim().is_empty());
     let Some(columns) = lines.find_map(|(_, line)| Columns::parse(line)) else {
-        return Err(LoadError::malformed(
-            path,
-            "the first line",
-            "it does not name the columns",
-            REMEDY,
-        ));
+        return fault("the first line", "it does not name the columns");
     };
     let (mut frames, mut missing, mut fell_back, mut first_missing) =
         (Vec::new(), Vec::new(), 0, None);
     for (number, line) in lines {
         if frames.len() + missing.len() == MAX_FRAMES {
-            return Err(LoadError::malformed(
-                path,
-                "the file",
-                "it lists more than a million",
-                REMEDY,
-            ));
+            return fault("the file", "it lists more than a million");
         }
         let row = Row { path, number, columns: &columns, cells: cells(line) };
         let name = row.text("name").trim();

@@ -334,11 +334,8 @@ mod tests {
         assert!(near > far && far > nothing && nothing == 0, "{near} {far} {nothing}");
         let range = depth.range.expect("a scale");
         assert!(is_near(range.start, 6.0 * units) && is_near(range.end, 2.0 * units), "{range:?}");
-        assert!(
-            depth.distance.is_some_and(|distance| is_near(distance, 6.0 * units)),
-            "{:?}",
-            depth.distance
-        );
+        let distance = depth.distance.expect("a distance");
+        assert!(is_near(distance, 6.0 * units), "{distance}");
         let (opacity, lights) = draw_kind(PictureKind::Opacity);
         assert_eq!((lights, opacity.range), ([3 * 255, 3 * 191, 0], None));
         let (count, [some, more, none]) = draw_kind(PictureKind::Count);

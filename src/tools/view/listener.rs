@@ -221,10 +221,8 @@ mod tests {
         assert!(one.is_public() && one.token != other.token);
         let token = one.token.clone().unwrap();
         assert_eq!(token.len(), 32);
-        assert!(
-            one.url().starts_with("http://127.0.0.1:")
-                && one.url().ends_with(&format!("/{token}/"))
-        );
+        let url = one.url();
+        assert!(url.starts_with("http://127.0.0.1:") && url.ends_with(&format!("/{token}/")));
         let ask =
             |path: &str| one.authorise(&request(path, "any.example", None)).map(str::to_owned).ok();
         assert_eq!(ask(&format!("/{token}/frame")).as_deref(), Some("frame"));
@@ -258,10 +256,8 @@ mod tests {
         let first = listener(host);
         let port = first.address.port();
         let refused = open(host, Some(port), false).unwrap_err();
-        assert!(
-            refused.code == 2 && refused.to_string().contains(&format!("--port {port}")),
-            "{refused}"
-        );
+        let message = refused.to_string();
+        assert!(refused.code == 2 && message.contains(&format!("--port {port}")), "{message}");
         let two = [(); 2].map(|()| open(host, None, false).unwrap());
         assert_ne!(two[0].address, two[1].address);
         let refused = open(Ipv4Addr::new(192, 0, 2, 7), Some(0), false).unwrap_err();

@@ -191,10 +191,8 @@ mod tests {
         assert!((key.fov_y.to_degrees() - 50.0).abs() < 1e-9);
         let at_view = json!({ "camera": null, "view": { "split": "train", "number": 0 }, "kind": "difference" });
         let request = parse_changed(&scene, at_view).unwrap();
-        assert_eq!(
-            (request.camera, request.kind),
-            (Viewpoint::View(Split::Train, 0), PictureKind::Difference)
-        );
+        assert_eq!(request.camera, Viewpoint::View(Split::Train, 0));
+        assert_eq!(request.kind, PictureKind::Difference);
     }
 
     #[test]
@@ -236,11 +234,8 @@ mod tests {
             (json!({ "camera": { "camera_to_world": vec![1; 17], "fov": 50 } }), "17 numbers"),
             (json!({ "camera": { "camera_to_world": [1, "a"], "fov": 50 } }), "no picture"),
         ] {
-            let refused = parse_changed(&scene, changes.clone()).expect_err(&changes.to_string());
-            assert!(
-                refused.starts_with("400 ") && refused.contains(reason),
-                "{changes}: {refused}"
-            );
+            let error = parse_changed(&scene, changes.clone()).expect_err(&changes.to_string());
+            assert!(error.starts_with("400 ") && error.contains(reason), "{changes}: {error}");
         }
         for fov in [0.0, 0.5, 171.0, 180.0, -1.0] {
             let mut changes = pose(0, 1.0);

@@ -269,6 +269,7 @@ mod tests {
     #[test]
     fn only_the_newest_request_of_a_pane_is_kept_and_none_starves() {
         let queue = RenderQueue::new(None, 1);
+        let failed = || RenderError::Failed("made".into());
         let waiting = |count: usize| {
             while queue.lock().waiting.len() < count {
                 thread::yield_now();
@@ -301,11 +302,8 @@ mod tests {
             {
                 let job = queue.next().unwrap();
                 assert_eq!(job.request, expected);
-                queue.finish_rendering(job, Err(RenderError::Failed("made".into())));
-                assert_eq!(
-                    replies.join().unwrap().unwrap_err(),
-                    RenderError::Failed("made".into())
-                );
+                queue.finish_rendering(job, Err(failed()));
+                assert_eq!(replies.join().unwrap().unwrap_err(), failed());
             }
             let left = submit("c", 0);
             waiting(1);

@@ -278,11 +278,8 @@ mod tests {
     fn the_ends_of_a_scale_ignore_outliers() {
         let mut values: Vec<f32> = (0_u16..1000).map(f32::from).collect();
         values.extend([1e9, -1e9, f32::NAN, f32::INFINITY]);
-        let ends = ends(&values);
-        assert!(
-            (0.0..20.0).contains(&ends.start) && (980.0..1000.0).contains(&ends.end),
-            "{ends:?}"
-        );
-        assert_eq!(super::ends(&[]), 0.0..0.0);
+        let Range { start, end } = ends(&values);
+        assert!((0.0..20.0).contains(&start) && (980.0..1000.0).contains(&end), "{start} {end}");
+        assert_eq!(ends(&[]), 0.0..0.0);
     }
 }

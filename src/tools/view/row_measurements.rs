@@ -164,11 +164,8 @@ mod tests {
         for views in 1..=2 {
             measured.measure_more(&scene, 0, Duration::ZERO).expect("a view");
             assert_eq!(measured.progress(), [views, 2]);
-            assert_eq!(
-                [positive(&measured.weight), positive(&measured.gradient)],
-                [views; 2],
-                "{measured:?}"
-            );
+            let found = [positive(&measured.weight), positive(&measured.gradient)];
+            assert_eq!(found, [views; 2], "{measured:?}");
             let measures =
                 measured.backend.as_ref().map(|backend| backend.download().expect("a model"));
             assert_eq!(measures.is_none(), views == 2, "the backend outlives the last view");
@@ -177,10 +174,7 @@ mod tests {
         let before = (measured.weight.clone(), measured.gradient.clone());
         measured.measure_more(&scene, 0, Duration::ZERO).expect("nothing to do");
         assert_eq!((&measured.weight, &measured.gradient), (&before.0, &before.1));
-        assert!(
-            measured.weight.iter().all(|weight| (0.5..=1.0).contains(weight)),
-            "{:?}",
-            measured.weight
-        );
+        let weights = &measured.weight;
+        assert!(weights.iter().all(|weight| (0.5..=1.0).contains(weight)), "{weights:?}");
     }
 }

@@ -124,10 +124,8 @@ impl<'a> Reader<'a> {
         if self.left == 0 {
             return Ok(());
         }
-        Err(self.fault(
-            field,
-            format!("{} bytes follow the {count} records the file announced", self.left),
-        ))
+        let problem = format!("{} bytes follow the {count} records the file announced", self.left);
+        Err(self.fault(field, problem))
     }
 }
 

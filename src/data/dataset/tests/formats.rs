@@ -29,10 +29,8 @@ fn all_formats_agree() {
             let (a, b) = (&a.camera, &b.camera);
             assert!((a.rotation - b.rotation).to_cols_array().iter().all(|e| e.abs() < 1e-12));
             assert!((a.translation - b.translation).length() < 1e-12);
-            assert_eq!(
-                (a.width, a.height, a.fx, a.fy, a.cx, a.cy),
-                (b.width, b.height, b.fx, b.fy, b.cx, b.cy)
-            );
+            let lens = |c: &Camera| (c.width, c.height, c.fx, c.fy, c.cx, c.cy);
+            assert_eq!(lens(a), lens(b));
         }
     }
     let world = text.normalisation.world_from_scene_camera(&text.train[0].camera);
@@ -311,9 +309,8 @@ fn frames_override_the_intrinsics_at_the_top() {
         json["camera_angle_x"] = 1.0.into();
     }));
     let camera = &data.train[0].camera;
-    assert!(
-        (camera.fx - 10.0 / 0.5f64.tan()).abs() < 1e-12 && (camera.fy - camera.fx).abs() < 1e-12
-    );
+    assert!((camera.fx - 10.0 / 0.5f64.tan()).abs() < 1e-12);
+    assert!((camera.fy - camera.fx).abs() < 1e-12);
     assert!((camera.cx - 10.0).abs() < 1e-12 && (camera.cy - 6.0).abs() < 1e-12);
 }
 

@@ -38,11 +38,8 @@ fn real_datasets_load() {
         }
         for view in data.train.iter().step_by(20) {
             let image = view.source.load().unwrap();
-            assert_eq!(
-                (image.width, image.height),
-                (view.camera.width, view.camera.height),
-                "{name}"
-            );
+            let size = (view.camera.width, view.camera.height);
+            assert_eq!((image.width, image.height), size, "{name}");
             assert_eq!(image.alpha.is_some(), name == "chair", "{name} {}", view.name);
             assert!(image.bytes() <= view.source.loaded_bytes());
         }

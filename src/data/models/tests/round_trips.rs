@@ -86,12 +86,10 @@ fn formats_in_f32_keep_every_bit() {
             let format = find(name).unwrap();
             let bytes = written(format, &model).unwrap();
             let again = read(&bytes);
-            assert_eq!(again, model, "{name}, {rows} rows, degree {degree}");
+            let case = format!("{name}, {rows} rows, degree {degree}");
+            assert_eq!(again, model, "{case}");
             // Bits too: −0 equals 0.
-            assert!(
-                written(format, &again).unwrap() == bytes,
-                "{name}, {rows} rows, degree {degree}"
-            );
+            assert!(written(format, &again).unwrap() == bytes, "{case}");
         }
     }
 }
