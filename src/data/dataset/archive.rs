@@ -147,9 +147,8 @@ impl Unpacked {
 
     /// Replaces the temporary folder by the archive's name in a path.
     pub(super) fn shown(&self, path: &Path) -> PathBuf {
-        let inside =
-            path.strip_prefix(&self.folder).or_else(|_| path.strip_prefix(self.all.path()));
-        inside.map_or_else(|_| path.to_owned(), |inside| self.archive.join(inside))
+        let rest = path.strip_prefix(&self.folder).or_else(|_| path.strip_prefix(self.all.path()));
+        rest.map_or_else(|_| path.to_owned(), |rest| self.archive.join(rest))
     }
 }
 

@@ -141,8 +141,7 @@ fn neighbourhood(image: &Image8, pixel: glam::DVec2) -> Option<([u8; 3], [u8; 3]
     let (mut lowest, mut highest) = ([u8::MAX; 3], [u8::MIN; 3]);
     let at = |x: i64, y: i64| (y * width + x) as usize;
     for place in (y - 1..=y + 1).flat_map(|y| (x - 1..=x + 1).map(move |x| at(x, y))) {
-        let whole =
-            |channel: &Option<Vec<u8>>| channel.as_ref().is_none_or(|c| c[place] == u8::MAX);
+        let whole = |plane: &Option<Vec<u8>>| plane.as_ref().is_none_or(|p| p[place] == u8::MAX);
         if !whole(&image.alpha) || !whole(&image.mask) {
             return None;
         }

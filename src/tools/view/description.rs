@@ -99,8 +99,7 @@ fn describe_without_points(scene: &Scene) -> Value {
         .models
         .iter()
         .map(|model| json!({ "name": model.name, "rows": model.rows, "degree": model.sh_degree }));
-    let is_available =
-        |kind: &PictureKind| scene.unavailable.iter().all(|(other, _)| other != kind);
+    let is_available = |kind: &PictureKind| scene.unavailable.iter().all(|(k, _)| k != kind);
     let kinds = PictureKind::ALL.into_iter().filter(is_available);
     let unavailable = scene.unavailable.iter();
     let unavailable =

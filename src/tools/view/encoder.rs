@@ -154,7 +154,7 @@ pub(super) fn camera(scene: &Scene, request: &PictureRequest) -> Camera {
 
 /// Shrinks a size to the largest allowed one, keeping the aspect ratio.
 fn limit_size((width, height): (u32, u32), largest: Option<(u32, u32)>) -> (u32, u32) {
-    let Some(largest) = largest.filter(|it| width > it.0 || height > it.1) else {
+    let Some(largest) = largest.filter(|most| width > most.0 || height > most.1) else {
         return (width, height);
     };
     let [x, y] =

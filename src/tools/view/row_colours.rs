@@ -242,11 +242,10 @@ mod tests {
     fn colours_represent_the_property() {
         let brightness = |colour: &[f32; 3]| colour.iter().sum::<f32>();
         let mut backend = Device::default().backend(&model(), &Setup::new(3)).unwrap();
-        let measurements =
-            RowMeasurements::from_values(vec![0.0, 1e-5, 1e-3], vec![0.0, 0.25, 1.0]);
+        let measured = RowMeasurements::from_values(vec![0.0, 1e-5, 1e-3], vec![0.0, 0.25, 1.0]);
         let history = history();
         let row_data = RowData {
-            measurements: Some(&measurements),
+            measurements: Some(&measured),
             history: Some((&history, 10)),
             signals: SignalSet::default(),
         };

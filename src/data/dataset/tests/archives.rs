@@ -94,11 +94,11 @@ fn in_headers(bytes: &[u8], own: usize, table: usize, change: impl Fn(&mut u8)) 
 
 /// The folder that an archive is unpacked in, according to the note.
 fn unpacked_in(data: &Dataset) -> PathBuf {
-    let said = data.notes.iter().find_map(|note| match note {
+    let parts = data.notes.iter().find_map(|note| match note {
         Note::Text(text) => text.split_once(" is unpacked in "),
         _ => None,
     });
-    let (_, place) = said.unwrap_or_else(|| panic!("{:?}", data.notes));
+    let (_, place) = parts.unwrap_or_else(|| panic!("{:?}", data.notes));
     place.split_once(" (").unwrap().0.into()
 }
 

@@ -181,8 +181,9 @@ fn a_photograph_that_lies_on_its_side_for_its_camera_is_turned() {
         assert_eq!((image.width, image.height), SIZE);
         assert_eq!(image.rgb[..3], left, "{orientation}");
         assert_ne!(image.rgb[57..60], left, "{orientation}");
-        let said = |note: &Note| note.contains("1 photographs lie on") && note.contains("b.png");
-        assert!(data.notes.iter().any(said), "{:?}", data.notes);
+        let is_noted =
+            |note: &Note| note.contains("1 photographs lie on") && note.contains("b.png");
+        assert!(data.notes.iter().any(is_noted), "{:?}", data.notes);
         // Turning takes the picture twice.
         let bytes = view.source.working_bytes();
         assert!(bytes >= 2 * 3 * u64::from(SIZE.0 * SIZE.1), "{bytes}");
@@ -247,7 +248,7 @@ fn an_ambiguous_orientation_is_noted() {
     ] {
         write_exif(&made.file("images/b.png"), turned(6));
         let data = load(&made);
-        let said = |note: &Note| note.contains("1 photographs have an EXIF orientation");
-        assert_eq!(data.notes.iter().any(said), is_named, "{:?}", data.notes);
+        let is_noted = |note: &Note| note.contains("1 photographs have an EXIF orientation");
+        assert_eq!(data.notes.iter().any(is_noted), is_named, "{:?}", data.notes);
     }
 }

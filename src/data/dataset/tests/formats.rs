@@ -165,8 +165,8 @@ fn masks_are_found() {
             .save(made.file(mask))
             .unwrap();
         let data = load(&made);
-        let said = |note: &Note| note.contains("1 of 3 photographs have a mask");
-        assert!(data.notes.iter().any(said), "{mask}: {:?}", data.notes);
+        let is_noted = |note: &Note| note.contains("1 of 3 photographs have a mask");
+        assert!(data.notes.iter().any(is_noted), "{mask}: {:?}", data.notes);
         assert_eq!(data.train[0].source.load().unwrap().mask, None, "{mask}");
         let found = data.train[1].source.load().unwrap().mask.unwrap();
         assert_eq!((found[0], found[19]), (0, 255), "{mask}");
@@ -191,9 +191,9 @@ fn masks_of_no_photograph_are_named() {
         image(&made.file(file), SIZE, 200);
         let folder = file.rsplit_once('/').unwrap().0;
         let notes = load(&made).notes;
-        let said =
+        let is_noted =
             |note: &Note| note.contains(folder) && note.contains("the mask of no photograph");
-        assert!(notes.iter().any(said), "{file}: {notes:?}");
+        assert!(notes.iter().any(is_noted), "{file}: {notes:?}");
     }
     assert!(!load(&Made::colmap_txt()).notes.iter().any(|note| note.contains("mask")));
 }

@@ -169,10 +169,10 @@ fn views_that_a_mask_hides_are_named_and_left_out() {
     let data = load_with(&made, &options);
     assert_eq!(names(&data.train), ["b.png"]);
     assert_eq!(names(&data.test), ["c.png"]);
-    let said = |data: &Dataset, name: &str| {
+    let is_noted = |data: &Dataset, name: &str| {
         data.notes.iter().any(|note| note.contains("masks hide") && note.contains(name))
     };
-    assert!(said(&data, "a.png") && !said(&data, "b.png"), "{:?}", data.notes);
+    assert!(is_noted(&data, "a.png") && !is_noted(&data, "b.png"), "{:?}", data.notes);
     for name in ["b.png", "c.png"] {
         grey(&made, name, |_| 0);
     }
@@ -185,7 +185,7 @@ fn views_that_a_mask_hides_are_named_and_left_out() {
     let data = load_with(&made, &options);
     let faces = ["front", "right", "up", "down"].map(|face| format!("b@{face}.png"));
     assert_eq!(names(&data.train), faces);
-    assert!(said(&data, "b@left.png"), "{:?}", data.notes);
+    assert!(is_noted(&data, "b@left.png"), "{:?}", data.notes);
     for view in &data.train {
         assert!(view.source.load().unwrap().mask.unwrap().iter().any(|&weight| weight > 0));
     }

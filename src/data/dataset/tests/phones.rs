@@ -290,8 +290,8 @@ fn masks_and_points_of_another_machine_are_found_too() {
     image(&without.file("masks/b.png"), (20, 12), 255);
     without.remove("points.ply");
     let data = load(&without);
-    let said = |note: &Note| note.contains("points.ply") && note.contains("left out");
-    assert!(data.points.is_empty() && data.notes.iter().any(said), "{:?}", data.notes);
+    let is_noted = |note: &Note| note.contains("points.ply") && note.contains("left out");
+    assert!(data.points.is_empty() && data.notes.iter().any(is_noted), "{:?}", data.notes);
     // Without the option no path is guessed.
     std::fs::rename(without.file("moved"), without.file("images")).unwrap();
     refused("phones", &without, &LoadOptions::default(), "is absolute, OtherImagesFolder");

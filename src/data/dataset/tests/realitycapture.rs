@@ -122,8 +122,8 @@ fn names_may_have_commas_spaces_and_other_scripts_and_lie_in_images() {
     made.remove("images/c.png");
     let data = load(&made);
     assert_eq!(data.train.len(), 2);
-    let said = |note: &Note| note.contains("1 of 3 photographs") && note.contains("c.png");
-    assert!(data.notes.iter().any(said), "{:?}", data.notes);
+    let is_noted = |note: &Note| note.contains("1 of 3 photographs") && note.contains("c.png");
+    assert!(data.notes.iter().any(is_noted), "{:?}", data.notes);
 }
 
 #[test]

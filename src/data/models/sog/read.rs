@@ -87,8 +87,7 @@ fn read_images(
     length: u64,
     open: OpenImage<'_>,
 ) -> Result<SplatFile, LoadError> {
-    let meta: Meta =
-        serde_json::from_str(text).map_err(|error| LoadError::damaged(path, META, error))?;
+    let meta: Meta = serde_json::from_str(text).map_err(|e| LoadError::damaged(path, META, e))?;
     if meta.version != Some(2) {
         let version = meta.version.map_or_else(|| "1 (it names none)".into(), |v| v.to_string());
         let problem = format!("version {version}, but densify reads 2");

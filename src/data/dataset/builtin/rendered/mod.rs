@@ -54,9 +54,9 @@ pub(in crate::dataset) fn load(
 ) -> Result<Dataset, LoadError> {
     let (source, parameters) = (Source::Preset(name.to_owned()), Options::default());
     // The name is checked before it becomes part of a file name.
-    let asked: PresetSpec = name.parse()?;
+    let preset: PresetSpec = name.parse()?;
     let entry = options.cache.as_deref();
-    let entry = entry.and_then(|folder| Entry::new(folder, &asked.to_string(), &parameters));
+    let entry = entry.and_then(|folder| Entry::new(folder, &preset.to_string(), &parameters));
     let kept = entry.as_ref().and_then(Entry::read);
     // Another program may have written an entry with another number of images.
     if let Some(kept) = kept.filter(|kept| kept.frames.len() == kept.about.views.len()) {
