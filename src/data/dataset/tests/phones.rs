@@ -271,7 +271,7 @@ fn masks_and_points_of_another_machine_are_found_too() {
         std::fs::rename(made.file("images"), made.file("moved")).unwrap();
         made
     };
-    let load = |made: &Made| load_with(&made, &options);
+    let load = |made: &Made| load_with(made, &options);
     let place = |data: &Dataset| data.test[0].source.mask.clone().unwrap().file.path;
     let found = made();
     for path in ["masks/hidden.png", "masks/b.png", "hidden.png"] {
