@@ -1,14 +1,61 @@
 //! The error of every reader: each message names the file, the field and the remedy.
 
 use std::fmt::Display;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use densify_core::files::one_line;
 
-/// A dataset, one of its images, or a model that cannot be loaded.
+/// A dataset, one of its images, or a model that cannot be loaded. Options are data, so that whoever shows the error spells
+/// them; as displayed here, remedies by options are missing.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{0}")]
-pub struct LoadError(pub(crate) String);
+pub enum LoadError {
+    /// A fault that no option remedies: the file, the field, and the remedy.
+    #[error("{0}")]
+    Data(String),
+    /// A fault that an option may remedy.
+    #[error("{problem}")]
+    Remedied {
+        /// The file, the field and the fault.
+        problem: String,
+        /// The option and the other ways out.
+        remedy: LoadRemedy,
+    },
+    /// A fault in the [list of views](crate::dataset::LoadOptions::views).
+    #[error("{}: {problem}", file.display())]
+    ViewList {
+        /// The list.
+        file: PathBuf,
+        /// The line and the fault.
+        problem: String,
+    },
+    /// Masks are to be inverted or carved away, but the dataset has none.
+    #[error("{}: no photograph has a mask", listing.display())]
+    NoMasks {
+        /// The file that lists the photographs.
+        listing: PathBuf,
+        /// True for inverted masks, false for the background that they carve away.
+        inverted: bool,
+    },
+}
+
+/// An option that remedies a [`LoadError`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LoadRemedy {
+    /// Restore a missing image, or name the folder of images.
+    RestoreOrImagesFolder,
+    /// Add the missing images, or name their folder.
+    AddOrImagesFolder,
+    /// Name a folder of images instead of paths that lead out of the dataset.
+    OtherImagesFolder,
+    /// Name the folder that holds both images at their original paths, as suffixes do not tell them apart.
+    ImagesFolderOfBoth,
+    /// Invert masks that hide everything, or do not.
+    InvertMasks(bool),
+    /// Hold fewer views out.
+    LargerTestEvery,
+    /// Keep the usable field of view of a lens that folds over.
+    KeepFieldOfView,
+}
 
 impl LoadError {
     /// A file cannot be opened or read.
@@ -18,9 +65,11 @@ impl LoadError {
             let is_ours = source.raw_os_error().is_none();
             let path = path.display();
             if is_ours && source.kind() == std::io::ErrorKind::Other {
-                return Self(format!("{path}: the file: {source}"));
+                return Self::Data(format!("{path}: the file: {source}"));
             }
-            Self(format!("cannot read {path}: {source}; check that it exists and is readable"))
+            Self::Data(format!(
+                "cannot read {path}: {source}; check that it exists and is readable"
+            ))
         }
     }
 
@@ -32,12 +81,23 @@ impl LoadError {
         remedy: &str,
     ) -> Self {
         let [field, problem] = [field.to_string(), problem.to_string()].map(|text| one_line(&text));
-        Self(format!("{}: {field}: {problem}; {remedy}", path.display()))
+        Self::Data(format!("{}: {field}: {problem}; {remedy}", path.display()))
     }
 
     /// As [`malformed`](Self::malformed), for a model or a point cloud, which is best exported again.
     pub(crate) fn damaged(path: &Path, field: impl Display, problem: impl Display) -> Self {
         Self::malformed(path, field, problem, "export the file again")
+    }
+
+    /// As [`malformed`](Self::malformed), for a fault that an option may remedy.
+    pub(crate) fn remedied(
+        path: &Path,
+        field: impl Display,
+        problem: impl Display,
+        remedy: LoadRemedy,
+    ) -> Self {
+        let [field, problem] = [field.to_string(), problem.to_string()].map(|text| one_line(&text));
+        Self::Remedied { problem: format!("{}: {field}: {problem}", path.display()), remedy }
     }
 
     /// A lens that cannot be converted to a pinhole.
@@ -48,7 +108,7 @@ impl LoadError {
 
     /// An image or mask whose size `[px]` disagrees with its camera.
     pub(crate) fn size(path: &Path, (width, height): (u32, u32), camera: (u32, u32)) -> Self {
-        Self(format!(
+        Self::Data(format!(
             "{} is {width}x{height} px, but its camera says {}x{} px; use the images that the cameras were \
              estimated from, or a proportional rescale of them",
             path.display(),
@@ -59,7 +119,7 @@ impl LoadError {
 
     /// An image that cannot be decoded.
     pub(crate) fn image(path: &Path, problem: impl Display) -> Self {
-        Self(format!(
+        Self::Data(format!(
             "cannot decode {}: {}; convert it to an 8- or 16-bit PNG, JPEG or WebP of at most 16384 px a \
              side",
             path.display(),
@@ -70,7 +130,6 @@ impl LoadError {
     /// An image that a field of a file names does not exist.
     pub(crate) fn missing_image(path: &Path, field: &str, image: &Path) -> Self {
         let problem = format!("the file {} does not exist", image.display());
-        let remedy = "restore it, or name the folder that holds the images with --images";
-        Self::malformed(path, field, problem, remedy)
+        Self::remedied(path, field, problem, LoadRemedy::RestoreOrImagesFolder)
     }
 }

@@ -12,4 +12,4 @@ pub mod points;
 pub mod track_colours;
 pub mod views;
 
-pub use error::LoadError;
+pub use error::{LoadError, LoadRemedy};

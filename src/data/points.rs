@@ -107,11 +107,8 @@ mod tests {
             );
             std::fs::write(&path, text).unwrap();
             let points = read_points(&path).unwrap();
-            assert_eq!(
-                (points.positions, points.colours),
-                (vec![[1.0, 2.0, 3.0].into()], vec![expected]),
-                "{kind}"
-            );
+            assert_eq!(points.positions, [DVec3::new(1.0, 2.0, 3.0)], "{kind}");
+            assert_eq!(points.colours, [expected], "{kind}");
         }
         let flat = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nend_header\n1 2";
         std::fs::write(&path, flat).unwrap();

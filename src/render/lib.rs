@@ -148,7 +148,7 @@ pub struct StepOutput {
 }
 
 /// A rendered view.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Rendering {
     /// Width `[px]`.
     pub width: u32,

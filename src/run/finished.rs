@@ -8,7 +8,7 @@ use crate::failure::{Failure, ModelProblem, notes};
 pub use crate::models::{
     is_model, iteration, iteration_so_far, model_file, name_of, names_of, read_model,
 };
-use crate::observer::Observer;
+use crate::observer::{Observer, say_notes};
 use crate::resolved::RunConfig;
 use crate::spec::{DataSpec, DeviceSpec};
 use densify_core::gaussians::Gaussians;
@@ -174,9 +174,7 @@ pub fn open_alone(
 /// When it cannot be read.
 pub fn load(path: &Path, data: &DataSpec, observer: &dyn Observer) -> Result<Dataset, Failure> {
     let dataset = Dataset::load(path, &data.load_options(false))?;
-    for note in &dataset.notes {
-        observer.say(format_args!("note: {note}"));
-    }
+    say_notes(observer, &dataset.notes);
     Ok(dataset)
 }
 

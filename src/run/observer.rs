@@ -3,10 +3,13 @@
 use std::fmt;
 
 use densify_core::spelling::Spelling;
+use densify_data::dataset::Note;
 use densify_render::Backend;
 use densify_train::evaluate::Mean;
 use densify_train::output::StepRecord;
 use densify_train::trainer::{EditEvent, RowHistory};
+
+use crate::failure::notes;
 
 /// A signal that asks a run to end in an orderly way.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -24,6 +27,13 @@ pub enum Between {
     Step,
     /// Write a checkpoint, then ask again.
     Checkpoint,
+}
+
+/// Passes the notes of a dataset on.
+pub fn say_notes(observer: &dyn Observer, notes: &[Note]) {
+    for note in notes {
+        observer.say(format_args!("{}", notes::dataset(observer.spelling(), note)));
+    }
 }
 
 /// Observes a run. Methods that are not implemented do nothing.

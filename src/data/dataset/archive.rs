@@ -12,9 +12,9 @@ use tempfile::TempDir;
 use zip::ZipArchive;
 use zip::result::ZipError;
 
-use super::DatasetError;
+use super::LoadError;
 use super::paths::{lexical_fault, relative};
-use super::{Dataset, LoadOptions, View};
+use super::{Dataset, LoadOptions, Note, View};
 use densify_core::files;
 use densify_core::memory::Bytes;
 
@@ -54,18 +54,20 @@ pub(super) fn is_zip(path: &Path) -> bool {
 ///
 /// # Errors
 /// When the archive is damaged, unsafe or too large for the disk, and as [`Dataset::load`].
-pub(super) fn load(path: &Path, options: &LoadOptions) -> Result<Dataset, DatasetError> {
+pub(super) fn load(path: &Path, options: &LoadOptions) -> Result<Dataset, LoadError> {
     let unpacked = Arc::new(Unpacked::new(path)?);
     let mut dataset = Dataset::load_folder(&unpacked.folder, options)
-        .map_err(|error| DatasetError(unpacked.named(&error.0)))?;
+        .map_err(|error| unpacked.named_error(error))?;
     for note in &mut dataset.notes {
-        *note = unpacked.named(note);
+        if let Note::Text(text) = note {
+            *text = unpacked.named(text);
+        }
     }
     let (bytes, place) = (Bytes(unpacked.bytes), unpacked.all.path().display());
-    dataset.notes.push(format!(
+    dataset.notes.push(Note::Text(format!(
         "{} is unpacked in {place} ({bytes}) while this command runs",
         path.display()
-    ));
+    )));
     for View { source, .. } in dataset.train.iter_mut().chain(&mut dataset.test) {
         source.file = source.file.clone().in_archive(&unpacked);
         if let Some(mask) = &mut source.mask {
@@ -78,7 +80,7 @@ pub(super) fn load(path: &Path, options: &LoadOptions) -> Result<Dataset, Datase
 }
 
 impl Unpacked {
-    fn new(path: &Path) -> Result<Self, DatasetError> {
+    fn new(path: &Path) -> Result<Self, LoadError> {
         let mut archive = open(path)?;
         let most = most_bytes(path)?;
         let bytes = check(path, &mut archive, most)?;
@@ -128,22 +130,36 @@ impl Unpacked {
         })
     }
 
+    /// Replaces the temporary folder by the archive's name in an error.
+    fn named_error(&self, error: LoadError) -> LoadError {
+        match error {
+            LoadError::Data(problem) => LoadError::Data(self.named(&problem)),
+            LoadError::Remedied { problem, remedy } => {
+                LoadError::Remedied { problem: self.named(&problem), remedy }
+            }
+            LoadError::NoMasks { listing, inverted } => {
+                LoadError::NoMasks { listing: self.shown(&listing), inverted }
+            }
+            // The list is a file of the user's.
+            LoadError::ViewList { .. } => error,
+        }
+    }
+
     /// Replaces the temporary folder by the archive's name in a path.
     pub(super) fn shown(&self, path: &Path) -> PathBuf {
-        let inside =
-            path.strip_prefix(&self.folder).or_else(|_| path.strip_prefix(self.all.path()));
-        inside.map_or_else(|_| path.to_owned(), |inside| self.archive.join(inside))
+        let rest = path.strip_prefix(&self.folder).or_else(|_| path.strip_prefix(self.all.path()));
+        rest.map_or_else(|_| path.to_owned(), |rest| self.archive.join(rest))
     }
 }
 
-fn open(path: &Path) -> Result<ZipArchive<BufReader<File>>, DatasetError> {
-    let file = files::open(path).map_err(DatasetError::io(path))?;
+fn open(path: &Path) -> Result<ZipArchive<BufReader<File>>, LoadError> {
+    let file = files::open(path).map_err(LoadError::io(path))?;
     ZipArchive::new(BufReader::new(file)).map_err(|error| broken(path, &error))
 }
 
 /// Largest unpacked size that is accepted `[bytes]`.
-fn most_bytes(path: &Path) -> Result<u64, DatasetError> {
-    let packed = fs::metadata(path).map_err(DatasetError::io(path))?.len();
+fn most_bytes(path: &Path) -> Result<u64, LoadError> {
+    let packed = fs::metadata(path).map_err(LoadError::io(path))?.len();
     Ok(files::most_unpacked(packed))
 }
 
@@ -152,7 +168,7 @@ fn check<R: Read + io::Seek>(
     path: &Path,
     archive: &mut ZipArchive<R>,
     most: u64,
-) -> Result<u64, DatasetError> {
+) -> Result<u64, LoadError> {
     if archive.len() > MAX_FILES {
         return Err(malformed(path, "archive", format!("it has more than {MAX_FILES} files")));
     }
@@ -170,7 +186,7 @@ fn check<R: Read + io::Seek>(
 fn data_name<R: Read>(
     path: &Path,
     file: &zip::read::ZipFile<'_, R>,
-) -> Result<Option<String>, DatasetError> {
+) -> Result<Option<String>, LoadError> {
     // Many programs write UTF-8 without declaring it.
     let name = match std::str::from_utf8(file.name_raw()) {
         Ok(name) => name.to_owned(),
@@ -191,12 +207,7 @@ fn data_name<R: Read>(
     }
     if file.encrypted() {
         let problem = "it is encrypted";
-        return Err(DatasetError::malformed(
-            path,
-            shown,
-            problem,
-            "pack it again without a password",
-        ));
+        return Err(LoadError::malformed(path, shown, problem, "pack it again without a password"));
     }
     Ok(Some(relative(&name)))
 }
@@ -233,27 +244,23 @@ fn copy(input: &mut impl Read, output: &mut File) -> Result<u64, Copying> {
     }
 }
 
-fn malformed(path: &Path, place: &str, problem: impl std::fmt::Display) -> DatasetError {
-    DatasetError::malformed(path, place, problem, REMEDY)
+fn malformed(path: &Path, place: &str, problem: impl std::fmt::Display) -> LoadError {
+    LoadError::malformed(path, place, problem, REMEDY)
 }
 
-fn broken(path: &Path, error: &ZipError) -> DatasetError {
+fn broken(path: &Path, error: &ZipError) -> LoadError {
     malformed(path, "archive", error)
 }
 
-fn bomb(path: &Path, most: u64) -> DatasetError {
+fn bomb(path: &Path, most: u64) -> LoadError {
     let problem =
         format!("it unpacks to more than {}, which is implausible for photographs", Bytes(most));
-    DatasetError::malformed(
-        path,
-        "archive",
-        problem,
-        "unpack it yourself if you trust it, and name the folder",
-    )
+    let remedy = "unpack it yourself if you trust it, and name the folder";
+    LoadError::malformed(path, "archive", problem, remedy)
 }
 
-fn no_room(path: &Path, place: &Path, bytes: u64, error: &io::Error) -> DatasetError {
-    DatasetError(format!(
+fn no_room(path: &Path, place: &Path, bytes: u64, error: &io::Error) -> LoadError {
+    LoadError::Data(format!(
         "cannot unpack {} into {}: {error}; set TMPDIR to a folder with room for {}, or unpack it yourself and name \
          that folder",
         path.display(),

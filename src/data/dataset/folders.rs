@@ -3,7 +3,7 @@
 use std::fs::DirEntry;
 use std::path::PathBuf;
 
-use super::DatasetError;
+use super::LoadError;
 use super::mask_files;
 use super::paths::{DataPath, Root, is_absolute, relative};
 use super::{LoadOptions, Resolution};
@@ -40,7 +40,7 @@ impl Folders {
         root: &Root,
         options: &LoadOptions,
         within_images: bool,
-    ) -> Result<Self, DatasetError> {
+    ) -> Result<Self, LoadError> {
         // The user may name any folder; a relative path is relative to the dataset.
         let chosen = options
             .images
@@ -58,7 +58,7 @@ impl Folders {
     }
 
     /// The file of an image, if there is one.
-    pub(super) fn image(&self, named: DataPath<'_>) -> Result<Option<ImageFile>, DatasetError> {
+    pub(super) fn image(&self, named: DataPath<'_>) -> Result<Option<ImageFile>, LoadError> {
         if let Some(folder) = self.folder_for_absolute(named.value) {
             return self.image_by_suffix(folder, named);
         }
@@ -77,7 +77,7 @@ impl Folders {
         self.chosen.as_ref().filter(|_| is_absolute(value))
     }
 
-    fn image_as_listed(&self, named: DataPath<'_>) -> Result<Option<ImageFile>, DatasetError> {
+    fn image_as_listed(&self, named: DataPath<'_>) -> Result<Option<ImageFile>, LoadError> {
         // A path that leads out of the folder is refused even if no such file exists.
         self.root.join(named)?;
         let (name, inside) = (relative(named.value), self.inside_images(named.value));
@@ -113,7 +113,7 @@ impl Folders {
         &self,
         folder: &Root,
         named: DataPath<'_>,
-    ) -> Result<Option<ImageFile>, DatasetError> {
+    ) -> Result<Option<ImageFile>, LoadError> {
         for name in named.suffixes()? {
             for ending in self.endings() {
                 let value = format!("{name}{ending}");
@@ -130,8 +130,8 @@ impl Folders {
         if self.within_images { &ENDINGS[..1] } else { &ENDINGS }
     }
 
-    pub(super) fn missing(&self, named: DataPath<'_>) -> DatasetError {
-        DatasetError::missing_image(named.file, named.field, &self.first_path(named))
+    pub(super) fn missing(&self, named: DataPath<'_>) -> LoadError {
+        LoadError::missing_image(named.file, named.field, &self.first_path(named))
     }
 
     /// The first path at which an image is looked for.

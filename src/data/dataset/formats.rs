@@ -2,7 +2,7 @@
 //! [`formats`], and a folder of example files in `tests/fuzz/corpus` with the format's name.
 
 use super::paths::Root;
-use super::{DatasetError, LoadOptions, Scene, colmap, realitycapture, transforms};
+use super::{LoadError, LoadOptions, Scene, colmap, realitycapture, transforms};
 
 /// A format of datasets in folders.
 #[derive(Debug, Clone, Copy)]
@@ -16,7 +16,7 @@ pub struct DatasetFormat {
     /// The files that identify the format, for messages.
     pub files: &'static str,
     /// Reads the dataset in a folder; `None` if the folder has none of the files.
-    pub(super) read: fn(&Root, &LoadOptions) -> Result<Option<Scene>, DatasetError>,
+    pub(super) read: fn(&Root, &LoadOptions) -> Result<Option<Scene>, LoadError>,
 }
 
 /// All formats, in the order in which they are tried.
@@ -29,13 +29,13 @@ pub fn formats() -> [&'static DatasetFormat; 4] {
 ///
 /// # Errors
 /// When no format does, or a file is unreadable or contradicts itself.
-pub(super) fn read_scene(root: &Root, options: &LoadOptions) -> Result<Scene, DatasetError> {
+pub(super) fn read_scene(root: &Root, options: &LoadOptions) -> Result<Scene, LoadError> {
     for format in formats() {
         if let Some(scene) = (format.read)(root, options)? {
             return Ok(scene);
         }
     }
-    Err(DatasetError(format!(
+    Err(LoadError::Data(format!(
         "{} is not a dataset: it has neither the files of {}; name a folder or ZIP archive with one of these",
         root.path().display(),
         formats().map(|format| format!("{} ({})", format.title, format.files)).join(" nor of ")

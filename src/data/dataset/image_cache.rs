@@ -10,7 +10,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
-use super::DatasetError;
+use super::LoadError;
 use super::images::{Image8, ImageSource, SharedImage};
 
 /// Decodes images on demand. Caching affects waiting times only, never pixels.
@@ -57,7 +57,7 @@ enum Content {
     Empty,
     Loading,
     Ready(SharedImage),
-    Failed(DatasetError),
+    Failed(LoadError),
 }
 
 impl ImageCache {
@@ -116,7 +116,7 @@ impl ImageCache {
     ///
     /// # Panics
     /// When there is no such source.
-    pub fn get(&self, index: usize) -> Result<SharedImage, DatasetError> {
+    pub fn get(&self, index: usize) -> Result<SharedImage, LoadError> {
         let source = &self.shared.sources[index];
         let mut state = self.shared.lock();
         state.slots[index].is_announced = false;
@@ -218,7 +218,7 @@ impl State {
     }
 
     /// Stores the result of loading an image for which [`Self::make_room`] reserved memory.
-    fn finish(&mut self, shared: &Shared, index: usize, result: Result<SharedImage, DatasetError>) {
+    fn finish(&mut self, shared: &Shared, index: usize, result: Result<SharedImage, LoadError>) {
         if result.is_err() {
             self.bytes -= shared.sources[index].loaded_bytes();
         }
@@ -273,9 +273,9 @@ impl ImageDemand {
 }
 
 /// Loads an image, turning a panic of the decoder into an error.
-fn load(source: &ImageSource) -> Result<Image8, DatasetError> {
+fn load(source: &ImageSource) -> Result<Image8, LoadError> {
     catch_unwind(AssertUnwindSafe(|| source.load()))
-        .unwrap_or_else(|_| Err(DatasetError::image(&source.file.path, "the decoder failed")))
+        .unwrap_or_else(|_| Err(LoadError::image(&source.file.path, "the decoder failed")))
 }
 
 #[cfg(test)]

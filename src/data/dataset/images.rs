@@ -4,13 +4,14 @@
 
 use std::fs::File;
 use std::io::{BufReader, Cursor, Read, Seek};
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use image::error::ImageFormatHint;
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits};
 
-use super::DatasetError;
+use super::LoadError;
 pub use super::image_cache::{ImageCache, ImageDemand};
 use super::jpeg;
 pub use super::mask::{Hides, Mask};
@@ -76,12 +77,27 @@ pub struct ImageHeader {
 impl ImageSource {
     /// An image file without further processing.
     #[cfg(test)]
-    pub(super) fn whole(path: std::path::PathBuf) -> Self {
+    pub(super) fn whole(path: PathBuf) -> Self {
         let header = read_header(&path).expect("an image");
         let (width, height) = (header.width, header.height);
         let (mask, undistortion, rendered) = (None, None, None);
         let file = SourceFile::found(path).expect("an image");
         Self { file, mask, width, height, undistortion, header, rendered, window: None }
+    }
+
+    /// Pixels in memory, which messages call `name`, shrunk to this size on load.
+    pub(crate) fn rendered(name: PathBuf, image: Image8, (width, height): (u32, u32)) -> Self {
+        let header = ImageHeader {
+            width: image.width,
+            height: image.height,
+            has_alpha: image.alpha.is_some(),
+            turn: None,
+            decoded_bytes: image.bytes(),
+            file_bytes: 0,
+        };
+        let (file, rendered) = (SourceFile::rendered(name), Some(Arc::new(image)));
+        let (mask, undistortion, window) = (None, None, None);
+        Self { file, mask, width, height, undistortion, header, rendered, window }
     }
 
     /// Largest size of the loaded image `[bytes]`.
@@ -119,7 +135,7 @@ impl ImageSource {
     pub fn is_masked(&self) -> bool {
         let is_ignored = |mask: &Mask| mask.mode == MaskMode::Ignore;
         self.mask.as_ref().is_some_and(is_ignored)
-            || self.undistortion.as_ref().is_some_and(Undistortion::is_masked)
+            || self.undistortion.as_ref().is_some_and(|undistortion| undistortion.masked)
     }
 
     /// Whether the mask becomes transparency.
@@ -130,7 +146,7 @@ impl ImageSource {
     /// Width and height before shrinking `[px]`.
     fn whole_size(&self) -> (u32, u32) {
         match &self.undistortion {
-            Some(undistortion) => (undistortion.pinhole().width, undistortion.pinhole().height),
+            Some(undistortion) => (undistortion.to.width, undistortion.to.height),
             None => (self.header.width, self.header.height),
         }
     }
@@ -143,7 +159,7 @@ impl ImageSource {
     ///
     /// # Errors
     /// When a file is missing, unreadable, over the limits, or differs from the header read at first.
-    pub fn load(&self) -> Result<Image8, DatasetError> {
+    pub fn load(&self) -> Result<Image8, LoadError> {
         let image = self.load_whole()?;
         Ok(match self.window {
             Some(window) => image.windowed(window),
@@ -151,7 +167,7 @@ impl ImageSource {
         })
     }
 
-    fn load_whole(&self) -> Result<Image8, DatasetError> {
+    fn load_whole(&self) -> Result<Image8, LoadError> {
         let header = self.header;
         if let Some(image) = &self.rendered {
             return Ok(if self.shrinks() {
@@ -166,7 +182,7 @@ impl ImageSource {
         }
         if (decoded.width(), decoded.height()) != (header.width, header.height) {
             let found = (decoded.width(), decoded.height());
-            return Err(DatasetError::size(&self.file.path, found, (header.width, header.height)));
+            return Err(LoadError::size(&self.file.path, found, (header.width, header.height)));
         }
         let mut image = pack(decoded);
         if let Some(mask) = &self.mask {
@@ -215,36 +231,36 @@ fn limits() -> Limits {
 }
 
 /// Reads the header of an image file, without decoding it, and checks it against the limits.
-pub(super) fn read_header(path: &Path) -> Result<ImageHeader, DatasetError> {
-    let mut file = files::open(path).map_err(DatasetError::io(path))?;
+pub(super) fn read_header(path: &Path) -> Result<ImageHeader, LoadError> {
+    let mut file = files::open(path).map_err(LoadError::io(path))?;
     header_of(path, &mut file)
 }
 
 /// As [`read_header`], from an open file.
-fn header_of(path: &Path, file: &mut File) -> Result<ImageHeader, DatasetError> {
-    let file_bytes = file.metadata().map_err(DatasetError::io(path))?.len();
+fn header_of(path: &Path, file: &mut File) -> Result<ImageHeader, LoadError> {
+    let file_bytes = file.metadata().map_err(LoadError::io(path))?.len();
     let mut start = Vec::new();
-    file.take(HEADER_BYTES).read_to_end(&mut start).map_err(DatasetError::io(path))?;
+    file.take(HEADER_BYTES).read_to_end(&mut start).map_err(LoadError::io(path))?;
     if let Some(problem) = files::wrong_kind(&start) {
-        return Err(DatasetError::malformed(path, "the image", problem, "put the image there"));
+        return Err(LoadError::malformed(path, "the image", problem, "put the image there"));
     }
     let header = match parse_header(ImageReader::new(Cursor::new(&start)), file_bytes) {
         // The header may follow a long preview or colour profile.
         Err(_) if file_bytes > HEADER_BYTES => {
-            file.rewind().map_err(DatasetError::io(path))?;
+            file.rewind().map_err(LoadError::io(path))?;
             parse_header(ImageReader::new(BufReader::new(file)), file_bytes)
         }
         header => header,
     }
-    .map_err(|problem| DatasetError::image(path, problem))?;
+    .map_err(|problem| LoadError::image(path, problem))?;
     let pixels = u64::from(header.width) * u64::from(header.height);
     if pixels == 0 {
-        return Err(DatasetError::image(path, "it has no pixels"));
+        return Err(LoadError::image(path, "it has no pixels"));
     }
     if pixels > MAX_PIXELS || header.decoded_bytes > MAX_DECODED_BYTES {
         let (width, height) = (header.width, header.height);
         let problem = format!("{width}x{height} px are more than supported");
-        return Err(DatasetError::image(path, problem));
+        return Err(LoadError::image(path, problem));
     }
     Ok(header)
 }
@@ -268,34 +284,34 @@ fn parse_header<R: std::io::BufRead + Seek>(
 }
 
 /// Decodes an image whose header has been checked.
-pub(super) fn decode(source: &SourceFile) -> Result<DynamicImage, DatasetError> {
+pub(super) fn decode(source: &SourceFile) -> Result<DynamicImage, LoadError> {
     decode_file(&source.path, source.open()?)
 }
 
 /// Reads the header of an image, passes it to `check`, and decodes the image from the same open file.
 pub(super) fn decode_checked(
     source: &SourceFile,
-    check: impl FnOnce(ImageHeader) -> Result<(), DatasetError>,
-) -> Result<DynamicImage, DatasetError> {
+    check: impl FnOnce(ImageHeader) -> Result<(), LoadError>,
+) -> Result<DynamicImage, LoadError> {
     let path = &source.path;
     let mut file = source.open()?;
     check(header_of(path, &mut file)?)?;
-    file.rewind().map_err(DatasetError::io(path))?;
+    file.rewind().map_err(LoadError::io(path))?;
     decode_file(path, file)
 }
 
-fn decode_file(path: &Path, file: File) -> Result<DynamicImage, DatasetError> {
+fn decode_file(path: &Path, file: File) -> Result<DynamicImage, LoadError> {
     let mut reader = ImageReader::new(BufReader::new(file))
         .with_guessed_format()
-        .map_err(DatasetError::io(path))?;
+        .map_err(LoadError::io(path))?;
     if reader.format() == Some(ImageFormat::Jpeg) {
         let mut bytes = Vec::new();
         let mut input = reader.into_inner().take(MAX_FILE_BYTES);
-        input.read_to_end(&mut bytes).map_err(DatasetError::io(path))?;
-        return jpeg::decode(&bytes).map_err(|problem| DatasetError::image(path, problem));
+        input.read_to_end(&mut bytes).map_err(LoadError::io(path))?;
+        return jpeg::decode(&bytes).map_err(|problem| LoadError::image(path, problem));
     }
     reader.limits(limits());
-    reader.decode().map_err(|problem| DatasetError::image(path, problem))
+    reader.decode().map_err(|problem| LoadError::image(path, problem))
 }
 
 #[cfg(test)]
@@ -356,8 +372,9 @@ mod tests {
         // A header that promises 100,000 x 100,000 px.
         let mut huge = bytes.clone();
         huge[16..24].copy_from_slice(&[0, 1, 0x86, 0xa0, 0, 1, 0x86, 0xa0]);
-        let crc = crc32(&huge[12..29]);
-        huge[29..33].copy_from_slice(&crc.to_be_bytes());
+        let mut sum = flate2::Crc::new();
+        sum.update(&huge[12..29]);
+        huge[29..33].copy_from_slice(&sum.sum().to_be_bytes());
         for (name, contents) in
             [("huge.png", huge), ("text.jpg", b"not an image".to_vec()), ("empty.png", vec![])]
         {
@@ -368,13 +385,5 @@ mod tests {
         }
         let message = read_header(&folder.path().join("none.png")).unwrap_err().to_string();
         assert!(message.contains("cannot read"), "{message}");
-    }
-
-    fn crc32(bytes: &[u8]) -> u32 {
-        !bytes.iter().fold(!0u32, |crc, &byte| {
-            (0..8).fold(crc ^ u32::from(byte), |crc, _| {
-                (crc >> 1) ^ (0xedb8_8320 & (crc & 1).wrapping_neg())
-            })
-        })
     }
 }

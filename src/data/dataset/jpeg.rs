@@ -61,8 +61,7 @@ mod tests {
     use super::*;
 
     fn sample() -> Vec<u8> {
-        let image =
-            RgbImage::from_fn(64, 48, |x, y| image::Rgb([(x * 4) as u8, (y * 5) as u8, 90]));
+        let image = RgbImage::from_fn(64, 48, |x, y| [(x * 4) as u8, (y * 5) as u8, 90].into());
         let mut bytes = Vec::new();
         JpegEncoder::new_with_quality(&mut bytes, 90).encode_image(&image).unwrap();
         bytes

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use serde_json::Value;
 
-use super::DatasetError;
+use super::LoadError;
 
 /// Largest file read `[bytes]`. (serde_json limits the depth to 128.)
 const MAX_BYTES: u64 = 64 << 20;
@@ -13,8 +13,8 @@ const MAX_BYTES: u64 = 64 << 20;
 ///
 /// # Errors
 /// When the file cannot be read or is not JSON; the message names line and column.
-pub(super) fn read(path: &Path) -> Result<Value, DatasetError> {
-    let text = densify_core::files::read_text(path, MAX_BYTES).map_err(DatasetError::io(path))?;
+pub(super) fn read(path: &Path) -> Result<Value, LoadError> {
+    let text = densify_core::files::read_text(path, MAX_BYTES).map_err(LoadError::io(path))?;
     serde_json::from_str(&text).map_err(|error| {
         let remedy = if is_at_nonfinite_number(&text, &error) {
             "NaN and Infinity, which Python writes, are not valid JSON: remove the frame that has them, or estimate \
@@ -22,7 +22,7 @@ pub(super) fn read(path: &Path) -> Result<Value, DatasetError> {
         } else {
             "correct the file or export it again"
         };
-        DatasetError::malformed(path, "JSON", &error, remedy)
+        LoadError::malformed(path, "JSON", &error, remedy)
     })
 }
 

@@ -2,7 +2,7 @@
 
 use image::{DynamicImage, GrayImage};
 
-use super::DatasetError;
+use super::LoadError;
 use super::images::{ImageHeader, SourceFile, decode, decode_checked};
 use super::options::MaskMode;
 use densify_core::image::Image8;
@@ -36,8 +36,8 @@ impl Mask {
     /// The decoded mask is not kept: masks of all photographs together would exceed the promised memory.
     pub(super) fn read_weights(
         &self,
-        check: impl FnOnce(ImageHeader) -> Result<(), DatasetError>,
-    ) -> Result<GrayImage, DatasetError> {
+        check: impl FnOnce(ImageHeader) -> Result<(), LoadError>,
+    ) -> Result<GrayImage, LoadError> {
         Ok(self.weights(decode_checked(&self.file, check)?))
     }
 
@@ -54,12 +54,12 @@ impl Mask {
     }
 
     /// Hides the masked pixels of a photograph, whose size may differ from that of the mask.
-    pub(super) fn apply(&self, image: &mut Image8) -> Result<(), DatasetError> {
+    pub(super) fn apply(&self, image: &mut Image8) -> Result<(), LoadError> {
         let mask = self.weights(decode(&self.file)?);
         if mask.iter().all(|&weight| weight == 0) {
             let (path, problem) = (&self.file.path, "the mask hides every pixel");
             let remedy = "repair it, or remove the photograph and its pose";
-            return Err(DatasetError::malformed(path, "the mask", problem, remedy));
+            return Err(LoadError::malformed(path, "the mask", problem, remedy));
         }
         let size = (image.width, image.height);
         let mask = if mask.dimensions() == size {
@@ -173,11 +173,8 @@ mod tests {
             GrayImage::from_pixel(4, 4, [colour].into()).save(&mask).unwrap();
             let mask = Some(mask_of(mask.clone(), hides));
             let source = ImageSource { mask, ..ImageSource::whole(path.clone()) };
-            let message = source.load().unwrap_err().to_string();
-            assert!(
-                message.contains("m.png") && message.contains("hides every pixel"),
-                "{message}"
-            );
+            let error = source.load().unwrap_err().to_string();
+            assert!(error.contains("m.png") && error.contains("hides every pixel"), "{error}");
         }
     }
 }

@@ -6,7 +6,7 @@
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
-use super::DatasetError;
+use super::LoadError;
 use super::folders::{Folders, ImageFile};
 use super::paths::{DataPath, Root};
 
@@ -58,7 +58,7 @@ impl Folders {
         &self,
         image: &ImageFile,
         named: DataPath<'_>,
-    ) -> Result<Option<MaskFile>, DatasetError> {
+    ) -> Result<Option<MaskFile>, LoadError> {
         let at = |root: &Root, value: String| root.existing(DataPath { value: &value, ..named });
         // The name of the file has an extension, which the listed name may lack.
         let listed = self.inside_images(&image.name);

@@ -1,7 +1,7 @@
 //! Loads datasets: photographs with known cameras, in any of the supported formats.
 //!
 //! `FORMATS` lists the formats; the first that recognises its files in a folder reads it. A ZIP archive is read as the
-//! folder inside it. All files are untrusted: see [`DatasetError`].
+//! folder inside it. All files are untrusted: see [`LoadError`].
 
 mod archive;
 pub mod builtin;
@@ -43,7 +43,7 @@ use std::sync::Arc;
 
 use glam::{DMat3, DVec3};
 
-pub use crate::error::LoadError as DatasetError;
+use crate::error::{LoadError, LoadRemedy};
 pub use crate::points::PointCloud;
 pub use archive::is_archive;
 pub use builtin::GroundTruth;
@@ -84,7 +84,28 @@ pub struct Dataset {
     /// Peak memory for building the [known surface](Self::ground_truth) `[bytes]`; `None` if the surface is not known.
     pub surface_bytes: Option<u64>,
     /// Notes for the user about dropped points, missing frames and the like.
-    pub notes: Vec<String>,
+    pub notes: Vec<Note>,
+}
+
+/// A note for the user about a dataset. Options are data, so that whoever shows the note spells them.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Note {
+    /// A note that names no option.
+    Text(String),
+    /// Cameras far from all others are left out, unless [kept](FarCameras::Keep).
+    FarCamerasLeftOut {
+        /// Number of cameras.
+        count: usize,
+        /// The first of their views.
+        names: String,
+    },
+    /// Undistortion crops photographs, unless the [field of view is kept](LoadOptions::keep_fov).
+    Cropped {
+        /// Largest share that is lost `[%]`.
+        percent: f64,
+        /// Number of photographs.
+        photographs: usize,
+    },
 }
 
 /// One posed image.
@@ -146,7 +167,7 @@ impl Dataset {
     /// # Errors
     /// When the format is unknown, a file is missing, unreadable or contradictory, or no view is left to train on. The
     /// message names the file, the field and the remedy.
-    pub fn load(path: &Path, options: &LoadOptions) -> Result<Self, DatasetError> {
+    pub fn load(path: &Path, options: &LoadOptions) -> Result<Self, LoadError> {
         if let Some(name) = builtin::name(path) {
             return builtin::load(path, name, options);
         }
@@ -154,7 +175,7 @@ impl Dataset {
             return archive::load(path, options);
         }
         if path.is_file() {
-            return Err(DatasetError(format!(
+            return Err(LoadError::Data(format!(
                 "{}: this file is no dataset and no ZIP archive; name the dataset's folder, or a complete ZIP \
                  archive of it (a damaged or incompletely downloaded archive is not recognised)",
                 path.display()
@@ -163,7 +184,7 @@ impl Dataset {
         Self::load_folder(path, options)
     }
 
-    fn load_folder(path: &Path, options: &LoadOptions) -> Result<Self, DatasetError> {
+    fn load_folder(path: &Path, options: &LoadOptions) -> Result<Self, LoadError> {
         let root = Root::new(path)?;
         let scene = read_scene(&root, options)?;
         if scene.frames.is_empty() {
@@ -171,10 +192,8 @@ impl Dataset {
             let first = scene.first_missing.map_or_else(String::new, |path| {
                 format!("; the first one looked for is {}", path.display())
             });
-            return Err(DatasetError(format!(
-                "{listing} lists no image that exists{first}; put the images there, or name their folder \
-                 with --images"
-            )));
+            let problem = format!("{listing} lists no image that exists{first}");
+            return Err(LoadError::Remedied { problem, remedy: LoadRemedy::AddOrImagesFolder });
         }
         prepare::prepare(path, scene, options)
     }

@@ -62,8 +62,7 @@ pub(super) fn outliers(centres: &[DVec3]) -> Vec<bool> {
     if is_one_place || centres.len() < MIN_CAMERAS {
         return vec![false; centres.len()];
     }
-    let far: Vec<bool> =
-        distances.iter().map(|&distance| distance > OUTLIER_DISTANCE * unit).collect();
+    let far: Vec<bool> = distances.iter().map(|&d| d > OUTLIER_DISTANCE * unit).collect();
     let count = far.iter().filter(|&&far| far).count();
     let most = ((MAX_OUTLIERS * centres.len() as f64) as usize).max(1);
     if count > most { vec![false; centres.len()] } else { far }

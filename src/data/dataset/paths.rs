@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use unicode_normalization::UnicodeNormalization;
 
-use super::DatasetError;
+use crate::error::{LoadError, LoadRemedy};
 
 /// Path separators of all systems, as paths may come from another one.
 const SEPARATORS: [char; 2] = ['/', '\\'];
@@ -36,10 +36,10 @@ pub(super) struct DataPath<'a> {
 }
 
 impl Root {
-    pub(super) fn new(folder: &Path) -> Result<Self, DatasetError> {
-        let canonical = folder.canonicalize().map_err(DatasetError::io(folder))?;
+    pub(super) fn new(folder: &Path) -> Result<Self, LoadError> {
+        let canonical = folder.canonicalize().map_err(LoadError::io(folder))?;
         if !canonical.is_dir() {
-            return Err(DatasetError::io(folder)(std::io::ErrorKind::NotADirectory.into()));
+            return Err(LoadError::io(folder)(std::io::ErrorKind::NotADirectory.into()));
         }
         Ok(Self { shown: folder.to_owned(), canonical, searched: Arc::default() })
     }
@@ -49,7 +49,7 @@ impl Root {
     }
 
     /// The full path, after all checks that do not need the file system. The file need not exist.
-    pub(super) fn join(&self, named: DataPath<'_>) -> Result<PathBuf, DatasetError> {
+    pub(super) fn join(&self, named: DataPath<'_>) -> Result<PathBuf, LoadError> {
         match lexical_fault(named.value) {
             None => Ok(self.shown.join(relative(named.value))),
             Some(problem) => Err(named.fault(problem)),
@@ -60,7 +60,7 @@ impl Root {
     pub(super) fn existing_on_any_system(
         &self,
         named: DataPath<'_>,
-    ) -> Result<Option<PathBuf>, DatasetError> {
+    ) -> Result<Option<PathBuf>, LoadError> {
         match self.existing(named)? {
             None if named.value.contains('\\') => {
                 self.existing(DataPath { value: &named.value.replace('\\', "/"), ..named })
@@ -70,7 +70,7 @@ impl Root {
     }
 
     /// As [`join`](Self::join), but also refuses links that lead out of the folder; `None` if there is no such file.
-    pub(super) fn existing(&self, named: DataPath<'_>) -> Result<Option<PathBuf>, DatasetError> {
+    pub(super) fn existing(&self, named: DataPath<'_>) -> Result<Option<PathBuf>, LoadError> {
         let mut path = self.join(named)?;
         if !named.value.is_ascii() && !path.exists() {
             path = self.other_spelling(&relative(named.value)).unwrap_or(path);
@@ -122,7 +122,7 @@ fn names(folder: &Path) -> Names {
 
 impl<'a> DataPath<'a> {
     /// The suffixes of an absolute path of any system, longest first, each of which is a relative path.
-    pub(super) fn suffixes(self) -> Result<impl Iterator<Item = String> + use<'a>, DatasetError> {
+    pub(super) fn suffixes(self) -> Result<impl Iterator<Item = String> + use<'a>, LoadError> {
         let parts = parts(self.value);
         let problem = if parts.is_empty() { Some("is empty") } else { text_fault(self.value) };
         match problem {
@@ -133,12 +133,10 @@ impl<'a> DataPath<'a> {
         }
     }
 
-    fn fault(self, problem: &str) -> DatasetError {
+    fn fault(self, problem: &str) -> LoadError {
         let value: String = self.value.chars().take(200).collect();
         let problem = format!("the path {value:?} {problem}");
-        let remedy = "only paths below the dataset's folder are followed (another folder of images can be given with \
-                      --images)";
-        DatasetError::malformed(self.file, self.field, problem, remedy)
+        LoadError::remedied(self.file, self.field, problem, LoadRemedy::OtherImagesFolder)
     }
 }
 
@@ -200,7 +198,7 @@ mod tests {
     /// The two Unicode spellings of "Küche/é.png".
     const SPELLINGS: [&str; 2] = ["K\u{fc}che/\u{e9}.png", "Ku\u{308}che/e\u{301}.png"];
 
-    fn existing(root: &Root, value: &str) -> Result<Option<PathBuf>, DatasetError> {
+    fn existing(root: &Root, value: &str) -> Result<Option<PathBuf>, LoadError> {
         root.existing(DataPath { file: Path::new("list"), field: "name", value })
     }
 

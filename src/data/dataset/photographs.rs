@@ -8,12 +8,12 @@ use glam::{DMat3, DVec2};
 use image::GrayImage;
 use rayon::prelude::*;
 
-use super::DatasetError;
 use super::exif::Exif;
 use super::images::{self, Hides, ImageHeader, ImageSource, Mask, SourceFile};
 use super::lens::{Lens, PinholeError, Pinholes};
 use super::undistort::{Pinhole, Undistortion};
-use super::{Frame, LoadOptions, MaskMode, Resolution, View};
+use super::{Frame, LoadOptions, MaskMode, Note, Resolution, View};
+use crate::error::{LoadError, LoadRemedy};
 use densify_core::camera::Camera;
 
 /// Share of a photograph that may be cropped without a note.
@@ -37,26 +37,26 @@ pub(super) fn photographs(
     listing: &Path,
     frames: &[Frame],
     options: &LoadOptions,
-    notes: &mut Vec<String>,
-) -> Result<Vec<Photograph>, DatasetError> {
+    notes: &mut Vec<Note>,
+) -> Result<Vec<Photograph>, LoadError> {
     let carves = options.mask_mode == MaskMode::Background;
-    let flag = if options.invert_masks { "--invert-masks" } else { "--mask-mode background" };
     if (options.invert_masks || carves) && frames.iter().all(|frame| frame.mask.is_none()) {
-        let problem = "no photograph has a mask";
-        let remedy = "put masks into `masks/`, named after their photographs as NAME.png, or leave the flag out";
-        return Err(DatasetError::malformed(listing, flag, problem, remedy));
+        let listing = listing.to_owned();
+        return Err(LoadError::NoMasks { listing, inverted: options.invert_masks });
     }
     // All frames are checked before the first error is reported, so that the message does not depend on the threads.
     let checked: Vec<_> = frames.par_iter().map(|frame| check(listing, frame)).collect();
     let checked: Vec<Checked> = checked.into_iter().collect::<Result<_, _>>()?;
-    notes.extend(turned_note(frames, &checked));
-    notes.extend(orientation_note(frames, &checked));
-    notes.extend(masks_note(frames));
+    let texts =
+        [turned_note(frames, &checked), orientation_note(frames, &checked), masks_note(frames)];
+    notes.extend(texts.into_iter().flatten().map(Note::Text));
     if let (Some(Resolution::Width(width)), Some(first)) = (options.resolution, frames.first())
         && checked.iter().any(|checked| checked.header.width < width)
     {
         let first = &first.name;
-        notes.push(format!("images narrower than {width} px are not enlarged ({first})"));
+        notes.push(Note::Text(format!(
+            "images narrower than {width} px are not enlarged ({first})"
+        )));
     }
     // Consecutive photographs mostly share a camera, and thus its pinholes.
     let mut runs = Vec::new();
@@ -65,7 +65,7 @@ pub(super) fn photographs(
         runs.push((first, run));
         first += run.len();
     }
-    let pinholes = |&(first, run): &(usize, &[Checked])| -> Result<_, DatasetError> {
+    let pinholes = |&(first, run): &(usize, &[Checked])| -> Result<_, LoadError> {
         let lens = &run[0].lens;
         if !lens.is_distorted() {
             return Ok(None);
@@ -98,7 +98,7 @@ struct Checked {
 
 /// Checks an image's header against its camera. An image that fits only after the quarter turn in its EXIF is turned:
 /// some programs turn images before they estimate poses, others do not.
-fn check(listing: &Path, frame: &Frame) -> Result<Checked, DatasetError> {
+fn check(listing: &Path, frame: &Frame) -> Result<Checked, LoadError> {
     let mut header = frame.header.map_or_else(|| images::read_header(&frame.image), Ok)?;
     let exif = OnceCell::new();
     let quarter_turn = || exif.get_or_init(|| Exif::open(&frame.image)).quarter_turn();
@@ -118,7 +118,7 @@ fn check(listing: &Path, frame: &Frame) -> Result<Checked, DatasetError> {
     }
     let size = (header.width, header.height);
     if !fits(size) {
-        return Err(DatasetError::size(&frame.image, size, expected));
+        return Err(LoadError::size(&frame.image, size, expected));
     }
     let lens = lens.resized(header.width, header.height);
     // The principal point of a crop may lie outside, but hardly by more than the size of the image.
@@ -127,7 +127,7 @@ fn check(listing: &Path, frame: &Frame) -> Result<Checked, DatasetError> {
         let DVec2 { x, y } = lens.principal;
         let problem = format!("the principal point ({x}, {y}) px is far outside the image");
         let remedy = "repair the camera or remove the frame";
-        return Err(DatasetError::malformed(listing, &frame.name, problem, remedy));
+        return Err(LoadError::malformed(listing, &frame.name, problem, remedy));
     }
     let is_turn_ambiguous = frame.header.is_some() && quarter_turn().is_some();
     Ok(Checked { header, lens, exif: exif.into_inner(), is_turn_ambiguous })
@@ -164,48 +164,47 @@ fn masks_note(frames: &[Frame]) -> Option<String> {
 }
 
 /// The error for a lens that no pinhole camera can replace, with the remedy.
-fn lens_error(frame: &Frame, lens: &Lens, error: PinholeError) -> DatasetError {
-    let problem = format!("{error} ({})", lens.distortion());
-    let remedy = match error {
-        PinholeError::Folds(degrees) if degrees > 1.0 => {
-            "train on that field alone with --keep-fov, or calibrate again with fewer terms, or undistort the \
-             images first, e.g. with `colmap image_undistorter`"
-        }
-        _ => "calibrate again, or undistort the images first, e.g. with `colmap image_undistorter`",
-    };
-    DatasetError::malformed(&frame.image, &frame.origin, problem, remedy)
+fn lens_error(frame: &Frame, lens: &Lens, error: PinholeError) -> LoadError {
+    let problem = format!("{error} ({})", lens.distortion);
+    let (image, origin) = (&frame.image, &frame.origin);
+    if matches!(error, PinholeError::Folds(degrees) if degrees > 1.0) {
+        return LoadError::remedied(image, origin, problem, LoadRemedy::KeepFieldOfView);
+    }
+    let remedy =
+        "calibrate again, or undistort the images first, e.g. with `colmap image_undistorter`";
+    LoadError::malformed(image, origin, problem, remedy)
 }
 
 /// Notes about split and cropped photographs, from numbers of photographs and their pinholes.
 fn pinhole_notes<'a>(
     all: impl Iterator<Item = (usize, &'a Option<Pinholes>)> + Clone,
     keep_fov: bool,
-) -> Vec<String> {
+) -> Vec<Note> {
     let all = all.filter_map(|(count, pinholes)| Some((count, pinholes.as_ref()?)));
     let mut notes = Vec::new();
     let wide = || all.clone().filter(|(_, pinholes)| pinholes.faces.len() > 1);
     if let Some(widest) = wide().max_by_key(|(_, pinholes)| pinholes.faces.len()) {
         let names: Vec<&str> = widest.1.faces.iter().map(|(name, _)| *name).collect();
-        notes.push(format!(
+        notes.push(Note::Text(format!(
             "the field of view of {} photographs is too wide for one pinhole camera; each becomes up to {} views: {}",
             wide().map(|(count, _)| count).sum::<usize>(),
             names.len(),
             names.join(", ")
-        ));
+        )));
     }
     let lost = all.clone().filter(|(_, pinholes)| pinholes.cropped > SILENTLY_CROPPED);
     let most = lost.clone().map(|(_, pinholes)| pinholes.cropped).fold(0.0, f64::max);
     if most > 0.0 {
-        let reason = if keep_fov {
-            "is beyond what the lens model can invert, and is not used"
+        let percent = (100.0 * most).max(1.0);
+        let photographs = lost.map(|(count, _)| count).sum();
+        notes.push(if keep_fov {
+            Note::Text(format!(
+                "up to {percent:.0} % of {photographs} photographs is beyond what the lens model can invert, and is \
+                 not used"
+            ))
         } else {
-            "is cropped by undistortion (--keep-fov keeps the whole field of view)"
-        };
-        notes.push(format!(
-            "up to {:.0} % of {} photographs {reason}",
-            (100.0 * most).max(1.0),
-            lost.map(|(count, _)| count).sum::<usize>()
-        ));
+            Note::Cropped { percent, photographs }
+        });
     }
     notes
 }
@@ -216,7 +215,7 @@ fn photograph(
     Checked { header, lens, exif, .. }: Checked,
     pinholes: Option<&Pinholes>,
     options: &LoadOptions,
-) -> Result<Photograph, DatasetError> {
+) -> Result<Photograph, LoadError> {
     let file = SourceFile::found(frame.image.clone())?.with_exif(exif);
     let mask = frame.mask.as_ref().map(|mask| {
         let hides = match (mask.hides_all_but_black, options.invert_masks) {
@@ -225,7 +224,7 @@ fn photograph(
             (true, false) => Hides::AllButBlack,
         };
         let file = SourceFile::found(mask.path.clone())?;
-        Ok::<_, DatasetError>(Mask { file, hides, mode: options.mask_mode })
+        Ok::<_, LoadError>(Mask { file, hides, mode: options.mask_mode })
     });
     let mask = mask.transpose()?;
     let view = |face: &str, undistortion: Option<Undistortion>| {
@@ -235,10 +234,10 @@ fn photograph(
             focal: lens.focal,
             principal: lens.principal,
         };
-        let pinhole = undistortion.as_ref().map_or(whole, |undistortion| *undistortion.pinhole());
+        let pinhole = undistortion.as_ref().map_or(whole, |undistortion| undistortion.to);
         // Multiplying by an identity matrix could still change the last bits.
         let turn =
-            undistortion.as_ref().map(|undistortion| undistortion.lens_from_pinhole().transpose());
+            undistortion.as_ref().map(|undistortion| undistortion.lens_from_pinhole.transpose());
         let (rotation, translation) = match turn.filter(|turn| *turn != DMat3::IDENTITY) {
             Some(turn) => (turn * frame.rotation, turn * frame.translation),
             None => (frame.rotation, frame.translation),
@@ -289,12 +288,12 @@ fn photograph(
 }
 
 /// Checks that a mask is a rescale of its photograph.
-fn check_mask(mask: &Mask, found: ImageHeader, image: ImageHeader) -> Result<(), DatasetError> {
+fn check_mask(mask: &Mask, found: ImageHeader, image: ImageHeader) -> Result<(), LoadError> {
     let (found, size) = ((found.width, found.height), (image.width, image.height));
     if is_proportional(found, size) {
         return Ok(());
     }
-    Err(DatasetError::size(&mask.file.path, found, size))
+    Err(LoadError::size(&mask.file.path, found, size))
 }
 
 /// Whether a mask hides all of a view, which may be one of `several` of its photograph.

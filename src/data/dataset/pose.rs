@@ -4,7 +4,7 @@ use std::path::Path;
 
 use glam::{DMat3, DVec3};
 
-use super::DatasetError;
+use super::LoadError;
 use super::lens::{Lens, Plane};
 
 /// Accepted fields of view of pinhole cameras `[degrees]`.
@@ -27,8 +27,8 @@ pub(super) fn checked_pose(
     frame: &str,
     rotation: DMat3,
     translation: DVec3,
-) -> Result<(DMat3, DVec3), DatasetError> {
-    let fault = |problem: String| Err(DatasetError::malformed(file, frame, problem, POSE_REMEDY));
+) -> Result<(DMat3, DVec3), LoadError> {
+    let fault = |problem: String| Err(LoadError::malformed(file, frame, problem, POSE_REMEDY));
     if !rotation.is_finite() || !translation.is_finite() {
         return fault("the pose is not finite".into());
     }
@@ -55,20 +55,20 @@ pub(super) fn checked_quaternion(
     file: &Path,
     frame: &str,
     q: [f64; 4],
-) -> Result<DMat3, DatasetError> {
+) -> Result<DMat3, LoadError> {
     let norm = q.iter().map(|v| v * v).sum::<f64>().sqrt();
     if !norm.is_finite() || (norm - 1.0).abs() > ROTATION_TOLERANCE {
         let problem = format!("the quaternion {q:?} has length {norm} instead of 1");
-        return Err(DatasetError::malformed(file, frame, problem, POSE_REMEDY));
+        return Err(LoadError::malformed(file, frame, problem, POSE_REMEDY));
     }
     let [w, x, y, z] = q.map(|v| v / norm);
     Ok(DMat3::from_quat(glam::DQuat::from_xyzw(x, y, z, w)))
 }
 
 /// Checks the parameters of a lens.
-pub(super) fn check_lens(file: &Path, camera: &str, lens: &Lens) -> Result<(), DatasetError> {
+pub(super) fn check_lens(file: &Path, camera: &str, lens: &Lens) -> Result<(), LoadError> {
     let fault = |problem: String| {
-        Err(DatasetError::malformed(file, camera, problem, "repair the camera's parameters"))
+        Err(LoadError::malformed(file, camera, problem, "repair the camera's parameters"))
     };
     let size = lens.size();
     if lens.width == 0 || lens.height == 0 {
@@ -82,19 +82,19 @@ pub(super) fn check_lens(file: &Path, camera: &str, lens: &Lens) -> Result<(), D
     if !lens.is_finite() {
         return fault("the principal point or the distortion is not finite".into());
     }
-    if let Plane::Fov(omega) = lens.distortion().plane
+    if let Plane::Fov(omega) = lens.distortion.plane
         && omega.abs() > MAX_OMEGA
     {
         return fault(format!("omega = {omega} is not within {MAX_OMEGA} of 0"));
     }
     for (name, focal, side) in [("fx", lens.focal.x, size.x), ("fy", lens.focal.y, size.y)] {
-        let (half, most) = match lens.distortion().plane {
+        let (half, most) = match lens.distortion.plane {
             Plane::Perspective => ((0.5 * side / focal).atan(), *FIELD_OF_VIEW.end()),
             Plane::Equidistant | Plane::Fov(_) => (0.5 * side / focal, WIDEST_FISHEYE),
         };
         let degrees = 2.0 * half.to_degrees();
         if !(*FIELD_OF_VIEW.start()..=most).contains(&degrees) {
-            let wide = if degrees > most && lens.distortion().plane == Plane::Perspective {
+            let wide = if degrees > most && lens.distortion.plane == Plane::Perspective {
                 "; a lens this wide is a fisheye: use a fisheye model, or undistort its images to a pinhole"
             } else {
                 ""

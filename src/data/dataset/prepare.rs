@@ -5,13 +5,13 @@ use std::path::Path;
 
 use glam::DVec3;
 
-use super::DatasetError;
 use super::mask_files::unused_masks_note;
 use super::normalise::{self, Normalisation};
 use super::photographs::{Photograph, photographs};
 use super::pose::POSE_REMEDY;
 use super::view_list::{ViewList, select};
-use super::{Dataset, FarCameras, Frame, LoadOptions, PointCloud, Scene, Split, View};
+use super::{Dataset, FarCameras, Frame, LoadOptions, Note, PointCloud, Scene, Split, View};
+use crate::error::{LoadError, LoadRemedy};
 use densify_core::files::one_line;
 
 /// Largest fraction of unusable points.
@@ -22,18 +22,22 @@ pub(super) fn prepare(
     path: &Path,
     mut scene: Scene,
     options: &LoadOptions,
-) -> Result<Dataset, DatasetError> {
+) -> Result<Dataset, LoadError> {
     let mut frames = std::mem::take(&mut scene.frames);
     // Sorted bytewise, as other trainers do for their test splits.
     frames.sort_by(|a, b| (a.name.as_bytes(), a.held_out).cmp(&(b.name.as_bytes(), b.held_out)));
     refuse_duplicates(&scene.listing, &frames)?;
-    let mut notes = std::mem::take(&mut scene.notes);
+    let mut notes = texts(std::mem::take(&mut scene.notes));
     let photographs = photographs(&scene.listing, &frames, options, &mut notes)?;
     if frames.iter().all(|frame| frame.mask.is_none()) {
-        notes.extend(unused_masks_note(path));
+        notes.extend(unused_masks_note(path).map(Note::Text));
     }
-    scene.notes = notes;
-    assemble(path, photographs, scene, options)
+    assemble(path, photographs, scene, notes, options)
+}
+
+/// Notes that name no option.
+pub(super) fn texts(notes: Vec<String>) -> Vec<Note> {
+    notes.into_iter().map(Note::Text).collect()
 }
 
 /// Splits photographs, which are sorted by name, and moves everything to normalised coordinates.
@@ -41,11 +45,10 @@ pub(super) fn assemble(
     path: &Path,
     photographs: Vec<Photograph>,
     scene: Scene,
+    mut notes: Vec<Note>,
     options: &LoadOptions,
-) -> Result<Dataset, DatasetError> {
-    let Scene {
-        listing, mut points, points_file, tracks, own_split, surface_bytes, mut notes, ..
-    } = scene;
+) -> Result<Dataset, LoadError> {
+    let Scene { listing, mut points, points_file, tracks, own_split, surface_bytes, .. } = scene;
     let surface_bytes = surface_bytes.or_else(|| super::builtin::surface_bytes(path));
     let centres: Vec<_> =
         photographs.iter().map(|photograph| photograph.views[0].camera.centre()).collect();
@@ -88,29 +91,24 @@ pub(super) fn assemble(
     }
     view_list.map_or(Ok(()), |list| list.check(&train))?;
     if train.is_empty() && test.is_empty() && !hidden_names.is_empty() {
-        let (ignored, remedy) = if options.invert_masks {
-            ("white", "leave --invert-masks out")
-        } else {
-            ("black", "give --invert-masks")
-        };
-        return Err(DatasetError(format!(
-            "no view is left to train on: masks hide every pixel of all {} ({ignored} is ignored); {remedy}, or \
-             remove the masks",
+        let ignored = if options.invert_masks { "white" } else { "black" };
+        let problem = format!(
+            "no view is left to train on: masks hide every pixel of all {} ({ignored} is ignored)",
             hidden_names.len()
-        )));
+        );
+        let remedy = LoadRemedy::InvertMasks(!options.invert_masks);
+        return Err(LoadError::Remedied { problem, remedy });
     }
     if let Some(shown) = first_names(&hidden_names) {
-        notes.push(format!(
+        notes.push(Note::Text(format!(
             "masks hide every pixel of {} views, which are left out: {shown}",
             hidden_names.len()
-        ));
+        )));
     }
     if train.is_empty() {
-        return Err(DatasetError(format!(
-            "no view is left to train on: the test split takes all {}; use a larger --test-every, or leave it \
-             out",
-            test.len()
-        )));
+        let problem =
+            format!("no view is left to train on: the test split takes all {}", test.len());
+        return Err(LoadError::Remedied { problem, remedy: LoadRemedy::LargerTestEvery });
     }
     let points_path = points_file.as_deref().unwrap_or(path);
     drop_bad(points_path, &mut points, &mut notes, "finite", DVec3::is_finite)?;
@@ -119,7 +117,7 @@ pub(super) fn assemble(
         view.camera = normalisation.scene_from_world_camera(&view.camera);
         if !view.camera.translation.as_vec3().is_finite() {
             let problem = "the camera is too far from the others";
-            return Err(DatasetError::malformed(&listing, &view.name, problem, POSE_REMEDY));
+            return Err(LoadError::malformed(&listing, &view.name, problem, POSE_REMEDY));
         }
     }
     for position in &mut points.positions {
@@ -142,13 +140,14 @@ pub(super) fn assemble(
 }
 
 /// Note about views whose camera is far from all others.
-fn far_note(names: &[&str], treatment: FarCameras) -> Option<String> {
-    let shown = first_names(names)?;
-    let treatment = match treatment {
-        FarCameras::LeaveOut => "left out (use --far-cameras keep to train on them)",
-        FarCameras::Keep => "kept, but not counted for the extent of the scene",
-    };
-    Some(format!("cameras far from all others, {} {treatment}: {shown}", names.len()))
+fn far_note(names: &[&str], treatment: FarCameras) -> Option<Note> {
+    let (count, shown) = (names.len(), first_names(names)?);
+    Some(match treatment {
+        FarCameras::LeaveOut => Note::FarCamerasLeftOut { count, names: shown },
+        FarCameras::Keep => Note::Text(format!(
+            "cameras far from all others, {count} kept, but not counted for the extent of the scene: {shown}"
+        )),
+    })
 }
 
 /// The first names of a list and the number of further ones; `None` if the list is empty.
@@ -160,26 +159,25 @@ fn first_names(names: &[impl AsRef<str>]) -> Option<String> {
     (!names.is_empty()).then(|| shown.join(", ") + &more)
 }
 
-fn refuse_duplicates(listing: &Path, frames: &[Frame]) -> Result<(), DatasetError> {
+fn refuse_duplicates(listing: &Path, frames: &[Frame]) -> Result<(), LoadError> {
     // Absolute paths are matched by suffix, so that two may refer to one file, which could then be both trained on and
     // held out.
     let mut by_image = HashMap::new();
     for frame in frames {
         let first = *by_image.entry(&frame.image).or_insert(frame);
         if first.listed != frame.listed {
-            return Err(DatasetError(one_line(&format!(
-                "{} and {} are the same file, {}; give with --images a folder that contains both at their original \
-                 paths, or remove one of the two",
-                first.origin,
-                frame.origin,
-                frame.image.display()
-            ))));
+            let image = frame.image.display();
+            let problem = one_line(&format!(
+                "{} and {} are the same file, {image}",
+                first.origin, frame.origin
+            ));
+            return Err(LoadError::Remedied { problem, remedy: LoadRemedy::ImagesFolderOfBoth });
         }
     }
     for pair in frames.windows(2) {
         if pair[0].name == pair[1].name && pair[0].held_out == pair[1].held_out {
             let (problem, remedy) = ("the image is listed twice", "remove one of the two");
-            return Err(DatasetError::malformed(listing, &pair[0].name, problem, remedy));
+            return Err(LoadError::malformed(listing, &pair[0].name, problem, remedy));
         }
     }
     Ok(())
@@ -189,23 +187,23 @@ fn refuse_duplicates(listing: &Path, frames: &[Frame]) -> Result<(), DatasetErro
 fn drop_bad(
     path: &Path,
     points: &mut PointCloud,
-    notes: &mut Vec<String>,
+    notes: &mut Vec<Note>,
     condition: &str,
     keep: impl Fn(DVec3) -> bool,
-) -> Result<(), DatasetError> {
+) -> Result<(), LoadError> {
     let total = points.len();
     let bad = points.retain(keep);
     if bad as f64 > MAX_BAD_POINTS * total as f64 {
         let path = path.display();
-        return Err(DatasetError(format!(
+        return Err(LoadError::Data(format!(
             "{path}: {bad} of {total} points are not finite, more than 1 %; repair the reconstruction"
         )));
     }
     if bad > 0 {
-        notes.push(format!(
+        notes.push(Note::Text(format!(
             "{}: {bad} of {total} points are not {condition} and are dropped",
             path.display()
-        ));
+        )));
     }
     Ok(())
 }

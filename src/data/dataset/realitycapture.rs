@@ -24,7 +24,7 @@ use super::lens::{Distortion, Lens, Plane};
 use super::paths::{DataPath, Root, relative};
 use super::pose::{check_lens, checked_pose};
 use super::transforms::usual_points;
-use super::{DatasetError, Frame, LoadOptions, Scene};
+use super::{Frame, LoadError, LoadOptions, Scene};
 use densify_core::files;
 
 pub(super) const FORMAT: DatasetFormat = DatasetFormat {
@@ -62,7 +62,7 @@ const RENAMED: [(&str, &str); 4] =
 ///
 /// # Errors
 /// When there are several, as they may belong to different scenes.
-fn find(root: &Root) -> Result<Option<PathBuf>, DatasetError> {
+fn find(root: &Root) -> Result<Option<PathBuf>, LoadError> {
     let is_csv = |name: &str| name.to_ascii_lowercase().ends_with(".csv");
     let entries = fs::read_dir(root.path()).into_iter().flatten().flatten();
     let names = entries.filter_map(|entry| entry.file_name().into_string().ok());
@@ -79,7 +79,7 @@ fn find(root: &Root) -> Result<Option<PathBuf>, DatasetError> {
     }
     if found.len() > 1 {
         let [first, second] = [0, 1].map(|i| found[i].display());
-        return Err(DatasetError(format!(
+        return Err(LoadError::Data(format!(
             "{first} and {second} both list cameras; leave only the one that belongs to the photographs"
         )));
     }
@@ -90,30 +90,22 @@ fn find(root: &Root) -> Result<Option<PathBuf>, DatasetError> {
 ///
 /// # Errors
 /// When a line is damaged or a camera is impossible.
-fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, DatasetError> {
+fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> {
     let Some(path) = &find(root)? else { return Ok(None) };
+    let fault =
+        |place: &str, problem: &str| Err(LoadError::malformed(path, place, problem, REMEDY));
     let [first, second] = [true, false].map(|within| Folders::new(root, options, within));
     let (first, second) = (first?, second?);
-    let text = files::read_text(path, MAX_BYTES).map_err(DatasetError::io(path))?;
+    let text = files::read_text(path, MAX_BYTES).map_err(LoadError::io(path))?;
     let mut lines = (1..).zip(text.lines()).filter(|(_, line)| !line.trim().is_empty());
     let Some(columns) = lines.find_map(|(_, line)| Columns::parse(line)) else {
-        return Err(DatasetError::malformed(
-            path,
-            "the first line",
-            "it does not name the columns",
-            REMEDY,
-        ));
+        return fault("the first line", "it does not name the columns");
     };
     let (mut frames, mut missing, mut fell_back, mut first_missing) =
         (Vec::new(), Vec::new(), 0, None);
     for (number, line) in lines {
         if frames.len() + missing.len() == MAX_FRAMES {
-            return Err(DatasetError::malformed(
-                path,
-                "the file",
-                "it lists more than a million",
-                REMEDY,
-            ));
+            return fault("the file", "it lists more than a million");
         }
         let row = Row { path, number, columns: &columns, cells: cells(line) };
         let name = row.text("name").trim();
@@ -212,19 +204,19 @@ impl Row<'_> {
     }
 
     /// A number; 0 if an optional column is missing or empty.
-    fn number(&self, column: &str) -> Result<f64, DatasetError> {
+    fn number(&self, column: &str) -> Result<f64, LoadError> {
         let text = self.text(column).trim();
         if text.is_empty() && !NEEDED.contains(&column) {
             return Ok(0.0);
         }
         text.parse().map_err(|_| {
             let place = format!("line {}: {column}", self.number);
-            DatasetError::malformed(self.path, place, format!("{text:?} is not a number"), REMEDY)
+            LoadError::malformed(self.path, place, format!("{text:?} is not a number"), REMEDY)
         })
     }
 
     /// camera_from_world with OpenCV axes.
-    fn pose(&self, frame: &str) -> Result<(DMat3, DVec3), DatasetError> {
+    fn pose(&self, frame: &str) -> Result<(DMat3, DVec3), LoadError> {
         let angle = |column| self.number(column).map(f64::to_radians);
         let (heading, pitch, roll) = (angle("heading")?, angle("pitch")?, angle("roll")?);
         let centre = DVec3::new(self.number("x")?, self.number("y")?, self.number("alt")?);
@@ -244,7 +236,7 @@ impl Row<'_> {
         frame: &str,
         image: &Path,
         reduced: Option<u32>,
-    ) -> Result<(Lens, ImageHeader), DatasetError> {
+    ) -> Result<(Lens, ImageHeader), LoadError> {
         let header = images::read_header(image)?;
         let k = reduced.unwrap_or(1);
         let (width, height) = (header.width * k, header.height * k);

@@ -4,7 +4,7 @@ use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use super::DatasetError;
+use super::LoadError;
 use super::archive::Unpacked;
 use super::exif::Exif;
 use densify_core::files;
@@ -27,8 +27,8 @@ impl SourceFile {
     ///
     /// # Errors
     /// When the file no longer exists.
-    pub(super) fn found(path: PathBuf) -> Result<Self, DatasetError> {
-        let real = path.canonicalize().map_err(DatasetError::io(&path))?;
+    pub(super) fn found(path: PathBuf) -> Result<Self, LoadError> {
+        let real = path.canonicalize().map_err(LoadError::io(&path))?;
         Ok(Self { path, real: real.into(), archive: None, exif: None })
     }
 
@@ -65,15 +65,15 @@ impl SourceFile {
     ///
     /// # Errors
     /// When it cannot be opened, or has been replaced by a link to another file.
-    pub(super) fn open(&self) -> Result<File, DatasetError> {
+    pub(super) fn open(&self) -> Result<File, LoadError> {
         if self.archive.is_some() {
-            return files::open(&self.real).map_err(DatasetError::io(&self.path));
+            return files::open(&self.real).map_err(LoadError::io(&self.path));
         }
-        let real = self.path.canonicalize().map_err(DatasetError::io(&self.path))?;
+        let real = self.path.canonicalize().map_err(LoadError::io(&self.path))?;
         if *real != *self.real {
             let problem = "it has become a link to another file since the run began";
-            return Err(DatasetError::malformed(&self.path, "the file", problem, "restore it"));
+            return Err(LoadError::malformed(&self.path, "the file", problem, "restore it"));
         }
-        files::open(&real).map_err(DatasetError::io(&self.path))
+        files::open(&real).map_err(LoadError::io(&self.path))
     }
 }

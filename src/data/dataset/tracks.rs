@@ -132,8 +132,7 @@ mod tests {
         }
         let tracks = sampler.finish();
         assert!((MAX_TRACKS..2 * MAX_TRACKS).contains(&tracks.count()), "{}", tracks.count());
-        let gaps: Vec<f64> =
-            tracks.positions.windows(2).map(|pair| pair[1].x - pair[0].x).collect();
+        let gaps: Vec<f64> = tracks.positions.windows(2).map(|p| p[1].x - p[0].x).collect();
         assert!(gaps.iter().all(|gap| (gap - 4.0).abs() < 1e-9), "{:?}", &gaps[..4]);
         assert!(tracks.views.iter().all(|views| views.len() == 5));
     }

@@ -20,7 +20,7 @@ use super::lens::{Distortion, Lens, Plane};
 use super::mask_files::MaskFile;
 use super::paths::{DataPath, Root, is_absolute, relative};
 use super::pose::{check_lens, checked_pose};
-use super::{DatasetError, Frame, LoadOptions, Scene, colmap};
+use super::{Frame, LoadError, LoadOptions, Scene, colmap};
 
 /// The pair of files that defines its own test split.
 pub(super) const SPLIT_FORMAT: DatasetFormat = DatasetFormat {
@@ -61,7 +61,7 @@ const PINHOLES: [&str; 7] = [
 const FISHEYE: &str = "OPENCV_FISHEYE";
 
 /// Reads `transforms_train.json` and `transforms_test.json`, with the tracks of a COLMAP model of the same scene.
-fn read_pair(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, DatasetError> {
+fn read_pair(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> {
     if !PAIR.iter().all(|name| root.path().join(name).is_file()) {
         return Ok(None);
     }
@@ -78,7 +78,7 @@ fn read_pair(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, Datase
 }
 
 /// Reads `transforms.json`.
-fn read_single(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, DatasetError> {
+fn read_single(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> {
     if !root.path().join(SINGLE).is_file() {
         return Ok(None);
     }
@@ -86,11 +86,11 @@ fn read_single(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, Data
 }
 
 /// Reads the file `name`. As in nerfstudio, the test split is in `test_filenames`, else in `val_filenames`.
-fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Scene, DatasetError> {
+fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Scene, LoadError> {
     let path = root.path().join(name);
     root.existing(DataPath { file: &path, field: "the file", value: name })?;
     let Value::Object(top) = json::read(&path)? else {
-        return Err(DatasetError::malformed(&path, "the file", "it is not a JSON object", REMEDY));
+        return Err(LoadError::malformed(&path, "the file", "it is not a JSON object", REMEDY));
     };
     let top = Fields { path: &path, place: String::new(), frame: None, top: &top };
     let Some(Value::Array(list)) = top.top.get("frames") else {
@@ -173,7 +173,7 @@ fn points_file(
     top: &Fields<'_>,
     held_out: bool,
     notes: &mut Vec<String>,
-) -> Result<Option<PathBuf>, DatasetError> {
+) -> Result<Option<PathBuf>, LoadError> {
     if let Some(value) = top.text("ply_file_path")? {
         let named = DataPath { file: top.path, field: "ply_file_path", value };
         if folders.folder_for_absolute(value).is_none() {
@@ -200,7 +200,7 @@ pub(super) fn usual_points(
     root: &Root,
     file: &Path,
     notes: &mut Vec<String>,
-) -> Result<Option<PathBuf>, DatasetError> {
+) -> Result<Option<PathBuf>, LoadError> {
     for value in POINT_FILES {
         if let Some(found) = root.existing(DataPath { file, field: "initial points", value })? {
             notes.push(format!("initial points are taken from {value}"));
@@ -224,8 +224,8 @@ impl<'a> Fields<'a> {
         format!("{}{field}", self.place)
     }
 
-    fn fault(&self, field: &str, problem: impl Display) -> DatasetError {
-        DatasetError::malformed(self.path, self.full(field), problem, REMEDY)
+    fn fault(&self, field: &str, problem: impl Display) -> LoadError {
+        LoadError::malformed(self.path, self.full(field), problem, REMEDY)
     }
 
     /// A field of the frame itself, or of the top level if there is no frame.
@@ -233,7 +233,7 @@ impl<'a> Fields<'a> {
         self.frame.unwrap_or(self.top).get(field).filter(|value| !value.is_null())
     }
 
-    fn text(&self, field: &str) -> Result<Option<&'a str>, DatasetError> {
+    fn text(&self, field: &str) -> Result<Option<&'a str>, LoadError> {
         match self.own(field) {
             None => Ok(None),
             Some(Value::String(text)) => Ok(Some(text)),
@@ -246,7 +246,7 @@ impl<'a> Fields<'a> {
         &self,
         folders: &Folders,
         field: &str,
-    ) -> Result<Option<HashSet<String>>, DatasetError> {
+    ) -> Result<Option<HashSet<String>>, LoadError> {
         let Some(value) = self.own(field) else {
             return Ok(None);
         };
@@ -271,13 +271,13 @@ impl<'a> Fields<'a> {
         folders: &Folders,
         image: &ImageFile,
         value: &str,
-    ) -> Result<MaskFile, DatasetError> {
+    ) -> Result<MaskFile, LoadError> {
         let field = self.full("mask_path");
         let named = DataPath { file: self.path, field: &field, value };
         if folders.folder_for_absolute(value).is_none() {
             let missing = || {
                 let place = root.path().join(relative(value));
-                DatasetError::missing_image(self.path, &field, &place)
+                LoadError::missing_image(self.path, &field, &place)
             };
             return Ok(MaskFile::black_hides(
                 root.existing_on_any_system(named)?.ok_or_else(missing)?,
@@ -294,7 +294,7 @@ impl<'a> Fields<'a> {
             let problem = format!("the mask {value:?} is not in the dataset's folder");
             let remedy =
                 "put it into `masks/` there, under the photograph's name, or remove the field";
-            DatasetError::malformed(self.path, &field, problem, remedy)
+            LoadError::malformed(self.path, &field, problem, remedy)
         })
     }
 
@@ -302,14 +302,14 @@ impl<'a> Fields<'a> {
         self.own(field).or_else(|| self.top.get(field)).filter(|value| !value.is_null())
     }
 
-    fn number(&self, field: &str) -> Result<Option<f64>, DatasetError> {
+    fn number(&self, field: &str) -> Result<Option<f64>, LoadError> {
         let Some(value) = self.inherited(field) else {
             return Ok(None);
         };
         value.as_f64().map(Some).ok_or_else(|| self.fault(field, "it is not a number"))
     }
 
-    fn side(&self, field: &str) -> Result<Option<u32>, DatasetError> {
+    fn side(&self, field: &str) -> Result<Option<u32>, LoadError> {
         let Some(value) = self.number(field)? else {
             return Ok(None);
         };
@@ -320,7 +320,7 @@ impl<'a> Fields<'a> {
     }
 
     /// camera_from_world with OpenCV axes.
-    fn pose(&self, file: &str) -> Result<(DMat3, DVec3), DatasetError> {
+    fn pose(&self, file: &str) -> Result<(DMat3, DVec3), LoadError> {
         const FIELD: &str = "transform_matrix";
         let shape = || self.fault(FIELD, "it is not a matrix of 3 or 4 rows of 4 numbers");
         let rows = self.own(FIELD).and_then(Value::as_array).ok_or_else(shape)?;
@@ -344,7 +344,7 @@ impl<'a> Fields<'a> {
     }
 
     /// The image size that the intrinsics are for, if the file states it.
-    fn size(&self) -> Result<Option<(u32, u32)>, DatasetError> {
+    fn size(&self) -> Result<Option<(u32, u32)>, LoadError> {
         Ok(self.side("w")?.zip(self.side("h")?))
     }
 
@@ -353,7 +353,7 @@ impl<'a> Fields<'a> {
         &self,
         image: &Path,
         reduced: Option<u32>,
-    ) -> Result<(Lens, Option<ImageHeader>), DatasetError> {
+    ) -> Result<(Lens, Option<ImageHeader>), LoadError> {
         let distortion = self.distortion()?;
         let ((width, height), header) = match self.size()? {
             Some(size) => (size, None),
@@ -386,7 +386,7 @@ impl<'a> Fields<'a> {
     }
 
     /// The lens model and its coefficients.
-    fn distortion(&self) -> Result<Distortion, DatasetError> {
+    fn distortion(&self) -> Result<Distortion, LoadError> {
         let named = match self.inherited("camera_model") {
             None => None,
             Some(Value::String(model)) => Some(model.as_str()),
@@ -396,7 +396,7 @@ impl<'a> Fields<'a> {
             || self.inherited("is_fisheye").is_some_and(|value| value.as_bool() != Some(false));
         if let Some(model) = named.filter(|model| *model != FISHEYE && !PINHOLES.contains(model)) {
             let problem = format!("{model:?} is not one of {}, {FISHEYE}", PINHOLES.join(", "));
-            return Err(DatasetError::lens(self.path, &self.full("camera_model"), problem));
+            return Err(LoadError::lens(self.path, &self.full("camera_model"), problem));
         }
         let (plane, fields) = if is_fisheye {
             (Plane::Equidistant, &FISHEYE_FIELDS[..])
@@ -412,7 +412,7 @@ impl<'a> Fields<'a> {
                 None if value == 0.0 => {}
                 None => {
                     let problem = format!("{field} = {value}, but a fisheye has only k1 to k4");
-                    return Err(DatasetError::lens(self.path, &self.full(field), problem));
+                    return Err(LoadError::lens(self.path, &self.full(field), problem));
                 }
             }
         }

@@ -24,36 +24,16 @@ pub(super) struct Pinhole {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Undistortion {
     /// The lens that took the image, at the image's size.
-    from: Lens,
-    to: Pinhole,
-    lens_from_pinhole: DMat3,
+    pub(super) from: Lens,
+    /// The pinhole that images are resampled to.
+    pub(super) to: Pinhole,
+    /// Rotation from the pinhole's axes to the lens's.
+    pub(super) lens_from_pinhole: DMat3,
     /// Whether the lens saw only a part of the pinhole's image, so that the rest is masked.
-    masked: bool,
+    pub(super) masked: bool,
 }
 
 impl Undistortion {
-    pub(super) fn new(from: Lens, to: Pinhole, lens_from_pinhole: DMat3, masked: bool) -> Self {
-        Self { from, to, lens_from_pinhole, masked }
-    }
-
-    /// The pinhole that images are resampled to.
-    #[must_use]
-    pub(super) fn pinhole(&self) -> &Pinhole {
-        &self.to
-    }
-
-    /// Rotation from the pinhole's axes to the lens's.
-    #[must_use]
-    pub(super) fn lens_from_pinhole(&self) -> DMat3 {
-        self.lens_from_pinhole
-    }
-
-    /// Whether resampled images have a mask of the field of view of the lens.
-    #[must_use]
-    pub(super) fn is_masked(&self) -> bool {
-        self.masked
-    }
-
     /// Whether the pinhole's image contains a ray of the lens.
     pub(super) fn shows(&self, ray: DVec3) -> bool {
         let ray = self.lens_from_pinhole.transpose() * ray;
@@ -78,7 +58,8 @@ impl Undistortion {
 
     /// Resamples an image of the lens in one row-major pass.
     ///
-    /// Interpolation is bicubic, because bilinear interpolation blurs and costs half a dB in test views (docs/data.md).
+    /// Interpolation is bicubic, because bilinear interpolation blurs and costs half a dB in test views
+    /// (docs/studies/disturbances.tsv).
     /// Near masked pixels it is bilinear, so that hidden colours do not reach pixels that count.
     #[must_use]
     pub(super) fn apply(&self, image: &Image8) -> Image8 {

@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
-use super::{DatasetError, Part, View};
+use super::{LoadError, Part, View};
 use densify_core::files;
 
 /// Largest view list `[bytes]`; it has room for millions of names.
@@ -41,9 +41,9 @@ struct Entry {
 
 impl ViewList {
     /// Reads a file with one view per line: its name, optionally followed by a tab and the part that is used.
-    pub(super) fn read(file: &Path) -> Result<Self, DatasetError> {
-        let text = files::read_text(file, MAX_BYTES)
-            .map_err(|error| DatasetError(format!("--views {}: {error}", file.display())))?;
+    pub(super) fn read(file: &Path) -> Result<Self, LoadError> {
+        let text =
+            files::read_text(file, MAX_BYTES).map_err(|error| fault(file, error.to_string()))?;
         let lines = text.lines().map(str::trim).zip(1..).filter(|(text, _)| !text.is_empty());
         let entries = lines.map(|(text, line)| {
             let (name, part) = match text.split_once(TAB) {
@@ -53,11 +53,11 @@ impl ViewList {
             Ok((name.to_owned(), Entry { line, part, exists: false }))
         });
         let entries = entries.collect::<Result<_, usize>>().map_err(|line| {
-            DatasetError(format!(
-                "--views {}: line {line}: after the tab come left, top, right and bottom of the part that is used, as \
-                 fractions of the image from 0 to 1, such as `0.25 0 1 0.5`",
-                file.display()
-            ))
+            let problem = format!(
+                "line {line}: after the tab come left, top, right and bottom of the part that is used, as \
+                 fractions of the image from 0 to 1, such as `0.25 0 1 0.5`"
+            );
+            fault(file, problem)
         })?;
         Ok(Self { file: file.to_owned(), entries })
     }
@@ -70,24 +70,28 @@ impl ViewList {
     }
 
     /// Checks that every listed view exists and that one is left to train on.
-    pub(super) fn check(&self, train: &[View]) -> Result<(), DatasetError> {
-        let file = self.file.display();
+    pub(super) fn check(&self, train: &[View]) -> Result<(), LoadError> {
         let missing = self.entries.iter().filter(|(_, entry)| !entry.exists);
         if let Some((name, Entry { line, .. })) = missing.min_by_key(|(_, entry)| entry.line) {
-            return Err(DatasetError(format!(
-                "--views {file}: line {line}: there is no view `{}`; the names of all views are in cameras.json of a run",
+            let problem = format!(
+                "line {line}: there is no view `{}`; the names of all views are in cameras.json of a run",
                 files::one_line(name)
-            )));
+            );
+            return Err(fault(&self.file, problem));
         }
         if train.is_empty() {
-            return Err(DatasetError(format!(
-                "--views {file}: none of the {} listed views is trained on; list others, or hold out \
-                 fewer",
+            let problem = format!(
+                "none of the {} listed views is trained on; list others, or hold out fewer",
                 self.entries.len()
-            )));
+            );
+            return Err(fault(&self.file, problem));
         }
         Ok(())
     }
+}
+
+fn fault(file: &Path, problem: String) -> LoadError {
+    LoadError::ViewList { file: file.to_owned(), problem }
 }
 
 /// The line of a view list for a view, or for a part of it.

@@ -92,6 +92,7 @@ impl View {
 #[allow(clippy::float_cmp, reason = "exact values")]
 mod tests {
     use super::*;
+    use crate::dataset::images::ImageSource;
     use crate::dataset::{Dataset, LoadOptions};
     use densify_core::image::Image8;
     use densify_fixtures::Made;
@@ -109,9 +110,8 @@ mod tests {
         assert_eq!(whole.window(200, 100), None);
         // A smaller image is used as a whole.
         assert_eq!(part(0.4, 0.6).window(30, 30), None);
-        assert!(
-            part(0.1, 0.2).is_valid() && !part(0.2, 0.1).is_valid() && !part(0.5, 1.1).is_valid()
-        );
+        let is_valid = |left, right| part(left, right).is_valid();
+        assert!(is_valid(0.1, 0.2) && !is_valid(0.2, 0.1) && !is_valid(0.5, 1.1));
         assert!(!part(f64::NAN, 1.0).is_valid());
     }
 
@@ -124,9 +124,7 @@ mod tests {
         let pixels = Image8 { width, height, rgb, alpha: None, mask: None };
         let mut view = dataset.train[0].clone();
         view.camera = view.camera.resized(width, height);
-        (view.source.width, view.source.height) = (width, height);
-        (view.source.header.width, view.source.header.height) = (width, height);
-        view.source.rendered = Some(std::sync::Arc::new(pixels));
+        view.source = ImageSource::rendered("made".into(), pixels, (width, height));
         let view = &view;
         let part = Part { left: 0.3, top: 0.0, right: 0.9, bottom: 1.0 };
         let cut = view.clone().windowed(&part);
@@ -141,10 +139,8 @@ mod tests {
         for y in 0..height as usize {
             let black = [0.0; 3];
             let x = image.width as usize - 1;
-            assert_eq!(
-                image.composited(x, y, black),
-                whole.composited(x + window.x as usize, y, black)
-            );
+            let expected = whole.composited(x + window.x as usize, y, black);
+            assert_eq!(image.composited(x, y, black), expected);
         }
     }
 

@@ -69,7 +69,7 @@ impl<'a> ModelFile<'a> {
         (&mut file).take(START).read_to_end(&mut start).map_err(LoadError::io(path))?;
         file.rewind().map_err(LoadError::io(path))?;
         if let Some(problem) = files::wrong_kind(&start) {
-            return Err(LoadError(format!("{}: the file: {problem}", path.display())));
+            return Err(LoadError::Data(format!("{}: the file: {problem}", path.display())));
         }
         let length = file.metadata().map_err(LoadError::io(path))?.len();
         let input = BufReader::with_capacity(1 << 16, file);
@@ -133,7 +133,7 @@ fn no_main_file(folder: &Path) -> LoadError {
         Some(format!("{}, which a {} folder has", reader.main_file?, format.name))
     };
     let known: Vec<String> = readers().into_iter().filter_map(known).collect();
-    LoadError(format!(
+    LoadError::Data(format!(
         "{} is a folder without {}; name a file of Gaussian splats",
         folder.display(),
         known.join(", or ")
@@ -142,7 +142,7 @@ fn no_main_file(folder: &Path) -> LoadError {
 
 fn unrecognised(path: &Path) -> LoadError {
     let readable: Vec<&Format> = readers().into_iter().map(|(format, _)| format).collect();
-    LoadError(format!(
+    LoadError::Data(format!(
         "{} is not a model of Gaussian splats that densify reads (its formats: {}); convert it, e.g. with \
          splat-transform or SuperSplat",
         path.display(),

@@ -80,7 +80,7 @@ impl Rows {
     pub(super) fn finish(self, path: &Path) -> Result<SplatFile, LoadError> {
         let (dropped, total) = (self.file.dropped, self.total);
         if dropped as f64 > MAX_BAD_ROWS * total as f64 {
-            return Err(LoadError(format!(
+            return Err(LoadError::Data(format!(
                 "{}: {dropped} of {total} Gaussians have a value that is not finite, more than 1 %; the file is damaged: \
                  export it again",
                 path.display()

@@ -73,9 +73,8 @@ impl Similarity {
                 turned.clear();
                 for (k, channel) in (0..count).flat_map(|k| (0..3).map(move |c| (k, c))) {
                     let old = |j: usize| f64::from(row[3 * (first + j) + channel]);
-                    turned.push(
-                        (0..count).map(|j| matrix[count * k + j] * old(j)).sum::<f64>() as f32
-                    );
+                    let sum: f64 = (0..count).map(|j| matrix[count * k + j] * old(j)).sum();
+                    turned.push(sum as f32);
                 }
                 row[3 * first..3 * (first + count)].copy_from_slice(&turned);
             }
@@ -151,9 +150,8 @@ mod tests {
             let mean = DVec3::from(before.means[row].map(f64::from));
             let found = DVec3::from(after.means[row].map(f64::from));
             assert!((2.0 * (rotation * mean) + DVec3::X - found).length() < 1e-6, "{found}");
-            assert!(
-                (after.log_scales[row][1] - before.log_scales[row][1] - 2f32.ln()).abs() < 1e-6
-            );
+            let larger = after.log_scales[row][1] - before.log_scales[row][1];
+            assert!((larger - 2f32.ln()).abs() < 1e-6);
             for d in [DVec3::X, DVec3::new(0.6, 0.0, -0.8), DVec3::new(0.36, -0.8, 0.48)] {
                 let (old, new) = (shown(&before, row, d), shown(&after, row, rotation * d));
                 assert!((0..3).all(|c| (old[c] - new[c]).abs() < 2e-5), "{old:?} and {new:?}");

@@ -117,7 +117,7 @@ impl Element {
     ) -> Result<usize, LoadError> {
         self.find(&[property]).ok_or_else(|| {
             let path = path.display();
-            LoadError(format!("{path}: the vertices have no property {property}; {remedy}"))
+            LoadError::Data(format!("{path}: the vertices have no property {property}; {remedy}"))
         })
     }
 
@@ -182,19 +182,13 @@ impl Header {
                             "a type is unknown, or the length of a list is not an integer",
                         ));
                     };
-                    lines.push(
-                        &mut elements,
-                        Property { name: name.to_owned(), kind, list: Some(length) },
-                    )?;
+                    lines.push(&mut elements, name, kind, Some(length))?;
                 }
                 ["property", kind, name] => {
                     let Some(kind) = Scalar::parse(kind) else {
                         return Err(lines.fault(format!("the type {kind:?} is unknown")));
                     };
-                    lines.push(
-                        &mut elements,
-                        Property { name: name.to_owned(), kind, list: None },
-                    )?;
+                    lines.push(&mut elements, name, kind, None)?;
                 }
                 ["end_header"] => break,
                 _ => {
@@ -238,11 +232,17 @@ impl<R: BufRead> Lines<'_, R> {
         Ok(String::from_utf8_lossy(&line).into_owned())
     }
 
-    fn push(&self, elements: &mut [Element], property: Property) -> Result<(), LoadError> {
+    fn push(
+        &self,
+        elements: &mut [Element],
+        name: &str,
+        kind: Scalar,
+        list: Option<Scalar>,
+    ) -> Result<(), LoadError> {
         let Some(element) = elements.last_mut() else {
             return Err(self.fault("a property comes before any element"));
         };
-        element.properties.push(property);
+        element.properties.push(Property { name: name.to_owned(), kind, list });
         Ok(())
     }
 }

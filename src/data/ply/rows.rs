@@ -68,11 +68,8 @@ impl<'a> Ply<'a> {
     }
 
     fn fault(&self, element: &Element, row: u64, problem: impl Display) -> LoadError {
-        LoadError::damaged(
-            self.path,
-            format!("{} {row} of {}", element.name, element.rows),
-            problem,
-        )
+        let place = format!("{} {row} of {}", element.name, element.rows);
+        LoadError::damaged(self.path, place, problem)
     }
 
     fn rows(
@@ -89,11 +86,8 @@ impl<'a> Ply<'a> {
                 "{} rows need {min_bytes} bytes each, but the file holds {}",
                 element.rows, self.data
             );
-            return Err(LoadError::damaged(
-                self.path,
-                format!("element {}", element.name),
-                problem,
-            ));
+            let place = format!("element {}", element.name);
+            return Err(LoadError::damaged(self.path, place, problem));
         }
         if min_bytes == 0 {
             return Ok(());
@@ -186,11 +180,8 @@ impl<'a> Ply<'a> {
                 used += 1;
                 if !byte.is_ascii_whitespace() {
                     if length == MAX_WORD {
-                        return Err(self.fault(
-                            element,
-                            row,
-                            "a number is longer than 128 characters",
-                        ));
+                        let problem = "a number is longer than 128 characters";
+                        return Err(self.fault(element, row, problem));
                     }
                     word[length] = byte;
                     length += 1;

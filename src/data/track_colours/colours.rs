@@ -1,6 +1,7 @@
 //! The colours of tracks in their views, and the gains of the views that best explain the differences.
 
-use crate::dataset::{DatasetError, MIN_VIEWS, Tracks, View};
+use crate::dataset::{MIN_VIEWS, Tracks, View};
+use crate::error::LoadError;
 use densify_core::image::Image8;
 
 /// Rounds of alternately fitting gains and colours of tracks.
@@ -56,7 +57,7 @@ impl TrackColours {
     ///
     /// # Errors
     /// When an image cannot be read.
-    pub fn read(tracks: &Tracks, views: &[View]) -> Result<Self, DatasetError> {
+    pub fn read(tracks: &Tracks, views: &[View]) -> Result<Self, LoadError> {
         let mut tracks_in = vec![Vec::new(); views.len()];
         for (track, seen_by) in tracks.views.iter().enumerate() {
             for &view in seen_by {
@@ -140,8 +141,7 @@ fn neighbourhood(image: &Image8, pixel: glam::DVec2) -> Option<([u8; 3], [u8; 3]
     let (mut lowest, mut highest) = ([u8::MAX; 3], [u8::MIN; 3]);
     let at = |x: i64, y: i64| (y * width + x) as usize;
     for place in (y - 1..=y + 1).flat_map(|y| (x - 1..=x + 1).map(move |x| at(x, y))) {
-        let whole =
-            |channel: &Option<Vec<u8>>| channel.as_ref().is_none_or(|c| c[place] == u8::MAX);
+        let whole = |plane: &Option<Vec<u8>>| plane.as_ref().is_none_or(|p| p[place] == u8::MAX);
         if !whole(&image.alpha) || !whole(&image.mask) {
             return None;
         }

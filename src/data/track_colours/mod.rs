@@ -29,8 +29,8 @@ pub use colours::{TrackColours, bytes};
 
 /// Smallest number of measured tracks for a decision.
 pub const MIN_TRACKS: usize = 500;
-/// The 95th percentiles from which on degrees 1, 2 and 3 are chosen `[1/255]`. `docs/tradeoffs.md` lists the scenes that
-/// they were fitted to.
+/// The 95th percentiles from which on degrees 1, 2 and 3 are chosen `[1/255]`, fitted to the scenes of
+/// `docs/studies/sh-degree-auto.tsv`.
 const THRESHOLDS: [f64; 3] = [1.0, 2.0, 3.0];
 /// Largest difference between a point's colour in the reconstruction and in a view, if the point lies on a surface
 /// `[1/255]`.

@@ -1,22 +1,22 @@
 //! Tests of track colours in synthetic views.
 
 use std::path::Path;
-use std::sync::Arc;
 
 use glam::{DMat3, DVec3};
 
 use super::exposures::ExposureSpread;
 use super::*;
 use crate::dataset::builtin::PREFIX;
-use crate::dataset::images::{ImageHeader, ImageSource, SourceFile};
-use crate::dataset::{Dataset, DatasetError, LoadOptions, View};
+use crate::dataset::images::ImageSource;
+use crate::dataset::{Dataset, LoadOptions, View};
+use crate::error::LoadError;
 use densify_core::camera::Camera;
 use densify_core::image::Image8;
 
 const SIZE: u32 = 60;
 const VIEWS: usize = 8;
 
-fn measured(tracks: &Tracks, views: &[View]) -> Result<Spread, DatasetError> {
+fn measured(tracks: &Tracks, views: &[View]) -> Result<Spread, LoadError> {
     Ok(measure(tracks, &TrackColours::read(tracks, views)?))
 }
 
@@ -46,26 +46,11 @@ fn posed(image: Image8) -> View {
     let (width, height) = (image.width, image.height);
     let camera = Camera::centred((width, height), (1.0, 1.0), DMat3::IDENTITY, DVec3::ZERO);
     let camera = Camera { cx: 0.0, cy: 0.0, ..camera };
-    let header = ImageHeader {
-        width,
-        height,
-        has_alpha: false,
-        turn: None,
-        decoded_bytes: image.bytes(),
-        file_bytes: 0,
-    };
-    let (file, rendered) = (SourceFile::rendered("made".into()), Some(Arc::new(image)));
-    let source = ImageSource {
-        file,
-        mask: None,
-        width,
-        height,
-        undistortion: None,
-        header,
-        rendered,
-        window: None,
-    };
-    View { name: "made".into(), camera, source }
+    View {
+        name: "made".into(),
+        camera,
+        source: ImageSource::rendered("made".into(), image, (width, height)),
+    }
 }
 
 #[test]
@@ -109,7 +94,6 @@ fn exposures_are_found_where_gains_explain_the_colours() {
     });
     assert_eq!(noise.decides(VIEWS), Some(false), "{noise:?}");
     assert_eq!(differ.decides(2 * VIEWS), None, "of half of the views nothing is known");
-    assert_eq!(ExposureSpread { tracks: 499, ..differ }.decides(VIEWS), None);
 }
 
 #[test]
@@ -129,8 +113,7 @@ fn colours_that_change_with_the_view_ask_for_more() {
 #[test]
 fn occlusion_in_a_quarter_of_the_views_is_ignored() {
     let hidden = |share: usize| {
-        let (tracks, views) =
-            scene(|view, _, value| if view < share { 255.0 - value } else { value });
+        let (tracks, views) = scene(|view, _, v| if view < share { 255.0 - v } else { v });
         measured(&tracks, &views).unwrap().twentieth
     };
     assert!(hidden(2) < 0.75, "{}", hidden(2));

@@ -126,7 +126,7 @@ macro_rules! problems {
 }
 
 problems!(OptionProblem: Options, SizeProblem: Size, ModelProblem: Model, ResumeProblem: Resume);
-problems!(TrainingProblem: Training, BackendRemedy: Backend, TrainRemedy: Train);
+problems!(TrainingProblem: Training, BackendRemedy: Backend, TrainRemedy: Train, LoadError: Load);
 
 macro_rules! bad_input {
     ($($error:ident),*) => {$(
@@ -138,7 +138,7 @@ macro_rules! bad_input {
     )*};
 }
 
-bad_input!(OptionProblem, SizeProblem, ModelProblem, ResumeProblem);
+bad_input!(OptionProblem, SizeProblem, ModelProblem, ResumeProblem, LoadError);
 
 impl OptionProblem {
     /// A wrong value of an option.
@@ -150,7 +150,6 @@ impl OptionProblem {
 /// Errors that are always caused by bad input.
 pub trait BadInput: Display {}
 
-impl BadInput for LoadError {}
 impl BadInput for FormatError {}
 /// Before training: the policy's name or parameters are wrong.
 impl BadInput for PolicyError {}

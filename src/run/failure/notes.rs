@@ -7,6 +7,7 @@ use crate::spec::Budget;
 use densify_core::memory::Bytes;
 use densify_core::numbers::grouped;
 use densify_core::spelling::Spelling;
+use densify_data::dataset::Note;
 use densify_render::{Accumulation, AdapterKind, BackendKind, Device};
 
 /// The device, with a hint where another choice may be better.
@@ -28,6 +29,22 @@ pub(crate) fn device(s: Spelling, device: &Device) -> String {
         }
     };
     format!("device   {device}")
+}
+
+/// A note of a dataset.
+pub(crate) fn dataset(s: Spelling, note: &Note) -> String {
+    match note {
+        Note::Text(text) => format!("note: {text}"),
+        Note::FarCamerasLeftOut { count, names } => format!(
+            "note: cameras far from all others, {count} left out (use {} to train on them): {names}",
+            s.text("far_cameras", "keep")
+        ),
+        Note::Cropped { percent, photographs } => format!(
+            "note: up to {percent:.0} % of {photographs} photographs is cropped by undistortion ({} keeps the whole \
+             field of view)",
+            s.switch("keep_fov")
+        ),
+    }
 }
 
 /// The order in which gradients are added up.

@@ -3,6 +3,7 @@
 
 use std::path::PathBuf;
 
+use densify_data::LoadError;
 use densify_render::{Accumulation, BackendKind};
 
 /// A problem with options: with one by itself, or with several that contradict each other.
@@ -156,6 +157,8 @@ pub enum Problem {
     Backend(BackendRemedy),
     /// The remedy for an error of training, which stands before it.
     Train(TrainRemedy),
+    /// A dataset or model that cannot be loaded.
+    Load(LoadError),
 }
 
 /// The remedy for an error of training: of its folder, its first Gaussians or its views.

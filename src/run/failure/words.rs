@@ -5,6 +5,7 @@ use std::path::Path;
 use densify_core::memory::Bytes;
 use densify_core::numbers::grouped;
 use densify_core::spelling::Spelling;
+use densify_data::{LoadError, LoadRemedy};
 use densify_render::Accumulation;
 
 use super::problem::{
@@ -26,8 +27,67 @@ impl Problem {
             Self::Training(problem) => problem.words(spelling),
             Self::Backend(remedy) => remedy.words(spelling),
             Self::Train(remedy) => remedy.words(spelling),
+            Self::Load(error) => load_error(error, spelling),
         }
     }
+}
+
+fn load_error(error: &LoadError, s: Spelling) -> String {
+    match error {
+        LoadError::Data(problem) => problem.clone(),
+        LoadError::Remedied { problem, remedy } => {
+            format!("{problem}; {}", load_remedy(*remedy, s))
+        }
+        LoadError::ViewList { file, problem } => {
+            format!("{}: {problem}", s.text("views", file.display()))
+        }
+        LoadError::NoMasks { listing, inverted } => {
+            let option = if *inverted {
+                s.switch("invert_masks")
+            } else {
+                s.text("mask_mode", "background")
+            };
+            let kind = match s {
+                Spelling::Terminal => "flag",
+                Spelling::Keyword => "argument",
+            };
+            format!(
+                "{}: {option}: no photograph has a mask; put masks into `masks/`, named after their photographs as \
+                 NAME.png, or leave the {kind} out",
+                listing.display()
+            )
+        }
+    }
+}
+
+fn load_remedy(remedy: LoadRemedy, s: Spelling) -> String {
+    let (words, option) = match remedy {
+        LoadRemedy::RestoreOrImagesFolder => {
+            ("restore it, or name the folder that holds the images with {}", s.option("images"))
+        }
+        LoadRemedy::AddOrImagesFolder => {
+            ("put the images there, or name their folder with {}", s.option("images"))
+        }
+        LoadRemedy::OtherImagesFolder => (
+            "only paths below the dataset's folder are followed (another folder of images can be given with {})",
+            s.option("images"),
+        ),
+        LoadRemedy::ImagesFolderOfBoth => (
+            "give with {} a folder that contains both at their original paths, or remove one of the two",
+            s.option("images"),
+        ),
+        LoadRemedy::InvertMasks(true) => ("give {}, or remove the masks", s.switch("invert_masks")),
+        LoadRemedy::InvertMasks(false) => {
+            ("leave {} out, or remove the masks", s.switch("invert_masks"))
+        }
+        LoadRemedy::LargerTestEvery => ("use a larger {}, or leave it out", s.option("test_every")),
+        LoadRemedy::KeepFieldOfView => (
+            "train on that field alone with {}, or calibrate again with fewer terms, or undistort the images first, \
+             e.g. with `colmap image_undistorter`",
+            s.switch("keep_fov"),
+        ),
+    };
+    words.replace("{}", &option)
 }
 
 impl BackendRemedy {
@@ -419,6 +479,22 @@ fn short(s: Spelling, name: &str, flag: &str) -> String {
 mod tests {
     use super::*;
     use crate::failure::{Failure, INPUT};
+
+    #[test]
+    fn errors_of_datasets_name_options() {
+        let (listing, remedy) = ("a.txt".into(), LoadRemedy::InvertMasks(false));
+        let remedied = LoadError::Remedied { problem: "none left".to_owned(), remedy };
+        let no_masks = LoadError::NoMasks { listing, inverted: false };
+        let views = LoadError::ViewList { file: "v.txt".into(), problem: "line 2".to_owned() };
+        let words = [remedied, no_masks, views].map(|error| Failure::from(error).to_string());
+        assert_eq!(words[0], "none left; leave --invert-masks out, or remove the masks");
+        assert_eq!(
+            words[1],
+            "a.txt: --mask-mode background: no photograph has a mask; put masks into `masks/`, named after their \
+             photographs as NAME.png, or leave the flag out"
+        );
+        assert_eq!(words[2], "--views v.txt: line 2");
+    }
 
     #[test]
     fn options_are_spelled_as_their_reader_writes_them() {

@@ -5,7 +5,7 @@ use std::path::Path;
 use crate::companion::Companion;
 use crate::failure::{Failure, OptionProblem, notes};
 use crate::host::Host;
-use crate::observer::Observer;
+use crate::observer::{Observer, say_notes};
 use crate::spec::knobs::Knobs;
 use crate::spec::{InitChoice, RunSpec, StartSpec};
 use densify_data::dataset::images::ImageDemand;
@@ -77,9 +77,7 @@ impl Inputs {
         let observer = host.observer;
         let scene = spec.scene()?;
         let mut dataset = Dataset::load(scene, &spec.data.load_options(reading.tracks))?;
-        for note in &dataset.notes {
-            observer.say(format_args!("note: {note}"));
-        }
+        say_notes(observer, &dataset.notes);
         observer.say(format_args!("scene    {}: {}", scene.display(), dataset.describe()));
         let usable_points = usable_points(&dataset.points);
         let StartSpec { init, freeze, .. } = &spec.start;

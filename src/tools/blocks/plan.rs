@@ -21,7 +21,7 @@ use densify_data::dataset::{Dataset, builtin, view_line};
 use densify_run::failure::Failure;
 use densify_run::{
     AbsolutePath, Budget, Host, InitChoice, ModelSize, Observer, Partial, RunSpec, ShDegree,
-    estimate,
+    estimate, say_notes,
 };
 use densify_train::exposure::ExposureChoice;
 
@@ -128,9 +128,7 @@ impl<'a> Planner<'a> {
             None => std::path::absolute(&options.scene).map_err(Failure::input)?,
         };
         let dataset = Dataset::load(&scene, &spec.data.load_options(true))?;
-        for note in &dataset.notes {
-            observer.say(format_args!("note: {note}"));
-        }
+        say_notes(observer, &dataset.notes);
         let to_world = &dataset.normalisation;
         let cameras: Vec<Camera> =
             dataset.train.iter().map(|v| to_world.world_from_scene_camera(&v.camera)).collect();

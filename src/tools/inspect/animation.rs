@@ -15,10 +15,10 @@ pub(crate) const MAX_SIDE: u32 = 16_383;
 const HEAD: usize = 12;
 /// The flag of animations in the extended header.
 const ANIMATED: u8 = 2;
-/// What a frame does with the one before it: it covers it, and is not blended.
-const COVERS: u8 = 2;
+/// The flag of frames that replace the previous one without blending.
+const REPLACES: u8 = 2;
 
-/// Frames of an animation, so far. They are kept in a temporary file.
+/// An animation that is being written. Its frames are kept in a temporary file.
 pub(crate) struct Animation {
     size: (u32, u32),
     milliseconds: u32,
@@ -26,7 +26,7 @@ pub(crate) struct Animation {
 }
 
 impl Animation {
-    /// An animation of this size, at most [`MAX_SIDE`] each way, with so many milliseconds per frame.
+    /// An animation of this size, at most [`MAX_SIDE`] each way, with this many milliseconds per frame.
     pub(crate) fn new(size: (u32, u32), milliseconds: u32) -> io::Result<Self> {
         Ok(Self { size, milliseconds, frames: tempfile::tempfile()? })
     }
@@ -44,7 +44,7 @@ impl Animation {
         for number in [0, 0, self.size.0 - 1, self.size.1 - 1, self.milliseconds.min(0x00ff_ffff)] {
             head.extend(&number.to_le_bytes()[..3]);
         }
-        head.push(COVERS);
+        head.push(REPLACES);
         self.frames.write_all(b"ANMF")?;
         self.frames.write_all(&((head.len() + picture.len()) as u32).to_le_bytes())?;
         self.frames.write_all(&head)?;
@@ -65,7 +65,7 @@ impl Animation {
             }
             head.extend(b"ANIM");
             head.extend(6_u32.to_le_bytes());
-            // Black beneath, and repeated for ever.
+            // A black background, repeated for ever.
             head.extend([0, 0, 0, 255, 0, 0]);
             let length = u32::try_from(head.len() as u64 + frames).map_err(|_| {
                 io::Error::other(
@@ -82,7 +82,7 @@ impl Animation {
     }
 }
 
-/// A chunk of a still picture with its name, length and padding, if there is one of this name.
+/// The chunk of this name in a still picture, with its header and padding.
 fn chunk_of<'a>(still: &'a [u8], name: &[u8; 4]) -> Option<&'a [u8]> {
     let mut rest = still.get(HEAD..)?;
     loop {

@@ -1,4 +1,4 @@
-//! How closely a model in another format reproduces the original, by the pictures of the views held out.
+//! Measures how closely a model in another format reproduces the original, in the views held out.
 
 use std::path::Path;
 
@@ -13,11 +13,11 @@ use densify_run::{DataSpec, Observer};
 use densify_train::evaluate::Split;
 use densify_train::metrics::psnr_between;
 
-/// The model that others are compared with.
+/// The original model, which others are compared with.
 pub struct Reference {
     dataset: Dataset,
     machine: Machine,
-    /// Nearest distance to a camera at which anything is drawn `[scene units]`.
+    /// Near plane `[scene units]`.
     near: f32,
     background: [f32; 3],
     sh_degree: u8,
@@ -29,7 +29,7 @@ impl Reference {
     /// scene's extent. Without a split of its own every 8th photograph is held out.
     ///
     /// # Errors
-    /// When the dataset cannot be loaded, or the model shows nothing of it.
+    /// When the dataset cannot be loaded or the model cannot be rendered.
     pub fn open(
         file: &Path,
         model: &Gaussians,
@@ -44,7 +44,7 @@ impl Reference {
         let mut backend = machine.backend(&dataset, model.clone(), near)?;
         let (background, sh_degree) = (data.background.fixed(), model.sh_degree);
         let views = views_of(&dataset, Split::Test)?;
-        // A model that is not in the pictures looks alike in every format.
+        // A model outside the views would look alike in every format.
         CoordinateCheck::measure(backend.as_mut(), &views, (background, sh_degree))?
             .note(None, file, observer);
         Ok(Self { dataset, machine, near, background, sh_degree, backend })

@@ -26,11 +26,11 @@ const PIXEL: u64 = 64;
 /// A path of cameras through a scene.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum CameraRoute {
-    /// Once around what the cameras of the dataset look at.
+    /// Once around the point that the cameras of the dataset look at.
     Orbit,
-    /// Two turns in front of it.
+    /// Two turns in front of that point.
     Spiral,
-    /// As a file describes it, in the coordinates of the dataset.
+    /// The path of a file, in the coordinates of the dataset.
     File(PathBuf),
 }
 
@@ -46,7 +46,7 @@ impl FromStr for CameraRoute {
     }
 }
 
-/// How a film is made; what is `None` comes from the file of the camera path, or is a default.
+/// Options of a film; `None` is replaced by the value in the file of the camera path, or by a default.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct FilmOptions<'a> {
     /// Number of frames, >= 1.
@@ -85,13 +85,13 @@ impl From<Opened> for FilmSource {
     }
 }
 
-/// Why a film cannot be made.
+/// An error of making a film.
 #[derive(Debug, thiserror::Error)]
 pub enum FilmError {
-    /// The file of the camera path is not one.
+    /// The file of the camera path is invalid.
     #[error("{0}")]
     Path(#[from] CameraPathError),
-    /// Neither the file nor a dataset says how large a frame is.
+    /// Neither the file nor a dataset states the size of a frame.
     #[error("the file does not say how large a frame is")]
     NoSize,
     /// A frame of this size does not fit into memory.
@@ -131,7 +131,7 @@ pub enum FilmError {
         path: PathBuf,
         /// The folder of the pictures, which are complete.
         pictures: PathBuf,
-        /// What failed.
+        /// The failed step and its error.
         problem: String,
     },
     /// The temporary file of the video could not be written.
@@ -150,7 +150,7 @@ pub enum FilmError {
     Backend(#[from] BackendError),
 }
 
-/// The film that was made.
+/// A finished film.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Film {
     /// Number of frames.
@@ -241,7 +241,7 @@ impl Film {
     }
 }
 
-/// Fails where a frame cannot be allocated: rendering it would abort the process.
+/// Checks that a frame can be allocated, as rendering it would abort the process otherwise.
 fn check_memory((width, height): (u32, u32)) -> Result<(), FilmError> {
     let bytes = PIXEL * u64::from(width) * u64::from(height);
     let size = usize::try_from(bytes).unwrap_or(usize::MAX);
@@ -257,7 +257,7 @@ fn ffmpeg(folder: &Path, arguments: &[&OsStr]) -> std::io::Result<Output> {
     command.current_dir(folder).args(arguments).stdin(Stdio::null()).stdout(Stdio::null()).output()
 }
 
-/// Makes a video of the first pictures. It has its name only when it is complete.
+/// Encodes the first pictures as a video, which gets its name only when it is complete.
 fn encode(pictures: &Path, path: &Path, frames: u32, fps: u32) -> Result<(), FilmError> {
     let failed = |problem: String| FilmError::Encoding {
         path: path.to_owned(),
@@ -278,8 +278,8 @@ fn encode(pictures: &Path, path: &Path, frames: u32, fps: u32) -> Result<(), Fil
     match ffmpeg(pictures, &arguments) {
         Ok(Output { status, .. }) if status.success() => {}
         Ok(Output { status, stderr, .. }) => {
-            let said = String::from_utf8_lossy(&stderr);
-            let last = said.lines().rfind(|line| !line.trim().is_empty()).unwrap_or_default();
+            let output = String::from_utf8_lossy(&stderr);
+            let last = output.lines().rfind(|line| !line.trim().is_empty()).unwrap_or_default();
             return Err(failed(format!("ffmpeg ended with {status}: {}", one_line(last))));
         }
         Err(e) => return Err(failed(format!("ffmpeg: {e}"))),

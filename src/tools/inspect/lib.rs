@@ -1,5 +1,5 @@
-//! Shows what a trained model looks like: pictures and depth, films along camera paths, how closely another format
-//! reproduces it, and whether its scores keep given limits. Prints nothing.
+//! Inspection of trained models: pictures and depth, films along camera paths, comparison with other formats, and limits on
+//! scores. Prints nothing.
 
 mod animation;
 mod fidelity;

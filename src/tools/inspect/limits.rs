@@ -1,4 +1,4 @@
-//! Limits on scores, as conditions of a script: which values may not be smaller or larger than a bound.
+//! Limits on scores, as pass or fail conditions of scripts.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -30,7 +30,7 @@ impl FromStr for Limit {
     }
 }
 
-/// The side on which a value may not be.
+/// The side of a limit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Bound {
     /// No smaller value is allowed.
@@ -48,7 +48,7 @@ pub struct Limits<'a> {
     pub highest: &'a [Limit],
 }
 
-/// Why limits are not kept, or cannot be checked.
+/// Limits that are exceeded or cannot be checked.
 #[derive(Debug, Clone, PartialEq)]
 pub enum LimitError {
     /// No value has this key.
@@ -87,13 +87,13 @@ fn flatten(prefix: &str, value: &Value, values: &mut BTreeMap<String, f64>) {
         prefix => format!("{prefix}.{key}"),
     };
     match value {
-        Value::Object(map) => map.iter().for_each(|(key, it)| flatten(&path(key), it, values)),
-        Value::Array(list) => {
-            (0..).zip(list).for_each(|(at, it): (u32, _)| {
-                flatten(&path(&at.to_string()), it, values);
-            });
+        Value::Object(map) => {
+            map.iter().for_each(|(key, value)| flatten(&path(key), value, values));
         }
-        // A value that was not measured keeps no limit.
+        Value::Array(list) => list.iter().enumerate().for_each(|(index, value)| {
+            flatten(&path(&index.to_string()), value, values);
+        }),
+        // A value that was not measured fails every limit.
         Value::Null => _ = values.insert(prefix.to_owned(), f64::NAN),
         value => values.extend(value.as_f64().map(|number| (prefix.to_owned(), number))),
     }
@@ -105,7 +105,7 @@ impl Limits<'_> {
         lowest.chain(self.highest.iter().map(|limit| (Bound::Highest, limit)))
     }
 
-    /// Fails, before anything is measured, where a limit names a value that will not be.
+    /// Checks, before anything is measured, that every limit names a value that will be measured.
     ///
     /// # Errors
     /// [`LimitError::Unknown`].
@@ -115,7 +115,7 @@ impl Limits<'_> {
         let mean = Mean { psnr: 0.0, ssim: 0.0, flip: 0.0, lpips, fitted: None };
         let known = measured_values(&mean, has_geometry.then_some(&example));
         for (bound, Limit { key, .. }) in self.each() {
-            // The number of widths of thin structures is found by measuring.
+            // The number of thin structures is known only after measuring.
             let first = |part| if str::parse::<u32>(part).is_ok() { "0" } else { part };
             let like = key.split('.').map(first).collect::<Vec<_>>().join(".");
             if !known.contains_key(&like) {
@@ -125,7 +125,7 @@ impl Limits<'_> {
         Ok(())
     }
 
-    /// Fails where a value is beyond its limit, or was not measured.
+    /// Checks that every value was measured and is within its limit.
     ///
     /// # Errors
     /// [`LimitError::Exceeded`] with every such value; [`LimitError::Unknown`] for a key that does not exist.
@@ -223,8 +223,9 @@ mod tests {
         for key in ["flip", "centres.f_score_one_percent", "thin.3.recall", "normal_error"] {
             assert_eq!(early(true, false, key), Ok(()), "{key}");
             let message = early(false, false, key).err().map(|error| error.to_string());
-            let told = message.is_some_and(|it| it.contains("flip") && it.contains("scenegen"));
-            assert_eq!(told, key != "flip", "{key}");
+            let is_explained =
+                message.is_some_and(|text| text.contains("flip") && text.contains("scenegen"));
+            assert_eq!(is_explained, key != "flip", "{key}");
         }
         assert_eq!(early(false, true, "lpips"), Ok(()));
         assert!(early(true, false, "lpips").unwrap_err().to_string().contains("--lpips"));

@@ -50,11 +50,8 @@ pub fn compare_images(
 ) -> Result<f64, String> {
     let pixels = boundary.len();
     if measured.len() != expected.len() || !expected.len().is_multiple_of(pixels.max(1)) {
-        return Err(format!(
-            "{} values measured, {} expected, {pixels} pixels",
-            measured.len(),
-            expected.len()
-        ));
+        let (found, wanted) = (measured.len(), expected.len());
+        return Err(format!("{found} values measured, {wanted} expected, {pixels} pixels"));
     }
     let channels = expected.len() / pixels.max(1);
     let (mut largest, mut flips, mut directions) = (0.0_f64, 0_usize, 0.0);

@@ -58,10 +58,13 @@ fn kind(quantity: &str) -> &str {
     match quantity {
         "rgb" | "alpha" | "depth" => "image",
         "means" | "log_scales" | "quats" | "opacity_logits" | "sh" => "gradient",
-        "mean2d" | "mean2d_abs" | "colour" | "max_weight" | "sum_weight" | "pixel_count" => {
-            "row statistics"
-        }
-        "rows blended but not visible" => "row statistics",
+        "mean2d"
+        | "mean2d_abs"
+        | "colour"
+        | "max_weight"
+        | "sum_weight"
+        | "pixel_count"
+        | "rows blended but not visible" => "row statistics",
         other if other.starts_with(BROKEN) => BROKEN,
         other => other,
     }

@@ -102,6 +102,26 @@ impl<'a> Trial<'a> {
         Ok(())
     }
 
+    /// Checks that the image of a view and its gradients are finite, then trains on it.
+    pub(super) fn check_finite(
+        &mut self,
+        label: &str,
+        model: &Gaussians,
+        camera: &Camera,
+        background: [f32; 3],
+        sh_degree: u8,
+    ) -> Result<ModelGradient, BackendError> {
+        let mut backend = self.subject.backend(model)?;
+        let upstream = scenes::narrowed(&scenes::upstream(camera, 5));
+        let (image, gradient) = backend.differentiate(camera, background, sh_degree, &upstream)?;
+        let images: [&[f32]; 3] = [&image.rgb, &image.alpha, &image.depth];
+        let gradients = CLASSES.map(|name| class(&gradient, name));
+        let broken = count_broken(&images) + count_broken(&gradients);
+        self.count(label, "NaN or infinity", broken);
+        self.train(label, &mut *backend, camera, background, sh_degree)?;
+        Ok(gradient)
+    }
+
     fn compare_image(&mut self, label: &str, found: &Rendering, image: &Image) {
         let deepest = image.depth.iter().fold(1.0_f64, |m, d| m.max(*d));
         let limits = self.limits;

@@ -74,24 +74,10 @@ pub(crate) fn slot_name(slot: usize) -> &'static str {
     }
 }
 
-/// `values`, of which each row has `per_row`, without those of row `row`.
-pub(crate) fn without<T: Clone>(values: &[T], row: usize, per_row: usize) -> Vec<T> {
-    let (before, rest) = (&values[..row * per_row], &values[(row + 1) * per_row..]);
-    [before, rest].concat()
-}
-
 /// The model without row `row`.
 #[must_use]
 pub fn remove(model: &Gaussians, row: usize) -> Gaussians {
-    let per_row = model.sh.len() / model.len();
-    Gaussians {
-        sh_degree: model.sh_degree,
-        means: without(&model.means, row, 1),
-        log_scales: without(&model.log_scales, row, 1),
-        quats: without(&model.quats, row, 1),
-        opacity_logits: without(&model.opacity_logits, row, 1),
-        sh: without(&model.sh, row, per_row),
-    }
+    model.gather(&(0..model.len()).filter(|&other| other != row).collect::<Vec<_>>())
 }
 
 /// Learning rates of tests that train: those of the schedule, with means in scene units.

@@ -99,8 +99,7 @@ fn describe_without_points(scene: &Scene) -> Value {
         .models
         .iter()
         .map(|model| json!({ "name": model.name, "rows": model.rows, "degree": model.sh_degree }));
-    let is_available =
-        |kind: &PictureKind| scene.unavailable.iter().all(|(other, _)| other != kind);
+    let is_available = |kind: &PictureKind| scene.unavailable.iter().all(|(k, _)| k != kind);
     let kinds = PictureKind::ALL.into_iter().filter(is_available);
     let unavailable = scene.unavailable.iter();
     let unavailable =
@@ -140,14 +139,10 @@ mod tests {
         scene.points.colours = vec![[255; 3]; count];
         let described = describe(&mut scene);
         let points = described.len() - without;
-        assert!(
-            points <= MAX_POINTS * MAX_POINT_BYTES && points > MAX_POINTS * MAX_POINT_BYTES / 3,
-            "{points}"
-        );
-        assert!(
-            scene.points.is_empty() && !lacks_points(&described),
-            "points are kept twice, or missing"
-        );
+        let most = MAX_POINTS * MAX_POINT_BYTES;
+        assert!(points <= most && points > most / 3, "{points}");
+        assert!(scene.points.is_empty(), "points are kept twice");
+        assert!(!lacks_points(&described), "points are missing");
         let described: Value = serde_json::from_slice(&described).expect("JSON");
         assert_eq!(described["points"]["positions"].as_array().expect("points").len(), MAX_POINTS);
         assert_eq!(described["title"], scene.title);

@@ -37,7 +37,7 @@ const MAX_FLIP: f64 = 0.5;
 const MIN_ALPHA: f32 = 0.02;
 
 /// A picture ready to be sent.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub(super) struct EncodedPicture {
     pub(super) jpeg: Vec<u8>,
     pub(super) size: (u32, u32),
@@ -154,7 +154,7 @@ pub(super) fn camera(scene: &Scene, request: &PictureRequest) -> Camera {
 
 /// Shrinks a size to the largest allowed one, keeping the aspect ratio.
 fn limit_size((width, height): (u32, u32), largest: Option<(u32, u32)>) -> (u32, u32) {
-    let Some(largest) = largest.filter(|it| width > it.0 || height > it.1) else {
+    let Some(largest) = largest.filter(|most| width > most.0 || height > most.1) else {
         return (width, height);
     };
     let [x, y] =
@@ -288,14 +288,7 @@ mod tests {
                 ];
                 for ((scene, _folder), (kind, size)) in scenes.iter().zip(kinds) {
                     for number in 0..3 {
-                        let request = PictureRequest {
-                            pane: ("a".to_owned(), 0),
-                            kind,
-                            model: 0,
-                            size,
-                            is_moving: false,
-                            camera: Viewpoint::View(Split::Train, number),
-                        };
+                        let request = PictureRequest::of_view("a", kind, size, number);
                         let Camera { width, height, .. } = camera(scene, &request);
                         let pixels = width as usize * height as usize;
                         let rendering = Rendering {
@@ -328,14 +321,7 @@ mod tests {
             depth: vec![2.0, 4.5, 0.0],
         };
         let draw_kind = |kind| {
-            let request = PictureRequest {
-                pane: ("a".to_owned(), 0),
-                kind,
-                model: 0,
-                size: (3, 1),
-                is_moving: false,
-                camera: Viewpoint::View(Split::Train, 0),
-            };
+            let request = PictureRequest::of_view("a", kind, (3, 1), 0);
             let rendered =
                 RenderedPicture { rendering: rendering.clone(), ..RenderedPicture::default() };
             let drawn = draw(&scene, &request, rendered).expect("a picture");
@@ -348,7 +334,8 @@ mod tests {
         assert!(near > far && far > nothing && nothing == 0, "{near} {far} {nothing}");
         let range = depth.range.expect("a scale");
         assert!(is_near(range.start, 6.0 * units) && is_near(range.end, 2.0 * units), "{range:?}");
-        assert!(depth.distance.is_some_and(|it| is_near(it, 6.0 * units)), "{:?}", depth.distance);
+        let distance = depth.distance.expect("a distance");
+        assert!(is_near(distance, 6.0 * units), "{distance}");
         let (opacity, lights) = draw_kind(PictureKind::Opacity);
         assert_eq!((lights, opacity.range), ([3 * 255, 3 * 191, 0], None));
         let (count, [some, more, none]) = draw_kind(PictureKind::Count);

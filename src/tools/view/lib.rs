@@ -24,8 +24,7 @@ mod scene;
 
 use std::thread;
 
-use listener::Listener;
-pub use listener::{FIRST_PORT, ListenAddress};
+pub use listener::{FIRST_PORT, ListenAddress, Server};
 pub use live::COMPANION;
 pub use open::{ViewOptions, is_run, open};
 use render::ModelCache;
@@ -38,30 +37,7 @@ use densify_run::failure::{Failure, OTHER};
 /// Pictures in progress at a time: one is rendered while another is encoded.
 const MAX_ACTIVE: usize = 2;
 
-/// An HTTP server for one page, bound to its port.
-pub struct Server {
-    listener: Listener,
-}
-
 impl Server {
-    /// Binds the port.
-    ///
-    /// # Errors
-    /// If the port is in use or the address does not belong to this machine.
-    pub fn open(address: ListenAddress) -> Result<Self, Failure> {
-        Ok(Self { listener: Listener::open(address)? })
-    }
-
-    /// The page's address for a browser on this machine.
-    pub fn url(&self) -> String {
-        self.listener.url()
-    }
-
-    /// True if other machines can reach the page.
-    pub fn is_public(&self) -> bool {
-        self.listener.is_public()
-    }
-
     /// Serves the page until `is_over` returns true.
     ///
     /// # Errors
@@ -69,13 +45,9 @@ impl Server {
     pub fn serve(&self, loaded: LoadedScene, is_over: &dyn Fn() -> bool) -> Result<(), Failure> {
         let LoadedScene { mut scene, mut backends } = loaded;
         let queue = RenderQueue::new(None, MAX_ACTIVE);
-        let routes = Routes {
-            listener: &self.listener,
-            queue: &queue,
-            limits: scene.limits(),
-            description: description::describe(&mut scene),
-            run_status: None,
-        };
+        let description = description::describe(&mut scene);
+        let routes =
+            Routes { listener: self, queue: &queue, scene: &scene, description, run_status: None };
         let failed = |message: String| Failure::new(OTHER, message);
         thread::scope(|scope| {
             let (queue, scene) = (&queue, &scene);
@@ -101,7 +73,7 @@ impl Server {
                 }
                 stops
             };
-            let served = http::serve(&self.listener.socket, &respond, &stops);
+            let served = http::serve(&self.socket, &respond, &stops);
             queue.close();
             let rendered = renderer.join().and(encoder.join());
             served.map_err(|error| failed(format!("the page can no longer be served: {error}")))?;

@@ -25,9 +25,9 @@ pub struct ListenAddress {
     pub needs_token: bool,
 }
 
-/// A bound listener.
+/// An HTTP server for one page, bound to its port.
 #[derive(Debug)]
-pub(super) struct Listener {
+pub struct Server {
     pub(super) socket: TcpListener,
     address: SocketAddr,
     /// True if other machines can reach it.
@@ -36,12 +36,12 @@ pub(super) struct Listener {
     token: Option<String>,
 }
 
-impl Listener {
+impl Server {
     /// Binds the port.
     ///
     /// # Errors
     /// If the port is in use or the address does not belong to this machine.
-    pub(super) fn open(address: ListenAddress) -> Result<Self, Failure> {
+    pub fn open(address: ListenAddress) -> Result<Self, Failure> {
         let ListenAddress { host, port, needs_token } = address;
         let bind = |port: u16| {
             let socket = TcpListener::bind((host, port))?;
@@ -74,7 +74,7 @@ impl Listener {
     }
 
     /// The page's address for a browser on this machine.
-    pub(super) fn url(&self) -> String {
+    pub fn url(&self) -> String {
         let mut address = self.address;
         match address.ip() {
             IpAddr::V4(ip) if ip.is_unspecified() => address.set_ip(Ipv4Addr::LOCALHOST.into()),
@@ -87,8 +87,8 @@ impl Listener {
         }
     }
 
-    /// True if other machines can reach it.
-    pub(super) fn is_public(&self) -> bool {
+    /// True if other machines can reach the page.
+    pub fn is_public(&self) -> bool {
         self.is_public
     }
 
@@ -158,8 +158,16 @@ fn random_token() -> Result<String, Failure> {
 mod tests {
     use super::*;
 
-    fn listener(host: IpAddr) -> Listener {
-        Listener::open(ListenAddress { host, port: Some(0), needs_token: false }).unwrap()
+    fn open(
+        host: impl Into<IpAddr>,
+        port: Option<u16>,
+        needs_token: bool,
+    ) -> Result<Server, Failure> {
+        Server::open(ListenAddress { host: host.into(), port, needs_token })
+    }
+
+    fn listener(host: Ipv4Addr) -> Server {
+        open(host, Some(0), false).unwrap()
     }
 
     fn request(path: &str, host: &str, origin: Option<&str>) -> Request {
@@ -168,12 +176,12 @@ mod tests {
 
     #[test]
     fn only_this_machine_and_this_page_may_send_requests() {
-        let listener = listener(Ipv4Addr::LOCALHOST.into());
+        let listener = listener(Ipv4Addr::LOCALHOST);
         let ask = |host: &str, origin: Option<&str>| {
             listener
                 .authorise(&request("/scene", host, origin))
                 .map(str::to_owned)
-                .map_err(|error| error.status())
+                .map_err(|error| error.status)
         };
         for host in ["localhost", "LOCALHOST:8080", "127.0.0.1:1", "[::1]:8080", "127.9.9.9"] {
             assert_eq!(ask(host, None), Ok("scene".to_owned()), "{host}");
@@ -193,14 +201,14 @@ mod tests {
 
     #[test]
     fn only_json_may_be_posted() {
-        let listener = listener(Ipv4Addr::LOCALHOST.into());
+        let listener = listener(Ipv4Addr::LOCALHOST);
         let post = |content_type: Option<&str>| {
             let request = Request {
                 method: Method::Post,
                 content_type: content_type.map(str::to_owned),
                 ..request("/frame", "localhost", None)
             };
-            listener.authorise(&request).map(str::to_owned).map_err(|error| error.status())
+            listener.authorise(&request).map(str::to_owned).map_err(|error| error.status)
         };
         assert_eq!(post(Some("application/json")), Ok("frame".to_owned()));
         assert_eq!(post(Some("text/plain")), Err(415));
@@ -209,14 +217,12 @@ mod tests {
 
     #[test]
     fn a_public_address_contains_a_token() {
-        let [one, other] = [(); 2].map(|()| listener(Ipv4Addr::UNSPECIFIED.into()));
+        let [one, other] = [(); 2].map(|()| listener(Ipv4Addr::UNSPECIFIED));
         assert!(one.is_public() && one.token != other.token);
         let token = one.token.clone().unwrap();
         assert_eq!(token.len(), 32);
-        assert!(
-            one.url().starts_with("http://127.0.0.1:")
-                && one.url().ends_with(&format!("/{token}/"))
-        );
+        let url = one.url();
+        assert!(url.starts_with("http://127.0.0.1:") && url.ends_with(&format!("/{token}/")));
         let ask =
             |path: &str| one.authorise(&request(path, "any.example", None)).map(str::to_owned).ok();
         assert_eq!(ask(&format!("/{token}/frame")).as_deref(), Some("frame"));
@@ -230,16 +236,14 @@ mod tests {
 
     #[test]
     fn a_page_that_controls_a_run_has_a_token_and_is_for_this_machine() {
-        let host = Ipv4Addr::LOCALHOST.into();
-        let listener =
-            Listener::open(ListenAddress { host, port: Some(0), needs_token: true }).unwrap();
+        let listener = open(Ipv4Addr::LOCALHOST, Some(0), true).unwrap();
         assert!(!listener.is_public());
         let token = listener.token.clone().unwrap();
         let ask = |path: &str, host: &str| {
             listener
                 .authorise(&request(path, host, None))
                 .map(str::to_owned)
-                .map_err(|error| error.status())
+                .map_err(|error| error.status)
         };
         assert_eq!(ask(&format!("/{token}/order"), "localhost:8080"), Ok("order".to_owned()));
         assert_eq!(ask("/order", "localhost:8080"), Err(404));
@@ -248,25 +252,15 @@ mod tests {
 
     #[test]
     fn a_port_in_use_is_named_and_the_default_is_the_next_free_one() {
-        let first = listener(Ipv4Addr::LOCALHOST.into());
+        let host = Ipv4Addr::LOCALHOST;
+        let first = listener(host);
         let port = first.address.port();
-        let host = Ipv4Addr::LOCALHOST.into();
-        let refused = Listener::open(ListenAddress { host, port: Some(port), needs_token: false })
-            .unwrap_err();
-        assert!(
-            refused.code == 2 && refused.to_string().contains(&format!("--port {port}")),
-            "{refused}"
-        );
-        let two = [(); 2].map(|()| {
-            Listener::open(ListenAddress { host, port: None, needs_token: false }).unwrap()
-        });
+        let refused = open(host, Some(port), false).unwrap_err();
+        let message = refused.to_string();
+        assert!(refused.code == 2 && message.contains(&format!("--port {port}")), "{message}");
+        let two = [(); 2].map(|()| open(host, None, false).unwrap());
         assert_ne!(two[0].address, two[1].address);
-        let elsewhere = ListenAddress {
-            host: Ipv4Addr::new(192, 0, 2, 7).into(),
-            port: Some(0),
-            needs_token: false,
-        };
-        let refused = Listener::open(elsewhere).unwrap_err();
+        let refused = open(Ipv4Addr::new(192, 0, 2, 7), Some(0), false).unwrap_err();
         assert!(refused.code == 2 && refused.to_string().contains("--host 192.0.2.7"), "{refused}");
     }
 }

@@ -113,11 +113,12 @@ impl Server {
         let (rows, signals) = (run.trainer.rows(), run.trainer.signals());
         let queue = RenderQueue::new(Some(MAX_WAITING), MAX_ACTIVE);
         let run_status = RunStatus::default();
+        let description = description::describe(&mut scene);
         let routes = Routes {
-            listener: &self.listener,
+            listener: self,
             queue: &queue,
-            limits: scene.limits(),
-            description: description::describe(&mut scene),
+            scene: &scene,
+            description,
             run_status: Some(&run_status),
         };
         thread::scope(|scope| {

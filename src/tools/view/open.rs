@@ -185,9 +185,9 @@ fn scene_without_cameras(
     data: &DataSpec,
 ) -> Result<LoadedScene, Failure> {
     if model.is_empty() {
+        let path = path.display();
         return Err(Failure::input(format!(
-            "{} contains no Gaussians: there is nothing to show",
-            path.display()
+            "{path} contains no Gaussians: there is nothing to show"
         )));
     }
     let normalisation = Normalisation::fit_model(model);

@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-/// The content of a picture.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+/// The content of a picture. From `Rows` on, Gaussians have colours other than their own.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(super) enum PictureKind {
     /// The model, as `densify render` draws it.
@@ -73,17 +73,7 @@ impl PictureKind {
 
     /// True if Gaussians are rendered in colours other than their own.
     pub(super) fn colours_rows(self) -> bool {
-        matches!(
-            self,
-            Self::Rows
-                | Self::RowOpacity
-                | Self::RowSize
-                | Self::RowShape
-                | Self::RowGradient
-                | Self::RowWeight
-                | Self::RowAge
-                | Self::RowEdit
-        )
+        self >= Self::Rows
     }
 
     pub(super) fn legend(self) -> Legend {

@@ -4,7 +4,7 @@ use serde::Deserialize;
 
 use super::http::Response;
 use super::picture_kind::PictureKind;
-use super::scene::RequestLimits;
+use super::scene::Scene;
 use densify_core::camera_path;
 use densify_core::camera_path::Keyframe;
 use densify_train::evaluate::Split;
@@ -67,6 +67,15 @@ pub(super) struct PictureRequest {
     pub(super) camera: Viewpoint,
 }
 
+#[cfg(test)]
+impl PictureRequest {
+    /// A request for the picture of a training view.
+    pub(super) fn of_view(page: &str, kind: PictureKind, size: (u32, u32), number: usize) -> Self {
+        let (pane, camera) = ((page.to_owned(), 0), Viewpoint::View(Split::Train, number));
+        Self { pane, kind, model: 0, size, is_moving: false, camera }
+    }
+}
+
 /// The camera of a picture.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Viewpoint {
@@ -77,14 +86,14 @@ pub(super) enum Viewpoint {
 }
 
 /// Parses and validates the body of a picture request.
-pub(super) fn parse(body: &[u8], limits: &RequestLimits) -> Result<PictureRequest, Response> {
+pub(super) fn parse(body: &[u8], scene: &Scene) -> Result<PictureRequest, Response> {
     let body: RequestBody = serde_json::from_slice(body).map_err(|error| {
         Response::error(400, format_args!("this is no picture request: {error}"))
     })?;
-    check(body, limits).map_err(|message| Response::error(400, message))
+    check(body, scene).map_err(|message| Response::error(400, message))
 }
 
-fn check(body: RequestBody, limits: &RequestLimits) -> Result<PictureRequest, String> {
+fn check(body: RequestBody, scene: &Scene) -> Result<PictureRequest, String> {
     let RequestBody { page, place, kind, model, width, height, moving, camera, view } = body;
     let is_plain = |c: char| c.is_ascii_alphanumeric() || c == '-';
     if page.is_empty() || page.len() > MAX_NAME || !page.chars().all(is_plain) {
@@ -100,13 +109,13 @@ fn check(body: RequestBody, limits: &RequestLimits) -> Result<PictureRequest, St
             pixels; make the window smaller, or choose a lower resolution"
         ));
     }
-    if model >= limits.models {
-        return Err(format!("model must be less than {}", limits.models));
+    if model >= scene.models.len() {
+        return Err(format!("model must be less than {}", scene.models.len()));
     }
     let camera = match (camera, view) {
-        (Some(camera), None) => Viewpoint::Free(key(&camera, limits)?),
+        (Some(camera), None) => Viewpoint::Free(key(&camera, scene)?),
         (None, Some(ViewBody { split, number })) => {
-            let views = limits.views[split as usize];
+            let views = scene.views[split as usize].len();
             if number >= views {
                 return Err(format!("there are {views} such views; number must be less"));
             }
@@ -117,21 +126,20 @@ fn check(body: RequestBody, limits: &RequestLimits) -> Result<PictureRequest, St
     if kind.needs_photograph() && matches!(camera, Viewpoint::Free(_)) {
         return Err("only the camera of a view has a photograph".into());
     }
-    if let Some((_, why)) = limits.unavailable.iter().find(|(unavailable, _)| *unavailable == kind)
-    {
+    if let Some((_, why)) = scene.unavailable.iter().find(|(unavailable, _)| *unavailable == kind) {
         return Err(format!("this cannot be shown: {why}"));
     }
     let (size, is_moving) = ((width, height), moving);
     Ok(PictureRequest { pane: (page, place), kind, model, size, is_moving, camera })
 }
 
-fn key(camera: &CameraBody, limits: &RequestLimits) -> Result<Keyframe, String> {
+fn key(camera: &CameraBody, scene: &Scene) -> Result<Keyframe, String> {
     let key = camera_path::parse_keyframe(&camera.camera_to_world, camera.fov)?;
     if !FIELDS.contains(&camera.fov) {
         let (least, most) = (FIELDS.start(), FIELDS.end());
         return Err(format!("fov is {}; it must be {least} to {most} degrees", camera.fov));
     }
-    let away = limits.normalisation.scene_from_world(key.centre).length();
+    let away = scene.normalisation.scene_from_world(key.centre).length();
     // The comparison is also false for NaN.
     if away <= FARTHEST { Ok(key) } else { Err("the camera is too far from the scene".into()) }
 }
@@ -141,18 +149,21 @@ mod tests {
     use serde_json::{Value, json};
 
     use super::*;
-    use densify_data::dataset::normalise::Normalisation;
+    use crate::open::scene_of_one_view;
+    use crate::scene::ModelInfo;
 
-    fn limits() -> RequestLimits {
-        let normalisation = Normalisation { centre: glam::DVec3::ZERO, scale: 0.5 };
-        let unavailable = vec![
-            (PictureKind::Count, "on a GPU".to_owned()),
-            (PictureKind::RowAge, "trains".to_owned()),
-        ];
-        RequestLimits { models: 2, views: [3, 0], normalisation, unavailable }
+    /// A scene with two models, one training view and no test views.
+    fn scene() -> Scene {
+        let (_folder, mut scene) = scene_of_one_view();
+        scene.mark_unavailable(&[PictureKind::Count], "on a GPU");
+        scene.mark_unavailable(&[PictureKind::RowAge], "trains");
+        let model =
+            || ModelInfo { name: "a".into(), rows: 1, sh_degree: 0, near: 0.1, checkpoint: None };
+        scene.models = vec![model(), model()];
+        scene
     }
 
-    fn parse_changed(changes: Value) -> Result<PictureRequest, String> {
+    fn parse_changed(scene: &Scene, changes: Value) -> Result<PictureRequest, String> {
         let pose = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
         let mut body = json!({
             "page": "a-1", "kind": "render", "width": 640, "height": 480,
@@ -164,28 +175,29 @@ mod tests {
                 value => body[name] = value.clone(),
             }
         }
-        parse(body.to_string().as_bytes(), &limits()).map_err(|response| {
-            format!("{} {}", response.status(), String::from_utf8_lossy(response.body()))
+        parse(body.to_string().as_bytes(), scene).map_err(|response| {
+            format!("{} {}", response.status, String::from_utf8_lossy(&response.body))
         })
     }
 
     #[test]
     fn valid_requests_are_parsed() {
-        let request = parse_changed(json!({ "moving": true, "model": 1, "place": 1 })).unwrap();
+        let scene = scene();
+        let request =
+            parse_changed(&scene, json!({ "moving": true, "model": 1, "place": 1 })).unwrap();
         assert_eq!((request.size, request.model, request.is_moving), ((640, 480), 1, true));
         assert_eq!(request.pane, ("a-1".to_owned(), 1));
         let Viewpoint::Free(key) = request.camera else { panic!("{request:?}") };
         assert!((key.fov_y.to_degrees() - 50.0).abs() < 1e-9);
-        let at_view = json!({ "camera": null, "view": { "split": "test", "number": 2 }, "kind": "difference" });
-        let request = parse_changed(at_view).unwrap();
-        assert_eq!(
-            (request.camera, request.kind),
-            (Viewpoint::View(Split::Test, 2), PictureKind::Difference)
-        );
+        let at_view = json!({ "camera": null, "view": { "split": "train", "number": 0 }, "kind": "difference" });
+        let request = parse_changed(&scene, at_view).unwrap();
+        assert_eq!(request.camera, Viewpoint::View(Split::Train, 0));
+        assert_eq!(request.kind, PictureKind::Difference);
     }
 
     #[test]
     fn invalid_requests_are_refused_with_the_reason() {
+        let scene = scene();
         let pose = |at: usize, value: f64| {
             let mut pose =
                 [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0];
@@ -211,8 +223,8 @@ mod tests {
             (json!({ "camera": null }), "either"),
             (json!({ "view": { "split": "test", "number": 0 } }), "either"),
             (json!({ "kind": "photograph" }), "photograph"),
-            (view("test", 3), "3 such views"),
-            (view("train", 0), "0 such views"),
+            (view("train", 1), "1 such views"),
+            (view("test", 0), "0 such views"),
             (view("test", -1), "no picture"),
             (view("../test", 0), "no picture"),
             (pose(0, -1.0), "mirrors"),
@@ -222,19 +234,16 @@ mod tests {
             (json!({ "camera": { "camera_to_world": vec![1; 17], "fov": 50 } }), "17 numbers"),
             (json!({ "camera": { "camera_to_world": [1, "a"], "fov": 50 } }), "no picture"),
         ] {
-            let refused = parse_changed(changes.clone()).expect_err(&changes.to_string());
-            assert!(
-                refused.starts_with("400 ") && refused.contains(reason),
-                "{changes}: {refused}"
-            );
+            let error = parse_changed(&scene, changes.clone()).expect_err(&changes.to_string());
+            assert!(error.starts_with("400 ") && error.contains(reason), "{changes}: {error}");
         }
         for fov in [0.0, 0.5, 171.0, 180.0, -1.0] {
             let mut changes = pose(0, 1.0);
             changes["camera"]["fov"] = fov.into();
-            assert!(parse_changed(changes).unwrap_err().contains("fov"), "{fov}");
+            assert!(parse_changed(&scene, changes).unwrap_err().contains("fov"), "{fov}");
         }
         for body in [&b""[..], b"{", b"[]", b"\xff", b"{\"width\": 1e999}", &[b'['; 4096]] {
-            assert_eq!(parse(body, &limits()).unwrap_err().status(), 400);
+            assert_eq!(parse(body, &scene).unwrap_err().status, 400);
         }
     }
 }

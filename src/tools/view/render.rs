@@ -20,7 +20,7 @@ use densify_train::trainer::RowHistory;
 const MEASURING_TIME: Duration = Duration::from_millis(150);
 
 /// A rendering with its data, ready to be encoded.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct RenderedPicture {
     /// Empty if the request is for a photograph.
     pub(super) rendering: Rendering,
@@ -30,19 +30,6 @@ pub(super) struct RenderedPicture {
     pub(super) measured_views: Option<[usize; 2]>,
     /// Rendering time `[ms]`.
     pub(super) milliseconds: f64,
-}
-
-impl Default for RenderedPicture {
-    fn default() -> Self {
-        let rendering = Rendering {
-            width: 0,
-            height: 0,
-            rgb: Vec::new(),
-            alpha: Vec::new(),
-            depth: Vec::new(),
-        };
-        Self { rendering, range: None, measured_views: None, milliseconds: 0.0 }
-    }
 }
 
 /// Data kept per model between pictures, as the model does not change.

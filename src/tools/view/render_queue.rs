@@ -70,10 +70,6 @@ impl RenderQueue {
         self.jobs.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn wait<'a>(&self, jobs: MutexGuard<'a, Jobs>) -> MutexGuard<'a, Jobs> {
-        self.changed.wait(jobs).unwrap_or_else(PoisonError::into_inner)
-    }
-
     /// Queues a request and waits for its picture.
     pub(super) fn submit(&self, request: PictureRequest) -> Result<EncodedPicture, RenderError> {
         let (reply, result) = sync_channel(1);
@@ -109,18 +105,22 @@ impl RenderQueue {
         Some(jobs.waiting.remove(0))
     }
 
+    /// Waits until `take` returns something; `None` once the queue is closed.
+    fn wait_for<T>(&self, take: impl Fn(&mut Jobs) -> Option<T>) -> Option<T> {
+        let mut jobs = self.lock();
+        while !jobs.is_closed {
+            let taken = take(&mut jobs);
+            if taken.is_some() {
+                return taken;
+            }
+            jobs = self.changed.wait(jobs).unwrap_or_else(PoisonError::into_inner);
+        }
+        None
+    }
+
     /// Waits for the next job to render; `None` once the queue is closed.
     pub(super) fn next(&self) -> Option<Job> {
-        let mut jobs = self.lock();
-        loop {
-            if jobs.is_closed {
-                return None;
-            }
-            if let Some(job) = self.take(&mut jobs) {
-                return Some(job);
-            }
-            jobs = self.wait(jobs);
-        }
+        self.wait_for(|jobs| self.take(jobs))
     }
 
     /// The next job to render, waiting for it at most this long.
@@ -154,16 +154,7 @@ impl RenderQueue {
 
     /// Waits for the next rendering to encode; `None` once the queue is closed.
     pub(super) fn next_rendered(&self) -> Option<(Job, RenderedPicture)> {
-        let mut jobs = self.lock();
-        loop {
-            if jobs.is_closed {
-                return None;
-            }
-            if !jobs.rendered.is_empty() {
-                return Some(jobs.rendered.remove(0));
-            }
-            jobs = self.wait(jobs);
-        }
+        self.wait_for(|jobs| (!jobs.rendered.is_empty()).then(|| jobs.rendered.remove(0)))
     }
 
     /// Answers an active job.
@@ -210,18 +201,9 @@ impl Drop for CloseOnDrop<'_> {
 mod tests {
     use super::*;
     use crate::picture_kind::PictureKind;
-    use crate::picture_request::Viewpoint;
-    use densify_train::evaluate::Split;
 
     fn picture_request(page: &str, number: usize) -> PictureRequest {
-        PictureRequest {
-            pane: (page.to_owned(), 0),
-            kind: PictureKind::Render,
-            model: 0,
-            size: (8, 8),
-            is_moving: true,
-            camera: Viewpoint::View(Split::Test, number),
-        }
+        PictureRequest::of_view(page, PictureKind::Render, (8, 8), number)
     }
 
     #[test]
@@ -249,15 +231,7 @@ mod tests {
     #[test]
     fn active_jobs_are_limited_until_their_pictures_are_encoded() {
         let queue = RenderQueue::new(None, 1);
-        let picture = EncodedPicture {
-            jpeg: vec![3],
-            size: (1, 1),
-            range: None,
-            mean: None,
-            distance: None,
-            measured_views: None,
-            milliseconds: 0.0,
-        };
+        let picture = EncodedPicture { jpeg: vec![3], ..EncodedPicture::default() };
         thread::scope(|scope| {
             let replies = ["a", "b"].map(|page| {
                 let queue = &queue;
@@ -295,6 +269,7 @@ mod tests {
     #[test]
     fn only_the_newest_request_of_a_pane_is_kept_and_none_starves() {
         let queue = RenderQueue::new(None, 1);
+        let failed = || RenderError::Failed("made".into());
         let waiting = |count: usize| {
             while queue.lock().waiting.len() < count {
                 thread::yield_now();
@@ -327,11 +302,8 @@ mod tests {
             {
                 let job = queue.next().unwrap();
                 assert_eq!(job.request, expected);
-                queue.finish_rendering(job, Err(RenderError::Failed("made".into())));
-                assert_eq!(
-                    replies.join().unwrap().unwrap_err(),
-                    RenderError::Failed("made".into())
-                );
+                queue.finish_rendering(job, Err(failed()));
+                assert_eq!(replies.join().unwrap().unwrap_err(), failed());
             }
             let left = submit("c", 0);
             waiting(1);

@@ -8,11 +8,11 @@ use serde::Deserialize;
 
 use super::encoder::EncodedPicture;
 use super::http::{Method, Request, Response};
-use super::listener::Listener;
+use super::listener::Server;
 use super::picture_request::{self, PictureRequest};
 use super::render_queue::{RenderError, RenderQueue};
 use super::run_status::{Command, RunStatus};
-use super::scene::RequestLimits;
+use super::scene::Scene;
 
 const PAGE: &str = include_str!("page/index.html");
 static STYLE: LazyLock<String> =
@@ -22,9 +22,9 @@ const LIVE_SCRIPT: &str = include_str!("page/live.js");
 
 /// Everything that responses are made from.
 pub(super) struct Routes<'a> {
-    pub(super) listener: &'a Listener,
+    pub(super) listener: &'a Server,
     pub(super) queue: &'a RenderQueue,
-    pub(super) limits: RequestLimits,
+    pub(super) scene: &'a Scene,
     /// The scene's [description](super::description), as JSON.
     pub(super) description: Arc<[u8]>,
     /// The status of the run, if one is in training.
@@ -61,7 +61,7 @@ impl Routes<'_> {
             (Method::Get | Method::Head, "progress") if let Some(run_status) = self.run_status => {
                 json(run_status.json())
             }
-            (Method::Post, "frame") => match picture_request::parse(&request.body, &self.limits) {
+            (Method::Post, "frame") => match picture_request::parse(&request.body, self.scene) {
                 Ok(request) => self.render(request),
                 Err(response) => response,
             },
@@ -140,19 +140,15 @@ mod tests {
 
     use super::*;
     use crate::listener::ListenAddress;
-    use crate::scene::{ModelInfo, Scene};
+    use crate::scene::ModelInfo;
     use densify_data::dataset::PointCloud;
     use densify_data::dataset::normalise::Normalisation;
     use densify_run::finished::Machine;
 
     #[test]
     fn only_built_in_paths_are_served() {
-        let listener = Listener::open(ListenAddress {
-            host: Ipv4Addr::LOCALHOST.into(),
-            port: Some(0),
-            needs_token: false,
-        })
-        .unwrap();
+        let (host, port) = (Ipv4Addr::LOCALHOST.into(), Some(0));
+        let listener = Server::open(ListenAddress { host, port, needs_token: false }).unwrap();
         let none = || [Vec::new(), Vec::new()];
         let points = PointCloud::default();
         let (machine, normalisation) = (Machine::default(), Normalisation::IDENTITY);
@@ -166,14 +162,16 @@ mod tests {
         });
         let queue = RenderQueue::new(None, 1);
         queue.close();
-        let routes = Routes {
+        let run_status = RunStatus::default();
+        let routes = |run_status| Routes {
             listener: &listener,
             queue: &queue,
-            limits: scene.limits(),
+            scene: &scene,
             description: Arc::from(*b"{}"),
-            run_status: None,
+            run_status,
         };
-        let status = |request: &Request| routes.respond(request).status();
+        let (routes, live) = (routes(None), routes(Some(&run_status)));
+        let status = |request: &Request| routes.respond(request).status;
         let get = |path: &str| status(&Request::get(path, "localhost", None));
         for path in ["/", "/view.css", "/view.js", "/live.js", "/scene"] {
             assert_eq!(get(path), 200, "{path}");
@@ -194,51 +192,35 @@ mod tests {
             assert_eq!(get(path), 404, "{path}");
         }
         assert_eq!(get("/frame"), 405);
-        let post = |path: &str, body: &str| {
-            status(&Request {
-                method: Method::Post,
-                content_type: Some("application/json".into()),
-                body: body.into(),
-                ..Request::get(path, "localhost", None)
-            })
+        let post_request = |path: &str, body: &str| Request {
+            method: Method::Post,
+            content_type: Some("application/json".into()),
+            body: body.into(),
+            ..Request::get(path, "localhost", None)
         };
+        let post = |path: &str, body: &str| status(&post_request(path, body));
         assert_eq!(post("/scene", "{}"), 405);
         assert_eq!(post("/frame", "{}"), 400);
         let picture = r#"{"page": "a", "kind": "render", "width": 9, "height": 9, "camera":
             {"camera_to_world": [1,0,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,1], "fov": 50}}"#;
         assert_eq!(post("/frame", picture), 503);
         // A run in training also has progress, and takes commands.
-        let run_status = RunStatus::default();
-        let live = Routes {
-            listener: &listener,
-            queue: &queue,
-            limits: scene.limits(),
-            description: Arc::from(*b"{}"),
-            run_status: Some(&run_status),
-        };
-        let send = |body: &str| {
-            live.respond(&Request {
-                method: Method::Post,
-                content_type: Some("application/json".into()),
-                body: body.into(),
-                ..Request::get("/order", "localhost", None)
-            })
-        };
+        let send = |body: &str| live.respond(&post_request("/order", body));
         for (body, status) in [
             ("{}", 400),
             (r#"{"order": "explode"}"#, 400),
             (r#"{"order": "stop", "now": true}"#, 400),
             ("stop", 400),
         ] {
-            assert_eq!(send(body).status(), status, "{body}");
+            assert_eq!(send(body).status, status, "{body}");
         }
         assert!(!run_status.is_stopped());
-        assert_eq!(send(r#"{"order": "stop"}"#).status(), 200);
+        assert_eq!(send(r#"{"order": "stop"}"#).status, 200);
         assert!(run_status.is_stopped(), "the command is lost");
         let progress = live.respond(&Request::get("/progress", "localhost", None));
-        let progress: serde_json::Value = serde_json::from_slice(progress.body()).unwrap();
+        let progress: serde_json::Value = serde_json::from_slice(&progress.body).unwrap();
         assert_eq!(progress["state"], "preparing");
-        assert_eq!(live.respond(&Request::get("/order", "localhost", None)).status(), 405);
+        assert_eq!(live.respond(&Request::get("/order", "localhost", None)).status, 405);
     }
 
     #[test]

@@ -242,11 +242,10 @@ mod tests {
     fn colours_represent_the_property() {
         let brightness = |colour: &[f32; 3]| colour.iter().sum::<f32>();
         let mut backend = Device::default().backend(&model(), &Setup::new(3)).unwrap();
-        let measurements =
-            RowMeasurements::from_values(vec![0.0, 1e-5, 1e-3], vec![0.0, 0.25, 1.0]);
+        let measured = RowMeasurements::from_values(vec![0.0, 1e-5, 1e-3], vec![0.0, 0.25, 1.0]);
         let history = history();
         let row_data = RowData {
-            measurements: Some(&measurements),
+            measurements: Some(&measured),
             history: Some((&history, 10)),
             signals: SignalSet::default(),
         };
@@ -278,11 +277,8 @@ mod tests {
     fn the_ends_of_a_scale_ignore_outliers() {
         let mut values: Vec<f32> = (0_u16..1000).map(f32::from).collect();
         values.extend([1e9, -1e9, f32::NAN, f32::INFINITY]);
-        let ends = ends(&values);
-        assert!(
-            (0.0..20.0).contains(&ends.start) && (980.0..1000.0).contains(&ends.end),
-            "{ends:?}"
-        );
-        assert_eq!(super::ends(&[]), 0.0..0.0);
+        let Range { start, end } = ends(&values);
+        assert!((0.0..20.0).contains(&start) && (980.0..1000.0).contains(&end), "{start} {end}");
+        assert_eq!(ends(&[]), 0.0..0.0);
     }
 }

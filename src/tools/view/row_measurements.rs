@@ -47,8 +47,7 @@ impl RowMeasurements {
     ) -> Result<Self, Failure> {
         let needs = Needs { signals: SIGNALS.into(), ..Needs::default() };
         let gaussians = backend.download()?;
-        let backend = scene.machine.backend_to_measure(&gaussians, model.near, needs);
-        let mut backend = backend?;
+        let mut backend = scene.machine.backend_to_measure(&gaussians, model.near, needs)?;
         backend.begin_epoch();
         let (views, rows) = (scene.photographs(Split::Train).count(), gaussians.len());
         Ok(Self {
@@ -98,8 +97,7 @@ impl RowMeasurements {
                 break;
             }
         }
-        let taken = backend.take_signals(SignalSet::from(SIGNALS));
-        let taken = taken?;
+        let taken = backend.take_signals(SignalSet::from(SIGNALS))?;
         let get = |signal| taken.get(signal).unwrap_or_default();
         self.gradient = mean_over_views(get(Signal::ScreenGradient), get(Signal::VisibleCount));
         self.weight = get(Signal::WeightMax).to_vec();
@@ -166,11 +164,8 @@ mod tests {
         for views in 1..=2 {
             measured.measure_more(&scene, 0, Duration::ZERO).expect("a view");
             assert_eq!(measured.progress(), [views, 2]);
-            assert_eq!(
-                [positive(&measured.weight), positive(&measured.gradient)],
-                [views; 2],
-                "{measured:?}"
-            );
+            let found = [positive(&measured.weight), positive(&measured.gradient)];
+            assert_eq!(found, [views; 2], "{measured:?}");
             let measures =
                 measured.backend.as_ref().map(|backend| backend.download().expect("a model"));
             assert_eq!(measures.is_none(), views == 2, "the backend outlives the last view");
@@ -179,10 +174,7 @@ mod tests {
         let before = (measured.weight.clone(), measured.gradient.clone());
         measured.measure_more(&scene, 0, Duration::ZERO).expect("nothing to do");
         assert_eq!((&measured.weight, &measured.gradient), (&before.0, &before.1));
-        assert!(
-            measured.weight.iter().all(|weight| (0.5..=1.0).contains(weight)),
-            "{:?}",
-            measured.weight
-        );
+        let weights = &measured.weight;
+        assert!(weights.iter().all(|weight| (0.5..=1.0).contains(weight)), "{weights:?}");
     }
 }

@@ -224,23 +224,18 @@ mod tests {
     #[test]
     fn commands_are_executed_once_and_a_paused_run_waits() {
         let run_status = RunStatus::default();
+        let next = || [(); 3].map(|()| run_status.next_action());
         assert_eq!(run_status.next_action(), Action::Step);
         run_status.command(Command::Pause);
-        assert_eq!([run_status.next_action(), run_status.next_action()], [Action::Wait; 2]);
+        assert_eq!(next(), [Action::Wait; 3]);
         run_status.command(Command::Step);
         run_status.command(Command::Step);
-        assert_eq!(
-            [(); 3].map(|()| run_status.next_action()),
-            [Action::Step, Action::Step, Action::Wait]
-        );
+        assert_eq!(next(), [Action::Step, Action::Step, Action::Wait]);
         run_status.command(Command::Checkpoint);
-        assert_eq!(
-            [run_status.next_action(), run_status.next_action()],
-            [Action::Checkpoint, Action::Wait]
-        );
+        assert_eq!(next(), [Action::Checkpoint, Action::Wait, Action::Wait]);
         run_status.command(Command::Step);
         run_status.command(Command::Continue);
-        assert_eq!([(); 3].map(|()| run_status.next_action()), [Action::Step; 3]);
+        assert_eq!(next(), [Action::Step; 3]);
         run_status.command(Command::Stop);
         assert!(run_status.next_action() == Action::Stop && run_status.is_stopped());
         assert!(run_status.json().contains("\"stopping\""));

@@ -70,17 +70,6 @@ pub(super) struct Scene {
     pub(super) start: Option<Camera>,
 }
 
-/// The facts about a scene that picture requests are validated against.
-#[derive(Debug, Clone)]
-pub(super) struct RequestLimits {
-    pub(super) models: usize,
-    /// Number of test views and training views.
-    pub(super) views: [usize; 2],
-    pub(super) normalisation: Normalisation,
-    /// Kinds of pictures that the scene cannot show, with the reasons.
-    pub(super) unavailable: Vec<(PictureKind, String)>,
-}
-
 impl LoadedScene {
     /// Adds a model and its backend.
     pub(super) fn add(&mut self, model: ModelInfo, mut backend: Box<dyn Backend>) {
@@ -193,15 +182,6 @@ impl Scene {
     pub(super) fn mark_unavailable(&mut self, kinds: &[PictureKind], reason: &str) {
         self.unavailable.retain(|(kind, _)| !kinds.contains(kind));
         self.unavailable.extend(kinds.iter().map(|&kind| (kind, reason.to_owned())));
-    }
-
-    pub(super) fn limits(&self) -> RequestLimits {
-        RequestLimits {
-            models: self.models.len(),
-            views: [self.views[0].len(), self.views[1].len()],
-            normalisation: self.normalisation,
-            unavailable: self.unavailable.clone(),
-        }
     }
 
     /// A view of this split.

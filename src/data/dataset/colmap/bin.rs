@@ -10,7 +10,7 @@ use std::path::Path;
 
 use glam::DVec3;
 
-use super::super::DatasetError;
+use super::super::LoadError;
 use super::super::PointCloud;
 use super::super::lens::Lens;
 use super::super::lens::models::LensModel;
@@ -29,23 +29,23 @@ struct Reader<'a> {
 }
 
 impl<'a> Reader<'a> {
-    fn open(path: &'a Path) -> Result<Self, DatasetError> {
-        let file = files::open(path).map_err(DatasetError::io(path))?;
-        let length = file.metadata().map_err(DatasetError::io(path))?.len();
+    fn open(path: &'a Path) -> Result<Self, LoadError> {
+        let file = files::open(path).map_err(LoadError::io(path))?;
+        let length = file.metadata().map_err(LoadError::io(path))?.len();
         Ok(Self { path, input: BufReader::with_capacity(1 << 16, file), length, left: length })
     }
 
-    fn fault(&self, field: &str, problem: impl Display) -> DatasetError {
+    fn fault(&self, field: &str, problem: impl Display) -> LoadError {
         self.fault_with_remedy(REMEDY, field, problem)
     }
 
-    fn fault_with_remedy(&self, remedy: &str, field: &str, problem: impl Display) -> DatasetError {
+    fn fault_with_remedy(&self, remedy: &str, field: &str, problem: impl Display) -> LoadError {
         let place = format!("byte {}: {field}", self.length - self.left);
-        DatasetError::malformed(self.path, place, problem, remedy)
+        LoadError::malformed(self.path, place, problem, remedy)
     }
 
     /// Accounts for bytes that are about to be read; fails if the file has fewer left.
-    fn claim(&mut self, field: &str, bytes: u64) -> Result<(), DatasetError> {
+    fn claim(&mut self, field: &str, bytes: u64) -> Result<(), LoadError> {
         if bytes > self.left {
             let problem = format!(
                 "the file ends here: {bytes} bytes needed, {} left (truncated?)",
@@ -57,26 +57,26 @@ impl<'a> Reader<'a> {
         Ok(())
     }
 
-    fn bytes<const N: usize>(&mut self, field: &str) -> Result<[u8; N], DatasetError> {
+    fn bytes<const N: usize>(&mut self, field: &str) -> Result<[u8; N], LoadError> {
         self.claim(field, N as u64)?;
         let mut bytes = [0; N];
-        self.input.read_exact(&mut bytes).map_err(DatasetError::io(self.path))?;
+        self.input.read_exact(&mut bytes).map_err(LoadError::io(self.path))?;
         Ok(bytes)
     }
 
-    fn u64(&mut self, field: &str) -> Result<u64, DatasetError> {
+    fn u64(&mut self, field: &str) -> Result<u64, LoadError> {
         self.bytes(field).map(u64::from_le_bytes)
     }
 
-    fn u32(&mut self, field: &str) -> Result<u32, DatasetError> {
+    fn u32(&mut self, field: &str) -> Result<u32, LoadError> {
         self.bytes(field).map(u32::from_le_bytes)
     }
 
-    fn f64(&mut self, field: &str) -> Result<f64, DatasetError> {
+    fn f64(&mut self, field: &str) -> Result<f64, LoadError> {
         self.bytes(field).map(f64::from_le_bytes)
     }
 
-    fn f64s<const N: usize>(&mut self, field: &str) -> Result<[f64; N], DatasetError> {
+    fn f64s<const N: usize>(&mut self, field: &str) -> Result<[f64; N], LoadError> {
         let mut values = [0.0; N];
         for value in &mut values {
             *value = self.f64(field)?;
@@ -85,16 +85,16 @@ impl<'a> Reader<'a> {
     }
 
     /// Skips `count` records of `size` bytes.
-    fn skip(&mut self, field: &str, count: u64, size: u64) -> Result<(), DatasetError> {
+    fn skip(&mut self, field: &str, count: u64, size: u64) -> Result<(), LoadError> {
         let bytes = count.saturating_mul(size);
         self.claim(field, bytes)?;
         // `claim` has bounded the number by the length of the file.
         let bytes = i64::try_from(bytes).map_err(|_| self.fault(field, "too long"))?;
-        self.input.seek_relative(bytes).map_err(DatasetError::io(self.path))
+        self.input.seek_relative(bytes).map_err(LoadError::io(self.path))
     }
 
     /// Reads the number of records, each of which takes at least `size` bytes.
-    fn count(&mut self, field: &str, size: u64, most: u64) -> Result<u64, DatasetError> {
+    fn count(&mut self, field: &str, size: u64, most: u64) -> Result<u64, LoadError> {
         let count = self.u64(field)?;
         if count > most || count > self.left / size {
             let problem = format!(
@@ -107,7 +107,7 @@ impl<'a> Reader<'a> {
         Ok(count)
     }
 
-    fn name(&mut self, field: &str) -> Result<String, DatasetError> {
+    fn name(&mut self, field: &str) -> Result<String, LoadError> {
         let mut name = Vec::new();
         loop {
             match self.bytes::<1>(field)? {
@@ -120,19 +120,17 @@ impl<'a> Reader<'a> {
         text.map_err(|_| self.fault_with_remedy(RENAME, field, "the name is not UTF-8"))
     }
 
-    fn end(&self, field: &str, count: u64) -> Result<(), DatasetError> {
+    fn end(&self, field: &str, count: u64) -> Result<(), LoadError> {
         if self.left == 0 {
             return Ok(());
         }
-        Err(self.fault(
-            field,
-            format!("{} bytes follow the {count} records the file announced", self.left),
-        ))
+        let problem = format!("{} bytes follow the {count} records the file announced", self.left);
+        Err(self.fault(field, problem))
     }
 }
 
 /// Reads cameras.bin.
-pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, Lens>, DatasetError> {
+pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, Lens>, LoadError> {
     let mut reader = Reader::open(path)?;
     // Id, model, size, and at least three parameters.
     let count = reader.count("number of cameras", 4 + 4 + 16 + 24, MAX_IMAGES)?;
@@ -153,7 +151,7 @@ pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, Lens>, DatasetError> {
 }
 
 /// Reads images.bin without its observations.
-pub(super) fn images(path: &Path) -> Result<Vec<Image>, DatasetError> {
+pub(super) fn images(path: &Path) -> Result<Vec<Image>, LoadError> {
     let mut reader = Reader::open(path)?;
     // Id, pose, camera, the NUL of an empty name, number of observations.
     let count = reader.count("number of images", 4 + 56 + 4 + 1 + 8, MAX_IMAGES)?;
@@ -177,7 +175,7 @@ pub(super) fn images(path: &Path) -> Result<Vec<Image>, DatasetError> {
 pub(super) fn points(
     path: &Path,
     mut tracks: Option<&mut TrackSampler>,
-) -> Result<PointCloud, DatasetError> {
+) -> Result<PointCloud, LoadError> {
     let mut reader = Reader::open(path)?;
     // Id, position, colour, error, length of the track.
     let count = reader.count("number of points", 8 + 24 + 3 + 8 + 8, MAX_POINTS)?;

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use glam::DVec2;
 
-use super::super::DatasetError;
+use super::super::LoadError;
 use super::super::lens::models::LensModel;
 use super::super::lens::{Distortion, Lens};
 use super::super::pose::check_lens;
@@ -16,12 +16,12 @@ pub(super) fn lens(
     file: &Path,
     camera: &str,
     [width, height]: [u64; 2],
-    mut next: impl FnMut() -> Result<f64, DatasetError>,
-) -> Result<Lens, DatasetError> {
+    mut next: impl FnMut() -> Result<f64, LoadError>,
+) -> Result<Lens, LoadError> {
     let side = |side: u64| u32::try_from(side).ok().filter(|&side| side > 0);
     let (Some(width), Some(height)) = (side(width), side(height)) else {
         let problem = format!("the size {width}x{height} px is impossible");
-        return Err(DatasetError::malformed(file, camera, problem, REMEDY));
+        return Err(LoadError::malformed(file, camera, problem, REMEDY));
     };
     let fx = next()?;
     let fy = if model.focals == 2 { next()? } else { fx };

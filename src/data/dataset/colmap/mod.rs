@@ -17,7 +17,7 @@ use super::lens::Lens;
 use super::paths::{DataPath, Root, relative};
 use super::pose::{checked_pose, checked_quaternion};
 use super::tracks::{TrackSampler, Tracks};
-use super::{DatasetError, Frame, LoadOptions, PointCloud, Scene};
+use super::{Frame, LoadError, LoadOptions, PointCloud, Scene};
 
 pub(super) const FORMAT: DatasetFormat = DatasetFormat {
     name: "colmap",
@@ -55,7 +55,7 @@ impl Image {
         camera: u32,
         q: [f64; 4],
         t: [f64; 3],
-    ) -> Result<Self, DatasetError> {
+    ) -> Result<Self, LoadError> {
         let frame = format!("image {name}");
         let rotation = checked_quaternion(file, &frame, q)?;
         let (rotation, translation) = checked_pose(file, &frame, rotation, t.into())?;
@@ -85,7 +85,7 @@ fn find(root: &Path) -> Option<PathBuf> {
 ///
 /// # Errors
 /// When a file is missing, damaged, or contradicts another.
-fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, DatasetError> {
+fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> {
     let Some(folder) = find(root.path()) else { return Ok(None) };
     let folders = Folders::new(root, options, true)?;
     let ([cameras, images, points], model) = model(root, &folder, options.tracks)?;
@@ -95,7 +95,7 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, DatasetErro
         let field = format!("image {}", image.name);
         let Some(lens) = model.cameras.get(&image.camera) else {
             let problem = format!("its camera {} is not in {}", image.camera, cameras.display());
-            return Err(DatasetError::malformed(&images, field, problem, REMEDY));
+            return Err(LoadError::malformed(&images, field, problem, REMEDY));
         };
         let named = DataPath { file: &images, field: &field, value: &image.name };
         let found = folders.image(named)?.ok_or_else(|| folders.missing(named))?;
@@ -142,7 +142,7 @@ fn model(
     root: &Root,
     folder: &Path,
     with_tracks: bool,
-) -> Result<([PathBuf; 3], Model), DatasetError> {
+) -> Result<([PathBuf; 3], Model), LoadError> {
     let binary = ["cameras.bin", "images.bin"].iter().any(|name| folder.join(name).is_file());
     let ending = if binary { "bin" } else { "txt" };
     let file = |name: &str| folder.join(format!("{name}.{ending}"));

@@ -9,7 +9,7 @@ use std::str::{FromStr, SplitWhitespace};
 
 use glam::DVec3;
 
-use super::super::DatasetError;
+use super::super::LoadError;
 use super::super::PointCloud;
 use super::super::lens::Lens;
 use super::super::lens::models::LensModel;
@@ -30,26 +30,26 @@ struct Lines<'a> {
 }
 
 impl<'a> Lines<'a> {
-    fn open(path: &'a Path) -> Result<Self, DatasetError> {
-        let file = files::open(path).map_err(DatasetError::io(path))?;
+    fn open(path: &'a Path) -> Result<Self, LoadError> {
+        let file = files::open(path).map_err(LoadError::io(path))?;
         Ok(Self { path, input: BufReader::new(file), number: 0, line: Vec::new() })
     }
 
-    fn fault(&self, field: &str, problem: impl Display) -> DatasetError {
+    fn fault(&self, field: &str, problem: impl Display) -> LoadError {
         self.fault_with_remedy(REMEDY, field, problem)
     }
 
-    fn fault_with_remedy(&self, remedy: &str, field: &str, problem: impl Display) -> DatasetError {
+    fn fault_with_remedy(&self, remedy: &str, field: &str, problem: impl Display) -> LoadError {
         let place = format!("line {}: {field}", self.number);
-        DatasetError::malformed(self.path, place, problem, remedy)
+        LoadError::malformed(self.path, place, problem, remedy)
     }
 
     /// Reads the next line, even if it is a comment; false at the end of the file.
-    fn advance(&mut self) -> Result<bool, DatasetError> {
+    fn advance(&mut self) -> Result<bool, LoadError> {
         self.line.clear();
         self.number += 1;
         let read = (&mut self.input).take(MAX_LINE).read_until(b'\n', &mut self.line);
-        let read = read.map_err(DatasetError::io(self.path))?;
+        let read = read.map_err(LoadError::io(self.path))?;
         if self.number == 1 {
             if let Some(problem) = files::wrong_kind(&self.line) {
                 return Err(self.fault("the file", problem));
@@ -65,7 +65,7 @@ impl<'a> Lines<'a> {
     }
 
     /// Reads the next line that is neither empty nor a comment; false at the end of the file.
-    fn advance_to_record(&mut self) -> Result<bool, DatasetError> {
+    fn advance_to_record(&mut self) -> Result<bool, LoadError> {
         while self.advance()? {
             let text = self.line.trim_ascii_start();
             if !text.is_empty() && text[0] != b'#' {
@@ -75,7 +75,7 @@ impl<'a> Lines<'a> {
         Ok(false)
     }
 
-    fn text(&self) -> Result<&str, DatasetError> {
+    fn text(&self) -> Result<&str, LoadError> {
         let text = std::str::from_utf8(&self.line);
         text.map_err(|_| self.fault_with_remedy(RENAME, "the line", "a name in it is not UTF-8"))
     }
@@ -85,7 +85,7 @@ impl<'a> Lines<'a> {
         &self,
         words: &mut SplitWhitespace<'_>,
         field: &str,
-    ) -> Result<T, DatasetError> {
+    ) -> Result<T, LoadError> {
         let word = words.next().ok_or_else(|| self.fault(field, "the line ends before it"))?;
         word.parse().map_err(|_| {
             let word: String = word.chars().take(40).collect();
@@ -97,7 +97,7 @@ impl<'a> Lines<'a> {
         &self,
         words: &mut SplitWhitespace<'_>,
         field: &str,
-    ) -> Result<[f64; N], DatasetError> {
+    ) -> Result<[f64; N], LoadError> {
         let mut values = [0.0; N];
         for value in &mut values {
             *value = self.number(words, field)?;
@@ -107,7 +107,7 @@ impl<'a> Lines<'a> {
 }
 
 /// Reads cameras.txt.
-pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, Lens>, DatasetError> {
+pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, Lens>, LoadError> {
     let mut lines = Lines::open(path)?;
     let mut cameras = HashMap::new();
     while lines.advance_to_record()? {
@@ -130,7 +130,7 @@ pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, Lens>, DatasetError> {
 }
 
 /// Reads images.txt. An image has two lines, the second of which lists its observations and may be empty.
-pub(super) fn images(path: &Path) -> Result<Vec<Image>, DatasetError> {
+pub(super) fn images(path: &Path) -> Result<Vec<Image>, LoadError> {
     let mut lines = Lines::open(path)?;
     let mut images = Vec::new();
     while lines.advance_to_record()? {
@@ -178,7 +178,7 @@ fn after_words(text: &str, count: usize) -> &str {
 pub(super) fn points(
     path: &Path,
     mut tracks: Option<&mut TrackSampler>,
-) -> Result<PointCloud, DatasetError> {
+) -> Result<PointCloud, LoadError> {
     let mut lines = Lines::open(path)?;
     let mut points = PointCloud::default();
     while lines.advance_to_record()? {

@@ -34,7 +34,8 @@ pub(crate) struct Lens {
     pub(crate) focal: DVec2,
     /// Principal point `[px]`.
     pub(crate) principal: DVec2,
-    distortion: Distortion,
+    /// The plane and its distortion.
+    pub(crate) distortion: Distortion,
     /// Distance from the centre of the plane up to which the distortion is invertible.
     reach: f64,
     /// Whether the distortion folds over beyond that distance; otherwise the plane ends there.
@@ -64,12 +65,6 @@ impl Lens {
         // The factor allows for the rounding of a square root; false if the limit is NaN.
         let is_whole = reach >= limit * (1.0 - 1e-12);
         Self { width, height, focal, principal, distortion, reach, folds: !is_whole }
-    }
-
-    /// The distortion.
-    #[must_use]
-    pub(crate) fn distortion(&self) -> &Distortion {
-        &self.distortion
     }
 
     /// Whether the lens differs from a pinhole.

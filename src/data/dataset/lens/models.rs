@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::{Distortion, Plane};
-use crate::dataset::DatasetError;
+use crate::dataset::LoadError;
 
 /// A parameter that follows the focal lengths and the principal point.
 #[derive(Debug, Clone, Copy)]
@@ -75,15 +75,11 @@ pub(crate) const FISHEYE_FIELDS: [(&str, Term); 4] =
 
 impl LensModel {
     /// The model with a name of COLMAP's text files.
-    pub(crate) fn named(
-        file: &Path,
-        camera: &str,
-        name: &str,
-    ) -> Result<&'static Self, DatasetError> {
+    pub(crate) fn named(file: &Path, camera: &str, name: &str) -> Result<&'static Self, LoadError> {
         MODELS.iter().find(|model| model.name == name).ok_or_else(|| {
             let all = MODELS.map(|model| model.name).join(", ");
             let problem = format!("the camera model {name} is not one of {all}");
-            DatasetError::lens(file, camera, problem)
+            LoadError::lens(file, camera, problem)
         })
     }
 
@@ -92,7 +88,7 @@ impl LensModel {
         file: &Path,
         camera: &str,
         number: i32,
-    ) -> Result<&'static Self, DatasetError> {
+    ) -> Result<&'static Self, LoadError> {
         match usize::try_from(number).ok().and_then(|number| MODELS.get(number)) {
             Some(model) => Ok(model),
             None if number == 11 => Self::named(file, camera, "RAD_TAN_THIN_PRISM_FISHEYE"),

@@ -37,7 +37,7 @@ const SAMPLES: u32 = 64;
 /// Cells along each side of a face that are tested for visibility.
 const CELLS: usize = 128;
 /// Steepest ray of a single pinhole, x/z: 65 degrees for a fisheye, 80 degrees for a distorted pinhole. At these angles
-/// cube faces are as good in narrow views but cost 4 dB in wide ones; docs/data.md has the measurements.
+/// cube faces are as good in narrow views but cost 4 dB in wide ones (docs/studies/wide-fisheyes.tsv).
 const STEEPEST: f64 = 2.15;
 const STEEPEST_PERSPECTIVE: f64 = 5.67;
 /// Smallest side of a face that becomes a view, x/z.
@@ -200,7 +200,7 @@ fn face(
     });
     let focal = DVec2::new(f64::from(width), f64::from(height)) / (high - low);
     let to = Pinhole { width, height, focal, principal: -low * focal };
-    Undistortion::new(*lens, to, turn, masked)
+    Undistortion { from: *lens, to, lens_from_pinhole: turn, masked }
 }
 
 /// The smallest rectangle that contains all set cells: first column and row, and last column and row plus 1.

@@ -26,7 +26,7 @@ impl Packed {
         self.folder.path().join("my scan.zip")
     }
 
-    fn load(&self) -> Result<Dataset, DatasetError> {
+    fn load(&self) -> Result<Dataset, LoadError> {
         Dataset::load(&self.path(), &LoadOptions::default())
     }
 }
@@ -94,8 +94,11 @@ fn in_headers(bytes: &[u8], own: usize, table: usize, change: impl Fn(&mut u8)) 
 
 /// The folder that an archive is unpacked in, according to the note.
 fn unpacked_in(data: &Dataset) -> PathBuf {
-    let said = data.notes.iter().find_map(|note| note.split_once(" is unpacked in "));
-    let (_, place) = said.unwrap_or_else(|| panic!("{:?}", data.notes));
+    let parts = data.notes.iter().find_map(|note| match note {
+        Note::Text(text) => text.split_once(" is unpacked in "),
+        _ => None,
+    });
+    let (_, place) = parts.unwrap_or_else(|| panic!("{:?}", data.notes));
     place.split_once(" (").unwrap().0.into()
 }
 

@@ -5,16 +5,8 @@ use std::num::NonZeroU32;
 use serde_json::Value;
 
 use super::super::*;
+use super::refused;
 use densify_fixtures::{Made, image};
-
-/// Loads a broken dataset; the message must contain all of `words`, which are separated by commas.
-fn refused(case: &str, made: &Made, options: &LoadOptions, words: &str) {
-    let Err(error) = Dataset::load(made.path(), options) else { panic!("{case}: it loaded") };
-    let message = error.to_string();
-    for word in words.split(", ") {
-        assert!(message.contains(word), "{case}: {word:?} is not in: {message}");
-    }
-}
 
 /// A text, its replacement, and words of the message.
 type Replacement = (&'static str, &'static str, &'static str);
@@ -41,7 +33,7 @@ const CAMERAS: &[Replacement] = &[
     (
         "PINHOLE 20 12 15 16 10 6",
         "RADIAL 20 12 15 10 6 -3 0",
-        "images.txt, folds over, largest usable field, --keep-fov, image_undistorter",
+        "images.txt, folds over, largest usable field, KeepFieldOfView",
     ),
 ];
 
@@ -67,14 +59,14 @@ fn masks_to_invert_must_be_there() {
         "no mask",
         &Made::colmap_txt(),
         &options,
-        "--invert-masks, no photograph has a mask, NAME.png",
+        "images.txt, no photograph has a mask, inverted: true",
     );
     let options = LoadOptions { mask_mode: MaskMode::Background, ..LoadOptions::default() };
     refused(
         "nothing to carve",
         &Made::colmap_txt(),
         &options,
-        "--mask-mode background, no photograph has a mask, NAME.png",
+        "images.txt, no photograph has a mask, inverted: false",
     );
 }
 
@@ -97,7 +89,7 @@ fn colmap_text() {
         (
             "no image",
             |m| m.remove("images/b.png"),
-            "images.txt, image b.png, images/b.png, --images",
+            "images.txt, image b.png, images/b.png, RestoreOrImagesFolder",
         ),
         (
             "other size",
@@ -175,6 +167,7 @@ fn colmap_binary() {
 #[test]
 fn no_damaged_byte_makes_it_panic() {
     let made = Made::colmap_bin();
+    let load = || Dataset::load(made.path(), &LoadOptions::default());
     for name in ["sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin"] {
         let whole = std::fs::read(made.file(name)).unwrap();
         for at in 0..whole.len().min(200) {
@@ -182,17 +175,14 @@ fn no_damaged_byte_makes_it_panic() {
                 let mut bytes = whole.clone();
                 bytes[at] = value;
                 made.write(name, &bytes);
-                let _ = Dataset::load(made.path(), &LoadOptions::default());
+                let _ = load();
             }
             made.write(name, &whole[..at]);
-            assert!(
-                Dataset::load(made.path(), &LoadOptions::default()).is_err(),
-                "{name} cut at {at}"
-            );
+            assert!(load().is_err(), "{name} cut at {at}");
         }
         made.write(name, whole);
     }
-    assert!(Dataset::load(made.path(), &LoadOptions::default()).is_ok());
+    assert!(load().is_ok());
 }
 
 /// Pointer to a field of transforms.json, its replacement (empty: the field is removed), and words of the message.
@@ -227,7 +217,7 @@ const TRANSFORMS: &[Replacement] = &[
     ("/w", "-20", "w, -20"),
     ("/camera_model", "\"EQUIRECTANGULAR\"", "camera_model, EQUIRECTANGULAR, image_undistorter"),
     ("/camera_model", "7", "camera_model, string"),
-    ("/k1", "-5.0", "folds over, a.png, largest usable field, --keep-fov"),
+    ("/k1", "-5.0", "folds over, a.png, largest usable field, KeepFieldOfView"),
     ("/k1", "-1e9", "folds over, a.png, calibrate again"),
     ("/k1", "\"x\"", "k1, number"),
 ];
@@ -299,7 +289,7 @@ fn folders_and_splits() {
 
     let made = Made::colmap_txt();
     let every_one = LoadOptions { split: Split::Every(NonZeroU32::MIN), ..LoadOptions::default() };
-    refused("every view", &made, &every_one, "all 3, --test-every");
+    refused("every view", &made, &every_one, "all 3, LargerTestEvery");
     let other = LoadOptions { images: Some("nowhere".into()), ..LoadOptions::default() };
     refused("no such folder", &made, &other, "nowhere");
     for name in densify_fixtures::NAMES {
@@ -319,7 +309,7 @@ fn links_out_of_the_dataset() {
     let made = Made::colmap_txt();
     std::fs::remove_dir_all(made.file("images")).unwrap();
     std::os::unix::fs::symlink(outside.path(), made.file("images")).unwrap();
-    refused("linked folder", &made, &LoadOptions::default(), "symbolic link, --images");
+    refused("linked folder", &made, &LoadOptions::default(), "symbolic link, OtherImagesFolder");
     let named = LoadOptions { images: Some(outside.path().to_owned()), ..LoadOptions::default() };
     assert!(Dataset::load(made.path(), &named).is_ok());
     // Links inside the dataset are followed.

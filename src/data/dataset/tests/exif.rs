@@ -7,6 +7,7 @@ use ::exif::experimental::Writer;
 use ::exif::{Field, In, Rational, Tag, Value};
 
 use super::super::*;
+use super::{load, refused};
 use densify_fixtures::{self, Made, NAMES, SIZE};
 
 /// Exposure time `[s]`, f-number and sensitivity (ISO) of a photograph.
@@ -54,7 +55,7 @@ fn with(settings: [Option<Settings>; 3]) -> Made {
 }
 
 fn reported(made: &Made) -> ReportedExposures {
-    let data = Dataset::load(made.path(), &LoadOptions::default()).unwrap();
+    let data = load(made);
     for view in &data.train {
         view.source.load().unwrap();
     }
@@ -108,7 +109,7 @@ fn exif_that_was_read_while_loading_is_kept() {
     for (made, is_kept) in [(Made::realitycapture(), true), (Made::colmap_txt(), false)] {
         let path = made.file("images/a.png");
         write_exif(&path, exposed(((1, 50), (4, 1), 100)));
-        let data = Dataset::load(made.path(), &LoadOptions::default()).unwrap();
+        let data = load(&made);
         std::fs::remove_file(path).unwrap();
         assert_eq!(ReportedExposures::read(&data.train).stops[0].is_some(), is_kept);
     }
@@ -148,7 +149,7 @@ fn damaged_exif_changes_nothing_else() {
             sum.update(&bytes[37..41 + length]);
             bytes[41 + length..45 + length].copy_from_slice(&sum.sum().to_be_bytes());
             std::fs::write(&path, &bytes).unwrap();
-            let data = Dataset::load(made.path(), &LoadOptions::default()).unwrap();
+            let data = load(&made);
             assert_eq!(ReportedExposures::read(&data.train).stops.len(), 3, "{at}");
         }
     }
@@ -174,14 +175,15 @@ fn a_photograph_that_lies_on_its_side_for_its_camera_is_turned() {
     for (orientation, left) in [(6, lower), (8, upper), (5, upper), (7, lower)] {
         let made = Made::colmap_txt();
         write_turned_image(&made, Some(orientation));
-        let data = Dataset::load(made.path(), &LoadOptions::default()).unwrap();
+        let data = load(&made);
         let view = &data.train[1];
         let image = view.source.load().unwrap();
         assert_eq!((image.width, image.height), SIZE);
         assert_eq!(image.rgb[..3], left, "{orientation}");
         assert_ne!(image.rgb[57..60], left, "{orientation}");
-        let said = |note: &String| note.contains("1 photographs lie on") && note.contains("b.png");
-        assert!(data.notes.iter().any(said), "{:?}", data.notes);
+        let is_noted =
+            |note: &Note| note.contains("1 photographs lie on") && note.contains("b.png");
+        assert!(data.notes.iter().any(is_noted), "{:?}", data.notes);
         // Turning takes the picture twice.
         let bytes = view.source.working_bytes();
         assert!(bytes >= 2 * 3 * u64::from(SIZE.0 * SIZE.1), "{bytes}");
@@ -191,7 +193,7 @@ fn a_photograph_that_lies_on_its_side_for_its_camera_is_turned() {
         image::GrayImage::from_pixel(SIZE.0, SIZE.1, [9].into())
             .save(made.file("masks/b.png"))
             .unwrap();
-        let data = Dataset::load(made.path(), &LoadOptions::default()).unwrap();
+        let data = load(&made);
         assert_eq!(data.train[1].source.load().unwrap().mask.unwrap()[0], 9);
     }
 }
@@ -201,7 +203,7 @@ fn a_photograph_that_lies_on_its_side_for_its_camera_is_turned() {
 fn a_photograph_that_fits_its_camera_is_not_turned() {
     let plain = Made::colmap_txt();
     let bytes = |made: &Made| {
-        let data = Dataset::load(made.path(), &LoadOptions::default()).unwrap();
+        let data = load(made);
         let view = &data.train[1].source;
         (view.load().unwrap(), view.working_bytes(), data.notes)
     };
@@ -217,14 +219,14 @@ fn a_photograph_that_fits_its_camera_is_not_turned() {
         densify_fixtures::image(&made.file(&format!("images/{name}")), (12, 12), 9);
     }
     write_exif(&made.file("images/b.png"), turned(6));
-    let data = Dataset::load(made.path(), &LoadOptions::default()).unwrap();
+    let data = load(&made);
     assert_eq!(data.train[1].source.header.turn, None);
     // An image that fits neither way is refused.
     for orientation in [None, Some(1), Some(3), Some(77)] {
         let made = Made::colmap_txt();
         write_turned_image(&made, orientation);
-        let error = Dataset::load(made.path(), &LoadOptions::default()).unwrap_err().to_string();
-        assert!(error.contains("b.png") && error.contains("12x20"), "{orientation:?}: {error}");
+        let case = format!("{orientation:?}");
+        refused(&case, &made, &LoadOptions::default(), "b.png, 12x20");
     }
 }
 
@@ -245,8 +247,8 @@ fn an_ambiguous_orientation_is_noted() {
         (Made::colmap_txt(), false),
     ] {
         write_exif(&made.file("images/b.png"), turned(6));
-        let data = Dataset::load(made.path(), &LoadOptions::default()).unwrap();
-        let said = |note: &String| note.contains("1 photographs have an EXIF orientation");
-        assert_eq!(data.notes.iter().any(said), is_named, "{:?}", data.notes);
+        let data = load(&made);
+        let is_noted = |note: &Note| note.contains("1 photographs have an EXIF orientation");
+        assert_eq!(data.notes.iter().any(is_noted), is_named, "{:?}", data.notes);
     }
 }

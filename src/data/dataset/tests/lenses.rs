@@ -3,13 +3,10 @@
 use glam::DVec3;
 
 use super::super::*;
+use super::{load_with, refused};
 use densify_fixtures::{Made, NAMES, SIZE};
 
 const PINHOLE: &str = "PINHOLE 20 12 15 16 10 6";
-
-fn load(made: &Made, options: &LoadOptions) -> Dataset {
-    Dataset::load(made.path(), options).unwrap_or_else(|e| panic!("{e}"))
-}
 
 fn colmap(camera: &str) -> Made {
     let made = Made::colmap_txt();
@@ -53,7 +50,7 @@ fn nerfstudio_and_colmap_lenses_agree() {
             }
         });
         let options = LoadOptions::default();
-        let [a, b] = [load(&colmap(camera), &options), load(&made, &options)];
+        let [a, b] = [load_with(&colmap(camera), &options), load_with(&made, &options)];
         for (a, b) in a.train.iter().zip(&b.train) {
             assert_eq!(a.source.undistortion, b.source.undistortion, "{camera}");
             assert!(a.source.undistortion.is_some());
@@ -68,7 +65,7 @@ fn views_of_one_photograph_share_it_and_its_split() {
     let made = colmap("OPENCV_FISHEYE 20 12 6 6 10 6 0 0 0 0");
     let every = Split::Every(std::num::NonZeroU32::new(2).unwrap());
     let options = LoadOptions { split: every, tracks: true, ..LoadOptions::default() };
-    let data = load(&made, &options);
+    let data = load_with(&made, &options);
     let faces = |name: &str| {
         let stem = name.trim_end_matches(".png");
         ["front", "left", "right", "up", "down"].map(|face| format!("{stem}@{face}.png")).to_vec()
@@ -76,9 +73,8 @@ fn views_of_one_photograph_share_it_and_its_split() {
     let names = |views: &[View]| views.iter().map(|view| view.name.clone()).collect::<Vec<_>>();
     assert_eq!(names(&data.train), faces("b.png"));
     assert_eq!(names(&data.test), [faces("a.png"), faces("c.png")].concat());
-    assert!(
-        data.notes.iter().any(|note| note.contains("3 photographs") && note.contains("5 views"))
-    );
+    let is_note = |note: &Note| note.contains("3 photographs") && note.contains("5 views");
+    assert!(data.notes.iter().any(is_note));
     // All views are from one place, at right angles to the front.
     let front = &data.train[0].camera;
     for view in &data.train[1..] {
@@ -91,7 +87,7 @@ fn views_of_one_photograph_share_it_and_its_split() {
     assert!(data.train[3].camera.forward().dot(front.rotation.row(1)) < -0.99, "up is −y");
     // Every image has the size of its camera, and the colour of its photograph.
     for (resolution, divisor) in [(None, 1), (Some(Resolution::Divisor(2)), 2)] {
-        let data = load(&made, &LoadOptions { resolution, ..options.clone() });
+        let data = load_with(&made, &LoadOptions { resolution, ..options.clone() });
         for view in data.train.iter().chain(&data.test) {
             let image = view.source.load().unwrap();
             assert_eq!((image.width, image.height), (view.camera.width, view.camera.height));
@@ -116,7 +112,7 @@ fn a_track_is_in_the_view_that_shows_its_point() {
     made.write("sparse/0/images.txt", images + "4 1 0 0 0 0.1 0 4 1 d.png\n1 1 -1\n");
     let points = std::fs::read_to_string(made.file("sparse/0/points3D.txt")).unwrap();
     made.write("sparse/0/points3D.txt", points.replace(" 0.1 1 2\n", " 0.1 1 0 2 0 3 0 4 0\n"));
-    let data = load(&made, &LoadOptions { tracks: true, ..LoadOptions::default() });
+    let data = load_with(&made, &LoadOptions { tracks: true, ..LoadOptions::default() });
     assert!(data.tracks.positions.len() >= 10, "{}", data.tracks.positions.len());
     for (point, views) in data.tracks.positions.iter().zip(&data.tracks.views) {
         for &view in views {
@@ -134,9 +130,9 @@ fn a_track_is_in_the_view_that_shows_its_point() {
 fn cropping_is_noted_and_can_be_avoided() {
     let made = colmap("SIMPLE_RADIAL 20 12 15 10 6 -0.2");
     let [cropped, kept] = [false, true]
-        .map(|keep_fov| load(&made, &LoadOptions { keep_fov, ..LoadOptions::default() }));
-    assert!(cropped.notes.iter().any(|note| note.contains("--keep-fov")), "{:?}", cropped.notes);
-    assert!(!kept.notes.iter().any(|note| note.contains("crop")), "{:?}", kept.notes);
+        .map(|keep_fov| load_with(&made, &LoadOptions { keep_fov, ..LoadOptions::default() }));
+    let is_crop = |note: &Note| matches!(note, Note::Cropped { .. });
+    assert!(cropped.notes.iter().any(is_crop) && !kept.notes.iter().any(is_crop));
     let [small, large] = [&cropped, &kept].map(|data| data.train[0].source.load().unwrap());
     assert_eq!((small.width, small.height, small.mask), (SIZE.0, SIZE.1, None));
     let mask = large.mask.unwrap();
@@ -151,7 +147,7 @@ fn cropping_is_noted_and_can_be_avoided() {
     assert_eq!((narrow, cropped.train.len()), (wide, NAMES.len()));
     // A distortion that folds over within the image is used up to there.
     let folding = colmap("RADIAL 20 12 15 10 6 -3 0");
-    let kept = load(&folding, &LoadOptions { keep_fov: true, ..LoadOptions::default() });
+    let kept = load_with(&folding, &LoadOptions { keep_fov: true, ..LoadOptions::default() });
     assert!(kept.notes.iter().any(|note| note.contains("beyond what")), "{:?}", kept.notes);
 }
 
@@ -170,29 +166,26 @@ fn views_that_a_mask_hides_are_named_and_left_out() {
     // One photograph is hidden; the others are split as if it counted.
     let made = Made::colmap_txt();
     grey(&made, "a.png", |_| 0);
-    let data = load(&made, &options);
-    assert_eq!(
-        (names(&data.train), names(&data.test)),
-        (vec!["b.png".into()], vec!["c.png".into()])
-    );
-    let said = |data: &Dataset, name: &str| {
+    let data = load_with(&made, &options);
+    assert_eq!(names(&data.train), ["b.png"]);
+    assert_eq!(names(&data.test), ["c.png"]);
+    let is_noted = |data: &Dataset, name: &str| {
         data.notes.iter().any(|note| note.contains("masks hide") && note.contains(name))
     };
-    assert!(said(&data, "a.png") && !said(&data, "b.png"), "{:?}", data.notes);
+    assert!(is_noted(&data, "a.png") && !is_noted(&data, "b.png"), "{:?}", data.notes);
     for name in ["b.png", "c.png"] {
         grey(&made, name, |_| 0);
     }
-    let message = Dataset::load(made.path(), &options).unwrap_err().to_string();
-    assert!(message.contains("all 3") && message.contains("give --invert-masks"), "{message}");
+    refused("all hidden", &made, &options, "all 3, InvertMasks(true)");
     let inverted = LoadOptions { invert_masks: true, ..options.clone() };
-    assert_eq!(load(&made, &inverted).train.len(), 1);
+    assert_eq!(load_with(&made, &inverted).train.len(), 1);
     // One face of a wide photograph is hidden by masking its left half.
     let made = colmap("OPENCV_FISHEYE 20 12 6 6 10 6 0 0 0 0");
     grey(&made, "b.png", |x| if x < 10 { 0 } else { 255 });
-    let data = load(&made, &options);
+    let data = load_with(&made, &options);
     let faces = ["front", "right", "up", "down"].map(|face| format!("b@{face}.png"));
     assert_eq!(names(&data.train), faces);
-    assert!(said(&data, "b@left.png"), "{:?}", data.notes);
+    assert!(is_noted(&data, "b@left.png"), "{:?}", data.notes);
     for view in &data.train {
         assert!(view.source.load().unwrap().mask.unwrap().iter().any(|&weight| weight > 0));
     }

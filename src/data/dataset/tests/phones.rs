@@ -3,11 +3,8 @@
 use serde_json::{Value, json};
 
 use super::super::*;
+use super::{load, load_with, refused};
 use densify_fixtures::{Made, image};
-
-fn load(made: &Made) -> Dataset {
-    Dataset::load(made.path(), &LoadOptions::default()).unwrap_or_else(|e| panic!("{e}"))
-}
 
 /// Renames the photographs, moves intrinsics into the frames, and adds the fields of an app.
 fn exported(names: [&str; 3], points: &str, edit: impl Fn(&mut Value)) -> Made {
@@ -158,7 +155,7 @@ fn paths_of_another_machine_are_found_in_the_folder_that_is_named() {
     image(&made.file("masks/1/a.png"), (20, 12), 255);
     let options = LoadOptions { images: Some("moved".into()), ..LoadOptions::default() };
     let names = |made: &Made| {
-        let data = Dataset::load(made.path(), &options).unwrap_or_else(|e| panic!("{e}"));
+        let data = load_with(made, &options);
         let name = |view: &View| (view.name.clone(), view.source.mask.is_some());
         [data.train.iter().map(name).collect::<Vec<_>>(), data.test.iter().map(name).collect()]
     };
@@ -194,7 +191,7 @@ fn paths_of_any_system_are_found_by_suffix() {
     ] {
         let made = Made::transforms(|json| json["frames"][1]["file_path"] = written.into());
         std::fs::rename(made.file("images"), made.file("moved")).unwrap();
-        let data = Dataset::load(made.path(), &with_images()).unwrap_or_else(|e| panic!("{e}"));
+        let data = load_with(&made, &with_images());
         let names: Vec<&str> = data.train.iter().map(|view| &*view.name).collect();
         let mut expected: Vec<&str> =
             found.into_iter().chain(["images/a.png", "images/c.png"]).collect();
@@ -209,7 +206,7 @@ fn paths_of_any_system_are_found_by_suffix() {
     ] {
         let made = Made::transforms(|json| json["frames"][1]["file_path"] = written.into());
         std::fs::create_dir(made.file("moved")).unwrap();
-        refused(&made, &with_images(), words);
+        refused("phones", &made, &with_images(), words);
     }
     // Other formats.
     let colmap = Made::colmap_txt();
@@ -217,9 +214,9 @@ fn paths_of_any_system_are_found_by_suffix() {
     let table = Made::realitycapture();
     table.replace("cameras.csv", "images/b.png", r"C:\walk\b.png");
     for (made, folder) in [(colmap, ""), (table, "images/")] {
-        refused(&made, &LoadOptions::default(), "C:, is absolute, --images");
+        refused("phones", &made, &LoadOptions::default(), "C:, is absolute, OtherImagesFolder");
         std::fs::rename(made.file("images"), made.file("moved")).unwrap();
-        let data = Dataset::load(made.path(), &with_images()).unwrap_or_else(|e| panic!("{e}"));
+        let data = load_with(&made, &with_images());
         let names: Vec<&str> = data.train.iter().map(|view| &*view.name).collect();
         let [a, c] = ["a.png", "c.png"].map(|name| format!("{folder}{name}"));
         let mut expected = ["b.png", &*a, &*c];
@@ -241,8 +238,8 @@ fn two_paths_to_one_photograph_are_refused() {
         image(&made.file(path), (20, 12), 9);
     }
     let options = LoadOptions { images: Some("moved".into()), ..LoadOptions::default() };
-    let words = "/x/train/r_0.png, /x/test/r_0.png, same file, moved/r_0.png, --images";
-    refused(&made, &options, words);
+    let words = "/x/train/r_0.png, /x/test/r_0.png, same file, moved/r_0.png, ImagesFolderOfBoth";
+    refused("phones", &made, &options, words);
     let all = std::fs::read_to_string(made.file("transforms.json")).unwrap();
     let all: Value = serde_json::from_str(&all).unwrap();
     for (file, frames) in
@@ -252,12 +249,12 @@ fn two_paths_to_one_photograph_are_refused() {
         part["frames"] = frames.iter().map(|&at: &usize| all["frames"][at].clone()).collect();
         made.write(file, part.to_string());
     }
-    refused(&made, &options, words);
+    refused("phones", &made, &options, words);
     // In folders of their own they are different files.
     for path in ["moved/train/r_0.png", "moved/test/r_0.png"] {
         image(&made.file(path), (20, 12), 9);
     }
-    let data = Dataset::load(made.path(), &options).unwrap_or_else(|e| panic!("{e}"));
+    let data = load_with(&made, &options);
     assert_eq!((data.train.len(), &*data.test[0].name), (2, "test/r_0.png"));
 }
 
@@ -274,7 +271,7 @@ fn masks_and_points_of_another_machine_are_found_too() {
         std::fs::rename(made.file("images"), made.file("moved")).unwrap();
         made
     };
-    let load = |made: &Made| Dataset::load(made.path(), &options).unwrap_or_else(|e| panic!("{e}"));
+    let load = |made: &Made| load_with(made, &options);
     let place = |data: &Dataset| data.test[0].source.mask.clone().unwrap().file.path;
     let found = made();
     for path in ["masks/hidden.png", "masks/b.png", "hidden.png"] {
@@ -287,17 +284,17 @@ fn masks_and_points_of_another_machine_are_found_too() {
     found.remove("masks/hidden.png");
     assert!(place(&load(&found)).ends_with("masks/b.png"));
     found.remove("masks/b.png");
-    refused(&found, &options, "frames[1].mask_path, hidden.png, `masks/`");
+    refused("phones", &found, &options, "frames[1].mask_path, hidden.png, `masks/`");
     // Points that were not copied along are left out.
     let without = made();
     image(&without.file("masks/b.png"), (20, 12), 255);
     without.remove("points.ply");
     let data = load(&without);
-    let said = |note: &String| note.contains("points.ply") && note.contains("left out");
-    assert!(data.points.is_empty() && data.notes.iter().any(said), "{:?}", data.notes);
+    let is_noted = |note: &Note| note.contains("points.ply") && note.contains("left out");
+    assert!(data.points.is_empty() && data.notes.iter().any(is_noted), "{:?}", data.notes);
     // Without the option no path is guessed.
     std::fs::rename(without.file("moved"), without.file("images")).unwrap();
-    refused(&without, &LoadOptions::default(), "is absolute, --images");
+    refused("phones", &without, &LoadOptions::default(), "is absolute, OtherImagesFolder");
 }
 
 #[test]
@@ -325,12 +322,5 @@ fn names_may_contain_backslashes() {
         std::fs::rename(made.file("moved"), made.file("images")).unwrap();
         image(&made.file(r"images\b.png"), (20, 12), 7);
         assert_eq!(load(&made).train[1].source.load().unwrap().rgb[0], 7);
-    }
-}
-
-fn refused(made: &Made, options: &LoadOptions, words: &str) {
-    let message = Dataset::load(made.path(), options).unwrap_err().to_string();
-    for word in words.split(", ") {
-        assert!(message.contains(word), "{word:?} is not in: {message}");
     }
 }

@@ -3,11 +3,8 @@
 use glam::DVec3;
 
 use super::super::*;
+use super::{load, refused};
 use densify_fixtures::{Made, SIZE, image};
-
-fn load(made: &Made) -> Dataset {
-    Dataset::load(made.path(), &LoadOptions::default()).unwrap_or_else(|e| panic!("{e}"))
-}
 
 const TABLE: &str = "cameras.csv";
 
@@ -125,8 +122,8 @@ fn names_may_have_commas_spaces_and_other_scripts_and_lie_in_images() {
     made.remove("images/c.png");
     let data = load(&made);
     assert_eq!(data.train.len(), 2);
-    let said = |note: &String| note.contains("1 of 3 photographs") && note.contains("c.png");
-    assert!(data.notes.iter().any(said), "{:?}", data.notes);
+    let is_noted = |note: &Note| note.contains("1 of 3 photographs") && note.contains("c.png");
+    assert!(data.notes.iter().any(is_noted), "{:?}", data.notes);
 }
 
 #[test]
@@ -148,7 +145,7 @@ fn damaged_tables_are_refused_by_line_and_column() {
     for (old, new, words) in cases {
         let made = Made::realitycapture();
         made.replace(TABLE, old, new);
-        refused(&made, new, words);
+        refused(new, &made, &LoadOptions::default(), words);
     }
     type Change = (&'static str, fn(&Made), &'static str);
     let cases: [Change; 6] = [
@@ -158,7 +155,7 @@ fn damaged_tables_are_refused_by_line_and_column() {
         (
             "no photographs",
             |m| std::fs::remove_dir_all(m.file("images")).unwrap(),
-            "cameras.csv, no image, a.png, --images",
+            "cameras.csv, no image, a.png, AddOrImagesFolder",
         ),
         ("not an image", |m| m.write("images/b.png", "hello"), "images/b.png, decode"),
         ("a far-off camera", |m| m.replace(TABLE, "images/a.png,", "images/a.png,1e308"), "line 3"),
@@ -166,16 +163,6 @@ fn damaged_tables_are_refused_by_line_and_column() {
     for (case, edit, words) in cases {
         let made = Made::realitycapture();
         edit(&made);
-        refused(&made, case, words);
-    }
-}
-
-fn refused(made: &Made, case: &str, words: &str) {
-    let Err(error) = Dataset::load(made.path(), &LoadOptions::default()) else {
-        panic!("{case}: it loaded")
-    };
-    let message = error.to_string();
-    for word in words.split(", ") {
-        assert!(message.contains(word), "{case}: {word:?} is not in: {message}");
+        refused(case, &made, &LoadOptions::default(), words);
     }
 }

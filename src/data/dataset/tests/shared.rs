@@ -25,9 +25,8 @@ fn real_datasets_load() {
         let data = Dataset::load(&path, &options).unwrap_or_else(|e| panic!("{name}: {e}"));
         assert_eq!((data.train.len(), data.test.len()), views, "{name}");
         assert_eq!(data.points.len(), points, "{name}");
-        let farthest =
-            data.train.iter().map(|view| view.camera.centre().length()).fold(0.0, f64::max);
-        assert!((farthest - 1.0).abs() < 1e-9, "{name}: {farthest}");
+        let reach = data.train.iter().map(|view| view.camera.centre().length()).fold(0.0, f64::max);
+        assert!((reach - 1.0).abs() < 1e-9, "{name}: {reach}");
         for view in data.train.iter().chain(&data.test) {
             // Sides differ by a few pixels between the cameras of `office`.
             let (width, height) = (view.camera.width, view.camera.height);
@@ -38,11 +37,8 @@ fn real_datasets_load() {
         }
         for view in data.train.iter().step_by(20) {
             let image = view.source.load().unwrap();
-            assert_eq!(
-                (image.width, image.height),
-                (view.camera.width, view.camera.height),
-                "{name}"
-            );
+            let size = (view.camera.width, view.camera.height);
+            assert_eq!((image.width, image.height), size, "{name}");
             assert_eq!(image.alpha.is_some(), name == "chair", "{name} {}", view.name);
             assert!(image.bytes() <= view.source.loaded_bytes());
         }

@@ -9,25 +9,11 @@
 pub(super) const CHUNK: usize = 256;
 /// The bounds of a chunk, minimum before maximum, of position, log-scale and colour. Older files have no bounds of
 /// colour, which then lies in `[0, 1]`.
+#[rustfmt::skip] // Minimum and maximum of one quantity per line.
 pub(super) const BOUNDS: [&str; 18] = [
-    "min_x",
-    "min_y",
-    "min_z",
-    "max_x",
-    "max_y",
-    "max_z",
-    "min_scale_x",
-    "min_scale_y",
-    "min_scale_z",
-    "max_scale_x",
-    "max_scale_y",
-    "max_scale_z",
-    "min_r",
-    "min_g",
-    "min_b",
-    "max_r",
-    "max_g",
-    "max_b",
+    "min_x", "min_y", "min_z", "max_x", "max_y", "max_z",
+    "min_scale_x", "min_scale_y", "min_scale_z", "max_scale_x", "max_scale_y", "max_scale_z",
+    "min_r", "min_g", "min_b", "max_r", "max_g", "max_b",
 ];
 /// The words of a Gaussian.
 pub(super) const WORDS: [&str; 4] =

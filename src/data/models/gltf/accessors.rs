@@ -7,9 +7,6 @@ use serde::Deserialize;
 use super::layout::SHAPES;
 use crate::error::LoadError;
 
-/// Decodes a number from its bytes.
-type ReadNumber<'a> = Box<dyn Fn(&[u8]) -> f32 + 'a>;
-
 /// An array of numbers.
 #[derive(Deserialize)]
 #[serde(rename_all = "camelCase")]
@@ -77,21 +74,18 @@ impl Buffers<'_> {
         let scale = |most: f32| if accessor.normalized { 1.0 / most } else { 1.0 };
         // The smallest signed integer is one step below −1 when normalised (glTF 2.0, section 3.11).
         let least = if accessor.normalized { -1.0 } else { f32::NEG_INFINITY };
-        let (size, number): (usize, ReadNumber<'_>) = match accessor.component_type {
-            5120 => (1, Box::new(move |b| (f32::from(b[0] as i8) * scale(127.0)).max(least))),
-            5121 => (1, Box::new(move |b| f32::from(b[0]) * scale(255.0))),
-            5122 => (
-                2,
-                Box::new(move |b| {
-                    (f32::from(i16::from_le_bytes([b[0], b[1]])) * scale(32_767.0)).max(least)
-                }),
-            ),
-            5123 => (
-                2,
-                Box::new(move |b| f32::from(u16::from_le_bytes([b[0], b[1]])) * scale(65_535.0)),
-            ),
-            5126 => (4, Box::new(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]))),
+        let size = match accessor.component_type {
+            5120 | 5121 => 1,
+            5122 | 5123 => 2,
+            5126 => 4,
             _ => return Err(wrong("its numbers are neither floats nor bytes or shorts")),
+        };
+        let number = |bytes: &[u8]| match (accessor.component_type, bytes) {
+            (5120, &[a]) => (f32::from(a as i8) * scale(127.0)).max(least),
+            (_, &[a]) => f32::from(a) * scale(255.0),
+            (5122, &[a, b]) => (f32::from(i16::from_le_bytes([a, b])) * scale(32_767.0)).max(least),
+            (_, &[a, b]) => f32::from(u16::from_le_bytes([a, b])) * scale(65_535.0),
+            (_, bytes) => f32::from_le_bytes(std::array::from_fn(|i| bytes[i])),
         };
         let stride = self.views[view].byte_stride.unwrap_or(size * width);
         let needed = accessor

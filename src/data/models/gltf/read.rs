@@ -86,11 +86,8 @@ pub(super) fn read_binary(
     };
     let header = words("header", 5)?;
     if header[1] != 2 || header[4] != u32::from_le_bytes(*b"JSON") {
-        return Err(LoadError::damaged(
-            path,
-            "header",
-            "it is not glTF 2.0 that begins with its JSON",
-        ));
+        let problem = "it is not glTF 2.0 that begins with its JSON";
+        return Err(LoadError::damaged(path, "header", problem));
     }
     let text = read_exactly(path, "JSON", &mut input, u64::from(header[3]))?;
     let text = String::from_utf8_lossy(&text).into_owned();
@@ -167,7 +164,7 @@ fn read(
         }
     }
     if primitives == 0 {
-        return Err(LoadError(format!(
+        return Err(LoadError::Data(format!(
             "{} holds no Gaussian splats ({SPLATS}); a mesh is rendered by `densify scenegen`",
             path.display()
         )));

@@ -101,8 +101,7 @@ mod tests {
         // Most values lie near 0, so the numbers must too.
         let many: Vec<f32> = (0..100_000).map(|i| ((i as f32 / 50_000.0) - 1.0).powi(3)).collect();
         let book = Codebook::fit(&many, |_| 1.0);
-        let error =
-            |&value: &f32| (book.values()[usize::from(book.nearest(value))] - value).powi(2);
+        let error = |&v: &f32| (book.values()[usize::from(book.nearest(v))] - v).powi(2);
         let rms = (many.iter().map(error).sum::<f32>() / many.len() as f32).sqrt();
         // The least possible mean square, (∫∛density)³/12/256² (Panter and Dite), is 0.0019²; even spacing has 0.00226².
         assert!(rms < 0.001_95, "{rms}");

@@ -87,8 +87,7 @@ fn read_images(
     length: u64,
     open: OpenImage<'_>,
 ) -> Result<SplatFile, LoadError> {
-    let meta: Meta =
-        serde_json::from_str(text).map_err(|error| LoadError::damaged(path, META, error))?;
+    let meta: Meta = serde_json::from_str(text).map_err(|e| LoadError::damaged(path, META, e))?;
     if meta.version != Some(2) {
         let version = meta.version.map_or_else(|| "1 (it names none)".into(), |v| v.to_string());
         let problem = format!("version {version}, but densify reads 2");
@@ -118,19 +117,13 @@ fn read_images(
     let palette = meta.bands.as_ref().map(|bands| picture(bands, 0, "shN")).transpose()?;
     let sh_degree = meta.bands.as_ref().map_or(0, |bands| bands.bands);
     if sh_degree > 3 || (meta.bands.is_some() && sh_degree == 0) {
-        return Err(LoadError::damaged(
-            path,
-            "shN",
-            format!("{sh_degree} bands, but 1 to 3 are possible"),
-        ));
+        let problem = format!("{sh_degree} bands, but 1 to 3 are possible");
+        return Err(LoadError::damaged(path, "shN", problem));
     }
     let coefficients = sh_coefficients(sh_degree) - 1;
     if palette.as_ref().is_some_and(|p| p.width < PALETTE_WIDTH * coefficients) {
-        return Err(LoadError::damaged(
-            path,
-            "shN",
-            "the image of the palette is too narrow for its degree",
-        ));
+        let problem = "the image of the palette is too narrow for its degree";
+        return Err(LoadError::damaged(path, "shN", problem));
     }
     let ([Some(mins), Some(maxs)], [scale_book, colour_book]) = (
         [&meta.means.mins, &meta.means.maxs].map(|all| all.first_chunk::<3>()),

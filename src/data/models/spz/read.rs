@@ -60,8 +60,7 @@ fn read_header(
 ) -> Result<Header, LoadError> {
     let wrong = |problem: String| Err(LoadError::damaged(path, "header", problem));
     let bytes = read_exactly(path, "header", input, 16)?;
-    let words: Vec<u32> =
-        bytes.as_chunks().0.iter().map(|&word| u32::from_le_bytes(word)).collect();
+    let words: Vec<u32> = bytes.as_chunks().0.iter().map(|&w| u32::from_le_bytes(w)).collect();
     let (version, rows) = (words[1], u64::from(words[2]));
     let (sh_degree, fractional_bits) = (bytes[12], bytes[13]);
     if words[0] != MAGIC {

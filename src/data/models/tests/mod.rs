@@ -7,6 +7,7 @@ mod round_trips;
 
 use std::io::{self, Write};
 use std::ops::Range;
+use std::path::PathBuf;
 
 use super::*;
 use densify_core::files::FileError;
@@ -33,15 +34,15 @@ pub(crate) fn model(rows: usize, sh_degree: u8) -> Gaussians {
 }
 
 fn piece(whole: &Gaussians, rows: Range<usize>) -> Gaussians {
-    let sh = 3 * sh_coefficients(whole.sh_degree);
-    Gaussians {
-        sh_degree: whole.sh_degree,
-        means: whole.means[rows.clone()].to_vec(),
-        log_scales: whole.log_scales[rows.clone()].to_vec(),
-        quats: whole.quats[rows.clone()].to_vec(),
-        opacity_logits: whole.opacity_logits[rows.clone()].to_vec(),
-        sh: whole.sh[sh * rows.start..sh * rows.end].to_vec(),
-    }
+    whole.gather(&rows.collect::<Vec<_>>())
+}
+
+/// A file with these contents in a folder of its own.
+pub(crate) fn saved(name: &str, contents: impl AsRef<[u8]>) -> (tempfile::TempDir, PathBuf) {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join(name);
+    std::fs::write(&path, contents).unwrap();
+    (folder, path)
 }
 
 /// A format that any crate could add; it writes how it was called.
@@ -139,18 +140,10 @@ fn an_unknown_format_names_the_nearest_and_the_list() {
 }
 
 #[test]
-fn a_ply_written_in_pieces_is_the_same_and_its_writer_holds_what_it_promises() {
+fn the_writer_of_ply_holds_what_it_promises() {
     let whole = model(300, 2);
-    let mut expected = Vec::new();
-    PLY.write(&whole, &mut expected).unwrap();
-    let mut bytes = Vec::new();
     let mut writer = PLY.open_writer().unwrap();
-    writer.begin(Shape { rows: 300, sh_degree: 2 }, &mut bytes).unwrap();
-    for rows in [0..0, 0..7, 7..270, 270..300] {
-        writer.rows(&piece(&whole, rows), &mut bytes).unwrap();
-    }
-    writer.finish(&mut bytes).unwrap();
-    assert!(bytes == expected);
+    writer.begin(Shape { rows: 300, sh_degree: 2 }, &mut io::sink()).unwrap();
 
     /// The largest write.
     struct Largest(usize);

@@ -2,18 +2,12 @@
 //!
 //! The files are the fuzz corpora: `ply/twelve.ply` has twelve Gaussians of degree 1, and the others were made from it.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
+use super::saved;
 use crate::models::read_model;
 use densify_core::gaussians::{Gaussians, sigmoid};
 use densify_fixtures::{corpus, corpus_files};
-
-fn saved(name: &str, contents: impl AsRef<[u8]>) -> (tempfile::TempDir, PathBuf) {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join(name);
-    std::fs::write(&path, contents).unwrap();
-    (folder, path)
-}
 
 fn read(path: &Path) -> Gaussians {
     let file = read_model(path).unwrap_or_else(|error| panic!("{error}"));
@@ -86,10 +80,8 @@ fn every_format_holds_the_same_model() {
         assert!(found.iter().zip(limits).all(|(f, l)| *f <= l), "{}: {found:?}", path.display());
     }
     let grey = differences(&truth.clone().with_degree(0), &read(&corpus("splat/twelve.splat")));
-    assert!(
-        grey.iter().zip([0.0, 1e-6, 0.002, 0.007, 0.0, 0.02]).all(|(f, l)| *f <= l),
-        "{grey:?}"
-    );
+    let limits = [0.0, 1e-6, 0.002, 0.007, 0.0, 0.02];
+    assert!(grey.iter().zip(limits).all(|(f, l)| *f <= l), "{grey:?}");
 }
 
 #[test]

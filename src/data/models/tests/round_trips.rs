@@ -1,12 +1,13 @@
 //! Round trips: exact in formats with f32, within half a step in quantised ones.
 
 use std::io;
+use std::ops::Range;
 use std::path::Path;
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::piece;
+use super::{piece, saved};
 use crate::models::{Format, Shape, export_formats, find, find_by_extension, read_model};
 use densify_core::gaussians::{Gaussians, sh_coefficients, sigmoid};
 
@@ -34,9 +35,7 @@ fn written(format: &Format, model: &Gaussians) -> io::Result<Vec<u8>> {
 }
 
 fn read(bytes: &[u8]) -> Gaussians {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("model");
-    std::fs::write(&path, bytes).unwrap();
+    let (_folder, path) = saved("model", bytes);
     let file = read_model(&path).unwrap_or_else(|error| panic!("{error}"));
     assert_eq!((file.dropped, file.repaired), (0, 0));
     file.gaussians
@@ -73,14 +72,24 @@ fn errors(a: &Gaussians, b: &Gaussians) -> [f32; 5] {
 
 #[test]
 fn formats_in_f32_keep_every_bit() {
-    for name in ["ply", "glb"] {
+    // Numbers of rows around that of a write of PLY.
+    for (name, rows) in
+        [("ply", 0), ("ply", 1), ("ply", 255), ("ply", 256), ("ply", 700), ("glb", 100)]
+    {
         for degree in 0..=3 {
-            let mut model = plausible(100, degree);
-            model.means[3] = [-0.0, f32::MIN_POSITIVE / 4.0, f32::MAX];
-            (model.opacity_logits[4], model.opacity_logits[5]) = (17.5, -40.0);
-            model.log_scales[6] = [-30.0, 3e-5, 12.0];
-            let again = read(&written(find(name).unwrap(), &model).unwrap());
-            assert_eq!(again, model, "{name}, degree {degree}");
+            let mut model = plausible(rows, degree);
+            if rows > 6 {
+                model.means[3] = [-0.0, f32::MIN_POSITIVE / 4.0, f32::MAX];
+                (model.opacity_logits[4], model.opacity_logits[5]) = (17.5, -40.0);
+                model.log_scales[6] = [-30.0, 3e-5, 12.0];
+            }
+            let format = find(name).unwrap();
+            let bytes = written(format, &model).unwrap();
+            let again = read(&bytes);
+            let case = format!("{name}, {rows} rows, degree {degree}");
+            assert_eq!(again, model, "{case}");
+            // Bits too: −0 equals 0.
+            assert!(written(format, &again).unwrap() == bytes, "{case}");
         }
     }
 }
@@ -136,20 +145,17 @@ fn coefficients_of_zero_are_zero_on_average() {
 fn pieces_do_not_matter_and_equal_models_are_equal_files() {
     let model = plausible(300, 2);
     for format in export_formats().into_iter().filter(|format| format.name != "call-log") {
-        let whole = {
+        let in_pieces = |pieces: &[Range<usize>]| {
             let (mut bytes, mut writer) = (Vec::new(), format.open_writer().unwrap());
             writer.begin(Shape { rows: 300, sh_degree: 2 }, &mut bytes).unwrap();
-            writer.rows(&model, &mut bytes).unwrap();
+            for rows in pieces {
+                writer.rows(&piece(&model, rows.clone()), &mut bytes).unwrap();
+            }
             writer.finish(&mut bytes).unwrap();
             bytes
         };
-        let (mut bytes, mut writer) = (Vec::new(), format.open_writer().unwrap());
-        writer.begin(Shape { rows: 300, sh_degree: 2 }, &mut bytes).unwrap();
-        for rows in [0..0, 0..7, 7..270, 270..300] {
-            writer.rows(&piece(&model, rows), &mut bytes).unwrap();
-        }
-        writer.finish(&mut bytes).unwrap();
-        assert!(bytes == whole, "{}", format.name);
+        let pieces = in_pieces(&[0..0, 0..7, 7..270, 270..300]);
+        assert!(pieces == in_pieces(&[0..300, 300..300]), "{}", format.name);
         assert!(written(format, &model).unwrap() == written(format, &model).unwrap());
     }
 }

@@ -1,10 +1,8 @@
 //! Rows at the camera, around the near plane, and at equal or nearly equal depths.
 
 use super::{GREY, UPRIGHT, flat_colour, straight};
-use crate::compare::class;
-use crate::reference::CLASSES;
 use crate::scenes;
-use crate::trial::{Trial, bits, count_broken, count_different};
+use crate::trial::{Trial, bits, count_different};
 use densify_core::gaussians::Gaussians;
 use densify_render::BackendError;
 
@@ -22,12 +20,7 @@ pub(super) fn near_plane(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let scale = [0.3, 0.2, 0.1].map(|s: f32| s * (z.abs() as f32).clamp(1e-3, 3.0));
         scenes::push(&mut model, mean, scale, [0.8, 0.2, -0.5, 0.1], 0.3, colour);
     }
-    let cloud = scenes::cloud(20, 1, &camera, 7);
-    model.means.extend(cloud.means);
-    model.log_scales.extend(cloud.log_scales);
-    model.quats.extend(cloud.quats);
-    model.opacity_logits.extend(cloud.opacity_logits);
-    model.sh.extend(cloud.sh);
+    model.append(scenes::cloud(20, 1, &camera, 7));
     trial.check("behind and near", &model, &camera, GREY, 1)?;
 
     // One bit to either side of the plane; without rotation, camera z equals the mean's z exactly.
@@ -52,11 +45,7 @@ pub(super) fn camera_inside(trial: &mut Trial<'_>) -> Result<(), BackendError> {
             scenes::push(&mut model, [0.0, 0.1 * z, z], [times * z; 3], UPRIGHT, -1.0, shade);
         }
         let mut back = scenes::cloud(10, 0, &camera, 34);
-        back.means.extend(&model.means);
-        back.log_scales.extend(&model.log_scales);
-        back.quats.extend(&model.quats);
-        back.opacity_logits.extend(&model.opacity_logits);
-        back.sh.extend(&model.sh);
+        back.append(model);
         let label = format!("{times} times as wide as distant");
         trial.check(&label, &back, &camera, GREY, 0)?;
     }
@@ -73,17 +62,10 @@ pub(super) fn camera_at_mean(trial: &mut Trial<'_>) -> Result<(), BackendError> 
             model.means[row] = direction.map(|d: f32| d * offset);
             model.log_scales[row] = [0.7, 0.0, 2.0];
         }
-        let mut backend = trial.subject.backend(&model)?;
-        let upstream = scenes::narrowed(&scenes::upstream(&camera, 5));
-        let (image, gradient) = backend.differentiate(&camera, GREY, 2, &upstream)?;
-        let gradients = CLASSES.map(|name| class(&gradient, name));
-        let mut broken = count_broken(&[&image.rgb, &image.alpha, &image.depth]);
-        broken += count_broken(&gradients);
         let label = format!("{label} from the camera");
-        trial.count(&label, "NaN or infinity", broken);
+        let gradient = trial.check_finite(&label, &model, &camera, GREY, 2)?;
         let pulled = gradient.sh[..3 * 27].iter().filter(|g| **g != 0.0).count();
         trial.count(&label, "gradients of SH without a direction", pulled);
-        trial.train(&label, &mut *backend, &camera, GREY, 2)?;
     }
     Ok(())
 }

@@ -14,15 +14,10 @@ const SOUND: usize = 1_000;
 
 /// Appends a copy of row 0 for each parameter of a row, with `value` in place of that parameter.
 fn with_value_in_each_slot(model: &Gaussians, value: f32) -> Gaussians {
-    let mut model = model.clone();
+    let first = model.len();
+    let mut model = model.gather(&(0..first).chain([0; SLOTS]).collect::<Vec<_>>());
     for slot in 0..SLOTS {
-        model.means.push(model.means[0]);
-        model.log_scales.push(model.log_scales[0]);
-        model.quats.push(model.quats[0]);
-        model.opacity_logits.push(model.opacity_logits[0]);
-        model.sh.extend_from_within(..48);
-        let row = model.len() - 1;
-        *slot_mut(&mut model, row, slot) = value;
+        *slot_mut(&mut model, first + slot, slot) = value;
     }
     model
 }

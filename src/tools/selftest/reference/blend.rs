@@ -31,7 +31,13 @@ const CLOSE_ALPHA: f64 = 1e-3;
 const CLOSE_TRANSMITTANCE: f64 = 1e-2;
 const CLOSE_DEPTH: f64 = 1e-6;
 
-fn trace(splats: &[Splat], order: &[usize], x: u32, y: u32, rules: &Rules) -> Pixel {
+/// The pixels of an image, row by row.
+fn pixels(view: View<'_>) -> impl Iterator<Item = [u32; 2]> {
+    let (width, height) = (view.camera.width, view.camera.height);
+    (0..height).flat_map(move |y| (0..width).map(move |x| [x, y]))
+}
+
+fn trace(splats: &[Splat], order: &[usize], [x, y]: [u32; 2], rules: &Rules) -> Pixel {
     let mut pixel = Pixel { contributions: Vec::new(), transmittance: 1.0, boundary: false };
     let mut last_depth = f64::NEG_INFINITY;
     for &row in order {
@@ -97,9 +103,9 @@ pub fn render_pixel(
     order: &[usize],
     view: View<'_>,
     rules: &Rules,
-    [x, y]: [u32; 2],
+    at: [u32; 2],
 ) -> Sample {
-    let pixel = trace(splats, order, x, y, rules);
+    let pixel = trace(splats, order, at, rules);
     let mut rgb = view.background.map(|b| b * pixel.transmittance);
     let mut depth = 0.0;
     for hit in &pixel.contributions {
@@ -123,10 +129,8 @@ pub fn render_pixel(
 /// Renders splats in the given order.
 #[must_use]
 pub fn render(splats: &[Splat], order: &[usize], view: View<'_>, rules: &Rules) -> Image {
-    let (width, height) = (view.camera.width, view.camera.height);
-    let pixels = (0..height).flat_map(|y| (0..width).map(move |x| [x, y]));
     let samples: Vec<Sample> =
-        pixels.map(|at| render_pixel(splats, order, view, rules, at)).collect();
+        pixels(view).map(|at| render_pixel(splats, order, view, rules, at)).collect();
     Image {
         rgb: samples.iter().flat_map(|s| s.rgb).collect(),
         alpha: samples.iter().map(|s| s.alpha).collect(),
@@ -146,13 +150,10 @@ pub fn each_blended(
     rules: &Rules,
     mut f: impl FnMut(usize, usize, f64, f64),
 ) {
-    for y in 0..view.camera.height {
-        for x in 0..view.camera.width {
-            let p = (y * view.camera.width + x) as usize;
-            for hit in trace(splats, order, x, y, rules).contributions {
-                let [dx, dy] = hit.offset;
-                f(p, hit.row, hit.alpha * hit.transmittance, dx.hypot(dy));
-            }
+    for (p, at) in pixels(view).enumerate() {
+        for hit in trace(splats, order, at, rules).contributions {
+            let [dx, dy] = hit.offset;
+            f(p, hit.row, hit.alpha * hit.transmittance, dx.hypot(dy));
         }
     }
 }
@@ -167,37 +168,34 @@ pub fn backward(
     upstream: &Upstream,
 ) -> Vec<ScreenGradient> {
     let mut gradient = vec![ScreenGradient::default(); splats.len()];
-    for y in 0..view.camera.height {
-        for x in 0..view.camera.width {
-            let p = (y * view.camera.width + x) as usize;
-            let pixel = trace(splats, order, x, y, rules);
-            let d_rgb = [0, 1, 2].map(|c| upstream.rgb[3 * p + c]);
-            let (d_alpha_out, d_depth) = (upstream.alpha[p], upstream.depth[p]);
-            // Loss contribution of everything behind; at first the background.
-            let mut behind: f64 =
-                pixel.transmittance * (0..3).map(|c| view.background[c] * d_rgb[c]).sum::<f64>();
-            for hit in pixel.contributions.iter().rev() {
-                let splat = &splats[hit.row];
-                let colour = visible_colour(splat);
-                let weight = hit.alpha * hit.transmittance;
-                let value = (0..3).map(|c| colour[c] * d_rgb[c]).sum::<f64>()
-                    + splat.depth * d_depth
-                    + d_alpha_out;
-                let d_alpha = hit.transmittance * value - behind / (1.0 - hit.alpha);
-                behind += weight * value;
+    for (p, at) in pixels(view).enumerate() {
+        let pixel = trace(splats, order, at, rules);
+        let d_rgb = [0, 1, 2].map(|c| upstream.rgb[3 * p + c]);
+        let (d_alpha_out, d_depth) = (upstream.alpha[p], upstream.depth[p]);
+        // Loss contribution of everything behind; at first the background.
+        let mut behind: f64 =
+            pixel.transmittance * (0..3).map(|c| view.background[c] * d_rgb[c]).sum::<f64>();
+        for hit in pixel.contributions.iter().rev() {
+            let splat = &splats[hit.row];
+            let colour = visible_colour(splat);
+            let weight = hit.alpha * hit.transmittance;
+            let value = (0..3).map(|c| colour[c] * d_rgb[c]).sum::<f64>()
+                + splat.depth * d_depth
+                + d_alpha_out;
+            let d_alpha = hit.transmittance * value - behind / (1.0 - hit.alpha);
+            behind += weight * value;
 
-                let sum = &mut gradient[hit.row];
-                for (colour, d) in sum.colour.iter_mut().zip(d_rgb) {
-                    *colour += weight * d;
-                }
-                sum.depth += weight * d_depth;
-                sum.max_weight = sum.max_weight.max(weight);
-                sum.sum_weight += weight;
-                sum.pixels += 1;
-                if !hit.clamped {
-                    sum.opacity += d_alpha * hit.falloff;
-                    add_exponent(sum, splat, hit, -d_alpha * hit.alpha);
-                }
+            let sum = &mut gradient[hit.row];
+            for (colour, d) in sum.colour.iter_mut().zip(d_rgb) {
+                *colour += weight * d;
+            }
+            sum.depth += weight * d_depth;
+            sum.max_weight = sum.max_weight.max(weight);
+            sum.sum_weight += weight;
+            sum.pixels += 1;
+            if !hit.clamped {
+                sum.opacity += d_alpha * hit.falloff;
+                add_exponent(sum, splat, hit, -d_alpha * hit.alpha);
             }
         }
     }
@@ -230,19 +228,14 @@ pub fn leeway(
     // Without thresholds nothing is skipped; an alpha 10 % below the minimum is never blended.
     let rules = Rules { alpha_min: 0.9 / 255.0, ..Rules::SMOOTH };
     let mut bounds = vec![(0.0, 0.0, 0); splats.len()];
-    for y in 0..view.camera.height {
-        for x in 0..view.camera.width {
-            if counted[(y * view.camera.width + x) as usize] {
-                continue;
-            }
-            for hit in trace(splats, order, x, y, &rules).contributions {
-                // A skipped row in front raises the transmittance by up to 1/255.
-                let weight = 1.01 * hit.alpha * hit.transmittance;
-                let (largest, sum, pixels) = &mut bounds[hit.row];
-                *largest = weight.max(*largest);
-                *sum += weight;
-                *pixels += 1;
-            }
+    for (at, _) in pixels(view).zip(counted).filter(|(_, counted)| !**counted) {
+        for hit in trace(splats, order, at, &rules).contributions {
+            // A skipped row in front raises the transmittance by up to 1/255.
+            let weight = 1.01 * hit.alpha * hit.transmittance;
+            let (largest, sum, pixels) = &mut bounds[hit.row];
+            *largest = weight.max(*largest);
+            *sum += weight;
+            *pixels += 1;
         }
     }
     bounds

@@ -168,13 +168,9 @@ fn geometry_backward(
             - (fx * d_j[0].x + fy * d_j[1].y) / (z * z)
             + (fx * geometry.slope[0] * d_j[0].z + fy * geometry.slope[1] * d_j[1].z) / (z * z),
     );
-    if !geometry.clamped[0] {
-        d_local.x += d_slope[0] / z;
-        d_local.z -= d_slope[0] * x / (z * z);
-    }
-    if !geometry.clamped[1] {
-        d_local.y += d_slope[1] / z;
-        d_local.z -= d_slope[1] * y / (z * z);
+    for axis in (0..2).filter(|&axis| !geometry.clamped[axis]) {
+        d_local[axis] += d_slope[axis] / z;
+        d_local.z -= d_slope[axis] * geometry.local[axis] / (z * z);
     }
 
     // Gradient of Σ = m·mᵀ, then of scale and rotation.

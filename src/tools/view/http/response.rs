@@ -17,12 +17,12 @@ const COMMON_HEADERS: &str = "Cache-Control: no-store\r\n\
 /// A complete response.
 #[derive(Debug, Clone)]
 pub(crate) struct Response {
-    status: u16,
+    pub(crate) status: u16,
     content_type: &'static str,
     /// Headers in addition to the common ones.
     headers: Vec<(&'static str, String)>,
     /// Shared, so that a body that every page requests exists once.
-    body: Arc<[u8]>,
+    pub(crate) body: Arc<[u8]>,
 }
 
 impl Response {
@@ -41,16 +41,6 @@ impl Response {
     pub(crate) fn with_header(mut self, name: &'static str, value: impl ToString) -> Self {
         self.headers.push((name, value.to_string()));
         self
-    }
-
-    #[cfg(test)]
-    pub(crate) fn status(&self) -> u16 {
-        self.status
-    }
-
-    #[cfg(test)]
-    pub(crate) fn body(&self) -> &[u8] {
-        &self.body
     }
 
     /// Sends the response; `HEAD` requests get no body.

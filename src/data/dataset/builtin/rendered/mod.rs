@@ -2,8 +2,7 @@
 
 mod scene_cache;
 
-use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::path::Path;
 
 pub use densify_scenegen::GroundTruth;
 use densify_scenegen::{
@@ -12,11 +11,11 @@ use densify_scenegen::{
 use serde::{Deserialize, Serialize};
 
 use super::PREFIX;
-use crate::dataset::images::{ImageHeader, ImageSource, SourceFile};
+use crate::dataset::images::ImageSource;
 use crate::dataset::photographs::{Photograph, target_size};
-use crate::dataset::prepare::assemble;
+use crate::dataset::prepare::{assemble, texts};
 use crate::dataset::tracks::TrackSampler;
-use crate::dataset::{self, Dataset, DatasetError, LoadOptions, PointCloud, View};
+use crate::dataset::{self, Dataset, LoadError, LoadOptions, PointCloud, View};
 use densify_core::camera::Camera;
 use densify_core::image::Image8;
 use scene_cache::Entry;
@@ -52,12 +51,12 @@ pub(in crate::dataset) fn load(
     path: &Path,
     name: &str,
     options: &LoadOptions,
-) -> Result<Dataset, DatasetError> {
+) -> Result<Dataset, LoadError> {
     let (source, parameters) = (Source::Preset(name.to_owned()), Options::default());
     // The name is checked before it becomes part of a file name.
-    let asked: PresetSpec = name.parse()?;
+    let preset: PresetSpec = name.parse()?;
     let entry = options.cache.as_deref();
-    let entry = entry.and_then(|folder| Entry::new(folder, &asked.to_string(), &parameters));
+    let entry = entry.and_then(|folder| Entry::new(folder, &preset.to_string(), &parameters));
     let kept = entry.as_ref().and_then(Entry::read);
     // Another program may have written an entry with another number of images.
     if let Some(kept) = kept.filter(|kept| kept.frames.len() == kept.about.views.len()) {
@@ -96,10 +95,10 @@ impl Dataset {
     ///
     /// # Errors
     /// When the surface exists but cannot be read.
-    pub fn ground_truth(&self) -> Result<Option<GroundTruth>, DatasetError> {
+    pub fn ground_truth(&self) -> Result<Option<GroundTruth>, LoadError> {
         if let Some(unpacked) = &self.unpacked {
             let found = GroundTruth::open(unpacked.folder());
-            return found.map_err(|error| DatasetError(unpacked.named(&error.to_string())));
+            return found.map_err(|error| LoadError::Data(unpacked.named(&error.to_string())));
         }
         let Some(name) = super::name(&self.root) else { return Ok(GroundTruth::open(&self.root)?) };
         let scene = Scene::prepare(&Source::Preset(name.to_owned()), &Options::default())?;
@@ -113,9 +112,9 @@ pub(in crate::dataset) fn surface_bytes(root: &Path) -> Option<u64> {
     GroundTruth::is_in(root).then(|| BUILD_FACTOR * mesh.map_or(0, |mesh| mesh.len()))
 }
 
-impl From<densify_scenegen::Error> for DatasetError {
+impl From<densify_scenegen::Error> for LoadError {
     fn from(error: densify_scenegen::Error) -> Self {
-        Self(error.to_string())
+        Self::Data(error.to_string())
     }
 }
 
@@ -127,7 +126,7 @@ fn dataset(
     path: &Path,
     Rendered { about, frames, points }: Rendered,
     options: &LoadOptions,
-) -> Result<Dataset, DatasetError> {
+) -> Result<Dataset, LoadError> {
     let mut photographs: Vec<Photograph> = (0..)
         .zip(&about.views)
         .zip(frames)
@@ -152,10 +151,9 @@ fn dataset(
         tracks: sampler.finish(),
         own_split: true,
         surface_bytes: Some(about.surface_bytes),
-        notes: about.notes,
         ..dataset::Scene::default()
     };
-    assemble(path, photographs, read, options)
+    assemble(path, photographs, read, texts(about.notes), options)
 }
 
 /// Converts the camera of a rendered view.
@@ -177,37 +175,14 @@ fn dataset_view(name: &str, camera: Camera, frame: Frame, options: &LoadOptions)
     let pixels = frame.rgba.chunks_exact(4);
     let rgb = pixels.clone().flat_map(|pixel| [pixel[0], pixel[1], pixel[2]]).collect();
     let alpha: Vec<u8> = pixels.map(|pixel| pixel[3]).collect();
-    let has_alpha = alpha.iter().any(|&a| a < 255);
-    let image = Image8 {
-        width: frame.width,
-        height: frame.height,
-        rgb,
-        alpha: has_alpha.then_some(alpha),
-        mask: None,
-    };
-    let header = ImageHeader {
-        width: frame.width,
-        height: frame.height,
-        has_alpha,
-        turn: None,
-        decoded_bytes: image.bytes(),
-        file_bytes: 0,
-    };
-    let (width, height) =
-        target_size((header.width, header.height), header.width, options.resolution, false);
+    let alpha = alpha.iter().any(|&a| a < 255).then_some(alpha);
+    let (width, height) = (frame.width, frame.height);
+    let image = Image8 { width, height, rgb, alpha, mask: None };
+    let (width, height) = target_size((width, height), width, options.resolution, false);
     View {
         name: format!("{name}.png"),
         camera: camera.resized(width, height),
-        source: ImageSource {
-            file: SourceFile::rendered(PathBuf::from(format!("{PREFIX}{name}"))),
-            mask: None,
-            width,
-            height,
-            undistortion: None,
-            header,
-            rendered: Some(Arc::new(image)),
-            window: None,
-        },
+        source: ImageSource::rendered(format!("{PREFIX}{name}").into(), image, (width, height)),
     }
 }
 
