@@ -215,7 +215,7 @@ fn table(blocks: &Blocks) -> String {
 }
 
 fn run_submit(args: &SubmitArgs, console: &Console) -> Result<(), Failure> {
-    let submission = args.more.with(args.engine)?;
+    let submission = args.more.for_engine(args.engine)?;
     let blocks = Blocks::read(&args.folder)?;
     let follower = Follower::new(console);
     follower.listen();

@@ -47,7 +47,7 @@ pub fn submit(
 fn job(blocks: &Blocks, task: Task) -> Job {
     Job {
         name: blocks.name(task).to_owned(),
-        place: if let Task::Block(place) = task { place } else { 0 },
+        index: if let Task::Block(index) = task { index } else { 0 },
         memory: blocks.memory(task),
         threads: if task == Task::Merge { 1 } else { blocks.threads },
         may_have_fewer_threads: true,

@@ -26,8 +26,8 @@ pub struct EngineArgs {
 impl EngineArgs {
     pub(super) fn submission(&self) -> Result<Option<Submission>, Failure> {
         match self.engine {
-            Some(engine) => self.more.with(engine).map(Some),
-            None => self.more.without().map(|()| None),
+            Some(engine) => self.more.for_engine(engine).map(Some),
+            None => self.more.require_none().map(|()| None),
         }
     }
 }
@@ -65,7 +65,9 @@ pub(super) fn submit(
     let open: Vec<&Cell> = cells.iter().filter(|cell| !is_done(cell)).collect();
     observer.say(format_args!("runs     {} of {} done", cells.len() - open.len(), cells.len()));
     let is_handed_in = !matches!(submission.engine, Engine::Local) && !submission.dry_run;
-    if let Some(jobs) = launch::submitted(&folder).filter(|_| is_handed_in && !submission.again) {
+    if let Some(jobs) =
+        launch::submitted_jobs(&folder).filter(|_| is_handed_in && !submission.again)
+    {
         observer.say(format_args!(
             "handed in before, as job {jobs}: call again when that has ended, with --again if it has failed (logs in {})",
             folder.join("logs").display()
@@ -75,7 +77,7 @@ pub(super) fn submit(
     let mut memory: Vec<(Partial, u64)> = Vec::new();
     let mut jobs: Vec<Job> = Vec::new();
     let mut described: Vec<&Partial> = Vec::new();
-    for (place, cell) in cells.iter().enumerate() {
+    for (index, cell) in cells.iter().enumerate() {
         // What several cells describe alike is one run.
         if is_done(cell) || described.contains(&&cell.spec) {
             continue;
@@ -87,7 +89,7 @@ pub(super) fn submit(
         }
         jobs.push(Job {
             name: cell.run(),
-            place,
+            index,
             memory: promised(cell, &spec, &mut memory)?,
             threads: threads(&spec),
             may_have_fewer_threads: false,
