@@ -17,10 +17,10 @@ pub(super) fn trade(args: &Trade, console: &Console) -> Result<(), Failure> {
 }
 
 pub(super) fn run(args: &StudyRun, _: &Console) -> Result<(), Failure> {
-    args.make()
+    args.train()
 }
 
-/// Shows what has come out; nothing yet, where a scheduler has runs.
+/// Prints the summary, unless a scheduler still has runs.
 fn finish(done: Option<Finished>, console: &Console) -> Result<(), Failure> {
     let Some(Finished { summary, report }) = done else { return Ok(()) };
     console.result(summary);

@@ -183,7 +183,7 @@ fn pairs(
 /// `30.12 [29.95, 30.29]`
 fn mean_of(values: &[Pair<'_>], digits: usize) -> String {
     let Some(found) = Difference::new(values) else { return DASH.to_owned() };
-    let within = found.within(|[low, high]| format!("{low:.digits$}, {high:.digits$}"));
+    let within = found.format_interval(|[low, high]| format!("{low:.digits$}, {high:.digits$}"));
     format!("{:.digits$}{within}", found.mean)
 }
 
@@ -196,7 +196,7 @@ fn against_first(group: &Group, first: &Group, runs: &[RunRecord]) -> String {
     };
     let differences: Vec<Pair<'_>> =
         pairs(group, runs, psnr).into_iter().filter_map(pair).collect();
-    Difference::new(&differences).map_or_else(|| DASH.to_owned(), |found| found.show(2))
+    Difference::new(&differences).map_or_else(|| DASH.to_owned(), |found| found.format(2))
 }
 
 /// Tabulates geometric errors against the known surface; `None` if it is not known.
