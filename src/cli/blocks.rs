@@ -12,7 +12,7 @@ use super::threads;
 use super::train::Follower;
 use densify_blocks as blocks;
 use densify_blocks::{
-    Block, Blocks, Grid, PlanOptions, Size, State, Task, merge, plan, status, submit,
+    Block, BlockPlan, Grid, PlanOptions, Size, Task, TaskState, merge, plan, status, submit,
 };
 use densify_core::memory::Bytes;
 use densify_core::numbers;
@@ -172,7 +172,7 @@ fn run_plan(args: &PlanArgs, console: &Console) -> Result<(), Failure> {
 }
 
 /// Table of the tasks, with size, iterations and memory.
-fn table(blocks: &Blocks) -> String {
+fn table(blocks: &BlockPlan) -> String {
     let mut text = String::new();
     let mut row = |cells: [String; 7]| {
         let [task, rows, trained, views, iterations, work, memory] = cells;
@@ -190,8 +190,8 @@ fn table(blocks: &Blocks) -> String {
                 let rows = blocks.coarse.rows;
                 (rows, grouped(rows), "all".to_owned(), String::new())
             }
-            Task::Block(place) => {
-                let Block { rows, budget, views, work, .. } = &blocks.block[place];
+            Task::Block(index) => {
+                let Block { rows, budget, views, work, .. } = &blocks.block[index];
                 (*rows, grouped(*budget), grouped(*views), format!("{:.1} %", 100.0 * work))
             }
             Task::Merge => (blocks.rows, String::new(), String::new(), String::new()),
@@ -215,15 +215,15 @@ fn table(blocks: &Blocks) -> String {
 }
 
 fn run_submit(args: &SubmitArgs, console: &Console) -> Result<(), Failure> {
-    let submission = args.more.with(args.engine)?;
-    let blocks = Blocks::read(&args.folder)?;
+    let submission = args.more.for_engine(args.engine)?;
+    let blocks = BlockPlan::read(&args.folder)?;
     let follower = Follower::new(console);
     follower.listen();
     submit(&args.folder, &blocks, submission, &follower)
 }
 
 fn run_task(args: &RunArgs, console: &Console) -> Result<(), Failure> {
-    let blocks = Blocks::read(&args.folder)?;
+    let blocks = BlockPlan::read(&args.folder)?;
     let task = blocks.task(&args.task)?;
     let follower = Follower::new(console);
     follower.listen();
@@ -232,16 +232,16 @@ fn run_task(args: &RunArgs, console: &Console) -> Result<(), Failure> {
 }
 
 fn run_status(args: &StatusArgs, console: &Console) -> Result<(), Failure> {
-    let blocks = Blocks::read(&args.folder)?;
+    let blocks = BlockPlan::read(&args.folder)?;
     let mut counts = [0; 2];
     for (task, state) in status(&args.folder, &blocks) {
-        counts[usize::from(state == State::Complete)] += 1;
+        counts[usize::from(state == TaskState::Complete)] += 1;
         let of = blocks.iterations(task);
         let state = match state {
-            State::Waiting => "waiting".to_owned(),
-            State::Running(step) => format!("running, saved {step} of {of} steps"),
-            State::Stopped(step) => format!("stopped, saved {step} of {of} steps"),
-            State::Complete => "complete".to_owned(),
+            TaskState::Waiting => "waiting".to_owned(),
+            TaskState::Running(step) => format!("running, saved {step} of {of} steps"),
+            TaskState::Stopped(step) => format!("stopped, saved {step} of {of} steps"),
+            TaskState::Complete => "complete".to_owned(),
         };
         console.result(format_args!("{:<14} {state}", blocks.name(task)));
     }
@@ -252,7 +252,7 @@ fn run_status(args: &StatusArgs, console: &Console) -> Result<(), Failure> {
 fn run_merge(args: &MergeArgs, console: &Console) -> Result<(), Failure> {
     let format = format_of(&args.output)?;
     check_output(&args.output, args.overwrite)?;
-    let blocks = Blocks::read(&args.folder)?;
+    let blocks = BlockPlan::read(&args.folder)?;
     let merged = merge(&args.folder, &blocks, &args.output, format, args.partial, console)?;
     if !merged.missing.is_empty() {
         console.say(format_args!("note: left out, not complete: {}", merged.missing.join(", ")));

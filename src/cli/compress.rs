@@ -157,20 +157,20 @@ fn formats(args: &CompressArgs) -> Result<Vec<&'static Format>, Failure> {
 
 /// The curve of size against quality: the whole model, each intermediate size, and the attempts at the final size.
 fn table(compressed: &Compressed) -> String {
-    let Compressed { whole, way, attempts, best, .. } = compressed;
+    let Compressed { whole, stages, attempts, best, .. } = compressed;
     let mut text = format!(
         "\n{:<10} {:>10} {:>7} {:>14} {:>13} {:>11} {:>11}",
         "", "Gaussians", "degree", "format", "bytes", "train [dB]", "test [dB]"
     );
     let mut line = |name: &str, attempt: &Attempt, of_whole: &str| {
-        let test = attempt.test.map_or_else(|| "–".to_owned(), |test| format!("{test:.2}"));
+        let test = attempt.test_psnr.map_or_else(|| "–".to_owned(), |test| format!("{test:.2}"));
         let bytes = grouped(usize::try_from(attempt.bytes).unwrap_or(usize::MAX));
         text += &format!(
             "\n{name:<10} {:>10} {:>7} {:>14} {bytes:>13} {:>11.2} {test:>11}{of_whole}",
             grouped(attempt.rows),
             attempt.sh_degree,
             attempt.format,
-            attempt.train
+            attempt.train_psnr
         );
     };
     line("whole PLY", whole, "");
@@ -178,7 +178,7 @@ fn table(compressed: &Compressed) -> String {
         .iter()
         .enumerate()
         .map(|(place, attempt)| (if place == *best { "written" } else { "tried" }, attempt));
-    for (name, attempt) in way.iter().map(|attempt| ("on the way", attempt)).chain(others) {
+    for (name, attempt) in stages.iter().map(|attempt| ("on the way", attempt)).chain(others) {
         let share = percent(attempt.bytes as f64 / whole.bytes as f64);
         line(name, attempt, &format!("  {share} of the PLY"));
     }

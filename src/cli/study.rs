@@ -17,7 +17,7 @@ pub(super) fn trade(args: &Trade, console: &Console) -> Result<(), Failure> {
 }
 
 pub(super) fn run(args: &StudyRun, _: &Console) -> Result<(), Failure> {
-    args.make()
+    args.train()
 }
 
 /// Prints the results, unless a scheduler still has runs to do.

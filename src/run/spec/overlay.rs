@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
 use super::knobs::{self, DEFAULT_PRESET};
@@ -16,8 +16,17 @@ use densify_policies::policy::RateOverrides;
 pub(crate) const NOT_OPTIONS: [&str; 2] = ["densify", "resolved"];
 
 /// Some options of a run by name, each with a value that is valid by itself.
-#[derive(Debug, Clone, Default, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "Table")]
 pub struct Partial(Table);
+
+impl TryFrom<Table> for Partial {
+    type Error = Failure;
+
+    fn try_from(table: Table) -> Result<Self, Failure> {
+        Self::new(table, "spec")
+    }
+}
 
 impl Partial {
     /// Checks that every key is an option and every value is valid. Messages name `origin`, the source of the table.

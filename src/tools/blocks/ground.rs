@@ -1,59 +1,59 @@
-//! The ground that a scene stands on, found from its cameras: they stay at about the same height, on foot or in flight.
+//! The ground plane of a scene, estimated from its cameras, which stay at about the same height on foot or in flight.
 
-use glam::{DMat3, DVec2, DVec3};
+use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
 
 use densify_core::camera::Camera;
 
-/// Cameras whose second spread is below this share of the first stand on a line, which has no plane.
-const LINE: f64 = 0.02;
-/// Sweeps of Jacobi's method; three suffice for a matrix this small.
+/// If the cameras' second principal spread is below this fraction of the first, they are on a line, which determines no
+/// plane.
+const MAX_LINE_WIDTH: f64 = 0.02;
+/// Sweeps of Jacobi's method; three suffice for a 3 × 3 matrix.
 const SWEEPS: usize = 12;
 
-/// A plane, with two axes.
+/// A plane with two orthonormal axes.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Ground {
-    /// Its origin `[world units]`.
+    /// Origin `[world units]`.
     pub origin: DVec3,
-    /// Its first axis, along which the cameras are spread most; unit length.
+    /// First axis: the direction in which the cameras are spread most. Unit length.
     pub u: DVec3,
-    /// Its second axis, orthogonal to the first; unit length.
+    /// Second axis, orthogonal to the first. Unit length.
     pub v: DVec3,
 }
 
 impl Ground {
-    /// The plane through the cameras' mean that is nearest to all; where they stand on a line, it is as level as their
-    /// images.
+    /// Fits the plane to the camera centres by least squares. If they are on a line, the plane is as level as the images.
     #[must_use]
-    pub fn of(cameras: &[Camera]) -> Self {
+    pub fn fit(cameras: &[Camera]) -> Self {
         let count = cameras.len().max(1) as f64;
         let origin = cameras.iter().map(Camera::centre).sum::<DVec3>() / count;
         let outer = |d: DVec3| DMat3::from_cols(d * d.x, d * d.y, d * d.z);
         let spread = cameras
             .iter()
             .fold(DMat3::ZERO, |sum, camera| sum + outer(camera.centre() - origin) * (1.0 / count));
-        let [(first, u), (second, v), _] = axes(spread);
-        if second > (LINE * LINE) * first {
+        let [(first, u), (second, v), _] = principal_axes(spread);
+        if second > (MAX_LINE_WIDTH * MAX_LINE_WIDTH) * first {
             return Self { origin, u, v };
         }
-        // Down in their images, but for what is along the line.
+        // The mean downward direction of the images, without its component along the line.
         let down = cameras.iter().map(|camera| camera.rotation.row(1)).sum::<DVec3>();
         let down = down - u * down.dot(u);
         let v = u.cross(down).try_normalize().unwrap_or_else(|| u.any_orthonormal_vector());
         Self { origin, u, v }
     }
 
-    /// Where a point lies, seen from above.
+    /// Projects a point onto the plane.
     #[must_use]
-    pub fn at(&self, point: DVec3) -> [f64; 2] {
+    pub fn project(&self, point: DVec3) -> [f64; 2] {
         let d = point - self.origin;
-        DVec2::new(d.dot(self.u), d.dot(self.v)).to_array()
+        [d.dot(self.u), d.dot(self.v)]
     }
 }
 
-/// Eigenvalues and unit eigenvectors of a symmetric matrix, the largest first: Jacobi's method.
-fn axes(mut matrix: DMat3) -> [(f64, DVec3); 3] {
+/// Eigenvalues and unit eigenvectors of a symmetric matrix by Jacobi's method, the largest first.
+fn principal_axes(mut matrix: DMat3) -> [(f64, DVec3); 3] {
     let mut vectors = DMat3::IDENTITY;
     for _ in 0..SWEEPS {
         for (p, q) in [(0, 1), (0, 2), (1, 2)] {
@@ -89,10 +89,10 @@ mod tests {
     }
 
     #[test]
-    fn axes_are_those_of_the_matrix() {
+    fn principal_axes_are_eigenvectors() {
         let turn = DMat3::from_rotation_z(0.4) * DMat3::from_rotation_x(1.1);
         let matrix = turn * DMat3::from_diagonal(DVec3::new(2.0, 7.0, 0.5)) * turn.transpose();
-        let found = axes(matrix);
+        let found = principal_axes(matrix);
         for ((value, axis), expected) in found.into_iter().zip([7.0, 2.0, 0.5]) {
             assert!((value - expected).abs() < 1e-12, "{value}");
             assert!((matrix * axis - axis * value).length() < 1e-12, "{axis}");
@@ -110,11 +110,11 @@ mod tests {
                 camera(turn * DVec3::new(x, y, height), look)
             })
             .collect();
-        let ground = Ground::of(&cameras);
+        let ground = Ground::fit(&cameras);
         let up = ground.u.cross(ground.v);
         assert!(up.dot(turn * DVec3::Z).abs() > 0.999, "{up}");
         assert!(ground.u.dot(turn * DVec3::X).abs() > 0.999, "the longer side comes first");
-        let [a, b] = [DVec3::ZERO, turn * DVec3::new(3.0, 4.0, 9.0)].map(|p| ground.at(p));
+        let [a, b] = [DVec3::ZERO, turn * DVec3::new(3.0, 4.0, 9.0)].map(|p| ground.project(p));
         // Heights lean with x by less than half a degree.
         assert!(((a[0] - b[0]).hypot(a[1] - b[1]) - 5.0).abs() < 0.1, "{a:?} {b:?}");
     }
@@ -124,7 +124,7 @@ mod tests {
         // Looking forward along z, y down.
         let cameras: Vec<Camera> =
             (0..9).map(|i| camera(DVec3::new(0.0, 0.0, f64::from(i)), DMat3::IDENTITY)).collect();
-        let ground = Ground::of(&cameras);
+        let ground = Ground::fit(&cameras);
         assert!(ground.u.cross(ground.v).dot(DVec3::Y).abs() > 0.999, "{ground:?}");
     }
 }

@@ -1,71 +1,69 @@
-//! A scene in blocks, for models and clusters larger than one machine: a plan of runs that know their memory, and one
-//! model of what they train.
+//! Trains a large scene in blocks and merges their models. A plan describes the runs and their memory.
 //!
-//! The ground is cut into cells of equal work (`divide.rs`). A coarse run sees the whole scene. Each block then is a run
-//! of its own: it has the views that see its cell (`sight.rs`), starts from the Gaussians of the coarse model in and
-//! around the cell, and has the others frozen behind them (`task.rs`). What it ends with in its cell is its part of the
-//! merged model (`merge.rs`), which has at most the rows that were promised, as every block has a share of them.
-//! Engines start the tasks (`densify_launch`); there is no scheduler here. Prints nothing.
+//! The ground is divided into cells of equal work (`cells.rs`). A coarse run trains the whole scene. Each block is then a
+//! run of its own: it trains on the views that see its cell (`visibility.rs`), starts from the coarse Gaussians in and
+//! around the cell, and renders the other visible ones as frozen (`task.rs`). Its Gaussians within the cell become its
+//! part of the merged model (`merge.rs`). Every block has a share of the budget, so the merged model stays within it.
+//! `densify_launch` starts the tasks. Prints nothing.
 
-mod crop;
-mod divide;
+mod cells;
 mod ground;
 mod merge;
 mod options;
-mod picture;
 mod plan;
-mod sight;
+mod plan_svg;
 mod status;
 mod submit;
 mod task;
+mod visibility;
 
 use std::path::{Path, PathBuf};
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
+pub use cells::Cell;
 use densify_core::files;
 use densify_core::files::FileError;
+use densify_core::gaussians::Gaussians;
 use densify_run::failure::Failure;
-pub use divide::Cell;
 pub use ground::Ground;
 pub use merge::{Merged, merge};
 pub use options::{Grid, PlanOptions, Size};
 pub use plan::plan;
-pub use status::{State, status};
+pub use status::{TaskState, status};
 pub use submit::submit;
 pub use task::run;
 
-/// Most bytes of a plan, which takes 0.4 kB per block.
+/// Largest accepted plan `[bytes]`; a block takes 0.4 kB.
 const MAX_PLAN: u64 = 256 << 20;
-/// The plan in its folder.
+/// File name of the plan.
 pub const PLAN_FILE: &str = "plan.toml";
-/// Description of the coarse run, and of each block's, in the plan's folder: options that the user gave, and what the
-/// plan decides.
+/// Run descriptions of the coarse run and of a block: the user's options and those that the plan decides.
 const COARSE_FILE: &str = "coarse.toml";
 const BLOCK_FILE: &str = "block.toml";
-/// The merged model, where nothing else is said.
+/// Default file name of the merged model.
 const MERGED_FILE: &str = "merged.ply";
 
-/// A plan, as it stands in its file.
+/// A plan, as stored in its file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Blocks {
-    /// Version of densify that made it.
+pub struct BlockPlan {
+    /// Version of densify that made the plan.
     pub densify: String,
-    /// Folder of the dataset, absolute.
+    /// Absolute path of the dataset.
     pub scene: PathBuf,
-    /// Most Gaussians of the merged model.
+    /// Budget of the merged model.
     pub rows: usize,
-    /// Their spherical-harmonic degree.
+    /// Spherical-harmonic degree.
     pub sh_degree: u8,
     /// Processor threads of a task.
     pub threads: u32,
-    /// How far beyond its cell a block trains, along both axes of the ground `[world units]`.
+    /// Margin around a cell in which its block trains too, along both axes of the ground `[world units]`.
     pub margin: [f64; 2],
-    /// Most memory of a merge `[bytes]`.
+    /// Upper bound of a merge's memory `[bytes]`.
     pub merge_memory: u64,
-    /// The ground that is divided.
+    /// The ground plane.
     pub ground: Ground,
     /// The run over the whole scene.
     pub coarse: Coarse,
@@ -73,37 +71,37 @@ pub struct Blocks {
     pub block: Vec<Block>,
 }
 
-/// The run over the whole scene that blocks start from.
+/// The run over the whole scene from whose model the blocks start.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Coarse {
-    /// Its budget.
+    /// Budget.
     pub rows: usize,
-    /// Its length.
+    /// Number of iterations.
     pub iterations: u32,
-    /// What it takes at most `[bytes]`.
+    /// Upper bound of its memory `[bytes]`.
     pub memory: u64,
 }
 
-/// One block.
+/// A block.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Block {
-    /// Its name, and that of its folder.
+    /// Name of the block and of its folder.
     pub name: String,
-    /// Most Gaussians of it in the merged model.
+    /// Its share of the merged model's budget.
     pub rows: usize,
-    /// Most Gaussians that it trains, in its cell and the margin, of which the others are left out in the end.
+    /// Budget in training, margin included; the merge drops the Gaussians in the margin.
     pub budget: usize,
-    /// Training views that see it.
+    /// Number of training views that see its cell.
     pub views: usize,
-    /// Length of its run.
+    /// Number of iterations.
     pub iterations: u32,
-    /// What it takes at most `[bytes]`.
+    /// Upper bound of its memory `[bytes]`.
     pub memory: u64,
-    /// Its share of the work.
+    /// Fraction of the total work.
     pub work: f64,
-    /// Its cell.
+    /// The part of the ground that it covers.
     pub cell: Cell,
 }
 
@@ -112,17 +110,17 @@ pub struct Block {
 pub enum Task {
     /// The run over the whole scene.
     Coarse,
-    /// The run of a block, by its place.
+    /// The run of the block with this index.
     Block(usize),
     /// The merge of all blocks.
     Merge,
 }
 
-impl Blocks {
+impl BlockPlan {
     /// Reads the plan of a folder.
     ///
     /// # Errors
-    /// When there is none, or it is not one.
+    /// If the file is missing or malformed.
     pub fn read(folder: &Path) -> Result<Self, Failure> {
         let path = folder.join(PLAN_FILE);
         let text = files::read_text(&path, MAX_PLAN).map_err(|error| {
@@ -139,16 +137,16 @@ impl Blocks {
         }
     }
 
-    /// All tasks, each after those that it needs.
+    /// All tasks, each after those it depends on.
     pub fn tasks(&self) -> impl Iterator<Item = Task> {
         let blocks = (0..self.block.len()).map(Task::Block);
         std::iter::once(Task::Coarse).chain(blocks).chain([Task::Merge])
     }
 
-    /// The task of this name.
+    /// Finds a task by name.
     ///
     /// # Errors
-    /// When there is none.
+    /// If there is no such task.
     pub fn task(&self, name: &str) -> Result<Task, Failure> {
         self.tasks().find(|task| self.name(*task) == name).ok_or_else(|| {
             let names: Vec<&str> = self.tasks().map(|task| self.name(task)).collect();
@@ -163,56 +161,61 @@ impl Blocks {
     pub fn name(&self, task: Task) -> &str {
         match task {
             Task::Coarse => "coarse",
-            Task::Block(place) => &self.block[place].name,
+            Task::Block(index) => &self.block[index].name,
             Task::Merge => "merge",
         }
     }
 
-    /// What a task takes at most `[bytes]`.
+    /// Upper bound of a task's memory `[bytes]`.
     #[must_use]
     pub fn memory(&self, task: Task) -> u64 {
         match task {
             Task::Coarse => self.coarse.memory,
-            Task::Block(place) => self.block[place].memory,
+            Task::Block(index) => self.block[index].memory,
             Task::Merge => self.merge_memory,
         }
     }
 
-    /// Length of the run of a task; 0 for the merge.
+    /// Number of iterations of a task; 0 for the merge.
     #[must_use]
     pub fn iterations(&self, task: Task) -> u32 {
         match task {
             Task::Coarse => self.coarse.iterations,
-            Task::Block(place) => self.block[place].iterations,
+            Task::Block(index) => self.block[index].iterations,
             Task::Merge => 0,
         }
     }
 
-    /// Where a point of the world lies on the ground.
-    fn on_ground(&self, mean: [f32; 3]) -> [f64; 2] {
-        self.ground.at(DVec3::from(mean.map(f64::from)))
+    /// True if the centre of a Gaussian lies in a cell.
+    fn is_in_cell(&self, cell: &Cell, mean: [f32; 3]) -> bool {
+        cell.contains(self.ground.project(DVec3::from(mean.map(f64::from))))
+    }
+
+    /// The rows of a model whose centres lie in a cell.
+    fn rows_in_cell(&self, cell: &Cell, model: &Gaussians) -> Vec<usize> {
+        (0..model.len()).filter(|&row| self.is_in_cell(cell, model.means[row])).collect()
     }
 }
 
-/// Whether a name from a file leads nowhere else.
+/// True if a name from a file cannot lead out of the plan's folder.
 fn is_plain(name: &str) -> bool {
     let is_word = |c: char| c.is_ascii_alphanumeric() || c == '-';
     !name.is_empty() && name.chars().all(is_word)
 }
 
-/// Folder of a block in that of the plan.
-fn block_folder(plan: &Path, name: &str) -> PathBuf {
-    plan.join("blocks").join(name)
+/// Folder of a block.
+fn block_folder(folder: &Path, name: &str) -> PathBuf {
+    folder.join("blocks").join(name)
 }
 
-/// Folder of the run of a task in that of the plan.
+/// Folder of the run of a task.
 ///
 /// # Panics
-/// For the merge, which is no run.
-fn run_folder(plan: &Path, blocks: &Blocks, task: Task) -> PathBuf {
+/// For the merge, which is not a run.
+fn run_folder(folder: &Path, plan: &BlockPlan, task: Task) -> PathBuf {
     match task {
-        Task::Coarse => plan.join("coarse"),
-        Task::Block(place) => block_folder(plan, &blocks.block[place].name).join("run"),
+        Task::Coarse => folder.join("coarse"),
+        Task::Block(index) => block_folder(folder, &plan.block[index].name).join("run"),
         Task::Merge => unreachable!("a merge is no run"),
     }
 }

@@ -1,10 +1,10 @@
-//! Puts the blocks together: of each the rows in its cell, streamed into one file.
+//! Merges the blocks: streams the Gaussians in each block's cell into one file.
 
 use std::fs::File;
 use std::path::Path;
 
-use super::crop::inside;
-use super::{Block, Blocks, Task, run_folder};
+use super::status::is_complete;
+use super::{Block, BlockPlan, Task, run_folder};
 use densify_core::files::{WriteError, write_atomically_from};
 use densify_core::gaussians::{Gaussians, sh_coefficients};
 use densify_core::pieces::ROWS_AT_A_TIME;
@@ -15,72 +15,71 @@ use densify_run::{Observer, RunConfig, Silent};
 use densify_train::importance::{footprints, largest};
 use densify_train::output::model_path;
 
-/// What the program takes beside models `[bytes]`.
-const PROGRAM: u64 = 32 << 20;
+/// Memory of the program beside models `[bytes]`.
+const PROGRAM_MEMORY: u64 = 32 << 20;
 
-/// What was merged.
+/// A merged model.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Merged {
-    /// Gaussians.
+    /// Number of Gaussians.
     pub rows: usize,
     /// Size of the file `[bytes]`.
     pub bytes: u64,
-    /// Names of the blocks that are not complete, and so are not in it.
+    /// Names of incomplete blocks, which were left out.
     pub missing: Vec<String>,
 }
 
-/// What merging takes at most, where a block and what it has frozen have so many rows `[bytes]`: its model as it is
-/// read, into arrays that grow, and the part that is kept.
+/// Upper bound of the memory of a merge `[bytes]`, for the largest number of rows of a block with its frozen ones: the
+/// model while it is read into growing arrays, and its part in the cell.
 pub(super) fn memory(largest: usize, sh_degree: u8) -> u64 {
     let row = size_of::<f32>() * (11 + 3 * sh_coefficients(sh_degree));
-    PROGRAM + 4 * (largest * row) as u64
+    PROGRAM_MEMORY + 4 * (largest * row) as u64
 }
 
-/// Merges the blocks into a file; where `partial`, those that are complete.
+/// Merges the blocks into a file; with `partial`, only the complete ones.
 ///
 /// # Errors
-/// When a block is not complete, or a file cannot be read or written; then nothing is written.
+/// If a required block is incomplete, or a file cannot be read or written; nothing is written then.
 pub fn merge(
     folder: &Path,
-    blocks: &Blocks,
+    plan: &BlockPlan,
     output: &Path,
     format: &Format,
     partial: bool,
     observer: &dyn Observer,
 ) -> Result<Merged, Failure> {
-    let is_there = |place: &usize| super::status::is_complete(folder, blocks, Task::Block(*place));
-    let (there, missing): (Vec<usize>, Vec<usize>) =
-        (0..blocks.block.len()).partition(|place| is_there(place));
+    let (complete, missing): (Vec<usize>, Vec<usize>) =
+        (0..plan.block.len()).partition(|&index| is_complete(folder, plan, Task::Block(index)));
     let missing: Vec<String> =
-        missing.into_iter().map(|place| blocks.block[place].name.clone()).collect();
+        missing.into_iter().map(|index| plan.block[index].name.clone()).collect();
     if !missing.is_empty() && !partial {
         return Err(Failure::input(format!(
             "not complete: {}; run them (`densify blocks submit`), or merge the others with --partial",
             missing.join(", ")
         )));
     }
-    if there.is_empty() {
+    if complete.is_empty() {
         return Err(Failure::input(
             "no block is complete; run the plan first (`densify blocks submit`)",
         ));
     }
-    // The number of rows comes first in a file, so each block is read twice.
+    // The header holds the number of rows, so each block is read twice.
     let mut rows = 0;
-    for &place in &there {
-        rows += part(folder, blocks, place, observer)?.len();
+    for &index in &complete {
+        rows += read_part(folder, plan, index, observer)?.len();
     }
-    if rows > blocks.rows {
-        let message = format!("{rows} rows of the promised {}; this is a bug", blocks.rows);
+    if rows > plan.rows {
+        let message = format!("{rows} rows of the promised {}; this is a bug", plan.rows);
         return Err(Failure::new(OTHER, message));
     }
-    let shape = Shape { rows, sh_degree: blocks.sh_degree };
+    let shape = Shape { rows, sh_degree: plan.sh_degree };
     write_atomically_from::<Failure>(output, |out| {
         let mut writer = format.open_writer()?;
         writer.begin(shape, out)?;
-        for &place in &there {
-            let part = part(folder, blocks, place, &Silent).map_err(WriteError::Source)?;
-            let all: Vec<usize> = (0..part.len()).collect();
-            for piece in all.chunks(ROWS_AT_A_TIME) {
+        for &index in &complete {
+            let part = read_part(folder, plan, index, &Silent).map_err(WriteError::Source)?;
+            let rows: Vec<usize> = (0..part.len()).collect();
+            for piece in rows.chunks(ROWS_AT_A_TIME) {
                 writer.rows(&part.gather(piece), out)?;
             }
         }
@@ -91,17 +90,21 @@ pub fn merge(
     Ok(Merged { rows, bytes: bytes.len(), missing })
 }
 
-/// What a block has trained in its cell; of more than its share the faintest and smallest are left out.
-fn part(
+/// Reads the Gaussians that a block has trained in its cell. If they exceed its share, the faintest and smallest are
+/// left out.
+fn read_part(
     folder: &Path,
-    blocks: &Blocks,
-    place: usize,
+    plan: &BlockPlan,
+    index: usize,
     observer: &dyn Observer,
 ) -> Result<Gaussians, Failure> {
-    let Block { cell, rows: most, .. } = &blocks.block[place];
-    let run = run_folder(folder, blocks, Task::Block(place));
+    let Block { cell, rows: limit, .. } = &plan.block[index];
+    let run = run_folder(folder, plan, Task::Block(index));
     let frozen = RunConfig::read(&run)?.resolved.frozen.map_or(0, |model| model.rows);
     let model = read_model(&model_path(&run, iteration(&run, None)?), observer)?;
-    let part = model.gather(&inside(blocks, cell, &model, frozen)).with_degree(blocks.sh_degree);
-    Ok(if part.len() > *most { part.gather(&largest(&footprints(&part), *most)) } else { part })
+    // Frozen rows come first in the model of a run.
+    let mut rows = plan.rows_in_cell(cell, &model);
+    rows.retain(|&row| row >= frozen);
+    let part = model.gather(&rows).with_degree(plan.sh_degree);
+    Ok(if part.len() > *limit { part.gather(&largest(&footprints(&part), *limit)) } else { part })
 }

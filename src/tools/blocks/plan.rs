@@ -1,16 +1,18 @@
-//! Makes a plan: cuts the ground, finds each block's views and share, and asks the ledger what each task takes.
+//! Plans blocks: divides the ground, determines each block's views and share of the budget, and estimates the memory of
+//! each task from its ledger.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use tempfile::TempDir;
 
-use super::divide::cells;
-use super::options::{Grid, MOST, PlanOptions, Size};
-use super::picture::picture;
-use super::sight::Sight;
+use super::cells::divide;
+use super::options::{Grid, MAX_GRID, PlanOptions, Size};
+use super::task::VIEWS_FILE;
+use super::visibility::Visibility;
 use super::{
-    BLOCK_FILE, Block, Blocks, COARSE_FILE, Cell, Coarse, Ground, PLAN_FILE, block_folder,
+    BLOCK_FILE, Block, BlockPlan, COARSE_FILE, Cell, Coarse, Ground, PLAN_FILE, block_folder,
+    plan_svg,
 };
 use densify_core::camera::Camera;
 use densify_core::files::{FileError, write_atomically};
@@ -25,16 +27,19 @@ use densify_run::{
 };
 use densify_train::exposure::ExposureChoice;
 
-/// A block with fewer Gaussians is none.
-const LEAST_ROWS: usize = 100;
-/// The coarse run: its share of the rows, at least so many; its share of the iterations; width of its images `[px]`.
-/// Blocks take up what their frozen neighbours show wrongly, so that these must be good; docs/blocks.md has the cost.
-const COARSE_ROWS: [usize; 2] = [2, 5];
-const COARSE_LEAST: usize = 1_000;
-const COARSE_ITERATIONS: u32 = 2;
+/// Fewest Gaussians of a block.
+const MIN_ROWS: usize = 100;
+/// Default budget of the coarse run, as a fraction of the merged model's. BlockPlan compensate errors of their frozen
+/// neighbours, so a better coarse model gives a better merged one (docs/blocks.md).
+const COARSE_SHARE: [usize; 2] = [2, 5];
+/// Smallest default budget of the coarse run.
+const MIN_COARSE_ROWS: usize = 1_000;
+/// The length of a single run over the whole scene is divided by this for the coarse run.
+const COARSE_SHORTENING: u32 = 2;
+/// Most width of the images of the coarse run `[px]`.
 const COARSE_WIDTH: u32 = 400;
-/// Options of a run that the plan itself decides.
-const OWN: [&str; 10] = [
+/// Options of a run that the plan sets itself.
+const OWN_OPTIONS: [&str; 10] = [
     "scene",
     "output",
     "budget",
@@ -47,26 +52,26 @@ const OWN: [&str; 10] = [
     "view",
 ];
 
-/// Plans, and writes the plan's folder as a whole or not at all.
+/// Plans blocks and writes the plan's folder, completely or not at all.
 ///
 /// # Errors
-/// When the dataset cannot be read or divided, something does not fit, or the folder is taken.
-pub fn plan(options: &PlanOptions, observer: &dyn Observer) -> Result<Blocks, Failure> {
+/// If the dataset cannot be read or divided, a task does not fit, or the folder is not empty.
+pub fn plan(options: &PlanOptions, observer: &dyn Observer) -> Result<BlockPlan, Failure> {
     let planner = Planner::new(options, observer)?;
-    let staged = stage(&options.output)?;
+    let staging = create_staging(&options.output)?;
     let blocks = match options.grid {
-        Grid::Of(grid) => planner.divided(grid, staged.path())?,
-        Grid::Auto => planner.fewest(staged.path())?,
+        Grid::Fixed(grid) => planner.plan_grid(grid, staging.path())?,
+        Grid::Auto => planner.plan_fewest(staging.path())?,
     };
-    planner.write(&blocks, staged.path())?;
+    planner.write(&blocks, staging.path())?;
     let target = &options.output;
-    fs::rename(staged.path(), target)
+    fs::rename(staging.path(), target)
         .map_err(FileError::io("move the plan to the folder", target))?;
     Ok(blocks)
 }
 
-/// A folder beside the plan's, which goes away with this value unless it is moved there.
-fn stage(output: &Path) -> Result<TempDir, Failure> {
+/// Creates a temporary folder beside the plan's.
+fn create_staging(output: &Path) -> Result<TempDir, Failure> {
     let is_empty = fs::read_dir(output).map(|mut entries| entries.next().is_none());
     match is_empty {
         Ok(true) => {}
@@ -93,7 +98,7 @@ struct Planner<'a> {
     spec: RunSpec,
     dataset: Dataset,
     ground: Ground,
-    sight: Sight,
+    visibility: Visibility,
     rows: usize,
     sh_degree: u8,
     coarse_rows: usize,
@@ -101,7 +106,7 @@ struct Planner<'a> {
 
 impl<'a> Planner<'a> {
     fn new(options: &'a PlanOptions, observer: &dyn Observer) -> Result<Self, Failure> {
-        if let Some((name, _)) = options.given.iter().find(|(name, _)| OWN.contains(name)) {
+        if let Some((name, _)) = options.given.iter().find(|(name, _)| OWN_OPTIONS.contains(name)) {
             return Err(Failure::input(format!(
                 "--{} is set by the plan itself; leave it out after `--`",
                 name.replace('_', "-")
@@ -129,67 +134,71 @@ impl<'a> Planner<'a> {
         };
         let dataset = Dataset::load(&scene, &spec.data.load_options(true))?;
         say_notes(observer, &dataset.notes);
-        let to_world = &dataset.normalisation;
-        let cameras: Vec<Camera> =
-            dataset.train.iter().map(|v| to_world.world_from_scene_camera(&v.camera)).collect();
-        let ground = Ground::of(&cameras);
-        let sight = Sight::of(&dataset, &ground)?;
+        let normalisation = &dataset.normalisation;
+        let cameras: Vec<Camera> = dataset
+            .train
+            .iter()
+            .map(|v| normalisation.world_from_scene_camera(&v.camera))
+            .collect();
+        let ground = Ground::fit(&cameras);
+        let visibility = Visibility::new(&dataset, &ground)?;
         let rows = match options.size {
             Size::Rows(rows) => rows,
             Size::Bytes(bytes) => {
                 let row = (size_of::<f32>() * (14 + 3 * sh_coefficients(sh_degree))) as u64;
-                // What comes before the rows takes less than this.
+                // 4,096 bytes are more than the header takes.
                 usize::try_from(bytes.saturating_sub(4096) / row).unwrap_or(usize::MAX)
             }
         };
-        if rows < LEAST_ROWS {
+        if rows < MIN_ROWS {
             return Err(Failure::input(format!(
-                "a merged model of {rows} Gaussians is none; give --rows or --bytes for at least {LEAST_ROWS}"
+                "a merged model of {rows} Gaussians is none; give --rows or --bytes for at least {MIN_ROWS}"
             )));
         }
-        let planner =
-            Self { options, scene, spec, dataset, ground, sight, rows, sh_degree, coarse_rows: 0 };
-        let coarse_rows = match options.coarse_rows {
-            Some(rows) => rows,
-            None => planner.usual_coarse_rows()?,
+        let mut planner = Self {
+            options,
+            scene,
+            spec,
+            dataset,
+            ground,
+            visibility,
+            rows,
+            sh_degree,
+            coarse_rows: 0,
         };
-        Ok(Self { coarse_rows, ..planner })
+        planner.coarse_rows =
+            options.coarse_rows.map_or_else(|| planner.default_coarse_rows(), Ok)?;
+        Ok(planner)
     }
 
-    /// Rows of the coarse run where none are given.
-    fn usual_coarse_rows(&self) -> Result<usize, Failure> {
-        let [part, whole] = COARSE_ROWS;
-        let usual = self.rows * part / whole;
-        let most = match self.options.memory {
-            Some(_) => {
-                let mut spec = self.shared().describe()?;
-                spec.start.scene = Some(self.scene.clone());
-                spec.size.budget = Some(Budget::Rows(self.rows));
-                // Half of what fits: a block has frozen rows and its own.
-                estimate(&spec, [None, None], Host::default())?.0 / 2
-            }
-            None => usual,
-        };
-        Ok(usual.min(most).max(COARSE_LEAST))
+    /// Default budget of the coarse run.
+    fn default_coarse_rows(&self) -> Result<usize, Failure> {
+        let [part, whole] = COARSE_SHARE;
+        let mut rows = self.rows * part / whole;
+        if self.options.memory.is_some() {
+            let spec = self.spec_of(self.shared_options(), self.rows)?;
+            // Half of what fits: a block holds frozen Gaussians besides its own.
+            rows = rows.min(estimate(&spec, [None, None], Host::default())?.0 / 2);
+        }
+        Ok(rows.max(MIN_COARSE_ROWS))
     }
 
-    /// The fewest blocks that fit the memory of a task.
-    fn fewest(&self, staged: &Path) -> Result<Blocks, Failure> {
+    /// Plans the fewest blocks whose tasks fit in memory.
+    fn plan_fewest(&self, staging: &Path) -> Result<BlockPlan, Failure> {
         let Some(memory) = self.options.memory else {
             return Err(Failure::input(
                 "--blocks auto: as few as fit --memory, which is missing; give it, or the number of blocks",
             ));
         };
         let mut last = None;
-        for side in 1..=MOST {
+        for side in 1..=MAX_GRID {
             for grid in [[side, side.saturating_sub(1).max(1)], [side, side]] {
-                match self.divided(grid, staged) {
+                match self.plan_grid(grid, staging) {
                     Ok(blocks) => return Ok(blocks),
-                    // Smaller blocks may fit, as long as they are blocks.
+                    // Smaller blocks may fit, until they are too small to train.
                     Err(failure) if is_too_large(&failure) => last = Some(failure),
                     Err(failure) => {
-                        let why = last.unwrap_or(failure);
-                        return Err(why.and(&format!(
+                        return Err(last.unwrap_or(failure).and(&format!(
                             "no division fits --memory {}: {}x{} blocks are too small already; give more memory, \
                              or fewer --rows",
                             Bytes(memory),
@@ -203,50 +212,47 @@ impl<'a> Planner<'a> {
         Err(Failure::input(format!("--memory {}: no division fits", Bytes(memory))))
     }
 
-    /// The plan with so many blocks.
-    fn divided(&self, grid: [usize; 2], staged: &Path) -> Result<Blocks, Failure> {
-        let work = self.sight.work();
+    /// Plans a given number of blocks.
+    fn plan_grid(&self, grid: [usize; 2], staging: &Path) -> Result<BlockPlan, Failure> {
+        let work = self.visibility.work();
         let total: f64 = work.iter().sum();
-        let widths = self.sight.widths();
+        let widths = self.visibility.widths();
         let margin = [0, 1].map(|axis| self.options.margin * widths[axis] / grid[axis] as f64);
+        let points = &self.visibility.on_ground;
         let mut block = Vec::new();
-        for (place, cell) in cells(&self.sight.at, &work, grid).into_iter().enumerate() {
-            let name = format!("block-{}-{}", place / grid[1], place % grid[1]);
+        for (index, cell) in divide(points, &work, grid).into_iter().enumerate() {
+            let name = format!("block-{}-{}", index / grid[1], index % grid[1]);
             let share = |cell: &Cell| {
-                let points = self.sight.at.iter().zip(&work).filter(|(at, _)| cell.has(**at));
-                points.map(|(_, work)| work).sum::<f64>() / total.max(f64::MIN_POSITIVE)
+                let inside = points.iter().zip(&work).filter(|(at, _)| cell.contains(**at));
+                inside.map(|(_, work)| work).sum::<f64>() / total.max(f64::MIN_POSITIVE)
             };
-            let of_all = |share: f64| (self.rows as f64 * share) as usize;
-            let wide = cell.widened(margin);
-            // As many per unit of work in the margin as in the cell.
-            let (budget, share) = (of_all(share(&wide)), share(&cell));
-            let rows = of_all(share);
-            let views = self.sight.views(&self.dataset, &self.ground, &wide);
+            let rows_for = |share: f64| (self.rows as f64 * share) as usize;
+            let widened = cell.widened(margin);
+            // The margin has the same density of Gaussians per unit of work.
+            let (budget, work) = (rows_for(share(&widened)), share(&cell));
+            let rows = rows_for(work);
+            let views = self.visibility.views(&self.dataset, &self.ground, &widened);
             let train = views.iter().filter(|(_, part)| part.is_some()).count();
-            if train == 0 || rows < LEAST_ROWS {
+            if train == 0 || rows < MIN_ROWS {
                 return Err(Failure::input(format!(
                     "{name} of {}x{} would have {train} training views and {rows} Gaussians, which is no model; \
                      give fewer --blocks, or more --rows",
                     grid[0], grid[1]
                 )));
             }
-            let folder = block_folder(staged, &name);
-            let written = fs::create_dir_all(&folder);
-            written.map_err(FileError::io("create the folder", &folder))?;
+            let folder = block_folder(staging, &name);
             let lines: String = views.iter().map(|(name, part)| view_line(name, *part)).collect();
-            write_atomically(&folder.join(super::task::VIEWS_FILE), |out| {
-                out.write_all(lines.as_bytes())
-            })?;
+            write_atomically(&folder.join(VIEWS_FILE), |out| out.write_all(lines.as_bytes()))?;
             let share_of_views = train as f64 / self.dataset.train.len() as f64;
             let whole = f64::from(self.spec.schedule.iterations.0);
             let iterations = ((whole * share_of_views).round() as u32).max(1);
             let memory = self.memory_of_block(&name, budget, iterations, &folder)?;
             let views = train;
-            block.push(Block { name, rows, budget, views, iterations, memory, work: share, cell });
+            block.push(Block { name, rows, budget, views, iterations, memory, work, cell });
         }
         let coarse = self.coarse()?;
         let largest = block.iter().map(|block| block.budget).max().unwrap_or(0) + self.coarse_rows;
-        Ok(Blocks {
+        Ok(BlockPlan {
             densify: env!("CARGO_PKG_VERSION").to_owned(),
             scene: self.scene.clone(),
             rows: self.rows,
@@ -266,35 +272,40 @@ impl<'a> Planner<'a> {
         own.unwrap_or_else(cores)
     }
 
-    /// The description that all tasks share.
-    fn shared(&self) -> Partial {
-        let degree = Partial::option("sh_degree", i64::from(self.sh_degree));
-        let threads = Partial::option("threads", i64::from(self.threads()));
-        let own = degree.over(threads);
-        let memory =
-            |bytes: u64| Partial::option("memory", i64::try_from(bytes).unwrap_or(i64::MAX));
-        let own = match self.options.memory {
-            Some(bytes) => memory(bytes).over(own),
-            None => own,
-        };
-        own.over(self.options.given.clone())
+    /// The options that all tasks share.
+    fn shared_options(&self) -> Partial {
+        let mut options = Partial::option("sh_degree", i64::from(self.sh_degree))
+            .over(Partial::option("threads", i64::from(self.threads())));
+        if let Some(bytes) = self.options.memory {
+            let bytes = i64::try_from(bytes).unwrap_or(i64::MAX);
+            options = Partial::option("memory", bytes).over(options);
+        }
+        options.over(self.options.given.clone())
     }
 
-    fn of_block(&self, iterations: u32) -> Partial {
-        Partial::option("iterations", i64::from(iterations)).over(self.shared())
+    fn block_options(&self, iterations: u32) -> Partial {
+        Partial::option("iterations", i64::from(iterations)).over(self.shared_options())
     }
 
-    fn of_coarse(&self) -> Partial {
-        let iterations = (self.spec.schedule.iterations.0 / COARSE_ITERATIONS).max(1);
-        let mut own = Partial::option("iterations", i64::from(iterations));
+    fn coarse_options(&self) -> Partial {
+        let iterations = (self.spec.schedule.iterations.0 / COARSE_SHORTENING).max(1);
+        let mut options = Partial::option("iterations", i64::from(iterations));
         let width = self.dataset.largest_image().0;
         if self.spec.data.resolution.is_none() && width > COARSE_WIDTH {
-            own = Partial::option("resolution", i64::from(COARSE_WIDTH)).over(own);
+            options = Partial::option("resolution", i64::from(COARSE_WIDTH)).over(options);
         }
-        own.over(self.shared())
+        options.over(self.shared_options())
     }
 
-    /// What the run of a block takes at most: with all of the coarse model.
+    /// The run with these options on the plan's scene.
+    fn spec_of(&self, options: Partial, budget: usize) -> Result<RunSpec, Failure> {
+        let mut spec = options.describe()?;
+        spec.start.scene = Some(self.scene.clone());
+        spec.size.budget = Some(Budget::Rows(budget));
+        Ok(spec)
+    }
+
+    /// Upper bound of the memory of a block's run, which at most holds the whole coarse model.
     fn memory_of_block(
         &self,
         name: &str,
@@ -302,25 +313,21 @@ impl<'a> Planner<'a> {
         iterations: u32,
         folder: &Path,
     ) -> Result<u64, Failure> {
-        let mut spec = self.of_block(iterations).describe()?;
-        spec.start.scene = Some(self.scene.clone());
-        spec.data.views = Some(AbsolutePath(folder.join(super::task::VIEWS_FILE)));
+        let mut spec = self.spec_of(self.block_options(iterations), rows + self.coarse_rows)?;
+        spec.data.views = Some(AbsolutePath(folder.join(VIEWS_FILE)));
         spec.start.init = Some(InitChoice::Model(AbsolutePath(folder.to_owned())));
-        spec.size.budget = Some(Budget::Rows(rows + self.coarse_rows));
         let coarse = Some(ModelSize { rows: self.coarse_rows, sh_degree: self.sh_degree });
-        self.fitting(name, &spec, [coarse, coarse])
+        self.memory_of_run(name, &spec, [coarse, coarse])
     }
 
     fn coarse(&self) -> Result<Coarse, Failure> {
-        let mut spec = self.of_coarse().describe()?;
-        spec.start.scene = Some(self.scene.clone());
-        spec.size.budget = Some(Budget::Rows(self.coarse_rows));
-        let memory = self.fitting("the coarse run", &spec, [None, None])?;
+        let spec = self.spec_of(self.coarse_options(), self.coarse_rows)?;
+        let memory = self.memory_of_run("the coarse run", &spec, [None, None])?;
         Ok(Coarse { rows: self.coarse_rows, iterations: spec.schedule.iterations.0, memory })
     }
 
-    /// What a run takes, if it fits.
-    fn fitting(
+    /// Upper bound of a run's memory; fails if it exceeds the limit.
+    fn memory_of_run(
         &self,
         name: &str,
         spec: &RunSpec,
@@ -340,34 +347,34 @@ impl<'a> Planner<'a> {
         Ok(ledger.on_host())
     }
 
-    /// Writes everything but the views, which are there.
-    fn write(&self, blocks: &Blocks, staged: &Path) -> Result<(), Failure> {
+    /// Writes all files but the lists of views, which exist already.
+    fn write(&self, plan: &BlockPlan, staging: &Path) -> Result<(), Failure> {
         let text =
             |partial: Partial| toml::to_string(&partial.into_table()).map_err(Failure::input);
         let put = |path: PathBuf, text: String| {
             write_atomically(&path, |out| out.write_all(text.as_bytes()))
         };
-        // Of divisions that were tried and did not fit, more may be there.
-        let names: Vec<&str> = blocks.block.iter().map(|block| &*block.name).collect();
-        let all = staged.join("blocks");
-        for entry in fs::read_dir(&all).into_iter().flatten().flatten() {
+        // Divisions that did not fit have left folders of other blocks.
+        let names: Vec<&str> = plan.block.iter().map(|block| &*block.name).collect();
+        for entry in fs::read_dir(staging.join("blocks")).into_iter().flatten().flatten() {
             if !names.iter().any(|name| entry.file_name() == *name) {
                 let path = entry.path();
                 fs::remove_dir_all(&path).map_err(FileError::io("remove", &path))?;
             }
         }
-        put(staged.join(COARSE_FILE), text(self.of_coarse())?)?;
-        for block in &blocks.block {
-            let path = block_folder(staged, &block.name).join(BLOCK_FILE);
-            put(path, text(self.of_block(block.iterations))?)?;
+        put(staging.join(COARSE_FILE), text(self.coarse_options())?)?;
+        for block in &plan.block {
+            let path = block_folder(staging, &block.name).join(BLOCK_FILE);
+            put(path, text(self.block_options(block.iterations))?)?;
         }
-        put(staged.join("plan.svg"), picture(blocks, &self.sight, &self.dataset))?;
-        put(staged.join(PLAN_FILE), toml::to_string(blocks).map_err(Failure::input)?)?;
+        let drawing = plan_svg::draw(plan, &self.visibility.on_ground, &self.dataset);
+        put(staging.join("plan.svg"), drawing)?;
+        put(staging.join(PLAN_FILE), toml::to_string(plan).map_err(Failure::input)?)?;
         Ok(())
     }
 }
 
-/// How the failure begins that more blocks may mend.
+/// Start of the message of a failure that more blocks may avoid.
 const TOO_LARGE: &str = "a task is too large";
 
 fn is_too_large(failure: &Failure) -> bool {

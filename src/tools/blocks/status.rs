@@ -1,56 +1,56 @@
-//! How far a plan is, from its folders alone, whatever started the tasks.
+//! Determines the progress of a plan from its folders alone, whatever started the tasks.
 
 use std::path::Path;
 
-use super::{Blocks, MERGED_FILE, Task, run_folder};
+use super::{BlockPlan, MERGED_FILE, Task, run_folder};
 use densify_train::checkpoint::newest_step;
 use densify_train::output::{CONFIG_FILE, is_in_use, model_path, summary_of};
 
-/// How far a task is.
+/// The progress of a task.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum State {
-    /// Nothing is there.
+pub enum TaskState {
+    /// Not started.
     Waiting,
-    /// A process is at it; the last checkpoint's step.
+    /// In progress, with the iteration of the last checkpoint.
     Running(u32),
-    /// It was stopped, and can go on; the last checkpoint's step.
+    /// Stopped, can be resumed; with the iteration of the last checkpoint.
     Stopped(u32),
-    /// It is done.
+    /// Done.
     Complete,
 }
 
-/// The state of each task, in their order.
+/// The state of each task, in the order of [`BlockPlan::tasks`].
 #[must_use]
-pub fn status(folder: &Path, blocks: &Blocks) -> Vec<(Task, State)> {
-    blocks.tasks().map(|task| (task, state(folder, blocks, task))).collect()
+pub fn status(folder: &Path, plan: &BlockPlan) -> Vec<(Task, TaskState)> {
+    plan.tasks().map(|task| (task, state(folder, plan, task))).collect()
 }
 
-fn state(folder: &Path, blocks: &Blocks, task: Task) -> State {
-    if is_complete(folder, blocks, task) {
-        return State::Complete;
+fn state(folder: &Path, plan: &BlockPlan, task: Task) -> TaskState {
+    if is_complete(folder, plan, task) {
+        return TaskState::Complete;
     }
     if task == Task::Merge {
-        return State::Waiting;
+        return TaskState::Waiting;
     }
-    let run = run_folder(folder, blocks, task);
+    let run = run_folder(folder, plan, task);
     let step = newest_step(&run).unwrap_or(0);
     if is_in_use(&run) {
-        State::Running(step)
+        TaskState::Running(step)
     } else if run.join(CONFIG_FILE).exists() {
-        State::Stopped(step)
+        TaskState::Stopped(step)
     } else {
-        State::Waiting
+        TaskState::Waiting
     }
 }
 
-/// Whether a task is done.
-pub(super) fn is_complete(folder: &Path, blocks: &Blocks, task: Task) -> bool {
+/// True if a task is done.
+pub(super) fn is_complete(folder: &Path, plan: &BlockPlan, task: Task) -> bool {
     if task == Task::Merge {
         return folder.join(MERGED_FILE).is_file();
     }
-    let run = run_folder(folder, blocks, task);
+    let run = run_folder(folder, plan, task);
     let summary = summary_of(&run).ok().flatten();
-    let iterations = blocks.iterations(task);
-    let is_finished = summary.is_some_and(|it| it.finished && it.iterations >= iterations);
-    is_finished && model_path(&run, iterations).is_file()
+    let iterations = plan.iterations(task);
+    summary.is_some_and(|summary| summary.finished && summary.iterations >= iterations)
+        && model_path(&run, iterations).is_file()
 }

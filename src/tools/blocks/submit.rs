@@ -1,34 +1,33 @@
-//! The tasks of a plan that are not complete, as an engine starts them.
+//! Submits the incomplete tasks of a plan.
 
 use std::path::Path;
 
-use super::{Blocks, State, Task, status};
+use super::{BlockPlan, Task, TaskState, status};
 use densify_launch as launch;
 use densify_launch::{Batch, Job, Stage, Submission, utf8};
 use densify_run::Observer;
 use densify_run::failure::Failure;
 
-/// Starts the tasks that are not complete, or hands them in.
+/// Runs the tasks that are not complete, or submits them to a scheduler.
 ///
 /// # Errors
-/// As [`launch::submit`].
+/// Errors of [`launch::submit`].
 pub fn submit(
     folder: &Path,
-    blocks: &Blocks,
+    plan: &BlockPlan,
     submission: Submission,
     observer: &dyn Observer,
 ) -> Result<(), Failure> {
-    let is_open = |(_, state): &(Task, State)| *state != State::Complete;
-    let open: Vec<Task> =
-        status(folder, blocks).into_iter().filter(is_open).map(|(task, _)| task).collect();
+    let open = |(task, state)| (state != TaskState::Complete).then_some(task);
+    let open: Vec<Task> = status(folder, plan).into_iter().filter_map(open).collect();
     if open.is_empty() {
         observer.say(format_args!("every task is complete"));
         return Ok(());
     }
     let folder = std::path::absolute(folder).map_err(Failure::input)?;
-    let stage = |name, is_array, of: fn(Task) -> bool| {
-        let tasks = open.iter().copied().filter(|task| of(*task));
-        Stage { name, is_array, jobs: tasks.map(|task| job(blocks, task)).collect() }
+    let stage = |name, is_array, includes: fn(Task) -> bool| {
+        let tasks = open.iter().copied().filter(|task| includes(*task));
+        Stage { name, is_array, jobs: tasks.map(|task| job(plan, task)).collect() }
     };
     let stages = [
         stage("coarse", false, |task| task == Task::Coarse),
@@ -44,12 +43,12 @@ pub fn submit(
     launch::submit(&batch, submission, observer)
 }
 
-fn job(blocks: &Blocks, task: Task) -> Job {
+fn job(plan: &BlockPlan, task: Task) -> Job {
     Job {
-        name: blocks.name(task).to_owned(),
-        place: if let Task::Block(place) = task { place } else { 0 },
-        memory: blocks.memory(task),
-        threads: if task == Task::Merge { 1 } else { blocks.threads },
+        name: plan.name(task).to_owned(),
+        index: if let Task::Block(index) = task { index } else { 0 },
+        memory: plan.memory(task),
+        threads: if task == Task::Merge { 1 } else { plan.threads },
         may_have_fewer_threads: true,
     }
 }

@@ -1,13 +1,16 @@
-//! Runs one task. Killed and started again, it goes on from its last checkpoint to the same bytes.
+//! Runs a task. A task that was killed resumes from its last checkpoint and produces the same bytes.
 
 use std::fs;
 use std::path::Path;
 
-use super::crop::{beyond, inside};
-use super::{BLOCK_FILE, Blocks, COARSE_FILE, MERGED_FILE, Task, block_folder, merge, run_folder};
+use glam::DVec3;
+
+use super::status::is_complete;
+use super::{
+    BLOCK_FILE, BlockPlan, COARSE_FILE, MERGED_FILE, Task, block_folder, merge, run_folder,
+};
 use densify_core::camera::Camera;
 use densify_core::files::{FileError, write_atomically};
-use densify_core::gaussians::Gaussians;
 use densify_core::numbers::grouped;
 use densify_data::dataset::Dataset;
 use densify_data::models::PLY;
@@ -17,108 +20,111 @@ use densify_run::finished::{iteration, read_model};
 use densify_run::{Host, Observer, Occupied, Partial, Run, start};
 use densify_train::output::model_path;
 
-/// Names of a block's views.
+/// Lists the views of a block.
 pub(super) const VIEWS_FILE: &str = "views.txt";
-/// What of the coarse model a block starts from, and what it has frozen.
+/// The coarse Gaussians from which a block starts, and those that it renders as frozen.
 const START_FILE: &str = "start.ply";
 const FROZEN_FILE: &str = "frozen.ply";
+/// Distance beyond an image's border at which a Gaussian may still contribute to it, as a fraction of the image's size.
+const IMAGE_MARGIN: f64 = 0.25;
 
-/// Runs a task of the plan in a folder, or what is left of it.
+/// Runs or resumes a task of the plan in a folder.
 ///
 /// # Errors
-/// When a task that it needs is not complete, a file of the plan is missing, and as a run's.
+/// If a task that it depends on is incomplete, a file of the plan is missing, or the run fails.
 pub fn run(
     folder: &Path,
-    blocks: &Blocks,
+    plan: &BlockPlan,
     task: Task,
     threads: Option<u32>,
     observer: &dyn Observer,
 ) -> Result<(), Failure> {
-    // A merge is made again, as what it is made of may have changed.
-    if task != Task::Merge && super::status::is_complete(folder, blocks, task) {
-        observer.say(format_args!("{} is complete", blocks.name(task)));
+    // Blocks may have changed since the last merge.
+    if task != Task::Merge && is_complete(folder, plan, task) {
+        observer.say(format_args!("{} is complete", plan.name(task)));
         return Ok(());
     }
     let given = match task {
-        Task::Coarse => coarse(folder, blocks)?,
-        Task::Block(place) => block(folder, blocks, place, observer)?,
+        Task::Coarse => budget(plan.coarse.rows).over(read_options(&folder.join(COARSE_FILE))?),
+        Task::Block(index) => prepare_block(folder, plan, index, observer)?,
         Task::Merge => {
             let output = folder.join(MERGED_FILE);
-            let merged = merge(folder, blocks, &output, PLY, false, observer)?;
+            let merged = merge(folder, plan, &output, PLY, false, observer)?;
             observer.say(format_args!("{}: {} Gaussians", output.display(), grouped(merged.rows)));
             return Ok(());
         }
     };
-    let output = run_folder(folder, blocks, task);
-    let scene = Partial::option("scene", utf8(&blocks.scene)?);
-    let own = text("output", &output)?.over(scene);
-    let own = match threads {
-        Some(threads) => Partial::option("threads", i64::from(threads)).over(own),
-        None => own,
-    };
-    let (spec, resumed) = start(own.over(given), observer)?;
-    let run = Run::prepare_on(&spec, resumed, Host::new(observer))?;
-    run.train(Occupied::Resume, observer)?;
+    let output = run_folder(folder, plan, task);
+    let scene = Partial::option("scene", utf8(&plan.scene)?);
+    let mut options = path_option("output", &output)?.over(scene).over(given);
+    if let Some(threads) = threads {
+        options = Partial::option("threads", i64::from(threads)).over(options);
+    }
+    let (spec, resumed) = start(options, observer)?;
+    Run::prepare_on(&spec, resumed, Host::new(observer))?.train(Occupied::Resume, observer)?;
     Ok(())
 }
 
-/// An option that is the path of a file in the plan's folder.
-fn text(name: &str, path: &Path) -> Result<Partial, Failure> {
+/// An option whose value is an absolute path.
+fn path_option(name: &str, path: &Path) -> Result<Partial, Failure> {
     let path = std::path::absolute(path).map_err(Failure::input)?;
     Ok(Partial::option(name, utf8(&path)?))
 }
 
-fn rows(budget: usize) -> Partial {
-    Partial::option("budget", i64::try_from(budget).unwrap_or(i64::MAX))
+fn budget(rows: usize) -> Partial {
+    Partial::option("budget", i64::try_from(rows).unwrap_or(i64::MAX))
 }
 
-fn described(path: &Path) -> Result<Partial, Failure> {
+fn read_options(path: &Path) -> Result<Partial, Failure> {
     Partial::read(path).map_err(|failure| {
         failure.and("this file is a part of the plan; if it is lost, plan again in another folder")
     })
 }
 
-fn coarse(folder: &Path, blocks: &Blocks) -> Result<Partial, Failure> {
-    Ok(rows(blocks.coarse.rows).over(described(&folder.join(COARSE_FILE))?))
-}
-
-/// Cuts the coarse model in two, and describes the run of a block between them.
-fn block(
+/// Splits the coarse model into the Gaussians that a block trains and those that it renders as frozen, writes both, and
+/// returns the options of the block's run.
+fn prepare_block(
     folder: &Path,
-    blocks: &Blocks,
-    place: usize,
+    plan: &BlockPlan,
+    index: usize,
     observer: &dyn Observer,
 ) -> Result<Partial, Failure> {
-    let block = &blocks.block[place];
-    let own = block_folder(folder, &block.name);
-    let given = described(&own.join(BLOCK_FILE))?;
-    let views = own.join(VIEWS_FILE);
-    if !super::status::is_complete(folder, blocks, Task::Coarse) {
+    let block = &plan.block[index];
+    let block_folder = block_folder(folder, &block.name);
+    let given = read_options(&block_folder.join(BLOCK_FILE))?;
+    let views = path_option("views", &block_folder.join(VIEWS_FILE))?;
+    if !is_complete(folder, plan, Task::Coarse) {
         return Err(Failure::input(format!(
             "{} starts from the coarse model, which is not complete; run the task coarse first",
             block.name
         )));
     }
-    let run = run_folder(folder, blocks, Task::Coarse);
+    let run = run_folder(folder, plan, Task::Coarse);
     let model = read_model(&model_path(&run, iteration(&run, None)?), observer)?;
-    let cell = block.cell.widened(blocks.margin);
-    let first = inside(blocks, &cell, &model, 0);
-    if first.is_empty() {
+    let cell = block.cell.widened(plan.margin);
+    let trained = plan.rows_in_cell(&cell, &model);
+    if trained.is_empty() {
         return Err(Failure::input(format!(
             "{}: the coarse model has no Gaussian there; plan with fewer --blocks or more --coarse-rows",
             block.name
         )));
     }
-    let cameras = cameras(blocks, given.clone(), &views)?;
-    let frozen = beyond(blocks, &cell, &model, &cameras);
-    let put = |file: &str, model: Gaussians| -> Result<Partial, Failure> {
-        let path = own.join(file);
-        write_atomically(&path, |out| PLY.write(&model, out))?;
-        text(if file == START_FILE { "init" } else { "freeze" }, &path)
+    let cameras = world_cameras(plan, views.clone().over(given.clone()))?;
+    let is_frozen = |row: &usize| {
+        let mean = model.means[*row];
+        let centre = DVec3::from(mean.map(f64::from));
+        let is_visible = |camera: &Camera| camera.depth_in_image(centre, IMAGE_MARGIN).is_some();
+        !plan.is_in_cell(&cell, mean) && cameras.iter().any(is_visible)
     };
-    let mut all = put(START_FILE, model.gather(&first))?;
+    let frozen: Vec<usize> = (0..model.len()).filter(is_frozen).collect();
+    let write = |option: &str, file: &str, rows: &[usize]| {
+        let path = block_folder.join(file);
+        write_atomically(&path, |out| PLY.write(&model.gather(rows), out))?;
+        path_option(option, &path)
+    };
+    let mut options = write("init", START_FILE, &trained)?;
     if frozen.is_empty() {
-        let path = own.join(FROZEN_FILE);
+        let path = block_folder.join(FROZEN_FILE);
         match fs::remove_file(&path) {
             Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
                 return Err(FileError::io("remove", &path)(error).into());
@@ -126,17 +132,17 @@ fn block(
             _ => {}
         }
     } else {
-        all = put(FROZEN_FILE, model.gather(&frozen))?.over(all);
+        options = write("freeze", FROZEN_FILE, &frozen)?.over(options);
     }
-    let all = text("views", &views)?.over(all).over(rows(block.budget + frozen.len()));
-    // The coarse model is where a block begins, not what it is to keep.
-    Ok(all.over(given).over(Partial::option("init_rates", "full")))
+    let options = views.over(options).over(budget(block.budget + frozen.len())).over(given);
+    // The coarse model is only a starting point, not a trained model to preserve.
+    Ok(options.over(Partial::option("init_rates", "full")))
 }
 
 /// The cameras of a block's training views, in world coordinates.
-fn cameras(blocks: &Blocks, given: Partial, views: &Path) -> Result<Vec<Camera>, Failure> {
-    let spec = text("views", views)?.over(given).describe()?;
-    let dataset = Dataset::load(&blocks.scene, &spec.data.load_options(false))?;
+fn world_cameras(plan: &BlockPlan, options: Partial) -> Result<Vec<Camera>, Failure> {
+    let spec = options.describe()?;
+    let dataset = Dataset::load(&plan.scene, &spec.data.load_options(false))?;
     let to_world = &dataset.normalisation;
     Ok(dataset.train.iter().map(|view| to_world.world_from_scene_camera(&view.camera)).collect())
 }

@@ -1,4 +1,4 @@
-//! How many Gaussians a file of a given size holds.
+//! Determines the number of Gaussians that fit in a file of a given size.
 
 use std::io::{self, Write};
 
@@ -9,18 +9,18 @@ use densify_data::models::{Format, is_unfit};
 use densify_run::failure::{Failure, INPUT, OTHER};
 use densify_train::importance::{footprints, largest};
 
-/// Share of the size that the first estimate fills: training changes how well the rows pack.
-const FILLED: f64 = 0.98;
-/// Estimates until the number of rows is taken as it is.
-const ESTIMATES: usize = 8;
-/// Share of the rows that is left out at a time where the file is still too large.
-const TRIMMED: f64 = 0.01;
+/// Fraction of the size that an estimate aims at: training changes the compression ratio.
+const FILL: f64 = 0.98;
+/// Most estimates of the number of rows.
+const MAX_ESTIMATES: usize = 8;
+/// Fraction of the rows that is dropped in addition if the file is still too large.
+const EXTRA_TRIM: f64 = 0.01;
 
-/// Counts what is written to it.
+/// Counts the bytes written to it.
 #[derive(Default)]
-struct Counted(u64);
+struct ByteCounter(u64);
 
-impl Write for Counted {
+impl Write for ByteCounter {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         self.0 += bytes.len() as u64;
         Ok(bytes.len())
@@ -31,19 +31,19 @@ impl Write for Counted {
     }
 }
 
-/// The size of a model's file in a format.
-pub(super) fn bytes(format: &Format, model: &Gaussians) -> Result<u64, Failure> {
-    let mut counted = Counted::default();
-    format.write(model, &mut counted).map_err(|error| {
+/// Size of a model's file in a format.
+pub(super) fn file_size(format: &Format, model: &Gaussians) -> Result<u64, Failure> {
+    let mut counter = ByteCounter::default();
+    format.write(model, &mut counter).map_err(|error| {
         Failure::new(
             if is_unfit(&error) { INPUT } else { OTHER },
             format!("cannot write the model as {}: {error}", format.name),
         )
     })?;
-    Ok(counted.0)
+    Ok(counter.0)
 }
 
-/// Fails where the model cannot become what is asked for.
+/// Checks that the model can reach the target, before anything is trained.
 pub(super) fn check(options: &Options<'_>, model: &Gaussians) -> Result<(), Failure> {
     match options.to {
         _ if model.is_empty() => {
@@ -54,32 +54,33 @@ pub(super) fn check(options: &Options<'_>, model: &Gaussians) -> Result<(), Fail
             options.model.display(),
             grouped(model.len())
         ))),
-        // Said before anything is trained.
-        Target::Bytes(most) if most < least(options, model).0 => Err(too_small(options, model)),
+        Target::Bytes(limit) if limit < smallest_size(options, model).0 => {
+            Err(too_small(options, model))
+        }
         _ => Ok(()),
     }
 }
 
-/// How many rows of a model, as it is, make a file of the target.
+/// A format, and the number of rows of the untrained model that reach the target in it.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Packing {
     pub(super) format: &'static Format,
     pub(super) rows: usize,
-    /// Whether they are all, at least as accurate as the format usually has them.
+    /// All rows fit, with at least the format's default accuracy.
     pub(super) is_whole: bool,
 }
 
-/// In which formats to try this model, and how many of its rows, as it is, then make a file of the target: the format
-/// that holds most, the first of equals; where it has several variants, all that hold at least four fifths as many as the one
-/// that holds most, or, where it holds all as it is, the most accurate if that does too. None where not even one row fits.
+/// Chooses the packings to try: the format that holds most rows, the first of equals. If it has several variants, these
+/// are all that hold at least four fifths of the most, or, if all rows fit with the default accuracy, the most accurate
+/// variant that still holds them. Empty if not even one row fits.
 ///
 /// # Errors
-/// When no format has room for the model, or one cannot be written for another reason.
+/// If no format can represent the model, or writing fails for another reason.
 pub(super) fn packings(options: &Options<'_>, model: &Gaussians) -> Result<Vec<Packing>, Failure> {
     let (mut best, mut unfit) = (None, None);
     for &format in options.formats {
         let most = best.map_or(0, |(_, rows)| rows);
-        match rows(options.to, format, model) {
+        match rows_that_fit(options.to, format, model) {
             Ok(Some(rows)) if rows > most => best = Some((format, rows)),
             Ok(_) => {}
             Err(failure) if failure.code == INPUT => unfit = unfit.or(Some(failure)),
@@ -87,90 +88,86 @@ pub(super) fn packings(options: &Options<'_>, model: &Gaussians) -> Result<Vec<P
         }
     }
     let Some((format, rows)) = best else { return unfit.map_or(Ok(Vec::new()), Err) };
-    let as_it_is = Packing { format, rows, is_whole: rows == model.len() };
+    let packing = Packing { format, rows, is_whole: rows == model.len() };
     let variants = format.variants();
-    // Without bands above 0 all variants are the same.
-    let has_one = variants.is_empty() || model.sh_degree == 0;
-    let Target::Bytes(most) = options.to else { return Ok(vec![as_it_is]) };
-    if has_one {
-        return Ok(vec![as_it_is]);
+    // Variants differ only in the bands above 0.
+    let (Target::Bytes(limit), [most_accurate, ..], 1..) = (options.to, variants, model.sh_degree)
+    else {
+        return Ok(vec![packing]);
+    };
+    if packing.is_whole {
+        let format = if file_size(most_accurate, model)? <= limit { most_accurate } else { format };
+        return Ok(vec![Packing { format, ..packing }]);
     }
-    if as_it_is.is_whole {
-        // Beside all rows there may be room for the most accurate colour.
-        let format = if bytes(&variants[0], model)? <= most { &variants[0] } else { format };
-        return Ok(vec![Packing { format, ..as_it_is }]);
-    }
-    let mut found: Vec<Packing> = Vec::new();
+    let mut packings: Vec<Packing> = Vec::new();
     for format in variants {
-        let Some(rows) = self::rows(options.to, format, model)? else { continue };
-        found.push(Packing { format, rows, is_whole: false });
+        let Some(rows) = rows_that_fit(options.to, format, model)? else { continue };
+        packings.push(Packing { format, rows, is_whole: false });
         if rows == model.len() {
             break;
         }
     }
-    // Rows show more than the accuracy of their colour.
-    let most = found.iter().map(|packing| packing.rows).max().unwrap_or(0);
-    found.retain(|packing| 5 * packing.rows >= 4 * most);
-    Ok(found)
+    // Losing many rows costs more quality than losing accuracy of their colour.
+    let most = packings.iter().map(|packing| packing.rows).max().unwrap_or(0);
+    packings.retain(|packing| 5 * packing.rows >= 4 * most);
+    Ok(packings)
 }
 
-/// How many rows of this model, as it is, make a file of the target; `None` where not even one does.
-pub(super) fn rows(
+/// Number of rows of this model that reach the target; `None` if not even one fits.
+pub(super) fn rows_that_fit(
     to: Target,
     format: &Format,
     model: &Gaussians,
 ) -> Result<Option<usize>, Failure> {
-    let most = match to {
+    let limit = match to {
         Target::Rows(rows) => return Ok(Some(rows.min(model.len()))),
-        Target::Bytes(most) => most,
+        Target::Bytes(limit) => limit,
     };
     let mut rows = model.len();
-    let mut size = bytes(format, model)?;
-    if size <= most {
+    let mut size = file_size(format, model)?;
+    if size <= limit {
         return Ok(Some(rows));
     }
-    // Files need not grow evenly with their rows, so each estimate stays between what fits and what does not.
+    // The size need not be proportional to the rows, so each estimate stays between the known bounds.
     let (mut fits, mut over) = (0, rows);
-    for _ in 0..ESTIMATES {
-        let next = (rows as f64 * (FILLED * most as f64 / size as f64)) as usize;
+    for _ in 0..MAX_ESTIMATES {
+        let next = (rows as f64 * (FILL * limit as f64 / size as f64)) as usize;
         rows = if fits < next && next < over { next } else { fits.midpoint(over) }.max(1);
-        size = bytes(format, &spread(model, rows))?;
-        if size <= most {
+        size = file_size(format, &subsample(model, rows))?;
+        if size <= limit {
             fits = rows;
         } else {
             over = rows;
         }
-        let filled = size as f64 / most as f64;
-        if (FILLED - 0.01..=1.0).contains(&filled) || over - fits <= 1 + model.len() / 500 {
+        let filled = size as f64 / limit as f64;
+        if (FILL - 0.01..=1.0).contains(&filled) || over - fits <= 1 + model.len() / 500 {
             break;
         }
     }
-    let found = if fits > 0 { fits } else { rows };
-    Ok((fits > 0 || rows > 1).then_some(found))
+    Ok((fits > 0 || rows > 1).then_some(if fits > 0 { fits } else { rows }))
 }
 
-/// So many rows, evenly from first to last, which is through space.
-fn spread(model: &Gaussians, rows: usize) -> Gaussians {
-    let at = |place: usize| (place as u64 * model.len() as u64 / rows as u64) as usize;
-    model.gather(&(0..rows).map(at).collect::<Vec<_>>())
+/// Evenly sampled rows of a model; trained models are ordered spatially.
+fn subsample(model: &Gaussians, rows: usize) -> Gaussians {
+    let row = |index: usize| (index as u64 * model.len() as u64 / rows as u64) as usize;
+    model.gather(&(0..rows).map(row).collect::<Vec<_>>())
 }
 
-/// The model with as few rows left out, the faintest and smallest first, as make its file small enough, and the file's
-/// size; `None` where no row is left.
-pub(super) fn trimmed(
+/// Drops rows, the faintest and smallest first, until the model's file is small enough. Returns the model and the size of
+/// its file; `None` if no row is left.
+pub(super) fn trim(
     to: Target,
     format: &Format,
     mut model: Gaussians,
 ) -> Result<Option<(Gaussians, u64)>, Failure> {
     loop {
-        let size = bytes(format, &model)?;
-        let most = match to {
-            Target::Bytes(most) if size > most => most,
+        let size = file_size(format, &model)?;
+        let limit = match to {
+            Target::Bytes(limit) if size > limit => limit,
             _ => return Ok(Some((model, size))),
         };
-        // As far over as the file is, so many rows too many; and a little more.
-        let over = 1.0 - most as f64 / size as f64 + TRIMMED;
-        let left = ((model.len() as f64 * (1.0 - over)) as usize).min(model.len() - 1);
+        let excess = 1.0 - limit as f64 / size as f64 + EXTRA_TRIM;
+        let left = ((model.len() as f64 * (1.0 - excess)) as usize).min(model.len() - 1);
         if left == 0 {
             return Ok(None);
         }
@@ -178,16 +175,17 @@ pub(super) fn trimmed(
     }
 }
 
-/// The least bytes that a Gaussian takes, and in which format.
-fn least(options: &Options<'_>, model: &Gaussians) -> (u64, &'static str) {
+/// Size of the smallest file with one Gaussian, and its format.
+fn smallest_size(options: &Options<'_>, model: &Gaussians) -> (u64, &'static str) {
     let one = model.gather(&[0]).with_degree(0);
-    let sizes = options.formats.iter().filter_map(|it| Some((bytes(it, &one).ok()?, it.name)));
+    let sizes = options.formats.iter();
+    let sizes = sizes.filter_map(|format| Some((file_size(format, &one).ok()?, format.name)));
     sizes.min().unwrap_or_default()
 }
 
-/// What to say where not even one Gaussian fits.
+/// The failure if not even one Gaussian fits.
 pub(super) fn too_small(options: &Options<'_>, model: &Gaussians) -> Failure {
-    let (least, format) = least(options, model);
+    let (least, format) = smallest_size(options, model);
     Failure::input(format!(
         "--to: no model fits; one Gaussian takes {least} bytes as {format}; give more"
     ))

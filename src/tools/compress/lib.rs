@@ -1,14 +1,14 @@
-//! A smaller model of a scene: fewer Gaussians and less colour, trained on, in a file no larger than asked.
+//! Compresses a trained model: fewer Gaussians and fewer colour coefficients, fine-tuned, in a file of limited size.
 //!
-//! Gaussians are pruned by how much they show in the training views, at most half of them at once, and the rest
-//! trained on in between (`tune.rs`). Colour that depends on the view is dropped from each Gaussian by itself where
-//! nobody would see it (`colour.rs`). How much of a file colour is worth depends on the scene, so several degrees of it
-//! are tried, and a format's coarser ways to keep it, each with as many Gaussians as then fit, in the format that holds
-//! most of them (`fit.rs`); and the one is kept whose file, read back, shows the training views best (`judge.rs`).
+//! Gaussians are pruned by importance, at most half of them at once, with training in between (`tune.rs`).
+//! View-dependent colour is dropped per Gaussian where this is invisible (`colour.rs`). The best trade between Gaussians
+//! and colour depends on the scene, so several degrees and accuracies of colour are tried, each with as many Gaussians as
+//! fit (`fit.rs`). The attempt whose file, read back, has the highest PSNR of the training views is kept
+//! (`evaluator.rs`).
 
 mod colour;
+mod evaluator;
 mod fit;
-mod judge;
 mod tune;
 
 use std::path::{Path, PathBuf};
@@ -23,46 +23,46 @@ use densify_run::failure::Failure;
 use densify_run::finished::read_model;
 use densify_run::{DataSpec, DeviceSpec, Fraction, Observer};
 use densify_train::exposure::ExposureModel;
+use evaluator::Evaluator;
 use fit::Packing;
-use judge::Judge;
 
-/// What a model is to shrink to.
+/// The size to reach.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Target {
-    /// A file of at most so many bytes.
+    /// Largest size of the file `[bytes]`.
     Bytes(u64),
-    /// So many Gaussians.
+    /// Number of Gaussians.
     Rows(usize),
 }
 
-/// What is compressed, and how.
+/// Options of [`compress`].
 #[derive(Debug, Clone)]
 pub struct Options<'a> {
-    /// The file of the model.
+    /// File of the model.
     pub model: &'a Path,
-    /// The dataset that it shows.
+    /// Dataset of the model.
     pub scene: &'a Path,
-    /// How the dataset is read.
+    /// Options with which the dataset is read.
     pub data: DataSpec,
-    /// What an exposure of each photograph may do, where the model was trained with them.
+    /// Exposure model, if the model was trained with an exposure per photograph.
     pub exposure: Option<ExposureModel>,
-    /// Nearest distance to a camera at which anything is drawn, as a fraction of the scene's extent.
+    /// Near plane, as a fraction of the scene's extent.
     pub near: Fraction,
-    /// Where to compute.
+    /// Device to compute on.
     pub device: DeviceSpec,
-    /// What the result is to be.
+    /// Size to reach.
     pub to: Target,
-    /// Training steps of each attempt, >= 1.
+    /// Training iterations of each attempt, >= 1.
     pub iterations: u32,
-    /// Seed of these.
+    /// Random seed of the training.
     pub seed: u64,
-    /// Formats that the file may have, at least one; of those that hold equally many Gaussians the first is taken.
+    /// Allowed formats of the file, at least one. Of those that hold equally many Gaussians, the first is used.
     pub formats: &'a [&'static Format],
-    /// The file, as [`file()`] names it.
+    /// File to write, named by [`file()`].
     pub output: &'a Path,
 }
 
-/// The file in one of several formats: then with its extension added, else as it is named.
+/// Path of the output in a format. If there are several formats to choose from, the extension is appended.
 #[must_use]
 pub fn file(output: &Path, formats: &[&Format], format: &Format) -> PathBuf {
     let mut name = output.as_os_str().to_owned();
@@ -72,45 +72,45 @@ pub fn file(output: &Path, formats: &[&Format], format: &Format) -> PathBuf {
     name.into()
 }
 
-/// A model that was made.
+/// A compressed model with its measurements.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Attempt {
-    /// Gaussians in it.
+    /// Number of Gaussians.
     pub rows: usize,
-    /// Highest degree of colour in it.
+    /// Spherical-harmonic degree.
     pub sh_degree: u8,
-    /// The format of its file.
+    /// Name of the file's format.
     pub format: &'static str,
-    /// The size of its file.
+    /// Size of the file.
     pub bytes: u64,
-    /// Mean PSNR of the training views `[dB]`, with the best exposure of each where exposures are learned.
-    pub train: f64,
-    /// The same of the views held out, if there are any.
-    pub test: Option<f64>,
+    /// Mean PSNR of the training views `[dB]`, with the best-fitting exposure of each if exposures are learned.
+    pub train_psnr: f64,
+    /// Mean PSNR of the test views, if there are any.
+    pub test_psnr: Option<f64>,
 }
 
-/// What came of it.
+/// The result of [`compress`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct Compressed {
-    /// The model as it was, and the PLY that training writes of it.
+    /// The original model as PLY.
     pub whole: Attempt,
-    /// What is in the file, after each stage of its training but the last.
-    pub way: Vec<Attempt>,
-    /// What was tried, in that order.
+    /// The best attempt after each stage of its training but the last.
+    pub stages: Vec<Attempt>,
+    /// All attempts in order.
     pub attempts: Vec<Attempt>,
-    /// Which of them is in the file.
+    /// Index of the attempt in the file.
     pub best: usize,
     /// The file.
     pub file: PathBuf,
 }
 
-/// Compresses a model, and writes its file.
+/// Compresses a model and writes its file.
 ///
 /// # Errors
-/// When a file cannot be used, nothing fits, the device or the disk fails, or the observer asks to stop; then nothing is
-/// written.
+/// If a file cannot be used, nothing fits, the device or the disk fails, or the observer interrupts; nothing is written
+/// then.
 pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compressed, Failure> {
-    let judge = Judge::open(options, observer)?;
+    let evaluator = Evaluator::open(options, observer)?;
     if options.exposure.is_some() {
         observer.say(format_args!(
             "exposure learned again, as the run has learned it; PSNR is with the best exposure of each photograph"
@@ -118,11 +118,11 @@ pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compre
     }
     let model = read_model(options.model, observer)?;
     fit::check(options, &model)?;
-    judge.require(&model, options.model, observer)?;
-    let whole = judge.attempt(model.clone(), PLY, fit::bytes(PLY, &model)?)?;
-    let scratch = scratch(options.output)?;
-    let search = Search { options, observer, judge, scratch, model };
-    let (mut attempts, mut way) = (Vec::<Attempt>::new(), Vec::new());
+    evaluator.check_coordinates(&model, options.model, observer)?;
+    let whole = evaluator.evaluate(model.clone(), PLY, fit::file_size(PLY, &model)?)?;
+    let scratch = create_scratch_file(options.output)?;
+    let search = Search { options, observer, evaluator, scratch, model };
+    let (mut attempts, mut best_stages) = (Vec::<Attempt>::new(), Vec::new());
     let mut best: Option<(usize, &Format, Gaussians)> = None;
     for degree in degrees(search.model.sh_degree, options.to) {
         let packings = fit::packings(options, &search.start(degree))?;
@@ -131,14 +131,15 @@ pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compre
             let Some((attempt, small)) = search.attempt(packing, degree, &mut stages)? else {
                 continue;
             };
-            let is_best = best.as_ref().is_none_or(|(at, ..)| attempt.train > attempts[*at].train);
+            let is_best =
+                best.as_ref().is_none_or(|(at, ..)| attempt.train_psnr > attempts[*at].train_psnr);
             attempts.push(attempt);
             if is_best {
                 best = Some((attempts.len() - 1, packing.format, small));
-                way = stages;
+                best_stages = stages;
             }
         }
-        if packings.first().is_some_and(|packing| search.loses_nothing(packing, degree)) {
+        if packings.first().is_some_and(|packing| search.is_lossless(packing, degree)) {
             break;
         }
     }
@@ -147,73 +148,78 @@ pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compre
     };
     let file = file(options.output, options.formats, format);
     write_atomically(&file, |out| format.write(&small, out))?;
-    Ok(Compressed { whole, way, attempts, best, file })
+    Ok(Compressed { whole, stages: best_stages, attempts, best, file })
 }
 
-/// What all attempts share.
+/// The state that all attempts share.
 struct Search<'a> {
     options: &'a Options<'a>,
     observer: &'a dyn Observer,
-    judge: Judge,
+    evaluator: Evaluator,
     scratch: TempPath,
-    /// The model as it was.
+    /// The original model.
     model: Gaussians,
 }
 
 impl Search<'_> {
-    /// The model with at most this degree: made anew for each attempt, so that it is not held while one is trained.
+    /// The original model with at most this degree. Each attempt creates its own, so that it is not held during training.
     fn start(&self, degree: u8) -> Gaussians {
-        colour::reduced(self.model.clone(), degree)
+        colour::reduce(self.model.clone(), degree)
     }
 
-    /// Whether it is the model with this degree as the format has it, which training has nothing to mend in.
-    fn loses_nothing(&self, packing: &Packing, degree: u8) -> bool {
+    /// True if the packing holds the model without loss, so that training cannot improve it.
+    fn is_lossless(&self, packing: &Packing, degree: u8) -> bool {
         packing.is_whole && degree == self.model.sh_degree
     }
 
-    /// About so many rows of the model with this degree, trained on, and what its file shows; `None` where no row
-    /// fits. What it was after each stage but the last is added to `way`.
+    /// Compresses the model with this packing and degree, and evaluates its file; `None` if no row fits. The result of each
+    /// stage but the last is added to `stages`.
     fn attempt(
         &self,
         packing: &Packing,
         degree: u8,
-        way: &mut Vec<Attempt>,
+        stages: &mut Vec<Attempt>,
     ) -> Result<Option<(Attempt, Gaussians)>, Failure> {
         let Self { options, observer, scratch, .. } = self;
         let start = self.start(degree);
         let Packing { format, rows, .. } = *packing;
-        let tuned = if self.loses_nothing(packing, degree) {
+        let tuned = if self.is_lossless(packing, degree) {
             start
         } else {
             let after_stage = &mut |model: &Gaussians| {
-                way.push(self.measured(model, format, fit::bytes(format, model)?)?);
+                stages.push(self.evaluate_file(model, format, fit::file_size(format, model)?)?);
                 Ok(())
             };
             tune::tune(start, (format, rows), options, scratch, *observer, after_stage)?
         };
-        let Some((small, bytes)) = fit::trimmed(options.to, format, tuned)? else {
+        let Some((small, bytes)) = fit::trim(options.to, format, tuned)? else {
             return Ok(None);
         };
-        let attempt = self.measured(&small, format, bytes)?;
+        let attempt = self.evaluate_file(&small, format, bytes)?;
         observer.say(format_args!(
             "tried    {} Gaussians of degree {degree} as {}: {} bytes, {:.2} dB",
             grouped(attempt.rows),
             format.name,
             grouped(usize::try_from(bytes).unwrap_or(usize::MAX)),
-            attempt.train
+            attempt.train_psnr
         ));
         Ok(Some((attempt, small)))
     }
 
-    /// What the file of a model shows: what is read back, not what was written.
-    fn measured(&self, model: &Gaussians, format: &Format, bytes: u64) -> Result<Attempt, Failure> {
+    /// Evaluates the file of a model as it is read back, with the losses of its format.
+    fn evaluate_file(
+        &self,
+        model: &Gaussians,
+        format: &Format,
+        bytes: u64,
+    ) -> Result<Attempt, Failure> {
         write_atomically(&self.scratch, |out| format.write(model, out))?;
-        self.judge.attempt(read_model(&self.scratch, self.observer)?, format, bytes)
+        self.evaluator.evaluate(read_model(&self.scratch, self.observer)?, format, bytes)
     }
 }
 
-/// A file for what is between two steps, in the folder that has room for the result; gone with this value.
-fn scratch(output: &Path) -> Result<TempPath, Failure> {
+/// Creates a temporary file in the folder of the result.
+fn create_scratch_file(output: &Path) -> Result<TempPath, Failure> {
     let folder = match output.parent() {
         Some(parent) if !parent.as_os_str().is_empty() => parent,
         _ => Path::new("."),
@@ -223,7 +229,7 @@ fn scratch(output: &Path) -> Result<TempPath, Failure> {
     Ok(made.map_err(FileError::io("write to the folder", folder))?.into_temp_path())
 }
 
-/// Degrees of colour that are tried, the model's own first.
+/// Spherical-harmonic degrees to try, the model's own first.
 fn degrees(own: u8, to: Target) -> Vec<u8> {
     match to {
         Target::Rows(_) => vec![own],

@@ -1,4 +1,4 @@
-//! What is tried, and what becomes of a model on the way.
+//! Tests of the attempts and of the training between them.
 
 use std::collections::HashSet;
 
@@ -16,7 +16,7 @@ fn degrees_are_tried_from_the_models_own_down() {
     assert_eq!(degrees(3, Target::Rows(1)), [3]);
 }
 
-/// Rows of which no two have the same colours.
+/// A model in which no two Gaussians have the same colour coefficients.
 fn colourful(rows: usize) -> Gaussians {
     let mut model = Gaussians::zeros(rows, 3);
     let share = |index: usize| (index * 7919 % 4093) as f32 / 4093.0;
@@ -58,54 +58,52 @@ fn a_size_that_no_gaussian_fits_is_refused_before_training() {
         let options = options(Target::Bytes(to), Path::new(""), &formats);
         fit::check(&options, &colourful(3)).map_err(|failure| failure.to_string())
     };
-    let one = fit::bytes(PLY, &colourful(1).with_degree(0)).expect("it is written");
+    let one = fit::file_size(PLY, &colourful(1).with_degree(0)).expect("it is written");
     let refused = check(one - 1).expect_err("too small");
     assert!(refused.contains(&format!("one Gaussian takes {one} bytes as ply")), "{refused}");
     assert_eq!(check(one), Ok(()));
 }
 
-/// Less accurate variants take fewer bytes, so that more rows fit; those that hold fewer than four fifths of the most are no
-/// attempt; and where the format holds all as it usually is, the most accurate form is tried if it does too.
+/// Less accurate variants are smaller, so that more rows fit. Variants that hold fewer than four fifths of the most rows
+/// are not tried. If all rows fit with the default accuracy, the most accurate variant that holds them is tried.
 #[test]
 fn variants_of_a_format_are_tried_that_hold_enough_rows() {
     let model = colourful(2_000);
     let sizes: Vec<u64> = sog()
         .variants()
         .iter()
-        .map(|form| fit::bytes(form, &model).expect("it is written"))
+        .map(|form| fit::file_size(form, &model).expect("it is written"))
         .collect();
     assert!(sizes.len() > 2 && sizes.windows(2).all(|pair| pair[0] > pair[1]), "{sizes:?}");
     let formats = [sog()];
-    let packed = |to: u64| {
-        let found = fit::packings(&options(Target::Bytes(to), Path::new(""), &formats), &model);
-        found.expect("it fits").iter().map(|it| (it.rows, it.is_whole)).collect::<Vec<_>>()
-    };
+    let packings =
+        |to: Target| fit::packings(&options(to, Path::new(""), &formats), &model).expect("it fits");
     let size_of_whole = |to: u64| {
-        let found = fit::packings(&options(Target::Bytes(to), Path::new(""), &formats), &model);
-        let [whole] = found.expect("it fits")[..] else { panic!("several attempts at {to}") };
+        let [whole] = packings(Target::Bytes(to))[..] else { panic!("several attempts at {to}") };
         assert!(whole.is_whole && whole.rows == 2_000, "{whole:?}");
-        fit::bytes(whole.format, &model).expect("it is written")
+        fit::file_size(whole.format, &model).expect("it is written")
     };
-    let usual = fit::bytes(sog(), &model).expect("it is written");
+    let usual = fit::file_size(sog(), &model).expect("it is written");
     assert!(sizes[2] < usual && usual < sizes[0], "{usual}, {sizes:?}");
     assert_eq!(size_of_whole(sizes[0]), sizes[0]);
     assert_eq!(size_of_whole(sizes[0] - 1), usual);
-    let tight = packed(usual - 1);
-    assert!(tight.len() > 1 && tight.is_sorted() && tight.iter().all(|it| !it.1), "{tight:?}");
-    assert!(tight.iter().all(|(rows, _)| 5 * rows >= 4 * tight[tight.len() - 1].0), "{tight:?}");
-    let few = fit::packings(&options(Target::Rows(500), Path::new(""), &formats), &model);
-    assert_eq!(few.expect("they fit").iter().map(|it| it.rows).collect::<Vec<_>>(), [500]);
+    let tight = packings(Target::Bytes(usual - 1));
+    assert!(tight.len() > 1 && tight.iter().all(|packing| !packing.is_whole), "{tight:?}");
+    let rows: Vec<usize> = tight.iter().map(|packing| packing.rows).collect();
+    assert!(rows.is_sorted() && rows.iter().all(|n| 5 * n >= 4 * rows[rows.len() - 1]), "{rows:?}");
+    let [few] = packings(Target::Rows(500))[..] else { panic!("several attempts") };
+    assert_eq!(few.rows, 500);
 }
 
-/// The last steps train a model whose colour by direction is as the file has it, an entry of a palette for many rows,
-/// and leave that as it is.
+/// The last iterations train the decoded model and keep its view-dependent colour, of which many rows share a palette
+/// entry.
 #[test]
-fn colours_end_as_a_file_has_them() {
+fn colours_end_as_in_the_file() {
     let made = Made::colmap_txt();
     let formats = [sog()];
     let options = options(Target::Rows(256), made.path(), &formats);
     let form = &sog().variants()[2];
-    let scratch = scratch(&made.path().join("small.sog")).expect("a file");
+    let scratch = create_scratch_file(&made.path().join("small.sog")).expect("a file");
     let start = colourful(256);
     let tuned =
         tune::tune(start.clone(), (form, 256), &options, &scratch, &Silent, &mut |_| Ok(()));

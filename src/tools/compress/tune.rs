@@ -1,8 +1,8 @@
-//! Prunes a model step by step, and trains what is left.
+//! Prunes a model in stages and trains the remaining Gaussians.
 
 use std::path::Path;
 
-use super::colour::reduced;
+use super::colour::reduce;
 use super::{Options, Target, fit};
 use densify_core::files::write_atomically;
 use densify_core::gaussians::Gaussians;
@@ -14,18 +14,18 @@ use densify_run::{
 };
 use densify_train::exposure::ExposureChoice;
 
-/// A policy that, set so, neither adds nor prunes.
+/// A policy that neither adds nor prunes with the settings below.
 const POLICY: &str = "vanilla";
-const STILL: [&str; 3] =
+const POLICY_SETTINGS: [&str; 3] =
     ["vanilla.grow_every=0", "vanilla.reset_every=0", "vanilla.white_reset_at=0"];
 
-/// About so many rows of the model, those that show most, trained on. How many fit a file is estimated once more before
-/// the last stage, as training changes how well rows pack; and where the format rounds, the last half of that stage
-/// trains what a file has made of the model, with its colour by direction as it is there: what the file rounds off most,
-/// the rest can mend. `after_stage` is shown the model after each stage but the last.
+/// Prunes the model to about this many rows, the most important, and trains them. Training changes the compression ratio,
+/// so the number of rows that fit is estimated again before the last stage. If the format is lossy, the second half of
+/// the last stage starts from the decoded file and freezes the view-dependent colour, which is quantised most, so that
+/// the other parameters compensate its errors. `after_stage` receives the model after each stage but the last.
 ///
 /// # Errors
-/// As a run's, and when the observer asks to stop.
+/// Errors of a run, and when the observer interrupts.
 pub(super) fn tune(
     mut model: Gaussians,
     (format, rows): (&Format, usize),
@@ -35,15 +35,14 @@ pub(super) fn tune(
     after_stage: &mut dyn FnMut(&Gaussians) -> Result<(), Failure>,
 ) -> Result<Gaussians, Failure> {
     let least = if matches!(options.to, Target::Bytes(_)) { 2 } else { 1 };
-    let rounds = format.is_lossy();
     let stages = stages((model.len(), rows), options.iterations, least);
     for (stage, &(mut budget, iterations)) in stages.iter().enumerate() {
         if stage > 0 {
             after_stage(&model)?;
         }
         if stage > 0 && stage + 1 == stages.len() {
-            model = reduced(model, u8::MAX);
-            budget = fit::rows(options.to, format, &model)?.unwrap_or(1);
+            model = reduce(model, u8::MAX);
+            budget = fit::rows_that_fit(options.to, format, &model)?.unwrap_or(1);
         }
         observer.say(format_args!(
             "training {budget} Gaussians of degree {} for {iterations} iterations ({} of {})",
@@ -51,67 +50,61 @@ pub(super) fn tune(
             stage + 1,
             stages.len()
         ));
-        let settling = if rounds && stage + 1 == stages.len() { iterations / 2 } else { 0 };
-        let setting = (budget, iterations - settling);
-        model = train(model, setting, Colour::Steps, options, scratch, observer)?;
-        if settling > 0 {
-            model = reduced(model, u8::MAX);
+        let is_last = stage + 1 == stages.len();
+        let adapting = if format.is_lossy() && is_last { iterations / 2 } else { 0 };
+        let setting = (budget, iterations - adapting);
+        model = train(model, setting, false, options, scratch, observer)?;
+        if adapting > 0 {
+            model = reduce(model, u8::MAX);
             write_atomically(scratch, |out| format.write(&model, out))?;
             model = read_model(scratch, observer)?;
-            let setting = (model.len(), settling);
-            model = train(model, setting, Colour::Stays, options, scratch, observer)?;
+            let setting = (model.len(), adapting);
+            model = train(model, setting, true, options, scratch, observer)?;
         }
     }
     Ok(model)
 }
 
-/// Whether the bands of colour above 0 are trained.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Colour {
-    Steps,
-    Stays,
-}
-
-/// The model after so many iterations with room for so many rows.
+/// Trains the model with a budget and a number of iterations.
 fn train(
     model: Gaussians,
     setting: (usize, u32),
-    colour: Colour,
+    freezes_sh: bool,
     options: &Options<'_>,
     scratch: &Path,
     observer: &dyn Observer,
 ) -> Result<Gaussians, Failure> {
     write_atomically(scratch, |out| PLY.write(&model, out))?;
-    let mut spec = described(&model, setting, options, scratch)?;
-    if colour == Colour::Stays {
-        // The least rate there is: no value of a band that shows changes by it.
-        spec.schedule.lr = vec![text("sh_rest=1e-30")?];
+    let mut spec = describe_run(&model, setting, options, scratch)?;
+    if freezes_sh {
+        // Rates must be positive; steps of the smallest are lost to rounding.
+        spec.schedule.lr = vec![assignment("sh_rest=1e-30")?];
     }
     drop(model);
     Run::prepare(&spec)?.model_after_training(observer)
 }
 
-fn text(assignment: &str) -> Result<Assignment, Failure> {
-    assignment.parse().map_err(Failure::input)
+fn assignment(text: &str) -> Result<Assignment, Failure> {
+    text.parse().map_err(Failure::input)
 }
 
-/// Bounds, at least `least`, each at least half of the one before, and the training steps under each; the last has two
-/// shares.
+/// The budget and the iterations of each stage. There are at least `least` stages, each budget is at least half of the one
+/// before, and the last stage is twice as long as the others.
 fn stages((whole, rows): (usize, usize), iterations: u32, least: u32) -> Vec<(usize, u32)> {
     let ratio = whole as f64 / rows.max(1) as f64;
     let count = (ratio.log2().ceil() as u32).max(least).min(iterations);
     let share = iterations / (count + 1);
-    let stage = |number: u32| match number == count {
-        true => (rows, iterations - share * (count - 1)),
-        false => {
-            ((whole as f64 / ratio.powf(f64::from(number) / f64::from(count))) as usize, share)
+    let stage = |number: u32| {
+        if number == count {
+            return (rows, iterations - share * (count - 1));
         }
+        ((whole as f64 / ratio.powf(f64::from(number) / f64::from(count))) as usize, share)
     };
     (1..=count).map(stage).filter(|(_, steps)| *steps > 0).collect()
 }
 
-/// The description of a stage.
-fn described(
+/// Describes the run of a stage.
+fn describe_run(
     model: &Gaussians,
     (budget, iterations): (usize, u32),
     options: &Options<'_>,
@@ -126,7 +119,8 @@ fn described(
     spec.size.budget = Some(Budget::Rows(budget));
     spec.size.sh_degree = Some(ShDegree::Fixed(model.sh_degree));
     POLICY.clone_into(&mut spec.density.policy);
-    spec.density.policy_set = STILL.into_iter().map(text).collect::<Result<_, _>>()?;
+    spec.density.policy_set =
+        POLICY_SETTINGS.into_iter().map(assignment).collect::<Result<_, _>>()?;
     spec.schedule.iterations = Whole(iterations);
     spec.schedule.seed = options.seed;
     if let Some(model) = options.exposure {

@@ -1,13 +1,13 @@
-//! HyperQueue: one job file, whose tasks know what they wait for.
+//! HyperQueue: one job file with dependencies between tasks.
 
 use serde::Serialize;
 use toml::Table;
 
-use super::{Batch, EngineFile, asked};
+use super::{Batch, EngineFile, run_scheduler};
 use densify_run::failure::Failure;
 
 const REMEDY: &str = "HyperQueue's `hq` must be on this machine's PATH, with a server that runs; else choose --engine local or slurm";
-/// A task that has taken its worker down so often is given up.
+/// HyperQueue gives up a task whose worker was lost this many times.
 const CRASH_LIMIT: u32 = 5;
 
 #[derive(Serialize)]
@@ -33,16 +33,19 @@ struct Request {
     resources: Table,
 }
 
-/// The job file.
+/// Creates the job file.
 pub(super) fn file(batch: &Batch, with_memory: bool) -> Result<EngineFile, Failure> {
-    let words = batch.words()?;
+    let command_line = batch.command_line()?;
     let mut tasks = Vec::new();
-    let mut before = 0..0;
+    let number = |count| u32::try_from(count).unwrap_or(u32::MAX);
+    let mut previous_stage = 0..0;
     for stage in &batch.stages {
         let first = number(tasks.len());
         for (id, job) in (first..).zip(&stage.jobs) {
-            let log = |kind: &str| batch.logs().join(format!("{}.{kind}", job.name));
-            let [out, error] = ["out", "err"].map(|kind| log(kind).to_string_lossy().into_owned());
+            let log = |kind: &str| {
+                let path = batch.logs().join(format!("{}.{kind}", job.name));
+                path.to_string_lossy().into_owned()
+            };
             let mut resources = Table::new();
             resources.insert("cpus".into(), i64::from(job.threads).into());
             if with_memory {
@@ -51,28 +54,24 @@ pub(super) fn file(batch: &Batch, with_memory: bool) -> Result<EngineFile, Failu
             }
             tasks.push(JobTask {
                 id,
-                command: words.iter().chain([&job.name]).cloned().collect(),
-                stdout: out,
-                stderr: error,
+                command: command_line.iter().chain([&job.name]).cloned().collect(),
+                stdout: log("out"),
+                stderr: log("err"),
                 crash_limit: CRASH_LIMIT,
-                deps: before.clone().collect(),
+                deps: previous_stage.clone().collect(),
                 request: vec![Request { resources }],
             });
         }
-        before = first..number(tasks.len());
+        previous_stage = first..number(tasks.len());
     }
     let text = toml::to_string(&HqJob { name: "densify".to_owned(), task: tasks });
     let text = text.map_err(Failure::input)?;
     Ok(EngineFile { path: batch.folder.join("hq").join("job.toml"), text })
 }
 
-fn number(count: usize) -> u32 {
-    u32::try_from(count).unwrap_or(u32::MAX)
-}
-
-/// Hands the job in; returns its number.
-pub(super) fn hand_in(file: &EngineFile) -> Result<String, Failure> {
+/// Submits the job and returns its ID.
+pub(super) fn submit(file: &EngineFile) -> Result<String, Failure> {
     let path = file.path.to_string_lossy();
     let arguments = ["--output-mode=quiet", "job", "submit-file", &path];
-    asked("hq", &arguments, REMEDY)
+    run_scheduler("hq", &arguments, REMEDY)
 }

@@ -1,5 +1,5 @@
-//! What starts tasks that need no human: this machine, or a scheduler that a cluster has, for which files are written and
-//! handed in. Who has the tasks describes them as a [`Batch`]; whether they are done is theirs to know.
+//! Starts batches of tasks: on this machine, or through the scheduler of a cluster, for which it writes and submits job
+//! files. The caller describes the tasks as a [`Batch`] and keeps track of which are complete.
 
 mod hq;
 mod local;
@@ -17,7 +17,7 @@ use densify_core::files::{FileError, write_atomically};
 use densify_run::Observer;
 use densify_run::failure::{Failure, OTHER};
 
-/// What starts tasks.
+/// The system that starts tasks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 pub enum Engine {
@@ -29,20 +29,20 @@ pub enum Engine {
     Hq,
 }
 
-/// How tasks are handed in.
+/// An engine and how to submit to it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Submission {
-    /// What starts them.
+    /// The engine that starts the tasks.
     pub engine: Engine,
-    /// Only shows the files of the engine.
+    /// Print the engine's files and start nothing.
     pub dry_run: bool,
-    /// Hands in again what was handed in before.
+    /// Submit again although the batch was submitted before.
     pub again: bool,
-    /// Whether HyperQueue's pool has `mem` as a resource, in bytes.
+    /// Request memory from HyperQueue, as the resource `mem` in bytes.
     pub with_memory: bool,
 }
 
-/// The options of commands that hand tasks in, beside `--engine`.
+/// The options of commands that submit tasks, beside `--engine`.
 #[derive(Debug, Clone, Default, Args)]
 pub struct SubmissionArgs {
     /// Print the files for the engine, and start nothing
@@ -57,11 +57,11 @@ pub struct SubmissionArgs {
 }
 
 impl SubmissionArgs {
-    /// What was asked for.
+    /// The submission to this engine.
     ///
     /// # Errors
-    /// When an option is for another engine than the one given.
-    pub fn with(&self, engine: Engine) -> Result<Submission, Failure> {
+    /// If an option does not apply to the engine.
+    pub fn for_engine(&self, engine: Engine) -> Result<Submission, Failure> {
         let Self { dry_run, again, mem_resource: with_memory } = *self;
         if with_memory && engine != Engine::Hq {
             return Err(Failure::input("--mem-resource is for --engine hq; leave it out"));
@@ -69,76 +69,72 @@ impl SubmissionArgs {
         Ok(Submission { engine, dry_run, again, with_memory })
     }
 
-    /// Where no engine is given.
+    /// Checks that none of these options is given, for commands without `--engine`.
     ///
     /// # Errors
-    /// When one of these options is.
-    pub fn without(&self) -> Result<(), Failure> {
-        let given = [
-            (self.dry_run, "--dry-run"),
-            (self.again, "--again"),
-            (self.mem_resource, "--mem-resource"),
-        ];
-        match given.into_iter().find(|(is_given, _)| *is_given) {
-            Some((_, flag)) => {
-                Err(Failure::input(format!("{flag} is for --engine; give both, or none")))
-            }
-            None => Ok(()),
-        }
+    /// Names the first option that is given.
+    pub fn require_none(&self) -> Result<(), Failure> {
+        let flag = if self.dry_run {
+            "--dry-run"
+        } else if self.again {
+            "--again"
+        } else if self.mem_resource {
+            "--mem-resource"
+        } else {
+            return Ok(());
+        };
+        Err(Failure::input(format!("{flag} is for --engine; give both, or none")))
     }
 }
 
-/// Tasks in stages, each to begin when the one before it is done.
+/// Tasks in stages. A stage begins when the one before it is done.
 #[derive(Debug, Clone)]
 pub struct Batch {
-    /// Where the files of the engine and the logs are; absolute.
+    /// Absolute path of the folder for the engine's files and the logs.
     pub folder: PathBuf,
-    /// The words after the program's name that start a task; its own name follows.
+    /// Arguments of this program that start a task; the task's name is appended.
     pub command: Vec<String>,
-    /// The stages, none of them empty.
+    /// The stages; none is empty.
     pub stages: Vec<Stage>,
-    /// What says how far they are.
+    /// How the user can see the progress, for messages.
     pub status: String,
 }
 
-/// Tasks that do not wait for each other.
+/// Independent tasks.
 #[derive(Debug, Clone)]
 pub struct Stage {
-    /// Its name.
+    /// Name of the stage.
     pub name: &'static str,
-    /// Whether it is one of many tasks by its nature, however few are left.
+    /// Submitted as an array job, even if only one task is left.
     pub is_array: bool,
-    /// Its tasks.
+    /// Tasks of the stage.
     pub jobs: Vec<Job>,
 }
 
 /// A task.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Job {
-    /// Its name.
+    /// Name of the task.
     pub name: String,
-    /// Its number in its stage, also where others are done.
-    pub place: usize,
-    /// What it takes at most `[bytes]`.
+    /// Index in the full stage, including tasks that are done already.
+    pub index: usize,
+    /// Upper bound of its memory `[bytes]`.
     pub memory: u64,
     /// Processor threads that it uses.
     pub threads: u32,
-    /// Whether it may be told to use fewer, with `--threads`.
+    /// The task accepts a smaller number of threads through `--threads`.
     pub may_have_fewer_threads: bool,
 }
 
 impl Batch {
-    /// The folder of what tasks say.
+    /// Folder of the tasks' output.
     fn logs(&self) -> PathBuf {
         self.folder.join("logs")
     }
 
-    /// The program and what starts a task, but its name.
-    fn words(&self) -> Result<Vec<String>, Failure> {
-        Ok([utf8(&program()?)?.to_owned()]
-            .into_iter()
-            .chain(self.command.iter().cloned())
-            .collect())
+    /// The command line of a task, up to its name.
+    fn command_line(&self) -> Result<Vec<String>, Failure> {
+        Ok([&[utf8(&program()?)?.to_owned()], &self.command[..]].concat())
     }
 }
 
@@ -148,7 +144,7 @@ struct EngineFile {
     text: String,
 }
 
-/// What was handed in, as it stands in the folder.
+/// The record of a submission in the batch's folder.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Submitted {
@@ -158,19 +154,18 @@ struct Submitted {
 
 const SUBMITTED_FILE: &str = "submitted.toml";
 
-/// The jobs that were handed in, of a folder.
+/// IDs of the jobs submitted from a folder, as text; `None` if there were none.
 #[must_use]
-pub fn submitted(folder: &Path) -> Option<String> {
+pub fn submitted_jobs(folder: &Path) -> Option<String> {
     let text = files::read_text(&folder.join(SUBMITTED_FILE), files::MAX_OPTIONS).ok()?;
-    let before = toml::from_str::<Submitted>(&text).map(|it| it.jobs.join(", "));
+    let before = toml::from_str::<Submitted>(&text).map(|record| record.jobs.join(", "));
     Some(before.unwrap_or_else(|_| "unknown".to_owned()))
 }
 
-/// Starts tasks here, and waits for their end, or hands them in.
+/// Runs the tasks on this machine and waits for them, or submits them to a scheduler.
 ///
 /// # Errors
-/// When the engine is not there or refuses, they were handed in before, and, of tasks that this machine runs, as
-/// theirs.
+/// If the scheduler is not available or refuses, the batch was submitted before, or a task on this machine fails.
 pub fn submit(
     batch: &Batch,
     submission: Submission,
@@ -188,7 +183,7 @@ pub fn submit(
         }
         return Ok(());
     }
-    if let Some(jobs) = submitted(&batch.folder).filter(|_| !submission.again) {
+    if let Some(jobs) = submitted_jobs(&batch.folder).filter(|_| !submission.again) {
         return Err(Failure::input(format!(
             "{} was handed in before, as job {jobs}; see {}, and give --again to hand in what is not complete once \
              those jobs have ended",
@@ -202,8 +197,8 @@ pub fn submit(
         write_atomically(path, |out| out.write_all(text.as_bytes()))?;
     }
     let jobs = match submission.engine {
-        Engine::Hq => files.iter().map(hq::hand_in).collect::<Result<_, _>>()?,
-        _ => slurm::hand_in(&files)?,
+        Engine::Hq => files.iter().map(hq::submit).collect::<Result<_, _>>()?,
+        _ => slurm::submit(&files)?,
     };
     observer.say(format_args!("job      {}", jobs.join(", ")));
     let text = toml::to_string(&Submitted { engine: submission.engine, jobs });
@@ -212,47 +207,42 @@ pub fn submit(
     Ok(())
 }
 
-/// What a scheduler's program prints.
-fn asked(program: &str, arguments: &[&str], remedy: &str) -> Result<String, Failure> {
+/// Runs a program of a scheduler and returns its output.
+fn run_scheduler(program: &str, arguments: &[&str], remedy: &str) -> Result<String, Failure> {
     let output = Command::new(program).args(arguments).stdin(Stdio::null()).output();
     let output = output
         .map_err(|error| Failure::input(format!("cannot start `{program}`: {error}; {remedy}")))?;
-    let said = |bytes: &[u8]| String::from_utf8_lossy(bytes).trim().to_owned();
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).trim().to_owned();
     if output.status.success() {
-        return Ok(said(&output.stdout));
+        return Ok(text(&output.stdout));
     }
     Err(Failure::input(format!(
         "`{program} {}` failed: {}",
         arguments.join(" "),
-        files::lines(&said(&output.stderr))
+        files::lines(&text(&output.stderr))
     )))
 }
 
-/// The program that is running, which also does what is handed in.
+/// Path of the running program, which also executes submitted tasks.
 ///
 /// # Errors
-/// When the system does not say where it is.
+/// If the system does not report it.
 pub fn program() -> Result<PathBuf, Failure> {
     std::env::current_exe().map_err(|error| {
         Failure::new(OTHER, format!("cannot find the program that is running: {error}"))
     })
 }
 
-/// A path as text, for commands and descriptions.
+/// A path as text, for commands and run descriptions.
 ///
 /// # Errors
-/// When it is not UTF-8.
+/// If it is not UTF-8.
 pub fn utf8(path: &Path) -> Result<&str, Failure> {
     let wrong = || Failure::input(format!("{}: the name is not UTF-8; rename it", path.display()));
     path.to_str().ok_or_else(wrong)
 }
 
-/// A word for a shell, whatever is in it.
-fn quoted(word: &str) -> String {
+/// Quotes a word for a POSIX shell.
+fn shell_quote(word: &str) -> String {
     format!("'{}'", word.replace('\'', r"'\''"))
-}
-
-/// Mebibytes, rounded up.
-fn mebibytes(bytes: u64) -> u64 {
-    bytes.div_ceil(1 << 20)
 }

@@ -1,4 +1,4 @@
-//! This machine: every task in a process of its own, as many at once as memory allows.
+//! Runs tasks on this machine, each in its own process, as many at once as fit in memory.
 
 use std::fs::{self, File, TryLockError};
 use std::path::{Path, PathBuf};
@@ -13,12 +13,12 @@ use densify_run::Observer;
 use densify_run::failure::{Failure, OTHER};
 use densify_run::grant;
 
-/// How often it is looked whether a task has ended.
-const LOOK: Duration = Duration::from_millis(100);
+/// Interval between checks for finished tasks.
+const POLL_INTERVAL: Duration = Duration::from_millis(100);
 const LOCK_FILE: &str = "local.lock";
 
-/// How many tasks of a stage run at once, and on how many threads each.
-fn at_once(jobs: &[Job]) -> (usize, u32) {
+/// Number of tasks of a stage to run at once, and threads of each.
+fn concurrency(jobs: &[Job]) -> (usize, u32) {
     let cores = u32::try_from(rayon::current_num_threads()).unwrap_or(u32::MAX);
     let memory = jobs.iter().map(|job| job.memory).max().unwrap_or(1);
     let threads = jobs.iter().map(|job| job.threads).max().unwrap_or(1).max(1);
@@ -31,23 +31,23 @@ fn at_once(jobs: &[Job]) -> (usize, u32) {
     (count, if is_fixed { threads } else { share.min(threads).max(1) })
 }
 
-/// Says what would be started.
+/// Prints the commands without running them.
 pub(super) fn show(batch: &Batch, observer: &dyn Observer) -> Result<(), Failure> {
-    let words = batch.words()?.join(" ");
+    let command_line = batch.command_line()?.join(" ");
     for Stage { name, jobs, .. } in &batch.stages {
-        let (count, threads) = at_once(jobs);
+        let (count, threads) = concurrency(jobs);
         observer.say(format_args!("# {name}: {count} at once, on {threads} threads each"));
         for Job { name, memory, .. } in jobs {
-            observer.say(format_args!("{words} {name}    # at most {}", Bytes(*memory)));
+            observer.say(format_args!("{command_line} {name}    # at most {}", Bytes(*memory)));
         }
     }
     Ok(())
 }
 
-/// Runs tasks to their end.
+/// Runs all tasks to completion. After a failure no task is started, and those that are running finish.
 ///
 /// # Errors
-/// When one fails, the first that did; others that were running then have ended, and none is started after it.
+/// The first failure of a task.
 pub(super) fn run(batch: &Batch, observer: &dyn Observer) -> Result<(), Failure> {
     let _lock = lock(batch)?;
     let logs = batch.logs();
@@ -61,19 +61,22 @@ fn run_stage(
     logs: &Path,
     observer: &dyn Observer,
 ) -> Result<(), Failure> {
-    let (count, threads) = at_once(jobs);
+    let (count, threads) = concurrency(jobs);
     let mut waiting = jobs.iter();
     let mut running: Vec<(&str, Child)> = Vec::new();
     let mut failed: Option<Failure> = None;
     loop {
         let mut ended = Vec::new();
-        for (place, (name, child)) in running.iter_mut().enumerate() {
-            if let Some(status) = child.try_wait().map_err(cannot_wait)? {
-                ended.push(place);
+        for (index, (name, child)) in running.iter_mut().enumerate() {
+            if let Some(status) = child
+                .try_wait()
+                .map_err(|error| Failure::new(OTHER, format!("cannot wait for a task: {error}")))?
+            {
+                ended.push(index);
                 if status.success() {
                     observer.say(format_args!("ended    {name}"));
                 } else {
-                    let log = log_of(logs, name);
+                    let log = log_path(logs, name);
                     let code = status.code().and_then(|code| u8::try_from(code).ok());
                     let message = format!(
                         "{name} has failed: {}; the same command goes on from here ({})",
@@ -84,38 +87,38 @@ fn run_stage(
                 }
             }
         }
-        for place in ended.into_iter().rev() {
-            running.remove(place);
+        for index in ended.into_iter().rev() {
+            running.remove(index);
         }
         if let Some(interrupt) = observer.interrupt() {
-            // The same signal has reached the tasks, which end in order.
+            // The tasks have received the same signal and stop by themselves.
             let message = format!("stopped by {}; the same command goes on", interrupt.name);
             failed.get_or_insert(Failure::new(interrupt.exit_code, message));
         }
         while failed.is_none() && running.len() < count {
             let Some(next) = waiting.next() else { break };
             observer.say(format_args!("started  {}", next.name));
-            running.push((&next.name, started(batch, next, threads, logs)?));
+            running.push((&next.name, start(batch, next, threads, logs)?));
         }
         if running.is_empty() {
             return failed.map_or(Ok(()), Err);
         }
-        sleep(LOOK);
+        sleep(POLL_INTERVAL);
     }
 }
 
-fn log_of(logs: &Path, name: &str) -> PathBuf {
+fn log_path(logs: &Path, name: &str) -> PathBuf {
     logs.join(format!("{name}.log"))
 }
 
-fn started(batch: &Batch, job: &Job, threads: u32, logs: &Path) -> Result<Child, Failure> {
-    let words = batch.words()?;
-    let path = log_of(logs, &job.name);
+fn start(batch: &Batch, job: &Job, threads: u32, logs: &Path) -> Result<Child, Failure> {
+    let command_line = batch.command_line()?;
+    let path = log_path(logs, &job.name);
     let log = File::options().create(true).append(true).open(&path);
     let log = log.map_err(FileError::io("write", &path))?;
     let copy = log.try_clone().map_err(FileError::io("write", &path))?;
-    let mut command = Command::new(&words[0]);
-    command.args(&words[1..]).arg(&job.name);
+    let mut command = Command::new(&command_line[0]);
+    command.args(&command_line[1..]).arg(&job.name);
     if job.may_have_fewer_threads {
         command.args(["--threads", &threads.to_string()]);
     }
@@ -124,7 +127,7 @@ fn started(batch: &Batch, job: &Job, threads: u32, logs: &Path) -> Result<Child,
     child.map_err(|error| Failure::new(OTHER, format!("cannot start {}: {error}", job.name)))
 }
 
-/// Held while tasks run here: they are not run twice at a time.
+/// Locks the batch, so that two processes do not run its tasks at the same time.
 fn lock(batch: &Batch) -> Result<File, Failure> {
     let path = batch.folder.join(LOCK_FILE);
     let file = File::options().create(true).append(true).open(&path);
@@ -140,13 +143,9 @@ fn lock(batch: &Batch) -> Result<File, Failure> {
     }
 }
 
-/// What a task said last.
+/// The last line of a task's output.
 fn last_line(log: &Path) -> String {
     let text = fs::read_to_string(log).unwrap_or_default();
     let line = text.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or("no word");
     line.trim().trim_start_matches("error: ").to_owned()
-}
-
-fn cannot_wait(error: std::io::Error) -> Failure {
-    Failure::new(OTHER, format!("cannot wait for a task: {error}"))
 }

@@ -1,16 +1,16 @@
-//! Slurm: a job for each stage, each after the one before has succeeded; a stage of many tasks is an array.
+//! Slurm: one job per stage, dependent on the success of the stage before; an array job for a stage of many tasks.
 
 use std::fmt::Write as _;
 
-use super::{Batch, EngineFile, Job, Stage, asked, mebibytes, quoted};
+use super::{Batch, EngineFile, Job, Stage, run_scheduler, shell_quote};
 use densify_run::failure::Failure;
 
-/// How often a task that was killed begins again by itself.
+/// Most automatic restarts of a task that was killed.
 const RESTARTS: u32 = 5;
 const REMEDY: &str =
     "Slurm's programs must be on this machine's PATH; else choose --engine local or hq";
 
-/// The batch scripts, in order.
+/// Creates the batch scripts, in the order of the stages.
 pub(super) fn files(batch: &Batch) -> Result<Vec<EngineFile>, Failure> {
     batch.stages.iter().map(|stage| script(batch, stage)).collect()
 }
@@ -22,20 +22,21 @@ fn script(batch: &Batch, Stage { name, is_array, jobs }: &Stage) -> Result<Engin
     let mut text = format!(
         "#!/bin/bash\n#SBATCH --job-name=densify-{name}\n#SBATCH --cpus-per-task={threads}\n#SBATCH --mem={}M\n\
          #SBATCH --requeue\n#SBATCH --open-mode=append\n#SBATCH --output=\"{}\"\n",
-        mebibytes(memory),
+        memory.div_ceil(1 << 20),
         log.display()
     );
     let task = if *is_array {
-        let places: Vec<String> = jobs.iter().map(|job| job.place.to_string()).collect();
-        let _ = writeln!(text, "#SBATCH --array={}", places.join(","));
-        let named = |job: &Job| format!("[{}]={}", job.place, quoted(&job.name));
+        let indices: Vec<String> = jobs.iter().map(|job| job.index.to_string()).collect();
+        let _ = writeln!(text, "#SBATCH --array={}", indices.join(","));
+        let named = |job: &Job| format!("[{}]={}", job.index, shell_quote(&job.name));
         let names: Vec<String> = jobs.iter().map(named).collect();
         let _ = writeln!(text, "names=({})", names.join(" "));
         "\"${names[$SLURM_ARRAY_TASK_ID]}\"".to_owned()
     } else {
-        jobs.iter().map(|job| quoted(&job.name)).collect()
+        jobs.iter().map(|job| shell_quote(&job.name)).collect()
     };
-    let words: Vec<String> = batch.words()?.iter().map(|word| quoted(word)).collect();
+    let command_line: Vec<String> =
+        batch.command_line()?.iter().map(|word| shell_quote(word)).collect();
     let _ = write!(
         text,
         "{} {task}\n\
@@ -45,13 +46,13 @@ fn script(batch: &Batch, Stage { name, is_array, jobs }: &Stage) -> Result<Engin
          scontrol requeue \"$SLURM_JOB_ID\" && sleep 60\n\
          fi\n\
          exit $code\n",
-        words.join(" ")
+        command_line.join(" ")
     );
     Ok(EngineFile { path: batch.folder.join("slurm").join(format!("{name}.sh")), text })
 }
 
-/// Hands the scripts in, each to begin when the one before has succeeded; returns the jobs' numbers.
-pub(super) fn hand_in(files: &[EngineFile]) -> Result<Vec<String>, Failure> {
+/// Submits the scripts, each dependent on the one before, and returns the job IDs.
+pub(super) fn submit(files: &[EngineFile]) -> Result<Vec<String>, Failure> {
     let mut jobs: Vec<String> = Vec::new();
     for EngineFile { path, .. } in files {
         let path = path.to_string_lossy();
@@ -59,14 +60,14 @@ pub(super) fn hand_in(files: &[EngineFile]) -> Result<Vec<String>, Failure> {
         let mut arguments = vec!["--parsable"];
         arguments.extend(after.as_deref());
         arguments.push(&path);
-        let said = asked("sbatch", &arguments, REMEDY).map_err(|failure| match &jobs[..] {
-            [] => failure,
-            jobs => {
-                failure.and(&format!("handed in already: {}; cancel with scancel", jobs.join(", ")))
-            }
-        })?;
-        // A cluster's name may follow.
-        jobs.push(said.split(';').next().unwrap_or(&said).to_owned());
+        let output =
+            run_scheduler("sbatch", &arguments, REMEDY).map_err(|failure| match &jobs[..] {
+                [] => failure,
+                jobs => failure
+                    .and(&format!("handed in already: {}; cancel with scancel", jobs.join(", "))),
+            })?;
+        // The output is `ID`, or `ID;CLUSTER`.
+        jobs.push(output.split(';').next().unwrap_or(&output).to_owned());
     }
     Ok(jobs)
 }

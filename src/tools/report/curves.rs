@@ -42,7 +42,7 @@ pub(super) fn draw(runs: &[RunRecord]) -> Result<Option<Markup>, Failure> {
         Some(Curve { name: run.name.clone(), points, colour: at % COLOURS, is_dashed: true })
     }));
     panels.push(("Memory; dashed: what was promised", memory));
-    panels.retain(|(_, panel)| panel.shows_something());
+    panels.retain(|(_, panel)| panel.has_points());
     if panels.is_empty() {
         return Ok(None);
     }

@@ -15,39 +15,33 @@ const MAX_CAUSES: usize = 12;
 const MAX_LINES: usize = 400;
 
 /// Totals over edits.
-#[derive(Debug, Default, Clone, PartialEq)]
+#[derive(Default)]
 struct Totals {
-    edits: usize,
-    removed: usize,
-    added: usize,
-    updated: usize,
-    denied: usize,
+    /// Edits, and Gaussians pruned, added, rewritten and denied, as in the table.
+    counts: [usize; 5],
+    /// Iteration of the first edit.
     first: u32,
+    /// Iteration of the last edit.
     last: u32,
 }
 
 impl Totals {
     fn add(&mut self, event: &EditEvent) {
-        if self.edits == 0 {
+        if self.counts[0] == 0 {
             self.first = event.step;
         }
-        self.edits += 1;
-        self.removed += event.removed;
-        self.added += event.added;
-        self.updated += event.updated;
-        self.denied += event.denied;
+        let counts = [1, event.removed, event.added, event.updated, event.denied];
+        self.counts = std::array::from_fn(|column| self.counts[column] + counts[column]);
         self.last = event.step;
     }
 
     fn row(&self, cause: &str) -> Vec<String> {
-        let counts = [self.edits, self.removed, self.added, self.updated, self.denied];
         let steps = if self.first == self.last {
             grouped(self.first as usize)
         } else {
             format!("{} to {}", grouped(self.first as usize), grouped(self.last as usize))
         };
-        let counts = counts.into_iter().map(grouped);
-        std::iter::once(cause.to_owned()).chain(counts).chain([steps]).collect()
+        std::iter::once(cause.to_owned()).chain(self.counts.map(grouped)).chain([steps]).collect()
     }
 }
 
@@ -98,7 +92,7 @@ fn totals_by_cause(events: &[EditEvent]) -> Vec<(String, Totals)> {
     }
     let mut totals: Vec<(String, Totals)> =
         by_cause.into_iter().map(|(cause, totals)| (cause.to_owned(), totals)).collect();
-    totals.sort_by_key(|(_, totals)| std::cmp::Reverse(totals.edits));
+    totals.sort_by_key(|(_, totals)| std::cmp::Reverse(totals.counts[0]));
     let others = totals.len().saturating_sub(MAX_CAUSES);
     totals.truncate(MAX_CAUSES);
     if totals.len() > 1 {
@@ -133,6 +127,6 @@ mod tests {
         let many: Vec<EditEvent> = (0..20).map(|n| event(n, &format!("c{n:02}"), 1, 1)).collect();
         let totals = totals_by_cause(&many);
         assert_eq!(totals.len(), MAX_CAUSES + 1);
-        assert_eq!((&*totals[12].0, totals[12].1.removed), ("all, with 8 rarer causes", 20));
+        assert_eq!((&*totals[12].0, totals[12].1.counts[1]), ("all, with 8 rarer causes", 20));
     }
 }

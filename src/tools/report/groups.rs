@@ -1,5 +1,6 @@
 //! Groups runs by scene, and within a scene by settings, so that the runs of a group differ only in their seed.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use toml::Table;
@@ -29,11 +30,6 @@ pub(super) struct Group {
     pub(super) runs: Vec<usize>,
 }
 
-/// All runs, grouped by scene and settings.
-pub(super) struct Groups {
-    pub(super) scenes: Vec<Scene>,
-}
-
 impl Scene {
     /// The runs that represent their groups in pictures: those with the smallest seed.
     pub(super) fn representatives(&self) -> impl Iterator<Item = usize> {
@@ -43,58 +39,49 @@ impl Scene {
 
 /// The name of a scene, without its parent folders.
 pub(super) fn scene_name(path: &Path) -> String {
-    let name = match builtin::name(path) {
-        Some(name) => name.to_owned(),
-        None => name_of(path),
-    };
-    files::one_line(&name)
+    files::one_line(&builtin::name(path).map_or_else(|| name_of(path), str::to_owned))
 }
 
-impl Groups {
-    pub(super) fn new(runs: &[RunRecord]) -> Result<Self, Failure> {
-        // Each with the canonical path of its dataset, and the settings of its groups.
-        let mut scenes: Vec<(Scene, PathBuf, Vec<Table>)> = Vec::new();
-        for (number, run) in runs.iter().enumerate() {
-            let path = run.config.scene_path();
-            let place = path.canonicalize().unwrap_or_else(|_| path.clone());
-            let data = DataSpec { no_cache: false, ..run.config.spec.data.clone() };
-            let settings = settings(run)?;
-            let found = scenes
-                .iter()
-                .position(|(scene, other, _)| *other == place && scene.data == data)
-                .unwrap_or_else(|| {
-                    let label = scene_name(&path);
-                    let same = scenes.iter().filter(|(scene, ..)| scene.label.starts_with(&label));
-                    let label = match same.count() {
-                        0 => label,
-                        others => format!("{label}, read another way ({})", others + 1),
-                    };
-                    scenes.push((
-                        Scene { label, path, data, groups: Vec::new() },
-                        place,
-                        Vec::new(),
-                    ));
-                    scenes.len() - 1
-                });
-            let (scene, _, known) = &mut scenes[found];
-            match known.iter().position(|other| *other == settings) {
-                Some(at) => scene.groups[at].runs.push(number),
-                None => {
-                    known.push(settings);
-                    scene.groups.push(Group { label: String::new(), runs: vec![number] });
-                }
+/// Groups all runs by scene and settings.
+pub(super) fn group(runs: &[RunRecord]) -> Result<Vec<Scene>, Failure> {
+    // Each with the canonical path of its dataset, and the settings of its groups.
+    let mut scenes: Vec<(Scene, PathBuf, Vec<Table>)> = Vec::new();
+    for (number, run) in runs.iter().enumerate() {
+        let path = run.config.scene_path();
+        let place = path.canonicalize().unwrap_or_else(|_| path.clone());
+        let data = DataSpec { no_cache: false, ..run.config.spec.data.clone() };
+        let settings = settings(run)?;
+        let found = scenes
+            .iter()
+            .position(|(scene, other, _)| *other == place && scene.data == data)
+            .unwrap_or_else(|| {
+                let label = scene_name(&path);
+                let same = scenes.iter().filter(|(scene, ..)| scene.label.starts_with(&label));
+                let label = match same.count() {
+                    0 => label,
+                    others => format!("{label}, read another way ({})", others + 1),
+                };
+                let scene = Scene { label, path, data, groups: Vec::new() };
+                scenes.push((scene, place, Vec::new()));
+                scenes.len() - 1
+            });
+        let (scene, _, known) = &mut scenes[found];
+        match known.iter().position(|other| *other == settings) {
+            Some(at) => scene.groups[at].runs.push(number),
+            None => {
+                known.push(settings);
+                scene.groups.push(Group { label: String::new(), runs: vec![number] });
             }
         }
-        let mut done = Vec::new();
-        for (mut scene, _, known) in scenes {
-            for (group, label) in scene.groups.iter_mut().zip(labels(&known)) {
-                group.runs.sort_by_key(|&run| runs[run].config.spec.schedule.seed);
-                group.label = label;
-            }
-            done.push(scene);
-        }
-        Ok(Self { scenes: done })
     }
+    let finish = |(mut scene, _, known): (Scene, PathBuf, Vec<Table>)| {
+        for (group, label) in scene.groups.iter_mut().zip(labels(&known)) {
+            group.runs.sort_by_key(|&run| runs[run].config.spec.schedule.seed);
+            group.label = label;
+        }
+        scene
+    };
+    Ok(scenes.into_iter().map(finish).collect())
 }
 
 /// The settings that determine the result of a run, except scene and seed.
@@ -123,16 +110,15 @@ fn labels(known: &[Table]) -> Vec<String> {
             && others.iter().all(|other| other.contains_key(*name))
     };
     let differing: Vec<&String> = first.keys().filter(differs).collect();
-    let label = |(number, options): (usize, &std::collections::BTreeMap<String, String>)| {
+    let label = |(number, options): (usize, &BTreeMap<String, String>)| {
         let policy = options.get("policy").cloned().unwrap_or_default();
         let some = differing.iter().take(MAX_OPTIONS);
         let some = some.map(|name| format!(", {name} {}", options[*name])).collect::<String>();
-        let more = if differing.len() > MAX_OPTIONS {
-            format!(" … ({})", number + 1)
-        } else {
-            String::new()
-        };
-        files::one_line(&format!("{policy}{some}{more}"))
+        let mut label = format!("{policy}{some}");
+        if differing.len() > MAX_OPTIONS {
+            label += &format!(" … ({})", number + 1);
+        }
+        files::one_line(&label)
     };
     all.iter().enumerate().map(label).collect()
 }
@@ -143,24 +129,24 @@ mod tests {
 
     #[test]
     fn groups_are_labelled_by_their_differences() {
-        let of = |tables: &[&str]| {
+        let labels_of = |tables: &[&str]| {
             labels(&tables.iter().map(|text| text.parse().unwrap()).collect::<Vec<Table>>())
         };
-        assert_eq!(of(&["policy = 'diet'\nbudget = 9"]), ["diet"]);
+        assert_eq!(labels_of(&["policy = 'diet'\nbudget = 9"]), ["diet"]);
         assert_eq!(
-            of(&["policy = 'diet'\nbudget = 9", "policy = 'mcmc'\nbudget = 9"]),
+            labels_of(&["policy = 'diet'\nbudget = 9", "policy = 'mcmc'\nbudget = 9"]),
             ["diet", "mcmc"]
         );
         assert_eq!(
-            of(&[
+            labels_of(&[
                 "policy = 'a'\nbudget = 9\nknob.x = '1/9'",
                 "policy = 'a'\nbudget = 8\nknob.x = '1/8'"
             ]),
             ["a, budget 9, knob.x 1/9", "a, budget 8, knob.x 1/8"]
         );
         let many = |n: u32| format!("policy = 'a'\nb = {n}\nc = {n}\nd = {n}\ne = {n}");
-        assert_eq!(of(&[&many(1), &many(2)])[1], "a, b 2, c 2, d 2 … (2)");
+        assert_eq!(labels_of(&[&many(1), &many(2)])[1], "a, b 2, c 2, d 2 … (2)");
         // An option that only one group has is not a difference.
-        assert_eq!(of(&["policy = 'a'\np.x = 1", "policy = 'b'\np.y = 1"]), ["a", "b"]);
+        assert_eq!(labels_of(&["policy = 'a'\np.x = 1", "policy = 'b'\np.y = 1"]), ["a", "b"]);
     }
 }

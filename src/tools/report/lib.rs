@@ -20,7 +20,6 @@ use densify_core::files::write_atomically;
 use densify_run::failure::Failure;
 use densify_run::finished::Machine;
 use densify_run::{DeviceSpec, Observer};
-use groups::Groups;
 use runs::RunRecord;
 
 /// The runs to report on, and how to render them.
@@ -45,9 +44,9 @@ pub fn write(
     observer: &dyn Observer,
 ) -> Result<(), Failure> {
     let runs = RunRecord::read_all(options, observer)?;
-    let groups = Groups::new(&runs)?;
+    let scenes = groups::group(&runs)?;
     if options.dataset.is_some()
-        && let [first, second, ..] = &groups.scenes[..]
+        && let [first, second, ..] = &scenes[..]
     {
         let (first, second) = (&first.label, &second.label);
         return Err(Failure::input(format!(
@@ -57,9 +56,9 @@ pub fn write(
     }
     let machine = Machine::open(options.device, observer)?;
     let mut pictures = Vec::new();
-    for scene in &groups.scenes {
+    for scene in &scenes {
         pictures.push(pictures::render(scene, &runs, options, &machine, observer)?);
     }
-    let text = page::page(&runs, &groups, &pictures)?;
+    let text = page::page(&runs, &scenes, &pictures)?;
     Ok(write_atomically(file, |out| out.write_all(text.as_bytes()))?)
 }

@@ -2,7 +2,7 @@
 
 use maud::{Markup, html};
 
-use super::groups::Groups;
+use super::groups::Scene;
 use super::pictures::{NamedPicture, Orbit, ScenePictures, ViewComparison};
 use super::runs::RunRecord;
 use super::scores::{self, last_step};
@@ -15,10 +15,10 @@ use densify_train::evaluate::Split;
 /// Composes the report.
 pub(super) fn page(
     runs: &[RunRecord],
-    groups: &Groups,
+    scenes: &[Scene],
     pictures: &[ScenePictures],
 ) -> Result<String, Failure> {
-    let title = match (runs, &groups.scenes[..]) {
+    let title = match (runs, scenes) {
         ([run], _) => format!("{}: report of a run", run.name),
         (_, [scene]) => format!("{}: report of {} runs", scene.label, runs.len()),
         (_, scenes) => format!("Report of {} runs of {} scenes", runs.len(), scenes.len()),
@@ -26,28 +26,28 @@ pub(super) fn page(
     let body = html! {
         header {
             h1 { (title) }
-            p { (introduction(groups)) }
+            p { (introduction(scenes)) }
             @for run in runs { @if let Some(note) = describe_unfinished(run) { p { strong { (note) } } } }
             @if let [run] = runs { (scores::summarise(run)) }
         }
         section {
             h2 { "Scores" }
-            (scores::tabulate_runs(runs, groups))
+            (scores::tabulate_runs(runs, scenes))
             @if runs.iter().all(|run| run.score().is_none()) {
                 p.note { "No view was held out, or none was evaluated; train with --eval to get scores." }
             } @else {
                 p.note { "Means over the views held out from training. Higher PSNR and SSIM are better, as is lower FLIP." }
             }
-            @if let Some(means) = scores::tabulate_means(runs, groups) { (means) }
+            @if let Some(means) = scores::tabulate_means(runs, scenes) { (means) }
             @if let Some(geometry) = scores::tabulate_geometry(runs) { (geometry) }
             @if let Some(differing) = options::list_differences(runs)? {
                 h3 { "What differs between the runs" }
                 (differing)
             }
         }
-        @for (scene, pictures) in groups.scenes.iter().zip(pictures) {
+        @for (scene, pictures) in scenes.iter().zip(pictures) {
             section {
-                h2 { "Views" @if groups.scenes.len() > 1 { " of " (scene.label) } }
+                h2 { "Views" @if scenes.len() > 1 { " of " (scene.label) } }
                 (views(pictures))
             }
         }
@@ -64,8 +64,8 @@ pub(super) fn page(
     Ok(whole_page(&title, &body))
 }
 
-fn introduction(groups: &Groups) -> Markup {
-    let scenes: Vec<&str> = groups.scenes.iter().map(|scene| &*scene.label).collect();
+fn introduction(scenes: &[Scene]) -> Markup {
+    let scenes: Vec<&str> = scenes.iter().map(|scene| &*scene.label).collect();
     html! {
         "3D Gaussian Splatting of " strong { (scenes.join(", ")) }
         ", by densify. Everything is in this file; nothing is loaded from elsewhere."

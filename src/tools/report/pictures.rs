@@ -217,7 +217,10 @@ fn named(name: &str, image: RgbImage, quality: u8) -> Result<NamedPicture, Failu
 }
 
 fn crop(name: &str, image: &RgbImage, window: Window) -> Result<NamedPicture, Failure> {
-    Ok(NamedPicture { name: name.to_owned(), picture: EmbeddedImage::lossless(&window.of(image))? })
+    Ok(NamedPicture {
+        name: name.to_owned(),
+        picture: EmbeddedImage::lossless(&window.crop(image))?,
+    })
 }
 
 /// Shrinks a size to fit a square of this side, keeping the aspect ratio.

@@ -2,7 +2,7 @@
 
 use maud::{Markup, html};
 
-use super::groups::{Group, Groups, Scene};
+use super::groups::{Group, Scene};
 use super::runs::RunRecord;
 use densify_core::memory::Bytes;
 use densify_core::numbers::{duration, grouped, percent};
@@ -26,7 +26,7 @@ pub(super) fn summarise(run: &RunRecord) -> Markup {
     let score = run.score();
     let summary = run.summary.as_ref();
     let of_budget = format!("of at most {}", grouped(run.config.budget));
-    let promised = summary.map(|it| format!("{} promised", Bytes(it.ledger_bytes)));
+    let promised = summary.map(|summary| format!("{} promised", Bytes(summary.ledger_bytes)));
     html! {
         dl.numbers {
             @for (name, value, digits) in SCORES {
@@ -63,10 +63,10 @@ fn number(value: f64, digits: usize) -> String {
 }
 
 /// Tabulates all runs.
-pub(super) fn tabulate_runs(runs: &[RunRecord], groups: &Groups) -> Markup {
+pub(super) fn tabulate_runs(runs: &[RunRecord], scenes: &[Scene]) -> Markup {
     let has_lpips = runs.iter().any(|run| run.score().is_some_and(|mean| mean.lpips.is_some()));
     let mut columns = vec![Column::text("run")];
-    if groups.scenes.len() > 1 {
+    if scenes.len() > 1 {
         columns.push(Column::text("scene"));
     }
     columns.extend([Column::text("policy"), Column::number("seed"), Column::number("iteration")]);
@@ -78,12 +78,12 @@ pub(super) fn tabulate_runs(runs: &[RunRecord], groups: &Groups) -> Markup {
     columns.extend(rest.map(Column::number));
     let scene_of = |number: usize| {
         let has = |scene: &&Scene| scene.groups.iter().any(|group| group.runs.contains(&number));
-        groups.scenes.iter().find(has).map_or(DASH.to_owned(), |scene| scene.label.clone())
+        scenes.iter().find(has).map_or(DASH.to_owned(), |scene| scene.label.clone())
     };
     let or_dash = |text: Option<String>| text.unwrap_or_else(|| DASH.to_owned());
     let row = |(at, run): (usize, &RunRecord)| {
         let mut row = vec![run.name.clone()];
-        if groups.scenes.len() > 1 {
+        if scenes.len() > 1 {
             row.push(scene_of(at));
         }
         let spec = &run.config.spec;
@@ -93,7 +93,8 @@ pub(super) fn tabulate_runs(runs: &[RunRecord], groups: &Groups) -> Markup {
             grouped(run.iteration as usize),
         ]);
         let score = run.score();
-        let cell = |(_, value, digits): Score| or_dash(score.map(|it| number(value(&it), digits)));
+        let cell =
+            |(_, value, digits): Score| or_dash(score.map(|mean| number(value(&mean), digits)));
         row.extend(SCORES.map(cell));
         if has_lpips {
             row.push(or_dash(score.and_then(|mean| Some(number(mean.lpips?, 4)))));
@@ -114,29 +115,25 @@ pub(super) fn tabulate_runs(runs: &[RunRecord], groups: &Groups) -> Markup {
 }
 
 /// Tabulates means over seeds, and differences from the first group of each scene; `None` if no scene has two runs.
-pub(super) fn tabulate_means(runs: &[RunRecord], groups: &Groups) -> Option<Markup> {
-    let several = groups.scenes.iter().filter(|scene| count(scene) > 1);
-    let several: Vec<&Scene> = several.collect();
+pub(super) fn tabulate_means(runs: &[RunRecord], scenes: &[Scene]) -> Option<Markup> {
+    let count = |scene: &Scene| scene.groups.iter().map(|group| group.runs.len()).sum::<usize>();
+    let several: Vec<&Scene> = scenes.iter().filter(|scene| count(scene) > 1).collect();
     if several.is_empty() {
         return None;
     }
     Some(html! {
         h3 { "Means over seeds" }
         @for scene in several {
-            @if groups.scenes.len() > 1 { p { strong { (scene.label) } } }
+            @if scenes.len() > 1 { p { strong { (scene.label) } } }
             (tabulate_scene(scene, runs))
         }
         p.note {
             "Brackets are 95 % intervals of the mean by Student's t, given from three seeds on."
-            @if groups.scenes.iter().any(|scene| scene.groups.len() > 1) {
+            @if scenes.iter().any(|scene| scene.groups.len() > 1) {
                 " Differences are between runs of the same seed."
             }
         }
     })
-}
-
-fn count(scene: &Scene) -> usize {
-    scene.groups.iter().map(|group| group.runs.len()).sum()
 }
 
 fn tabulate_scene(scene: &Scene, runs: &[RunRecord]) -> Markup {
@@ -154,11 +151,8 @@ fn tabulate_scene(scene: &Scene, runs: &[RunRecord]) -> Markup {
             row.push(mean_of(&values, digits));
         }
         if scene.groups.len() > 1 {
-            row.push(if std::ptr::eq(group, first) {
-                DASH.to_owned()
-            } else {
-                against_first(group, first, runs)
-            });
+            let is_first = std::ptr::eq(group, first);
+            row.push(if is_first { DASH.to_owned() } else { against_first(group, first, runs) });
         }
         row
     };
@@ -183,7 +177,7 @@ fn pairs(
 /// `30.12 [29.95, 30.29]`
 fn mean_of(values: &[Pair<'_>], digits: usize) -> String {
     let Some(found) = Difference::new(values) else { return DASH.to_owned() };
-    let within = found.within(|[low, high]| format!("{low:.digits$}, {high:.digits$}"));
+    let within = found.format_interval(|[low, high]| format!("{low:.digits$}, {high:.digits$}"));
     format!("{:.digits$}{within}", found.mean)
 }
 
@@ -196,7 +190,7 @@ fn against_first(group: &Group, first: &Group, runs: &[RunRecord]) -> String {
     };
     let differences: Vec<Pair<'_>> =
         pairs(group, runs, psnr).into_iter().filter_map(pair).collect();
-    Difference::new(&differences).map_or_else(|| DASH.to_owned(), |found| found.show(2))
+    Difference::new(&differences).map_or_else(|| DASH.to_owned(), |found| found.format(2))
 }
 
 /// Tabulates geometric errors against the known surface; `None` if it is not known.

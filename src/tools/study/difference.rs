@@ -1,4 +1,4 @@
-//! Paired differences, with intervals that say how far chance may have moved them.
+//! Means of paired differences with confidence intervals.
 
 use std::collections::BTreeMap;
 
@@ -6,17 +6,17 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use statrs::distribution::{ContinuousCDF, StudentsT};
 
-/// Resamples of a bootstrap: its standard error is then known to a hundredth.
+/// Resamples of a bootstrap, enough for a standard error accurate to one percent.
 const RESAMPLES: usize = 10_000;
-/// Fewest runs, or scenes, that an interval is given for.
-const FEWEST: usize = 3;
+/// Fewest runs, or scenes, for which an interval is computed.
+const MIN_VALUES: usize = 3;
 
-/// What [`Difference`] does, for reports.
+/// Explanation of the intervals of [`Difference`], for reports.
 pub(super) const INTERVALS: &str = "Brackets are 95 % intervals of the mean: Student's t over seeds; over several scenes \
     scenes and then their seeds are resampled, and the standard error is multiplied by Student's t, as scenes are few. \
     Below three seeds, or three scenes, there is none";
 
-/// The mean of some numbers; `None` without any.
+/// Mean of some numbers; `None` if there are none.
 pub(super) fn mean(values: impl IntoIterator<Item = f64>) -> Option<f64> {
     let (sum, count) =
         values.into_iter().fold((0.0, 0_u32), |(sum, count), value| (sum + value, count + 1));
@@ -30,95 +30,95 @@ pub struct Pair<'a> {
     pub scene: &'a str,
     /// The seed of both runs.
     pub seed: u32,
-    /// The second run's value less the first one's.
+    /// Value of the second run minus that of the first.
     pub difference: f64,
 }
 
 /// The mean of paired differences.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Difference {
-    /// Over scenes, of means over seeds.
+    /// Mean over scenes of the means over seeds.
     pub mean: f64,
-    /// 95 % interval of the mean ([`INTERVALS`]).
+    /// 95 % confidence interval of the mean ([`INTERVALS`]).
     pub(super) interval: Option<[f64; 2]>,
+    /// Number of pairs.
     pub(super) pairs: usize,
-    /// Most seeds of a scene, >= 1.
+    /// Largest number of seeds of a scene, >= 1.
     pub(super) seeds: usize,
-    /// Pairs in which the difference is above zero.
+    /// Number of pairs with a positive difference.
     pub(super) above: usize,
-    /// Pairs in which it is below zero.
+    /// Number of pairs with a negative difference.
     pub(super) below: usize,
-    /// Scenes that the pairs are of, >= 1.
+    /// Number of scenes, >= 1.
     pub(super) scenes: usize,
 }
 
 impl Difference {
-    /// The statistics of these pairs; `None` where there are none.
+    /// Computes the statistics of pairs; `None` if there are none.
     pub fn new(pairs: &[Pair<'_>]) -> Option<Self> {
         let mut by_scene: BTreeMap<&str, BTreeMap<u32, Vec<f64>>> = BTreeMap::new();
         for pair in pairs {
             let seeds = by_scene.entry(pair.scene).or_default();
             seeds.entry(pair.seed).or_default().push(pair.difference);
         }
-        // Of a seed with several budgets the mean: its runs start alike.
-        let of_scene = |seeds: BTreeMap<u32, Vec<f64>>| -> Vec<f64> {
-            seeds.into_values().filter_map(mean).collect()
-        };
-        let by_scene: Vec<Vec<f64>> = by_scene.into_values().map(of_scene).collect();
+        // Runs of one seed with several budgets start alike, so only their mean is an independent value.
+        let means = |seeds: BTreeMap<u32, Vec<f64>>| seeds.into_values().filter_map(mean).collect();
+        let by_scene: Vec<Vec<f64>> = by_scene.into_values().map(means).collect();
         let mean = mean(by_scene.iter().filter_map(|seeds| mean(seeds.iter().copied())))?;
         let half = match &by_scene[..] {
-            [seeds] => half_over_seeds(seeds),
-            scenes => half_over_scenes(scenes),
+            [seeds] => half_interval_over_seeds(seeds),
+            scenes => half_interval_over_scenes(scenes),
         };
-        let signs = |is: fn(f64) -> bool| pairs.iter().filter(|it| is(it.difference)).count();
+        let count = |is: fn(f64) -> bool| pairs.iter().filter(|pair| is(pair.difference)).count();
         Some(Self {
             mean,
             interval: half.map(|half| [mean - half, mean + half]),
             pairs: pairs.len(),
             seeds: by_scene.iter().map(Vec::len).max().unwrap_or(0),
-            above: signs(|d| d > 0.0),
-            below: signs(|d| d < 0.0),
+            above: count(|d| d > 0.0),
+            below: count(|d| d < 0.0),
             scenes: by_scene.len(),
         })
     }
 
-    /// `+0.12 [+0.05, +0.19]`; `+0.12, two runs` where there is no interval.
-    pub fn show(&self, digits: usize) -> String {
+    /// Formats the mean and its interval, as `+0.12 [+0.05, +0.19]`, or `+0.12, two runs` if there is no interval.
+    pub fn format(&self, digits: usize) -> String {
         let low_and_high = |[low, high]: [f64; 2]| format!("{low:+.digits$}, {high:+.digits$}");
-        format!("{:+.digits$}{}", self.mean, self.within(low_and_high))
+        format!("{:+.digits$}{}", self.mean, self.format_interval(low_and_high))
     }
 
-    /// What follows the mean: the interval as `show` writes it, or why there is none.
-    pub fn within(&self, show: impl Fn([f64; 2]) -> String) -> String {
-        let why = match (self.scenes, self.seeds, self.pairs == self.seeds) {
+    /// Formats the interval in brackets, or the reason why there is none, to follow the mean.
+    pub fn format_interval(&self, bounds: impl Fn([f64; 2]) -> String) -> String {
+        let reason = match (self.scenes, self.seeds, self.pairs == self.seeds) {
             (2.., ..) => "two scenes",
             (_, 1, true) => "one run",
             (_, 1, false) => "one seed",
             (_, _, true) => "two runs",
             (_, _, false) => "two seeds",
         };
-        self.interval.map_or_else(|| format!(", {why}"), |it| format!(" [{}]", show(it)))
+        self.interval
+            .map_or_else(|| format!(", {reason}"), |interval| format!(" [{}]", bounds(interval)))
     }
 }
 
-/// The factor of a standard error for 95 %, where it is known from so many values.
-fn student(values: usize) -> Option<f64> {
-    let freedom = values.checked_sub(1).filter(|_| values >= FEWEST)?;
-    Some(StudentsT::new(0.0, 1.0, freedom as f64).ok()?.inverse_cdf(0.975))
+/// Student's t for a 95 % interval; `None` for too few values.
+fn student_factor(values: usize) -> Option<f64> {
+    let degrees_of_freedom = values.checked_sub(1).filter(|_| values >= MIN_VALUES)?;
+    Some(StudentsT::new(0.0, 1.0, degrees_of_freedom as f64).ok()?.inverse_cdf(0.975))
 }
 
-/// Half of the interval of the mean of independent values.
-fn half_over_seeds(values: &[f64]) -> Option<f64> {
-    Some(student(values.len())? * super::standard_error(values)?)
+/// Half the width of the interval of the mean of independent values.
+fn half_interval_over_seeds(values: &[f64]) -> Option<f64> {
+    Some(student_factor(values.len())? * super::standard_error(values)?)
 }
 
-/// The same where scenes are drawn first and then their seeds. The bootstrap's own error of `n` scenes is
-/// too small by (n − 1)/n; and its percentiles would end at the extremes of a few scenes, which hold the
-/// mean less often than they say (Efron and Tibshirani 1993, chapters 8 and 12).
-fn half_over_scenes(scenes: &[Vec<f64>]) -> Option<f64> {
+/// Half the width of the interval of the mean if scenes are resampled first and then their seeds. The variance of a
+/// bootstrap over `n` scenes is too small by (n − 1)/n. Percentiles of the bootstrap would not cover the mean often enough
+/// with few scenes (Efron and Tibshirani 1993, chapters 8 and 12).
+fn half_interval_over_scenes(scenes: &[Vec<f64>]) -> Option<f64> {
     let n = scenes.len();
-    let factor = student(n)? * (n as f64 / (n as f64 - 1.0)).sqrt();
-    // The same resamples at every call: a table does not change by being written again.
+    let factor = student_factor(n)? * (n as f64 / (n as f64 - 1.0)).sqrt();
+    // The seed is fixed so that reports are reproducible.
     let mut rng = ChaCha8Rng::seed_from_u64(n as u64);
     let mut resample = || {
         let scene = |rng: &mut ChaCha8Rng| {
@@ -129,8 +129,8 @@ fn half_over_scenes(scenes: &[Vec<f64>]) -> Option<f64> {
         (0..n).map(|_| scene(&mut rng)).sum::<f64>() / n as f64
     };
     let means: Vec<f64> = (0..RESAMPLES).map(|_| resample()).collect();
-    let spread = super::standard_error(&means)? * (RESAMPLES as f64).sqrt();
-    Some(factor * spread)
+    let deviation = super::standard_error(&means)? * (RESAMPLES as f64).sqrt();
+    Some(factor * deviation)
 }
 
 #[cfg(test)]
@@ -139,8 +139,8 @@ mod tests {
 
     use super::*;
 
-    /// Differences by scene and seed.
-    fn of(scenes: &[&[f64]]) -> Option<Difference> {
+    /// The difference of values by scene and seed.
+    fn difference(scenes: &[&[f64]]) -> Option<Difference> {
         let names: Vec<String> = (0..scenes.len()).map(|i| i.to_string()).collect();
         let pairs = names.iter().zip(scenes).flat_map(|(scene, seeds)| {
             let pair = |(seed, &difference)| Pair { scene, seed, difference };
@@ -160,15 +160,15 @@ mod tests {
             (&[1.0, 2.0, 3.0, 4.0, 5.0], 2.776, root(0.5)),
             (&ten, 2.262, root(55.0 / 60.0)),
         ] {
-            let found = of(&[values]).unwrap();
+            let found = difference(&[values]).unwrap();
             let [low, high] = found.interval.unwrap();
             assert!((high - found.mean - quantile * error).abs() < 1e-3 * error, "{high}");
             assert!((found.mean - low - (high - found.mean)).abs() < 1e-12);
         }
-        let found = of(&[&[0.0, 1.0, 2.0]]).unwrap();
+        let found = difference(&[&[0.0, 1.0, 2.0]]).unwrap();
         assert!((found.mean - 1.0).abs() < 1e-12);
         assert_eq!((found.pairs, found.above, found.below), (3, 2, 0));
-        assert_eq!(of(&[&[0.5; 3]]).unwrap().show(1), "+0.5 [+0.5, +0.5]");
+        assert_eq!(difference(&[&[0.5; 3]]).unwrap().format(1), "+0.5 [+0.5, +0.5]");
     }
 
     #[test]
@@ -178,17 +178,17 @@ mod tests {
             (&[&[0.0, 1.0]], "+0.50, two runs"),
             (&[&[0.0; 9], &[1.0; 9]], "+0.50, two scenes"),
         ] {
-            assert_eq!(of(scenes).unwrap().show(2), said);
+            assert_eq!(difference(scenes).unwrap().format(2), said);
         }
-        assert!(of(&[]).is_none());
-        // Budgets of one seed are no runs by chance.
+        assert!(difference(&[]).is_none());
+        // Several budgets of one seed are not independent.
         let pair = |difference| Pair { scene: "room", seed: 0, difference };
         let found = Difference::new(&[pair(1.0), pair(2.0), pair(3.0)]).unwrap();
-        assert_eq!((found.show(1).as_str(), found.pairs), ("+2.0, one seed", 3));
+        assert_eq!((found.format(1).as_str(), found.pairs), ("+2.0, one seed", 3));
     }
 
-    /// The variance of such a resample is known: (that of the scenes' means + the mean of those of the
-    /// scenes' seeds, each over their number) over the number of scenes.
+    /// The variance of a resample is (variance of the scenes' means + mean over scenes of the seeds' variance divided by
+    /// their number) / number of scenes.
     #[test]
     fn resampled_errors_are_those_of_the_closed_form() {
         let scenes: [&[f64]; 4] = [&[0.0, 1.0, 2.0], &[2.0, 4.0], &[-1.0, 0.0, 4.0], &[5.0]];
@@ -200,13 +200,13 @@ mod tests {
         let within = scenes.map(|seeds| variance(seeds) / seeds.len() as f64);
         let error = ((variance(&means) + mean(within).unwrap()) / 4.0).sqrt();
         let expected = 3.182 * (4.0_f64 / 3.0).sqrt() * error;
-        let found = of(&scenes).unwrap();
+        let found = difference(&scenes).unwrap();
         let half = found.interval.unwrap()[1] - found.mean;
         assert!((half / expected - 1.0).abs() < 0.03, "{half}, not {expected}");
     }
 
-    /// Of imaginary studies of three scenes and three seeds, 19 in 20 intervals must hold the truth,
-    /// whether scenes differ or not; those of percentiles would in 15 to 17.
+    /// In simulated studies of three scenes and three seeds, 19 of 20 intervals must contain the true mean, whether scenes
+    /// differ or not. Percentile intervals would in 15 to 17.
     #[test]
     fn intervals_over_scenes_hold_the_truth_as_often_as_they_say() {
         let normal = Normal::new(0.0, 1.0).unwrap();
@@ -218,11 +218,12 @@ mod tests {
                     let scene = of_scenes * draw();
                     [(); 3].map(|()| scene + draw())
                 });
-                let [low, high] = of(&scenes.each_ref().map(|s| &s[..])).unwrap().interval.unwrap();
+                let [low, high] =
+                    difference(&scenes.each_ref().map(|s| &s[..])).unwrap().interval.unwrap();
                 low <= 0.0 && 0.0 <= high
             };
             let held = (0..200).filter(holds).count();
-            // 190 are expected at least; by chance 182 in one study of a hundred.
+            // At least 190 are expected; the first percentile is 182.
             assert!(held >= 182, "{held} of 200 where scenes differ by {of_scenes}");
         }
     }

@@ -1,16 +1,16 @@
-//! The runs of a study as tasks of an engine: several at once here, or on a cluster whose machines share the folder.
+//! Submits the runs of a study to an engine: several at once on this machine, or on a cluster with a shared folder.
 
 use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use super::cell::Cell;
+use super::planned_run::PlannedRun;
 use densify_launch as launch;
 use densify_launch::{Batch, Engine, Job, Stage, Submission, SubmissionArgs, utf8};
 use densify_run::failure::Failure;
 use densify_run::{Host, Observer, Partial, RunSpec, host_bytes};
 
-/// Who makes the runs of a study.
+/// The engine that trains the runs of a study.
 #[derive(Debug, Clone, Default, Args)]
 #[command(next_help_heading = "Engine")]
 pub struct EngineArgs {
@@ -26,8 +26,8 @@ pub struct EngineArgs {
 impl EngineArgs {
     pub(super) fn submission(&self) -> Result<Option<Submission>, Failure> {
         match self.engine {
-            Some(engine) => self.more.with(engine).map(Some),
-            None => self.more.without().map(|()| None),
+            Some(engine) => self.more.for_engine(engine).map(Some),
+            None => self.more.require_none().map(|()| None),
         }
     }
 }
@@ -44,52 +44,56 @@ pub struct StudyRun {
 }
 
 impl StudyRun {
-    /// Makes the run.
+    /// Trains the run.
     ///
     /// # Errors
-    /// When the description of the run cannot be read, or the run fails.
-    pub fn make(&self) -> Result<(), Failure> {
-        Cell::read(&self.folder, &self.name)?.make(&self.folder)
+    /// If the description of the run cannot be read, or the run fails.
+    pub fn train(&self) -> Result<(), Failure> {
+        PlannedRun::read(&self.folder, &self.name)?.train_and_record(&self.folder)
     }
 }
 
-/// Starts the runs that are not done, or hands them in; says how far they are where that was done before.
+/// Starts or submits the runs that are not done. If they were submitted before, reports the jobs instead.
 pub(super) fn submit(
     output: &Path,
-    cells: &[Cell],
-    is_done: impl Fn(&Cell) -> bool,
+    runs: &[PlannedRun],
+    is_done: impl Fn(&PlannedRun) -> bool,
     submission: Submission,
     observer: &dyn Observer,
 ) -> Result<(), Failure> {
     let folder = std::path::absolute(output).map_err(Failure::input)?;
-    let open: Vec<&Cell> = cells.iter().filter(|cell| !is_done(cell)).collect();
-    observer.say(format_args!("runs     {} of {} done", cells.len() - open.len(), cells.len()));
-    let is_handed_in = !matches!(submission.engine, Engine::Local) && !submission.dry_run;
-    if let Some(jobs) = launch::submitted(&folder).filter(|_| is_handed_in && !submission.again) {
+    let done = runs.iter().filter(|run| is_done(run)).count();
+    observer.say(format_args!("runs     {done} of {} done", runs.len()));
+    let is_scheduled = !matches!(submission.engine, Engine::Local) && !submission.dry_run;
+    if let Some(jobs) =
+        launch::submitted_jobs(&folder).filter(|_| is_scheduled && !submission.again)
+    {
         observer.say(format_args!(
             "handed in before, as job {jobs}: call again when that has ended, with --again if it has failed (logs in {})",
             folder.join("logs").display()
         ));
         return Ok(());
     }
-    let mut memory: Vec<(Partial, u64)> = Vec::new();
+    let mut known_memory: Vec<(Partial, u64)> = Vec::new();
     let mut jobs: Vec<Job> = Vec::new();
-    let mut described: Vec<&Partial> = Vec::new();
-    for (place, cell) in cells.iter().enumerate() {
-        // What several cells describe alike is one run.
-        if is_done(cell) || described.contains(&&cell.spec) {
+    let mut submitted: Vec<&Partial> = Vec::new();
+    for (index, run) in runs.iter().enumerate() {
+        // Runs with the same description are trained once.
+        if is_done(run) || submitted.contains(&&run.spec) {
             continue;
         }
-        described.push(&cell.spec);
-        let spec = cell.spec.clone().describe()?;
+        submitted.push(&run.spec);
+        let spec = run.spec.clone().describe()?;
         if !submission.dry_run {
-            cell.write(&folder)?;
+            run.write(&folder)?;
         }
+        let threads = spec.device.threads.map(|threads| threads.0);
         jobs.push(Job {
-            name: cell.run(),
-            place,
-            memory: promised(cell, &spec, &mut memory)?,
-            threads: threads(&spec),
+            name: run.name(),
+            index,
+            memory: promised_bytes(run, &spec, &mut known_memory)?,
+            threads: threads
+                .unwrap_or_else(|| rayon::current_num_threads().try_into().unwrap_or(1)),
             may_have_fewer_threads: false,
         });
     }
@@ -100,26 +104,24 @@ pub(super) fn submit(
         folder,
     };
     launch::submit(&batch, submission, observer)?;
-    if is_handed_in {
+    if is_scheduled {
         observer.say(format_args!("call the same command again to collect what is done"));
     }
     Ok(())
 }
 
-/// What a run takes at most `[bytes]`, which does not depend on its seed.
-fn promised(cell: &Cell, spec: &RunSpec, known: &mut Vec<(Partial, u64)>) -> Result<u64, Failure> {
-    let mut kind = cell.spec.clone();
-    kind.remove("seed");
-    if let Some((_, bytes)) = known.iter().find(|(other, _)| *other == kind) {
+/// Upper bound of a run's memory `[bytes]`. It does not depend on the seed, so it is computed once for all seeds.
+fn promised_bytes(
+    run: &PlannedRun,
+    spec: &RunSpec,
+    known: &mut Vec<(Partial, u64)>,
+) -> Result<u64, Failure> {
+    let mut options = run.spec.clone();
+    options.remove("seed");
+    if let Some((_, bytes)) = known.iter().find(|(other, _)| *other == options) {
         return Ok(*bytes);
     }
     let bytes = host_bytes(spec, Host::default())?;
-    known.push((kind, bytes));
+    known.push((options, bytes));
     Ok(bytes)
-}
-
-/// Processor threads of a run: those that were asked for, or all.
-fn threads(spec: &RunSpec) -> u32 {
-    let own = spec.device.threads.map(|threads| threads.0);
-    own.unwrap_or_else(|| rayon::current_num_threads().try_into().unwrap_or(1))
 }

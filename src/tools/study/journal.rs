@@ -1,21 +1,21 @@
-//! The file of records of a study: a line for everything that is finished, so that it is not done again.
+//! The journal of a study: a file with a line per finished run, so that none is repeated.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use super::record::Outcome;
+use super::outcome::Outcome;
 use densify_core::files::{FileError, write_atomically};
 use densify_run::Partial;
 use densify_run::failure::Failure;
 
-/// The records in a file.
+/// The outcomes of the finished runs.
 pub(super) struct Journal {
     path: PathBuf,
-    records: Vec<Outcome>,
+    outcomes: Vec<Outcome>,
 }
 
 impl Journal {
-    /// Reads what is there. A last line that was cut off is not: its run runs again.
+    /// Reads the journal, which need not exist. An incomplete last line is ignored, and its run repeated.
     pub(super) fn open(path: &Path) -> Result<Self, Failure> {
         let text = match fs::read_to_string(path) {
             Ok(text) => text,
@@ -23,9 +23,9 @@ impl Journal {
             Err(e) => return Err(Failure::input(format!("{}: {e}", path.display()))),
         };
         let whole = text.rfind('\n').map_or("", |end| &text[..end]);
-        let mut records = Vec::new();
+        let mut outcomes = Vec::new();
         for (i, line) in whole.lines().enumerate() {
-            records.push(serde_json::from_str(line).map_err(|e| {
+            outcomes.push(serde_json::from_str(line).map_err(|e| {
                 Failure::input(format!(
                     "{}, line {}: {e}; delete the line, and its run runs again",
                     path.display(),
@@ -33,21 +33,21 @@ impl Journal {
                 ))
             })?);
         }
-        Ok(Self { path: path.to_owned(), records })
+        Ok(Self { path: path.to_owned(), outcomes })
     }
 
     /// The outcome of the run with this description, by this version of densify.
     pub(super) fn outcome(&self, spec: &Partial) -> Option<&Outcome> {
-        self.records.iter().rev().find(|run| run.is_of(spec))
+        self.outcomes.iter().rev().find(|run| run.is_of(spec))
     }
 
-    /// Adds a record and writes them all.
-    pub(super) fn add(&mut self, record: Outcome) -> Result<(), FileError> {
-        self.records.push(record);
-        let lines = self.records.iter().map(|r| serde_json::to_string(r).map(|line| line + "\n"));
+    /// Adds an outcome and writes the file.
+    pub(super) fn add(&mut self, outcome: Outcome) -> Result<(), FileError> {
+        self.outcomes.push(outcome);
         write_atomically(&self.path, |out| {
-            for line in lines {
-                out.write_all(line.map_err(std::io::Error::other)?.as_bytes())?;
+            for outcome in &self.outcomes {
+                serde_json::to_writer(&mut *out, outcome)?;
+                out.write_all(b"\n")?;
             }
             Ok(())
         })

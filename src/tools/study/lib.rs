@@ -1,20 +1,19 @@
-//! Studies: many runs of `densify train` in processes of their own, a journal that lets an interrupted
-//! study go on, paired statistics, tables and plots.
+//! Studies: many runs of `densify train` in child processes, paired statistics, tables and plots. A journal of finished
+//! runs lets an interrupted study continue.
 //!
-//! A study is a list of descriptions of runs, and a report over their outcomes. [`Comparison`] varies
-//! policy and budget, [`Trade`] knobs and their levels. Nothing is printed; an [`Observer`] hears what
-//! there is to say.
+//! A study is a list of planned runs and a report on their outcomes. [`Comparison`] varies the policy and the budget,
+//! [`Trade`] the knobs. Prints nothing; messages go to an [`Observer`].
 
-mod cell;
-mod child;
-mod columns;
 mod compare;
 pub mod difference;
 mod engines;
 mod journal;
+mod outcome;
 pub mod panel;
+mod planned_run;
 mod plot;
-mod record;
+mod process;
+mod text_table;
 mod trade;
 pub mod window;
 
@@ -24,25 +23,25 @@ pub use compare::Comparison;
 pub use engines::{EngineArgs, StudyRun};
 pub use trade::Trade;
 
-use cell::Cell;
 use densify_core::files::write_atomically;
 use densify_data::dataset::builtin;
 use densify_html::{Document, data_uri_of_file};
-use densify_run::Observer;
 use densify_run::failure::Failure;
+use densify_run::{Observer, Partial};
 use journal::Journal;
-use record::Outcome;
+use outcome::Outcome;
+use planned_run::PlannedRun;
 
-/// What a finished study leaves.
+/// A finished study.
 #[derive(Debug)]
 pub struct Finished {
-    /// A few lines for the terminal.
+    /// Summary for the terminal.
     pub summary: String,
-    /// The file with tables and pictures.
+    /// File with the tables and pictures.
     pub report: PathBuf,
 }
 
-/// A file in the output folder, and what it shows.
+/// A picture file in the output folder.
 struct Picture {
     file: String,
     caption: String,
@@ -56,67 +55,66 @@ struct Study<'a> {
 }
 
 impl<'a> Study<'a> {
-    /// Begins or goes on, with the journal `name`.jsonl in the folder `output`.
+    /// Starts or continues the study with the journal `name`.jsonl in the folder `output`.
     fn open(output: &'a Path, name: &str, observer: &'a dyn Observer) -> Result<Self, Failure> {
         let journal = Journal::open(&output.join(name).with_extension("jsonl"))?;
         Ok(Self { output, observer, journal })
     }
 
-    /// Makes the runs that are not done yet, one after another or by an engine; returns the outcomes of all,
-    /// or `None` where not all are done, as a scheduler has them. Where several cells describe the same run,
-    /// it is made once: the seed decides everything.
+    /// Trains the runs that are not done yet, one after another or with an engine, and returns all outcomes; `None` while
+    /// a scheduler still has runs. Runs with the same description are trained once, as training is reproducible.
     fn run(
         &mut self,
-        cells: &[Cell],
+        runs: &[PlannedRun],
         engine: &EngineArgs,
     ) -> Result<Option<Vec<Outcome>>, Failure> {
         let submission = engine.submission()?;
-        let is_left = self.collect(cells)?;
+        let has_open = self.collect(runs)?;
         if let Some(submission) = submission
-            && is_left
+            && has_open
         {
-            let is_done = |cell: &Cell| self.journal.outcome(&cell.spec).is_some();
-            engines::submit(self.output, cells, is_done, submission, self.observer)?;
-            if self.collect(cells)? {
+            let is_done = |run: &PlannedRun| self.journal.outcome(&run.spec).is_some();
+            engines::submit(self.output, runs, is_done, submission, self.observer)?;
+            if self.collect(runs)? {
                 return Ok(None);
             }
         }
-        let count = cells.len();
+        let count = runs.len();
         let mut outcomes = Vec::new();
-        for (i, cell) in cells.iter().enumerate() {
-            let number = i + 1;
-            let before = self.journal.outcome(&cell.spec).cloned();
-            let done = if before.is_some() { ": done before" } else { "" };
-            self.observer.say(format_args!("[{number}/{count}] {cell}{done}"));
-            let outcome = match before {
+        for (index, run) in runs.iter().enumerate() {
+            let number = index + 1;
+            let known = self.journal.outcome(&run.spec).cloned();
+            let done = if known.is_some() { ": done before" } else { "" };
+            self.observer.say(format_args!("[{number}/{count}] {run}{done}"));
+            let outcome = match known {
                 Some(outcome) => outcome,
                 None => {
-                    let outcome = cell.train(self.output)?;
+                    let outcome = run.train(self.output)?;
                     self.journal.add(outcome.clone())?;
                     outcome
                 }
             };
-            let (factor, level) = (cell.factor.clone(), cell.level.clone());
+            let (factor, level) = (run.factor.clone(), run.level.clone());
             outcomes.push(Outcome { factor, level, ..outcome });
         }
         Ok(Some(outcomes))
     }
 
-    /// Takes the records of runs that an engine has made into the journal; whether runs are left.
-    fn collect(&mut self, cells: &[Cell]) -> Result<bool, Failure> {
-        let mut is_left = false;
-        for cell in cells {
-            if self.journal.outcome(&cell.spec).is_none() {
-                match cell.made(self.output) {
+    /// Adds the outcomes of runs that an engine has finished to the journal. Returns true if runs are still open.
+    fn collect(&mut self, runs: &[PlannedRun]) -> Result<bool, Failure> {
+        let mut has_open = false;
+        for run in runs {
+            if self.journal.outcome(&run.spec).is_none() {
+                match run.recorded(self.output) {
                     Some(outcome) => self.journal.add(outcome)?,
-                    None => is_left = true,
+                    None => has_open = true,
                 }
             }
         }
-        Ok(is_left)
+        Ok(has_open)
     }
 
-    /// Writes the report as `name`.md, and as `name`.html with embedded pictures.
+    /// Writes the report as `name`.md and as `name`.html with embedded pictures.
     fn finish(
         &self,
         name: &str,
@@ -139,7 +137,23 @@ fn standard_error(values: &[f64]) -> Option<f64> {
     Some((squares / (n - 1.0) / n).sqrt())
 }
 
-/// Distinct values, in the order of their appearance.
+/// The options that all runs of a study share: those of the user, with test views held out and without checkpoints. An
+/// interrupted run starts over, so that its times are complete.
+fn shared_options(given: Partial, own: &[&str]) -> Result<Partial, Failure> {
+    if let Some((name, _)) = given.iter().find(|(name, _)| own.contains(name)) {
+        return Err(Failure::input(format!(
+            "--{} is set by the study itself; leave it out after `--`",
+            name.replace('_', "-")
+        )));
+    }
+    let mut defaults = Partial::option("checkpoint_every", 0);
+    if given.get("test_every").is_none() {
+        defaults = Partial::option("eval", true).over(defaults);
+    }
+    Ok(given.over(defaults))
+}
+
+/// Distinct values in the order of their first appearance.
 fn distinct<T: PartialEq>(values: impl IntoIterator<Item = T>) -> Vec<T> {
     let mut all = Vec::new();
     for value in values {
@@ -150,30 +164,26 @@ fn distinct<T: PartialEq>(values: impl IntoIterator<Item = T>) -> Vec<T> {
     all
 }
 
-/// A short name for each scene: its folder's, or that of the built-in scene.
+/// A short name for each scene: that of its folder or of the built-in scene.
 fn labels(scenes: &[PathBuf]) -> Result<Vec<String>, Failure> {
     let mut labels = Vec::new();
     for scene in scenes {
-        if let Some(name) = builtin::label(scene) {
-            labels.push(unless_taken(&labels, name)?);
-            continue;
+        let label = match builtin::label(scene) {
+            Some(label) => label,
+            None => {
+                let path = scene.canonicalize().map_err(|e| {
+                    Failure::input(format!("{}: {e}; name the scene's folder", scene.display()))
+                })?;
+                let name = path.file_name().unwrap_or_default().to_string_lossy();
+                name.replace(|c: char| !c.is_ascii_alphanumeric() && c != '.', "-")
+            }
+        };
+        if labels.contains(&label) {
+            return Err(Failure::input(format!(
+                "two scenes are called {label}; take them in two calls, or rename one folder"
+            )));
         }
-        let whole = std::fs::canonicalize(scene).map_err(|e| {
-            Failure::input(format!("{}: {e}; name the scene's folder", scene.display()))
-        })?;
-        let name = whole.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let name = name.replace(|c: char| !c.is_ascii_alphanumeric() && c != '.', "-");
-        labels.push(unless_taken(&labels, name)?);
+        labels.push(label);
     }
     Ok(labels)
-}
-
-/// The name, if it is none of those that are taken.
-fn unless_taken(taken: &[String], name: String) -> Result<String, Failure> {
-    if taken.contains(&name) {
-        return Err(Failure::input(format!(
-            "two scenes are called {name}; take them in two calls, or rename one folder"
-        )));
-    }
-    Ok(name)
 }

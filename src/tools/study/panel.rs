@@ -1,4 +1,4 @@
-//! Curves over axes, for studies and reports.
+//! Line plots for studies and reports.
 
 use std::ops::Range;
 
@@ -10,9 +10,9 @@ use super::plot::{self, Area, range};
 use densify_core::numbers::grouped;
 use densify_run::failure::Failure;
 
-/// Number of colours of curves.
+/// Number of colours in the palette.
 pub const COLOURS: usize = PALETTE.len();
-/// Colours that stay apart for the colour-blind (Okabe and Ito 2008).
+/// Colours that colour-blind people can distinguish (Okabe and Ito 2008).
 pub const PALETTE: [RGBColor; 7] = [
     RGBColor(0, 114, 178),
     RGBColor(213, 94, 0),
@@ -23,10 +23,10 @@ pub const PALETTE: [RGBColor; 7] = [
     RGBColor(0, 0, 0),
 ];
 
-/// A dash and the gap after it `[px]`.
+/// Length of a dash and of a gap `[px]`.
 const DASH: [i32; 2] = [6, 4];
-/// So many points at most are each marked.
-const FEW: usize = 16;
+/// Most points of a curve whose points are marked.
+const MAX_MARKED_POINTS: usize = 16;
 
 /// A line through some points.
 pub struct Curve {
@@ -57,13 +57,13 @@ pub struct Panel {
 }
 
 impl Panel {
-    /// Whether any curve has a point.
-    pub fn shows_something(&self) -> bool {
+    /// True if any curve has a point.
+    pub fn has_points(&self) -> bool {
         self.curves.iter().any(|curve| !curve.points.is_empty())
     }
 }
 
-/// The panels, one above the other, each of so many pixels.
+/// Draws the panels one above the other, each with this size in pixels.
 pub fn svg(panels: &[Panel], (width, height): (u32, u32)) -> Result<String, Failure> {
     plot::svg((width, height * panels.len() as u32), |area| {
         for (panel, area) in panels.iter().zip(area.split_evenly((panels.len(), 1))) {
@@ -76,7 +76,7 @@ pub fn svg(panels: &[Panel], (width, height): (u32, u32)) -> Result<String, Fail
     })
 }
 
-/// What the axes must show, with a margin: `[[x least, x most], [y least, y most]]`.
+/// Range of the axes with a margin, `[[x min, x max], [y min, y max]]`; `None` without points.
 fn bounds(panel: &Panel) -> Option<[[f64; 2]; 2]> {
     let points = || panel.curves.iter().flat_map(|curve| &curve.points);
     let [x0, x1] = range(points().map(|p| p.0))?;
@@ -117,19 +117,19 @@ fn draw_panel(
     for Curve { name, points, colour, is_dashed } in &panel.curves {
         let colour = PALETTE[*colour];
         let style = colour.stroke_width(2);
-        let points_of = points.iter().copied();
+        let xy = points.iter().copied();
         let ends = |(x, y)| [(x, y), (x + 18, y)];
         if *is_dashed {
             let [dash, gap] = DASH;
-            let line = chart.draw_series(DashedLineSeries::new(points_of, dash, gap, style))?;
+            let line = chart.draw_series(DashedLineSeries::new(xy, dash, gap, style))?;
             let legend = move |at| DashedPathElement::new(ends(at), dash, gap, style);
             line.label(name).legend(legend);
         } else {
-            let line = chart.draw_series(LineSeries::new(points_of, style))?;
+            let line = chart.draw_series(LineSeries::new(xy, style))?;
             line.label(name).legend(move |at| PathElement::new(ends(at), style));
         }
-        // Few points are measurements, which a line alone would hide.
-        if points.len() <= FEW && !is_dashed {
+        // Few points are separate measurements, which a line alone would hide.
+        if points.len() <= MAX_MARKED_POINTS && !is_dashed {
             let dot = |&point: &(f64, f64)| Circle::new(point, 3, colour.filled());
             chart.draw_series(points.iter().map(dot))?;
         }
@@ -146,7 +146,7 @@ fn draw_panel(
     Ok(())
 }
 
-/// An axis with ticks at chosen places.
+/// An axis with given ticks.
 struct Axis {
     range: Range<f64>,
     ticks: Vec<f64>,
@@ -179,7 +179,7 @@ fn ticks_at_points(panel: &Panel) -> Vec<f64> {
     ticks
 }
 
-/// Ticks from `least` to `most` in steps of 1, 2 or 5 times a power of ten, at most eleven.
+/// At most eleven ticks from `least` to `most` in steps of 1, 2 or 5 times a power of ten.
 fn even_ticks(least: f64, most: f64) -> Vec<f64> {
     let decade = 10_f64.powf(((most - least) / 10.0).log10().floor());
     let steps = [1.0, 2.0, 5.0, 10.0].map(|n| n * decade);
@@ -188,7 +188,7 @@ fn even_ticks(least: f64, most: f64) -> Vec<f64> {
     (first..=last).map(|i| f64::from(i) * step).collect()
 }
 
-/// The fewest digits after the point that write every tick without loss.
+/// Smallest number of decimals that represents every tick exactly.
 fn digits(ticks: &[f64]) -> usize {
     let is_exact = |digits: &i32| {
         let scaled = |tick: &f64| tick * 10_f64.powi(*digits);
@@ -223,7 +223,7 @@ mod tests {
             let text = svg(&[panel(log_x), panel(log_x)], SIZE).unwrap();
             assert!(text.starts_with("<svg") && text.trim_end().ends_with("</svg>"));
             assert_eq!(text.matches("title").count(), 2);
-            // A line on either panel, and one in either legend.
+            // Each curve has a line in its panel and one in the legend.
             assert_eq!(text.matches("<polyline").count() % 2, 0);
             for name in ["one", "two", "PSNR"] {
                 assert!(text.contains(name), "{name} is not in {text}");
@@ -231,7 +231,7 @@ mod tests {
         }
         assert_eq!(even_ticks(0.0, 300.0), [0.0, 50.0, 100.0, 150.0, 200.0, 250.0, 300.0]);
         assert_eq!(even_ticks(0.0, 7000.0).len(), 8);
-        // From 29 to 33 dB, with margins, in half dB; no label says more than it must.
+        // From 29 to 33 dB with margins, in steps of 0.5 dB, with one decimal.
         let text = svg(&[panel(false)], SIZE).unwrap();
         for (label, is_there) in [("30.5", true), ("30.0", true), ("30.000", false)] {
             let lines = text.lines().filter(|line| line.trim() == label);
@@ -245,7 +245,7 @@ mod tests {
             let panel = Panel { curves: vec![line(is_dashed)], has_legend, ..panel(false) };
             svg(&[panel], SIZE).unwrap().matches("stroke-width=\"2\"").count()
         };
-        // A line, and another in the legend; of dashes many.
+        // A solid curve is one stroke, and one in the legend; a dashed one is many.
         assert_eq!((strokes(false, true), strokes(false, false)), (2, 1));
         assert!(strokes(true, true) > 20, "{}", strokes(true, true));
         let empty = Panel { curves: Vec::new(), ..panel(false) };

@@ -1,4 +1,4 @@
-//! Plots as SVG files.
+//! Writes plots as SVG files.
 
 use std::error::Error;
 use std::path::Path;
@@ -10,10 +10,10 @@ use super::Picture;
 use densify_core::files::write_atomically;
 use densify_run::failure::{Failure, OTHER};
 
-/// What a plot is drawn on.
+/// Drawing area of a plot.
 pub(super) type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 
-/// The SVG of so many pixels that `draw` draws on white.
+/// Creates an SVG with this size in pixels and a white background, drawn by `draw`.
 pub(super) fn svg(
     size: (u32, u32),
     draw: impl FnOnce(&Area<'_>) -> Result<(), Box<dyn Error>>,
@@ -41,7 +41,7 @@ pub(super) fn write(
     Ok(Picture { file, caption })
 }
 
-/// The least and the largest of some numbers; `None` without any.
+/// Minimum and maximum of some numbers; `None` if there are none.
 pub(super) fn range(values: impl Iterator<Item = f64>) -> Option<[f64; 2]> {
     values.fold(None, |range: Option<[f64; 2]>, v| {
         Some(range.map_or([v, v], |[low, high]| [low.min(v), high.max(v)]))

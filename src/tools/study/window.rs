@@ -1,10 +1,10 @@
-//! A window of a picture, to look at closely: chosen by a rule and not by hand. Of all windows of a quarter of
-//! the picture's sides, and at most 160 px, it is the one with the most edges.
+//! Chooses a crop of a picture for comparison by a rule: the window with the most edges, of a quarter of the picture's
+//! sides and at most 160 px.
 
 use image::{RgbImage, imageops};
 
-/// Longest side of a window `[px]`: more would be too small to be told apart.
-const LONGEST: u32 = 160;
+/// Longest side of a window `[px]`. Larger windows would not show details enlarged.
+const MAX_SIDE: u32 = 160;
 
 /// A window of a picture.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -16,14 +16,14 @@ pub struct Window {
 }
 
 impl Window {
-    /// The window with the largest sum of |∂G/∂x| + |∂G/∂y| of the green channel, and that sum; of equal
-    /// ones the first, row by row.
+    /// The window with the largest sum of |∂G/∂x| + |∂G/∂y| of the green channel, and that sum. Of equal windows the first
+    /// in row-major order.
     pub fn with_most_edges(picture: &RgbImage) -> (u64, Self) {
         let (width, height) = picture.dimensions();
-        let side = |of: u32| (of / 4).clamp(1, LONGEST);
+        let side = |length: u32| (length / 4).clamp(1, MAX_SIDE);
         let window = |x, y| Self { x, y, width: side(width), height: side(height) };
         let Self { width: w, height: h, .. } = window(0, 0);
-        // Sums over the rectangle from the corner, so that a window's sum takes four of them.
+        // A summed-area table: the sum over a window takes four entries.
         let columns = width as usize + 1;
         let mut sums = vec![0_u64; columns * (height as usize + 1)];
         let green =
@@ -51,8 +51,8 @@ impl Window {
         best
     }
 
-    /// What it shows of a picture.
-    pub fn of(self, picture: &RgbImage) -> RgbImage {
+    /// Crops a picture to the window.
+    pub fn crop(self, picture: &RgbImage) -> RgbImage {
         imageops::crop_imm(picture, self.x, self.y, self.width, self.height).to_image()
     }
 }
@@ -67,24 +67,15 @@ mod tests {
     fn the_window_with_the_most_edges_is_found() {
         // A checkerboard of 10 × 6 pixels, as large as a window.
         let picture = RgbImage::from_fn(40, 24, |x, y| {
-            let is_on_it = (23..33).contains(&x) && (11..17).contains(&y);
-            Rgb([
-                100,
-                if !is_on_it {
-                    100
-                } else if (x + y) % 2 == 0 {
-                    0
-                } else {
-                    255
-                },
-                100,
-            ])
+            let is_inside = (23..33).contains(&x) && (11..17).contains(&y);
+            let green = if is_inside { 255 * ((x + y) % 2) as u8 } else { 100 };
+            Rgb([100, green, 100])
         });
         let (edges, window) = Window::with_most_edges(&picture);
         assert!(edges > 0);
         assert!((22..=23).contains(&window.x) && (10..=11).contains(&window.y), "{window:?}");
-        assert_eq!(window.of(&picture).dimensions(), (10, 6));
-        // Of large photographs too.
+        assert_eq!(window.crop(&picture).dimensions(), (10, 6));
+        // Windows of large photographs are limited in size.
         let (_, window) = Window::with_most_edges(&RgbImage::new(2000, 700));
         assert_eq!((window.width, window.height), (160, 160));
     }

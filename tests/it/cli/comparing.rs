@@ -143,7 +143,7 @@ fn bad_comparisons_are_refused_before_anything_runs() {
     for (more, words) in cases {
         compare(scene.path(), &output, more).refused(more, words);
     }
-    // What a contender may be is in `src/study/compare/contender.rs`.
+    // `src/tools/study/compare/policy_variant.rs` defines the syntax of policies with parameters.
     for (policies, words) in [
         ("diet,dite", ["dite", "diet"]),
         ("diet,diet:rho", ["--policies", "diet.rho"]),

@@ -1,26 +1,26 @@
-//! How many Gaussians every policy had: at the end, beside the true peak.
+//! Tabulates the Gaussians of each policy at the end and at the true peak.
 //!
-//! Budgets bound the peak, and policies are compared at equal budgets. Some end far below their peak: who
-//! pays for storage or display rather than for training compares them by what they end with.
+//! Budgets bound the peak, and policies are compared at equal budgets. Some policies end far below their peak, which
+//! matters if the cost of storage or display is more important than that of training.
 
-use super::{Outcome, scenes_and_budgets};
-use crate::columns::Columns;
+use super::{Outcome, at, scenes_and_budgets};
 use crate::difference::mean;
 use crate::distinct;
+use crate::text_table::{TextTable, or_dash};
 use densify_core::numbers::grouped;
 use densify_html::{Column, Document, Table};
 
-/// Rows at the end, in the mean of some runs; a dash without any.
-fn at_the_end(runs: &[&Outcome]) -> String {
+/// Mean number of Gaussians at the end; a dash without runs.
+fn final_count(runs: &[&Outcome]) -> String {
     let rows = mean(runs.iter().map(|run| run.rows as f64));
-    rows.map_or_else(|| "–".to_owned(), |rows| grouped(rows.round() as usize))
+    or_dash(rows.map(|rows| grouped(rows.round() as usize)))
 }
 
-/// Most rows at any instant of any of the runs; a dash without any.
-fn peak(runs: &[&Outcome]) -> String {
+/// Most Gaussians at any instant of any run; a dash without runs.
+fn peak_count(runs: &[&Outcome]) -> String {
     let peak = runs.iter().map(|run| run.peak_rows).max();
     let mark = if runs.iter().all(|run| run.kept_its_budget()) { "" } else { " (over)" };
-    peak.map_or_else(|| "–".to_owned(), |rows| format!("{}{mark}", grouped(rows)))
+    or_dash(peak.map(|rows| format!("{}{mark}", grouped(rows))))
 }
 
 /// All budgets, ascending.
@@ -30,7 +30,7 @@ fn budgets(outcomes: &[Outcome]) -> Vec<usize> {
     budgets
 }
 
-/// Adds a table per budget: counts at the end in every scene, beside them the true peaks.
+/// Adds a table per budget with the final counts and the true peaks in each scene.
 pub(super) fn add_tables(document: &mut Document, outcomes: &[Outcome], policies: &[String]) {
     document.section("Gaussians at the end and at the true peak");
     document.paragraph(
@@ -41,19 +41,19 @@ pub(super) fn add_tables(document: &mut Document, outcomes: &[Outcome], policies
         let all = scenes_and_budgets(outcomes);
         let scenes = all.iter().filter(|(_, other)| *other == budget).map(|(scene, _)| *scene);
         let scenes: Vec<&str> = scenes.collect();
-        let titled = |what: &str| scenes.iter().map(|s| format!("{s}, {what}")).collect::<Vec<_>>();
-        let titles = [titled("at the end"), titled("peak")].concat();
-        let titles = std::iter::once("policy").chain(titles.iter().map(String::as_str));
-        let mut table = Table::new(titles.map(Column::text));
+        let title =
+            |count| scenes.iter().map(move |scene| Column::text(&format!("{scene}, {count}")));
+        let columns = title("at the end").chain(title("peak"));
+        let mut table = Table::new(std::iter::once(Column::text("policy")).chain(columns));
         for policy in policies {
-            let of = |scene: &&str| -> Vec<&Outcome> {
-                let is_of =
-                    |r: &&Outcome| r.scene == **scene && r.budget == budget && r.factor == *policy;
-                outcomes.iter().filter(is_of).collect()
+            let runs = |scene: &&str| {
+                let mut runs = at(outcomes, scene, budget);
+                runs.retain(|run| run.factor == *policy);
+                runs
             };
-            let runs: Vec<Vec<&Outcome>> = scenes.iter().map(of).collect();
-            let counts = runs.iter().map(|runs| at_the_end(runs));
-            let cells = counts.chain(runs.iter().map(|runs| peak(runs)));
+            let runs: Vec<Vec<&Outcome>> = scenes.iter().map(runs).collect();
+            let counts = runs.iter().map(|runs| final_count(runs));
+            let cells = counts.chain(runs.iter().map(|runs| peak_count(runs)));
             table.row(std::iter::once(policy.clone()).chain(cells));
         }
         document.subsection(&format!("Budget of {}", grouped(budget)));
@@ -61,32 +61,32 @@ pub(super) fn add_tables(document: &mut Document, outcomes: &[Outcome], policies
     }
 }
 
-/// The same for the terminal, over all scenes of a budget.
-pub(super) fn lines(outcomes: &[Outcome], policies: &[String]) -> String {
+/// Formats the counts for the terminal, over all scenes of a budget.
+pub(super) fn format(outcomes: &[Outcome], policies: &[String]) -> String {
     let budgets = budgets(outcomes);
     let mut titles = vec!["<policy".to_owned()];
     for &budget in &budgets {
         titles.extend([format!(">{}: end", grouped(budget)), ">peak".to_owned()]);
     }
-    let mut columns = Columns::new(&titles.iter().map(String::as_str).collect::<Vec<_>>());
+    let mut table = TextTable::new(&titles.iter().map(String::as_str).collect::<Vec<_>>());
     for policy in policies {
         let mut cells = vec![policy.clone()];
         for &budget in &budgets {
-            let is_of = |r: &&Outcome| r.budget == budget && r.factor == *policy;
-            let runs: Vec<&Outcome> = outcomes.iter().filter(is_of).collect();
-            cells.extend([at_the_end(&runs), peak(&runs)]);
+            let is_included = |run: &&Outcome| run.budget == budget && run.factor == *policy;
+            let runs: Vec<&Outcome> = outcomes.iter().filter(is_included).collect();
+            cells.extend([final_count(&runs), peak_count(&runs)]);
         }
-        columns.row(cells);
+        table.row(cells);
     }
     format!(
-        "Gaussians at the end (mean of the runs) and at the true peak (most of any), by budget\n\n{columns}"
+        "Gaussians at the end (mean of the runs) and at the true peak (most of any), by budget\n\n{table}"
     )
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::record::sample;
+    use crate::outcome::sample;
 
     fn run(
         policy: &str,
@@ -129,12 +129,12 @@ mod tests {
 | b | 2,700 | 2,000 | 9,000 | 9,001 (over) |
 ";
         assert!(text.ends_with(expected), "{text}");
-        let said = lines(&all, &policies);
+        let text = format(&all, &policies);
         // (8000 + 8501 + 7000) / 3 = 7833.67.
         let expected = "
 policy  500: end  peak  9,000: end          peak
 a            499   500       7,834         9,000
 b              –     –       2,350  9,001 (over)";
-        assert!(said.ends_with(expected), "{said}");
+        assert!(text.ends_with(expected), "{text}");
     }
 }

@@ -1,7 +1,6 @@
-//! Crops at equal budget: the same window of the same view, by every policy.
+//! Compares crops of renders: the same window of the same view for every policy at equal budget.
 //!
-//! The window is chosen by a rule and not by hand: over all views held out, the one whose photograph has the
-//! most edges.
+//! The window is chosen by a rule: of all test photographs, the one with the most edges.
 
 use std::path::Path;
 
@@ -11,7 +10,7 @@ use image::{RgbImage, imageops};
 use super::{Outcome, at, scenes_and_budgets};
 use crate::Picture;
 use crate::window::Window;
-use densify_core::image::Image8;
+use densify_core::image::SharedImage;
 use densify_core::numbers::grouped;
 use densify_data::views::{DatasetViews, ViewSource};
 use densify_run::failure::Failure;
@@ -21,13 +20,13 @@ use densify_train::evaluate::Split;
 use densify_train::output::model_path;
 use densify_train::pictures::{photograph, picture, side_by_side, write_png};
 
-/// Least width of a crop in the picture `[px]`, to which windows are enlarged by whole numbers.
-const SHOWN: u32 = 480;
+/// Least width of an enlarged crop `[px]`. The factor is an integer.
+const MIN_WIDTH: u32 = 480;
 /// Space between crops `[px]`.
 const GAP: u32 = 6;
 
-/// Draws a row of crops for every scene and budget: the photograph, then every policy at the first
-/// seed. Runs whose model is gone are left out.
+/// Draws a row of crops for each scene and budget: the photograph, then each policy at the first seed. Runs whose model
+/// file no longer exists are left out.
 pub(super) fn draw(
     output: &Path,
     outcomes: &[Outcome],
@@ -35,29 +34,29 @@ pub(super) fn draw(
 ) -> Result<Vec<Picture>, Failure> {
     let mut pictures = Vec::new();
     for (scene, budget) in scenes_and_budgets(outcomes) {
-        let (crops, shown) = crops(output, &at(outcomes, scene, budget), observer)?;
+        let (crops, names) = crops(output, &at(outcomes, scene, budget), observer)?;
         if crops.is_empty() {
             continue;
         }
         let file = format!("crops-{scene}-{budget}.png");
         write_png(&output.join(&file), &side_by_side(&crops, GAP).into())?;
-        let order = shown.join(", ");
+        let order = names.join(", ");
         let caption = format!("{scene}, {} rows, from the left: {order}", grouped(budget));
         pictures.push(Picture { file, caption });
     }
     Ok(pictures)
 }
 
-/// The crops of the runs at the first seed after that of the photograph, and what each shows.
+/// The crops of the photograph and of the runs at the first seed, with their names.
 fn crops(
     output: &Path,
     runs: &[&Outcome],
     observer: &dyn Observer,
 ) -> Result<(Vec<RgbImage>, Vec<String>), Failure> {
-    let (mut crops, mut shown) = (Vec::new(), vec!["photograph".to_owned()]);
-    let mut place = None;
-    let first = runs.iter().map(|r| r.seed).min();
-    for run in runs.iter().filter(|r| Some(r.seed) == first) {
+    let (mut crops, mut names) = (Vec::new(), vec!["photograph".to_owned()]);
+    let mut chosen = None;
+    let first_seed = runs.iter().map(|r| r.seed).min();
+    for run in runs.iter().filter(|r| Some(r.seed) == first_seed) {
         let folder = output.join("runs").join(&run.run);
         if !model_path(&folder, run.iterations).is_file() {
             observer.say(format_args!("note: {} is gone; no crop of it", folder.display()));
@@ -68,30 +67,27 @@ fn crops(
         let mut opened = open_run(&folder, run.iterations, None, machine, needs, &Silent)?;
         let views = opened.views(Split::Test)?;
         let background = opened.data.background.fixed();
-        let (view, window) = match place {
-            Some(place) => place,
+        let (view, window) = match chosen {
+            Some(chosen) => chosen,
             None => {
-                let Some((view, window)) = richest_window(&views, background)? else { continue };
-                crops.push(cut(&photograph(&*image(&views, view)?, background), window));
-                *place.insert((view, window))
+                let Some((view, window)) = choose_window(&views, background)? else { continue };
+                crops.push(enlarge(&photograph(&*image(&views, view)?, background), window));
+                *chosen.insert((view, window))
             }
         };
         let rendering = opened.backend.render(views.camera(view), background, opened.sh_degree)?;
-        crops.push(cut(&picture(&rendering), window));
-        shown.push(run.factor.clone());
+        crops.push(enlarge(&picture(&rendering), window));
+        names.push(run.factor.clone());
     }
-    Ok((crops, shown))
+    Ok((crops, names))
 }
 
-fn image(
-    views: &DatasetViews,
-    view: usize,
-) -> Result<impl std::ops::Deref<Target = Image8>, Failure> {
+fn image(views: &DatasetViews, view: usize) -> Result<SharedImage, Failure> {
     views.image(view).map_err(|e| Failure::input(format!("{}: {e}", views.name(view))))
 }
 
-/// The window with the most edges of all views.
-fn richest_window(
+/// Finds the view and the window with the most edges.
+fn choose_window(
     views: &DatasetViews,
     background: [f32; 3],
 ) -> Result<Option<(usize, Window)>, Failure> {
@@ -106,11 +102,11 @@ fn richest_window(
     Ok(best.map(|(_, view, window)| (view, window)))
 }
 
-/// What the window shows, enlarged.
-fn cut(picture: &RgbImage, window: Window) -> RgbImage {
-    let crop = window.of(picture);
+/// Crops a picture and enlarges the crop by an integer factor.
+fn enlarge(picture: &RgbImage, window: Window) -> RgbImage {
+    let crop = window.crop(picture);
     let (width, height) = crop.dimensions();
-    let times = SHOWN.div_ceil(width);
+    let times = MIN_WIDTH.div_ceil(width);
     imageops::resize(&crop, width * times, height * times, imageops::FilterType::Nearest)
 }
 
@@ -123,7 +119,7 @@ mod tests {
         for ((width, height), shown) in [((40, 24), (480, 288)), ((2000, 700), (480, 480))] {
             let picture = RgbImage::new(width, height);
             let (_, window) = Window::with_most_edges(&picture);
-            let crop = cut(&picture, window);
+            let crop = enlarge(&picture, window);
             assert_eq!(crop.dimensions(), shown);
             let pair = side_by_side(&[crop.clone(), crop], GAP);
             assert_eq!(pair.dimensions(), (2 * shown.0 + GAP, shown.1));

@@ -1,9 +1,9 @@
-//! The study behind `densify compare`: policies under equal conditions, at several budgets.
+//! `densify compare`: policies under equal conditions at several budgets.
 
-mod contender;
 mod counts;
 mod crops;
 mod plots;
+mod policy_variant;
 mod ranking;
 mod report;
 
@@ -15,24 +15,23 @@ use clap::Args;
 use densify_policies::registry;
 use toml::Value;
 
-use super::cell::Cell;
-use super::child::shared_options;
 use super::difference::{Difference, Pair};
-use super::record::Outcome;
-use super::{EngineArgs, Finished, Study, distinct, labels};
-use contender::Contender;
+use super::outcome::Outcome;
+use super::planned_run::PlannedRun;
+use super::{EngineArgs, Finished, Study, distinct, labels, shared_options};
 use densify_core::numbers;
 use densify_core::numbers::grouped;
 use densify_run::failure::Failure;
 use densify_run::{Observer, Partial};
+use policy_variant::PolicyVariant;
 
-/// Options of a run that are the comparison's to set.
+/// Options of a run that the comparison sets itself.
 const OWN_OPTIONS: [&str; 8] =
     ["scene", "policy", "budget", "seed", "iterations", "output", "test_iterations", "view"];
-/// What stands for all policies.
+/// Stands for all policies.
 const ALL: &str = "all";
-/// Measurements along each run, for the curves.
-const POINTS: u32 = 8;
+/// Evaluations during each run, for the curves.
+const EVALUATIONS: u32 = 8;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -93,7 +92,7 @@ pub struct Comparison {
 /// A budget for all scenes, or for one.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct SceneBudget {
-    /// The label of the only scene that it is for.
+    /// Label of the scene, if the budget is for one scene only.
     pub scene: Option<String>,
     /// Most Gaussians.
     pub rows: usize,
@@ -120,16 +119,17 @@ impl SceneBudget {
 }
 
 impl Comparison {
-    /// Makes the runs that are not done yet, or hands them in, which is `None`; all with the options `train`, and writes tables and pictures.
+    /// Trains the runs that are not done yet, all with the options `train`, and writes tables and pictures; `None` while a
+    /// scheduler still has runs.
     pub fn run(
         &self,
         train: Partial,
         observer: &dyn Observer,
     ) -> Result<Option<Finished>, Failure> {
         let policies = all_policies(&self.policies)?;
-        let cells = self.cells(&policies, train)?;
+        let runs = self.plan_runs(&policies, train)?;
         let mut study = Study::open(&self.output, "compare", observer)?;
-        let Some(outcomes) = study.run(&cells, &self.engine)? else { return Ok(None) };
+        let Some(outcomes) = study.run(&runs, &self.engine)? else { return Ok(None) };
         let mut document = report::document(&outcomes, &policies);
         document.section("Pictures");
         for picture in plots::draw(&self.output, &outcomes, &policies)? {
@@ -144,61 +144,62 @@ impl Comparison {
         study.finish("compare", &document, report::summary(&outcomes, &policies)).map(Some)
     }
 
-    /// All runs, in the order in which they run: seed after seed, so that an interrupted comparison is a
-    /// fair one of fewer seeds.
-    fn cells(&self, policies: &[String], train: Partial) -> Result<Vec<Cell>, Failure> {
+    /// All runs in the order of training: seed after seed, so that an interrupted comparison is fair with fewer seeds.
+    fn plan_runs(&self, policies: &[String], train: Partial) -> Result<Vec<PlannedRun>, Failure> {
         let shared = shared_options(train, &OWN_OPTIONS)?;
-        unique(&self.budget, "--budget")?;
+        require_unique(&self.budget, "--budget")?;
         let labels = labels(&self.scenes)?;
         let budgets = budgets(&self.budget, &labels)?;
         let least = budgets.iter().flatten().copied().min().unwrap_or(1);
-        let contenders: Vec<Contender<'_>> =
-            policies.iter().map(|policy| Contender::new(policy)).collect();
-        for contender in &contenders {
-            contender.check(least, self.iterations)?;
+        let variants: Vec<PolicyVariant<'_>> =
+            policies.iter().map(|policy| PolicyVariant::parse(policy)).collect();
+        for variant in &variants {
+            variant.check(least, self.iterations)?;
         }
-        let tests = (1..POINTS).map(|i| i64::from((self.iterations * i / POINTS).max(1)));
+        let tests = (1..EVALUATIONS).map(|i| i64::from((self.iterations * i / EVALUATIONS).max(1)));
         let shared = Partial::option("test_iterations", tests.map(Value::from).collect::<Vec<_>>())
             .over(shared);
-        let mut cells = Vec::new();
+        let mut runs = Vec::new();
         for seed in 0..self.seeds {
             for ((scene, label), budgets) in self.scenes.iter().zip(&labels).zip(&budgets) {
                 for &budget in budgets {
-                    let base = Cell::new(&shared, (scene, label), budget, seed, self.iterations);
-                    cells.extend(policies.iter().zip(&contenders).map(|(policy, contender)| {
-                        Cell {
+                    let base =
+                        PlannedRun::new(&shared, (scene, label), budget, seed, self.iterations);
+                    for (policy, variant) in policies.iter().zip(&variants) {
+                        runs.push(PlannedRun {
                             factor: policy.clone(),
                             level: budget.to_string(),
                             title: format!("{policy}, {} rows", grouped(budget)),
-                            folder: format!("{}-{budget}", contender.folder()),
-                            spec: contender.options().over(base.spec.clone()),
+                            folder: format!("{}-{budget}", variant.folder()),
+                            spec: variant.options().over(base.spec.clone()),
                             ..base.clone()
-                        }
-                    }));
+                        });
+                    }
                 }
             }
         }
-        Ok(cells)
+        Ok(runs)
     }
 }
 
-/// The policies that are named, each once. `all` becomes every registered policy that is not named by
-/// itself, in the order of their names.
+/// The named policies, each once. `all` stands for the registered policies that are not named besides, ordered by
+/// name.
 fn all_policies(named: &[String]) -> Result<Vec<String>, Failure> {
-    unique(named, "--policies")?;
+    require_unique(named, "--policies")?;
     let registered = registry::policies()?;
-    let others = || {
-        let names = registered.iter().map(|entry| entry.name.to_owned());
-        names.filter(|name| !named.contains(name))
-    };
-    let expand = |name: &String| match name.as_str() {
-        ALL => others().collect(),
-        _ => vec![name.clone()],
-    };
-    Ok(named.iter().flat_map(expand).collect())
+    let mut policies = Vec::new();
+    for name in named {
+        if name == ALL {
+            let names = registered.iter().map(|entry| entry.name.to_owned());
+            policies.extend(names.filter(|name| !named.contains(name)));
+        } else {
+            policies.push(name.clone());
+        }
+    }
+    Ok(policies)
 }
 
-fn unique<T: Ord + std::fmt::Display>(values: &[T], flag: &str) -> Result<(), Failure> {
+fn require_unique<T: Ord + fmt::Display>(values: &[T], flag: &str) -> Result<(), Failure> {
     let mut seen = BTreeSet::new();
     match values.iter().find(|&value| !seen.insert(value)) {
         Some(twice) => Err(Failure::input(format!("{flag} names {twice} twice"))),
@@ -206,21 +207,21 @@ fn unique<T: Ord + std::fmt::Display>(values: &[T], flag: &str) -> Result<(), Fa
     }
 }
 
-/// The budgets of each scene: its own, or else those for all.
-fn budgets(asked: &[SceneBudget], labels: &[String]) -> Result<Vec<Vec<usize>>, Failure> {
-    let stranger = asked.iter().find(|b| b.scene.as_ref().is_some_and(|s| !labels.contains(s)));
-    if let Some(stranger) = stranger {
+/// The budgets of each scene: its own, or else those for all scenes.
+fn budgets(given: &[SceneBudget], labels: &[String]) -> Result<Vec<Vec<usize>>, Failure> {
+    let unknown = given.iter().find(|b| b.scene.as_ref().is_some_and(|s| !labels.contains(s)));
+    if let Some(unknown) = unknown {
         return Err(Failure::input(format!(
-            "--budget {stranger} is for none of the scenes; they are called {}",
+            "--budget {unknown} is for none of the scenes; they are called {}",
             labels.join(", ")
         )));
     }
-    let of = |scene: Option<&String>| -> Vec<usize> {
-        asked.iter().filter(|b| b.scene.as_ref() == scene).map(|b| b.rows).collect()
+    let rows_for = |scene: Option<&String>| -> Vec<usize> {
+        given.iter().filter(|b| b.scene.as_ref() == scene).map(|b| b.rows).collect()
     };
-    let one = |label: &String| {
-        let own = of(Some(label));
-        let rows = if own.is_empty() { of(None) } else { own };
+    let scene_budgets = |label: &String| {
+        let own = rows_for(Some(label));
+        let rows = if own.is_empty() { rows_for(None) } else { own };
         if rows.is_empty() {
             return Err(Failure::input(format!(
                 "--budget has none for {label}; add {label}=ROWS, or ROWS for all scenes"
@@ -228,7 +229,7 @@ fn budgets(asked: &[SceneBudget], labels: &[String]) -> Result<Vec<Vec<usize>>, 
         }
         Ok(rows)
     };
-    labels.iter().map(one).collect()
+    labels.iter().map(scene_budgets).collect()
 }
 
 /// The outcomes of a scene at a budget.
@@ -236,17 +237,16 @@ fn at<'a>(outcomes: &'a [Outcome], scene: &str, budget: usize) -> Vec<&'a Outcom
     outcomes.iter().filter(|run| run.scene == scene && run.budget == budget).collect()
 }
 
-/// The scenes with their budgets, in the order of their appearance.
+/// Pairs of scene and budget, in the order of the scenes' first appearance.
 fn scenes_and_budgets(outcomes: &[Outcome]) -> Vec<(&str, usize)> {
     let runs: Vec<(&str, usize)> = outcomes.iter().map(|run| (&*run.scene, run.budget)).collect();
     let scenes = distinct(runs.iter().map(|(scene, _)| *scene));
-    let of_scene =
-        |scene: &str| distinct(runs.iter().copied().filter(|(other, _)| *other == scene));
-    scenes.into_iter().flat_map(of_scene).collect()
+    let pairs = |scene: &str| distinct(runs.iter().copied().filter(|(other, _)| *other == scene));
+    scenes.into_iter().flat_map(pairs).collect()
 }
 
-/// Differences of the policy's outcomes from those of `base` with the same scene, budget and seed. `None`
-/// where there is no pair. Runs that broke their budget make no pair.
+/// Difference of a policy from `base` over pairs of runs with the same scene, budget and seed that kept their budgets;
+/// `None` without a pair.
 fn difference<'a>(
     outcomes: impl Iterator<Item = &'a Outcome> + Clone,
     policy: &str,
@@ -270,7 +270,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn all_are_those_registered_that_are_not_named_besides() {
+    fn all_stands_for_the_policies_that_are_not_named_besides() {
         let expanded = |text: &str| {
             let named: Vec<String> = text.split(',').map(String::from).collect();
             all_policies(&named).map_err(|failure| failure.to_string())
@@ -285,7 +285,7 @@ mod tests {
             Ok([vec![vanilla.clone()], without("vanilla")].concat())
         );
         assert_eq!(expanded("all,vanilla"), Ok([without("vanilla"), vec![vanilla]].concat()));
-        // With parameters it is one more, and `diet` itself is there too.
+        // A policy with parameters is an additional one.
         let with = expanded("diet:rho=0,all").expect("they are known");
         assert_eq!((with[0].as_str(), with[1..].to_vec()), ("diet:rho=0", names().collect()));
         assert!(expanded("all,diet,all").is_err_and(|message| message.contains("all twice")));
@@ -294,12 +294,10 @@ mod tests {
     #[test]
     fn a_scene_with_budgets_of_its_own_takes_no_others() {
         let labels = ["room".to_owned(), "cup".to_owned()];
-        let of = |text: &str| {
-            let asked: Result<Vec<SceneBudget>, String> =
-                text.split(',').map(SceneBudget::parse).collect();
-            budgets(&asked.expect("they parse"), &labels)
+        let rows = |text: &str| {
+            let given: Result<Vec<_>, _> = text.split(',').map(SceneBudget::parse).collect();
+            budgets(&given.expect("they parse"), &labels).map_err(|failure| failure.to_string())
         };
-        let rows = |text| of(text).map_err(|failure| failure.to_string());
         assert_eq!(rows("30k"), Ok(vec![vec![30_000]; 2]));
         assert_eq!(rows("30k,room=28k,room=1k"), Ok(vec![vec![28_000, 1_000], vec![30_000]]));
         assert!(rows("room=28k").is_err_and(|m| m.contains("cup=ROWS")));

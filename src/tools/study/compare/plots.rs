@@ -1,4 +1,4 @@
-//! Plots as SVG: quality against budget; rows, PSNR and memory along the runs.
+//! Plots quality against the budget, and Gaussians, PSNR and memory over the iterations.
 
 use std::path::Path;
 
@@ -10,11 +10,12 @@ use crate::panel::{COLOURS, Curve, Panel, svg};
 use crate::plot;
 use densify_core::numbers::grouped;
 use densify_run::failure::Failure;
+use densify_train::output::{StepRecord, steps_of};
 
 /// Size of a panel `[px]`.
 const PANEL: (u32, u32) = (720, 300);
 
-/// Draws every plot into the folder `output`.
+/// Draws all plots into the folder `output`.
 pub(super) fn draw(
     output: &Path,
     outcomes: &[Outcome],
@@ -43,7 +44,7 @@ pub(super) fn draw(
     Ok(pictures)
 }
 
-/// Scores against budget.
+/// Scores against the budget.
 fn quality(
     outcomes: &[Outcome],
     policies: &[String],
@@ -68,7 +69,7 @@ fn quality(
     [panel("PSNR (dB)", |r| r.psnr), panel("SSIM", |r| r.ssim), panel("FLIP", |r| r.flip)]
 }
 
-/// Rows, PSNR and memory along the runs at the first seed.
+/// Gaussians, PSNR and memory over the iterations of the runs at the first seed.
 fn growth(output: &Path, runs: &[&Outcome], policies: &[String]) -> Vec<Panel> {
     let (scene, budget) = runs.first().map_or(("", 0), |run| (&*run.scene, run.budget));
     let panel = |y: &'static str, curve: &dyn Fn(&Outcome) -> Vec<(u32, f64)>| Panel {
@@ -83,40 +84,28 @@ fn growth(output: &Path, runs: &[&Outcome], policies: &[String]) -> Vec<Panel> {
             points.into_iter().map(|(x, y)| (f64::from(x), y)).collect()
         }),
     };
-    let memory = |r: &Outcome| {
-        let bytes = over_time(output, r, "resident_bytes").into_iter();
-        bytes.map(|(step, bytes)| (step, bytes / f64::from(1 << 20))).collect()
+    let logged = |run: &Outcome, value: fn(&StepRecord) -> Option<f64>| {
+        let steps = steps_of(&output.join("runs").join(&run.run)).unwrap_or_default();
+        steps.iter().filter_map(|step| Some((step.step, value(step)?))).collect()
     };
+    let memory = |step: &StepRecord| Some(step.resident_bytes? as f64 / f64::from(1 << 20));
     let mut panels = vec![
-        panel("rows", &|r| over_time(output, r, "rows")),
-        panel("PSNR (dB)", &|r| r.curve.clone()),
-        panel("resident memory (MiB)", &memory),
+        panel("rows", &|run| logged(run, |step| Some(step.rows as f64))),
+        panel("PSNR (dB)", &|run| run.curve.clone()),
+        panel("resident memory (MiB)", &|run| logged(run, memory)),
     ];
-    // Not every system says.
-    panels.retain(Panel::shows_something);
+    // Not every system reports resident memory.
+    panels.retain(Panel::has_points);
     panels
 }
 
-/// (iteration, value) of a field of the run's log; nothing where it has none.
-fn over_time(output: &Path, run: &Outcome, field: &str) -> Vec<(u32, f64)> {
-    let path = output.join("runs").join(&run.run).join("stats/train.jsonl");
-    let text = std::fs::read_to_string(path).unwrap_or_default();
-    let steps =
-        text.lines().filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok());
-    let point = |step: serde_json::Value| {
-        let iteration = u32::try_from(step["step"].as_u64()?).ok()?;
-        Some((iteration, step[field].as_f64()?))
-    };
-    steps.filter_map(point).collect()
-}
-
-/// A curve per policy. With more of them than colours, those that repeat a colour are dashed.
+/// One curve per policy; those that repeat a colour are dashed.
 fn by_policy(policies: &[String], points: impl Fn(&str) -> Vec<(f64, f64)>) -> Vec<Curve> {
-    let curve = |(at, policy): (usize, &String)| Curve {
+    let curve = |(index, policy): (usize, &String)| Curve {
         name: policy.clone(),
         points: points(policy),
-        colour: at % COLOURS,
-        is_dashed: at >= COLOURS,
+        colour: index % COLOURS,
+        is_dashed: index >= COLOURS,
     };
     policies.iter().enumerate().map(curve).collect()
 }

@@ -1,65 +1,59 @@
-//! Who did best: every policy against the first in each score, with ranks and intervals.
+//! Ranks the policies in each score by their difference from the first, with intervals.
 
 use super::{Outcome, difference};
-use crate::columns::{Columns, number_or_dash};
 use crate::difference::{Difference, mean};
+use crate::text_table::{TextTable, number_or_dash, or_dash};
 use densify_html::{Column, Table};
 
 /// A score of a run.
 struct Score {
     title: &'static str,
-    of: fn(&Outcome) -> f64,
+    value: fn(&Outcome) -> f64,
     digits: usize,
-    /// Whether less of it is better.
+    /// Lower is better.
     is_error: bool,
 }
 
 const SCORES: [Score; 3] = [
-    Score { title: "PSNR [dB]", of: |run| run.psnr, digits: 2, is_error: false },
-    Score { title: "SSIM", of: |run| run.ssim, digits: 4, is_error: false },
-    Score { title: "FLIP", of: |run| run.flip, digits: 4, is_error: true },
+    Score { title: "PSNR [dB]", value: |run| run.psnr, digits: 2, is_error: false },
+    Score { title: "SSIM", value: |run| run.ssim, digits: 4, is_error: false },
+    Score { title: "FLIP", value: |run| run.flip, digits: 4, is_error: true },
 ];
 
-/// How a policy did in a score.
+/// A policy's result in a score.
 struct Standing {
-    /// Over its runs that kept their budget.
+    /// Mean over its runs that kept their budget.
     mean: Option<f64>,
-    /// From the first policy; `None` for itself, and without a pair of runs that both kept their budget.
+    /// Difference from the first policy; `None` for that policy itself, and without a pair of runs that kept their budgets.
     difference: Option<Difference>,
-    /// 1 for the best by mean difference, equal ones alike; `None` where there is nothing to rank by.
+    /// Rank by mean difference, 1 for the best, shared by equal ones; `None` without a difference.
     rank: Option<usize>,
 }
 
 impl Standing {
     fn rank(&self) -> String {
-        self.rank.map_or_else(|| "–".to_owned(), |rank| rank.to_string())
+        or_dash(self.rank.map(|rank| rank.to_string()))
     }
 }
 
 impl Score {
-    /// Every policy's standing. Ranks go by the mean of paired differences, not by the policies' own
-    /// means: where a run broke its budget, these would be of other scenes.
+    /// The standing of each policy. Ranks are by the mean of paired differences, not by the policies' means, which would
+    /// cover different scenes if a run broke its budget.
     fn standings(&self, outcomes: &[Outcome], policies: &[String]) -> Vec<Standing> {
         let first = policies.first().map_or("", String::as_str);
-        let mut standings: Vec<Standing> = policies
-            .iter()
-            .map(|policy| {
-                let runs = outcomes.iter().filter(|r| r.factor == *policy && r.kept_its_budget());
-                let versus = difference(outcomes.iter(), policy, first, self.of);
-                Standing {
-                    mean: mean(runs.map(self.of)),
-                    difference: versus.filter(|_| policy != first),
-                    rank: None,
-                }
-            })
-            .collect();
-        // What a policy gains over the first one, which gains nothing over itself.
-        let gains: Vec<Option<f64>> = (standings.iter().enumerate())
-            .map(|(place, standing)| match place {
-                0 => standing.mean.map(|_| 0.0),
-                _ => standing.difference.map(|d| if self.is_error { -d.mean } else { d.mean }),
-            })
-            .collect();
+        let standing = |policy: &String| {
+            let runs = outcomes.iter().filter(|r| r.factor == *policy && r.kept_its_budget());
+            let difference = difference(outcomes.iter(), policy, first, self.value);
+            let difference = difference.filter(|_| policy != first);
+            Standing { mean: mean(runs.map(self.value)), difference, rank: None }
+        };
+        let mut standings: Vec<Standing> = policies.iter().map(standing).collect();
+        // The gain over the first policy, which itself gains 0.
+        let gain = |(index, standing): (usize, &Standing)| match index {
+            0 => standing.mean.map(|_| 0.0),
+            _ => standing.difference.map(|d| if self.is_error { -d.mean } else { d.mean }),
+        };
+        let gains: Vec<Option<f64>> = standings.iter().enumerate().map(gain).collect();
         for (standing, gain) in standings.iter_mut().zip(&gains) {
             let better = |gain: f64| gains.iter().flatten().filter(|other| **other > gain).count();
             standing.rank = gain.map(|gain| 1 + better(gain));
@@ -68,19 +62,19 @@ impl Score {
     }
 }
 
-/// Ranks and differences in every score, in the order in which the policies were named.
+/// Tabulates ranks and differences in each score, in the order of the policies on the command line.
 pub(super) fn table(outcomes: &[Outcome], policies: &[String]) -> Table {
     let titles = SCORES.iter().flat_map(|score| [score.title, "better in", "rank"]);
     let mut table = Table::new(std::iter::once("policy").chain(titles).map(Column::text));
     let all = SCORES.map(|score| (score.standings(outcomes, policies), score));
-    for (place, policy) in policies.iter().enumerate() {
+    for (index, policy) in policies.iter().enumerate() {
         let mut cells = vec![policy.clone()];
         for (standings, score) in &all {
-            let standing = &standings[place];
+            let standing = &standings[index];
             let (shown, better) = match standing.difference {
-                Some(versus) => {
-                    let better = if score.is_error { versus.below } else { versus.above };
-                    (versus.show(score.digits), format!("{better} of {}", versus.pairs))
+                Some(difference) => {
+                    let better = if score.is_error { difference.below } else { difference.above };
+                    (difference.format(score.digits), format!("{better} of {}", difference.pairs))
                 }
                 None if standing.rank.is_some() => ("–".to_owned(), "–".to_owned()),
                 None => ("not ranked: no pair kept its budget".to_owned(), "–".to_owned()),
@@ -92,17 +86,16 @@ pub(super) fn table(outcomes: &[Outcome], policies: &[String]) -> Table {
     table
 }
 
-/// The same for the terminal, the best in PSNR first: means, ranks in every score, and the difference in
-/// PSNR with its interval. (Three intervals would not fit into a line; the report has them.)
-pub(super) fn lines(outcomes: &[Outcome], policies: &[String]) -> String {
+/// Formats the ranking for the terminal, the best in PSNR first: means and ranks in each score, and the difference in
+/// PSNR with its interval. Three intervals would not fit into a line; the report has them.
+pub(super) fn format(outcomes: &[Outcome], policies: &[String]) -> String {
     let [psnr, ssim, flip] = SCORES.map(|score| (score.standings(outcomes, policies), score));
     let first = policies.first().map_or("", String::as_str);
-    let versus = format!("from {first}");
-    let mut columns = Columns::new(&[
+    let mut table = TextTable::new(&[
         ">rank",
         "<policy",
         ">PSNR [dB]",
-        &format!("<{versus}"),
+        &format!("<from {first}"),
         ">SSIM",
         ">rank",
         ">FLIP",
@@ -111,40 +104,40 @@ pub(super) fn lines(outcomes: &[Outcome], policies: &[String]) -> String {
         "<",
     ]);
     let mut order: Vec<usize> = (0..policies.len()).collect();
-    // Stable: those without a rank stay at the end in the order of their names on the command line.
-    order.sort_by_key(|&place| psnr.0[place].rank.unwrap_or(usize::MAX));
-    for place in order {
-        let policy = &policies[place];
+    // A stable sort keeps policies without a rank in the order of the command line.
+    order.sort_by_key(|&index| psnr.0[index].rank.unwrap_or(usize::MAX));
+    for index in order {
+        let policy = &policies[index];
         let (kept, over): (Vec<&Outcome>, Vec<&Outcome>) =
             outcomes.iter().filter(|r| r.factor == *policy).partition(|r| r.kept_its_budget());
         let over = match over.len() {
             0 => String::new(),
             over => format!("({over} more over the budget, not counted)"),
         };
-        let standing = &psnr.0[place];
-        let show = |it: Difference| it.show(psnr.1.digits);
+        let standing = &psnr.0[index];
+        let format = |difference: Difference| difference.format(psnr.1.digits);
         let mut cells = vec![
             standing.rank(),
             policy.clone(),
             number_or_dash(standing.mean, 3),
-            standing.difference.map_or_else(String::new, show),
+            standing.difference.map(format).unwrap_or_default(),
         ];
         for (standings, score) in [&ssim, &flip] {
-            cells.push(number_or_dash(standings[place].mean, score.digits));
-            cells.push(standings[place].rank());
+            cells.push(number_or_dash(standings[index].mean, score.digits));
+            cells.push(standings[index].rank());
         }
         cells.extend([kept.len().to_string(), over]);
-        columns.row(cells);
+        table.row(cells);
     }
-    columns.to_string()
+    table.to_string()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::record::sample;
+    use crate::outcome::sample;
 
-    /// A run of the policy in this scene. SSIM is a hundredth of the PSNR, and FLIP 1 less that.
+    /// An outcome in this scene. SSIM is PSNR / 100, and FLIP is 1 − SSIM.
     fn run(policy: &str, scene: &str, seed: u32, psnr: f64) -> Outcome {
         Outcome { scene: scene.into(), ..sample(policy, "1000", seed, psnr) }
     }
@@ -174,20 +167,20 @@ mod tests {
         ] {
             assert!(text.contains(row), "{row} is not in {text}");
         }
-        let said = lines(&all, &policies);
+        let text = format(&all, &policies);
         let expected = "\
 rank  policy  PSNR [dB]  from a                  SSIM  rank    FLIP  rank  runs
    1  b          31.000  +1.00 [+1.00, +1.00]  0.3100     1  0.6900     1     3
    1  d          31.000  +1.00 [+1.00, +1.00]  0.3100     1  0.6900     1     3
    3  a          30.000                        0.3000     3  0.7000     3     3
    4  c          29.000  -1.00 [-1.00, -1.00]  0.2900     4  0.7100     4     3";
-        assert_eq!(said, expected, "{said}");
+        assert_eq!(text, expected, "{text}");
     }
 
     #[test]
     fn a_scene_without_one_policy_does_not_change_its_rank() {
-        // b is better by 1 where it can be ranked, and broke its budget in the scene that is easy for both:
-        // by its own mean, 31, it would be behind a, 35.
+        // b is better by 1 in the scene where it kept its budget, and broke it in the scene that is easy for both. By its
+        // mean of 31 it would rank behind a with 35.
         let mut broken = run("b", "easy", 0, 42.0);
         broken.peak_rows = 1001;
         let all = [
@@ -199,9 +192,9 @@ rank  policy  PSNR [dB]  from a                  SSIM  rank    FLIP  rank  runs
         let policies = names(&["a", "b"]);
         let ranks = SCORES[0].standings(&all, &policies).iter().map(|s| s.rank).collect::<Vec<_>>();
         assert_eq!(ranks, [Some(2), Some(1)]);
-        let said = lines(&all, &policies);
-        assert!(said.contains("1  b          31.000  +1.00, one run"), "{said}");
-        assert!(said.contains("1  (1 more over the budget, not counted)"), "{said}");
+        let text = format(&all, &policies);
+        assert!(text.contains("1  b          31.000  +1.00, one run"), "{text}");
+        assert!(text.contains("1  (1 more over the budget, not counted)"), "{text}");
     }
 
     #[test]
@@ -211,9 +204,9 @@ rank  policy  PSNR [dB]  from a                  SSIM  rank    FLIP  rank  runs
         let text = table(&all, &names(&["a", "b", "c"])).to_string();
         assert!(text.contains("| b | not ranked: no pair kept its budget | – | – |"), "{text}");
         assert!(text.contains("| c | -1.00, one run | 0 of 1 | 2 |"), "{text}");
-        let said = lines(&all, &names(&["b", "a", "c"]));
-        // Without runs of the first there is nothing to compare with.
-        let mut ranked = said.lines().skip(1).filter(|line| !line.trim_start().starts_with('–'));
-        assert_eq!(ranked.next(), None, "{said}");
+        let text = format(&all, &names(&["b", "a", "c"]));
+        // Without runs of the first policy there are no differences.
+        let mut ranked = text.lines().skip(1).filter(|line| !line.trim_start().starts_with('–'));
+        assert_eq!(ranked.next(), None, "{text}");
     }
 }

@@ -1,25 +1,25 @@
-//! The report of a comparison: a document, and a few lines for the terminal.
+//! The report of a comparison, and its summary for the terminal.
 
 use std::collections::BTreeSet;
 
 use toml::{Table, Value};
 
 use super::{Outcome, at, counts, difference, ranking, scenes_and_budgets};
-use crate::columns::number_or_dash;
 use crate::difference::{INTERVALS, mean};
 use crate::distinct;
+use crate::text_table::number_or_dash;
 use densify_core::numbers::grouped;
 use densify_html::{Column, Document, Table as ReportTable, Text};
 use densify_run::Partial;
 use densify_run::failure::Failure;
 use densify_train::metrics::geometry::Geometry;
 
-/// Mean over runs; `None` where one has no value.
+/// Mean over runs; `None` if a run has no value.
 fn mean_of(runs: &[&Outcome], value: impl Fn(&Outcome) -> Option<f64>) -> Option<f64> {
     mean(runs.iter().map(|run| value(run)).collect::<Option<Vec<f64>>>()?)
 }
 
-/// The comparison as a document, without pictures and options.
+/// Creates the report without pictures and options.
 pub(super) fn document(outcomes: &[Outcome], policies: &[String]) -> Document {
     let mut document = Document::new("Comparison of density-control policies");
     let (Some(first), Some(run)) = (policies.first(), outcomes.first()) else {
@@ -90,7 +90,7 @@ pub(super) fn add_options(document: &mut Document, outcomes: &[Outcome]) -> Resu
     Ok(())
 }
 
-/// Keeps what another table has too.
+/// Removes the entries that differ from another table.
 fn keep_common(table: &mut Table, other: &Table) {
     table.retain(|name, value| match (value, other.get(name)) {
         (Value::Table(inner), Some(Value::Table(other))) => {
@@ -101,14 +101,14 @@ fn keep_common(table: &mut Table, other: &Table) {
     });
 }
 
-/// A policy's results among those of a scene and budget.
+/// The results of a policy in a scene at a budget.
 fn row(policy: &str, first: &str, here: &[&Outcome], budget: usize) -> Vec<Text> {
     let runs: Vec<&Outcome> = here.iter().filter(|r| r.factor == policy).copied().collect();
     let score = |score: fn(&Outcome) -> f64, digits| {
         let mean = number_or_dash(mean_of(&runs, |r| Some(score(r))), digits);
         let difference = difference(here.iter().copied(), policy, first, score);
         match difference.filter(|_| policy != first) {
-            Some(difference) => format!("{mean} ({})", difference.show(digits)),
+            Some(difference) => format!("{mean} ({})", difference.format(digits)),
             None => mean,
         }
     };
@@ -133,7 +133,7 @@ fn row(policy: &str, first: &str, here: &[&Outcome], budget: usize) -> Vec<Text>
     ]
 }
 
-/// A number of those measured against the known surface.
+/// A geometric error.
 type Measure = fn(&Geometry) -> f64;
 
 /// Adds the table of geometric errors, if the surface of the scene is known.
@@ -168,9 +168,9 @@ fn add_geometry(document: &mut Document, here: &[&Outcome], policies: &[String])
     document.table(table);
 }
 
-/// For the terminal: who did best over everything, and with how many Gaussians.
+/// Formats the overall ranking and the counts for the terminal.
 pub(super) fn summary(outcomes: &[Outcome], policies: &[String]) -> String {
-    let (ranks, counts) = (ranking::lines(outcomes, policies), counts::lines(outcomes, policies));
+    let (ranks, counts) = (ranking::format(outcomes, policies), counts::format(outcomes, policies));
     format!(
         "{ranks}\n\nDifferences are paired by scene, budget and seed; brackets are 95 % intervals of \
          their mean.\n\n{counts}\n"
@@ -180,7 +180,7 @@ pub(super) fn summary(outcomes: &[Outcome], policies: &[String]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::record::sample;
+    use crate::outcome::sample;
 
     fn record(policy: &str, seed: u32, psnr: f64, peak_rows: usize) -> Outcome {
         Outcome { peak_rows, cpu_seconds: Some(2.5), ..sample(policy, "1000", seed, psnr) }
@@ -209,13 +209,13 @@ mod tests {
         assert!(text.contains("| a | 30.67 | 0.3067 | 0.6933 | 900 | 1,000 | – |"), "{text}");
         assert!(text.contains("1,001 **over the budget: not ranked**"), "{text}");
         assert!(!text.contains("Geometry"), "{text}");
-        let said = summary(&all, &policies);
+        let text = summary(&all, &policies);
         let of_c = "   –  c               –                        –     –       –     –     0  (2 more over";
         assert!(
-            said.contains(of_c) && said.contains("b          31.500  +0.50, two runs"),
-            "{said}"
+            text.contains(of_c) && text.contains("b          31.500  +0.50, two runs"),
+            "{text}"
         );
-        assert!(said.contains("policy  1,000: end          peak"), "{said}");
+        assert!(text.contains("policy  1,000: end          peak"), "{text}");
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! What a study varies, and at which levels.
+//! The factors of a study and their levels.
 
 use super::Trade;
 use densify_render::{BackendChoice, BackendKind};
@@ -6,37 +6,37 @@ use densify_run::failure::Failure;
 use densify_run::knobs::{Class, KNOBS, Knob, find};
 use densify_run::{Observer, Partial, RunOption};
 
-/// A knob or an option of a run that a study varies.
+/// A knob or option that the study varies.
 #[derive(Debug, Clone)]
 pub(super) struct Factor {
     pub(super) name: String,
-    /// Whether it may change no bit of a model.
+    /// The factor must not change the model at all.
     pub(super) is_exact: bool,
-    /// Its levels besides that of `exact`.
+    /// Levels other than that of `exact`.
     pub(super) levels: Vec<String>,
 }
 
-/// Levels of an option that is no knob.
+/// Default levels of an option that is not a knob.
 enum Levels {
-    These(&'static [&'static str]),
+    Values(&'static [&'static str]),
     TimesBudget(&'static [f64]),
     TimesIterations(&'static [f64]),
 }
 
-/// Options that are varied unless knobs are named, and whether they may change no bit of a model.
+/// Options that are varied by default: name, [`Factor::is_exact`] and levels.
 const OPTIONS: [(&str, bool, Levels); 6] = [
     ("tile_cap", true, Levels::TimesBudget(&[1.0, 4.0, 32.0])),
-    ("image_cache", true, Levels::These(&["0", "16777216"])),
-    ("preset", false, Levels::These(&["balanced", "fast", "tiny-memory"])),
-    ("sh_degree", false, Levels::These(&["0", "1", "2"])),
+    ("image_cache", true, Levels::Values(&["0", "16777216"])),
+    ("preset", false, Levels::Values(&["balanced", "fast", "tiny-memory"])),
+    ("sh_degree", false, Levels::Values(&["0", "1", "2"])),
     ("iterations", false, Levels::TimesIterations(&[0.25, 0.5, 2.0])),
     ("budget", false, Levels::TimesBudget(&[0.25, 0.5, 2.0])),
 ];
 
-/// The factors that are asked for, or all that these runs have.
+/// The factors named by `--knobs`, or all that apply to these runs.
 ///
 /// # Errors
-/// When there is no such knob or option, or a level is outside its domain.
+/// If a knob or option does not exist, or does not accept a level.
 pub(super) fn factors(
     study: &Trade,
     train: &Partial,
@@ -49,77 +49,79 @@ pub(super) fn factors(
         _ => BackendKind::Cpu,
     };
     if study.knobs.is_empty() {
-        let here = |knob: &&Knob| knob.only_on.is_none_or(|only| only == kind);
-        let knobs = KNOBS.iter().filter(here).map(|knob| knob.name);
+        let applies = |knob: &&Knob| knob.only_on.is_none_or(|only| only == kind);
+        let knobs = KNOBS.iter().filter(applies).map(|knob| knob.name);
         let names = knobs.chain(OPTIONS.iter().map(|(name, ..)| *name));
-        let mut all = Vec::new();
+        let mut factors = Vec::new();
         for name in names {
-            match factor(study, name, &[]).and_then(|one| check(train, &one).map(|()| one)) {
-                Ok(one) => all.push(one),
+            match checked_factor(study, train, name, &[]) {
+                Ok(factor) => factors.push(factor),
                 Err(failure) => {
                     observer.say(format_args!("note: {name} is left out: {failure}"));
                 }
             }
         }
-        return Ok(all);
+        return Ok(factors);
     }
-    let mut all: Vec<Factor> = Vec::new();
+    let mut factors: Vec<Factor> = Vec::new();
     for text in &study.knobs {
         let mut parts = text.split(':').map(str::trim);
         let name = parts.next().unwrap_or_default();
         let levels: Vec<&str> = parts.collect();
-        if all.iter().any(|one| one.name == name) {
+        if factors.iter().any(|factor| factor.name == name) {
             return Err(Failure::input(format!("--knobs names {name} twice")));
         }
-        let one = factor(study, name, &levels);
-        let one = one.and_then(|one| check(train, &one).map(|()| one));
-        all.push(one.map_err(|failure| failure.within(&format!("--knobs {text}")))?);
+        let factor = checked_factor(study, train, name, &levels);
+        factors.push(factor.map_err(|failure| failure.within(&format!("--knobs {text}")))?);
     }
-    Ok(all)
+    Ok(factors)
 }
 
-/// A knob or an option by name, at these levels, or at its own where there are none.
-fn factor(study: &Trade, name: &str, levels: &[&str]) -> Result<Factor, Failure> {
-    let given = levels.iter().map(|level| (*level).to_owned()).collect::<Vec<_>>();
-    let of_option = OPTIONS.iter().find(|(option, ..)| *option == name);
-    let (is_exact, own) = match (of_option, RunOption::find(name), find(name)) {
-        (Some((_, is_exact, levels)), ..) => (*is_exact, sized(study, levels)),
-        (None, Some(_), _) if given.is_empty() => {
-            return Err(Failure::input(format!("say at which levels, as {name}:VALUE:VALUE")));
-        }
-        (None, Some(_), _) => (false, Vec::new()),
-        (None, None, Ok(knob)) => {
+/// The knob or option of this name at the given levels, or else its default levels.
+///
+/// # Errors
+/// If a run would refuse the option or a level.
+fn checked_factor(
+    study: &Trade,
+    train: &Partial,
+    name: &str,
+    levels: &[&str],
+) -> Result<Factor, Failure> {
+    let mut given: Vec<String> = levels.iter().map(|level| (*level).to_owned()).collect();
+    let (is_exact, defaults) =
+        if let Some((_, is_exact, levels)) = OPTIONS.iter().find(|(option, ..)| *option == name) {
+            (*is_exact, levels.for_study(study))
+        } else if RunOption::find(name).is_some() {
+            if given.is_empty() {
+                return Err(Failure::input(format!("say at which levels, as {name}:VALUE:VALUE")));
+            }
+            (false, Vec::new())
+        } else {
+            let knob = find(name).map_err(Failure::input)?;
             let canonical = |level: &String| knob.canonical(level).map_err(Failure::input);
-            let given = given.iter().map(canonical).collect::<Result<Vec<_>, _>>()?;
-            let own = knob.levels.iter().map(|level| (*level).to_owned()).collect();
-            let levels = if given.is_empty() { own } else { given };
-            let is_exact = knob.class == Class::Exact;
-            return Ok(Factor { name: name.to_owned(), is_exact, levels });
-        }
-        (None, None, Err(error)) => return Err(Failure::input(error)),
-    };
-    let levels = if given.is_empty() { own } else { given };
+            given = given.iter().map(canonical).collect::<Result<_, _>>()?;
+            let defaults = knob.levels.iter().map(|level| (*level).to_owned()).collect();
+            (knob.class == Class::Exact, defaults)
+        };
+    let levels = if given.is_empty() { defaults } else { given };
+    for level in &levels {
+        let setting = Partial::setting(name, level).into_table();
+        Partial::new(setting, name)?.over(train.clone()).describe()?;
+    }
     Ok(Factor { name: name.to_owned(), is_exact, levels })
 }
 
-/// The levels for runs of this size.
-fn sized(study: &Trade, levels: &Levels) -> Vec<String> {
-    let times = |factors: &[f64], base: f64| {
-        let level = |factor: &f64| ((base * factor).round().max(1.0) as u64).to_string();
-        factors.iter().map(level).collect()
-    };
-    match levels {
-        Levels::These(values) => values.iter().map(|v| (*v).to_owned()).collect(),
-        Levels::TimesBudget(factors) => times(factors, study.budget as f64),
-        Levels::TimesIterations(factors) => times(factors, f64::from(study.iterations)),
+impl Levels {
+    /// The levels for runs with the budget and length of a study.
+    fn for_study(&self, study: &Trade) -> Vec<String> {
+        let scale = |base: f64, factors: &[f64]| {
+            let level = |factor: &f64| ((base * factor).round().max(1.0) as u64).to_string();
+            factors.iter().map(level).collect()
+        };
+        match self {
+            Self::Values(values) => values.iter().map(|value| (*value).to_owned()).collect(),
+            Self::TimesBudget(factors) => scale(study.budget as f64, factors),
+            Self::TimesIterations(factors) => scale(f64::from(study.iterations), factors),
+        }
     }
-}
-
-/// Fails where a run with the factor at one of its levels would be refused for it.
-fn check(train: &Partial, one: &Factor) -> Result<(), Failure> {
-    for level in &one.levels {
-        let setting = Partial::setting(&one.name, level).into_table();
-        Partial::new(setting, &one.name)?.over(train.clone()).describe()?;
-    }
-    Ok(())
 }

@@ -1,31 +1,30 @@
-//! The study behind `densify trade`: what each knob costs and buys.
+//! `densify trade`: the effect of each knob on quality, time and memory.
 
 mod levels;
 mod plots;
 mod report;
-mod table;
+mod results;
 
 use std::path::PathBuf;
 
 use clap::Args;
 
-use super::cell::Cell;
-use super::child::shared_options;
-use super::record::Outcome;
-use super::{EngineArgs, Finished, Study, labels};
+use super::outcome::Outcome;
+use super::planned_run::PlannedRun;
+use super::{EngineArgs, Finished, Study, labels, shared_options};
 use densify_core::numbers;
 use densify_run::failure::Failure;
 use densify_run::knobs::{EXACT, preset};
 use densify_run::{DEFAULT_BUDGET, Observer, Partial};
 use densify_train::schedule::REFERENCE_ITERATIONS;
 use levels::{Factor, factors};
-use report::Report;
+use results::Results;
 
-/// Options of a run that are the study's to set.
+/// Options of a run that the study sets itself.
 const OWN_OPTIONS: [&str; 8] =
     ["scene", "budget", "seed", "iterations", "output", "knob", "preset", "view"];
 
-/// The factor of a run in which no knob is changed, which is one with the preset `exact`.
+/// The factor of a run with the preset `exact`, in which no knob is changed.
 const BASE: &str = "";
 
 const EXAMPLES: &str = "\
@@ -74,7 +73,8 @@ pub struct Trade {
 }
 
 impl Trade {
-    /// Makes what is not done yet, or hands it in, which is `None`; all runs with the options `train`, and writes tables and plots.
+    /// Trains the runs that are not done yet, all with the options `train`, and writes tables and plots; `None` while a
+    /// scheduler still has runs.
     pub fn run(
         &self,
         train: Partial,
@@ -82,27 +82,28 @@ impl Trade {
     ) -> Result<Option<Finished>, Failure> {
         let shared = shared_options(train, &OWN_OPTIONS)?;
         let factors = factors(self, &shared, observer)?;
-        let cells = self.cells(&factors, &shared)?;
+        let runs = self.plan_runs(&factors, &shared)?;
         let mut study = Study::open(&self.output, "trade", observer)?;
-        let Some(outcomes) = study.run(&cells, &self.engine)? else { return Ok(None) };
-        let report = Report::new(self, &factors, outcomes);
-        let mut document = table::document(&report);
+        let Some(outcomes) = study.run(&runs, &self.engine)? else { return Ok(None) };
+        let results = Results::new(self, &factors, outcomes);
+        let mut document = report::document(&results);
         document.section("Plots");
-        for picture in plots::draw(&self.output, &report)? {
+        for picture in plots::draw(&self.output, &results)? {
             document.picture(picture.file, picture.caption);
         }
-        study.finish("trade", &document, table::summary(&report)).map(Some)
+        study.finish("trade", &document, report::summary(&results)).map(Some)
     }
 
-    /// All runs in which at most one knob is changed, in the order in which they run: seed after seed, so
-    /// that an interrupted study is a fair one of fewer seeds.
-    fn cells(&self, factors: &[Factor], shared: &Partial) -> Result<Vec<Cell>, Failure> {
+    /// All runs in the order of training, each with at most one knob changed: seed after seed, so that an interrupted study
+    /// is fair with fewer seeds.
+    fn plan_runs(&self, factors: &[Factor], shared: &Partial) -> Result<Vec<PlannedRun>, Failure> {
         let labels = labels(&self.scenes)?;
-        let mut cells = Vec::new();
+        let mut runs = Vec::new();
         for seed in 0..self.seeds {
             for (scene, label) in self.scenes.iter().zip(&labels) {
-                let base = Cell::new(shared, (scene, label), self.budget, seed, self.iterations);
-                let base = Cell {
+                let base =
+                    PlannedRun::new(shared, (scene, label), self.budget, seed, self.iterations);
+                let base = PlannedRun {
                     factor: BASE.to_owned(),
                     title: "exact".to_owned(),
                     folder: "exact".to_owned(),
@@ -110,39 +111,38 @@ impl Trade {
                     scores_without_shortcuts: true,
                     ..base
                 };
-                cells.push(base.clone());
+                runs.push(base.clone());
                 for factor in factors {
                     let levels = factor.levels.iter();
-                    cells.extend(levels.map(|level| changed(&base, &factor.name, level)));
+                    runs.extend(levels.map(|level| with_level(&base, &factor.name, level)));
                 }
             }
         }
-        Ok(cells)
+        Ok(runs)
     }
 }
 
 /// The base run with a knob at a level.
-fn changed(base: &Cell, factor: &str, level: &str) -> Cell {
-    let plain = |c: char| c.is_ascii_alphanumeric() || "._".contains(c);
+fn with_level(base: &PlannedRun, factor: &str, level: &str) -> PlannedRun {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || "._".contains(c);
     let mut spec = base.spec.clone();
-    for (name, value) in changes(factor, level, base.iterations) {
+    for (name, value) in settings(factor, level, base.iterations) {
         spec = Partial::setting(&name, &value).over(spec);
     }
-    Cell {
+    PlannedRun {
         factor: factor.to_owned(),
         level: level.to_owned(),
         title: format!("{factor}={level}"),
-        folder: format!("{factor}-{level}").replace(|c| !plain(c), "-"),
+        folder: format!("{factor}-{level}").replace(|c| !is_plain(c), "-"),
         spec,
         ..base.clone()
     }
 }
 
-/// The options and knobs that a knob at a level stands for, in runs of so many iterations: a preset by its
-/// own levels, where iterations are as much fewer than these as they are fewer than those of a run by
-/// default.
-fn changes(knob: &str, level: &str, iterations: u32) -> Vec<(String, String)> {
-    let change = |&(name, value): &(&str, &str)| {
+/// The options and knobs that a factor at a level sets. For a preset these are its levels, with its iterations in
+/// proportion to those of the study.
+fn settings(knob: &str, level: &str, iterations: u32) -> Vec<(String, String)> {
+    let setting = |&(name, value): &(&str, &str)| {
         let value = match (name, value.parse::<u64>()) {
             ("iterations", Ok(own)) => {
                 let scaled = own * u64::from(iterations) / u64::from(REFERENCE_ITERATIONS);
@@ -153,7 +153,7 @@ fn changes(knob: &str, level: &str, iterations: u32) -> Vec<(String, String)> {
         (name.to_owned(), value)
     };
     match (knob, preset(level)) {
-        ("preset", Ok(preset)) => preset.levels.iter().map(change).collect(),
+        ("preset", Ok(preset)) => preset.levels.iter().map(setting).collect(),
         _ => vec![(knob.to_owned(), level.to_owned())],
     }
 }
@@ -165,9 +165,9 @@ mod tests {
     #[test]
     fn a_preset_is_set_by_its_levels_and_shortens_runs_in_proportion() {
         let pair = |name: &str, value: &str| (name.to_owned(), value.to_owned());
-        assert_eq!(changes("alpha_min", "1/64", 600), [pair("alpha_min", "1/64")]);
-        assert_eq!(changes("preset", "fast", 600), [pair("iterations", "300")]);
-        assert_eq!(changes("preset", "fast", 1), [pair("iterations", "1")]);
-        assert_eq!(changes("preset", "tiny-memory", 600)[0], pair("image_cache", "auto"));
+        assert_eq!(settings("alpha_min", "1/64", 600), [pair("alpha_min", "1/64")]);
+        assert_eq!(settings("preset", "fast", 600), [pair("iterations", "300")]);
+        assert_eq!(settings("preset", "fast", 1), [pair("iterations", "1")]);
+        assert_eq!(settings("preset", "tiny-memory", 600)[0], pair("image_cache", "auto"));
     }
 }

@@ -1,17 +1,17 @@
-//! Pareto plots as SVG, one per scene: time against PSNR, coloured by peak memory.
+//! Pareto plots, one per scene: PSNR against time, coloured by peak memory.
 
 use std::path::Path;
 
 use plotters::prelude::*;
 
-use super::report::{PSNR, Report, SECONDS};
+use super::results::{PSNR, Results, SECONDS};
 use crate::Picture;
 use crate::plot::{self, Area, range};
 use densify_run::failure::Failure;
 
 /// Size of a plot `[px]`.
 const SIZE: (u32, u32) = (900, 560);
-/// Ends of the colour scale: little memory and much, apart for the colour-blind (viridis).
+/// Colour scale for memory, from low to high, readable for the colour-blind (after viridis).
 const SCALE: [RGBColor; 3] = [RGBColor(68, 1, 84), RGBColor(33, 145, 140), RGBColor(253, 180, 37)];
 
 /// A level in the plot.
@@ -19,19 +19,19 @@ const SCALE: [RGBColor; 3] = [RGBColor(68, 1, 84), RGBColor(33, 145, 140), RGBCo
 struct Point {
     name: String,
     seconds: f64,
-    /// Against `exact` `[dB]`.
+    /// Difference from `exact` `[dB]`.
     psnr: f64,
     /// Peak memory `[MiB]`.
     peak: f64,
-    /// Whether no other is faster and better.
-    front: bool,
+    /// No other point is both faster and better.
+    is_optimal: bool,
 }
 
 /// Draws a plot per scene into the folder `output`.
-pub(super) fn draw(output: &Path, report: &Report) -> Result<Vec<Picture>, Failure> {
+pub(super) fn draw(output: &Path, results: &Results) -> Result<Vec<Picture>, Failure> {
     let mut drawn = Vec::new();
-    for scene in &report.scenes {
-        let points = points(report, scene);
+    for scene in &results.scenes {
+        let points = points(results, scene);
         if points.is_empty() {
             continue;
         }
@@ -42,30 +42,30 @@ pub(super) fn draw(output: &Path, report: &Report) -> Result<Vec<Picture>, Failu
     Ok(drawn)
 }
 
-fn points(report: &Report, scene: &str) -> Vec<Point> {
-    let Some(base) = report.mean(scene, "", "", PSNR) else { return Vec::new() };
-    let levels = report.effects.iter().map(|e| (&*e.factor.name, &*e.level));
+fn points(results: &Results, scene: &str) -> Vec<Point> {
+    let Some(base) = results.mean(scene, "", "", PSNR) else { return Vec::new() };
+    let levels = results.effects.iter().map(|e| (&*e.factor.name, &*e.level));
     let point = |(knob, level): (&str, &str)| {
         let name = if knob.is_empty() { "exact".to_owned() } else { format!("{knob}={level}") };
         Some(Point {
             name,
-            seconds: report.mean(scene, knob, level, SECONDS)?.exp(),
-            psnr: report.mean(scene, knob, level, PSNR)? - base,
-            peak: report.peak_mib(scene, knob, level)?,
-            front: false,
+            seconds: results.mean(scene, knob, level, SECONDS)?.exp(),
+            psnr: results.mean(scene, knob, level, PSNR)? - base,
+            peak: results.peak_mib(scene, knob, level)?,
+            is_optimal: false,
         })
     };
     let mut points: Vec<Point> =
         std::iter::once(("", "")).chain(levels).filter_map(point).collect();
-    let beaten = |p: &Point| points.iter().any(|q| q.seconds < p.seconds && q.psnr > p.psnr);
-    let front: Vec<bool> = points.iter().map(|p| !beaten(p)).collect();
-    for (point, front) in points.iter_mut().zip(front) {
-        point.front = front;
+    for index in 0..points.len() {
+        let point = &points[index];
+        let beats = |other: &Point| other.seconds < point.seconds && other.psnr > point.psnr;
+        points[index].is_optimal = !points.iter().any(beats);
     }
     points
 }
 
-/// The colour of a peak within the range of all.
+/// Colour of a peak within the range of all peaks.
 fn colour(peak: f64, [least, most]: [f64; 2]) -> RGBColor {
     let share = if most > least { (peak - least) / (most - least) } else { 0.0 };
     let (from, to, t) = if share < 0.5 {
@@ -104,26 +104,27 @@ fn draw_points(
     for point in points {
         let at = (point.seconds, point.psnr);
         let filled = colour(point.peak, peaks).filled();
-        let radius = if point.front { 6 } else { 4 };
-        let ink = if point.front { BLACK.to_rgba() } else { RGBColor(120, 120, 120).to_rgba() };
+        let radius = if point.is_optimal { 6 } else { 4 };
+        let ink =
+            if point.is_optimal { BLACK.to_rgba() } else { RGBColor(120, 120, 120).to_rgba() };
         let label =
             Text::new(point.name.clone(), (9, -5), ("sans-serif", 11).into_font().color(&ink));
         chart.draw_series(std::iter::once(
             EmptyElement::at(at) + Circle::new((0, 0), radius, filled) + label,
         ))?;
     }
-    scale(area, peaks)
+    draw_scale(area, peaks)
 }
 
-/// The colour scale, right of the plot.
-fn scale(area: &Area<'_>, [least, most]: [f64; 2]) -> Result<(), Box<dyn std::error::Error>> {
+/// Draws the colour scale at the right of the plot.
+fn draw_scale(area: &Area<'_>, [least, most]: [f64; 2]) -> Result<(), Box<dyn std::error::Error>> {
     const STEPS: i32 = 40;
     let (x, bottom) = (SIZE.0 as i32 - 108, 400);
     for step in 0..=STEPS {
         let peak = least + (most - least) * f64::from(step) / f64::from(STEPS);
         let y = bottom - 6 * step;
-        let box_ = [(x, y), (x + 16, y - 6)];
-        area.draw(&Rectangle::new(box_, colour(peak, [least, most]).filled()))?;
+        let corners = [(x, y), (x + 16, y - 6)];
+        area.draw(&Rectangle::new(corners, colour(peak, [least, most]).filled()))?;
     }
     let font = ("sans-serif", 12).into_font();
     for (peak, y) in [(least, bottom - 4), (most, bottom - 6 * STEPS - 4)] {
@@ -135,27 +136,27 @@ fn scale(area: &Area<'_>, [least, most]: [f64; 2]) -> Result<(), Box<dyn std::er
 
 #[cfg(test)]
 mod tests {
-    use super::super::report::sample;
+    use super::super::results::sample;
     use super::*;
 
     #[test]
-    fn a_plot_shows_every_level_and_its_front() {
-        let report = sample();
-        let points = points(&report, "room");
-        let front: Vec<(&str, bool)> = points.iter().map(|p| (&*p.name, p.front)).collect();
+    fn a_plot_shows_every_level_and_the_optimal_ones() {
+        let results = sample();
+        let points = points(&results, "room");
+        let optimal: Vec<_> = points.iter().map(|p| (&*p.name, p.is_optimal)).collect();
         let expected = [
             ("exact", false),
             ("alpha_min=1/64", false),
             ("alpha_min=1/32", false),
             ("sh_degree=0", true),
         ];
-        assert_eq!(front, expected);
+        assert_eq!(optimal, expected);
         let text = plot::svg(SIZE, |area| draw_points("title", &points, area)).unwrap();
         for words in ["title", "alpha_min=1/64", "sh_degree=0", "peak memory", "logarithmic"] {
             assert!(text.contains(words), "{words} is not in {text}");
         }
         assert_eq!(text.matches("<circle").count(), 4);
-        assert!(super::points(&report, "nowhere").is_empty());
+        assert!(super::points(&results, "nowhere").is_empty());
     }
 
     #[test]

@@ -1,161 +1,127 @@
-//! What the records of a study say, level by level.
+//! The report of the study, and its summary for the terminal.
 
-use super::levels::Factor;
-use super::{BASE, Outcome, Trade};
-use crate::difference::{Difference, Pair, mean};
-use crate::distinct;
+use std::fmt::Write;
 
-/// A study's results.
-pub(super) struct Report {
-    pub(super) study: Trade,
-    /// Labels of the scenes.
-    pub(super) scenes: Vec<String>,
-    pub(super) outcomes: Vec<Outcome>,
-    pub(super) effects: Vec<Effect>,
+use super::Trade;
+use super::results::{Effect, PSNR, Results, SECONDS};
+use crate::difference::{Difference, INTERVALS};
+use crate::text_table::{number_or_dash, or_dash};
+use densify_core::numbers::grouped;
+use densify_html::{Column, Document, Table, Text};
+
+/// Creates the report without plots.
+pub(super) fn document(results: &Results) -> Document {
+    let mut document = Document::new("What each knob costs and buys");
+    let Trade { iterations, budget, seeds, train, .. } = &results.study;
+    let mut text = Text::from(format!(
+        "densify {}; scenes: {}; {} iterations, at most {} rows, {seeds} {} per level.",
+        env!("CARGO_PKG_VERSION"),
+        results.scenes.join(", "),
+        grouped(*iterations as usize),
+        grouped(*budget),
+        if *seeds == 1 { "seed" } else { "seeds" },
+    ));
+    if !train.is_empty() {
+        text = text.plain(" Options of every run: ").code(&train.join(" ")).plain(".");
+    }
+    let differences = format!(
+        " with the same scene and seed; ratios are geometric means. {INTERVALS}. Scores are of views held out, \
+         rendered without any shortcut."
+    );
+    document.paragraph(text.plain(" Differences are from ").code("exact").plain(&differences));
+    document.section("exact");
+    document.table(exact_table(results));
+    document.section("Outcome of training");
+    document.table(outcome_table(results));
+    document
 }
 
-/// What a knob does at a level, against `exact`.
-pub(super) struct Effect {
-    pub(super) factor: Factor,
-    pub(super) level: String,
-    pub(super) psnr: Difference,
-    pub(super) ssim: Difference,
-    /// Logarithms of ratios, as the next two.
-    pub(super) seconds: Difference,
-    /// Of processor time, which other programs disturb less.
-    pub(super) cpu: Option<Difference>,
-    pub(super) peak: Difference,
-    /// Runs whose model is that of `exact` to the bit.
-    pub(super) same: usize,
+/// Tabulates the runs with the preset `exact`, to which differences refer.
+fn exact_table(results: &Results) -> Table {
+    let mut table = Table::new(["scene", "PSNR [dB]", "time [s]", "peak [MiB]"].map(Column::text));
+    for scene in &results.scenes {
+        let psnr = number_or_dash(results.mean(scene, "", "", PSNR), 2);
+        let seconds = number_or_dash(results.mean(scene, "", "", SECONDS).map(f64::exp), 1);
+        let peak = number_or_dash(results.peak_mib(scene, "", ""), 0);
+        table.row([scene.clone(), psnr, seconds, peak]);
+    }
+    table
 }
 
-/// A number of a run; none where it was not measured.
-type Measure = fn(&Outcome) -> Option<f64>;
-
-pub(super) const PSNR: Measure = |r| Some(r.psnr);
-const SSIM: Measure = |r| Some(r.ssim);
-pub(super) const SECONDS: Measure = |r| positive(r.seconds).map(f64::ln);
-const CPU: Measure = |r| positive(r.cpu_seconds?).map(f64::ln);
-/// Where the system does not say, what was promised.
-const PEAK: Measure = |r| positive(r.peak_bytes.unwrap_or(r.ledger_bytes) as f64).map(f64::ln);
-
-fn positive(value: f64) -> Option<f64> {
-    (value.is_finite() && value > 0.0).then_some(value)
+fn outcome_table(results: &Results) -> Table {
+    let columns = [
+        "knob",
+        "level",
+        "ΔPSNR [dB]",
+        "ΔSSIM",
+        "time ×",
+        "processor time ×",
+        "peak ×",
+        "same bits",
+    ];
+    let mut table = Table::new(columns.map(Column::text));
+    for effect in &results.effects {
+        table.row(row(effect));
+    }
+    table
 }
 
-impl Report {
-    pub(super) fn new(study: &Trade, chosen: &[Factor], outcomes: Vec<Outcome>) -> Self {
-        let scenes = distinct(outcomes.iter().map(|outcome| outcome.scene.clone()));
-        let mut report = Self { study: study.clone(), scenes, outcomes, effects: Vec::new() };
-        for one in chosen {
-            for level in &one.levels {
-                report.effects.extend(report.effect(one, level));
-            }
-        }
-        report
-    }
-
-    /// The runs with a knob at a level.
-    pub(super) fn runs(&self, knob: &str, level: &str) -> impl Iterator<Item = &Outcome> {
-        let is_it = move |run: &&Outcome| run.factor == knob && run.level == level;
-        self.outcomes.iter().filter(is_it)
-    }
-
-    /// Each run with a knob at a level, and the exact one of the same scene and seed.
-    fn pairs(&self, knob: &str, level: &str) -> Vec<(&Outcome, &Outcome)> {
-        let base = |run: &Outcome| {
-            self.runs(BASE, "").find(|base| (&base.scene, base.seed) == (&run.scene, run.seed))
-        };
-        self.runs(knob, level).filter_map(|run| Some((run, base(run)?))).collect()
-    }
-
-    fn differences(&self, knob: &str, level: &str, of: Measure) -> Vec<Pair<'_>> {
-        let all = self.pairs(knob, level).into_iter();
-        all.filter_map(|(run, base)| {
-            let difference = of(run)? - of(base)?;
-            Some(Pair { scene: &run.scene, seed: run.seed, difference })
-        })
-        .collect()
-    }
-
-    fn effect(&self, factor: &Factor, level: &str) -> Option<Effect> {
-        let name = &*factor.name;
-        let of = |measure: Measure| Difference::new(&self.differences(name, level, measure));
-        let pairs = self.pairs(name, level);
-        let same = pairs.iter().filter(|(run, base)| run.model == base.model).count();
-        Some(Effect {
-            factor: factor.clone(),
-            level: level.to_owned(),
-            psnr: of(PSNR)?,
-            ssim: of(SSIM)?,
-            seconds: of(SECONDS)?,
-            cpu: of(CPU),
-            peak: of(PEAK)?,
-            same,
-        })
-    }
-
-    /// Mean over the runs with a knob at a level in a scene.
-    pub(super) fn mean(&self, scene: &str, knob: &str, level: &str, of: Measure) -> Option<f64> {
-        let values: Option<Vec<f64>> =
-            self.runs(knob, level).filter(|run| run.scene == scene).map(of).collect();
-        mean(values?)
-    }
-
-    /// Peak memory of the runs with a knob at a level in a scene `[MiB]`.
-    pub(super) fn peak_mib(&self, scene: &str, knob: &str, level: &str) -> Option<f64> {
-        self.mean(scene, knob, level, PEAK).map(|peak| peak.exp() / f64::from(1 << 20))
-    }
-}
-
-/// For tests of what shows a report.
-#[cfg(test)]
-pub(super) fn sample() -> Report {
-    let outcome = |knob: &str, level: &str, seed, psnr: f64, seconds: f64| Outcome {
-        peak_bytes: Some(64 << 20),
-        seconds,
-        ..crate::record::sample(knob, level, seed, psnr)
+fn row(effect: &Effect) -> Vec<Text> {
+    let ratio = |d: &Difference| {
+        let bounds = |[low, high]: [f64; 2]| format!("{:.3}, {:.3}", low.exp(), high.exp());
+        format!("{:.3}{}", d.mean.exp(), d.format_interval(bounds))
     };
-    let outcomes = (0..3).flat_map(|seed| {
-        let by = f64::from(seed);
-        [
-            outcome("", "", seed, 30.0 + by, 100.0),
-            outcome("alpha_min", "1/64", seed, 30.0 + by, 90.0),
-            outcome("alpha_min", "1/32", seed, 29.0 + 1.1 * by, 95.0),
-            outcome("sh_degree", "0", seed, 30.2 + by, 50.0),
-        ]
-    });
-    let study = Trade {
-        scenes: vec!["scene:room".into()],
-        knobs: Vec::new(),
-        seeds: 3,
-        iterations: 100,
-        budget: 1000,
-        output: "x".into(),
-        train: vec!["--policy=diet".into()],
-        engine: crate::EngineArgs::default(),
-    };
-    let factor = |name: &str, levels: &[&str]| Factor {
-        name: name.to_owned(),
-        is_exact: false,
-        levels: levels.iter().map(|level| (*level).to_owned()).collect(),
-    };
-    let chosen = [factor("alpha_min", &["1/64", "1/32"]), factor("sh_degree", &["0"])];
-    Report::new(&study, &chosen, outcomes.collect())
+    let mut identical = Text::from(format!("{} of {}", effect.identical, effect.psnr.pairs));
+    if effect.factor.is_exact && effect.identical < effect.psnr.pairs {
+        identical = identical.plain(": ").bold("not exact");
+    }
+    vec![
+        effect.factor.name.as_str().into(),
+        effect.level.as_str().into(),
+        effect.psnr.format(2).into(),
+        effect.ssim.format(4).into(),
+        ratio(&effect.seconds).into(),
+        or_dash(effect.cpu.as_ref().map(ratio)).into(),
+        ratio(&effect.peak).into(),
+        identical,
+    ]
+}
+
+/// Formats a line per level for the terminal.
+pub(super) fn summary(results: &Results) -> String {
+    let mut text = format!("{:<28}  dPSNR [dB]  time x  peak x", "knob");
+    for effect in &results.effects {
+        let name = format!("{}={}", effect.factor.name, effect.level);
+        let _ = write!(
+            text,
+            "\n{name:<28}  {:>+10.2}  {:>6.3}  {:>6.3}",
+            effect.psnr.mean,
+            effect.seconds.mean.exp(),
+            effect.peak.mean.exp()
+        );
+    }
+    text
 }
 
 #[cfg(test)]
 mod tests {
+    use super::super::results::sample;
     use super::*;
 
     #[test]
-    fn effects_are_paired_with_the_exact_one_of_the_same_seed() {
-        let report = sample();
-        let of = |level: &str| report.effects.iter().find(|e| e.level == level).expect("there");
-        let equal = of("1/64");
-        assert!(equal.psnr.mean.abs() < 1e-12 && equal.same == 3);
-        assert!((equal.seconds.mean.exp() - 0.9).abs() < 1e-12);
-        let bad = of("1/32");
-        assert!((bad.psnr.mean + 0.9).abs() < 1e-12 && bad.same == 0);
+    fn every_level_has_its_row() {
+        let results = sample();
+        let text = document(&results).to_string();
+        for words in [
+            "| room | 31.00 | 100.0 | 64 |",
+            "| sh_degree | 0 | +0.20 [+0.20, +0.20] |",
+            "| alpha_min | 1/32 | -0.90 [",
+            "| 0 of 3 |",
+            "--policy=diet",
+        ] {
+            assert!(text.contains(words), "{words:?} is not in {text}");
+        }
+        let summary = summary(&results);
+        assert!(summary.contains("sh_degree=0") && summary.contains("0.500   1.000"), "{summary}");
     }
 }

@@ -1,4 +1,4 @@
-//! One run of a study: how it is called, described and made, and the record of its outcome.
+//! A run of a study: its name, description and training, and the record of its outcome.
 
 use std::fmt;
 use std::fs;
@@ -7,63 +7,47 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use toml::Value;
 
-use super::child::{Child, has_geometry, in_run, summary};
-use super::record::Outcome;
+use super::outcome::Outcome;
+use super::process;
 use densify_core::files;
 use densify_core::files::write_atomically;
+use densify_data::dataset::{GroundTruth, builtin};
 use densify_run::Partial;
 use densify_run::failure::{Failure, OTHER};
-use densify_train::output::{geometry_of, model_path, scores_of};
+use densify_train::output::{geometry_of, model_path, scores_of, summary_of};
 
-/// A run of a study, as it also stands in a file for who is to make it.
+/// A run of a study. Engines receive it as a file.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Cell {
+pub(super) struct PlannedRun {
     pub(super) scene: PathBuf,
     /// The scene's short name.
     pub(super) label: String,
-    /// What is varied, and at which level.
+    /// The factor that is varied, and its level.
     pub(super) factor: String,
     pub(super) level: String,
     pub(super) budget: usize,
     pub(super) seed: u32,
     pub(super) iterations: u32,
-    /// What factor and level are called to the user, such as `vanilla, 9 rows`.
+    /// Factor and level for the user, such as `vanilla, 9 rows`.
     pub(super) title: String,
-    /// The same for names of folders.
+    /// Factor and level for the name of the folder.
     pub(super) folder: String,
-    /// Whether scores are of the model as any viewer would show it, without shortcuts; else they are
-    /// those that the run measured itself.
+    /// Scores are measured by `densify eval`, which renders without shortcuts, as any viewer does; otherwise they are those
+    /// that the run measured itself.
     pub(super) scores_without_shortcuts: bool,
-    /// The description of the run.
-    #[serde(with = "as_table")]
+    /// Description of the run.
     pub(super) spec: Partial,
 }
 
-mod as_table {
-    use serde::de::Error;
-    use serde::{Deserialize, Deserializer, Serialize, Serializer};
-    use toml::Table;
-
-    use densify_run::Partial;
-
-    pub(super) fn serialize<S: Serializer>(spec: &Partial, to: S) -> Result<S::Ok, S::Error> {
-        spec.clone().into_table().serialize(to)
-    }
-
-    pub(super) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Partial, D::Error> {
-        Partial::new(Table::deserialize(from)?, "spec").map_err(D::Error::custom)
-    }
-}
-
-impl fmt::Display for Cell {
+impl fmt::Display for PlannedRun {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}, {}, seed {}", self.label, self.title, self.seed)
     }
 }
 
-impl Cell {
-    /// A run of a study with nothing varied: the options that all runs share, under those that each sets.
+impl PlannedRun {
+    /// A run in which nothing is varied yet, with the options that all runs of the study share.
     pub(super) fn new(
         shared: &Partial,
         (scene, label): (&Path, &str),
@@ -77,53 +61,51 @@ impl Cell {
             ("seed", Value::from(seed)),
             ("iterations", Value::from(iterations)),
         ];
-        let lay = |spec: Partial, (name, value)| Partial::option(name, value).over(spec);
+        let add = |spec, (name, value)| Partial::option(name, value).over(spec);
         Self {
             scene: scene.to_owned(),
             label: label.to_owned(),
             budget,
             seed,
             iterations,
-            spec: own.into_iter().fold(shared.clone(), lay),
+            spec: own.into_iter().fold(shared.clone(), add),
             ..Self::default()
         }
     }
 
     /// Name of the run's folder.
-    pub(super) fn run(&self) -> String {
+    pub(super) fn name(&self) -> String {
         format!("{}-{}-seed{}", self.label, self.folder, self.seed)
     }
 
-    /// Where the run is, in the folder of the study.
-    pub(super) fn path(&self, output: &Path) -> PathBuf {
-        output.join("runs").join(self.run())
-    }
-
-    /// Trains, measures what was trained, and returns the record.
+    /// Trains and evaluates the run, and returns its outcome.
     pub(super) fn train(&self, output: &Path) -> Result<Outcome, Failure> {
-        let folder = self.path(output);
-        let child = Child { spec: &self.spec, folder: &folder };
-        let measure = || {
-            let is_missing = || match has_geometry(&self.scene) {
-                true => geometry_of(&folder, self.iterations).map(|found| found.is_none()),
-                false => Ok(false),
-            };
-            let again = self.scores_without_shortcuts || is_missing()?;
-            if again { child.measure() } else { Ok(()) }
-        };
-        let done = child.train().and_then(|()| measure());
-        done.map_err(|failure| in_run(self, failure))?;
-        self.record(&folder)
+        let folder = output.join("runs").join(self.name());
+        self.train_and_evaluate(&folder).map_err(|failure| {
+            failure.and(&format!("this was the run {self}; the same command goes on from here"))
+        })?;
+        self.outcome(&folder)
     }
 
-    /// Writes what whoever is to make the run needs.
-    pub(super) fn write(&self, output: &Path) -> Result<(), Failure> {
-        let text = toml::to_string(self).map_err(Failure::input)?;
-        write_atomically(&task_file(output, &self.run()), |out| out.write_all(text.as_bytes()))?;
+    fn train_and_evaluate(&self, folder: &Path) -> Result<(), Failure> {
+        process::train(&self.spec, folder)?;
+        let has_surface = builtin::name(&self.scene).is_some() || GroundTruth::is_in(&self.scene);
+        if self.scores_without_shortcuts
+            || has_surface && geometry_of(folder, self.iterations)?.is_none()
+        {
+            process::evaluate(&self.spec, folder)?;
+        }
         Ok(())
     }
 
-    /// The run of this name, as it was written.
+    /// Writes the run to a file for an engine.
+    pub(super) fn write(&self, output: &Path) -> Result<(), Failure> {
+        let text = toml::to_string(self).map_err(Failure::input)?;
+        write_atomically(&task_file(output, &self.name()), |out| out.write_all(text.as_bytes()))?;
+        Ok(())
+    }
+
+    /// Reads the run of this name from its file.
     pub(super) fn read(output: &Path, name: &str) -> Result<Self, Failure> {
         let path = task_file(output, name);
         let within = |problem: String| Failure::input(format!("{}: {problem}", path.display()));
@@ -132,30 +114,34 @@ impl Cell {
         toml::from_str(&text).map_err(|e| within(e.to_string().trim().to_owned()))
     }
 
-    /// Makes the run, unless that is done, and leaves its record beside its folder.
-    pub(super) fn make(&self, output: &Path) -> Result<(), Failure> {
-        if self.made(output).is_some() {
+    /// Trains the run unless it is done, and writes its record beside its folder.
+    pub(super) fn train_and_record(&self, output: &Path) -> Result<(), Failure> {
+        if self.recorded(output).is_some() {
             return Ok(());
         }
         let outcome = self.train(output)?;
         let text = serde_json::to_string(&outcome).map_err(Failure::input)?;
-        write_atomically(&record_file(output, &self.run()), |out| out.write_all(text.as_bytes()))?;
+        write_atomically(&record_file(output, &self.name()), |out| out.write_all(text.as_bytes()))?;
         Ok(())
     }
 
-    /// The record that [`Self::make`] has left of this very run.
-    pub(super) fn made(&self, output: &Path) -> Option<Outcome> {
-        let text = files::read_text(&record_file(output, &self.run()), files::MAX_OPTIONS).ok()?;
+    /// The outcome that [`Self::train_and_record`] has written for the same description.
+    pub(super) fn recorded(&self, output: &Path) -> Option<Outcome> {
+        let text = files::read_text(&record_file(output, &self.name()), files::MAX_OPTIONS).ok()?;
         let outcome: Outcome = serde_json::from_str(&text).ok()?;
         outcome.is_of(&self.spec).then_some(outcome)
     }
 
-    fn record(&self, folder: &Path) -> Result<Outcome, Failure> {
-        let summary = summary(folder)?;
+    /// Reads the outcome from the run's folder.
+    fn outcome(&self, folder: &Path) -> Result<Outcome, Failure> {
+        let summary = summary_of(folder)?.ok_or_else(|| {
+            Failure::new(OTHER, format!("{}: there is no stats/summary.json", folder.display()))
+        })?;
         let iterations = summary.iterations;
-        let scores = match self.scores_without_shortcuts {
-            true => scores_of(folder, iterations)?,
-            false => summary.test.values().next_back().copied(),
+        let scores = if self.scores_without_shortcuts {
+            scores_of(folder, iterations)?
+        } else {
+            summary.test.values().next_back().copied()
         };
         let Some(scores) = scores else {
             let scene = self.scene.display();
@@ -172,7 +158,7 @@ impl Cell {
             budget: self.budget,
             seed: self.seed,
             iterations,
-            run: self.run(),
+            run: self.name(),
             spec: self.spec.clone().into_table(),
             model: crc32c::crc32c(&model),
             psnr: scores.psnr,
@@ -191,12 +177,12 @@ impl Cell {
     }
 }
 
-/// What whoever is to make a run needs.
+/// File with the description of a run for an engine.
 fn task_file(output: &Path, name: &str) -> PathBuf {
     output.join("runs").join(format!("{name}.task.toml"))
 }
 
-/// The record of a run that an engine has started.
+/// File with the outcome of a run that an engine has started.
 fn record_file(output: &Path, name: &str) -> PathBuf {
     output.join("runs").join(format!("{name}.record.json"))
 }

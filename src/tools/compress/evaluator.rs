@@ -1,4 +1,4 @@
-//! How well a model shows the photographs.
+//! Measures models against the photographs.
 
 use std::path::Path;
 
@@ -15,18 +15,18 @@ use densify_train::evaluate::Split;
 use densify_train::exposure::fitted;
 use densify_train::metrics::psnr;
 
-/// The photographs, and what models are rendered on.
-pub(super) struct Judge {
+/// The photographs and the settings to render with.
+pub(super) struct Evaluator {
     dataset: Dataset,
     machine: Machine,
-    /// Distance `[scene units]`.
+    /// Near plane `[scene units]`.
     near: f32,
     background: [f32; 3],
-    /// Whether each photograph is compared with the exposure that fits it best.
+    /// Each render is compared with its best-fitting exposure.
     fits_exposure: bool,
 }
 
-impl Judge {
+impl Evaluator {
     pub(super) fn open(options: &Options<'_>, observer: &dyn Observer) -> Result<Self, Failure> {
         let machine = Machine::open(&options.device, observer)?;
         let dataset = load(options.scene, &options.data, observer)?;
@@ -36,8 +36,8 @@ impl Judge {
         Ok(Self { dataset, machine, near, background, fits_exposure })
     }
 
-    /// Fails where the model is in other coordinates than the dataset.
-    pub(super) fn require(
+    /// Checks that the model is in the coordinates of the dataset.
+    pub(super) fn check_coordinates(
         &self,
         model: &Gaussians,
         file: &Path,
@@ -51,7 +51,7 @@ impl Judge {
     }
 
     /// Measures a model whose file has this size.
-    pub(super) fn attempt(
+    pub(super) fn evaluate(
         &self,
         model: Gaussians,
         format: &Format,
@@ -65,21 +65,20 @@ impl Judge {
             for view in 0..views.count() {
                 views.prefetch_after(view);
                 let image = views.image(view).map_err(Failure::input)?;
-                let shown = backend.render(views.camera(view), self.background, sh_degree)?;
-                // Which also finds out whether the two can be compared.
-                let plain = psnr(&shown.rgb, &image, self.background).map_err(Failure::input)?;
-                sum += match self.fits_exposure {
-                    true => {
-                        let rgb = fitted(&shown.rgb, &image, self.background);
-                        psnr(&rgb, &image, self.background).map_err(Failure::input)?
-                    }
-                    false => plain,
-                };
+                let rendering = backend.render(views.camera(view), self.background, sh_degree)?;
+                let score =
+                    |rgb: &[f32]| psnr(rgb, &image, self.background).map_err(Failure::input);
+                // Also checks that the render and the photograph can be compared.
+                let mut value = score(&rendering.rgb)?;
+                if self.fits_exposure {
+                    value = score(&fitted(&rendering.rgb, &image, self.background))?;
+                }
+                sum += value;
             }
             Ok::<_, Failure>(sum / views.count() as f64)
         };
-        let train = mean(Split::Train)?;
-        let test = if self.dataset.test.is_empty() { None } else { Some(mean(Split::Test)?) };
-        Ok(Attempt { rows, sh_degree, format: format.name, bytes, train, test })
+        let train_psnr = mean(Split::Train)?;
+        let test_psnr = if self.dataset.test.is_empty() { None } else { Some(mean(Split::Test)?) };
+        Ok(Attempt { rows, sh_degree, format: format.name, bytes, train_psnr, test_psnr })
     }
 }

@@ -1,4 +1,4 @@
-//! What a study leaves on disk of every run: a line in its file of records.
+//! The outcome of a run, a line of a study's journal.
 
 use serde::{Deserialize, Serialize};
 use toml::Table;
@@ -6,64 +6,66 @@ use toml::Table;
 use densify_run::Partial;
 use densify_train::metrics::geometry::Geometry;
 
-/// The result of a run.
+/// The outcome of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct Outcome {
     /// Version of densify.
     pub(super) densify: String,
     /// Label of the scene.
     pub(super) scene: String,
-    /// What is varied: a policy of `compare`, a knob of `trade`.
+    /// The factor that is varied: a policy in `compare`, a knob in `trade`.
     pub(super) factor: String,
-    /// At which level: the budget, or the knob's value.
+    /// Its level: the budget, or the knob's value.
     pub(super) level: String,
     pub(super) budget: usize,
     pub(super) seed: u32,
     pub(super) iterations: u32,
     /// Folder of the run, in `runs`.
     pub(super) run: String,
-    /// The run's description: one with the same is not run again.
+    /// Description of the run, by which a finished run is recognised.
     pub(super) spec: Table,
-    /// Checksum of the model's file: equal models have equal ones.
+    /// Checksum of the model's file.
     pub(super) model: u32,
-    /// Mean over the views held out `[dB]`.
+    /// Mean PSNR of the test views `[dB]`.
     pub(super) psnr: f64,
+    /// Mean SSIM of the test views.
     pub(super) ssim: f64,
+    /// Mean FLIP of the test views.
     pub(super) flip: f64,
-    /// Rows at the end.
+    /// Gaussians at the end.
     pub(super) rows: usize,
-    /// Most rows at any instant.
+    /// Most Gaussians at any instant.
     pub(super) peak_rows: usize,
-    /// Largest resident memory of the process.
+    /// Peak resident memory of the process, if known.
     pub(super) peak_bytes: Option<u64>,
-    /// What was promised.
+    /// Memory promised by the ledger.
     pub(super) ledger_bytes: u64,
-    /// Wall time of the steps.
+    /// Wall time of training `[s]`.
     pub(super) seconds: f64,
-    /// Processor time of the steps.
+    /// Processor time of training `[s]`, if known.
     pub(super) cpu_seconds: Option<f64>,
     /// Views rendered for the policy's decisions.
     pub(super) extra_forwards: u64,
-    /// (iteration, PSNR) along the run.
+    /// Iterations and PSNR of the test views during training.
     pub(super) curve: Vec<(u32, f64)>,
-    /// How the model sits on the surface, where that is known.
+    /// Geometric errors, if the surface is known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(super) geometry: Option<Geometry>,
 }
 
 impl Outcome {
-    /// Whether it is of the run with this description, by this version of densify.
+    /// True for a run with this description by this version of densify.
     pub(super) fn is_of(&self, spec: &Partial) -> bool {
         self.densify == env!("CARGO_PKG_VERSION") && spec.is_table(&self.spec)
     }
 
-    /// Whether the budget was kept at every instant.
+    /// True if the budget was kept at every instant.
     pub(super) fn kept_its_budget(&self) -> bool {
         self.peak_rows <= self.budget
     }
 }
 
-/// A run for tests of what shows results.
+/// An outcome for tests.
 #[cfg(test)]
 pub(super) fn sample(factor: &str, level: &str, seed: u32, psnr: f64) -> Outcome {
     Outcome {
