@@ -33,8 +33,10 @@ class Intended:
     reason: str
 
 
+MEMORY_TABLE = r"^memory promised|MiB\)?$|promised in all$|MiB of --memory$"
 INTENDED = [
-    Intended("*", "*.out", r"^memory promised|MiB\)?$|promised in all$", "train prints the table of memory only with -v"),
+    Intended("*", "*.out", MEMORY_TABLE, "train prints the table of memory only with -v"),
+    Intended("extra/blocks", "*/logs/*.log", MEMORY_TABLE, "train prints the table of memory only with -v"),
     Intended("extra/meshes", "*/scene.json", None, "the notes of the scene generator are in plain English"),
 ]
 
