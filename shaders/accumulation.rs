@@ -21,7 +21,6 @@ impl Accumulation {
     pub const ALL: [Self; 3] = [Self::Slots, Self::SubgroupAtomics, Self::SubgroupCas];
 
     /// Value of the knob `accumulation`.
-    #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
             Self::Slots => "slots",
@@ -31,13 +30,11 @@ impl Accumulation {
     }
 
     /// The kind with this value of the knob.
-    #[must_use]
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|accumulation| accumulation.name() == name)
     }
 
     /// True if runs are reproducible byte for byte.
-    #[must_use]
     pub const fn is_deterministic(self) -> bool {
         matches!(self, Self::Slots)
     }

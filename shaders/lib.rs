@@ -76,7 +76,6 @@ pub const STAGES: &[Stage] = &[
 
 impl Stage {
     /// The WGSL of the module for a device with this accumulation; `None` if the device does not have the stage.
-    #[must_use]
     pub fn text(&self, accumulation: Accumulation) -> Option<String> {
         let more: &[&str] = match (self.on, accumulation) {
             (On::All, _) => &[],

@@ -26,13 +26,11 @@ pub struct Window {
 
 impl Window {
     /// True if `step` (1-based) is on the schedule.
-    #[must_use]
     pub fn is_due(&self, step: u32) -> bool {
         self.every > 0 && self.from < step && step < self.until && step.is_multiple_of(self.every)
     }
 
     /// Number of scheduled steps up to and including `step` (1-based).
-    #[must_use]
     pub fn count(&self, step: u32) -> u32 {
         let last = step.min(self.until.saturating_sub(1));
         match self.every {
@@ -72,7 +70,6 @@ impl OpacityResets {
     }
 
     /// True if opacities are reset at `step` (1-based).
-    #[must_use]
     pub fn is_due(&self, step: u32) -> bool {
         step > 0 && (self.regular.is_due(step) || self.white == Some(step))
     }
@@ -90,7 +87,6 @@ impl OpacityResets {
 /// Number of rows allowed at `step` by the concave growth curve N(x) = S + (B − S)(2x/M − (x/M)²) at
 /// event x of M, from S = `start` rows before the first event to B = `end` after the last (*Taming
 /// 3DGS*, Mallick et al. 2024, equation 2).
-#[must_use]
 pub fn concave_curve(window: Window, step: u32, start: usize, end: usize) -> usize {
     let Window { from, until, every } = window;
     if every == 0 {
@@ -105,7 +101,6 @@ pub fn concave_curve(window: Window, step: u32, start: usize, end: usize) -> usi
 
 /// Divides a sum over views by the number of views that saw the row. 0 if no view saw it or the mean is not
 /// finite. Shape: `[rows]`.
-#[must_use]
 pub fn mean_over_views(sum: &[f32], views: &[f32]) -> Vec<f32> {
     let mean = |(&sum, &views): (&f32, &f32)| {
         let mean = sum / views;
@@ -132,7 +127,6 @@ pub(crate) fn add_colour_gradient(
 }
 
 /// A clone: the parent is unchanged, and a copy is placed at `offset` from it `[scene units]`.
-#[must_use]
 pub fn clone_at(offset: [f32; 3]) -> Offspring {
     Offspring {
         children: 1,
@@ -145,7 +139,6 @@ pub fn clone_at(offset: [f32; 3]) -> Offspring {
 }
 
 /// A split: two children, sampled from the parent and smaller by `factor`, replace it.
-#[must_use]
 pub fn split_by(factor: f32) -> Offspring {
     Offspring {
         parent: ParentFate::BecomesChild,
@@ -160,7 +153,6 @@ pub fn split_by(factor: f32) -> Offspring {
 /// With d = `share`, the children are placed at ±3d standard deviations; their longest axis is 1 − d
 /// times the parent's, the others √(1 − d²) times. As 3d + 3(1 − d) = 3, the outer ends stay in place
 /// (*Improving Densification in 3D Gaussian Splatting*, 2025). Opacities are multiplied by `opacity`.
-#[must_use]
 pub fn split_long_axis(share: f32, opacity: f32) -> Offspring {
     Offspring {
         placement: Placement::LongAxis { sigmas: 3.0 * share },
@@ -182,7 +174,6 @@ pub struct PruneLimits {
 impl PruneLimits {
     /// The limits at an event. `max_scale` is a fraction of the scene extent and applies after step
     /// `max_scale_from`; 0: no limit.
-    #[must_use]
     pub fn at(now: &Snapshot<'_>, min_opacity: f64, max_scale: f64, max_scale_from: u32) -> Self {
         let limits_size = max_scale > 0.0 && now.step > max_scale_from;
         let max_scale = (max_scale * f64::from(now.scene.extent)) as f32;
@@ -194,7 +185,6 @@ impl PruneLimits {
 
     /// True if a Gaussian of this opacity and largest standard deviation `[scene units]` is to be pruned.
     /// Non-finite values always are, as training cannot repair them.
-    #[must_use]
     pub fn exceeded(&self, opacity: f32, scale: f32) -> bool {
         !(opacity.is_finite() && scale.is_finite())
             || opacity < self.min_opacity

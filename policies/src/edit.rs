@@ -177,7 +177,6 @@ fn first_failed(checks: &[(bool, &'static str)]) -> Option<&'static str> {
 
 impl Offspring {
     /// The field that is not finite or out of its range, if any.
-    #[must_use]
     pub fn bad_field(&self) -> Option<&'static str> {
         let placement = match self.placement {
             Placement::Offset(v) | Placement::Axes(v) => all_finite(&v),
@@ -195,14 +194,12 @@ impl Offspring {
 
     /// True if the children are rotated, or their scales are set or change by axis. Such edits must be
     /// declared by [`Needs::detailed_edits`](crate::policy::Needs).
-    #[must_use]
     pub fn is_detailed(&self) -> bool {
         matches!(self.scale, ScaleRule::Axes(_) | ScaleRule::Set(_))
             || self.turn.map(f32::to_bits) != NO_ROTATION.map(f32::to_bits)
     }
 
     /// Number of Gaussians that share the parent's opacity: its children, and the parent if it becomes one.
-    #[must_use]
     pub fn siblings(&self) -> u32 {
         self.children.saturating_add(u32::from(self.parent == ParentFate::BecomesChild))
     }
@@ -210,7 +207,6 @@ impl Offspring {
 
 impl ScaleRule {
     /// True if all values are finite and positive.
-    #[must_use]
     pub fn is_valid(&self) -> bool {
         match *self {
             Self::Uniform(factor) => is_positive(factor),
@@ -223,7 +219,6 @@ impl ScaleRule {
 
 impl OpacityRule {
     /// True if the value is in its range.
-    #[must_use]
     pub fn is_valid(&self) -> bool {
         match *self {
             Self::Same | Self::Conserved => true,
@@ -246,7 +241,6 @@ impl Update {
 
     /// Restarts the row in place: round, with this standard deviation `[scene units]` and opacity, its base
     /// colour from all directions, and no moments.
-    #[must_use]
     pub const fn restart(scale: f32, opacity: f32) -> Self {
         Self {
             opacity: OpacityRule::Set(opacity),
@@ -259,7 +253,6 @@ impl Update {
 
     /// The field that is not finite or out of its range, if any. [`OpacityRule::Conserved`] is out of
     /// range, as there are no children to share the opacity with.
-    #[must_use]
     pub fn bad_field(&self) -> Option<&'static str> {
         let opacity = self.opacity.is_valid() && self.opacity != OpacityRule::Conserved;
         let colour = |colour: [f32; 3]| colour.iter().all(|c| c.abs() <= COLOUR_MAX);
@@ -274,7 +267,6 @@ impl Update {
 
 impl Decay {
     /// The field that is not finite or out of its range, if any.
-    #[must_use]
     pub fn bad_field(&self) -> Option<&'static str> {
         let opacity = self.opacity.is_finite() && self.opacity >= 0.0;
         first_failed(&[(opacity, "opacity"), ((0.0..1.0).contains(&self.scale), "scale")])
@@ -283,13 +275,11 @@ impl Decay {
 
 impl Seed {
     /// A seed with standard deviation `scale` along all axes.
-    #[must_use]
     pub const fn round(position: [f32; 3], colour: [f32; 3], scale: f32, opacity: f32) -> Self {
         Self { position, colour, scales: [scale; 3], orientation: NO_ROTATION, opacity }
     }
 
     /// The field that is not finite or out of its range, if any.
-    #[must_use]
     pub fn bad_field(&self) -> Option<&'static str> {
         first_failed(&[
             (all_finite(&self.position), "position"),

@@ -40,7 +40,6 @@ const NOT_FOUND: Neighbour = Neighbour { square: f64::INFINITY, index: u32::MAX 
 
 impl<'a> Neighbours<'a> {
     /// Builds the tree of at most 2³² points, whose coordinates must not be NaN.
-    #[must_use]
     pub fn new(points: &'a [[f64; 3]]) -> Self {
         let mut order: Vec<u32> = (0..points.len() as u32).collect();
         let mut axes = vec![0; points.len()];
@@ -53,7 +52,6 @@ impl<'a> Neighbours<'a> {
     ///
     /// # Panics
     /// When there is no such point.
-    #[must_use]
     pub fn mean_square_distance(&self, index: usize) -> f64 {
         let mut found = [NOT_FOUND; AVERAGED];
         let found = self.nearest(index, &mut found).iter();

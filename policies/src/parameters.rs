@@ -55,7 +55,6 @@ pub fn in_range(parameter: &str, value: f64, range: impl RangeBounds<f64>) -> Po
 /// A [`PolicyError::BadParameter`], for [`ConfiguredPolicy::new`]. The registry adds the policy's name.
 ///
 /// [`ConfiguredPolicy::new`]: crate::registry::ConfiguredPolicy::new
-#[must_use]
 pub fn bad_parameter(parameter: &str, reason: impl Into<String>) -> PolicyError {
     PolicyError::BadParameter {
         policy: String::new(),
@@ -65,7 +64,6 @@ pub fn bad_parameter(parameter: &str, reason: impl Into<String>) -> PolicyError 
 }
 
 /// Parses a value given on the command line: as TOML if it is valid TOML, otherwise as text.
-#[must_use]
 pub fn parse_value(text: &str) -> Value {
     let parsed = format!("value = {text}").parse::<Table>().ok();
     // A text with a line break could set further keys; it is not a single value then.
@@ -91,7 +89,6 @@ pub enum StepParameter {
 ///
 /// # Panics
 /// When the total is not N. In a constant this is a compile error.
-#[must_use]
 pub const fn extended<const N: usize>(
     first: &[StepParameter],
     more: &[StepParameter],
@@ -108,7 +105,6 @@ pub const fn extended<const N: usize>(
 
 impl StepParameter {
     /// The parameter's name.
-    #[must_use]
     pub fn name(self) -> &'static str {
         let (Self::Step(name) | Self::Interval(name)) = self;
         name
@@ -133,7 +129,6 @@ pub(crate) fn scale_steps(table: &mut Table, parameters: &[StepParameter], itera
 }
 
 /// The name in `known` most similar to `name`, if any is similar enough.
-#[must_use]
 pub fn nearest<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> Option<String> {
     // 0.7 accepts a missing or wrong letter in a short name, but not a different word.
     let scored = known.into_iter().map(|k| (strsim::jaro_winkler(name, k), k));

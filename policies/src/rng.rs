@@ -29,27 +29,23 @@ pub struct PolicyRng {
 
 impl PolicyRng {
     /// The draws of iteration `step` in a run with this seed.
-    #[must_use]
     pub fn new(seed: u64, step: u32) -> Self {
         // Folding keeps both halves of a 64-bit seed significant.
         Self { seed: (seed ^ (seed >> 32).wrapping_mul(0x9e37_79b9)) as u32, step }
     }
 
     /// Four independent 32-bit words for (row, purpose, counter), with `counter` < 65,536.
-    #[must_use]
     #[inline]
     pub fn bits(&self, row: u32, purpose: Purpose, counter: u32) -> [u32; 4] {
         pcg4d([row, self.step, self.seed, (purpose as u32) << 16 ^ counter])
     }
 
     /// A number in (0, 1): (k + ½) / 2²³.
-    #[must_use]
     pub fn uniform(&self, row: u32, purpose: Purpose) -> f32 {
         unit_open(self.bits(row, purpose, 0)[0])
     }
 
     /// A number in (0, 1) with 52 bits: among millions of rows, numbers of 23 bits often repeat.
-    #[must_use]
     pub fn uniform_f64(&self, row: u32, purpose: Purpose) -> f64 {
         let [high, low, ..] = self.bits(row, purpose, 0);
         let bits = (u64::from(high) << 32 | u64::from(low)) >> 12;
@@ -57,7 +53,6 @@ impl PolicyRng {
     }
 
     /// Three independent standard normals, by Box–Muller.
-    #[must_use]
     pub fn normal3(&self, row: u32, purpose: Purpose, counter: u32) -> [f32; 3] {
         let u = self.bits(row, purpose, counter).map(unit_open);
         let polar = |radius: f32, angle: f32| {

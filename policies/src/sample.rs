@@ -8,7 +8,6 @@ use std::cmp::Ordering;
 use crate::rng::{PolicyRng, Purpose};
 
 /// The `k` rows with the largest values, largest first; ties by row, NaN last.
-#[must_use]
 pub fn top_k(values: &[f32], k: usize) -> Vec<u32> {
     largest((0..values.len() as u32).collect(), values, k)
 }
@@ -17,7 +16,6 @@ pub fn top_k(values: &[f32], k: usize) -> Vec<u32> {
 ///
 /// # Panics
 /// When a row is not in `values`.
-#[must_use]
 pub fn largest(rows: Vec<u32>, values: &[f32], k: usize) -> Vec<u32> {
     first_k(rows, k, |&a, &b| {
         let (x, y) = (values[a as usize], values[b as usize]);
@@ -29,7 +27,6 @@ pub fn largest(rows: Vec<u32>, values: &[f32], k: usize) -> Vec<u32> {
 ///
 /// # Panics
 /// When a row is not in `values`.
-#[must_use]
 pub fn smallest(rows: Vec<u32>, values: &[f32], k: usize) -> Vec<u32> {
     first_k(rows, k, |&a, &b| {
         let (x, y) = (values[a as usize], values[b as usize]);
@@ -43,7 +40,6 @@ pub fn smallest(rows: Vec<u32>, values: &[f32], k: usize) -> Vec<u32> {
 /// The rows with the smallest −ln(u) / weight are drawn, an exponential variable whose rate is the
 /// weight (Efraimidis and Spirakis, *Weighted random sampling with a reservoir*, 2006). Rows with zero,
 /// negative or NaN weights are never drawn; those with infinite weights always come first.
-#[must_use]
 pub fn weighted(weights: &[f32], k: usize, rng: &PolicyRng) -> Vec<u32> {
     let drawn = (0..).zip(weights).filter(|(_, weight)| **weight > 0.0);
     let keyed = drawn.map(|(row, &weight)| {
@@ -59,7 +55,6 @@ pub fn weighted(weights: &[f32], k: usize, rng: &PolicyRng) -> Vec<u32> {
 /// drawn, ascending, with their counts; nothing if no weight is positive.
 ///
 /// Rows with zero, negative or NaN weights are never drawn; infinite weights count as `f32::MAX`.
-#[must_use]
 pub fn with_replacement(weights: &[f32], k: usize, rng: &PolicyRng) -> Vec<(u32, u32)> {
     let mut total = 0.0_f64;
     let sums: Vec<f64> = weights
@@ -86,7 +81,6 @@ pub fn with_replacement(weights: &[f32], k: usize, rng: &PolicyRng) -> Vec<(u32,
 }
 
 /// The linearly interpolated `share` quantile of the finite values; `None` if there are none.
-#[must_use]
 pub fn quantile(values: &[f32], share: f64) -> Option<f64> {
     let mut finite: Vec<f32> = values.iter().copied().filter(|value| value.is_finite()).collect();
     let place = share * finite.len().checked_sub(1)? as f64;

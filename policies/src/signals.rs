@@ -60,7 +60,6 @@ macro_rules! signals {
             pub const ALL: [Self; [$(stringify!($name)),*].len()] = [$(Self::$name),*];
 
             /// The kind of the signal.
-            #[must_use]
             pub const fn kind(self) -> SignalKind {
                 match self {
                     $(Self::$name => SignalKind::$kind $(($width))?,)*
@@ -68,7 +67,6 @@ macro_rules! signals {
             }
 
             /// The unit; `1` for none.
-            #[must_use]
             pub const fn unit(self) -> &'static str {
                 match self {
                     $(Self::$name => $unit,)*
@@ -76,7 +74,6 @@ macro_rules! signals {
             }
 
             /// Additional sums in the backward pass.
-            #[must_use]
             pub const fn pixel_sums(self) -> &'static [PixelSum] {
                 match self {
                     $(Self::$name => &[$(PixelSum::$sum),*],)*
@@ -161,7 +158,6 @@ pub const SUPPORT_WEIGHT: f32 = 0.02;
 
 impl Signal {
     /// True if the signal accumulates until a policy [resets](crate::plan::Reset) it.
-    #[must_use]
     pub const fn is_resettable(self) -> bool {
         matches!(
             self.kind(),
@@ -170,7 +166,6 @@ impl Signal {
     }
 
     /// Numbers per row.
-    #[must_use]
     pub const fn width(self) -> usize {
         match self.kind() {
             SignalKind::Attribute(width) => width,
@@ -197,25 +192,21 @@ impl SignalSet {
     }
 
     /// True if the set is empty.
-    #[must_use]
     pub fn is_empty(self) -> bool {
         self.0 == 0
     }
 
     /// True if `signal` is in the set.
-    #[must_use]
     pub fn contains(self, signal: Signal) -> bool {
         self.0 & (1 << signal as u32) != 0
     }
 
     /// Number of signals in the set.
-    #[must_use]
     pub fn count(self) -> usize {
         self.0.count_ones() as usize
     }
 
     /// Numbers per row of all signals in the set.
-    #[must_use]
     pub fn width(self) -> usize {
         self.iter().map(Signal::width).sum()
     }
@@ -249,13 +240,11 @@ pub struct Signals {
 
 impl Signals {
     /// Columns for `set`, all zero, of shape `[rows, width]` each.
-    #[must_use]
     pub fn zeros(rows: usize, set: SignalSet) -> Self {
         Self::zeros_in(Vec::new(), rows, set)
     }
 
     /// Like [`zeros`](Self::zeros), in the allocation of `values`, whose contents are discarded.
-    #[must_use]
     pub fn zeros_in(mut values: Vec<f32>, rows: usize, set: SignalSet) -> Self {
         values.clear();
         values.resize(rows * set.width(), 0.0);
@@ -263,19 +252,16 @@ impl Signals {
     }
 
     /// The allocation of all columns, for reuse.
-    #[must_use]
     pub fn into_values(self) -> Vec<f32> {
         self.values
     }
 
     /// Number of rows.
-    #[must_use]
     pub fn rows(&self) -> usize {
         self.rows
     }
 
     /// The column of `signal`, if present. Shape: `[rows, width]`.
-    #[must_use]
     pub fn get(&self, signal: Signal) -> Option<&[f32]> {
         self.range(signal).map(|range| &self.values[range])
     }

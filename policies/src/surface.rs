@@ -14,7 +14,6 @@ const LONE_SIZE: f64 = 0.02;
 
 /// The standard deviations of round rows at these positions: the root mean square distance to the three nearest
 /// neighbours `[scene units]`, in a scene of this `extent`. Shape: `[positions]`.
-#[must_use]
 pub fn sizes(positions: &[[f64; 3]], extent: f32) -> Vec<f32> {
     let extent = f64::from(extent);
     if positions.len() == 1 {
@@ -56,7 +55,6 @@ pub fn replace_model(
 }
 
 /// Number of surface points per view for a total of `most` over all `views`, at least one.
-#[must_use]
 pub fn points_per_view(most: usize, views: u32) -> u32 {
     let per_view = (most / views.max(1) as usize).max(1);
     u32::try_from(per_view).unwrap_or(u32::MAX)

@@ -36,7 +36,6 @@ pub struct Camera {
 impl Camera {
     /// A camera at `centre` that looks at `target` with `up` towards the top of the image, horizontal field of
     /// view `fov_x` `[rad]` and square pixels.
-    #[must_use]
     pub fn looking(
         centre: DVec3,
         target: DVec3,
@@ -94,7 +93,6 @@ impl Camera {
 
     /// The world-space direction through an image point `[px]`. Its component along the camera's axis is 1, so
     /// that a ray parameter along it is a depth.
-    #[must_use]
     pub fn direction(&self, pixel: DVec2) -> DVec3 {
         let m = &self.world_from_camera;
         let image = DVec2::new((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy);
@@ -103,13 +101,11 @@ impl Camera {
     }
 
     /// The viewing direction, unit length.
-    #[must_use]
     pub fn forward(&self) -> DVec3 {
         self.world_from_camera.z_axis
     }
 
     /// Image point `[px]` and depth of a point in the world.
-    #[must_use]
     pub fn project(&self, world: DVec3) -> (DVec2, f64) {
         let offset = world - self.centre;
         let m = &self.world_from_camera;
@@ -122,7 +118,6 @@ impl Camera {
     }
 
     /// True if an image point lies within the image.
-    #[must_use]
     pub fn contains(&self, pixel: DVec2) -> bool {
         let (w, h) = (f64::from(self.width), f64::from(self.height));
         pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x < w && pixel.y < h

@@ -129,7 +129,6 @@ impl Default for Material {
 
 impl Material {
     /// A diffuse material of one linear colour.
-    #[must_use]
     pub fn lambert(name: &str, colour: [f32; 3]) -> Self {
         Self { name: name.into(), base: Vec3::from(colour).extend(1.0), ..Self::default() }
     }
@@ -244,14 +243,12 @@ impl Model {
     }
 
     /// True if a triangle belongs to a thin structure.
-    #[must_use]
     pub fn is_thin(&self, triangle: u32) -> bool {
         let material = self.triangle_materials.get(triangle as usize);
         material.is_some_and(|&m| self.materials[m as usize].thin)
     }
 
     /// Smallest and largest coordinates of all triangles' vertices.
-    #[must_use]
     pub fn bounds(&self) -> (DVec3, DVec3) {
         let used = self.triangles.iter().flatten().map(|&i| self.positions[i as usize]);
         let empty = (DVec3::INFINITY, DVec3::NEG_INFINITY);

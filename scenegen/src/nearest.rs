@@ -17,7 +17,6 @@ pub struct Nearest {
 
 impl Surface {
     /// The surface's point nearest to `p`.
-    #[must_use]
     pub fn nearest(&self, p: DVec3) -> Nearest {
         let (slot, point, distance) = self.nearest_local(self.local_from_world(p));
         Nearest {

@@ -7,6 +7,9 @@ use std::fs::{File, OpenOptions};
 use std::io::{Cursor, Read};
 use std::path::{Path, PathBuf};
 
+use base64::Engine as _;
+use base64::alphabet::STANDARD;
+use base64::engine::{DecodePaddingMode, GeneralPurpose, GeneralPurposeConfig};
 use image::{ImageFormat, ImageReader, Limits};
 
 use crate::error::Error;
@@ -73,10 +76,7 @@ pub(crate) struct Folder {
 
 impl Folder {
     pub(crate) fn around(file: &Path) -> Result<Self, Error> {
-        let folder = match file.parent() {
-            Some(parent) if !parent.as_os_str().is_empty() => parent,
-            _ => Path::new("."),
-        };
+        let folder = folder_of(file);
         let folder = folder.canonicalize().map_err(Error::io(folder))?;
         Ok(Self { file: file.to_owned(), folder })
     }
@@ -183,32 +183,22 @@ fn percent_decoded(text: &str) -> Option<String> {
     String::from_utf8(bytes).ok()
 }
 
-/// The bytes of a base64 `data:` URI; `None` for other URIs.
+/// The bytes of a base64 `data:` URI, with or without padding; `None` for other URIs.
 pub(crate) fn data_uri(uri: &str) -> Option<Vec<u8>> {
+    const BASE64: GeneralPurpose = GeneralPurpose::new(
+        &STANDARD,
+        GeneralPurposeConfig::new().with_decode_padding_mode(DecodePaddingMode::Indifferent),
+    );
     let (head, body) = uri.strip_prefix("data:")?.split_once(',')?;
-    head.ends_with(";base64").then(|| base64(body)).flatten()
+    head.ends_with(";base64").then(|| BASE64.decode(body).ok()).flatten()
 }
 
-fn base64(text: &str) -> Option<Vec<u8>> {
-    let mut bytes = Vec::with_capacity(text.len() / 4 * 3);
-    let (mut held, mut bits) = (0_u32, 0);
-    for c in text.trim_end_matches('=').bytes() {
-        let value = match c {
-            b'A'..=b'Z' => c - b'A',
-            b'a'..=b'z' => c - b'a' + 26,
-            b'0'..=b'9' => c - b'0' + 52,
-            b'+' | b'-' => 62,
-            b'/' | b'_' => 63,
-            _ => return None,
-        };
-        held = held << 6 | u32::from(value);
-        bits += 6;
-        if bits >= 8 {
-            bits -= 8;
-            bytes.push((held >> bits) as u8);
-        }
+/// The folder that holds a file.
+pub(crate) fn folder_of(file: &Path) -> &Path {
+    match file.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder,
+        _ => Path::new("."),
     }
-    Some(bytes)
 }
 
 /// A decoder with limits for one of these formats; `problem` is the error for other formats.

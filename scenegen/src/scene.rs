@@ -265,7 +265,6 @@ impl Scene {
     }
 
     /// Renders a view. The result does not depend on the number of threads.
-    #[must_use]
     pub fn render(&self, view: usize) -> Frame {
         let (camera, gains) = (&self.views[view].camera, self.gains(view));
         let mut frame = self.tracer().render(camera, view as u64, gains);
@@ -276,7 +275,6 @@ impl Scene {
     }
 
     /// The factors on the channels of a training view, if [exposures vary](Options::exposure_jitter).
-    #[must_use]
     pub fn gains(&self, view: usize) -> Option<[f32; 3]> {
         let stops = self.options.exposure_jitter;
         if stops == 0.0 || self.views[view].split == Split::Test {
@@ -290,7 +288,6 @@ impl Scene {
     }
 
     /// A collector of initial points, which is given training views as they are rendered.
-    #[must_use]
     pub fn point_collector(&self) -> PointCollector<'_> {
         PointCollector::new(self.tracer(), &self.train_cameras, self.options.points)
     }

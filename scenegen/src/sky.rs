@@ -35,7 +35,6 @@ fn shared<S: Serializer>(image: &Panorama, to: S) -> Result<S::Ok, S::Error> {
 
 impl Sky {
     /// A sky with equal radiance in all directions.
-    #[must_use]
     pub fn uniform(radiance: f32) -> Self {
         Self::Gradient { zenith: [radiance; 3], ground: [radiance; 3], up: [0.0, 1.0, 0.0] }
     }

@@ -52,7 +52,6 @@ pub struct TextureRef {
 
 impl TextureRef {
     /// A texture with the first set of coordinates, repeated and filtered.
-    #[must_use]
     pub fn new(texture: u32) -> Self {
         let transform = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
         Self { texture, uv_set: 0, sampler: Sampler::default(), transform }
@@ -89,7 +88,6 @@ struct Level {
 impl Texture {
     /// A texture of `width` x `height` RGBA texels, top row first. `texels` has four bytes per texel; missing
     /// ones are white.
-    #[must_use]
     pub fn new(width: u32, height: u32, mut texels: Vec<u8>, srgb: bool) -> Self {
         let (width, height) = (width.max(1), height.max(1));
         texels.resize(4 * width as usize * height as usize, 255);
@@ -104,14 +102,12 @@ impl Texture {
     }
 
     /// Width and height `[texels]`.
-    #[must_use]
     pub fn size(&self) -> (u32, u32) {
         (self.levels[0].width, self.levels[0].height)
     }
 
     /// The linear RGBA value at `uv`, averaged over about `footprint` of the texture's width. (0, 0) is the top
     /// left corner.
-    #[must_use]
     pub fn sample(&self, uv: Vec2, sampler: &Sampler, footprint: f32) -> Vec4 {
         let uv = Vec2::new(wrapped(uv.x, sampler.wrap_u), wrapped(uv.y, sampler.wrap_v));
         let values = Values::tables(self.srgb);
@@ -224,13 +220,11 @@ fn to_u8(v: f32) -> u8 {
 }
 
 /// The linear value of an sRGB value in `[0, 1]` (IEC 61966-2-1).
-#[must_use]
 pub fn linear_from_srgb(v: f64) -> f64 {
     if v <= 0.04045 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) }
 }
 
 /// The sRGB value of a linear value in `[0, 1]` (IEC 61966-2-1).
-#[must_use]
 pub fn srgb_from_linear(v: f64) -> f64 {
     if v <= 0.003_130_8 { 12.92 * v } else { 1.055 * v.powf(1.0 / 2.4) - 0.055 }
 }
@@ -255,7 +249,6 @@ impl Values {
 
 /// The sRGB byte nearest to a linear value, which is clamped to `[0, 1]`. Rounds half up in the encoded space;
 /// NaN gives 0.
-#[must_use]
 pub fn encode(v: f32) -> u8 {
     (srgb_from_linear(f64::from(v.clamp(0.0, 1.0))) * 255.0 + 0.5) as u8
 }

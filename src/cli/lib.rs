@@ -130,7 +130,6 @@ enum Command {
 }
 
 /// Runs the command line of this process. For `main` functions, here and in other crates.
-#[must_use]
 pub fn run() -> ExitCode {
     ExitCode::from(run_with(std::env::args_os()))
 }

@@ -21,31 +21,26 @@ impl From<usize> for RowBudget {
 
 impl RowBudget {
     /// The budget that leaves room for `trainable` rows besides the frozen ones.
-    #[must_use]
     pub fn for_trainable(trainable: usize, frozen: usize) -> Self {
         Self { total: trainable.saturating_add(frozen), frozen }
     }
 
     /// Most rows that can be trained.
-    #[must_use]
     pub fn trainable(self) -> usize {
         self.total.saturating_sub(self.frozen)
     }
 
     /// True for a frozen row.
-    #[must_use]
     pub fn is_frozen(self, row: usize) -> bool {
         row < self.frozen
     }
 
     /// The number of a row as policies count, without frozen rows; `None` for a frozen one.
-    #[must_use]
     pub fn trained_row(self, row: u32) -> Option<u32> {
         row.checked_sub(u32::try_from(self.frozen).ok()?)
     }
 
     /// The trained rows of a model that has `rows` in all.
-    #[must_use]
     pub fn trained(self, rows: usize) -> usize {
         rows.saturating_sub(self.frozen)
     }

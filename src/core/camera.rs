@@ -26,7 +26,6 @@ pub struct Camera {
 
 impl Camera {
     /// A camera at `centre` with the principal point in the middle of its image.
-    #[must_use]
     pub fn centred(
         (width, height): (u32, u32),
         (fx, fy): (f64, f64),
@@ -38,19 +37,16 @@ impl Camera {
     }
 
     /// The camera's centre in world coordinates, −Rᵀt.
-    #[must_use]
     pub fn centre(&self) -> DVec3 {
         -(self.rotation.transpose() * self.translation)
     }
 
     /// The viewing direction in world coordinates, unit length.
-    #[must_use]
     pub fn forward(&self) -> DVec3 {
         self.rotation.row(2)
     }
 
     /// Projects a world point to pixel and depth (camera z). The pixel is meaningless where depth <= 0.
-    #[must_use]
     pub fn project(&self, world: DVec3) -> (DVec2, f64) {
         let p = self.rotation * world + self.translation;
         (DVec2::new(self.fx * p.x / p.z + self.cx, self.fy * p.y / p.z + self.cy), p.z)
@@ -58,7 +54,6 @@ impl Camera {
 
     /// The depth of a world point in front of the camera whose projection is in the image; `None` for other points.
     /// The image is extended on every side by `margin`, a fraction of that side.
-    #[must_use]
     pub fn depth_in_image(&self, world: DVec3, margin: f64) -> Option<f64> {
         let (pixel, depth) = self.project(world);
         let within = |x: f64, size: u32| {
@@ -70,7 +65,6 @@ impl Camera {
     }
 
     /// The same view with an image of another size; intrinsics scale per axis.
-    #[must_use]
     pub fn resized(&self, width: u32, height: u32) -> Self {
         let sx = f64::from(width) / f64::from(self.width);
         let sy = f64::from(height) / f64::from(self.height);

@@ -39,7 +39,6 @@ impl ColourTransform {
         Self { matrix: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], offset: [0.0; 3] };
 
     /// The transformed colour.
-    #[must_use]
     pub fn apply(&self, colour: [f32; 3]) -> [f32; 3] {
         let [r, g, b] = colour;
         std::array::from_fn(|i| {
@@ -49,7 +48,6 @@ impl ColourTransform {
     }
 
     /// The inverse transform; the identity if this one is singular.
-    #[must_use]
     pub fn inverse(&self) -> Self {
         let inverse = self.inverse_matrix();
         let offset = -(inverse * DVec3::from(self.offset.map(f64::from)));
@@ -60,13 +58,11 @@ impl ColourTransform {
 
     /// The colour that the transform turns into `background`. Rendering over it keeps the background the same in
     /// every photograph, whatever its exposure.
-    #[must_use]
     pub fn behind(&self, background: [f32; 3]) -> [f32; 3] {
         self.inverse().apply(background)
     }
 
     /// Returns whether all coefficients are finite.
-    #[must_use]
     pub fn is_finite(&self) -> bool {
         self.matrix.as_flattened().iter().chain(&self.offset).all(|x| x.is_finite())
     }
@@ -78,7 +74,6 @@ impl ColourTransform {
 
     /// The gradient with respect to this transform, for an image rendered over [`behind`](Self::behind) of
     /// `background`.
-    #[must_use]
     pub fn gradient(&self, background: [f32; 3], sums: &ExposureSums) -> ColourGradient {
         let inverse = self.inverse_matrix();
         let behind = self.behind(background);
@@ -95,7 +90,6 @@ impl ColourTransform {
     }
 
     /// The transform as a 3×4 matrix, as INRIA's trainer writes it.
-    #[must_use]
     pub fn rows(&self) -> [[f32; 4]; 3] {
         std::array::from_fn(|i| {
             let [x, y, z] = self.matrix[i];

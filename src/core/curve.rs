@@ -8,7 +8,6 @@ const BITS: u32 = 10;
 
 /// The Morton code of a point. Coordinates are compressed to (−1, 1), so that no bounds are needed and outliers
 /// do no harm; the scene's extent is about 1.
-#[must_use]
 pub fn morton_code(point: [f64; 3]) -> u32 {
     let [x, y, z] = point.map(|x| {
         let squeezed = x / (1.0 + x.abs());

@@ -5,7 +5,6 @@
 //! coefficients of its colour: colour = max(0, ½ + Σ Y_k(direction)·sh_k).
 
 /// Number of spherical-harmonic coefficients per channel at `degree`: (degree + 1)².
-#[must_use]
 pub const fn sh_coefficients(degree: u8) -> usize {
     (degree as usize + 1) * (degree as usize + 1)
 }
@@ -34,14 +33,12 @@ impl ModelArray {
         [Self::Means, Self::LogScales, Self::Quats, Self::OpacityLogits, Self::Sh];
 
     /// The array that holds a parameter of a row, by its index.
-    #[must_use]
     pub fn of_parameter(index: usize) -> Self {
         let holds = |array: &Self| array.parameters(MAX_SH_DEGREE).contains(&index);
         Self::ALL.into_iter().find(holds).unwrap_or(Self::Sh)
     }
 
     /// The array's part of a row's parameters at a degree.
-    #[must_use]
     pub const fn parameters(self, sh_degree: u8) -> std::ops::Range<usize> {
         match self {
             Self::Means => 0..3,
@@ -90,7 +87,6 @@ impl Gaussians {
     }
 
     /// A model whose parameters are all 0.
-    #[must_use]
     pub fn zeros(rows: usize, sh_degree: u8) -> Self {
         Self {
             sh_degree,
@@ -133,7 +129,6 @@ impl Gaussians {
     ///
     /// # Panics
     /// When a row does not exist.
-    #[must_use]
     pub fn gather(&self, rows: &[usize]) -> Self {
         Self {
             sh_degree: self.sh_degree,
@@ -146,19 +141,16 @@ impl Gaussians {
     }
 
     /// Number of rows.
-    #[must_use]
     pub fn len(&self) -> usize {
         self.means.len()
     }
 
     /// Returns whether the model has no rows.
-    #[must_use]
     pub fn is_empty(&self) -> bool {
         self.means.is_empty()
     }
 
     /// The coefficients of one row. Shape: `[(degree + 1)², 3]`.
-    #[must_use]
     pub fn sh_of(&self, row: usize) -> &[f32] {
         let n = 3 * sh_coefficients(self.sh_degree);
         &self.sh[row * n..(row + 1) * n]
@@ -171,26 +163,22 @@ fn in_rows<const N: usize>(values: Vec<f32>) -> Vec<[f32; N]> {
 }
 
 /// The opacity of a logit: 1 / (1 + exp(−x)), without overflow.
-#[must_use]
 pub fn sigmoid(x: f32) -> f32 {
     let e = (-x.abs()).exp();
     if x >= 0.0 { 1.0 / (1.0 + e) } else { e / (1.0 + e) }
 }
 
 /// The logit of an opacity in (0, 1): ln(o / (1 − o)).
-#[must_use]
 pub fn logit(opacity: f32) -> f32 {
     opacity.ln() - (-opacity).ln_1p()
 }
 
 /// The band-0 coefficient of a view-independent colour: (c − ½)/Y₀.
-#[must_use]
 pub fn rgb_to_dc(colour: f32) -> f32 {
     (colour - 0.5) / crate::sh::C0
 }
 
 /// The view-independent colour of a band-0 coefficient, not clamped: ½ + Y₀·c.
-#[must_use]
 pub fn dc_to_rgb(coefficient: f32) -> f32 {
     0.5 + crate::sh::C0 * coefficient
 }

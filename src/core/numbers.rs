@@ -85,19 +85,16 @@ pub fn fraction(text: &str) -> Result<f64, String> {
 }
 
 /// Formats a fraction as a percentage; a non-finite one as a dash.
-#[must_use]
 pub fn percent(value: f64) -> String {
     if value.is_finite() { format!("{:.3} %", 100.0 * value) } else { "–".into() }
 }
 
 /// Formats a number of Gaussians: `1 Gaussian`, `2,000 Gaussians`.
-#[must_use]
 pub fn gaussians(number: usize) -> String {
     format!("{} Gaussian{}", grouped(number), if number == 1 { "" } else { "s" })
 }
 
 /// Formats 1234567 as 1,234,567.
-#[must_use]
 pub fn grouped(number: usize) -> String {
     let digits = number.to_string();
     let mut shown = String::with_capacity(digits.len() + digits.len() / 3);
@@ -111,7 +108,6 @@ pub fn grouped(number: usize) -> String {
 }
 
 /// Formats a duration: 4.2 s, 45 s, 2 min 5 s, 3 h 0 min.
-#[must_use]
 pub fn duration(time: Duration) -> String {
     let seconds = time.as_secs_f64().round() as u64;
     match (seconds / 3600, seconds / 60 % 60, seconds % 60) {

@@ -15,7 +15,6 @@ pub enum Spelling {
 
 impl Spelling {
     /// An option without its value.
-    #[must_use]
     pub fn option(self, name: &str) -> String {
         match (self, name) {
             (Self::Terminal, "scene") => "SCENE".to_owned(),
@@ -25,7 +24,6 @@ impl Spelling {
     }
 
     /// An option that is on or off, switched on.
-    #[must_use]
     pub fn switch(self, name: &str) -> String {
         match self {
             Self::Terminal => self.option(name),
@@ -34,7 +32,6 @@ impl Spelling {
     }
 
     /// An option with a number.
-    #[must_use]
     pub fn set(self, name: &str, value: impl Display) -> String {
         match self {
             Self::Terminal => format!("{} {value}", self.option(name)),
@@ -43,7 +40,6 @@ impl Spelling {
     }
 
     /// An option with a text, such as a word, a size with its unit, or a file.
-    #[must_use]
     pub fn text(self, name: &str, value: impl Display) -> String {
         match self {
             Self::Terminal => self.set(name, value),
@@ -52,7 +48,6 @@ impl Spelling {
     }
 
     /// One member of an option that has several, with its value.
-    #[must_use]
     pub fn member(self, name: &str, member: &str, value: impl Display) -> String {
         match self {
             Self::Terminal => format!("{} {member}={value}", self.option(name)),

@@ -1,7 +1,6 @@
 //! Splines through equally spaced values.
 
 /// Weights of four consecutive values at `t` in `[0, 1]` between the second and the third (Catmull and Rom 1974).
-#[must_use]
 pub fn catmull_rom(t: f64) -> [f64; 4] {
     let (t2, t3) = (t * t, t * t * t);
     [

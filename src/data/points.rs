@@ -21,19 +21,16 @@ pub struct PointCloud {
 
 impl PointCloud {
     /// Number of points.
-    #[must_use]
     pub fn len(&self) -> usize {
         self.positions.len()
     }
 
     /// True if there is no point.
-    #[must_use]
     pub fn is_empty(&self) -> bool {
         self.positions.is_empty()
     }
 
     /// At most `most` points, equally spaced in their order.
-    #[must_use]
     pub fn thinned(&self, most: usize) -> Self {
         let stride = self.len().div_ceil(most.max(1)).max(1);
         Self {

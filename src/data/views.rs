@@ -48,7 +48,6 @@ pub struct DatasetViews {
 
 impl DatasetViews {
     /// Views with a cache of about `cache_bytes` of decoded images, which `threads` threads fill ahead of use.
-    #[must_use]
     pub fn new(views: Vec<View>, cache_bytes: u64, threads: usize) -> Self {
         let sources = views.iter().map(|view| view.source.clone()).collect();
         let cache = ImageCache::new(sources, cache_bytes, threads);

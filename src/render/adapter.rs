@@ -40,13 +40,11 @@ pub struct AdapterSummary {
 
 impl AdapterSummary {
     /// The default method of accumulating gradients: the fastest one supported.
-    #[must_use]
     pub fn accumulation(&self) -> Accumulation {
         self.accumulations.last().copied().unwrap_or(Accumulation::Slots)
     }
 
     /// Returns whether the automatic choice may take it: a usable GPU that is not a software driver.
-    #[must_use]
     pub fn is_gpu(&self) -> bool {
         self.kind != AdapterKind::Software && self.missing.is_empty()
     }

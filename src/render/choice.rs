@@ -25,7 +25,6 @@ pub enum BackendChoice {
 
 impl BackendChoice {
     /// The name of the choice.
-    #[must_use]
     pub const fn word(self) -> &'static str {
         match self {
             Self::Auto => "auto",
@@ -46,7 +45,6 @@ pub enum BackendKind {
 
 impl BackendKind {
     /// The name in messages.
-    #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
             Self::Cpu => "native",
@@ -55,13 +53,11 @@ impl BackendKind {
     }
 
     /// Returns whether this program was built with the backend.
-    #[must_use]
     pub const fn is_built(self) -> bool {
         matches!(self, Self::Cpu) || cfg!(feature = "gpu")
     }
 
     /// The choice that requests this backend.
-    #[must_use]
     pub const fn choice(self) -> BackendChoice {
         match self {
             Self::Cpu => BackendChoice::Cpu,
@@ -112,7 +108,6 @@ impl Device {
     }
 
     /// The kind of backend that runs on the device.
-    #[must_use]
     pub fn kind(&self) -> BackendKind {
         match self {
             Self::Processor => BackendKind::Cpu,
@@ -121,7 +116,6 @@ impl Device {
     }
 
     /// The name of the adapter; `None` for the processor.
-    #[must_use]
     pub fn adapter(&self) -> Option<&str> {
         match self {
             Self::Processor => None,
@@ -130,7 +124,6 @@ impl Device {
     }
 
     /// The method of accumulating gradients on a GPU; `None` for the processor, which has only one.
-    #[must_use]
     pub fn accumulation(&self) -> Option<Accumulation> {
         match self {
             Self::Processor => None,
@@ -139,7 +132,6 @@ impl Device {
     }
 
     /// The largest budget that the device can hold at a degree.
-    #[must_use]
     pub fn largest_budget(&self, sh_degree: u8) -> usize {
         match self {
             Self::Processor => u32::MAX as usize,
@@ -148,7 +140,6 @@ impl Device {
     }
 
     /// The most (row, tile) pairs that the device can hold at a time.
-    #[must_use]
     pub fn most_pairs(&self, needs: &Needs) -> usize {
         match self {
             Self::Processor => u32::MAX as usize,
@@ -158,7 +149,6 @@ impl Device {
 
     /// The bytes that a backend with these options allocates for models of this degree. Nothing is allocated yet.
     /// `threads` takes precedence over [`Setup::threads`].
-    #[must_use]
     pub fn memory_plan(&self, sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
         match self {
             Self::Processor => CpuBackend::memory_plan(sh_degree, options, threads),
@@ -167,7 +157,6 @@ impl Device {
     }
 
     /// Bytes of a ledger that count against a memory limit: those on the GPU if it is used, else all.
-    #[must_use]
     pub fn limited_bytes(&self, ledger: &Ledger) -> u64 {
         match self {
             Self::Processor => ledger.total(),
@@ -177,7 +166,6 @@ impl Device {
 
     /// The f32 columns that the host needs in addition to the backend while signals are read; none if the backend
     /// lends its own memory.
-    #[must_use]
     pub fn columns_on_host(&self, columns: usize) -> usize {
         match self {
             Self::Processor => 0,

@@ -42,7 +42,6 @@ pub struct Setup {
 
 impl Setup {
     /// Default settings for models of at most `budget` rows.
-    #[must_use]
     pub fn new(budget: usize) -> Self {
         Self {
             budget: budget.into(),
@@ -84,7 +83,6 @@ pub struct KeptPhotographs {
 
 impl KeptPhotographs {
     /// Bytes per photograph on the device, given the largest size: of its pixels and of its mask.
-    #[must_use]
     pub fn bytes((width, height): (u32, u32), with_masks: bool) -> [u64; 2] {
         let pixels = u64::from(width) * u64::from(height);
         [4 * pixels, if with_masks { pixels.next_multiple_of(4) } else { 0 }]

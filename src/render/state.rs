@@ -49,7 +49,6 @@ impl Tensor {
     }
 
     /// Steps since each row was last created or rewritten; `None` for an array without ages. Shape: `[rows]`.
-    #[must_use]
     pub fn ages(&self) -> Option<Vec<u32>> {
         match &self.values {
             _ if !Self::has_ages(&self.name) => None,
@@ -87,7 +86,6 @@ pub struct StateError {
 
 impl Values {
     /// Number of values.
-    #[must_use]
     pub fn len(&self) -> usize {
         match self {
             Self::F32(values) => values.len(),
@@ -97,7 +95,6 @@ impl Values {
     }
 
     /// Returns whether there are no values.
-    #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -124,7 +121,6 @@ impl Values {
     }
 
     /// The name of the type in safetensors.
-    #[must_use]
     pub fn kind(&self) -> &'static str {
         match self {
             Self::F32(_) => "F32",
@@ -136,19 +132,16 @@ impl Values {
 
 impl Tensor {
     /// An array of numbers.
-    #[must_use]
     pub fn f32(name: impl Into<String>, shape: &[usize], values: Vec<f32>) -> Self {
         Self::new(name, shape, Values::F32(values))
     }
 
     /// An array of counts.
-    #[must_use]
     pub fn u16(name: impl Into<String>, shape: &[usize], values: Vec<u16>) -> Self {
         Self::new(name, shape, Values::U16(values))
     }
 
     /// An array of flags.
-    #[must_use]
     pub fn u8(name: impl Into<String>, shape: &[usize], values: Vec<u8>) -> Self {
         Self::new(name, shape, Values::U8(values))
     }
@@ -195,7 +188,6 @@ impl Tensor {
     }
 
     /// An error about this array.
-    #[must_use]
     pub fn error(&self, problem: impl Into<String>) -> StateError {
         StateError { name: self.name.clone(), problem: problem.into() }
     }

@@ -44,7 +44,6 @@ pub enum ErrorMap {
 
 impl ErrorMap {
     /// The weights of |I − G| and of 1 − SSIM.
-    #[must_use]
     pub fn weights(self) -> [f32; 2] {
         match self {
             Self::Loss => [0.8, 0.2],
@@ -62,13 +61,11 @@ impl Default for ErrorScore {
 
 impl ErrorScore {
     /// True if M is the error itself, apart from edges.
-    #[must_use]
     pub fn is_plain_map(&self) -> bool {
         self.power.total_cmp(&1.0).is_eq()
     }
 
     /// The score of one view, from Σ w·M and Σ w; 0 where the row has no error.
-    #[must_use]
     pub fn of_view(&self, error: f32, weight: f32) -> f32 {
         if !(error > 0.0 && weight > 0.0) {
             return 0.0;

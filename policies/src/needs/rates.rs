@@ -23,14 +23,12 @@ impl Default for Cadence {
 impl Cadence {
     /// True where the optimiser steps after iteration `step`: for `[all other parameters, the
     /// spherical-harmonic coefficients of bands 1–3]`.
-    #[must_use]
     pub fn steps_at(self, step: u32) -> [bool; 2] {
         let all = self.all.max(1);
         [step.is_multiple_of(all), step.is_multiple_of(self.sh_rest.max(all))]
     }
 
     /// True if a backend made for `longest` has the gradient sums and step counts that this cadence needs.
-    #[must_use]
     pub fn is_within(self, longest: Self) -> bool {
         let is_sound = self.all > 0 && self.sh_rest > 0;
         let all = self.all == 1 || longest.all > 1;
@@ -79,7 +77,6 @@ pub struct Fade {
 
 impl Rate {
     /// A rate that does not change during the run.
-    #[must_use]
     pub const fn constant(rate: f64) -> Self {
         Self { start: rate, end: rate }
     }

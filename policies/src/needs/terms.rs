@@ -15,7 +15,6 @@ pub struct LossTerms {
 
 impl LossTerms {
     /// True if no term is added.
-    #[must_use]
     pub fn is_none(&self) -> bool {
         !(self.opacity > 0.0 || self.scale > 0.0)
     }
@@ -47,7 +46,6 @@ pub struct NoiseTerm {
 
 impl NoiseTerm {
     /// The factor on the noise at this opacity, in (0, 1).
-    #[must_use]
     pub fn share(&self, opacity: f32) -> f32 {
         1.0 / (1.0 + (self.sharpness * (opacity - self.opacity)).exp())
     }

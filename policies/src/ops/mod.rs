@@ -99,7 +99,6 @@ impl Family {
     }
 
     /// Fate of the parent's own slot.
-    #[must_use]
     pub fn fate(&self) -> ParentFate {
         self.fate
     }
@@ -126,13 +125,11 @@ pub struct BrokenOps(String);
 impl RowOps {
     /// True if neither rows nor accumulators change. This includes plans whose edits were all refused; see
     /// [`EditCounts::denied`].
-    #[must_use]
     pub fn is_empty(&self) -> bool {
         !self.edits_rows() && self.reset_signals.is_empty() && !self.reset_candidates
     }
 
     /// True if any row is added, removed or changed.
-    #[must_use]
     pub fn edits_rows(&self) -> bool {
         !(self.families.is_empty()
             && self.updates.is_empty()
@@ -170,7 +167,6 @@ impl RowOps {
     ///
     /// Rows keep their order, each followed by its children; seeds come last. Initially, neighbours in memory
     /// are neighbours in space; this order preserves that, which makes steps faster.
-    #[must_use]
     pub fn order(&self) -> Vec<u32> {
         // Sort key of each slot: the row's index before the edit, or its parent's, and a bit for children.
         let mut origin: Vec<u64> = (0..self.rows_after as u64).map(|row| row << 1).collect();
@@ -198,7 +194,6 @@ impl RowOps {
     ///
     /// # Panics
     /// When `family` does not belong to this plan.
-    #[must_use]
     pub fn children(&self, family: &Family) -> &[u32] {
         &self.child_slots[family.first_child as usize..][..family.children as usize]
     }
@@ -207,7 +202,6 @@ impl RowOps {
     ///
     /// # Panics
     /// When `family` does not belong to this plan.
-    #[must_use]
     pub fn offspring(&self, family: &Family) -> Offspring {
         self.find_offspring(family).expect("a family of this plan")
     }

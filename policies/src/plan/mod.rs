@@ -49,7 +49,6 @@ enum RowEdit {
 
 /// Maximum memory of a plan per row, without seeds `[bytes]`: the edit's byte, and either a family and its
 /// child's slot for every second row (as each family has a child), or an update of each row.
-#[must_use]
 pub fn bytes_per_row(needs: &Needs) -> usize {
     let family = size_of::<Family>() + size_of::<u32>();
     let rows = if needs.detailed_edits {
@@ -89,7 +88,6 @@ pub struct EditPlan {
 
 impl EditPlan {
     /// An empty plan for a model of `rows` rows with a limit of `budget` rows, without detailed edits.
-    #[must_use]
     pub fn new(rows: usize, budget: usize) -> Self {
         Self {
             budget,
@@ -120,32 +118,27 @@ impl EditPlan {
     }
 
     /// Rows before the edit.
-    #[must_use]
     pub fn rows(&self) -> usize {
         self.edits.len()
     }
 
     /// Maximum number of rows of the model.
-    #[must_use]
     pub fn budget(&self) -> usize {
         self.budget
     }
 
     /// Number of rows that may still be added: budget − (rows − pruned + added).
-    #[must_use]
     pub fn room(&self) -> usize {
         // Slots are u32 on every backend, whatever the budget.
         self.budget.min(u32::MAX as usize).saturating_sub(self.rows() - self.pruned + self.added)
     }
 
     /// Rows pruned so far.
-    #[must_use]
     pub fn pruned(&self) -> usize {
         self.pruned
     }
 
     /// True if `row` exists and has no edit yet.
-    #[must_use]
     pub fn is_free(&self, row: u32) -> bool {
         self.edits.get(row as usize) == Some(&RowEdit::None)
     }
@@ -270,7 +263,6 @@ impl EditPlan {
     /// Children, family by family in the order of the calls, then seeds, fill the slots of pruned rows
     /// in ascending order, then slots from `rows` upward. The last rows move into the holes that
     /// remain, in unchanged order.
-    #[must_use]
     pub fn compile(self) -> RowOps {
         let rows_before = self.rows();
         let rows_after = rows_before - self.pruned + self.added;

@@ -136,7 +136,6 @@ pub struct Snapshot<'a> {
 
 impl<'a> Snapshot<'a> {
     /// Current number of rows.
-    #[must_use]
     pub fn rows(&self) -> usize {
         self.signals.rows()
     }

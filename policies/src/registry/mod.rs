@@ -79,7 +79,6 @@ pub struct PolicyEntry {
 
 impl PolicyEntry {
     /// The entry of policy `P`; called by [`register_policy!`](crate::register_policy).
-    #[must_use]
     pub const fn new<P: ConfiguredPolicy>(
         name: &'static str,
         summary: &'static str,
@@ -108,13 +107,11 @@ impl PolicyEntry {
     }
 
     /// The place where the policy is registered (file:line).
-    #[must_use]
     pub fn location(&self) -> String {
         format!("{}:{}", self.place.0, self.place.1)
     }
 
     /// The manual page: the leading `//!` block of the file that defines the policy.
-    #[must_use]
     pub fn manual(&self) -> String {
         let block: Vec<&str> = self
             .doc
@@ -127,13 +124,11 @@ impl PolicyEntry {
     }
 
     /// The parameters that count steps and scale with the run's length.
-    #[must_use]
     pub fn step_parameters(&self) -> &'static [StepParameter] {
         self.step_parameters
     }
 
     /// Names of all parameters, in declaration order.
-    #[must_use]
     pub fn parameter_names(&self) -> Vec<String> {
         let known = (self.field_names)().unwrap_or_default();
         let mut names: Vec<String> = known.iter().map(|name| (*name).to_owned()).collect();
@@ -145,7 +140,6 @@ impl PolicyEntry {
     /// Names and defaults for a run of 30,000 steps, in declaration order. Parameters that are `None` by
     /// default are not listed, as TOML has no such value. Empty if the defaults cannot be written as TOML;
     /// [`build`](Self::build) then returns the error.
-    #[must_use]
     pub fn parameters(&self) -> Vec<(String, Value)> {
         let mut defaults = self.defaults().unwrap_or_default();
         let known = (self.field_names)().unwrap_or_default();

@@ -142,7 +142,6 @@ impl<'a> PointCollector<'a> {
     }
 
     /// The points of all observed views.
-    #[must_use]
     pub fn finish(mut self) -> InitPoints {
         let PointOptions { count, noise, outliers, .. } = self.options;
         let mut draws = Draws::new(self.tracer.seed, &[0x006e_6f69_7365]);

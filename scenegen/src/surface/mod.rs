@@ -110,7 +110,6 @@ impl Surface {
 
     /// The first triangle that a ray hits from either side, up to the ray parameter `range`. `None` for a
     /// direction of length 0.
-    #[must_use]
     pub fn cast(&self, origin: DVec3, direction: DVec3, range: f64) -> Option<SurfaceHit> {
         let ray = self.enter(origin, direction, range)?;
         let hit = self.closest(&ray, None, None, |_, _| true)?;
@@ -120,7 +119,6 @@ impl Surface {
 
     /// True if the surface separates two points. The segment is shortened at both ends by a millionth of the
     /// diagonal, so that its ends may lie on the surface.
-    #[must_use]
     pub fn blocked(&self, from: DVec3, to: DVec3) -> bool {
         let segment = to - from;
         let length = segment.length();
@@ -135,26 +133,22 @@ impl Surface {
     }
 
     /// Smallest and largest coordinates.
-    #[must_use]
     pub fn bounds(&self) -> (DVec3, DVec3) {
         self.bounds
     }
 
     /// Length of the bounding box's diagonal `[world units]`.
-    #[must_use]
     pub fn diagonal(&self) -> f64 {
         (self.bounds.1 - self.bounds.0).length()
     }
 
     /// Memory of tree and triangles `[bytes]`.
-    #[must_use]
     pub fn bytes(&self) -> usize {
         self.bvh.nodes.len() * size_of::<Bvh2Node>()
             + self.triangles.len() * (size_of::<[Vec3; 3]>() + size_of::<u32>())
     }
 
     /// All triangles as traced, in the order of the model.
-    #[must_use]
     pub fn triangles(&self) -> Vec<[DVec3; 3]> {
         let mut all = vec![[DVec3::ZERO; 3]; self.triangles.len()];
         for (slot, triangle) in self.triangles.iter().enumerate() {

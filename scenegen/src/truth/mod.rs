@@ -54,13 +54,11 @@ pub struct GBuffer {
 
 impl GroundTruth {
     /// The ground truth of a scene in memory.
-    #[must_use]
     pub fn of_scene(scene: Scene) -> Self {
         Self { kind: Kind::Scene(Box::new(scene)) }
     }
 
     /// True if a folder holds a scene written by this program, according to its `scene.json`.
-    #[must_use]
     pub fn is_in(root: &Path) -> bool {
         record_in(root)["generator"].as_str().is_some_and(|by| by.starts_with("densify-scenegen"))
     }
@@ -86,7 +84,6 @@ impl GroundTruth {
     }
 
     /// The surface, in world coordinates.
-    #[must_use]
     pub fn surface(&self) -> &Surface {
         match &self.kind {
             Kind::Scene(scene) => &scene.surface,
@@ -124,7 +121,6 @@ impl GroundTruth {
     }
 
     /// True if there are thin structures, such as wires.
-    #[must_use]
     pub fn has_thin(&self) -> bool {
         match &self.kind {
             Kind::Scene(scene) => scene.model.materials.iter().any(|material| material.thin),
@@ -135,7 +131,6 @@ impl GroundTruth {
     /// Thickness `[world units]` of the thin structure that the ray from `origin` along `direction` hits first,
     /// at ray parameter `depth`: the smallest of its extents along the normal and along two perpendicular
     /// directions; the diameter for a wire. `None` if the first hit is not thin or at a different depth.
-    #[must_use]
     pub fn thickness(&self, origin: DVec3, direction: DVec3, depth: f64) -> Option<f64> {
         let surface = self.surface();
         let hit = surface.cast(origin, direction, depth * (1.0 + SAME_DEPTH))?;

@@ -17,6 +17,7 @@ use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
 
 use crate::error::Error;
 use crate::points::InitPoints;
+use crate::resource::folder_of;
 use crate::scene::{Scene, Split};
 use crate::trace::Frame;
 
@@ -44,10 +45,7 @@ pub fn write(
     mut progress: impl FnMut(usize),
 ) -> Result<Written, Error> {
     let replaces = holds_scene(target, overwrite)?;
-    let parent = match target.parent() {
-        Some(parent) if !parent.as_os_str().is_empty() => parent,
-        _ => Path::new("."),
-    };
+    let parent = folder_of(target);
     fs::create_dir_all(parent).map_err(Error::write(parent))?;
     let folder = tempfile::Builder::new()
         .prefix(".densify-scene-")
@@ -188,7 +186,6 @@ fn write_file(path: &Path, bytes: &[u8]) -> Result<(), Error> {
 }
 
 /// One image of eight evenly spaced training views over light grey: width, height and RGBA pixels.
-#[must_use]
 pub fn contact_sheet(scene: &Scene) -> (u32, u32, Vec<u8>) {
     const COLUMNS: usize = 4;
     const GREY: f32 = 224.0;

@@ -86,7 +86,6 @@ pub struct Orientation {
 ///
 /// # Panics
 /// Without cameras.
-#[must_use]
 pub fn orientation(cameras: &[Camera]) -> Orientation {
     let Rig { up, focus, looks_inward, .. } = Rig::new(cameras);
     Orientation { up, focus, looks_inward }
@@ -118,7 +117,6 @@ fn plane_normal(directions: impl Iterator<Item = DVec3> + Clone) -> Option<DVec3
 ///
 /// # Panics
 /// Without cameras.
-#[must_use]
 pub fn orbit(cameras: &[Camera]) -> CameraPath {
     let rig = Rig::new(cameras);
     let level = |v: DVec3| v - rig.up * v.dot(rig.up);
@@ -146,7 +144,6 @@ pub fn orbit(cameras: &[Camera]) -> CameraPath {
 ///
 /// # Panics
 /// Without cameras.
-#[must_use]
 pub fn spiral(cameras: &[Camera]) -> CameraPath {
     let rig = Rig::new(cameras);
     let right = rig.forward.cross(rig.up).normalize_or(rig.forward.any_orthonormal_vector());

@@ -32,7 +32,6 @@ pub struct CameraPath {
 
 impl Keyframe {
     /// A camera that looks at `target`; `up` must not be parallel to the viewing direction.
-    #[must_use]
     pub fn looking_at(centre: DVec3, target: DVec3, up: DVec3, fov_y: f64) -> Self {
         let forward = (target - centre).normalize_or(DVec3::Z);
         let right = forward.cross(up).normalize_or(forward.any_orthonormal_vector());
@@ -41,7 +40,6 @@ impl Keyframe {
     }
 
     /// The camera with an image of the given size, (width, height) `[px]`.
-    #[must_use]
     pub fn camera(&self, (width, height): (u32, u32)) -> Camera {
         let focal = 0.5 * f64::from(height) / (0.5 * self.fov_y).tan();
         let rotation = DMat3::from_quat(self.world_from_camera.inverse());
@@ -53,7 +51,6 @@ impl CameraPath {
     /// Interpolates the camera of frame `frame` of `frames`. A loop's last frame precedes its first; any other path
     /// ends at its last keyframe. Positions, rotations and fields of view follow a Catmull-Rom spline, so that
     /// speed is continuous.
-    #[must_use]
     pub fn frame(&self, frame: u32, frames: u32) -> Keyframe {
         let count = self.keyframes.len();
         let (steps, intervals) =

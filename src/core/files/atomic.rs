@@ -4,14 +4,13 @@ use std::ffi::OsStr;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
-use super::FileError;
 use super::disk::{Operation, WatchedFile, attempt};
+use super::{FileError, folder_of};
 
 /// Prefix of the names of temporary files and folders.
 const TEMPORARY: &str = ".densify-";
 
 /// Returns whether this is the name of a temporary file or folder.
-#[must_use]
 pub fn is_temporary(name: &OsStr) -> bool {
     name.to_string_lossy().starts_with(TEMPORARY)
 }
@@ -53,10 +52,7 @@ pub fn write_atomically_from<E: From<FileError>>(
     path: &Path,
     write: impl FnOnce(&mut dyn Write) -> Result<(), WriteError<E>>,
 ) -> Result<(), E> {
-    let folder = match path.parent() {
-        Some(parent) if !parent.as_os_str().is_empty() => parent,
-        _ => Path::new("."),
-    };
+    let folder = folder_of(path);
     std::fs::create_dir_all(folder).map_err(FileError::io("create the folder", folder))?;
     replace(folder, path, write).map_err(|error| match error {
         WriteError::Io(error) => FileError::io("write", path)(error).into(),

@@ -40,7 +40,6 @@ fn remedy(source: &std::io::Error) -> &'static str {
 
 impl FileError {
     /// An error about the contents of a file that densify had written.
-    #[must_use]
     pub fn malformed(file: &Path, problem: impl Display) -> Self {
         Self::Malformed { file: file.to_owned(), problem: problem.to_string() }
     }

@@ -10,4 +10,6 @@ pub use atomic::{
     write_atomically_from,
 };
 pub use error::FileError;
-pub use read::{MAX_OPTIONS, lines, most_unpacked, one_line, open, read_text, wrong_kind};
+pub use read::{
+    MAX_OPTIONS, folder_of, lines, most_unpacked, one_line, open, read_text, wrong_kind,
+};

@@ -54,7 +54,6 @@ pub fn read_text(path: &Path, limit: u64) -> io::Result<String> {
 }
 
 /// The most bytes that a compressed file of `packed` bytes may be unpacked to.
-#[must_use]
 pub fn most_unpacked(packed: u64) -> u64 {
     /// The limit for small files.
     const LEAST: u64 = 64 << 20;
@@ -66,7 +65,6 @@ pub fn most_unpacked(packed: u64) -> u64 {
 
 /// Recognises, by its first bytes, a kind of file that is often found in place of data. Returns a message with the
 /// remedy.
-#[must_use]
 pub fn wrong_kind(start: &[u8]) -> Option<&'static str> {
     if start.starts_with(b"version https://git-lfs") {
         Some("it is a pointer of Git LFS, not the file itself; fetch that with `git lfs pull`")
@@ -78,13 +76,11 @@ pub fn wrong_kind(start: &[u8]) -> Option<&'static str> {
 }
 
 /// Escapes control characters, so that a text stays on one line and no terminal executes them.
-#[must_use]
 pub fn one_line(text: &str) -> String {
     escaped(text, &[])
 }
 
 /// Escapes control characters except line breaks and tabs.
-#[must_use]
 pub fn lines(text: &str) -> String {
     escaped(text, &['\n', '\t'])
 }
@@ -99,6 +95,14 @@ fn escaped(text: &str, kept: &[char]) -> String {
         }
     }
     shown
+}
+
+/// The folder that holds a file; `.` for a bare file name.
+pub fn folder_of(file: &Path) -> &Path {
+    match file.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder,
+        _ => Path::new("."),
+    }
 }
 
 #[cfg(test)]

@@ -39,7 +39,6 @@ pub type SharedImage = Arc<Image8>;
 
 impl Image8 {
     /// The colour of a pixel over `background`, in `[0, 1]`.
-    #[must_use]
     pub fn composited(&self, x: usize, y: usize, background: [f32; 3]) -> [f32; 3] {
         let pixel = y * self.width as usize + x;
         let alpha = self.alpha.as_ref().map_or(1.0, |a| f32::from(a[pixel]) / 255.0);
@@ -50,20 +49,17 @@ impl Image8 {
     }
 
     /// A smaller copy; each pixel is the mean of the pixels that it covers.
-    #[must_use]
     pub fn shrunk(&self, width: u32, height: u32) -> Self {
         resample::shrink(self, width, height)
     }
 
     /// Size of the pixels `[bytes]`.
-    #[must_use]
     pub fn bytes(&self) -> u64 {
         let length = |channel: &Option<Vec<u8>>| channel.as_ref().map_or(0, Vec::len);
         (self.rgb.len() + length(&self.alpha) + length(&self.mask)) as u64
     }
 
     /// An image without pixels yet: memory is reserved, with the channels of `like`.
-    #[must_use]
     pub fn blank(width: u32, height: u32, like: &Self) -> Self {
         let pixels = width as usize * height as usize;
         let channel =
@@ -78,7 +74,6 @@ impl Image8 {
     }
 
     /// A copy of a window, which must lie within the image.
-    #[must_use]
     pub fn windowed(&self, window: Window) -> Self {
         let cut = |values: &[u8], channels: usize| {
             let row = channels * self.width as usize;

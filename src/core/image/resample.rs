@@ -45,7 +45,6 @@ impl PixelMean {
 
 /// Shrinks an image with an area filter: every source pixel is weighted by its overlap with the
 /// target pixel.
-#[must_use]
 pub fn shrink(image: &Image8, width: u32, height: u32) -> Image8 {
     let columns = spans(image.width, width);
     let rows = spans(image.height, height);

@@ -63,7 +63,6 @@ pub enum Section {
 
 impl Section {
     /// The name in the table.
-    #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
             Self::Model => "model",
@@ -101,13 +100,11 @@ impl Ledger {
 
     /// The peak `[bytes]`: the process, and the largest of the three phases, which are loading, training and
     /// measuring at the end.
-    #[must_use]
     pub fn total(&self) -> u64 {
         peak(&self.lines.iter().collect::<Vec<_>>())
     }
 
     /// The peak of host memory until training has ended `[bytes]`.
-    #[must_use]
     pub fn on_host(&self) -> u64 {
         let lines = self.lines.iter();
         let lines = lines.filter(|line| !line.on_device && line.section != Section::After);
@@ -115,7 +112,6 @@ impl Ledger {
     }
 
     /// The sum of all buffers in GPU memory, which are held throughout `[bytes]`.
-    #[must_use]
     pub fn on_device(&self) -> u64 {
         sum(self.lines.iter().filter(|line| line.on_device).map(|line| line.bytes))
     }

@@ -90,7 +90,6 @@ pub struct ReportedExposures {
 
 impl ReportedExposures {
     /// Collects the exposures of these views, reading the EXIF of each photograph that has not been read yet.
-    #[must_use]
     pub fn read(views: &[View]) -> Self {
         let mut all = Self::default();
         // The views of one photograph follow each other.

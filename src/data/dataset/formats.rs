@@ -20,7 +20,6 @@ pub struct DatasetFormat {
 }
 
 /// All formats, in the order in which they are tried.
-#[must_use]
 pub fn formats() -> [&'static DatasetFormat; 4] {
     [&transforms::SPLIT_FORMAT, &colmap::FORMAT, &transforms::FORMAT, &realitycapture::FORMAT]
 }

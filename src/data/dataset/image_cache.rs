@@ -64,7 +64,6 @@ impl ImageCache {
     /// A cache of at most `cache_bytes` of decoded images, or of two images if that is more.
     /// `threads` decode the images announced by [`Self::prefetch`]; with 0 threads, all images are
     /// decoded on demand.
-    #[must_use]
     pub(crate) fn new(sources: Vec<ImageSource>, cache_bytes: u64, threads: usize) -> Self {
         let capacity = ImageDemand::total(sources.iter()).capacity(cache_bytes);
         let slots = sources.iter().map(|_| Slot::default()).collect();
@@ -242,7 +241,6 @@ pub struct ImageDemand {
 
 impl ImageDemand {
     /// The demand of these images.
-    #[must_use]
     pub fn total<'a>(sources: impl Iterator<Item = &'a ImageSource>) -> Self {
         sources.fold(Self { all: 0, largest: 0, working: 0 }, |sum, source| {
             let loaded = source.loaded_bytes();
@@ -256,13 +254,11 @@ impl ImageDemand {
 
     /// Peak memory of decoded images with a cache of `cache_bytes`, including one image that is in use
     /// but no longer cached `[bytes]`.
-    #[must_use]
     pub fn held(&self, cache_bytes: u64) -> u64 {
         self.all.min(self.capacity(cache_bytes).saturating_add(self.largest))
     }
 
     /// Peak memory for decoding: one image per thread, and one on demand `[bytes]`.
-    #[must_use]
     pub fn decoding(&self, threads: usize) -> u64 {
         (threads as u64 + 1) * self.working + self.largest
     }

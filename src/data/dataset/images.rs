@@ -101,7 +101,6 @@ impl ImageSource {
     }
 
     /// Largest size of the loaded image `[bytes]`.
-    #[must_use]
     pub(crate) fn loaded_bytes(&self) -> u64 {
         let [width, height] = match self.window {
             Some(window) => [window.width, window.height],
@@ -111,7 +110,6 @@ impl ImageSource {
     }
 
     /// Peak memory while loading, including the result `[bytes]`.
-    #[must_use]
     pub(super) fn working_bytes(&self) -> u64 {
         let bytes = |(width, height)| u64::from(width) * u64::from(height) * self.channels();
         let packed = bytes((self.header.width, self.header.height));
@@ -131,7 +129,6 @@ impl ImageSource {
     }
 
     /// Whether loaded images have a mask: from a file, or of the field of view of the lens.
-    #[must_use]
     pub fn is_masked(&self) -> bool {
         let is_ignored = |mask: &Mask| mask.mode == MaskMode::Ignore;
         self.mask.as_ref().is_some_and(is_ignored)

@@ -200,20 +200,17 @@ impl Dataset {
 
     /// The scene's extent `[scene units]`: 1.1 times the largest distance of a training camera from the mean of all
     /// training cameras. It is the same for every normalised scene.
-    #[must_use]
     pub fn extent(&self) -> f64 {
         normalise::EXTENT
     }
 
     /// Largest width and largest height of all views `[px]`.
-    #[must_use]
     pub fn largest_image(&self) -> (u32, u32) {
         let cameras = self.train.iter().chain(&self.test).map(|view| &view.camera);
         cameras.fold((1, 1), |(w, h), camera| (w.max(camera.width), h.max(camera.height)))
     }
 
     /// One line for the user: numbers of views and points, and image sizes.
-    #[must_use]
     pub fn describe(&self) -> String {
         let (width, height) = self.largest_image();
         let decoded: u64 = self.train.iter().map(|view| view.source.loaded_bytes()).sum();

@@ -50,7 +50,6 @@ pub fn median(mut values: Vec<f64>) -> Option<f64> {
 }
 
 /// Marks cameras whose poses are probably wrong, because they are few and far away from all others. Shape: `[cameras]`.
-#[must_use]
 pub(super) fn outliers(centres: &[DVec3]) -> Vec<bool> {
     let along = |axis: usize| {
         median(centres.iter().map(|centre| centre[axis]).collect()).unwrap_or_default()
@@ -97,7 +96,6 @@ impl Normalisation {
 
     /// Moves the mean of the camera centres to the origin and the farthest of them to distance 1. If all cameras are at
     /// one place, the median distance of the points becomes 1; without points the unit stays the same.
-    #[must_use]
     pub fn fit(centres: &[DVec3], points: &[DVec3]) -> Self {
         let (centre, mut unit) = mean_and_radius(centres);
         if unit <= SAME_PLACE * centre.length() {
@@ -109,39 +107,33 @@ impl Normalisation {
     }
 
     /// Transforms a point from world to scene coordinates.
-    #[must_use]
     pub fn scene_from_world(&self, world: DVec3) -> DVec3 {
         (world - self.centre) * self.scale
     }
 
     /// Transforms a point from scene to world coordinates.
-    #[must_use]
     pub fn world_from_scene(&self, scene: DVec3) -> DVec3 {
         scene / self.scale + self.centre
     }
 
     /// Transforms a camera from world to scene coordinates.
-    #[must_use]
     pub fn scene_from_world_camera(&self, world: &Camera) -> Camera {
         let translation = (world.rotation * self.centre + world.translation) * self.scale;
         Camera { translation, ..*world }
     }
 
     /// Transforms a camera from scene to world coordinates.
-    #[must_use]
     pub fn world_from_scene_camera(&self, scene: &Camera) -> Camera {
         let translation = scene.translation / self.scale - scene.rotation * self.centre;
         Camera { translation, ..*scene }
     }
 
     /// Transforms a model from scene to world coordinates, computing in f64.
-    #[must_use]
     pub fn world_from_model(&self, scene: Gaussians) -> Gaussians {
         self.mapped(scene, -self.scale.ln(), |mean| self.world_from_scene(mean))
     }
 
     /// Transforms a model from world to scene coordinates, computing in f64.
-    #[must_use]
     pub fn model_from_world(&self, world: Gaussians) -> Gaussians {
         self.mapped(world, self.scale.ln(), |mean| self.scene_from_world(mean))
     }
@@ -165,7 +157,6 @@ impl Normalisation {
     }
 
     /// A warning if world coordinates in f32 are too coarse for this scene.
-    #[must_use]
     pub fn f32_warning(&self) -> Option<String> {
         let offset = self.centre.length() * self.scale / EXTENT;
         (offset > F32_OFFSET).then(|| {

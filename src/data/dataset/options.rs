@@ -84,7 +84,6 @@ impl Split {
 
 impl Resolution {
     /// The resolution as a number, as on the command line.
-    #[must_use]
     pub fn number(self) -> u32 {
         let (Self::Divisor(number) | Self::Width(number)) = self;
         number

@@ -33,7 +33,6 @@ impl SourceFile {
     }
 
     /// A placeholder for pixels in memory, which have no EXIF.
-    #[must_use]
     pub(crate) fn rendered(path: PathBuf) -> Self {
         Self { path, real: Path::new("").into(), archive: None, exif: Some(Box::default()) }
     }

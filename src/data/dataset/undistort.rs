@@ -44,7 +44,6 @@ impl Undistortion {
     }
 
     /// Position in the lens's image of a point in the pinhole's `[px]`; `None` if the lens did not see it.
-    #[must_use]
     pub(super) fn source_of(&self, pixel: DVec2) -> Option<DVec2> {
         let p = (pixel - self.to.principal) / self.to.focal;
         let ray = self.lens_from_pinhole * p.extend(1.0);
@@ -61,7 +60,6 @@ impl Undistortion {
     /// Interpolation is bicubic, because bilinear interpolation blurs and costs half a dB in test views
     /// (docs/studies/disturbances.tsv).
     /// Near masked pixels it is bilinear, so that hidden colours do not reach pixels that count.
-    #[must_use]
     pub(super) fn apply(&self, image: &Image8) -> Image8 {
         let (width, height) = (self.to.width, self.to.height);
         let mut out = Image8::blank(width, height, image);

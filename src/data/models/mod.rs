@@ -65,7 +65,6 @@ fn names(formats: &[&Format]) -> String {
 }
 
 /// All formats, sorted by name.
-#[must_use]
 pub fn formats() -> Vec<&'static Format> {
     let mut formats: Vec<&Format> = inventory::iter::<Format>.into_iter().collect();
     formats.sort_by_key(|format| format.name);
@@ -73,13 +72,11 @@ pub fn formats() -> Vec<&'static Format> {
 }
 
 /// The formats that densify writes, sorted by name.
-#[must_use]
 pub fn export_formats() -> Vec<&'static Format> {
     formats().into_iter().filter(|format| format.writer.is_some()).collect()
 }
 
 /// The formats that `densify compress --format any` tries, the most exact first.
-#[must_use]
 pub fn compress_formats() -> Vec<&'static Format> {
     let mut formats = export_formats();
     formats.retain(|format| format.compress_rank.is_some());

@@ -118,7 +118,6 @@ pub fn read_model(path: &Path) -> Result<SplatFile, LoadError> {
 }
 
 /// The file by which a folder is a model, if it is one.
-#[must_use]
 pub fn main_file(folder: &Path) -> Option<PathBuf> {
     let names = readers().into_iter().filter_map(|(_, reader)| reader.main_file);
     names.map(|name| folder.join(name)).find(|path| path.is_file())

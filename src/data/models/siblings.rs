@@ -4,7 +4,7 @@ use std::fs::File;
 use std::path::Path;
 
 use crate::error::LoadError;
-use densify_core::files;
+use densify_core::files::{self, folder_of};
 
 /// Opens the file called `name` in the folder of `path`; `field` is where `path` names it.
 ///
@@ -21,10 +21,7 @@ pub(super) fn open(path: &Path, field: &str, name: &str) -> Result<File, LoadErr
         return Err(LoadError::damaged(path, field, problem));
     }
     let sibling = path.with_file_name(name);
-    let folder = match path.parent() {
-        Some(folder) if !folder.as_os_str().is_empty() => folder,
-        _ => Path::new("."),
-    };
+    let folder = folder_of(path);
     let real = sibling.canonicalize().map_err(LoadError::io(&sibling))?;
     let home = folder.canonicalize().map_err(LoadError::io(folder))?;
     if !real.starts_with(home) {

@@ -62,7 +62,6 @@ pub trait ModelWriter {
 }
 
 /// True if a writer failed because its format cannot hold the model, and not because of the disk.
-#[must_use]
 pub fn is_unfit(error: &io::Error) -> bool {
     error.raw_os_error().is_none() && error.kind() == io::ErrorKind::InvalidInput
 }
@@ -81,19 +80,16 @@ impl Format {
     }
 
     /// [`ModelWriter::held_bytes`] of this format; 0 if densify does not write it.
-    #[must_use]
     pub fn held_bytes(&self, shape: Shape) -> u64 {
         self.writer.map_or(0, |make| make().held_bytes(shape))
     }
 
     /// [`ModelWriter::is_lossy`] of this format; false if densify does not write it.
-    #[must_use]
     pub fn is_lossy(&self) -> bool {
         self.writer.is_some_and(|make| make().is_lossy())
     }
 
     /// [`ModelWriter::variants`] of this format; none if densify does not write it.
-    #[must_use]
     pub fn variants(&self) -> &'static [Self] {
         self.writer.map_or(&[], |make| make().variants())
     }

@@ -25,7 +25,6 @@ pub(super) struct Observation {
 }
 
 /// Peak memory for reading and measuring the colours of tracks, in addition to an image `[bytes]`.
-#[must_use]
 pub fn bytes(tracks: &Tracks) -> u64 {
     let colours: usize = tracks.views.iter().map(Vec::len).sum();
     // The observations, and one channel of them, which is sorted for a median.

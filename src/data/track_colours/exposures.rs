@@ -37,7 +37,6 @@ pub struct ExposureSpread {
 impl ExposureSpread {
     /// Measures the spread. Also returns the gains of all views, normalised to a geometric mean of 1; views with too few
     /// trusted colours have gain 1.
-    #[must_use]
     pub fn measure(colours: &TrackColours) -> (Self, Vec<[f32; 3]>) {
         let known: Vec<usize> = (0..colours.views()).filter(|&view| colours.knows(view)).collect();
         let mean = |function: &dyn Fn([f32; 3]) -> [f64; 3]| {
@@ -92,7 +91,6 @@ impl ExposureSpread {
     }
 
     /// Whether exposures shall be learned; `None` if too few tracks or views are known for a decision.
-    #[must_use]
     pub fn decides(&self, views: usize) -> Option<bool> {
         let is_enough = self.tracks >= MIN_TRACKS && 2 * self.views > views;
         let differ = self.stops >= MIN_STOPS && self.with_gains <= MAX_UNEXPLAINED * self.alike;

@@ -58,7 +58,6 @@ pub struct Spread {
 
 impl Spread {
     /// The degree of spherical harmonics to train with; `None` if too few tracks were measured or lie on surfaces.
-    #[must_use]
     pub fn degree(&self) -> Option<u8> {
         let above = THRESHOLDS.iter().filter(|&&from| self.twentieth >= from).count();
         (self.tracks >= MIN_TRACKS && self.on_surface >= 0.5).then_some(above as u8)
@@ -66,7 +65,6 @@ impl Spread {
 }
 
 /// Measures how much the colours of tracks change with the view, after correcting exposures.
-#[must_use]
 pub fn measure(tracks: &Tracks, colours: &TrackColours) -> Spread {
     let (mut each, mut on_surface, mut buffer) = (Vec::new(), 0, Vec::new());
     for (place, seen) in colours.by_track().enumerate() {

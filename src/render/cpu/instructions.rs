@@ -18,7 +18,6 @@ pub enum InstructionSet {
 
 impl InstructionSet {
     /// The sets that differ on this machine, the simplest first.
-    #[must_use]
     pub fn available() -> Vec<Self> {
         let mut all = vec![Self::Best, Self::Avx2, Self::Scalar];
         all.dedup_by_key(|set| set.lanes());

@@ -134,7 +134,6 @@ pub struct CpuBackend {
 impl CpuBackend {
     /// The bytes that a backend with these options allocates for models of this degree, on `threads` threads, whatever
     /// [`Setup::threads`] says.
-    #[must_use]
     pub fn memory_plan(sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
         budget::ledger(sh_degree, options, threads)
     }
@@ -203,7 +202,6 @@ impl CpuBackend {
     }
 
     /// The tasks of the last training step; empty unless they are [recorded](Self::record_tasks).
-    #[must_use]
     pub fn recorded_tasks(&self) -> StepTasks {
         self.threads.recorded()
     }

@@ -56,7 +56,6 @@ impl AdapterSummary {
 
     /// Largest budget that this adapter supports at an SH degree: each array of rows (the geometry, a band of
     /// coefficients, the gradients) must fit one buffer.
-    #[must_use]
     pub fn largest_budget(&self, sh_degree: u8) -> u64 {
         let largest = self.largest_binding.min(self.largest_buffer);
         (largest / widest_row(sh_degree)).min(MAX_ROWS)
@@ -65,7 +64,6 @@ impl AdapterSummary {
 
 /// False if there is certainly no GPU: on Linux, if the kernel shows no device. Drivers, also software drivers,
 /// take time to load and memory that is never freed.
-#[must_use]
 pub fn may_be_present() -> bool {
     const NODES: [&str; 6] =
         ["/dev/dri", "/dev/nvidiactl", "/dev/dxg", "/dev/kgsl-3d0", "/dev/mali0", "/dev/kfd"];
@@ -123,7 +121,6 @@ pub(super) fn enumerate() -> Vec<(Adapter, AdapterSummary)> {
 }
 
 /// All adapters that `WGPU_BACKEND` and the variables of the drivers admit.
-#[must_use]
 pub fn adapters() -> Vec<AdapterSummary> {
     enumerate().into_iter().map(|(_, summary)| summary).collect()
 }

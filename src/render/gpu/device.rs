@@ -47,31 +47,26 @@ impl GpuDevice {
     }
 
     /// The adapter of the device.
-    #[must_use]
     pub fn adapter(&self) -> &AdapterSummary {
         &self.0.summary
     }
 
     /// The accumulation of gradients in use.
-    #[must_use]
     pub fn accumulation(&self) -> Accumulation {
         self.0.accumulation
     }
 
     /// Largest budget at an SH degree.
-    #[must_use]
     pub fn largest_budget(&self, sh_degree: u8) -> u64 {
         self.0.summary.largest_budget(sh_degree)
     }
 
     /// Largest number of (row, tile) pairs held at a time, for a policy's needs.
-    #[must_use]
     pub fn max_pairs(&self, needs: &Needs) -> u64 {
         memory_plan::max_pairs(&self.0, needs)
     }
 
     /// Memory of a backend with these options for models of this SH degree. Nothing is allocated.
-    #[must_use]
     pub fn memory_plan(&self, sh_degree: u8, options: &Setup) -> Ledger {
         memory_plan::ledger(&memory_plan::sizes(&self.0, sh_degree, options), &options.needs)
     }

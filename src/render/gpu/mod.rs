@@ -160,19 +160,16 @@ impl GpuBackend {
     }
 
     /// The adapter in use.
-    #[must_use]
     pub fn adapter(&self) -> &AdapterSummary {
         &self.device.summary
     }
 
     /// Planned size of all buffers on the device `[bytes]`.
-    #[must_use]
     pub fn planned_bytes(&self) -> u64 {
         self.sizes.planned().iter().map(|planned| planned.bytes).sum()
     }
 
     /// Current size of all buffers on the device `[bytes]`.
-    #[must_use]
     pub fn allocated_bytes(&self) -> u64 {
         self.buffers.bytes()
     }

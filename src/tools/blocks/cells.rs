@@ -17,13 +17,11 @@ impl Cell {
     pub(super) const ALL: Self = Self { low: [f64::NEG_INFINITY; 2], high: [f64::INFINITY; 2] };
 
     /// True if a point lies in the cell.
-    #[must_use]
     pub fn contains(&self, point: [f64; 2]) -> bool {
         (0..2).all(|axis| self.low[axis] <= point[axis] && point[axis] < self.high[axis])
     }
 
     /// The cell with a margin on all sides.
-    #[must_use]
     pub fn widened(&self, margin: [f64; 2]) -> Self {
         let low = [0, 1].map(|axis| self.low[axis] - margin[axis]);
         Self { low, high: [0, 1].map(|axis| self.high[axis] + margin[axis]) }

@@ -25,7 +25,6 @@ pub struct Ground {
 
 impl Ground {
     /// Fits the plane to the camera centres by least squares. If they are on a line, the plane is as level as the images.
-    #[must_use]
     pub fn fit(cameras: &[Camera]) -> Self {
         let count = cameras.len().max(1) as f64;
         let origin = cameras.iter().map(Camera::centre).sum::<DVec3>() / count;
@@ -45,7 +44,6 @@ impl Ground {
     }
 
     /// Projects a point onto the plane.
-    #[must_use]
     pub fn project(&self, point: DVec3) -> [f64; 2] {
         let d = point - self.origin;
         [d.dot(self.u), d.dot(self.v)]

@@ -157,7 +157,6 @@ impl BlockPlan {
     }
 
     /// The name of a task.
-    #[must_use]
     pub fn name(&self, task: Task) -> &str {
         match task {
             Task::Coarse => "coarse",
@@ -167,7 +166,6 @@ impl BlockPlan {
     }
 
     /// Upper bound of a task's memory `[bytes]`.
-    #[must_use]
     pub fn memory(&self, task: Task) -> u64 {
         match task {
             Task::Coarse => self.coarse.memory,
@@ -177,7 +175,6 @@ impl BlockPlan {
     }
 
     /// Number of iterations of a task; 0 for the merge.
-    #[must_use]
     pub fn iterations(&self, task: Task) -> u32 {
         match task {
             Task::Coarse => self.coarse.iterations,

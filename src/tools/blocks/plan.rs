@@ -15,7 +15,7 @@ use super::{
     plan_svg,
 };
 use densify_core::camera::Camera;
-use densify_core::files::{FileError, write_atomically};
+use densify_core::files::{FileError, folder_of, write_atomically};
 use densify_core::gaussians::{MAX_SH_DEGREE, sh_coefficients};
 use densify_core::memory::Bytes;
 use densify_core::numbers::grouped;
@@ -83,10 +83,7 @@ fn create_staging(output: &Path) -> Result<TempDir, Failure> {
             )));
         }
     }
-    let parent = match output.parent() {
-        Some(parent) if !parent.as_os_str().is_empty() => parent,
-        _ => Path::new("."),
-    };
+    let parent = folder_of(output);
     let made = fs::create_dir_all(parent)
         .and_then(|()| tempfile::Builder::new().prefix(".densify-").tempdir_in(parent));
     Ok(made.map_err(FileError::io("write to the folder", parent))?)

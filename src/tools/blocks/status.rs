@@ -20,7 +20,6 @@ pub enum TaskState {
 }
 
 /// The state of each task, in the order of [`BlockPlan::tasks`].
-#[must_use]
 pub fn status(folder: &Path, plan: &BlockPlan) -> Vec<(Task, TaskState)> {
     plan.tasks().map(|task| (task, state(folder, plan, task))).collect()
 }

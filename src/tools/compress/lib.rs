@@ -15,7 +15,7 @@ use std::path::{Path, PathBuf};
 
 use tempfile::TempPath;
 
-use densify_core::files::{FileError, write_atomically};
+use densify_core::files::{FileError, folder_of, write_atomically};
 use densify_core::gaussians::Gaussians;
 use densify_core::numbers::grouped;
 use densify_data::models::{Format, PLY};
@@ -63,7 +63,6 @@ pub struct Options<'a> {
 }
 
 /// Path of the output in a format. If there are several formats to choose from, the extension is appended.
-#[must_use]
 pub fn file(output: &Path, formats: &[&Format], format: &Format) -> PathBuf {
     let mut name = output.as_os_str().to_owned();
     if formats.len() > 1 {
@@ -220,10 +219,7 @@ impl Search<'_> {
 
 /// Creates a temporary file in the folder of the result.
 fn create_scratch_file(output: &Path) -> Result<TempPath, Failure> {
-    let folder = match output.parent() {
-        Some(parent) if !parent.as_os_str().is_empty() => parent,
-        _ => Path::new("."),
-    };
+    let folder = folder_of(output);
     let made = std::fs::create_dir_all(folder)
         .and_then(|()| tempfile::NamedTempFile::with_prefix_in(".densify-", folder));
     Ok(made.map_err(FileError::io("write to the folder", folder))?.into_temp_path())

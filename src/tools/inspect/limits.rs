@@ -67,7 +67,6 @@ pub enum LimitError {
 }
 
 /// The values that limits may name: the scores, and every number of geometry.json by its path.
-#[must_use]
 pub fn measured_values(mean: &Mean, geometry: Option<&Geometry>) -> BTreeMap<String, f64> {
     let mut values = BTreeMap::new();
     if let Some(geometry) = geometry.and_then(|measured| serde_json::to_value(measured).ok()) {

@@ -35,14 +35,12 @@ pub struct PictureFolder {
 impl PictureFolder {
     /// Writes to `folder`, which is created with the first picture. Depth is in the units of the dataset that
     /// `normalisation` leads back to.
-    #[must_use]
     pub fn new(folder: &Path, channels: Channels, normalisation: &Normalisation) -> Self {
         let units = 1.0 / normalisation.scale;
         Self { folder: folder.to_owned(), channels, units, largest_depth: BTreeMap::new() }
     }
 
     /// The folder.
-    #[must_use]
     pub fn path(&self) -> &Path {
         &self.folder
     }
@@ -99,7 +97,6 @@ impl PictureFolder {
 
 /// A file name without extension for each view. Names come from data files: no part of one may lead out of the
 /// output folder, and no two are the same.
-#[must_use]
 pub fn file_names(views: &[&str]) -> Vec<String> {
     let plain = |name: &str| {
         let parts = name.split(['/', '\\']).filter(|part| !matches!(*part, "" | "." | ".."));

@@ -155,7 +155,6 @@ struct Submitted {
 const SUBMITTED_FILE: &str = "submitted.toml";
 
 /// IDs of the jobs submitted from a folder, as text; `None` if there were none.
-#[must_use]
 pub fn submitted_jobs(folder: &Path) -> Option<String> {
     let text = files::read_text(&folder.join(SUBMITTED_FILE), files::MAX_OPTIONS).ok()?;
     let before = toml::from_str::<Submitted>(&text).map(|record| record.jobs.join(", "));

@@ -96,7 +96,6 @@ pub fn compare_images(
 ///
 /// # Panics
 /// When the arrays differ in length.
-#[must_use]
 pub fn relative_error<M: Copy + Into<f64>>(measured: &[M], expected: &[f64]) -> f64 {
     assert_eq!(measured.len(), expected.len(), "two arrays of one quantity differ in length");
     let mut largest = 0.0_f64;
@@ -115,7 +114,6 @@ pub fn relative_error<M: Copy + Into<f64>>(measured: &[M], expected: &[f64]) -> 
 ///
 /// # Panics
 /// When there is no such class.
-#[must_use]
 pub fn class<'a>(gradient: &'a ModelGradient, name: &str) -> &'a [f32] {
     match name {
         "means" => gradient.means.as_flattened(),
@@ -137,7 +135,6 @@ pub struct Table {
 
 impl Table {
     /// An empty table.
-    #[must_use]
     pub fn new(title: &str) -> Self {
         Self { title: title.into(), rows: Vec::new(), messages: Vec::new() }
     }

@@ -36,7 +36,6 @@ impl SubjectReport {
 
 impl Finding {
     /// True if the error is within its tolerance.
-    #[must_use]
     pub fn passes(&self) -> bool {
         self.error <= self.tolerance
     }

@@ -41,7 +41,6 @@ pub struct Case {
 impl Case {
     /// Runs the case and returns the worst finding of each kind of figure. `long` includes checks that take
     /// minutes.
-    #[must_use]
     pub fn run(&self, subject: &Subject, long: bool) -> Vec<Finding> {
         let mut trial = Trial::new(subject, long);
         // A panic is a bug; the figures of the other cases are still needed.

@@ -19,7 +19,6 @@ fn verdict(finding: &Finding) -> &'static str {
 }
 
 /// The lines of one case for a terminal.
-#[must_use]
 pub fn table(case: &Case, findings: &[Finding]) -> String {
     let mut text = format!("{:>2}  {}", case.number, case.title);
     for finding in findings {
@@ -43,7 +42,6 @@ of their class. Other figures count what must never happen. `tests/it/extremes.r
 ";
 
 /// A Markdown file with a section for each backend and a table of its findings.
-#[must_use]
 pub fn markdown(reports: &[SubjectReport]) -> String {
     let mut text = HEAD.to_owned();
     for SubjectReport { subject, cases } in reports {

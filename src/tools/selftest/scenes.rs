@@ -12,7 +12,6 @@ use rand_chacha::ChaCha8Rng;
 use super::reference::Upstream;
 
 /// A camera with an arbitrary pose and a principal point off the centre of the image.
-#[must_use]
 pub fn camera(width: u32, height: u32, seed: u64) -> Camera {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut number = || rng.random_range(-1.0..1.0);
@@ -32,7 +31,6 @@ pub fn camera(width: u32, height: u32, seed: u64) -> Camera {
 }
 
 /// The camera with every number rounded to `f32`, so that backends and reference start from the same values.
-#[must_use]
 pub fn rounded(camera: &Camera) -> Camera {
     let round = |v: f64| f64::from(v as f32);
     Camera {
@@ -47,7 +45,6 @@ pub fn rounded(camera: &Camera) -> Camera {
 }
 
 /// World position of a point in camera coordinates.
-#[must_use]
 pub fn world(camera: &Camera, local: [f64; 3]) -> [f32; 3] {
     let world = camera.rotation.inverse() * (DVec3::from(local) - camera.translation);
     world.to_array().map(|v| v as f32)
@@ -71,7 +68,6 @@ pub fn push(
 
 /// `rows` translucent Gaussians over the image and a little beyond, 2 to 40 % of the image wide, with
 /// quaternions of any length. Depths lie between 2 and 5 and differ by more than rounding.
-#[must_use]
 pub fn cloud(rows: usize, sh_degree: u8, camera: &Camera, seed: u64) -> Gaussians {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut model = Gaussians { sh_degree, ..Gaussians::default() };
@@ -95,7 +91,6 @@ pub fn cloud(rows: usize, sh_degree: u8, camera: &Camera, seed: u64) -> Gaussian
 }
 
 /// One row at a point in camera coordinates, with a view-dependent colour (degree 1).
-#[must_use]
 pub fn one_at(camera: &Camera, local: [f64; 3], scale: [f32; 3]) -> Gaussians {
     let mut model = Gaussians { sh_degree: 1, ..Gaussians::default() };
     let quat = [0.9, -0.3, 0.4, 0.2];
@@ -104,7 +99,6 @@ pub fn one_at(camera: &Camera, local: [f64; 3], scale: [f32; 3]) -> Gaussians {
 }
 
 /// A photograph of the camera's size in which neighbouring pixels differ.
-#[must_use]
 pub fn target(camera: &Camera) -> Image8 {
     let n = 3 * camera.width * camera.height;
     let rgb = (0..n).map(|i| (i * 37 % 251) as u8).collect();
@@ -112,7 +106,6 @@ pub fn target(camera: &Camera) -> Image8 {
 }
 
 /// dL/d(image) of a loss with random weights of both signs on every pixel.
-#[must_use]
 pub fn upstream(camera: &Camera, seed: u64) -> Upstream {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let pixels = (camera.width * camera.height) as usize;
@@ -124,7 +117,6 @@ pub fn upstream(camera: &Camera, seed: u64) -> Upstream {
 }
 
 /// The gradient in `f32`, as backends take it.
-#[must_use]
 pub fn narrowed(upstream: &Upstream) -> ImageGradient {
     let narrow = |values: &[f64]| values.iter().map(|&v| v as f32).collect();
     ImageGradient {
@@ -135,7 +127,6 @@ pub fn narrowed(upstream: &Upstream) -> ImageGradient {
 }
 
 /// A noisy rendering of a random photograph, and the photograph.
-#[must_use]
 pub fn noisy((width, height): (u32, u32), noise: f32, seed: u64) -> (Vec<f32>, Image8) {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let n = 3 * (width * height) as usize;
@@ -148,7 +139,6 @@ pub fn noisy((width, height): (u32, u32), noise: f32, seed: u64) -> (Vec<f32>, I
 }
 
 /// A rendering with these colours and the photograph's size: opaque, at depth 1.
-#[must_use]
 pub fn opaque(rgb: &[f32], target: &Image8) -> Rendering {
     let pixels = rgb.len() / 3;
     Rendering {

@@ -25,7 +25,6 @@ impl Subject {
     pub const NATIVE: Self = Self::Native { instructions: InstructionSet::Best, threads: None };
 
     /// A name for people.
-    #[must_use]
     pub fn name(&self) -> String {
         match self {
             Self::Native { instructions: InstructionSet::Best, .. } => "native".into(),
@@ -74,7 +73,6 @@ impl Subject {
     }
 
     /// True if two runs give the same bits.
-    #[must_use]
     pub fn is_deterministic(&self) -> bool {
         match self {
             Self::Gpu(device) => device.accumulation().is_deterministic(),
@@ -84,7 +82,6 @@ impl Subject {
 
     /// Tolerances of an image against the reference. Functions are less accurate on a GPU: WGSL allows `exp(x)`
     /// an error of 3 + 2·|x| units in the last place.
-    #[must_use]
     pub fn limits(&self) -> Limits {
         match self {
             Self::Gpu(_) => Limits { interior: 1e-4, ..Limits::CPU },
@@ -95,7 +92,6 @@ impl Subject {
     /// Tolerance of a gradient against the reference, relative to the largest of its class. Single
     /// precision loses about 1e-6 in a sum over pixels; a hundred times that allows for cancellation, but
     /// not for a wrong term.
-    #[must_use]
     pub fn gradient_tolerance(&self) -> f64 {
         match self {
             Self::Gpu(_) => 1e-3,

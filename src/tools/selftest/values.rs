@@ -75,7 +75,6 @@ pub(crate) fn slot_name(slot: usize) -> &'static str {
 }
 
 /// The model without row `row`.
-#[must_use]
 pub fn remove(model: &Gaussians, row: usize) -> Gaussians {
     model.gather(&(0..model.len()).filter(|&other| other != row).collect::<Vec<_>>())
 }

@@ -13,13 +13,11 @@ pub(super) use rendered::{load, surface_bytes};
 pub(crate) const PREFIX: &str = "scene:";
 
 /// The name of a built-in scene, if the path is one.
-#[must_use]
 pub fn name(path: &Path) -> Option<&str> {
     path.to_str()?.strip_prefix(PREFIX)
 }
 
 /// The name of a built-in scene for use in a file name: `scene:town:4` becomes `town-4`.
-#[must_use]
 pub fn label(path: &Path) -> Option<String> {
     name(path).map(|name| name.replace(':', "-"))
 }

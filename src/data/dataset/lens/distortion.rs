@@ -27,7 +27,6 @@ const STEPS: u32 = 60;
 
 impl Distortion {
     /// No distortion of a plane.
-    #[must_use]
     pub(crate) fn none(plane: Plane) -> Self {
         let (radial, denominator) = ([0.0; 4], [0.0; 3]);
         Self { plane, radial, denominator, tangential: [0.0; 2], prism: [0.0; 2] }
@@ -53,7 +52,6 @@ impl Distortion {
     }
 
     /// Distorts a point of the plane.
-    #[must_use]
     pub(crate) fn apply(&self, p: DVec2) -> DVec2 {
         let s = p.length_squared();
         let ([n, m], _) = self.radial_at(s);
@@ -81,7 +79,6 @@ impl Distortion {
 
     /// The point of the plane that is distorted to `target`; `None` if no such point lies within `reach` of the centre,
     /// which is at most the invertible radius.
-    #[must_use]
     pub(crate) fn inverse(&self, target: DVec2, reach: f64) -> Option<DVec2> {
         let mut p = target.clamp_length_max(reach);
         let mut miss = self.apply(p) - target;

@@ -53,7 +53,6 @@ pub(crate) enum Unseen {
 
 impl Lens {
     /// A lens; the parameters may be invalid.
-    #[must_use]
     pub(crate) fn new(
         (width, height): (u32, u32),
         focal: DVec2,
@@ -68,13 +67,11 @@ impl Lens {
     }
 
     /// Whether the lens differs from a pinhole.
-    #[must_use]
     pub(crate) fn is_distorted(&self) -> bool {
         self.distortion != Distortion::none(Plane::Perspective)
     }
 
     /// Whether all parameters are finite numbers.
-    #[must_use]
     pub(crate) fn is_finite(&self) -> bool {
         let omega = match self.distortion.plane {
             Plane::Fov(omega) => omega,
@@ -85,13 +82,11 @@ impl Lens {
     }
 
     /// Largest field of view that is imaged one-to-one `[degrees]`.
-    #[must_use]
     pub(crate) fn usable_field(&self) -> f64 {
         2.0 * self.distortion.plane.angle(self.reach).to_degrees()
     }
 
     /// The same lens with an image of another size.
-    #[must_use]
     pub(crate) fn resized(&self, width: u32, height: u32) -> Self {
         let scale = DVec2::new(
             f64::from(width) / f64::from(self.width),
@@ -102,7 +97,6 @@ impl Lens {
     }
 
     /// Image size `[px]`.
-    #[must_use]
     pub(crate) fn size(&self) -> DVec2 {
         DVec2::new(f64::from(self.width), f64::from(self.height))
     }
@@ -122,7 +116,6 @@ impl Lens {
     }
 
     /// Projection of a ray `[px]`, which may lie outside the image; `None` where the distortion is not invertible.
-    #[must_use]
     pub(crate) fn project(&self, direction: DVec3) -> Option<DVec2> {
         // A relative 1e-9 is far below a pixel, and above the rounding of a point on the rim.
         let is_within = |p: &DVec2| p.length() <= self.reach * (1.0 + 1e-9);
@@ -130,7 +123,6 @@ impl Lens {
     }
 
     /// Projection of a ray `[px]`, even where the distortion is not invertible.
-    #[must_use]
     pub(crate) fn extrapolate(&self, direction: DVec3) -> Option<DVec2> {
         self.on_plane(direction).map(|p| self.imaged(p))
     }

@@ -20,7 +20,6 @@ const WIDEST_FISHEYE: f64 = 120.0_f64.to_radians();
 
 impl Plane {
     /// Distance from the centre, for an angle `[rad]` below [`Self::widest`].
-    #[must_use]
     pub(crate) fn radius(self, angle: f64) -> f64 {
         match self {
             Self::Perspective => angle.tan(),
@@ -30,7 +29,6 @@ impl Plane {
     }
 
     /// Inverse of [`Self::radius`] `[rad]`.
-    #[must_use]
     pub(crate) fn angle(self, radius: f64) -> f64 {
         match self {
             Self::Perspective => radius.atan(),
@@ -41,7 +39,6 @@ impl Plane {
 
     /// Derivative of [`Self::radius`] on the axis: the focal length, relative to that of the lens, with which a pinhole
     /// has as many pixels per radian.
-    #[must_use]
     pub(crate) fn slope(self) -> f64 {
         match self {
             Self::Perspective | Self::Equidistant => 1.0,
@@ -50,7 +47,6 @@ impl Plane {
     }
 
     /// Largest supported angle from the axis `[rad]`.
-    #[must_use]
     pub(crate) fn widest(self) -> f64 {
         match self {
             Self::Perspective | Self::Fov(_) => WIDEST,

@@ -20,7 +20,6 @@ const GREY: [f32; 3] = [0.2, 0.5, 0.3];
 const UPRIGHT: [f32; 4] = [1.0, 0.0, 0.0, 0.0];
 
 /// All cases, in the order of their numbers.
-#[must_use]
 #[rustfmt::skip] // One case per line.
 pub fn cases() -> &'static [Case] {
     &[

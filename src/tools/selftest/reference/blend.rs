@@ -97,7 +97,6 @@ pub struct Sample {
 }
 
 /// Renders one pixel of splats in the given order.
-#[must_use]
 pub fn render_pixel(
     splats: &[Splat],
     order: &[usize],
@@ -127,7 +126,6 @@ pub fn render_pixel(
 }
 
 /// Renders splats in the given order.
-#[must_use]
 pub fn render(splats: &[Splat], order: &[usize], view: View<'_>, rules: &Rules) -> Image {
     let samples: Vec<Sample> =
         pixels(view).map(|at| render_pixel(splats, order, view, rules, at)).collect();
@@ -159,7 +157,6 @@ pub fn each_blended(
 }
 
 /// Gradients of Σ image · upstream with respect to the splats. Shape: `[rows]`.
-#[must_use]
 pub fn backward(
     splats: &[Splat],
     order: &[usize],
@@ -218,7 +215,6 @@ fn add_exponent(sum: &mut ScreenGradient, splat: &Splat, hit: &Contribution, d_e
 
 /// Upper bounds of what the pixels outside `counted` add to a row's statistics, whatever is decided at close
 /// thresholds: largest weight, sum of weights, number of pixels.
-#[must_use]
 pub fn leeway(
     splats: &[Splat],
     order: &[usize],

@@ -53,7 +53,6 @@ fn product(a: &[f64], b: &[f64]) -> Vec<f64> {
 }
 
 /// The loss of `rendered` against `target`: [height, width, 3], not clamped.
-#[must_use]
 pub fn loss(rendered: &[f64], target: &[f64], width: usize, height: usize) -> Loss {
     let n = rendered.len() as f64;
     let blurred = |image: &[f64]| blur(image, width, height);

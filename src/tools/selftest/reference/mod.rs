@@ -77,7 +77,6 @@ impl From<&Gaussians> for Model {
 
 impl Model {
     /// A gradient of zeros.
-    #[must_use]
     pub fn zeros(rows: usize, coefficients: usize) -> Self {
         Self {
             coefficients,
@@ -90,7 +89,6 @@ impl Model {
     }
 
     /// Number of rows.
-    #[must_use]
     pub fn rows(&self) -> usize {
         self.means.len()
     }
@@ -99,7 +97,6 @@ impl Model {
     ///
     /// # Panics
     /// When `name` is not in [`CLASSES`].
-    #[must_use]
     pub fn class(&self, name: &str) -> &[f64] {
         match name {
             "means" => self.means.as_flattened(),
@@ -190,7 +187,6 @@ pub struct Image {
 
 impl Image {
     /// Σ image · upstream.
-    #[must_use]
     pub fn dot(&self, upstream: &Upstream) -> f64 {
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
         dot(&self.rgb, &upstream.rgb)
@@ -232,14 +228,12 @@ pub struct ScreenGradient {
 }
 
 /// Renders a view.
-#[must_use]
 pub fn render(model: &Model, view: View<'_>, rules: &Rules) -> Image {
     let splats = project::project(model, view, rules);
     blend::render(&splats, &project::by_depth(&splats), view, rules)
 }
 
 /// Renders a view and differentiates Σ image · upstream.
-#[must_use]
 pub fn differentiate(
     model: &Model,
     view: View<'_>,

@@ -72,7 +72,6 @@ impl Geometry {
 }
 
 /// Projects all rows of a model.
-#[must_use]
 pub fn project(model: &Model, view: View<'_>, rules: &Rules) -> Vec<Splat> {
     (0..model.rows())
         .map(|row| {
@@ -102,7 +101,6 @@ pub fn project(model: &Model, view: View<'_>, rules: &Rules) -> Vec<Splat> {
 }
 
 /// Rows in front of the camera, front to back; equal depths by row.
-#[must_use]
 pub fn by_depth(splats: &[Splat]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..splats.len()).filter(|&i| splats[i].in_front).collect();
     order.sort_by(|&i, &j| splats[i].depth.total_cmp(&splats[j].depth).then(i.cmp(&j)));
@@ -110,7 +108,6 @@ pub fn by_depth(splats: &[Splat]) -> Vec<usize> {
 }
 
 /// Gradients of the parameters from those of the projected rows.
-#[must_use]
 pub fn backward(
     model: &Model,
     view: View<'_>,
