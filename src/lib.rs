@@ -1,6 +1,6 @@
 //! `densify` trains 3D Gaussian Splatting scenes under a hard memory budget.
 //!
-//! What decides where Gaussians are born and die is a plugin, a *policy* (see
+//! A *policy*, which is a plugin, decides where Gaussians are added and removed (see
 //! `densify_policies`). This crate is everything around it: data, renderer, trainer and the
 //! command line. All that `densify train` does can be done from code:
 //!
@@ -26,15 +26,15 @@
 //!
 //! The layers are packages of their own, and each knows only those below it:
 //!
-//! | package | what it is | may know |
+//! | package | purpose | may depend on |
 //! |---|---|---|
-//! | [`cli`] | arguments and words | all below |
+//! | [`cli`] | command-line arguments and messages | all below |
 //! | [`blocks`], [`compress`], [`launch`], … | tools over many runs, or after one | `run` and below |
-//! | [`run`] | a run as data: asked, decided, running | all below |
+//! | [`run`] | a run: its options, the values chosen for them, and its execution | all below |
 //! | [`train`] | the loop, schedule, metrics, checkpoints | all below |
 //! | [`render`] | rasterisers, native and on a GPU | `core`, policies, shaders |
 //! | [`data`] | datasets and models as files | `core`, scene generator |
-//! | [`core`] | cameras, Gaussians, ledger, whole files | nothing of this workspace |
+//! | [`core`] | cameras, Gaussians, memory ledger, atomic file writing | nothing of this workspace |
 //!
 //! Features, all on by default: `gpu` (the GPU backend), `selftest` (the float64 renderer and the command that
 //! compares with it), `study` (`compare`, `trade` and `report`), `view` (a page in the browser).

@@ -1,6 +1,6 @@
 //! The kinds of edits: children of a parent, rows rewritten in place, rows without a parent, resets.
 //!
-//! Over 400 lines, as the types belong together and most lines are their documentation.
+//! The file is long because the types belong together; most lines are their documentation.
 
 use serde::{Deserialize, Serialize};
 
@@ -113,7 +113,7 @@ pub struct Decay {
     pub opacity: f32,
     /// Share by which standard deviations are reduced, in `[0, 1)`.
     pub scale: f32,
-    /// If true, only rows decay that a view has shown since the last reset of
+    /// If true, only those rows decay that were visible in a view since the last reset of
     /// [`Signal::VisibleCount`](crate::signals::Signal::VisibleCount), which must then be declared.
     pub seen_only: bool,
 }
@@ -143,7 +143,7 @@ pub struct Seed {
 /// An accumulator that a plan resets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Reset {
-    /// All [`Signal`](crate::signals::Signal)s that accumulate; neither `WeightMax` (kept per epoch) nor the
+    /// All [`Signal`](crate::signals::Signal)s that accumulate. This excludes `WeightMax` (kept per epoch) and the
     /// current state of rows (`Opacity`, `ScaleMax`, `ScaleProduct`, `Age`, attributes).
     Signals,
     /// The given signals, except those that do not accumulate; for signals with a reset interval of their own.
@@ -303,7 +303,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bad_field_of_a_family_is_named() {
+    fn a_bad_field_of_an_offspring_is_named() {
         let clone = crate::adc::clone_at([0.0; 3]);
         assert_eq!(clone.bad_field(), None);
         assert_eq!(Offspring { children: 0, ..clone }.bad_field(), Some("children"));

@@ -37,7 +37,7 @@ pub enum PolicyError {
         policy: String,
         /// The requested parameter.
         parameter: String,
-        /// Its parameter most similar to it.
+        /// The policy's parameter with the most similar name.
         nearest: Option<String>,
     },
     /// A parameter's value has the wrong type or is out of its range.

@@ -29,10 +29,11 @@ pub(crate) fn assert_conforms(name: &str, sets: &[&str]) {
     }
 }
 
-/// Asserts that the policy has the parameters of `vanilla`, and plans like `vanilla` with the settings
-/// `defaults` at a growth step of four rows that `event` makes.
+/// Asserts that the policy has the parameters of `vanilla`, and that at a growth step with the four rows of `event` it
+/// plans
+/// like `vanilla` with the settings `defaults`.
 pub(crate) fn assert_grows_like_vanilla(name: &str, event: Event, defaults: &str) {
-    // Over 4 views the means are 2e-4, less, and 1e-3; the last row is faint.
+    // Averaged over 4 views, the gradients are just above 2e-4, just below it, and 1e-3; the last row is faint.
     let event = Event { budget: 9, ..event }
         .with(Signal::ScreenGradient, &[8.01e-4, 7.99e-4, 4e-3, 1.0])
         .with(Signal::ScaleMax, &[0.05, 0.05, 0.2, 0.05])

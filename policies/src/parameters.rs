@@ -66,7 +66,7 @@ pub fn bad_parameter(parameter: &str, reason: impl Into<String>) -> PolicyError 
 /// Parses a value given on the command line: as TOML if it is valid TOML, otherwise as text.
 pub fn parse_value(text: &str) -> Value {
     let parsed = format!("value = {text}").parse::<Table>().ok();
-    // A text with a line break could set further keys; it is not a single value then.
+    // Text with a line break could set further keys; such text is not a single value.
     let single = parsed.filter(|table| table.len() == 1);
     single.and_then(|mut table| table.remove("value")).unwrap_or_else(|| text.into())
 }

@@ -1,4 +1,4 @@
-//! The number of rows that one event may add or replace, as its part of a share of the budget.
+//! Divides a share of the budget among events: the number of rows that each event may add or replace.
 
 use crate::adc::Window;
 
@@ -11,8 +11,9 @@ pub(crate) fn share_of_budget(share: f64, budget: usize) -> usize {
 /// except for rounding.
 pub(crate) fn event_quota(share: f64, window: Window, step: u32, budget: usize) -> usize {
     let events = f64::from(window.count(u32::MAX).max(1));
-    let until = |step: u32| floor(share * budget as f64 * f64::from(window.count(step)) / events);
-    until(step) - until(step.saturating_sub(1))
+    let quota_through =
+        |step: u32| floor(share * budget as f64 * f64::from(window.count(step)) / events);
+    quota_through(step) - quota_through(step.saturating_sub(1))
 }
 
 /// ⌊x⌋, where x just below an integer counts as that integer: 0.29 · 100 is 28.999999999999996. x is the result

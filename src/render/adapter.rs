@@ -34,7 +34,7 @@ pub struct AdapterSummary {
     pub largest_buffer: u64,
     /// Missing features and limits; empty if the adapter is usable.
     pub missing: Vec<String>,
-    /// The supported methods of accumulating gradients, the fastest last; [`Accumulation::Slots`] always is.
+    /// The supported methods of accumulating gradients, the fastest last; [`Accumulation::Slots`] is always supported.
     pub accumulations: Vec<Accumulation>,
 }
 
@@ -44,7 +44,7 @@ impl AdapterSummary {
         self.accumulations.last().copied().unwrap_or(Accumulation::Slots)
     }
 
-    /// Returns whether the automatic choice may take it: a usable GPU that is not a software driver.
+    /// True if the adapter may be chosen automatically: it is usable and not a software driver.
     pub fn is_gpu(&self) -> bool {
         self.kind != AdapterKind::Software && self.missing.is_empty()
     }

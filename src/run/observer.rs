@@ -65,11 +65,11 @@ pub trait Observer {
     fn tested(&self, _step: u32, _mean: &Mean) {}
 
     /// A checkpoint was written, or failed because of `trouble`.
-    fn kept(&self, _step: u32, _trouble: Option<&str>) {}
+    fn checkpoint_written(&self, _step: u32, _trouble: Option<&str>) {}
 
     /// Called before every step, so that the model can be rendered while training waits; rendering changes nothing. The
     /// history of rows is known if there is a [companion](crate::Companion).
-    fn between(&self, _model: &mut dyn Backend, _rows: Option<&RowHistory>) -> Between {
+    fn between_steps(&self, _model: &mut dyn Backend, _rows: Option<&RowHistory>) -> Between {
         Between::Step
     }
 

@@ -13,7 +13,7 @@ class Case:
     name: str
     # Without the program's name; split into words as a shell does.
     commands: tuple[str, ...]
-    # Case whose output by the reference program is copied into the folder first, for both programs.
+    # Case whose output by the reference program is copied into the folder before either program runs.
     start: str | None = None
     # Files and folders to delete from that copy.
     without: tuple[str, ...] = ()
@@ -76,7 +76,7 @@ def training(policies: list[str]):
 
 
 def resuming(policies: list[str]):
-    """Runs that continue from a checkpoint of the reference program, from the middle of a run."""
+    """Runs that resume from a checkpoint written by the reference program in the middle of a run."""
     resume = ("train -o run --resume",)
     without = ("run/checkpoints/iteration_300.safetensors", "run/point_cloud")
     for backend in BACKENDS:

@@ -1,5 +1,6 @@
-//! Every backend against the native one: losses, and training step by step. Sums in any order, which
-//! `extremes` leaves out, are among them; `oracle` holds images and gradients of all.
+//! Compares the losses and training steps of every backend with those of the native backend, including backends that
+//! sum in no fixed order, which
+//! `extremes` leaves out. `oracle` compares the images and gradients of all backends with stored references.
 
 use densify::core::camera::Camera;
 use densify::core::gaussians::Gaussians;
@@ -21,7 +22,7 @@ fn the_loss_and_its_gradient_are_those_of_the_native_backend() {
     for subject in others() {
         let mut table = Table::new(&format!("loss, {} against native", subject.name()));
         let mut backend = make(&subject, &empty);
-        // Widths that leave every number of pixels for the last vector, among others.
+        // The widths include every possible number of pixels left over for the last vector.
         let sizes = [(64, 48), (37, 29), (1, 1), (17, 3)].into_iter();
         for (seed, (width, height)) in (0..).zip(sizes.chain((33..49).map(|width| (width, 19)))) {
             for (with_alpha, with_mask) in [(false, false), (true, false), (false, true)] {
@@ -30,14 +31,14 @@ fn the_loss_and_its_gradient_are_those_of_the_native_backend() {
                 target.alpha = with_alpha.then(|| plane.clone());
                 target.mask = with_mask.then_some(plane);
                 let mut rng = ChaCha8Rng::seed_from_u64(90 + seed);
-                // Half of it equal to the target but for little, where SSIM cancels.
+                // Every other value is almost equal to the target, where the terms of SSIM cancel.
                 let mut value = |(i, near): (usize, &u8)| match i % 2 {
                     0 => f32::from(*near) / 255.0 + 1e-4,
                     _ => rng.random_range(0.0..1.0),
                 };
                 let rgb: Vec<f32> = target.rgb.iter().enumerate().map(&mut value).collect();
                 let rendering = scenes::opaque(&rgb, &target);
-                let (expected, by) = native.loss(&rendering, &target, GREY).expect("a loss");
+                let (expected, gradient) = native.loss(&rendering, &target, GREY).expect("a loss");
                 let (found, measured) = backend.loss(&rendering, &target, GREY).expect("a loss");
                 let what = format!("{width}x{height}, alpha {with_alpha}, mask {with_mask}");
                 for (name, found, expected) in [
@@ -47,7 +48,7 @@ fn the_loss_and_its_gradient_are_those_of_the_native_backend() {
                 ] {
                     table.check(&what, name, f64::from((found - expected).abs()), 2e-6);
                 }
-                table.check(&what, "gradient", relative_error(&measured, &wide(&by)), 2e-5);
+                table.check(&what, "gradient", relative_error(&measured, &wide(&gradient)), 2e-5);
             }
         }
         table.finish();
@@ -75,7 +76,7 @@ fn step(
 
 fn columns(backend: &mut dyn Backend, needs: &Needs) -> Vec<(Signal, Vec<f32>)> {
     let signals = backend.take_signals(needs.signals).expect("signals");
-    // Of the smallest values the inverses: rows that were not seen have none.
+    // Minima are compared by their inverses, because rows that were not seen have an infinite minimum.
     let shown = |s: Signal, x: f32| if s.kind() == SignalKind::Minimum { 1.0 / x } else { x };
     let of = |s: Signal| -> Vec<f32> {
         signals.get(s).expect("it was asked for").iter().map(|&x| shown(s, x)).collect()
@@ -99,7 +100,7 @@ fn compare_models(table: &mut Table, what: &str, found: &Gaussians, expected: &G
     ];
     for (class, found, expected, rate) in pairs {
         assert_eq!(found.len(), expected.len(), "{what}: {class}");
-        // Where a gradient is all rounding, Adam's first steps go either way by a step each; such
+        // Where a gradient consists only of rounding errors, Adam's first steps may have either sign; such
         // entries are few.
         let off = found.iter().zip(expected).filter(|(a, b)| {
             let difference = (**a - **b).abs();
@@ -110,7 +111,7 @@ fn compare_models(table: &mut Table, what: &str, found: &Gaussians, expected: &G
     }
 }
 
-/// What policies ask for, each with the cadence of its steps.
+/// The needs of typical policies, each with the cadence of its steps.
 fn asked_for() -> [(&'static str, Needs, Cadence); 7] {
     let all = SignalSet::from(Signal::ALL);
     let absolute = SignalSet::from([Signal::ScreenGradientAbs]);
@@ -118,7 +119,7 @@ fn asked_for() -> [(&'static str, Needs, Cadence); 7] {
     let some = SignalSet::from([Signal::ScreenGradient, Signal::WeightMax, Signal::Age]);
     let noise = NoiseTerm { strength: 5e3, sharpness: 100.0, opacity: 0.3 };
     let loss_terms = LossTerms { opacity: 0.01, scale: 0.02 };
-    // Some fall to the threshold within the six steps.
+    // Some masks fall to the threshold within the six steps.
     let mask = MaskTerm { start: 1.0, rate: 0.01, weight: 1e-3, threshold: 0.725 };
     let [plain, third, other] =
         [(1, 1), (1, 3), (2, 4)].map(|(all, sh_rest)| Cadence { all, sh_rest });

@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Starting from a mesh: runs the README's commands from the mesh to a test for continuous integration.
+# Tour "Test against known geometry": starts from a mesh and runs the README's commands, up to the test for continuous
+# integration.
 #
 # tests/tours/mesh.sh PROGRAM MESH
 set -euo pipefail

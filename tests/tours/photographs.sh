@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Starting from photographs: runs the README's commands from a dataset to pictures of a model.
+# Tour "Train on your photographs": starts from a dataset and runs the README's commands, up to the pictures of a model.
 #
 # tests/tours/photographs.sh PROGRAM DATASET [FOLDER]: the pictures are kept in FOLDER, which must be new.
 set -euo pipefail

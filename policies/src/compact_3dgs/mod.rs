@@ -122,7 +122,7 @@ impl Default for CompactParams {
 pub struct Compact {
     params: CompactParams,
     growth: Vanilla,
-    /// Prunes by mask in addition to those at growth steps.
+    /// When to prune by mask, in addition to the growth steps.
     prune: Window,
     iterations: u32,
 }

@@ -68,7 +68,9 @@ fn check_range(entry: &PolicyEntry, name: &str, default: &Value, range: &str) ->
         outside.iter().find_map(|value| match build(value) {
             Ok(()) => Some(format!("`{name}` = {value} is accepted, but its range is `{range}`")),
             Err(PolicyError::BadParameter { parameter, .. }) if parameter == name => None,
-            Err(error) => Some(format!("`{name}` = {value} is refused as: {error}")),
+            Err(error) => {
+                Some(format!("`{name}` = {value} is refused for another reason: {error}"))
+            }
         })
     })
 }

@@ -21,7 +21,7 @@ const MAX_VIEWS: u32 = 3;
 type Failure = (Check, String);
 
 /// Runs a scenario with several copies of the policy: two as in training, one that is shown more than it
-/// declares, and two that were saved and restored, after one third and two thirds of the run. All must make
+/// declares, and two restored from states saved one third and two thirds of the way through the run. All must make
 /// the same plans. Returns true if any plan edited the model.
 pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Result<bool, Failure> {
     let scene = &scenario.scene;
@@ -145,17 +145,18 @@ fn observe(
         let columns = view.columns.iter();
         let columns = columns.filter(|(column, _)| sees_all || request.columns.contains(column));
         let columns: Vec<_> = columns.cloned().collect();
-        // `sees_all` shows points only to a policy that requested none.
+        // With `sees_all`, a policy that requested no points is shown all of them; one that requested some gets only
+        // those.
         let most =
             if sees_all && request.points == 0 { usize::MAX } else { request.points as usize };
         let points = &view.points[..most.min(view.points.len())];
         let view = AuxView { step, rows, loss: view.loss, columns: &columns, points };
-        let observed = catch_panic(|| policy.observe(&view)).map_err(never_fails)?;
+        let observed = catch_panic(|| policy.observe(&view)).map_err(unexpected_error)?;
         observed.map_err(|error| match error {
             PolicyError::UndeclaredColumn { column } => {
                 (Check::ReadsOnlyDeclared, format!("{column:?} was read but not declared"))
             }
-            error => never_fails(error.to_string()),
+            error => unexpected_error(error.to_string()),
         })?;
     }
     Ok(())
@@ -180,12 +181,12 @@ fn plan(
     let budget = scenario.budget(rows);
     let mut plan = EditPlan::new(rows, budget).allowing(needs);
     let rng = PolicyRng::new(3, event.step);
-    let planned = catch_panic(|| policy.plan(&now, &rng, &mut plan)).map_err(never_fails)?;
+    let planned = catch_panic(|| policy.plan(&now, &rng, &mut plan)).map_err(unexpected_error)?;
     planned.map_err(|error| match error {
         PolicyError::Undeclared { signal } => {
             (Check::ReadsOnlyDeclared, format!("{signal:?} was read but not declared"))
         }
-        error => never_fails(error.to_string()),
+        error => unexpected_error(error.to_string()),
     })?;
     if plan.was_undeclared() {
         return Err((Check::DeclaresEdits, Refused::Undeclared.to_string()));
@@ -201,7 +202,7 @@ fn plan(
     Ok(ops)
 }
 
-fn never_fails(why: String) -> Failure {
+fn unexpected_error(why: String) -> Failure {
     (Check::NeverFails, why)
 }
 

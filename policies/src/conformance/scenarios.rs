@@ -18,14 +18,14 @@ pub(super) struct Scenario {
 /// Maximum number of events of a run, which bounds the time of policies that are due at every step.
 const MOST_EVENTS: usize = 400;
 /// Maximum number of events of a run with models of [`MANY`] rows.
-const MOST_EVENTS_OF_MANY: usize = 40;
+const MAX_EVENTS_OF_LARGE_MODEL: usize = 40;
 /// Rows of a large model, in which a small fraction is still several rows.
 const MANY: usize = 5_000;
 
 impl Scenario {
     /// Maximum number of events that are run.
     pub(super) fn most_events(&self) -> usize {
-        if self.scene.initial_rows >= MANY { MOST_EVENTS_OF_MANY } else { MOST_EVENTS }
+        if self.scene.initial_rows >= MANY { MAX_EVENTS_OF_LARGE_MODEL } else { MOST_EVENTS }
     }
 
     /// The budget of the plan for a model of `rows` rows.

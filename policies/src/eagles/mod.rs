@@ -21,7 +21,7 @@
 //! `governor`).
 //!
 //! **Pruning.** A Gaussian's influence is the sum of its blend weights α·T over all pixels of the views
-//! trained on since the last prune, or since it was created. Every `prune_every` steps before `prune_until`
+//! trained on since the last prune, or since it was created. Every `prune_every` steps before `prune_until`, those
 //! Gaussians are pruned whose influence is at most the `prune_share` quantile, interpolated linearly as numpy
 //! and PyTorch do. Gaussians that grow in the same step are kept.
 //!
@@ -31,7 +31,8 @@
 //! ## Under a budget
 //!
 //! The budget bounds growth and is never exceeded. Until `grow_until`, new Gaussians take the place of pruned
-//! ones. Later prunes, two with the defaults, keep 1 − `prune_share` of the model each, together 72 %.
+//! ones. Each later prune (there are two with the defaults) keeps the share 1 − `prune_share` of the model; together
+//! they keep 72 %.
 //!
 //! ## Differences from the published code
 //!

@@ -28,7 +28,7 @@
 //! prunes Gaussians below `min_opacity`; at the last nothing would take their place, so it prunes only with
 //! `prune_last`. `recover` steps after each of the first `recoveries` opacity resets, a recovery prune also
 //! removes the share `recovery_share` of the remaining Gaussians, those with the lowest opacity: a Gaussian
-//! that has not recovered is not needed. Before all growth, at step `first_prune_at`, Gaussians below
+//! that has not recovered is not needed. Before growth starts, at step `first_prune_at`, Gaussians below
 //! `first_prune_opacity` are pruned.
 //!
 //! **Opacity resets** limit opacities to `reset_opacity` every `reset_every` steps, `resets` times in
@@ -40,7 +40,8 @@
 //!
 //! ## Differences from the published code
 //!
-//! - **`sums`.** The published 5 and 20 give 1,500 + 375 optimiser steps in the second half of 30,000
+//! - **`sums`.** The published values of `sum` and `sum_more`, 5 and 20, give 1,500 + 375 optimiser steps in the second
+//!   half of 30,000
 //!   iterations, but 350 + 88 in a run of 7,000. By default (`"scaled"`) both are multiplied by
 //!   iterations / 30,000 and rounded, at least 1, so that a short run has about as many optimiser steps if
 //!   it has enough iterations; 7,000 gives 1 and 5. `"fixed"` uses the same values in a run of any length.
@@ -333,7 +334,8 @@ impl Igs {
         if self.is_first_prune(now.step) {
             plan.cause("first-prune");
         }
-        // The opacity after the splits, that of each child for split rows; NaN if pruned before them.
+        // The opacity of each row after the splits (for split rows, of each child); NaN for rows pruned before the
+        // splits.
         let is_pruned = |&opacity: &f32| limits.exceeded(opacity, 0.0);
         let mut after: Vec<f32> =
             opacity.iter().map(|o| if is_pruned(o) { f32::NAN } else { *o }).collect();
@@ -359,8 +361,9 @@ impl Igs {
     }
 }
 
-/// The smallest value that is not below the interpolated `share` quantile. Equal values are either all below
-/// it or all not.
+/// The smallest value that is not below the interpolated `share` quantile. Equal values are never separated: all of
+/// them are below
+/// the limit, or none.
 fn limit_of_share(mut values: Vec<f32>, share: f64) -> f32 {
     if values.is_empty() {
         return 0.0;

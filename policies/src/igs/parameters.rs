@@ -49,9 +49,9 @@ pub struct IgsParams {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Sums {
-    /// They are proportional to the run's length, so that the number of optimiser steps stays the same.
+    /// Scaled with the run's length, so that the number of optimiser steps stays the same.
     Scaled,
-    /// None.
+    /// Used as given in a run of any length.
     Fixed,
 }
 

@@ -60,7 +60,7 @@ fn volume_counts_by_its_tenth_root() {
     // Volumes 1 and 1024: factors 1 and 1024^0.1 = 2. Pixels · ½ · factor: 5, 4.5·2 = 9, 4, 2.5·2 = 5.
     let mut event = event(16_000, 4).with(Signal::ScaleProduct, &[1.0, 1024.0, 1.0, 1024.0]);
     event.views = vec![view(&[10.0, 9.0, 8.0, 4.9], &[0.0; 4])];
-    // 4, 4.9, 5, 9.
+    // In ascending order: 4, 4.9, 5, 9.
     let pruned = |set: &str| run(&event, set).pruned;
     assert_eq!(pruned("first_share = 0.25"), [2]);
     assert_eq!(pruned("first_share = 0.5"), [2, 3]);
@@ -85,7 +85,7 @@ fn significance(event: &Event, set: &str, pixels: &[f32]) -> Vec<f32> {
 #[test]
 fn the_largest_tenth_of_volumes_is_clipped() {
     // Two of twenty volumes are larger than V90 = 32^10 and are clipped: factors 1, 32, 32 and 32
-    // instead of 1, 32, 64 and 128. Pixels 2 · ½ = 1.
+    // instead of 1, 32, 64 and 128. The factor pixels · opacity is 2 · ½ = 1.
     let mut volume = [1.0; 20];
     volume[7] = 32_f32.powi(10);
     volume[8] = 64_f32.powi(10);
@@ -133,7 +133,7 @@ fn prunes_come_after_growth_and_scale_with_the_run() {
     };
     assert_eq!(due("", REFERENCE_ITERATIONS), [16_000, 24_000]);
     assert_eq!(due("schedule = \"once\"", REFERENCE_ITERATIONS), [20_000]);
-    // 7,000/30,000 of them: 3733.3 and 5600; 4666.7.
+    // Steps scale by 7,000/30,000: to 3733.3 and 5600; with `once` to 4666.7.
     assert_eq!(due("", 7000), [3733, 5600]);
     assert_eq!(due("schedule = \"once\"", 7000), [4667]);
     assert_eq!(due("first_share = 0.0", REFERENCE_ITERATIONS), [24_000]);

@@ -14,7 +14,7 @@
 //! 1. Gaussians with an opacity of at most `min_opacity` are dead. Each is replaced by a copy of a
 //!    living Gaussian, drawn with replacement in proportion to opacity.
 //! 2. The model grows by the factor 1 + `growth`, up to the budget, by further copies drawn in the same
-//!    way. An event that stands for n published ones grows by (1 + `growth`)ⁿ; n is 1 in a run of 30,000
+//!    way. An event that replaces n events of the published code grows by (1 + `growth`)ⁿ; n is 1 in a run of 30,000
 //!    with the default `grow_every`.
 //!
 //! A Gaussian drawn n times becomes N = n + 1 equal ones that together render like the original. Each

@@ -103,9 +103,10 @@ fn an_event_of_a_short_run_stands_for_several_published_ones() {
             .ops
             .rows_after
     };
-    // 100 steps of 30,000; of 15,000 two events, 1.1025; of 2,000 fifteen, 1.05¹⁵ = 2.0789.
+    // An event stands for one published event in a run of 30,000, two (1.05² = 1.1025) in 15,000, and fifteen (1.05¹⁵ =
+    // 2.0789) in 2,000.
     assert_eq!([after(30_000, ""), after(15_000, ""), after(2000, "")], [105, 110, 207]);
-    // Intervals grow with longer runs (100 becomes 200), and the growth stays.
+    // In longer runs the interval increases (100 becomes 200), and the growth per event stays the same.
     assert_eq!(after(60_000, ""), 105);
     // Half the interval halves the exponent: √1.21 = 1.1. Twice the interval squares the factor.
     assert_eq!(after(30_000, "growth = 0.21\ngrow_every = 50"), 110);
@@ -172,7 +173,7 @@ fn opaque_rows_are_drawn_more_often() {
 }
 
 #[test]
-fn many_copies_count_as_most_shares() {
+fn the_formulas_use_at_most_most_shares_copies() {
     let mut opacity = [0.001; 80];
     opacity[7] = 0.5;
     let family = run(&event(&opacity, 80), "").offspring()[0];
@@ -190,7 +191,7 @@ fn nothing_happens_if_no_row_is_alive() {
 }
 
 #[test]
-fn terms_and_noise_are_declared_in_the_unit_of_the_cameras() {
+fn terms_and_noise_are_scaled_by_the_camera_radius() {
     let scene = Event::new(1, 1, 1).scene;
     let close = |a: f32, b: f32| (a / b - 1.0).abs() < 1e-5;
     for extent in [1.1, 11.0] {

@@ -63,7 +63,7 @@ fn the_schedule_is_the_published_one() {
     let needs = policy.needs(&scene);
     assert_eq!(needs.rates.opacity, Some(Rate::constant(0.05)));
     assert!(needs.detailed_edits && needs.check() == Ok(()));
-    // 7,000/30,000 of them.
+    // Steps scale by 7,000/30,000.
     let short = SceneInfo { iterations: 7000, ..scene.clone() };
     assert_eq!(due_steps("mini-splatting", "grow_every = 0", &short), [1167, 2333, 3500, 4667]);
     // No opacity resets.
@@ -108,11 +108,11 @@ fn half_of_the_rows_with_an_importance_are_kept_and_restarted() {
     ];
     let done = run(&event, "");
     assert_eq!((done.pruned.as_slice(), done.ops.cause.as_str()), (&[1, 2, 3, 4][..], "sample"));
-    // Alone: 0.02 of the extent of 10.
+    // The only row that is kept has no neighbours; its size is 0.02 · the extent of 10.
     let restart = Update::restart(0.2, 0.1);
     assert_eq!(done.ops.updates, [(0, restart)]);
     assert_eq!((restart.opacity, restart.sh_degree), (OpacityRule::Set(0.1), Some(0)));
-    // All three: at 0, 2 and 3. Row 0: √((4 + 9)/2).
+    // All three rows are kept, at x = 0, 2 and 3. The size of row 0 is √((2² + 3²)/2).
     let all = run(&event, "sample_share = 1.0");
     assert_eq!(all.pruned, [1, 4]);
     let ScaleRule::Set(size) = all.ops.updates[0].1.scale else { panic!("{:?}", all.ops.updates) };

@@ -28,7 +28,7 @@ pub struct Needs {
     /// Gaussians near a camera have large screen gradients but appear in few other views; growing them
     /// mostly produces floaters that fit a single photograph (*Pixel-GS*, Zhang et al. 2024, section 3.3).
     pub full_depth: f32,
-    /// The sum of pixel errors that is [`Signal::ErrorScore`].
+    /// How pixel errors are summed into [`Signal::ErrorScore`].
     pub error_score: ErrorScore,
     /// Pixels to collect as candidates for new rows, if any.
     pub candidates: Option<CandidateRequest>,
@@ -63,12 +63,12 @@ impl Needs {
     ///
     /// # Errors
     /// When it is NaN, above 1 or below the declared one; the message has both.
-    pub fn check_resolution(&self, share: f64) -> Result<(), String> {
+    pub fn check_resolution(&self, factor: f64) -> Result<(), String> {
         let least = self.least_resolution.unwrap_or(1.0);
-        if (least..=1.0).contains(&share) {
+        if (least..=1.0).contains(&factor) {
             return Ok(());
         }
-        Err(format!("the resolution is {share}; it must be from {least}, as declared, to 1"))
+        Err(format!("the resolution is {factor}; it must be from {least}, as declared, to 1"))
     }
 
     /// Checks that every number is finite and in its range.
@@ -88,7 +88,7 @@ impl Needs {
                 }
             }
             None if self.signals.contains(Signal::Mask) => {
-                return Err("the signal Mask is declared, but no mask".to_owned());
+                return Err("the signal Mask is declared, but `mask` is not set".to_owned());
             }
             None => {}
         }

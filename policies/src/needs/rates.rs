@@ -21,7 +21,7 @@ impl Default for Cadence {
 }
 
 impl Cadence {
-    /// True where the optimiser steps after iteration `step`: for `[all other parameters, the
+    /// True if an optimiser step follows iteration `step`: for `[all other parameters, the
     /// spherical-harmonic coefficients of bands 1–3]`.
     pub fn steps_at(self, step: u32) -> [bool; 2] {
         let all = self.all.max(1);

@@ -263,7 +263,9 @@ impl RowOps {
         })?;
         let expected = rows_before.checked_sub(counts.removed).map(|kept| kept + added);
         require(expected == Some(*rows_after) && counts.added == added, || {
-            format!("{rows_before} rows, {counts:?}, {added} added: not {rows_after} rows after")
+            format!(
+                "{rows_before} rows before, {counts:?}, {added} added; this does not give {rows_after} rows after"
+            )
         })?;
         let is_child = |family: &&Family| family.fate == ParentFate::BecomesChild;
         let updated = self.updates.len() + self.families.iter().filter(is_child).count();
@@ -307,7 +309,7 @@ impl RowOps {
                 format!("move from row {from}, not in the tail {rows_after}..{rows_before}")
             })?;
             require((self.first_row..*rows_after).contains(&(to as usize)), || {
-                format!("move to row {to} of {}..{rows_after}", self.first_row)
+                format!("move to row {to}, which is not in {}..{rows_after}", self.first_row)
             })?;
             moved.claim("moved row", from)?;
             claimed.claim("hole", to)?;
@@ -322,21 +324,25 @@ impl RowOps {
         let new_slots = self.child_slots.iter().chain(seeds);
         let on_top = new_slots.filter(|&&slot| slot as usize >= *rows_before).count();
         require(on_top == rows_after.saturating_sub(*rows_before), || {
-            format!("{on_top} rows added on top of {rows_before}, {rows_after} rows after")
+            format!(
+                "{on_top} rows added beyond row {rows_before}, which does not give {rows_after} rows after"
+            )
         })
     }
 
     fn check_live(&self, role: &str, row: u32) -> Result<(), BrokenOps> {
         let Self { first_row, rows_before, .. } = self;
         require((*first_row..*rows_before).contains(&(row as usize)), || {
-            format!("{role} {row}, rows {first_row}..{rows_before}")
+            format!("{role} {row} is not in rows {first_row}..{rows_before}")
         })
     }
 
     fn check_new_slot(&self, role: &str, slot: u32) -> Result<(), BrokenOps> {
         let Self { first_row, rows_after, budget, .. } = self;
         require((*first_row..*rows_after.min(budget)).contains(&(slot as usize)), || {
-            format!("{role} in slot {slot}, rows {first_row}..{rows_after} after, budget {budget}")
+            format!(
+                "{role} in slot {slot}, which is not in {first_row}..{rows_after} or is beyond the budget {budget}"
+            )
         })
     }
 }

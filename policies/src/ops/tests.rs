@@ -67,25 +67,25 @@ fn every_corruption_is_found() {
         ("a shape that is not listed", |ops| {
             ops.families[0].shape = Shape::Listed(0);
         }),
-        ("children elsewhere", |ops| ops.families[0].first_child = 1),
+        ("first child slot is wrong", |ops| ops.families[0].first_child = 1),
         ("a child without a slot", |ops| {
             ops.families[0].children = 2;
         }),
-        ("child upon parent", |ops| ops.child_slots[0] = 9),
-        ("child upon seed", |ops| ops.child_slots[0] = 2),
+        ("child in the parent's slot", |ops| ops.child_slots[0] = 9),
+        ("child in a seed's slot", |ops| ops.child_slots[0] = 2),
         ("child beyond the model", |ops| ops.child_slots[0] = 8),
         ("updated row does not exist", |ops| ops.updates[0].0 = 12),
         ("updated row not moved", |ops| ops.updates[0].0 = 8),
         ("bad update", |ops| {
             ops.updates[0].1.opacity = OpacityRule::Set(0.0);
         }),
-        ("seed upon child", |ops| ops.seeds[0].0 = 1),
-        ("seed upon a moved row", |ops| ops.seeds[0].0 = 3),
+        ("seed in a child's slot", |ops| ops.seeds[0].0 = 1),
+        ("seed in the slot of a moved row", |ops| ops.seeds[0].0 = 3),
         ("bad seed", |ops| ops.seeds[0].1.scales[1] = f32::NAN),
         ("move out of the middle", |ops| ops.moves[0].0 = 4),
         ("move of nothing", |ops| ops.moves[0].0 = 10),
         ("move twice", |ops| ops.moves[0].0 = 9),
-        ("move upon child", |ops| ops.moves[0].1 = 1),
+        ("move to a child's slot", |ops| ops.moves[0].1 = 1),
         ("move beyond the model", |ops| ops.moves[0].1 = 8),
         ("move missing", |ops| ops.moves.truncate(1)),
     ];
@@ -130,7 +130,7 @@ fn frozen_rows_are_out_of_reach() {
 }
 
 #[test]
-fn a_hole_left_on_top_is_found() {
+fn an_empty_slot_at_the_end_is_found() {
     let mut plan = EditPlan::new(3, 5);
     plan.prune(0).unwrap();
     plan.append(SEED).unwrap();

@@ -91,7 +91,7 @@ fn more_children_than_slots_are_refused() {
 }
 
 #[test]
-fn the_lowest_bound_and_every_cause_hold() {
+fn the_lowest_opacity_limit_applies_and_causes_are_joined() {
     let mut plan = EditPlan::new(1, 1);
     plan.clamp_opacity(0.01).unwrap();
     plan.clamp_opacity(0.5).unwrap();

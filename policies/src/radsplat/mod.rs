@@ -26,7 +26,8 @@
 //! ## Under a budget
 //!
 //! The budget bounds growth and is never exceeded. Nothing grows after the prunes, so a run ends below
-//! the budget, by an amount that depends on the scene; compare by final number, too. With a budget of 8,000
+//! the budget, by an amount that depends on the scene; when comparing policies, also compare at equal final numbers.
+//! With a budget of 8,000
 //! and 2,000 steps at half size, the defaults kept 97 % of the grown model on room256 and 87 % on cup, the
 //! light variant 34 % and 11 %.
 //!
@@ -62,7 +63,7 @@
 //! | second_at | 24000 | >= 0 | step | second prune; 0: none |
 //! | min_weight | 0.01 | 0 to 1 | | Gaussians whose largest blend weight is below this are pruned |
 //! | victims | "lowest" | lowest, random | | which Gaussians are pruned |
-//! | random_keep | 0 | >= 0 | Gaussians | number after the second prune of `random`; 0: as by `min_weight` |
+//! | random_keep | 0 | >= 0 | Gaussians | Gaussians that `random` keeps at the second prune; 0: prunes as many as `min_weight` would |
 //!
 //! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
 //! (`…_every`) do not shrink below 100 steps.

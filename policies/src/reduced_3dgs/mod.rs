@@ -38,7 +38,8 @@
 //! The budget bounds growth and is never exceeded. Until `grow_until`, new Gaussians take the place of pruned
 //! ones. Nothing grows after that, so a run ends below the budget: with the defaults each prune removes at
 //! least the faintest 3 %, as long as these are below `faint_opacity`. With a budget of 8,000, runs of 7,000
-//! steps at half size ended at 24 to 34 % of it (six scenes). Compare by final number, too.
+//! steps at half size ended at 24 to 34 % of it (six scenes). When comparing policies, also compare at equal final
+//! numbers.
 //!
 //! ## Differences from the published code
 //!
@@ -47,7 +48,7 @@
 //!   published codebook for the finished model is not part of density control.
 //! - The paper does not define the extent of an ellipsoid. Three standard deviations is where a rasteriser
 //!   stops drawing it.
-//! - The smallest pixel is that of the views since the last prune, a few epochs, not of all views. A
+//! - The smallest pixel width is taken over the views since the last prune (a few epochs), not over all views. A
 //!   Gaussian that was visible in none of them has no sphere.
 //! - Redundancy is measured before the growth of the same step, and Gaussians that grow are not pruned.
 //! - The last Gaussian is never pruned.
@@ -75,8 +76,8 @@
 //! | prune_until | 30000 | >= 0 | step | end of pruning (inclusive) |
 //! | neighbours | 30 | 1 to 1000 | Gaussians | nearest neighbours that are tested |
 //! | sigmas | 3.0 | > 0 | standard deviations | half-axes of an ellipsoid |
-//! | deviations | 1.0 | >= 0 | standard deviations | how far above the mean R is for a redundant Gaussian |
-//! | min_redundancy | 3.0 | >= 0 | Gaussians | R of a redundant Gaussian is above this |
+//! | deviations | 1.0 | >= 0 | standard deviations | a Gaussian is redundant only if R is this far above the mean |
+//! | min_redundancy | 3.0 | >= 0 | Gaussians | a Gaussian is redundant only if R is above this |
 //! | faint_share | 0.03 | 0 to 1 | Gaussians | Gaussians below this quantile of opacity … |
 //! | faint_opacity | 0.05 | 0 to 1 | | … and below this opacity are pruned; 0: none |
 //! | opacity_term | 0.001 | >= 0 | loss | coefficient of the mean opacity |
@@ -113,7 +114,7 @@ crate::register_policy!(
 );
 
 /// Smallest alpha that is rendered.
-const INVISIBLE: f32 = 1.0 / 255.0;
+const MIN_RENDERED_ALPHA: f32 = 1.0 / 255.0;
 
 /// Growth as in `vanilla`, with pruning of redundant and faint rows.
 #[derive(Debug)]
@@ -202,7 +203,7 @@ impl Reduced {
         let faint = quantile(opacity, self.params.faint_share)
             .map_or(0.0, |limit| limit.min(self.params.faint_opacity) as f32);
         let is_after_growth = now.step >= self.params.growth.grow_until;
-        let invisible = if is_after_growth { INVISIBLE } else { 0.0 };
+        let invisible = if is_after_growth { MIN_RENDERED_ALPHA } else { 0.0 };
         let is_faint = |opacity: f32| opacity < faint.max(invisible);
         victims.extend((0..).zip(opacity).filter(|(_, o)| is_faint(**o)).map(|(row, _)| row));
         Ok(victims)

@@ -4,7 +4,7 @@
 //! the shared step counter of other implementations it would have 3.2 times that length
 //! (√((1 − β₁)²/(1 − β₂))).
 //!
-//! After the step parameters are confined to a range in which the renderer's arithmetic is safe: unit
+//! After the step, parameters are confined to a range in which the renderer's arithmetic is safe: unit
 //! quaternions, and opacities and scales beyond which nothing visible changes.
 
 use std::ops::Range;

@@ -3,13 +3,13 @@
 //!
 //! Numerics. With V = J·W·R·S (2×3, rows v₀ and v₁) the projected covariance is Σ = V·Vᵀ + 0.3·I.
 //! - Its determinant comes from the Lagrange identity |v₀ × v₁|² + 0.3(|v₀|² + |v₁|²) + 0.09: all
-//!   terms positive, where a·c − b² loses everything from 1,000:1 needles on.
+//!   terms are positive, whereas a·c − b² loses all precision for needles with an aspect ratio above 1,000:1.
 //! - Its inverse is kept as the Cholesky factor L, Σ⁻¹ = L·Lᵀ: with (u, z) = Lᵀ·d the exponent is
 //!   −½(u² + z²), never positive. L = [[l₁, 0], `[−l₁·r, l₃]`], l₁ = √(c/det), r = b/c, l₃ = 1/√c.
 //!   Inside a splat's footprint the error of u does not depend on which axis is eliminated; the
 //!   choice here makes z constant along an image row.
 //!
-//! The file is one piece because the backward pass needs what the forward pass computes on its way.
+//! The file is not split because the backward pass reuses intermediate results of the forward pass.
 
 use bytemuck::{Pod, Zeroable};
 use pulp::{Simd, WithSimd};
@@ -28,7 +28,8 @@ pub(super) const BLUR: f32 = 0.3;
 /// Margin around the image, as a fraction of its size, beyond which the direction used in J is clamped:
 /// 0.15 = 0.3/2 (the original clamps at 1.3 tan(fov/2)).
 const FOV_MARGIN: f64 = 0.15;
-/// Rows with a larger colour are broken and not drawn: added to a pixel, it would cancel all bits of the others.
+/// Rows with a larger colour are broken and are not drawn: added to a pixel, such a colour would leave no bits of
+/// precision for the other rows.
 const COLOUR_MAX: f32 = 1e6;
 /// √(½·log₂ e): folded into the conic so that exp(−p) becomes 2^(−u² − z²).
 pub(crate) const FOLD: f32 = 0.849_321_8;
@@ -274,7 +275,7 @@ fn below<S: Simd>(x: V<S>, most: f32) -> Mask<S> {
     x.abs().le(V::splat_like(x, most))
 }
 
-/// Returns whether a splat reaches any pixel centre, from ½ to size − ½. False for NaN, so that rows with NaN are not
+/// True if a splat reaches any pixel centre (½ to size − ½). False for NaN, so that rows with NaN are not
 /// drawn.
 #[inline(always)]
 fn reaches<S: Simd>(s: S, centre: V<S>, half: V<S>, size: u32) -> Mask<S> {
@@ -293,7 +294,7 @@ pub(super) struct Project<'a> {
     pub(super) rows: usize,
     /// Shape: `[rows]`.
     pub(super) splats: &'a mut [Splat],
-    /// Bit per lane of each block: on screen. Shape: `[blocks]`.
+    /// One bit per lane of each block, set if the row is on screen. Shape: `[blocks]`.
     pub(super) seen: &'a mut [u16],
 }
 

@@ -216,7 +216,7 @@ pub(super) fn rebound() -> HashMap<&'static str, Vec<Vec<Rebinding>>> {
 /// One launch of a kernel for each array that edits change.
 fn row_launches<L>(kernel: &str, bind: Bind<'_, L>, sizes: &Sizes) -> Vec<RowLaunch<L>> {
     let launch = |array: &RowArray| {
-        let [first_row, rows] = sizes.places(array);
+        let [first_row, rows] = sizes.row_range(array);
         RowLaunch {
             launch: bind(kernel, &[("buffer", array.name)]),
             edited: array.content.traits().edited,
@@ -238,7 +238,7 @@ fn audits<L>(bind: Bind<'_, L>, sizes: &Sizes) -> Vec<Audit<L>> {
         let first = array.parameters.start as u32;
         Some(Audit {
             launch: bind("audit", &[("marks", "sums"), ("numbers", array.name)]),
-            first_row: sizes.places(array)[0] as u32,
+            first_row: sizes.row_range(array)[0] as u32,
             numbers: array.numbers as u32,
             mark: match array.content.traits().audited? {
                 NumberKind::Parameter => first,

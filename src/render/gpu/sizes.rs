@@ -36,9 +36,9 @@ pub(super) struct Sizes {
     pub(super) planes: usize,
     /// Layout of the records and their sums.
     pub(super) records: RecordLayout,
-    /// Accumulation of gradients; only slots need records.
+    /// How gradients are accumulated; only [`Accumulation::Slots`] needs records.
     pub(super) accumulation: Accumulation,
-    /// Gradients of alpha and depth too.
+    /// True if gradients of alpha and depth are computed too.
     pub(super) alpha_and_depth: bool,
     pub(super) cadence: Cadence,
     /// Count the pixels that each row dominates.
@@ -47,7 +47,7 @@ pub(super) struct Sizes {
     pub(super) with_masks: bool,
     /// The loss writes the error per pixel.
     with_error: bool,
-    /// Pixels weigh more at edges.
+    /// True if pixels at edges have more weight.
     pub(super) with_edges: bool,
     /// Photographs have exposures.
     pub(super) exposures: bool,
@@ -93,7 +93,8 @@ impl Sizes {
         }
     }
 
-    /// True if gradients may wait for an optimiser step: those of the geometry and band 0, and those of bands 1–3.
+    /// True if gradients may be summed over several iterations before an optimiser step: `[geometry and band 0, bands
+    /// 1–3]`.
     pub(super) fn may_wait(&self) -> [bool; 2] {
         let Cadence { all, sh_rest } = self.cadence;
         [all > 1, all > 1 || sh_rest > 1]
@@ -105,7 +106,7 @@ impl Sizes {
     }
 
     /// First row that is stored in an array, and the largest number of stored rows.
-    pub(super) fn places(&self, array: &RowArray) -> [u64; 2] {
+    pub(super) fn row_range(&self, array: &RowArray) -> [u64; 2] {
         if array.content.traits().is_for_training {
             [self.budget.frozen as u64, self.trained()]
         } else {
@@ -138,7 +139,7 @@ impl Sizes {
         let cap = self.cap;
         for array in self.row_arrays() {
             let traits = array.content.traits();
-            let [_, rows] = self.places(&array);
+            let [_, rows] = self.row_range(&array);
             add(traits.section, traits.line, array.name, rows * array.row_bytes());
         }
         add(Section::Model, Content::Ages.traits().line, "bias", BiasCorrection::bytes());

@@ -93,7 +93,7 @@ impl GpuBackend {
             let start = plane as u64 * self.sizes.trained() + first;
             self.write_at("signals", 4 * start, &values[missing..]);
         } else if let Some(array) = self.saved_array(&name) {
-            let [first_row, _] = self.sizes.places(&array);
+            let [first_row, _] = self.sizes.row_range(&array);
             let (first, missing) = stored_rows(first_row, &rows);
             let at = array.row_bytes() * first;
             if array.content == Content::Ages {

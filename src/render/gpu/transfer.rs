@@ -139,7 +139,7 @@ impl GpuBackend {
         array: &RowArray,
         rows: Range<usize>,
     ) -> Result<Vec<f32>, BackendError> {
-        let (first, missing) = stored_rows(self.sizes.places(array)[0], &rows);
+        let (first, missing) = stored_rows(self.sizes.row_range(array)[0], &rows);
         let (bytes, count) = (array.row_bytes(), rows.len() - missing);
         let mut values = vec![0.0; array.numbers * missing];
         values.extend(self.read(array.name, bytes * first, bytes * count as u64)?);

@@ -1,5 +1,5 @@
 //! The session of a run: the loop around the trainer with its progress, logs, saved models, measurements and checkpoints.
-//! One piece, as all of it happens between two steps, in an order that matters.
+//! The file is not split because all of this happens between two steps, and the order matters.
 
 mod first_model;
 mod geometry;
@@ -44,7 +44,7 @@ const RECORD_EVERY: u32 = 10;
 /// A run in progress.
 struct Session<'a> {
     run: Run,
-    /// The configuration as checkpoints have it.
+    /// The configuration in the form in which checkpoints store it.
     config: toml::Table,
     observer: &'a dyn Observer,
     /// The folder that files are written to.
@@ -62,7 +62,7 @@ struct Session<'a> {
 pub enum Occupied {
     /// Keep it, and refuse the new run.
     Refuse,
-    /// Replace it by the new run once that is complete.
+    /// Replace it with the new run once the new run is complete.
     Replace,
     /// Go on with it.
     Resume,
@@ -70,7 +70,7 @@ pub enum Occupied {
 
 /// Trains to the end and writes all files of the run; returns the folder.
 fn train(run: Run, occupied: Occupied, observer: &dyn Observer) -> Result<PathBuf, Failure> {
-    // Nothing of a run that goes on is removed, even if it is only the description.
+    // Nothing is removed from a run that is being resumed, even if it consists only of its configuration file.
     let has_begun = run.session.is_some() || run.output.join(CONFIG_FILE).exists();
     let resumes = occupied == Occupied::Resume && has_begun;
     let folder = match occupied {
@@ -104,14 +104,14 @@ fn train(run: Run, occupied: Occupied, observer: &dyn Observer) -> Result<PathBu
         }
         // Another run may have taken the folder.
         Err(failure) if guard.check().is_err() => Err(failure),
-        // Such as a photograph that cannot be decoded, before anything worth keeping was learned.
+        // For example, a photograph cannot be decoded and the run has not yet saved anything worth keeping.
         Err(failure) if failure.code == INPUT && !resumes && has_nothing(&folder.path()) => {
-            // The lock goes with its last holder, and then the folder can be removed.
+            // Dropping the last guard releases the lock; only then can the folder be removed.
             drop((session, guard));
             folder.discard();
             Err(failure)
         }
-        // The cause is reported first; another error of writing would add nothing.
+        // `failure` is the cause; a further error while writing the summary would add nothing.
         Err(failure) => {
             let _ = session.write_summary(false);
             let scene = session.run.spec.start.scene.clone().unwrap_or_default();
@@ -170,8 +170,9 @@ impl<'a> Session<'a> {
         let done = self.run.trainer.steps_done();
         let (last, budget) = (self.run.last, self.run.config.budget);
         if done > 0 {
-            // A run may have been stopped before its last step was saved, measured and kept.
-            self.after(done, true)?;
+            // A run may have been stopped after its last step, before the model was saved and measured and the
+            // checkpoint written.
+            self.save_and_measure_if_due(done, true)?;
         }
         self.observer.begin(done, last, budget);
         let stepped = (done + 1..=last).try_for_each(|step| {
@@ -181,7 +182,7 @@ impl<'a> Session<'a> {
             }
             let report = self.step()?;
             self.observer.step(step, report.output.loss, report.rows);
-            self.after(step, false)
+            self.save_and_measure_if_due(step, false)
         });
         self.observer.end();
         stepped.and_then(|()| self.check_drawn())
@@ -191,7 +192,7 @@ impl<'a> Session<'a> {
     fn consult_observer(&mut self) {
         loop {
             let (model, rows) = self.run.trainer.backend_and_history();
-            match self.observer.between(model, rows) {
+            match self.observer.between_steps(model, rows) {
                 Between::Checkpoint => self.try_checkpoint(),
                 Between::Step => return,
             }
@@ -206,10 +207,10 @@ impl<'a> Session<'a> {
             tracing::error!(step, "the checkpoint could not be written, training goes on: {error}");
             format!("the checkpoint of step {step} could not be written: {error}")
         });
-        self.observer.kept(step, trouble.as_deref());
+        self.observer.checkpoint_written(step, trouble.as_deref());
     }
 
-    /// Fails if the model draws nothing in most of the last views, which is no result.
+    /// Fails if most of the last views were rendered empty, because such a model is useless.
     fn check_drawn(&self) -> Result<(), Failure> {
         let drawn = &self.totals.drawn;
         let (views, empty) = (drawn.len(), drawn.iter().filter(|drawn| !**drawn).count());
@@ -221,7 +222,7 @@ impl<'a> Session<'a> {
 
     /// Saves and measures the model and writes a checkpoint if they are due after `step`; in a resumed run, only those
     /// that do not exist yet.
-    fn after(&mut self, step: u32, resumed: bool) -> Result<(), Failure> {
+    fn save_and_measure_if_due(&mut self, step: u32, resumed: bool) -> Result<(), Failure> {
         let (output, is_last) = (&self.run.spec.output, step == self.run.last);
         let every = output.checkpoint_every;
         let due = every > 0 && (step.is_multiple_of(every) || is_last);
@@ -304,7 +305,8 @@ impl<'a> Session<'a> {
                 Err(Failure::from(error).with(TrainingProblem::ModelSaved { saved }))
             }
             Err(error @ TrainError::NonFinite { .. }) => Err(self.with_checkpoint(error.into())),
-            // The photograph could be read before. In the first epoch little is lost.
+            // This photograph was readable earlier, so the run is worth saving. In the first epoch little would be
+            // lost.
             Err(error @ TrainError::View { step, .. })
                 if step > self.run.trainer.steps_done() && step as usize > train_views =>
             {

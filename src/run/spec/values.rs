@@ -10,11 +10,11 @@ use toml::{Table, Value};
 use densify_core::gaussians::MAX_SH_DEGREE;
 use densify_core::numbers;
 
-/// A number of rows, at least 1: `200000`, `28k`, `1.5M`; in a file also a plain number.
+/// A number of rows, at least 1: `200000`, `28k`, `1.5M`. Files may also contain a plain number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 pub struct Rows(pub usize);
 
-/// A number of bytes: `512MiB`, `800MB`, `1000000`; in a file also a plain number.
+/// A number of bytes: `512MiB`, `800MB`, `1000000`. Files may also contain a plain number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 pub struct ByteCount(pub u64);
 
@@ -23,7 +23,7 @@ pub struct ByteCount(pub u64);
 pub enum ImageCache {
     /// This number of bytes.
     Bytes(u64),
-    /// An eighth of the memory of the run, and the rest of `--memory`.
+    /// An eighth of the run's memory, plus the part of `--memory` that is left over.
     Auto,
 }
 
@@ -77,7 +77,7 @@ impl Budget {
 pub enum ShDegree {
     /// A number, 0 to 3.
     Fixed(u8),
-    /// As the scene requires; once decided, with the degree (`auto:2`).
+    /// Chosen for the scene; `auto:2` records the degree once it has been chosen.
     Auto(Option<u8>),
 }
 
@@ -202,7 +202,7 @@ impl FromStr for AbsolutePath {
             return Err("give a file".to_owned());
         }
         let path = std::path::absolute(text);
-        path.map(Self).map_err(|error| format!("`{text}` is no path: {error}"))
+        path.map(Self).map_err(|error| format!("`{text}` is not a path: {error}"))
     }
 }
 
@@ -301,7 +301,7 @@ impl FromStr for Assignment {
     }
 }
 
-/// Assignments as a table, as files have them.
+/// Converts assignments to a table, the form that they have in files.
 ///
 /// # Errors
 /// When a name is assigned two values, or is a value and a table at once.

@@ -64,13 +64,13 @@ fn kind(quantity: &str) -> &str {
         | "sum_weight"
         | "pixel_count"
         | "rows blended but not visible" => "row statistics",
-        other if other.starts_with(BROKEN) => BROKEN,
+        other if other.starts_with(NOT_FINITE) => NOT_FINITE,
         other => other,
     }
 }
 
-/// Beginning of the name of every quantity that counts numbers which are not finite.
-const BROKEN: &str = "NaN or infinity";
+/// Prefix of the names of quantities that count NaN and infinite values.
+const NOT_FINITE: &str = "NaN or infinity";
 
 /// The worst finding of each kind, in the order in which kinds first appear; then the failures without a figure.
 pub(super) fn worst(case: u8, table: &Table) -> Vec<Finding> {

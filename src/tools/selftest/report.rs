@@ -38,7 +38,7 @@ const HEAD: &str = "\
 Written by `densify selftest --markdown FILE`; `--all` includes every backend. The tables show the worst
 figure of each kind in each case, beside its tolerance. Images and gradients are compared with those of a
 float64 renderer: images except where a threshold of the renderer is close, gradients relative to the largest
-of their class. Other figures count what must never happen. `tests/it/extremes.rs` has the same case numbers.
+of their class. Other figures count errors that must never occur. `tests/it/extremes.rs` has the same case numbers.
 ";
 
 /// A Markdown file with a section for each backend and a table of its findings.

@@ -211,9 +211,9 @@ impl Observer for LiveObserver<'_> {
         self.observer.tested(step, mean);
     }
 
-    fn kept(&self, step: u32, trouble: Option<&str>) {
+    fn checkpoint_written(&self, step: u32, trouble: Option<&str>) {
         self.run_status.record_checkpoint(step, trouble);
-        self.observer.kept(step, trouble);
+        self.observer.checkpoint_written(step, trouble);
     }
 
     fn end(&self) {
@@ -221,7 +221,7 @@ impl Observer for LiveObserver<'_> {
         self.observer.end();
     }
 
-    fn between(&self, model: &mut dyn Backend, rows: Option<&RowHistory>) -> Between {
+    fn between_steps(&self, model: &mut dyn Backend, rows: Option<&RowHistory>) -> Between {
         self.render_next(model, rows, Duration::ZERO);
         loop {
             match self.run_status.next_action() {
@@ -276,7 +276,7 @@ mod tests {
                 queue.close();
                 is_paused
             });
-            assert_eq!(live.between(&mut *backend, None), Between::Step);
+            assert_eq!(live.between_steps(&mut *backend, None), Between::Step);
             assert!(queue.is_closed() && waits.join().expect("it ends"), "the run was not paused");
         });
     }

@@ -40,7 +40,7 @@ pub enum MetricError {
 /// Reason why a model cannot be evaluated.
 #[derive(Debug, thiserror::Error)]
 pub enum EvaluateError {
-    /// A view's pixels or known surface cannot be read, or not be compared with the rendering.
+    /// A view's pixels or known surface cannot be read, or cannot be compared with the rendering.
     #[error("view `{view}`: {source}")]
     View {
         /// The view's name.

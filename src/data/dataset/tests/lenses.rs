@@ -60,7 +60,7 @@ fn nerfstudio_and_colmap_lenses_agree() {
 }
 
 #[test]
-fn views_of_one_photograph_share_it_and_its_split() {
+fn views_of_one_photograph_share_its_file_and_split() {
     // 191 by 115 degrees.
     let made = colmap("OPENCV_FISHEYE 20 12 6 6 10 6 0 0 0 0");
     let every = Split::Every(std::num::NonZeroU32::new(2).unwrap());
@@ -142,10 +142,10 @@ fn cropping_is_noted_and_can_be_avoided() {
     for (pixel, weight) in large.rgb.chunks_exact(3).zip(&mask) {
         assert!(*weight == 0 || pixel == [0, 100, 200], "{pixel:?} {weight}");
     }
-    // A ray that only the wider view shows.
+    // Cropping changes the field of view, but not the poses or the number of views.
     let [narrow, wide] = [&cropped, &kept].map(|data| data.train[0].camera.project(DVec3::ZERO).1);
     assert_eq!((narrow, cropped.train.len()), (wide, NAMES.len()));
-    // A distortion that folds over within the image is used up to there.
+    // If the distortion folds over within the image, the image is used up to the fold.
     let folding = colmap("RADIAL 20 12 15 10 6 -3 0");
     let kept = load_with(&folding, &LoadOptions { keep_fov: true, ..LoadOptions::default() });
     assert!(kept.notes.iter().any(|note| note.contains("beyond what")), "{:?}", kept.notes);

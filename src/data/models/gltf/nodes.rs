@@ -44,10 +44,10 @@ pub(super) fn placed_meshes(
     roots: Option<&[usize]>,
 ) -> Result<Vec<(usize, Similarity)>, LoadError> {
     let wrong = |problem: &str| LoadError::damaged(path, "nodes", problem);
-    let home = DMat4::from_quat(DQuat::from_array(HALF_TURN));
+    let to_our_frame = DMat4::from_quat(DQuat::from_array(HALF_TURN));
     let every: Vec<usize> = (0..nodes.len()).collect();
     let mut open: Vec<(usize, DMat4)> =
-        roots.unwrap_or(&every).iter().rev().map(|&node| (node, home)).collect();
+        roots.unwrap_or(&every).iter().rev().map(|&node| (node, to_our_frame)).collect();
     let (mut placed, mut seen) = (Vec::new(), vec![false; nodes.len()]);
     while let Some((index, parent)) = open.pop() {
         let node = nodes.get(index).ok_or_else(|| wrong("there is no such node"))?;
@@ -56,7 +56,8 @@ pub(super) fn placed_meshes(
         }
         let matrix = parent * node.matrix();
         if let Some(mesh) = node.mesh {
-            let problem = "a transform is more than a rotation, an even scale and a translation, which splats cannot follow";
+            let problem =
+                "a transform contains shear or an uneven scale, which cannot be applied to splats";
             let transform = Similarity::from_matrix(&matrix).ok_or_else(|| wrong(problem))?;
             placed.push((mesh, transform));
         }

@@ -13,7 +13,7 @@ pub mod project;
 use densify_core::camera::Camera;
 use densify_core::gaussians::{Gaussians, sh_coefficients};
 
-/// The constants at which renderers differ.
+/// The constants in which renderers differ.
 #[derive(Debug, Clone, Copy)]
 pub struct Rules {
     /// Near plane `[scene units]`: rows at smaller camera z are not rendered.
@@ -28,8 +28,8 @@ pub struct Rules {
 
 /// Added to the diagonal of the projected covariance `[px²]`.
 const BLUR: f64 = 0.3;
-/// Centres outside of the image widened by this factor about its centre are clamped in the Jacobian of the
-/// projection.
+/// In the Jacobian of the projection, centres are clamped to the image enlarged by this factor about its own
+/// centre.
 const FRUSTUM_MARGIN: f64 = 1.3;
 
 impl Rules {

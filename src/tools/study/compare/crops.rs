@@ -59,7 +59,10 @@ fn crops(
     for run in runs.iter().filter(|r| Some(r.seed) == first_seed) {
         let folder = output.join("runs").join(&run.run);
         if !model_path(&folder, run.iterations).is_file() {
-            observer.say(format_args!("note: {} is gone; no crop of it", folder.display()));
+            observer.say(format_args!(
+                "note: {} no longer exists; its crop is left out",
+                folder.display()
+            ));
             continue;
         }
         let machine = Machine::default();

@@ -22,7 +22,7 @@ pub(super) struct Convolution {
     /// Numbers of input and output channels.
     pub(super) channels: [usize; 2],
     side: usize,
-    step: usize,
+    stride: usize,
     padding: usize,
     /// Weights, padded with zeros for outputs beyond the last. Shape: `[outputs / 6, input channels · side · side, 6]`.
     weights: Vec<[f32; OUTPUTS]>,
@@ -34,31 +34,32 @@ impl Convolution {
     /// A convolution with published weights. Shapes: `[outputs, inputs, side, side]`, `[outputs]`.
     pub(super) fn new(
         channels: [usize; 2],
-        (side, step, padding): (usize, usize, usize),
+        (side, stride, padding): (usize, usize, usize),
         weights: &[f32],
         bias: Vec<f32>,
     ) -> Self {
-        let seen = channels[0] * side * side;
+        let inputs = channels[0] * side * side;
         let groups = channels[1].div_ceil(OUTPUTS);
         let weight = |output: usize, at: usize| {
-            if output < channels[1] { weights[output * seen + at] } else { 0.0 }
+            if output < channels[1] { weights[output * inputs + at] } else { 0.0 }
         };
         let weights = (0..groups)
-            .flat_map(|group| (0..seen).map(move |at| (group, at)))
+            .flat_map(|group| (0..inputs).map(move |at| (group, at)))
             .map(|(group, at)| std::array::from_fn(|i| weight(group * OUTPUTS + i, at)))
             .collect();
-        Self { channels, side, step, padding, weights, bias }
+        Self { channels, side, stride, padding, weights, bias }
     }
 
     /// Side of the result for an image of this side `[px]`; 0 if the image is too small.
     pub(super) fn output_side(&self, side: usize) -> usize {
-        (side + 2 * self.padding).checked_sub(self.side).map_or(0, |rest| rest / self.step + 1)
+        (side + 2 * self.padding).checked_sub(self.side).map_or(0, |rest| rest / self.stride + 1)
     }
 
     /// The rows of an image of this height on which some rows of the result depend.
     pub(super) fn input_rows(&self, rows: &Range<usize>, height: usize) -> Range<usize> {
-        let first = (rows.start * self.step).saturating_sub(self.padding);
-        let end = (rows.end.saturating_sub(1) * self.step + self.side).saturating_sub(self.padding);
+        let first = (rows.start * self.stride).saturating_sub(self.padding);
+        let end =
+            (rows.end.saturating_sub(1) * self.stride + self.side).saturating_sub(self.padding);
         first..end.min(height)
     }
 
@@ -72,8 +73,8 @@ impl Convolution {
         let block = |block: usize| {
             let pixels = block * PIXELS..((block + 1) * PIXELS).min(pixels);
             let place = |pixel: usize| (rows.start + pixel / width, pixel % width);
-            let seen = self.gather(image, pixels.map(place));
-            arch.dispatch(|| self.multiply(&seen))
+            let inputs = self.gather(image, pixels.map(place));
+            arch.dispatch(|| self.multiply(&inputs))
         };
         let all = || (0..blocks).into_par_iter().map(block).collect::<Vec<_>>();
         let by_block = match &*THREADS {
@@ -103,38 +104,38 @@ impl Convolution {
         pixels: impl Iterator<Item = (usize, usize)>,
     ) -> Vec<[f32; PIXELS]> {
         let area = self.side * self.side;
-        let mut seen = vec![[0.0; PIXELS]; self.channels[0] * area];
+        let mut inputs = vec![[0.0; PIXELS]; self.channels[0] * area];
         for (lane, (row, column)) in pixels.enumerate() {
             for y in 0..self.side {
-                let row = (row * self.step + y).checked_sub(self.padding);
+                let row = (row * self.stride + y).checked_sub(self.padding);
                 let Some(row) = row.filter(|row| image.rows.contains(row)) else { continue };
                 for x in 0..self.side {
-                    let column = (column * self.step + x).checked_sub(self.padding);
+                    let column = (column * self.stride + x).checked_sub(self.padding);
                     let Some(column) = column.filter(|&column| column < image.width) else {
                         continue;
                     };
                     let first = (row - image.rows.start) * image.width + column;
                     let plane = image.rows.len() * image.width;
                     let values = image.values[first..].iter().step_by(plane);
-                    let to = seen[y * self.side + x..].iter_mut().step_by(area);
+                    let to = inputs[y * self.side + x..].iter_mut().step_by(area);
                     for (to, &value) in to.zip(values) {
                         to[lane] = value;
                     }
                 }
             }
         }
-        seen
+        inputs
     }
 
     /// Sums of all outputs for pixels that are processed together.
     #[inline(always)]
-    fn multiply(&self, seen: &[[f32; PIXELS]]) -> Vec<[f32; PIXELS]> {
-        let mut result = Vec::with_capacity(self.weights.len() / seen.len().max(1) * OUTPUTS);
-        for weights in self.weights.chunks_exact(seen.len()) {
+    fn multiply(&self, inputs: &[[f32; PIXELS]]) -> Vec<[f32; PIXELS]> {
+        let mut result = Vec::with_capacity(self.weights.len() / inputs.len().max(1) * OUTPUTS);
+        for weights in self.weights.chunks_exact(inputs.len()) {
             let mut sums = [[0.0_f32; PIXELS]; OUTPUTS];
-            for (weights, seen) in weights.iter().zip(seen) {
+            for (weights, inputs) in weights.iter().zip(inputs) {
                 for (sums, &weight) in sums.iter_mut().zip(weights) {
-                    for (sum, &value) in sums.iter_mut().zip(seen) {
+                    for (sum, &value) in sums.iter_mut().zip(inputs) {
                         *sum = weight.mul_add(value, *sum);
                     }
                 }
