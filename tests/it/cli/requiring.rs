@@ -5,7 +5,7 @@ use std::path::Path;
 use densify_policies::registry::find;
 use serde_json::Value;
 
-use super::{call, copy_unfinished, json, model, often, resume, scratch, text};
+use super::{call, copy_unfinished, frequent_edits, json, model, resume, scratch, text};
 use crate::photographs::Photographs;
 
 const ITERATIONS: u32 = 400;
@@ -30,7 +30,7 @@ fn what_is_found_out_survives_a_stop_and_does_not_depend_on_threads() {
     let policy = find("mcmc").expect("it is registered");
     let flags = format!(
         "--sh-degree auto --budget auto --policy mcmc {} --init random --init-points 1k",
-        often(policy)
+        frequent_edits(policy)
     );
     let (root, whole) = scratch();
     let outcome =

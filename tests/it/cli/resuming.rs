@@ -8,14 +8,14 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 use super::{
-    Outcome, copy_unfinished, count, files, json, model, often, read, records, resume, scratch,
-    train,
+    Outcome, copy_unfinished, count, files, frequent_edits, json, model, read, records, resume,
+    scratch, train,
 };
 use crate::photographs::Photographs;
 use crate::subject::devices;
 
 const ITERATIONS: u32 = 202;
-/// Half of it: in the midst of an epoch of 12 views, and of any interval of `often`.
+/// Half of it: in the midst of an epoch of 12 views, and of any interval of `frequent_edits`.
 const HALF: u32 = 101;
 
 fn checkpoint(run: &Path, step: u32) -> std::path::PathBuf {
@@ -95,7 +95,7 @@ fn late(policy: &PolicyEntry) -> String {
 /// Every registered policy, with flags for a short run of it.
 fn short_policies() -> impl Iterator<Item = (&'static str, String)> {
     policies().expect("the registry is sound").into_iter().map(|entry| {
-        let (policy, often, late) = (entry.name, often(entry), late(entry));
+        let (policy, often, late) = (entry.name, frequent_edits(entry), late(entry));
         (policy, format!("--policy {policy} {often} {late} --eval"))
     })
 }

@@ -2,7 +2,7 @@
 
 use densify_policies::registry::policies;
 
-use super::{model, often, scratch, train};
+use super::{frequent_edits, model, scratch, train};
 use crate::photographs::{Photographs, SIZE};
 
 const ITERATIONS: u32 = 60;
@@ -20,7 +20,7 @@ fn every_policy_gives_the_same_model_at_any_number_of_threads() {
     let registered = policies().expect("the registry is sound");
     assert!(registered.len() >= 2);
     for entry in registered {
-        let (policy, often) = (entry.name, often(entry));
+        let (policy, often) = (entry.name, frequent_edits(entry));
         let with = |flags: &str| trained(&scene, &format!("--policy {policy} {often} {flags}"));
         let first = with("--threads 1");
         for threads in ["--threads 1", "--threads 2", "--threads 5", ""] {

@@ -5,7 +5,7 @@ use std::path::Path;
 use densify_policies::registry::{find, policies};
 use serde_json::Value;
 
-use super::{Outcome, config, count, files, json, model, often, records, scratch, train};
+use super::{Outcome, config, count, files, frequent_edits, json, model, records, scratch, train};
 use crate::photographs::{POINTS, Photographs, VIEWS};
 
 const ITERATIONS: u32 = 100;
@@ -102,7 +102,7 @@ fn check_loss(run: &Path, policy: &str, least_psnr: f64) {
 
 fn check(scene: &Photographs, policy: &str, flags: &str, least_psnr: f64) -> Outcome {
     let (_root, run) = scratch();
-    let often = often(find(policy).expect("it is registered"));
+    let often = frequent_edits(find(policy).expect("it is registered"));
     let flags = format!("--budget {BUDGET} --policy {policy} {often} --eval {flags}");
     let outcome = train(scene.path(), &run, ITERATIONS, &flags).ok();
     check_tree(&run);
