@@ -62,7 +62,7 @@ fn every_run_appears_once_in_the_log_and_the_table() {
     }
     // The HTML report is a single file.
     let page = read_text(&output.join("compare.html"));
-    super::reporting::stands_for_itself(&page);
+    super::reporting::assert_self_contained(&page);
     assert_eq!(page.matches("src=\"data:image/").count(), 5);
     assert!(page.contains("<td>vanilla</td>") && page.contains("near = 0.04"), "{page}");
 
