@@ -1,6 +1,5 @@
-//! Compares the losses and training steps of every backend with those of the native backend, including backends that
-//! sum in no fixed order, which
-//! `extremes` leaves out. `oracle` compares the images and gradients of all backends with stored references.
+//! Compares every backend with the native one: losses, and training step by step. Unlike `extremes`, this includes
+//! backends that add gradients in any order; `oracle` checks images and gradients.
 
 use densify::core::camera::Camera;
 use densify::core::gaussians::Gaussians;
@@ -16,13 +15,13 @@ use rand_chacha::ChaCha8Rng;
 use crate::subject::{GREY, RATES, make, make_with, others, step_input, wide};
 
 #[test]
-fn the_loss_and_its_gradient_are_those_of_the_native_backend() {
+fn loss_and_gradient_match_the_native_backend() {
     let empty = Gaussians::default();
     let mut native = make(&Subject::NATIVE, &empty);
     for subject in others() {
         let mut table = Table::new(&format!("loss, {} against native", subject.name()));
         let mut backend = make(&subject, &empty);
-        // The widths include every possible number of pixels left over for the last vector.
+        // Includes widths with every possible remainder in the last SIMD vector.
         let sizes = [(64, 48), (37, 29), (1, 1), (17, 3)].into_iter();
         for (seed, (width, height)) in (0..).zip(sizes.chain((33..49).map(|width| (width, 19)))) {
             for (with_alpha, with_mask) in [(false, false), (true, false), (false, true)] {
@@ -31,24 +30,30 @@ fn the_loss_and_its_gradient_are_those_of_the_native_backend() {
                 target.alpha = with_alpha.then(|| plane.clone());
                 target.mask = with_mask.then_some(plane);
                 let mut rng = ChaCha8Rng::seed_from_u64(90 + seed);
-                // Every other value is almost equal to the target, where the terms of SSIM cancel.
+                // Half of the values almost equal the target, where SSIM suffers from cancellation.
                 let mut value = |(i, near): (usize, &u8)| match i % 2 {
                     0 => f32::from(*near) / 255.0 + 1e-4,
                     _ => rng.random_range(0.0..1.0),
                 };
                 let rgb: Vec<f32> = target.rgb.iter().enumerate().map(&mut value).collect();
                 let rendering = scenes::opaque(&rgb, &target);
-                let (expected, gradient) = native.loss(&rendering, &target, GREY).expect("a loss");
-                let (found, measured) = backend.loss(&rendering, &target, GREY).expect("a loss");
-                let what = format!("{width}x{height}, alpha {with_alpha}, mask {with_mask}");
+                let (expected, expected_gradient) =
+                    native.loss(&rendering, &target, GREY).expect("a loss");
+                let (found, gradient) = backend.loss(&rendering, &target, GREY).expect("a loss");
+                let case = format!("{width}x{height}, alpha {with_alpha}, mask {with_mask}");
                 for (name, found, expected) in [
                     ("loss", found.loss, expected.loss),
                     ("l1", found.l1, expected.l1),
                     ("ssim", found.ssim, expected.ssim),
                 ] {
-                    table.check(&what, name, f64::from((found - expected).abs()), 2e-6);
+                    table.check(&case, name, f64::from((found - expected).abs()), 2e-6);
                 }
-                table.check(&what, "gradient", relative_error(&measured, &wide(&gradient)), 2e-5);
+                table.check(
+                    &case,
+                    "gradient",
+                    relative_error(&gradient, &wide(&expected_gradient)),
+                    2e-5,
+                );
             }
         }
         table.finish();
@@ -76,16 +81,16 @@ fn step(
 
 fn columns(backend: &mut dyn Backend, needs: &Needs) -> Vec<(Signal, Vec<f32>)> {
     let signals = backend.take_signals(needs.signals).expect("signals");
-    // Minima are compared by their inverses, because rows that were not seen have an infinite minimum.
-    let shown = |s: Signal, x: f32| if s.kind() == SignalKind::Minimum { 1.0 / x } else { x };
-    let of = |s: Signal| -> Vec<f32> {
-        signals.get(s).expect("it was asked for").iter().map(|&x| shown(s, x)).collect()
+    // Minima are compared as inverses, because those of unseen Gaussians are infinite.
+    let comparable = |s: Signal, x: f32| if s.kind() == SignalKind::Minimum { 1.0 / x } else { x };
+    let column = |s: Signal| -> Vec<f32> {
+        signals.get(s).expect("a requested signal").iter().map(|&x| comparable(s, x)).collect()
     };
-    needs.signals.iter().map(|s| (s, of(s))).collect()
+    needs.signals.iter().map(|s| (s, column(s))).collect()
 }
 
-/// Counts the parameters that differ by more than a fraction of a step.
-fn compare_models(table: &mut Table, what: &str, found: &Gaussians, expected: &Gaussians) {
+/// Checks the share of parameters that differ by more than a fraction of a step.
+fn compare_models(table: &mut Table, case: &str, found: &Gaussians, expected: &Gaussians) {
     let pairs: [(&str, &[f32], &[f32], f32); 5] = [
         ("means", found.means.as_flattened(), expected.means.as_flattened(), RATES.mean),
         (
@@ -99,27 +104,27 @@ fn compare_models(table: &mut Table, what: &str, found: &Gaussians, expected: &G
         ("sh", &found.sh, &expected.sh, RATES.sh_dc),
     ];
     for (class, found, expected, rate) in pairs {
-        assert_eq!(found.len(), expected.len(), "{what}: {class}");
-        // Where a gradient consists only of rounding errors, Adam's first steps may have either sign; such
-        // entries are few.
+        assert_eq!(found.len(), expected.len(), "{case}: {class}");
+        // Where a gradient is only rounding error, Adam's first steps may go a full step either way. Few entries
+        // are affected.
         let off = found.iter().zip(expected).filter(|(a, b)| {
             let difference = (**a - **b).abs();
             difference.is_nan() || difference > 0.02 * rate + 1e-6 * b.abs()
         });
         let share = off.count() as f64 / expected.len().max(1) as f64;
-        table.check(what, class, share, 0.01);
+        table.check(case, class, share, 0.01);
     }
 }
 
-/// The needs of typical policies, each with the cadence of its steps.
-fn asked_for() -> [(&'static str, Needs, Cadence); 7] {
+/// Typical needs of policies, each with its update cadence.
+fn policy_needs() -> [(&'static str, Needs, Cadence); 7] {
     let all = SignalSet::from(Signal::ALL);
     let absolute = SignalSet::from([Signal::ScreenGradientAbs]);
     let pixels = SignalSet::from([Signal::PixelCount, Signal::WeightMax, Signal::ScreenGradient]);
     let some = SignalSet::from([Signal::ScreenGradient, Signal::WeightMax, Signal::Age]);
     let noise = NoiseTerm { strength: 5e3, sharpness: 100.0, opacity: 0.3 };
     let loss_terms = LossTerms { opacity: 0.01, scale: 0.02 };
-    // Some masks fall to the threshold within the six steps.
+    // Some masks reach the threshold within the six steps.
     let mask = MaskTerm { start: 1.0, rate: 0.01, weight: 1e-3, threshold: 0.725 };
     let [plain, third, other] =
         [(1, 1), (1, 3), (2, 4)].map(|(all, sh_rest)| Cadence { all, sh_rest });
@@ -143,16 +148,16 @@ fn asked_for() -> [(&'static str, Needs, Cadence); 7] {
 }
 
 #[test]
-fn steps_are_those_of_the_native_backend() {
+fn training_steps_match_the_native_backend() {
     let camera = scenes::camera(48, 40, 51);
     let model = scenes::cloud(200, 3, &camera, 52);
     for subject in others() {
         let mut table = Table::new(&format!("training, {} against native", subject.name()));
-        for (what, needs, cadence) in &asked_for() {
-            let with = |subject: &Subject| {
+        for (case, needs, cadence) in &policy_needs() {
+            let start = |subject: &Subject| {
                 make_with(subject, &model, Setup { needs: needs.clone(), ..Setup::default() })
             };
-            let (mut native, mut backend) = (with(&Subject::NATIVE), with(&subject));
+            let (mut native, mut backend) = (start(&Subject::NATIVE), start(&subject));
             for n in 1..=6 {
                 if n == 4 {
                     native.begin_epoch();
@@ -161,18 +166,18 @@ fn steps_are_those_of_the_native_backend() {
                 let expected = step(&mut *native, &camera, n, needs, *cadence);
                 let found = step(&mut *backend, &camera, n, needs, *cadence);
                 let off = f64::from((found.loss - expected.loss).abs());
-                table.check(what, "loss", off, 1e-4);
-                assert_eq!(found.visible, expected.visible, "{what}, step {n}");
+                table.check(case, "loss", off, 1e-4);
+                assert_eq!(found.visible, expected.visible, "{case}, step {n}");
                 let entries = (found.entries as f64 / expected.entries as f64 - 1.0).abs();
-                table.check(what, "entries", entries, 0.02);
+                table.check(case, "entries", entries, 0.02);
             }
             let (found, expected) = (backend.download(), native.download());
-            compare_models(&mut table, what, &found.expect("a model"), &expected.expect("a model"));
+            compare_models(&mut table, case, &found.expect("a model"), &expected.expect("a model"));
             for ((signal, found), (_, expected)) in
                 columns(&mut *backend, needs).into_iter().zip(columns(&mut *native, needs))
             {
                 let error = relative_error(&found, &wide(&expected));
-                table.check(what, &format!("{signal:?}"), error, 0.02);
+                table.check(case, &format!("{signal:?}"), error, 0.02);
             }
         }
         table.finish();

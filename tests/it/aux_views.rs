@@ -1,6 +1,6 @@
-//! Auxiliary views against the reference: every column, the pixel map, the loss, surface points.
+//! Compares auxiliary views with the reference: every column, the pixel map, the loss and surface points.
 
-#![expect(clippy::float_cmp, reason = "colours are carried to the last bit")]
+#![expect(clippy::float_cmp, reason = "colours must match bit for bit")]
 
 use densify::core::camera::Camera;
 use densify::core::gaussians::Gaussians;
@@ -18,7 +18,7 @@ use densify::selftest::{Differentiable, Setup, Subject, scenes};
 use crate::subject::{all, make_with, on_each, repeatable, step_input};
 
 const BACKGROUND: [f32; 3] = [0.1, 0.3, 0.2];
-/// That of sums over pixels in `signals`; a pixel at the step of alpha may be gained or lost.
+/// The tolerance of pixel sums in `signals`: pixels near the alpha threshold may flip.
 const TOLERANCE: f64 = 1e-3;
 
 struct Scene {
@@ -30,14 +30,14 @@ struct Scene {
 fn scene() -> Scene {
     let camera = scenes::camera(45, 37, 91);
     let mut model = scenes::cloud(40, 2, &camera, 92);
-    // Some of them end the light of their pixels.
+    // Some Gaussians saturate their pixels, so that blending stops early.
     for logit in model.opacity_logits.iter_mut().skip(3).step_by(2) {
         *logit = 6.0;
     }
-    // Behind the camera.
+    // These lie behind the camera.
     model.means[..3].fill(scenes::world(&camera, [0.1, 0.2, -3.0]));
     let (_, mut target) = scenes::noisy((camera.width, camera.height), 0.0, 93);
-    // Half of the pixels count in full, the others by half or not at all.
+    // Half of the pixels have full weight; the others are weighted partly or not at all.
     let weight = |i: usize| if i.is_multiple_of(2) { 255 } else { (i % 3) as u8 * 64 };
     target.mask = Some((0..target.rgb.len() / 3).map(weight).collect());
     Scene { camera, model, target }
@@ -47,7 +47,7 @@ fn request(map: PixelMap) -> AuxRequest {
     AuxRequest { map, columns: AuxColumn::ALL.to_vec(), points: 0 }
 }
 
-/// `cap` bounds the tile lists, and half of it the records.
+/// `cap` limits the tile lists; records are limited to half of it.
 fn backend(
     subject: &Subject,
     scene: &Scene,
@@ -85,7 +85,7 @@ fn observe(
     backend.observe(&input).expect("a small image is rendered")
 }
 
-/// The first view of a new backend.
+/// Observes view 0 on a new backend.
 fn observe_on(subject: &Subject, scene: &Scene, request: &AuxRequest, cap: usize) -> AuxOutput {
     observe(&mut *backend(subject, scene, request, cap), scene, request, 0)
 }
@@ -94,14 +94,14 @@ fn weight(scene: &Scene, pixel: usize) -> f64 {
     scene.target.mask.as_ref().map_or(1.0, |mask| f64::from(mask[pixel]) / 255.0)
 }
 
-/// 0..1 by the least and the largest.
-fn stretched(values: &[f64]) -> Vec<f64> {
+/// Scales values linearly to 0..1.
+fn normalised(values: &[f64]) -> Vec<f64> {
     let low = values.iter().copied().fold(f64::INFINITY, f64::min);
     let high = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
     values.iter().map(|v| (v - low) / (high - low)).collect()
 }
 
-fn map(scene: &Scene, image: &Image, weights: PixelMap) -> Vec<f64> {
+fn pixel_map(scene: &Scene, image: &Image, weights: PixelMap) -> Vec<f64> {
     let (width, height) = (i64::from(scene.camera.width), i64::from(scene.camera.height));
     let rgb = |pixel: usize| [0, 1, 2].map(|c| f64::from(scene.target.rgb[3 * pixel + c]));
     let error: Vec<f64> = (0..(width * height) as usize)
@@ -125,12 +125,12 @@ fn map(scene: &Scene, image: &Image, weights: PixelMap) -> Vec<f64> {
             weight(scene, p as usize) * (8.0 * luma(x, y) - sum).clamp(0.0, 255.0)
         })
         .collect();
-    let parts = stretched(&error).into_iter().zip(stretched(&edge));
+    let parts = normalised(&error).into_iter().zip(normalised(&edge));
     parts.map(|(e, g)| f64::from(weights.error) * e + f64::from(weights.edge) * g).collect()
 }
 
 #[test]
-fn every_column_is_that_of_the_reference() {
+fn every_column_matches_the_reference() {
     let scene = scene();
     let model = Model::from(&scene.model);
     let view = View { camera: &scene.camera, background: BACKGROUND.map(f64::from), sh_degree: 2 };
@@ -138,9 +138,9 @@ fn every_column_is_that_of_the_reference() {
     let splats = project(&model, view, &Rules::STANDARD);
     let order = by_depth(&splats);
     let maps = [(50.0, 50.0), (1.0, 0.0), (0.0, 1.0)].map(|(error, edge)| PixelMap { error, edge });
-    // The smaller cap takes several bands.
+    // The smallest cap forces several bands.
     for (weights, cap) in maps.into_iter().zip([10_000, 10_000, 1]) {
-        let pixels = map(&scene, &image, weights);
+        let pixels = pixel_map(&scene, &image, weights);
         let mut sums = vec![[0.0_f64; 5]; scene.model.len()];
         let mut largest = vec![(0.0, None); pixels.len()];
         each_blended(&splats, &order, view, &Rules::STANDARD, |p, row, weight, distance| {
@@ -152,7 +152,7 @@ fn every_column_is_that_of_the_reference() {
                 largest[p] = (weight, Some(row));
             }
         });
-        // A row may be on screen without being blended anywhere.
+        // A Gaussian can be on screen without being blended in any pixel.
         let shown: Vec<usize> = (0..sums.len()).filter(|&row| sums[row][1] > 0.0).collect();
         assert!(shown.len() > 20 && shown[0] > 0, "{}", shown.len());
         let expected = |column: AuxColumn, row: usize| match column {
@@ -175,14 +175,17 @@ fn every_column_is_that_of_the_reference() {
             let mut table = Table::new(&format!("auxiliary views, {}", subject.name()));
             let found = observe_on(&subject, &scene, &request(weights), cap);
             assert_eq!(found.columns.len(), AuxColumn::ALL.len());
-            let what = format!("{weights:?}, cap {cap}");
+            let case = format!("{weights:?}, cap {cap}");
             for (column, values) in &found.columns {
                 let unseen = &values[..3];
-                assert!(unseen.iter().all(|x| x.to_bits() == 0), "{column:?} of rows not seen");
+                assert!(
+                    unseen.iter().all(|x| x.to_bits() == 0),
+                    "{column:?} of unseen Gaussians is not 0"
+                );
                 let measured: Vec<f32> = shown.iter().map(|&row| values[row]).collect();
                 let expected: Vec<f64> = shown.iter().map(|&row| expected(*column, row)).collect();
                 let error = relative_error(&measured, &expected);
-                table.check(&what, &format!("{column:?}"), error, TOLERANCE);
+                table.check(&case, &format!("{column:?}"), error, TOLERANCE);
             }
             table.finish();
         }
@@ -190,7 +193,7 @@ fn every_column_is_that_of_the_reference() {
 }
 
 #[test]
-fn neither_threads_nor_bands_change_a_bit() {
+fn output_is_independent_of_threads_and_bands() {
     let scene = scene();
     let points = AuxRequest { points: 50, ..request(PixelMap { error: 1.0, edge: 1.0 }) };
     for subject in repeatable() {
@@ -206,10 +209,10 @@ fn neither_threads_nor_bands_change_a_bit() {
 }
 
 #[test]
-fn training_goes_on_as_if_nothing_had_been_observed() {
+fn observing_does_not_affect_training() {
     let scene = scene();
     let request = AuxRequest { points: 9, ..request(PixelMap { error: 1.0, edge: 1.0 }) };
-    let run = |subject: &Subject, observes: bool| {
+    let run = |subject: &Subject, with_views: bool| {
         let mut backend = backend(subject, &scene, &request, 10_000);
         let mut observed = None;
         for step in 1..=4 {
@@ -218,21 +221,25 @@ fn training_goes_on_as_if_nothing_had_been_observed() {
                 ..step_input(step, &scene.camera, &scene.target, 2)
             };
             let output = backend.train_step(&input).expect("a small image is rendered");
-            // It is the loss with which the next step begins.
+            // The observed loss is the one that the next step starts from.
             assert!(observed.is_none_or(|loss: f32| (loss - output.loss).abs() < 1e-6));
-            observed = observes.then(|| observe(&mut *backend, &scene, &request, 0).loss);
+            observed = with_views.then(|| observe(&mut *backend, &scene, &request, 0).loss);
         }
         let signals = SignalSet::from([Signal::ScreenGradient, Signal::WeightSum]);
         let signals = backend.take_signals(signals).expect("signals can be taken");
-        let of = |signal| signals.get(signal).expect("a requested signal").to_vec();
-        (backend.download().expect("a model"), of(Signal::ScreenGradient), of(Signal::WeightSum))
+        let column = |signal| signals.get(signal).expect("a requested signal").to_vec();
+        (
+            backend.download().expect("a model"),
+            column(Signal::ScreenGradient),
+            column(Signal::WeightSum),
+        )
     };
     for subject in repeatable() {
         assert!(run(&subject, false) == run(&subject, true), "{}", subject.name());
     }
 }
 
-/// One opaque Gaussian in the left of the image.
+/// One opaque Gaussian in the left part of the image.
 fn opaque_on_the_left() -> Scene {
     let camera = scenes::camera(60, 40, 95);
     let local = [(15.0 - camera.cx) / camera.fx * 3.0, (20.0 - camera.cy) / camera.fy * 3.0, 3.0];
@@ -247,40 +254,44 @@ fn points_lie_on_surfaces_and_follow_alpha_on(subject: &Subject) {
     let camera = scene.camera;
     let request = AuxRequest { points: 40, ..AuxRequest::default() };
     let mut backend = backend(subject, &scene, &request, 10_000);
-    let mut look = |request, view| observe(&mut *backend, &scene, request, view);
-    let first = look(&request, 0);
+    let mut observe_view = |request, view| observe(&mut *backend, &scene, request, view);
+    let first = observe_view(&request, 0);
     assert!(first.columns.is_empty() && first.points.len() == 40, "{}", first.points.len());
     let centre = DVec3::from(scene.model.means[0].map(f64::from));
-    let mut places: Vec<[u32; 3]> = Vec::new();
+    let mut positions: Vec<[u32; 3]> = Vec::new();
     for point in &first.points {
         let world = DVec3::from(point.position.map(f64::from));
         let local = camera.rotation * world + camera.translation;
-        // Of a sphere the nearest point of the ray: at right angles to its radius.
+        // The depth of a spherical Gaussian is where the ray comes nearest to its centre, hence the right angle.
         let from_centre = world - centre;
         assert!(from_centre.length() < 0.2 * 3.5, "{point:?}");
         let along = (world - camera.centre()).normalize();
         assert!(from_centre.dot(along).abs() < 1e-3, "{point:?}");
         let focal = 0.5 * (camera.fx + camera.fy);
         assert!((f64::from(point.pixel_size) / (local.z / focal) - 1.0).abs() < 1e-4);
-        // The colour of the pixel that the point is seen in.
+        // The point has the colour of its pixel.
         let x = (camera.fx * local.x / local.z + camera.cx).floor() as usize;
         let y = (camera.fy * local.y / local.z + camera.cy).floor() as usize;
         assert_eq!(point.colour, scene.target.composited(x, y, BACKGROUND));
         assert!(point.error > 1.0 / 256.0 && point.error < 1.0);
-        places.push(point.position.map(f32::to_bits));
+        positions.push(point.position.map(f32::to_bits));
     }
-    places.sort_unstable();
-    places.dedup();
-    assert_eq!(places.len(), 40, "a pixel was drawn twice");
-    // Opaque pixels are drawn more often: of the blended ones the mean alpha is lower.
+    positions.sort_unstable();
+    positions.dedup();
+    assert_eq!(positions.len(), 40, "a pixel was sampled twice");
+    // Opaque pixels are sampled more often, so the mean alpha of the sample exceeds that of all blended pixels.
     let mean = first.points.iter().map(|p| p.error).sum::<f32>() / 40.0;
     let all = AuxRequest { points: u32::MAX, ..request.clone() };
-    let every = look(&all, 0).points;
-    let of_all = every.iter().map(|p| p.error).sum::<f32>() / every.len() as f32;
-    assert!(every.len() > 80 && mean > 1.1 * of_all, "{} {mean} {of_all}", every.len());
-    // Each view draws anew.
-    assert!(look(&request, 1).points != first.points);
-    assert!(look(&request, 0) == first);
+    let all_points = observe_view(&all, 0).points;
+    let mean_of_all = all_points.iter().map(|p| p.error).sum::<f32>() / all_points.len() as f32;
+    assert!(
+        all_points.len() > 80 && mean > 1.1 * mean_of_all,
+        "{} {mean} {mean_of_all}",
+        all_points.len()
+    );
+    // Each view has its own sample, which is reproducible.
+    assert!(observe_view(&request, 1).points != first.points);
+    assert!(observe_view(&request, 0) == first);
 }
 
 #[test]

@@ -1,5 +1,4 @@
-//! Candidates: on a plane, where they are found, by which error mode, and where never; in any scene, the
-//! same on every backend.
+//! Candidates: where each error mode finds them on a plane, where none may appear, and that all backends agree.
 
 use densify::core::camera::Camera;
 use densify::core::gaussians::{Gaussians, logit, rgb_to_dc};
@@ -14,11 +13,11 @@ use crate::subject::{devices, make_with, others, repeatable, step_input};
 
 const SIDE: u32 = 96;
 const GREY: [f32; 3] = [0.2; 3];
-/// Left, top, right and bottom of the patch whose colour is off [px].
+/// Left, top, right and bottom of the patch with a wrong colour [px].
 const PATCH: [f64; 4] = [50.0, 50.0, 80.0, 80.0];
-/// Left of this column, fine structure is missing [px].
+/// Left of this column, the model lacks fine structure [px].
 const FINE: usize = 30;
-/// Half the width of SSIM's window, and a pixel.
+/// Half the width of the SSIM window plus one pixel.
 const WINDOW: f64 = 6.0;
 const MODES: [ErrorMode; 3] = [ErrorMode::Gradient, ErrorMode::L1, ErrorMode::L1Dssim];
 
@@ -36,18 +35,18 @@ fn camera() -> Camera {
     }
 }
 
-/// Flat rows on the plane z = 2 for x < `until`, softly mottled.
+/// Flat Gaussians with smoothly varying grey on the plane z = 2, where x < `until`.
 fn plane(until: f64) -> Gaussians {
     let mut model = Gaussians::default();
     for i in 0..64 * 64 {
-        let at = |i: i32| -1.26 + 0.04 * f64::from(i);
-        let (x, y) = (at(i % 64), at(i / 64));
+        let coordinate = |i: i32| -1.26 + 0.04 * f64::from(i);
+        let (x, y) = (coordinate(i % 64), coordinate(i / 64));
         if x < until {
             let colour = 0.45 + 0.1 * ((3.0 * x).sin() * (4.0 * y).cos()) as f32;
             let quat = [1.0, 0.0, 0.0, 0.0];
-            let place = scenes::world(&camera(), [x, y, 2.0]);
+            let position = scenes::world(&camera(), [x, y, 2.0]);
             let scale = [0.024, 0.024, 1e-3];
-            scenes::push(&mut model, place, scale, quat, logit(0.9), |_| rgb_to_dc(colour));
+            scenes::push(&mut model, position, scale, quat, logit(0.9), |_| rgb_to_dc(colour));
         }
     }
     model
@@ -80,7 +79,7 @@ fn rendered(model: &Gaussians) -> Rendering {
     native.render(&camera(), GREY, 0).expect("a small image is rendered")
 }
 
-/// The candidates of one step with this target.
+/// Returns the candidates of one training step.
 fn candidates(
     subject: &Subject,
     model: &Gaussians,
@@ -105,9 +104,9 @@ fn pixel(candidate: &Candidate) -> DVec2 {
 }
 
 #[test]
-fn a_constant_offset_is_an_error_but_no_structure() {
-    // The picture is the model's own, but for a patch that is brighter by 0.25 throughout, and a
-    // strip with a weave of ±0.03 that the model lacks.
+fn gradient_mode_ignores_a_constant_colour_offset() {
+    // The target is the model's own rendering, except for a patch that is brighter by 0.25 and a strip with a
+    // ±0.03 checkerboard that the model lacks.
     let model = plane(2.0);
     let own = rendered(&model);
     let side = SIDE as usize;
@@ -129,7 +128,7 @@ fn a_constant_offset_is_an_error_but_no_structure() {
         let found = candidates(subject, &model, &target, request(mode, 0.5));
         assert!(found.len() >= 20, "{mode:?}: {} candidates", found.len());
         let [left, top, right, bottom] = PATCH;
-        // Well within: at the patch's border there is structure.
+        // Well inside, because the patch's border is structure too.
         let within = |c: &&Candidate| {
             let p = pixel(c);
             (left + WINDOW..right - WINDOW).contains(&p.x)
@@ -150,8 +149,9 @@ fn a_constant_offset_is_an_error_but_no_structure() {
 }
 
 #[test]
-fn nothing_comes_from_where_nothing_was_hit() {
-    // Right of the middle rows are a veil, before a picture that is white there: the worst is there.
+fn candidates_require_the_minimum_alpha() {
+    // The right half of the model is nearly transparent and the target there is white, so the largest errors are
+    // where alpha is low.
     let mut model = plane(2.0);
     for (mean, value) in model.means.iter().zip(&mut model.opacity_logits) {
         if mean[0] > 0.1 {
@@ -162,8 +162,8 @@ fn nothing_comes_from_where_nothing_was_hit() {
     let side = SIDE as usize;
     let white = image(|i| if i / 3 % side > 52 { 1.0 } else { 0.6 });
     for (subject, mode) in repeatable().iter().flat_map(|s| MODES.map(|mode| (s, mode))) {
-        // How many there are, and how many of them where alpha is low.
-        let taken = |min_alpha| {
+        // The number of candidates, and of those where alpha is low.
+        let count = |min_alpha| {
             let request = CandidateRequest { spaced: false, ..request(mode, min_alpha) };
             let found = candidates(subject, &model, &white, request);
             let alpha = |c: &Candidate| {
@@ -172,15 +172,18 @@ fn nothing_comes_from_where_nothing_was_hit() {
             };
             (found.len(), found.iter().filter(|c| alpha(c) < 0.5).count())
         };
-        let (all, faint) = taken(0.5);
+        let (all, faint) = count(0.5);
         assert!(all > 0, "{mode:?}: no candidate");
         assert_eq!(faint, 0, "{mode:?}: {faint} of {all} where alpha is below 0.5");
-        let (all, faint) = taken(0.0);
-        assert!(mode == ErrorMode::Gradient || faint > all / 2, "{mode:?}: nothing to keep away");
+        let (all, faint) = count(0.0);
+        assert!(
+            mode == ErrorMode::Gradient || faint > all / 2,
+            "{mode:?}: the minimum alpha excludes nothing"
+        );
     }
 }
 
-/// A cloud, of which some rows end the light of their pixels.
+/// A cloud in which some Gaussians saturate their pixels, so that blending stops early.
 fn cloud() -> (Gaussians, Camera) {
     let camera = scenes::camera(53, 41, 91);
     let mut model = scenes::cloud(120, 2, &camera, 92);
@@ -191,7 +194,7 @@ fn cloud() -> (Gaussians, Camera) {
     (model, camera)
 }
 
-/// Trains for some steps; the candidates after each of them.
+/// Trains for a number of steps and returns the candidates of each.
 fn train(backend: &mut dyn Backend, camera: &Camera, steps: u32) -> Vec<Vec<Candidate>> {
     let target = scenes::target(camera);
     let step = |number: u32| {
@@ -202,39 +205,43 @@ fn train(backend: &mut dyn Backend, camera: &Camera, steps: u32) -> Vec<Vec<Cand
     (1..=steps).map(step).collect()
 }
 
-/// Places and colours, flattened.
-fn places(points: &[Candidate]) -> Vec<f32> {
-    let of = |c: &Candidate| c.position.into_iter().chain(c.colour).chain([c.pixel_size, c.error]);
-    points.iter().flat_map(of).collect()
+/// All numbers of the candidates, flattened.
+fn numbers(points: &[Candidate]) -> Vec<f32> {
+    let numbers =
+        |c: &Candidate| c.position.into_iter().chain(c.colour).chain([c.pixel_size, c.error]);
+    points.iter().flat_map(numbers).collect()
 }
 
-/// Most of the points are the same; which pixels are taken may differ where two are nearly equal.
+/// Checks that most points match. Where two pixels have nearly equal errors, either may be chosen.
 fn compare_points(table: &mut Table, what: &str, found: &[Candidate], expected: &[Candidate]) {
     if found.is_empty() || found.len().abs_diff(expected.len()) > 1 + expected.len() / 50 {
         table.fail(format!("{what}: {} points, not {}", found.len(), expected.len()));
         return;
     }
     let near = |a: &Candidate, b: &Candidate| {
-        places(&[*a]).iter().zip(places(&[*b])).all(|(a, b)| (a - b).abs() < 2e-3 * (1.0 + b.abs()))
+        numbers(&[*a])
+            .iter()
+            .zip(numbers(&[*b]))
+            .all(|(a, b)| (a - b).abs() < 2e-3 * (1.0 + b.abs()))
     };
     let missing = found.iter().filter(|a| !expected.iter().any(|b| near(a, b))).count();
     table.check(what, "points", missing as f64 / found.len() as f64, 0.04);
 }
 
 #[test]
-fn candidates_are_those_of_the_native_backend() {
+fn candidates_match_the_native_backend() {
     let (model, camera) = cloud();
-    let ways = [
+    let cases = [
         (ErrorMode::Gradient, DepthMode::MaxWeight, false, 3),
         (ErrorMode::L1, DepthMode::Median, true, 3),
         (ErrorMode::L1Dssim, DepthMode::MaxWeight, true, 3),
         (ErrorMode::L1Dssim, DepthMode::Median, true, 50),
-        // More than a device has room to list.
+        // More candidates than the device list can hold.
         (ErrorMode::Gradient, DepthMode::Median, true, 1),
     ];
     for subject in others().iter().filter(|subject| subject.is_deterministic()) {
         let mut table = Table::new(&format!("candidates, {} against native", subject.name()));
-        for (error, depth, spaced, rows_per_candidate) in ways {
+        for (error, depth, spaced, rows_per_candidate) in cases {
             let capacity = 200;
             let request = CandidateRequest {
                 rows_per_candidate,
@@ -246,32 +253,32 @@ fn candidates_are_those_of_the_native_backend() {
             let [expected, found] = [&Subject::NATIVE, subject]
                 .map(|subject| train(&mut *backend(subject, &model, Some(request)), &camera, 2));
             for (step, (found, expected)) in found.iter().zip(&expected).enumerate() {
-                let what = format!("{request:?}, {step}");
-                compare_points(&mut table, &what, found, expected);
+                let case = format!("{request:?}, {step}");
+                compare_points(&mut table, &case, found, expected);
             }
         }
         table.finish();
     }
 }
 
-/// What a device lists is what the host finds in all errors: with a larger budget there is room for
-/// the list.
+/// The device lists the pixels that the host finds in the full error map. Only the larger budget leaves room for the
+/// device list.
 #[test]
-fn the_device_finds_the_pixels_that_the_host_would() {
+fn device_and_host_select_the_same_pixels() {
     let (model, camera) = cloud();
     for device in devices() {
         for error in MODES {
             let request =
                 CandidateRequest { rows_per_candidate: 1, capacity: 500, ..request(error, 0.3) };
             let needs = Needs { candidates: Some(request), ..Needs::default() };
-            let [by_host, by_device] = [1, 2].map(|times| {
+            let [by_host, by_device] = [1, 2].map(|factor| {
                 let setup = Setup {
-                    budget: (times * model.len()).into(),
+                    budget: (factor * model.len()).into(),
                     needs: needs.clone(),
                     ..Setup::default()
                 };
                 let mut backend = make_with(&Subject::Gpu(device.clone()), &model, setup);
-                places(train(&mut *backend, &camera, 3).last().expect("three steps"))
+                numbers(train(&mut *backend, &camera, 3).last().expect("three steps"))
             });
             assert!(by_host.len() > 8 * 30, "{error:?}: {} numbers", by_host.len());
             if device.adapter().kind == AdapterKind::Software {
@@ -285,9 +292,9 @@ fn the_device_finds_the_pixels_that_the_host_would() {
     }
 }
 
-/// One row before everything, so that all pixels are equally wrong: more than a device can list.
+/// One Gaussian covers the whole image, so that all pixels have the same error, more than the device can list.
 #[test]
-fn where_all_pixels_are_equally_wrong_the_first_is_taken() {
+fn the_first_of_equal_pixels_is_selected() {
     let (width, height) = (24, 20);
     let camera = Camera {
         rotation: DMat3::IDENTITY,
@@ -307,7 +314,9 @@ fn where_all_pixels_are_equally_wrong_the_first_is_taken() {
         let mut backend = backend(&subject, &model, Some(request));
         let input = StepInput { background: [0.0; 3], ..step_input(1, &camera, &black, 0) };
         backend.train_step(&input).expect("a small image is rendered");
-        let [first] = backend.candidates() else { panic!("{}: not one", subject.name()) };
+        let [first] = backend.candidates() else {
+            panic!("{}: expected one candidate", subject.name())
+        };
         let (pixel, _) = camera.project(DVec3::from(first.position.map(f64::from)));
         assert!((pixel - DVec2::splat(0.5)).length() < 1e-2, "{}: {pixel}", subject.name());
     }

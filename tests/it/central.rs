@@ -1,5 +1,5 @@
-//! The reference renderer against central differences of itself: step 1e-6, in `f64`, without the steps
-//! that make a render discontinuous, and with the order of the rows held fixed.
+//! Checks the reference gradients against central differences in `f64`, without the thresholds that make a
+//! rendering discontinuous and with the depth order held fixed.
 
 use densify::core::camera::Camera;
 use rand::{RngExt, SeedableRng};
@@ -13,14 +13,14 @@ use densify::selftest::reference::{
 };
 use densify::selftest::scenes;
 
-/// Half the distance between the two evaluations.
+/// Step of the central difference, to either side.
 const STEP: f64 = 1e-6;
-/// Against the largest gradient of the class. Rounding leaves eps·|L| / STEP ≈ 1e-16·10 / 1e-6,
-/// truncation STEP²; both stay below this for losses around 1 with gradients around 1.
+/// Relative to the largest gradient of the class. The rounding error is eps·|L| / STEP ≈ 1e-16·10 / 1e-6 and the
+/// truncation error STEP²; both are smaller for losses and gradients around 1.
 const TOLERANCE: f64 = 1e-6;
 
-/// Compares every gradient of Σ image · upstream with differences; reports the worst per class.
-fn check(table: &mut Table, what: &str, model: &Model, view: View<'_>, upstream: &Upstream) {
+/// Compares every gradient of Σ image · upstream with its central difference; reports the worst per class.
+fn check(table: &mut Table, case: &str, model: &Model, view: View<'_>, upstream: &Upstream) {
     let order = by_depth(&project(model, view, &Rules::SMOOTH));
     let value = |model: &Model| {
         let splats = project(model, view, &Rules::SMOOTH);
@@ -42,7 +42,7 @@ fn check(table: &mut Table, what: &str, model: &Model, view: View<'_>, upstream:
             let difference = ((above - below) / (2.0 * STEP) - analytic).abs();
             worst = if difference.is_nan() { f64::NAN } else { worst.max(difference) };
         }
-        table.check(what, class, worst / largest.max(1e-3), TOLERANCE);
+        table.check(case, class, worst / largest.max(1e-3), TOLERANCE);
     }
 }
 
@@ -59,9 +59,9 @@ fn gradients_of_every_class_at_every_degree() {
         let upstream = scenes::upstream(&camera, 3);
         check(&mut table, &format!("degree {degree}"), &model, view(&camera, degree), &upstream);
         if degree > 0 {
-            // Fewer harmonics evaluated than stored: the rest gets no gradient.
-            let what = format!("degree {} of {degree}", degree - 1);
-            check(&mut table, &what, &model, view(&camera, degree - 1), &upstream);
+            // Stored harmonics above the evaluated degree get no gradient.
+            let case = format!("degree {} of {degree}", degree - 1);
+            check(&mut table, &case, &model, view(&camera, degree - 1), &upstream);
         }
     }
     table.finish();
@@ -69,17 +69,19 @@ fn gradients_of_every_class_at_every_degree() {
 
 #[test]
 fn gradients_where_the_jacobian_is_clamped() {
-    // Centres far outside the image, wide enough to be seen: the slope is clamped in x, in y,
-    // and in both.
+    // Large Gaussians whose centres are far outside the image: the slope is clamped in x, in y, or in both.
     let camera = Camera { cx: 2.0, cy: 9.5, fx: 9.0, fy: 14.0, ..scenes::camera(12, 10, 5) };
     let mut table = Table::new("reference beyond the frustum");
-    for (what, local) in
+    for (case, local) in
         [("x", [4.0, 0.2, 2.0]), ("y", [0.1, -3.5, 2.2]), ("both", [-2.6, 2.0, 2.1])]
     {
         let model = Model::from(&scenes::one_at(&camera, local, [1.1, 0.9, 1.3]));
         let seen = render(&model, view(&camera, 1), &Rules::SMOOTH);
-        assert!(seen.alpha.iter().any(|&alpha| alpha > 0.01), "{what}: the row is not seen");
-        check(&mut table, what, &model, view(&camera, 1), &scenes::upstream(&camera, 9));
+        assert!(
+            seen.alpha.iter().any(|&alpha| alpha > 0.01),
+            "{case}: the Gaussian is not visible"
+        );
+        check(&mut table, case, &model, view(&camera, 1), &scenes::upstream(&camera, 9));
     }
     table.finish();
 }
@@ -91,7 +93,7 @@ fn gradient_of_the_loss() {
     for (width, height) in [(1, 1), (1, 17), (17, 1), (7, 5), (14, 12)] {
         let n = 3 * width * height;
         let target: Vec<f64> = (0..n).map(|_| rng.random::<f64>()).collect();
-        // Away from equality, where L1 has no derivative.
+        // L1 has no derivative at equality.
         let rendered: Vec<f64> = target
             .iter()
             .map(|t| t + rng.random_range(0.01..0.3) * if rng.random() { 1.0 } else { -1.0 })

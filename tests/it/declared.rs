@@ -1,7 +1,7 @@
-//! What policies declare beside signals: terms of the loss, noise on the means, and the optimiser's
-//! cadence. Each is held to its formula, worked out here in f64.
+//! Policy declarations other than signals: loss terms, noise on the means, masks and optimiser cadence. Each is
+//! compared with its formula, computed here in f64.
 
-#![expect(clippy::float_cmp, reason = "what rests does so to the last bit")]
+#![expect(clippy::float_cmp, reason = "unchanged values must match bit for bit")]
 
 use std::ops::Range;
 
@@ -42,7 +42,7 @@ fn backend(subject: &Subject, model: &Gaussians, needs: Needs) -> Box<dyn Differ
     make_with(subject, model, Setup { needs, ..Setup::default() })
 }
 
-/// A step with the terms and the noise of these needs.
+/// Trains one step with the loss terms and noise of `needs`.
 fn step(backend: &mut dyn Backend, camera: &Camera, step: u32, needs: &Needs, cadence: Cadence) {
     let target = target(camera, step.into());
     let sh_degree = backend.sh_degree();
@@ -57,8 +57,8 @@ fn step(backend: &mut dyn Backend, camera: &Camera, step: u32, needs: &Needs, ca
     backend.train_step(&input).expect("a small image is rendered");
 }
 
-/// Rows in pairs of one shape, every second one turned by a quarter.
-fn alike(rows: usize) -> Gaussians {
+/// Identical Gaussians, every second one rotated by 90°.
+fn identical_gaussians(rows: usize) -> Gaussians {
     let mut model = Gaussians { sh_degree: 0, ..Gaussians::default() };
     let half = std::f32::consts::FRAC_1_SQRT_2;
     for row in 0..rows {
@@ -72,7 +72,7 @@ fn alike(rows: usize) -> Gaussians {
 fn noise_has_the_declared_covariance() {
     on_each(repeatable(), |subject| {
         let rows = 20_000;
-        let model = alike(rows);
+        let model = identical_gaussians(rows);
         let noise = NoiseTerm { strength: 7.0, sharpness: 100.0, opacity: 0.005 };
         let run = |subject: &Subject, at: u32| {
             let needs = Needs { noise: Some(noise), ..Needs::default() };
@@ -83,15 +83,15 @@ fn noise_has_the_declared_covariance() {
         let moved = run(subject, 3);
         if let Subject::Native { instructions, .. } = *subject {
             let alone = Subject::Native { instructions, threads: Some(1) };
-            assert!(moved == run(&alone, 3), "it depends on the threads");
+            assert!(moved == run(&alone, 3), "noise depends on the threads");
         }
-        assert!(moved.means != run(subject, 4).means, "it does not depend on the step");
+        assert!(moved.means != run(subject, 4).means, "noise does not depend on the step");
         assert_eq!((&moved.log_scales, &moved.sh), (&model.log_scales, &model.sh));
-        // σ(−4) = 0.017986; its share is σ(−100·0.012986).
+        // The opacity is σ(−4) = 0.017986, which scales the noise by σ(−100·0.012986).
         let opacity = 1.0 / (1.0 + 4.0_f64.exp());
         let share = 1.0 / (1.0 + (100.0 * (opacity - 0.005)).exp());
         let factor = 7.0 * f64::from(RATES.noise) * share;
-        // Deviations Σ·factor: variances of the axes, x and y swapped in turned rows.
+        // The standard deviation is Σ·factor. Rotated Gaussians have x and y swapped.
         for (parity, variances) in [(0, [0.01, 0.04, 0.16]), (1, [0.04, 0.01, 0.16])] {
             let of_parity = moved.means.iter().skip(parity).step_by(2);
             let deltas: Vec<[f64; 3]> =
@@ -117,7 +117,7 @@ fn noise_has_the_declared_covariance() {
     });
 }
 
-/// The gradient of the image's loss, without a step.
+/// The gradient of the image loss, without a step.
 fn gradient(subject: &Subject, model: &Gaussians, camera: &Camera, seed: u64) -> ModelGradient {
     let mut backend = make(subject, model);
     let rendering = backend.render(camera, BACKGROUND, 1).expect("a small image is rendered");
@@ -142,22 +142,29 @@ fn values<'a>(model: &'a Gaussians, class: &str) -> &'a [f32] {
 struct Adam {
     class: &'static str,
     rate: f64,
-    /// Which of the values of a row belong to it, of how many.
+    /// The range of values of a row that belong to this class.
     values: Range<usize>,
-    of: usize,
+    /// The number of values of a row.
+    width: usize,
     steps: i32,
     sums: Vec<f64>,
     moments: [Vec<f64>; 2],
 }
 
 impl Adam {
-    fn new(class: &'static str, rate: f32, values: Range<usize>, of: usize, rows: usize) -> Self {
-        let zeros = vec![0.0; of * rows];
+    fn new(
+        class: &'static str,
+        rate: f32,
+        values: Range<usize>,
+        width: usize,
+        rows: usize,
+    ) -> Self {
+        let zeros = vec![0.0; width * rows];
         let moments = [zeros.clone(), zeros.clone()];
-        Self { class, rate: rate.into(), values, of, steps: 0, sums: zeros, moments }
+        Self { class, rate: rate.into(), values, width, steps: 0, sums: zeros, moments }
     }
 
-    /// Compares what a step did with what it should have done; the largest error in learning rates.
+    /// Compares a step with the expected one; returns the largest error as a multiple of the learning rate.
     fn check(
         &mut self,
         before: &Gaussians,
@@ -169,24 +176,24 @@ impl Adam {
         for (sum, g) in self.sums.iter_mut().zip(class(gradient, self.class)) {
             *sum += f64::from(*g);
         }
-        let mine: Vec<usize> =
-            (0..before.len()).filter(|i| self.values.contains(&(i % self.of))).collect();
+        let indices: Vec<usize> =
+            (0..before.len()).filter(|i| self.values.contains(&(i % self.width))).collect();
         if !due {
-            let rests = mine.iter().all(|&i| before[i].to_bits() == after[i].to_bits());
-            assert!(rests, "{}", self.class);
+            let is_unchanged = indices.iter().all(|&i| before[i].to_bits() == after[i].to_bits());
+            assert!(is_unchanged, "{}", self.class);
             return 0.0;
         }
         self.steps += 1;
-        let largest = mine.iter().map(|&i| self.sums[i].abs()).fold(0.0, f64::max);
+        let largest = indices.iter().map(|&i| self.sums[i].abs()).fold(0.0, f64::max);
         let mut worst: f64 = 0.0;
-        for i in mine {
+        for i in indices {
             let g = std::mem::take(&mut self.sums[i]);
             let [m, v] = &mut self.moments;
             m[i] = 0.9 * m[i] + 0.1 * g;
             v[i] = 0.999 * v[i] + 0.001 * g * g;
             let m_hat = m[i] / (1.0 - 0.9_f64.powi(self.steps));
             let v_hat = v[i] / (1.0 - 0.999_f64.powi(self.steps));
-            // Where nearly nothing is left of the sum, its sign is that of rounding.
+            // The sign of a nearly cancelled sum is determined by rounding.
             if g.abs() > 1e-3 * largest {
                 let expected = self.rate * m_hat / v_hat.sqrt();
                 let found = f64::from(before[i]) - f64::from(after[i]);
@@ -197,9 +204,9 @@ impl Adam {
     }
 }
 
-/// And of the terms of the loss, which pull at rows that no view shows, too.
+/// Includes the loss terms, which affect Gaussians outside all views, too.
 #[test]
-fn a_step_takes_the_sum_of_the_gradients_since_the_last() {
+fn steps_use_the_gradients_accumulated_since_the_last_step() {
     const ROWS: usize = 40;
     let none = LossTerms::default();
     let pulling = LossTerms { opacity: 0.01, scale: 0.02 };
@@ -207,7 +214,7 @@ fn a_step_takes_the_sum_of_the_gradients_since_the_last() {
     on_each(repeatable(), |subject| {
         for (all, sh_rest, loss_terms) in cases {
             let longest = Cadence { all, sh_rest };
-            // One of them: shorter than declared, and changing on the way.
+            // One case changes its cadence and stays below the declared one.
             let cadence_at = |step: u32| match all {
                 20 if step < 5 => Cadence { all: 1, sh_rest: 2 },
                 20 => Cadence { all: 2, sh_rest: 3 },
@@ -244,18 +251,18 @@ fn a_step_takes_the_sum_of_the_gradients_since_the_last() {
                 for (i, class) in classes.iter_mut().enumerate() {
                     let due = if i == 4 { rest } else { main };
                     let error = class.check(&before, &after, &gradient, due);
-                    let what = format!("{longest:?}, step {number}, {}", class.class);
-                    assert!(error < 0.01, "{what}: {error} learning rates");
+                    let case = format!("{longest:?}, step {number}, {}", class.class);
+                    assert!(error < 0.01, "{case}: {error} learning rates");
                 }
             }
         }
     });
 }
 
-/// The mask is a factor on opacity and scales, of which it has the derivative; what falls to the threshold
-/// becomes transparent; masks go where their rows go.
+/// A mask scales opacity and scales and gets the corresponding gradient. Gaussians whose mask falls to the threshold
+/// become transparent. Masks move with their rows.
 #[test]
-fn masks_step_by_what_they_would_switch_off() {
+fn masks_follow_their_gradient_and_hide_gaussians() {
     const ROWS: usize = 40;
     let mask = MaskTerm { start: 1.0, rate: 0.02, weight: 1e-3, threshold: 0.72 };
     let signals = SignalSet::from([Signal::Mask]);
@@ -265,7 +272,7 @@ fn masks_step_by_what_they_would_switch_off() {
         let mut backend = backend(subject, &model(ROWS), needs.clone());
         let values = |backend: &mut dyn Differentiable| -> Vec<f64> {
             let signals = backend.take_signals(signals).expect("signals can be taken");
-            let masks = signals.get(Signal::Mask).expect("it was declared");
+            let masks = signals.get(Signal::Mask).expect("a declared signal");
             masks.iter().map(|&value| f64::from(value)).collect()
         };
         let mut expected = [[1.0_f64, 0.0, 0.0]; ROWS];
@@ -285,9 +292,9 @@ fn masks_step_by_what_they_would_switch_off() {
                 *first = 0.9 * *first + 0.1 * g;
                 *second = 0.999 * *second + 0.001 * g * g;
                 let age = number as i32;
-                let of_first = *first / (1.0 - 0.9_f64.powi(age));
-                let of_second = *second / (1.0 - 0.999_f64.powi(age));
-                *m -= 0.02 * of_first / of_second.sqrt();
+                let first_hat = *first / (1.0 - 0.9_f64.powi(age));
+                let second_hat = *second / (1.0 - 0.999_f64.powi(age));
+                *m -= 0.02 * first_hat / second_hat.sqrt();
                 // A hundredth of a step.
                 let off = (found[row] - sigmoid(*m)).abs();
                 assert!(off < 0.01 * 0.02, "step {number}, row {row}: {} {m}", found[row]);
@@ -298,13 +305,13 @@ fn masks_step_by_what_they_would_switch_off() {
         }
         let masks = values(&mut *backend);
         let fallen = masks.iter().filter(|&&mask| mask <= 0.72).count();
-        assert!((1..ROWS - 1).contains(&fallen), "{fallen} of {ROWS}: nothing is shown");
+        assert!((1..ROWS - 1).contains(&fallen), "{fallen} of {ROWS} fell to the threshold");
         let mut plan = EditPlan::new(ROWS, ROWS);
         plan.prune_all([0, 1]);
-        plan.grow(5, clone_at([0.1; 3])).expect("there is room");
-        plan.append(Seed::round([0.5; 3], [0.5; 3], 0.1, 0.1)).expect("there is room");
+        plan.grow(5, clone_at([0.1; 3])).expect("room in the budget");
+        plan.append(Seed::round([0.5; 3], [0.5; 3], 0.1, 0.1)).expect("room in the budget");
         backend.apply(&plan.compile(), 5, 5).expect("a plan is applied");
-        // The child stands behind its parent, the seed at the end, with a fresh mask.
+        // The child follows its parent with the same mask; the seed is last, with a new mask.
         let edited = values(&mut *backend);
         assert_eq!(edited[..4], masks[2..6]);
         assert_eq!(edited[4..ROWS - 1], masks[5..]);
@@ -313,7 +320,7 @@ fn masks_step_by_what_they_would_switch_off() {
 }
 
 #[test]
-fn sums_move_with_their_rows_and_end_with_them() {
+fn accumulated_gradients_move_with_their_rows() {
     on_each(repeatable(), |subject| {
         let cadence = Cadence { all: 2, sh_rest: 2 };
         let model = model(20);
@@ -324,17 +331,17 @@ fn sums_move_with_their_rows_and_end_with_them() {
             let mut plan = EditPlan::new(20, 20);
             edit(&mut plan);
             backend.apply(&plan.compile(), 5, 1).expect("a plan is applied");
-            // Nothing is seen: only what waits is left.
+            // No Gaussian is visible, so only accumulated gradients take effect.
             step(&mut *backend, &turned_away(&view(0)), 2, &needs, cadence);
             backend.download().expect("a model")
         };
         // The rows after row 4 move up.
-        let (plain, edited) = (run(|_| {}), run(|plan| plan.prune(4).expect("the row is free")));
+        let (plain, edited) = (run(|_| {}), run(|plan| plan.prune(4).expect("an unedited row")));
         assert!(plain.means[19] != model.means[19] && plain.sh_of(19) != model.sh_of(19));
         assert_eq!((plain.means[19], plain.sh_of(19)), (edited.means[18], edited.sh_of(18)));
         assert_eq!(plain.means[..4], edited.means[..4]);
         assert_eq!(plain.means[5..], edited.means[4..]);
-        // Bounding opacities forgets what waits for them, as it forgets their moments.
+        // Clamping opacities discards their accumulated gradients along with their moments.
         let bounded = run(|plan| plan.clamp_opacity(0.999).expect("the bound is sound"));
         assert_eq!(bounded.opacity_logits, model.opacity_logits);
         assert_eq!(bounded.means, plain.means);
@@ -342,7 +349,7 @@ fn sums_move_with_their_rows_and_end_with_them() {
 }
 
 #[test]
-fn a_row_that_starts_anew_steps_as_a_newborn() {
+fn resetting_moments_restarts_bias_correction() {
     on_each(repeatable(), |subject| {
         let cadence = Cadence { all: 1, sh_rest: 2 };
         let needs = Needs { cadence, detailed_edits: true, ..Needs::default() };
@@ -353,13 +360,13 @@ fn a_row_that_starts_anew_steps_as_a_newborn() {
         let mut plan = EditPlan::new(20, 20).allowing(&needs);
         let opacity = OpacityRule::Same;
         let update = Update { opacity, keep_moments: false, ..Update::NONE };
-        plan.update(11, update).expect("the row is free");
+        plan.update(11, update).expect("an unedited row");
         backend.apply(&plan.compile(), 5, 6).expect("a plan is applied");
         let before = backend.download().expect("a model");
         step(&mut *backend, &view(0), 7, &needs, cadence);
         step(&mut *backend, &view(1), 8, &needs, cadence);
         let after = backend.download().expect("a model");
-        // Bands 1–3 of the row have stepped once: by one learning rate, whatever the gradient.
+        // Adam's first step has the length of the learning rate, and bands 1–3 of the row have stepped once.
         let moved = |row: usize| -> Vec<f32> {
             let pairs = after.sh_of(row).iter().zip(before.sh_of(row));
             pairs.skip(3).map(|(a, b)| (a - b).abs() / RATES.sh_rest).collect()
@@ -370,14 +377,14 @@ fn a_row_that_starts_anew_steps_as_a_newborn() {
 }
 
 #[test]
-fn present_values_are_those_of_the_model() {
+fn state_signals_match_the_model() {
     on_each(repeatable(), |subject| {
         let model = model(20);
         let wanted = [Signal::Opacity, Signal::ScaleMax, Signal::ScaleProduct];
         let needs = Needs { signals: SignalSet::from(wanted), ..Needs::default() };
         let mut backend = backend(subject, &model, needs.clone());
         let signals = backend.take_signals(needs.signals).expect("signals can be taken");
-        let of = |signal| signals.get(signal).expect("a requested signal");
+        let column = |signal| signals.get(signal).expect("a requested signal");
         for row in 0..20 {
             let scales = model.log_scales[row].map(|x| f64::from(x).exp());
             let largest = scales.into_iter().fold(0.0, f64::max);
@@ -387,7 +394,7 @@ fn present_values_are_those_of_the_model() {
                 scales.into_iter().product(),
             ];
             for (signal, expected) in wanted.into_iter().zip(expected) {
-                let found = f64::from(of(signal)[row]);
+                let found = f64::from(column(signal)[row]);
                 assert!((found / expected - 1.0).abs() < 1e-5, "{signal:?}: {found} {expected}");
             }
         }

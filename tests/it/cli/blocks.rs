@@ -1,4 +1,4 @@
-//! `densify blocks`: a scene divided, trained in parts and put together, whatever starts the parts.
+//! `densify blocks`: a scene is divided, trained block by block and merged, locally or by a scheduler.
 
 use std::path::Path;
 
@@ -6,10 +6,10 @@ use toml::Table;
 
 use super::{Outcome, call, count, gaussians, json, read, read_text, scratch, text};
 #[cfg(unix)]
-use super::{call_with_path, run_place, stand_in};
+use super::{call_with_path, run_array_task, write_program};
 use crate::photographs::{Photographs, VIEWS};
 
-/// Two blocks of a small scene.
+/// Plans two blocks of a small scene.
 fn plan(scene: &Path, folder: &Path, more: &str) -> Outcome {
     let sizes = "--rows 400 --blocks 2x1 --coarse-rows 150";
     let train = "-i 120 --sh-degree 1 --backend cpu --checkpoint-every 40";
@@ -25,20 +25,20 @@ fn blocks(words: &str, folder: &Path) -> Outcome {
     call(&format!("blocks {command} {} {rest}", text(folder)))
 }
 
-/// The lines of `blocks status`, but for the spaces.
+/// The lines of `blocks status` with single spaces.
 fn status(folder: &Path) -> Vec<String> {
-    let said = blocks("status", folder).ok().stdout;
-    said.lines().map(|line| line.split_whitespace().collect::<Vec<_>>().join(" ")).collect()
+    let stdout = blocks("status", folder).ok().stdout;
+    stdout.lines().map(|line| line.split_whitespace().collect::<Vec<_>>().join(" ")).collect()
 }
 
 #[test]
-fn a_scene_in_blocks_becomes_one_model() {
+fn blocks_are_trained_and_merged_into_one_model() {
     let scene = Photographs::colmap_text();
     let (_root, folder) = scratch();
-    let said = plan(scene.path(), &folder, "").ok().stdout;
-    assert!(said.contains("block-0-0") && said.contains("block-1-0"), "{said}");
+    let stdout = plan(scene.path(), &folder, "").ok().stdout;
+    assert!(stdout.contains("block-0-0") && stdout.contains("block-1-0"), "{stdout}");
     assert!(read(&folder.join("plan.svg")).starts_with(b"<svg"));
-    let plan: Table = read_text(&folder.join("plan.toml")).parse().expect("it is TOML");
+    let plan: Table = read_text(&folder.join("plan.toml")).parse().expect("a TOML file");
     let listed = plan["block"].as_array().expect("a list of blocks");
     let number = |block: &toml::Value, key: &str| block[key].as_integer().expect("a number") as u64;
     assert!(listed.iter().map(|block| number(block, "rows")).sum::<u64>() <= 400);
@@ -46,7 +46,7 @@ fn a_scene_in_blocks_becomes_one_model() {
         let views = read_text(&folder.join("blocks").join(name).join("views.txt"));
         assert!((1..=VIEWS).contains(&views.lines().count()), "{views}");
         assert!(views.lines().all(|view| view.starts_with("view_")), "{views}");
-        // Of most only the part that shows the block.
+        // Most views are cropped to the part that shows the block.
         assert!(2 * views.matches('\t').count() > views.lines().count(), "{views}");
     }
     let waiting = ["coarse waiting", "block-0-0 waiting", "block-1-0 waiting", "merge waiting"];
@@ -58,8 +58,8 @@ fn a_scene_in_blocks_becomes_one_model() {
     merge("").refused("nothing is trained", &["block-0-0, block-1-0", "--partial"]);
     assert!(!merged.exists());
 
-    let said = blocks("submit", &folder).ok().stdout;
-    assert!(said.contains("started  coarse") && said.contains("ended    merge"), "{said}");
+    let stdout = blocks("submit", &folder).ok().stdout;
+    assert!(stdout.contains("started  coarse") && stdout.contains("ended    merge"), "{stdout}");
     assert_eq!(status(&folder).last().unwrap(), "4 complete, 0 to go");
     merge("").ok();
     let whole = read(&merged);
@@ -69,15 +69,15 @@ fn a_scene_in_blocks_becomes_one_model() {
     for block in listed {
         let name = block["name"].as_str().expect("a name");
         let summary = json(&folder.join("blocks").join(name).join("run/stats/summary.json"));
-        // Its own rows, and those of the coarse model that it has frozen.
+        // The peak includes the frozen Gaussians of the coarse model.
         assert!(count(&summary, "peak_rows") <= number(block, "budget") + 150, "{summary}");
-        assert!(number(block, "budget") > number(block, "rows"), "{block}: there is a margin");
+        assert!(number(block, "budget") > number(block, "rows"), "{block}: there is no margin");
         assert!(count(&summary, "peak_bytes") <= number(block, "memory"), "{block}: {summary}");
     }
-    let said = blocks("submit", &folder).ok().stdout;
-    assert!(said.contains("every task is complete"), "{said}");
+    let stdout = blocks("submit", &folder).ok().stdout;
+    assert!(stdout.contains("every task is complete"), "{stdout}");
 
-    // A block that was killed before its end goes on to the same bytes.
+    // A block that is killed before its end resumes to the same bytes.
     let run = folder.join("blocks/block-1-0/run");
     let iterations = number(&listed[1], "iterations");
     std::fs::remove_dir_all(run.join(format!("point_cloud/iteration_{iterations}"))).unwrap();
@@ -97,18 +97,18 @@ fn a_scene_in_blocks_becomes_one_model() {
     merge("").ok();
     assert!(read(&merged) == whole);
 
-    // In another format, and never where something is already.
+    // Merging writes other formats too, and never replaces a file unasked.
     let spz = folder.join("whole.spz");
     blocks(&format!("merge -o {}", text(&spz)), &folder).ok();
     assert_eq!(gaussians(&spz).len(), rows);
     blocks(&format!("merge -o {}", text(&spz)), &folder).refused("it exists", &["--overwrite"]);
 }
 
-/// The files for schedulers do what this machine does. Slurm's program is one that takes down how it is called; its
-/// scripts are then run by hand.
+/// Scheduler jobs produce the same model as a local run. A stand-in for `sbatch` records its arguments; the test then
+/// runs the scripts itself.
 #[cfg(unix)]
 #[test]
-fn schedulers_are_handed_what_makes_the_same_model() {
+fn scheduler_scripts_produce_the_same_model() {
     let scene = Photographs::colmap_text();
     let (root, folder) = scratch();
     plan(scene.path(), &folder, "").ok();
@@ -129,10 +129,10 @@ fn schedulers_are_handed_what_makes_the_same_model() {
     let calls = root.path().join("calls");
     let counted = "wc -l <";
     let script = format!("echo \"$@\" >> {0}; echo \"$({counted} {0});cluster\"", text(&calls));
-    stand_in(&bin, "sbatch", &script);
+    write_program(&bin, "sbatch", &script);
     let path = format!("{}:{}", text(&bin), std::env::var("PATH").unwrap());
-    let said = submit("--engine slurm", &path).ok().stdout;
-    assert!(said.contains("1, 2, 3"), "{said}");
+    let stdout = submit("--engine slurm", &path).ok().stdout;
+    assert!(stdout.contains("1, 2, 3"), "{stdout}");
     let calls = read_text(&calls);
     let calls: Vec<&str> = calls.lines().collect();
     assert!(!calls[0].contains("--dependency"), "{calls:?}");
@@ -141,29 +141,30 @@ fn schedulers_are_handed_what_makes_the_same_model() {
     let script = |name: &str| folder.join("slurm").join(format!("{name}.sh"));
     let array = read_text(&script("blocks"));
     assert!(shown.contains(&array), "{shown}");
-    let plan: Table = read_text(&folder.join("plan.toml")).parse().expect("it is TOML");
+    let plan: Table = read_text(&folder.join("plan.toml")).parse().expect("a TOML file");
     let memory = |block: &toml::Value| block["memory"].as_integer().expect("a number");
     let most = plan["block"].as_array().unwrap().iter().map(memory).max().unwrap();
-    let asked = array.lines().find_map(|line| line.strip_prefix("#SBATCH --mem=")).unwrap();
-    let asked: i64 = asked.trim_end_matches('M').parse().expect("a number");
-    assert_eq!(asked, (most + (1 << 20) - 1) >> 20);
+    let requested = array.lines().find_map(|line| line.strip_prefix("#SBATCH --mem=")).unwrap();
+    let requested: i64 = requested.trim_end_matches('M').parse().expect("a number");
+    assert_eq!(requested, (most + (1 << 20) - 1) >> 20);
     assert!(array.contains("#SBATCH --array=0,1\n") && array.contains("#SBATCH --requeue\n"));
     for (name, place) in [("coarse", ""), ("blocks", "1"), ("blocks", "0"), ("merge", "")] {
-        run_place(&script(name), place);
+        run_array_task(&script(name), place);
     }
     assert!(read(&folder.join("merged.ply")) == read(&local.join("merged.ply")));
 
-    // The same as a job of HyperQueue, before anything was done.
+    // The same plan as a HyperQueue job, with one block and the merge left to do.
     std::fs::remove_file(folder.join("merged.ply")).unwrap();
     std::fs::remove_dir_all(folder.join("blocks/block-0-0/run")).unwrap();
-    stand_in(&bin, "hq", "[ \"$3\" = submit-file ] && [ -f \"$4\" ] && echo 7");
+    write_program(&bin, "hq", "[ \"$3\" = submit-file ] && [ -f \"$4\" ] && echo 7");
     submit("--engine hq", &path).refused("twice", &["--again"]);
     submit("--engine hq --again --mem-resource", &path).ok();
-    let job: Table = read_text(&folder.join("hq/job.toml")).parse().expect("it is TOML");
+    let job: Table = read_text(&folder.join("hq/job.toml")).parse().expect("a TOML file");
     let tasks = job["task"].as_array().expect("tasks");
-    let of = |task: &toml::Value| task["command"].as_array().unwrap().last().unwrap().clone();
+    let last_word =
+        |task: &toml::Value| task["command"].as_array().unwrap().last().unwrap().clone();
     assert_eq!(tasks.len(), 2);
-    assert_eq!([of(&tasks[0]), of(&tasks[1])], ["block-0-0".into(), "merge".into()]);
+    assert_eq!([last_word(&tasks[0]), last_word(&tasks[1])], ["block-0-0".into(), "merge".into()]);
     assert!(tasks[0].get("deps").is_none());
     assert_eq!(tasks[1]["deps"], toml::Value::from(vec![0]));
     let resources = &tasks[0]["request"].as_array().unwrap()[0]["resources"];
@@ -171,7 +172,7 @@ fn schedulers_are_handed_what_makes_the_same_model() {
 }
 
 #[test]
-fn what_cannot_be_planned_is_named_and_nothing_is_written() {
+fn impossible_plans_are_refused_and_write_nothing() {
     let scene = Photographs::colmap_text();
     let (root, folder) = scratch();
     let plan = |words: &str| {
@@ -195,9 +196,9 @@ fn what_cannot_be_planned_is_named_and_nothing_is_written() {
     let left: Vec<_> = std::fs::read_dir(root.path()).unwrap().collect();
     assert!(left.is_empty(), "{left:?}");
 
-    // Few enough blocks for a memory are found; the coarse run leaves them room.
+    // `plan` chooses the number of blocks that fits the memory; the coarse model leaves room for their Gaussians.
     let most = 96 << 20;
-    let bounded = plan_of(
+    let bounded = read_plan(
         scene.path(),
         &folder,
         "--rows 100k --memory 96MiB -- -i 20 --backend cpu --threads 2",
@@ -210,19 +211,19 @@ fn what_cannot_be_planned_is_named_and_nothing_is_written() {
     let coarse = |plan: &Table| plan["coarse"]["rows"].as_integer().expect("a number");
     assert!((1_000..40_000).contains(&coarse(&bounded)), "{bounded}");
     let unbounded =
-        plan_of(scene.path(), &root.path().join("other"), "--rows 4000 --blocks 2 -- -i 20");
+        read_plan(scene.path(), &root.path().join("other"), "--rows 4000 --blocks 2 -- -i 20");
     assert_eq!(coarse(&unbounded), 1_600, "{unbounded}");
-    // What may be learned beside the model is a part of what each task takes.
+    // Learned exposures count towards the memory of each task.
     let words = "--rows 4000 --blocks 2 -- -i 20 --exposure on";
-    let exposed = plan_of(scene.path(), &root.path().join("exposed"), words);
+    let exposed = read_plan(scene.path(), &root.path().join("exposed"), words);
     let memory = |plan: &Table, at: usize| plan["block"][at]["memory"].as_integer();
     assert!((0..2).all(|at| memory(&exposed, at) > memory(&unbounded, at)), "{exposed}");
-    let again = call(&format!(
+    let occupied = call(&format!(
         "blocks plan {} -o {} --rows 400 --blocks 2",
         text(scene.path()),
         text(&folder)
     ));
-    again.refused("the folder is taken", &["not empty", "-o"]);
+    occupied.refused("the folder is taken", &["not empty", "-o"]);
     blocks("run block-7-7", &folder).refused("no such task", &["block-7-7", "coarse"]);
     std::fs::remove_file(folder.join("coarse.toml")).unwrap();
     blocks("run coarse", &folder).refused("half deleted", &["coarse.toml", "plan again"]);
@@ -230,14 +231,14 @@ fn what_cannot_be_planned_is_named_and_nothing_is_written() {
     blocks("status", &folder).refused("no plan", &["plan.toml", "blocks plan"]);
 }
 
-/// Plans; returns what the plan says.
-fn plan_of(scene: &Path, folder: &Path, words: &str) -> Table {
+/// Plans and returns the contents of `plan.toml`.
+fn read_plan(scene: &Path, folder: &Path, words: &str) -> Table {
     call(&format!("blocks plan {} -o {} {words}", text(scene), text(folder))).ok();
-    read_text(&folder.join("plan.toml")).parse().expect("it is TOML")
+    read_text(&folder.join("plan.toml")).parse().expect("a TOML file")
 }
 
 #[test]
-fn a_run_uses_only_the_views_that_are_named() {
+fn a_run_uses_only_the_listed_views() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
     let file = root.path().join("views.txt");
@@ -246,15 +247,15 @@ fn a_run_uses_only_the_views_that_are_named() {
         let flags = format!("--budget 200 --eval --views {} -i 4 --overwrite", text(&file));
         call(&format!("train {} -o {} {flags}", text(scene.path()), text(&run)))
     };
-    // Of 14 views the first and the ninth are held out, whichever are named.
+    // The first and ninth of the 14 views are held out, whichever views are listed.
     train("view_01.png\n\nview_08.png\n  view_03.png\n").ok();
     let summary = json(&run.join("stats/summary.json"));
     assert_eq!((count(&summary, "train_views"), count(&summary, "test_views")), (2, 1));
     train("view_01.png\nno.png\n").refused("an unknown view", &["line 2", "no.png", "views.txt"]);
     train("view_08.png\n").refused("nothing to train on", &["--views", "trained on"]);
-    // A part of a view, of 48 by 40 pixels.
-    let said = train("view_01.png\t0.2 0 0.9 1\n").ok().stdout;
-    assert!(said.contains("up to 35x40 px"), "{said}");
+    // Only part of a view of 48x40 px.
+    let stdout = train("view_01.png\t0.2 0 0.9 1\n").ok().stdout;
+    assert!(stdout.contains("up to 35x40 px"), "{stdout}");
     for wrong in ["0 0 1", "0.5 0 0.5 1", "0 0 1 1.1", "0 0 a 1"] {
         let words = ["views.txt", "line 1", "left, top, right and bottom"];
         train(&format!("view_01.png\t{wrong} \nview_03.png\n")).refused(wrong, &words);

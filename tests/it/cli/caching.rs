@@ -1,4 +1,4 @@
-//! Built-in scenes are rendered once, and the cache changes nothing but the time.
+//! The cache of rendered built-in scenes: scenes are rendered once, and results do not depend on the cache.
 
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
@@ -26,19 +26,19 @@ fn a_built_in_scene_is_rendered_once() {
     let (root, _) = scratch();
     let cache = root.path().join("cache");
     let run = |name: &str| root.path().join(name);
-    let expected = train(&cache, &run("anew"), &["--no-cache"]);
+    let expected = train(&cache, &run("uncached"), &["--no-cache"]);
     assert!(entries(&cache).is_empty());
     assert!(train(&cache, &run("first"), &[]) == expected);
-    let kept = entries(&cache);
-    assert_eq!(kept.len(), 1, "{kept:?}");
-    // An entry that is made anew is another file.
-    let number = || std::fs::metadata(&kept[0]).expect("an entry").ino();
-    let before = number();
+    let cached = entries(&cache);
+    assert_eq!(cached.len(), 1, "{cached:?}");
+    // A rewritten entry would be a new file with another inode.
+    let inode = || std::fs::metadata(&cached[0]).expect("an entry").ino();
+    let before = inode();
     assert!(train(&cache, &run("second"), &[]) == expected);
-    assert_eq!(number(), before, "it was rendered again");
-    // A damaged entry is made anew.
-    let bytes = std::fs::read(&kept[0]).expect("an entry");
-    std::fs::write(&kept[0], &bytes[..bytes.len() / 2]).expect("a damaged entry");
+    assert_eq!(inode(), before, "the scene was rendered again");
+    // A damaged entry is replaced.
+    let bytes = std::fs::read(&cached[0]).expect("an entry");
+    std::fs::write(&cached[0], &bytes[..bytes.len() / 2]).expect("a damaged entry");
     assert!(train(&cache, &run("damaged"), &[]) == expected);
-    assert!(std::fs::read(&kept[0]).expect("an entry") == bytes);
+    assert!(std::fs::read(&cached[0]).expect("an entry") == bytes);
 }

@@ -1,4 +1,4 @@
-//! `densify compare`: policies under equal conditions.
+//! `densify compare`: trains several policies under equal conditions.
 
 use std::path::Path;
 
@@ -7,25 +7,25 @@ use serde_json::{Value, json};
 
 use super::{Outcome, call, files, read, read_text, records, scratch, text};
 #[cfg(unix)]
-use super::{call_with_path, run_place, stand_in};
+use super::{call_with_path, run_array_task, write_program};
 use crate::photographs::Photographs;
 
-/// Two policies, two budgets, two seeds, in runs of some dozen steps.
+/// Compares two policies with two budgets and two seeds in short runs.
 fn compare(scene: &Path, output: &Path, more: &str) -> Outcome {
     call(&compare_words(scene, output, more))
 }
 
 fn compare_words(scene: &Path, output: &Path, more: &str) -> String {
-    let what = "--seeds 2 --policies vanilla,diet --budget 250,320 --iterations 24";
-    format!("compare {} -o {} {what} {more}", text(scene), text(output))
+    let options = "--seeds 2 --policies vanilla,diet --budget 250,320 --iterations 24";
+    format!("compare {} -o {} {options} {more}", text(scene), text(output))
 }
 
 #[test]
-fn every_run_is_there_once_and_in_the_table() {
+fn every_run_appears_once_in_the_log_and_the_table() {
     let scene = Photographs::colmap_text();
     let (_root, output) = scratch();
-    let said = compare(scene.path(), &output, "-- --sh-degree 0").ok().stdout;
-    assert!(said.contains("[8/8]") && said.contains("PSNR [dB]"), "{said}");
+    let stdout = compare(scene.path(), &output, "-- --sh-degree 0").ok().stdout;
+    assert!(stdout.contains("[8/8]") && stdout.contains("PSNR [dB]"), "{stdout}");
     let all = records(&output.join("compare.jsonl"));
     assert_eq!(all.len(), 8);
     for record in &all {
@@ -36,9 +36,9 @@ fn every_run_is_there_once_and_in_the_table() {
         assert_eq!(record["curve"].as_array().map(Vec::len), Some(8), "{record}");
         assert_eq!(record["spec"]["sh_degree"], 0, "{record}");
     }
-    // Seeds differ, and so do budgets; nothing else was varied.
+    // Different seeds give different results.
     let psnr = |i: usize| all[i]["psnr"].as_f64().expect("a number");
-    assert_ne!(psnr(0).to_bits(), psnr(4).to_bits(), "the seeds do nothing");
+    assert_ne!(psnr(0).to_bits(), psnr(4).to_bits(), "the seeds have no effect");
     let table = read_text(&output.join("compare.md"));
     for word in [
         "| vanilla |",
@@ -52,7 +52,7 @@ fn every_run_is_there_once_and_in_the_table() {
         assert!(table.contains(word), "{word} is not in {table}");
     }
     assert!(!table.contains("Chamfer") && all.iter().all(|r| r.get("geometry").is_none()));
-    // Every picture that the table shows is there.
+    // Every picture in the table exists.
     let pictures: Vec<&str> =
         table.split("](").skip(1).filter_map(|rest| rest.split(')').next()).collect();
     assert_eq!(pictures.len(), 5, "{pictures:?}");
@@ -60,38 +60,38 @@ fn every_run_is_there_once_and_in_the_table() {
         let bytes = read(&output.join(picture));
         assert!(bytes.starts_with(b"<svg") || bytes.starts_with(b"\x89PNG"), "{picture}");
     }
-    // The same as one file.
+    // The HTML report is a single file.
     let page = read_text(&output.join("compare.html"));
-    super::reporting::stands_for_itself(&page);
+    super::reporting::assert_self_contained(&page);
     assert_eq!(page.matches("src=\"data:image/").count(), 5);
     assert!(page.contains("<td>vanilla</td>") && page.contains("near = 0.04"), "{page}");
 
-    // Again: nothing runs, and nothing changes.
+    // Repeating the call trains nothing and changes no file.
     let before = files(&output);
-    let said = compare(scene.path(), &output, "-- --sh-degree 0").ok().stdout;
-    assert_eq!(said.matches("done before").count(), 8, "{said}");
-    assert!(before == files(&output), "a comparison that was complete has changed");
+    let stdout = compare(scene.path(), &output, "-- --sh-degree 0").ok().stdout;
+    assert_eq!(stdout.matches("done before").count(), 8, "{stdout}");
+    assert!(before == files(&output), "a complete comparison was changed");
 
-    // A record that was lost, or cut off: its run runs again, to the same end.
+    // A lost or truncated record: only its run is repeated, with the same result.
     let log = output.join("compare.jsonl");
     let lines = read_text(&log);
     let kept: Vec<&str> = lines.lines().take(7).collect();
-    std::fs::write(&log, kept.join("\n") + "\n{\"densify\":").expect("it is written");
-    let said = compare(scene.path(), &output, "-- --sh-degree 0").ok().stdout;
-    assert_eq!(said.matches("done before").count(), 7, "{said}");
+    std::fs::write(&log, kept.join("\n") + "\n{\"densify\":").expect("written");
+    let stdout = compare(scene.path(), &output, "-- --sh-degree 0").ok().stdout;
+    assert_eq!(stdout.matches("done before").count(), 7, "{stdout}");
     assert_eq!(records(&log)[7]["psnr"], all[7]["psnr"]);
 }
 
 #[test]
-fn a_policy_competes_with_itself_by_its_parameters() {
+fn a_policy_can_be_compared_under_different_parameters() {
     let scene = Photographs::colmap_text();
     let (_root, output) = scratch();
     let variant = "diet:min_opacity=0.5:rho=0";
-    let what = format!("--seeds 1 --policies diet,{variant} --budget 320 --iterations 400");
-    call(&format!("compare {} -o {} {what}", text(scene.path()), text(&output))).ok();
+    let options = format!("--seeds 1 --policies diet,{variant} --budget 320 --iterations 400");
+    call(&format!("compare {} -o {} {options}", text(scene.path()), text(&output))).ok();
     let all = records(&output.join("compare.jsonl"));
     assert_eq!([&all[0]["factor"], &all[1]["factor"]], ["diet", variant]);
-    assert_ne!(all[0]["psnr"], all[1]["psnr"], "the parameters do nothing");
+    assert_ne!(all[0]["psnr"], all[1]["psnr"], "the parameters have no effect");
     let run = all[1]["run"].as_str().expect("a name");
     assert!(run.ends_with("diet-min_opacity-0.5-rho-0-320-seed0"), "{run}");
     assert!(output.join("runs").join(run).is_dir());
@@ -100,12 +100,12 @@ fn a_policy_competes_with_itself_by_its_parameters() {
 }
 
 #[test]
-fn all_policies_compete_and_are_ranked() {
+fn all_policies_are_run_and_ranked() {
     let scene = Photographs::colmap_text();
     let (_root, output) = scratch();
-    let what = "--seeds 1 --policies vanilla,all --budget 320 --iterations 24";
-    let said =
-        call(&format!("compare {} -o {} {what}", text(scene.path()), text(&output))).ok().stdout;
+    let options = "--seeds 1 --policies vanilla,all --budget 320 --iterations 24";
+    let stdout =
+        call(&format!("compare {} -o {} {options}", text(scene.path()), text(&output))).ok().stdout;
     let registered = policies().expect("the registry is sound");
     let others = registered.iter().map(|entry| entry.name).filter(|name| *name != "vanilla");
     let names: Vec<&str> = std::iter::once("vanilla").chain(others).collect();
@@ -114,23 +114,23 @@ fn all_policies_compete_and_are_ranked() {
     assert_eq!(ran, names);
     let table = read_text(&output.join("compare.md"));
     for name in names {
-        // RANK NAME PSNR …, then NAME END PEAK.
+        // The first table has RANK NAME PSNR …, the second NAME END PEAK.
         let words = |line: &str| line.split_whitespace().map(String::from).collect::<Vec<_>>();
         let has = |at: usize, other: usize| {
-            said.lines().map(words).any(|it| {
-                it.get(at).is_some_and(|word| word == name)
-                    && it.get(other).is_some_and(|word| word.parse::<usize>().is_ok())
+            stdout.lines().map(words).any(|row| {
+                row.get(at).is_some_and(|word| word == name)
+                    && row.get(other).is_some_and(|word| word.parse::<usize>().is_ok())
             })
         };
-        assert!(has(1, 0) && has(0, 2), "{name}: {said}");
+        assert!(has(1, 0) && has(0, 2), "{name}: {stdout}");
         assert!(table.contains(&format!("| {name} |")), "{name}: {table}");
     }
-    assert!(said.contains("from vanilla") && said.contains("320: end"), "{said}");
+    assert!(stdout.contains("from vanilla") && stdout.contains("320: end"), "{stdout}");
     assert!(table.contains("### Budget of 320\n"), "{table}");
 }
 
 #[test]
-fn bad_comparisons_are_refused_before_anything_runs() {
+fn invalid_comparisons_are_refused_before_any_run() {
     let scene = Photographs::colmap_text();
     let (root, output) = scratch();
     let nowhere = root.path().join("nowhere");
@@ -158,7 +158,7 @@ fn bad_comparisons_are_refused_before_anything_runs() {
     assert!(!output.join("compare.md").exists());
 }
 
-/// What the runs of a study are called and arrive at, in an order that does not depend on who made them.
+/// Name, model and PSNR of every run, in an order that does not depend on the engine.
 fn results(folder: &Path) -> Vec<Value> {
     let found = records(&folder.join("compare.jsonl"));
     let mut found: Vec<Value> =
@@ -167,50 +167,50 @@ fn results(folder: &Path) -> Vec<Value> {
     found
 }
 
-/// A scheduler is handed the runs, and the same call collects them. Slurm's program is one that does nothing; its script
-/// is then run by hand.
+/// The first call submits the runs to a scheduler; repeating it collects the results. `sbatch` is a stand-in that does
+/// nothing; the test then runs the script itself.
 #[cfg(unix)]
 #[test]
-fn a_scheduler_makes_the_same_runs_and_the_same_call_collects_them() {
+fn scheduler_runs_match_local_ones_and_are_collected_by_repeating_the_call() {
     let scene = Photographs::colmap_text();
     let (root, alone) = scratch();
     let flags = "-- --sh-degree 0 --threads 1";
     compare(scene.path(), &alone, flags).ok();
-    let output = root.path().join("handed-in");
+    let output = root.path().join("submitted");
     let bin = root.path().join("bin");
     std::fs::create_dir(&bin).expect("a folder");
     let path = format!("{}:{}", text(&bin), std::env::var("PATH").expect("a path"));
-    let handed = |more: &str, path: &str| {
+    let submit = |more: &str, path: &str| {
         let words = compare_words(scene.path(), &output, &format!("--engine slurm {more} {flags}"));
         call_with_path(&words, path)
     };
-    let shown = handed("--dry-run", text(&bin)).ok().stdout;
+    let shown = submit("--dry-run", text(&bin)).ok().stdout;
     assert!(shown.contains("0 of 8 done") && !output.exists(), "{shown}");
-    handed("", text(&bin)).refused("no Slurm", &["sbatch", "PATH"]);
-    stand_in(&bin, "sbatch", "echo 7");
-    let said = handed("", &path).ok().stdout;
-    assert!(said.contains("job      7") && said.contains("again to collect"), "{said}");
+    submit("", text(&bin)).refused("no Slurm", &["sbatch", "PATH"]);
+    write_program(&bin, "sbatch", "echo 7");
+    let stdout = submit("", &path).ok().stdout;
+    assert!(stdout.contains("job      7") && stdout.contains("again to collect"), "{stdout}");
     let script = output.join("slurm/runs.sh");
     let text_of_script = read_text(&script);
     assert!(shown.contains(&text_of_script), "{shown}");
     assert!(text_of_script.contains("#SBATCH --array=0,1,2,3,4,5,6,7\n"), "{text_of_script}");
     assert!(text_of_script.contains("#SBATCH --cpus-per-task=1\n"), "{text_of_script}");
     for place in ["3", "0", "1", "2", "4", "5", "6"] {
-        run_place(&script, place);
+        run_array_task(&script, place);
     }
-    let said = handed("", &path).ok().stdout;
-    assert!(said.contains("7 of 8 done") && said.contains("as job 7"), "{said}");
+    let stdout = submit("", &path).ok().stdout;
+    assert!(stdout.contains("7 of 8 done") && stdout.contains("as job 7"), "{stdout}");
     assert!(!output.join("compare.md").exists());
-    // What is left, and nothing else, is handed in again.
-    handed("--again", &path).ok();
+    // Only unfinished runs are submitted again.
+    submit("--again", &path).ok();
     assert!(read_text(&script).contains("#SBATCH --array=7\n"));
-    run_place(&script, "7");
-    let said = handed("", &path).ok().stdout;
-    assert!(said.contains("[8/8]") && said.contains("PSNR [dB]"), "{said}");
+    run_array_task(&script, "7");
+    let stdout = submit("", &path).ok().stdout;
+    assert!(stdout.contains("[8/8]") && stdout.contains("PSNR [dB]"), "{stdout}");
     assert!(read_text(&output.join("compare.md")).contains("| diet |"));
     assert_eq!(results(&output), results(&alone));
 
-    // A run with other options is another run, whatever has its name.
+    // A run with other options does not count as done, even if a folder has its name.
     let other = compare_words(
         scene.path(),
         &output,
@@ -222,16 +222,16 @@ fn a_scheduler_makes_the_same_runs_and_the_same_call_collects_them() {
 }
 
 #[test]
-fn several_runs_at_once_are_the_same_runs() {
+fn parallel_runs_match_sequential_ones() {
     let scene = Photographs::colmap_text();
     let (root, alone) = scratch();
     let flags = "-- --sh-degree 0 --threads 1";
     compare(scene.path(), &alone, flags).ok();
     let output = root.path().join("at-once");
-    let said = compare(scene.path(), &output, &format!("--engine local {flags}")).ok().stdout;
-    assert!(said.contains("started  ") && said.contains("[8/8]"), "{said}");
+    let stdout = compare(scene.path(), &output, &format!("--engine local {flags}")).ok().stdout;
+    assert!(stdout.contains("started  ") && stdout.contains("[8/8]"), "{stdout}");
     assert_eq!(results(&output), results(&alone));
-    // One that fails is named, with what it said.
+    // A failed run is named with its error message.
     let wrong =
         compare(scene.path(), &output, "--engine local -- --sh-degree 0 --threads 1 --memory 1MiB");
     wrong.refused("too little memory", &["--memory"]);

@@ -1,4 +1,4 @@
-//! `densify compress`: files no larger than asked, and what is refused.
+//! `densify compress`: files within the requested size, and refused calls.
 
 use densify::train::output::model_path;
 
@@ -6,7 +6,7 @@ use super::{call, files, gaussians, read, scratch, text, train};
 use crate::photographs::Photographs;
 
 #[test]
-fn what_is_written_is_no_larger_than_asked() {
+fn compressed_files_stay_within_the_requested_size() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
     train(scene.path(), &run, 100, "--budget 300 --eval --quiet").ok();
@@ -21,33 +21,33 @@ fn what_is_written_is_no_larger_than_asked() {
         );
         (call(&words), output)
     };
-    // Half of the bytes, in the same format: by fewer Gaussians, or by less colour.
+    // Half of the bytes in the same format, by fewer Gaussians or a lower SH degree.
     let (outcome, ply) = compress(&format!("{}B", whole / 2), "half.ply", "");
     let outcome = outcome.ok();
     let size = read(&ply).len();
     assert!(size <= whole / 2 && size > whole / 4, "{size} of {whole}");
     let written: Vec<_> = outcome.stdout.lines().filter(|l| l.starts_with("written ")).collect();
     assert_eq!(written.len(), 1, "{outcome:?}");
-    assert!(outcome.stdout.contains("tried "), "the other degree was tried: {outcome:?}");
+    assert!(outcome.stdout.contains("tried "), "no other degree was tried: {outcome:?}");
     // The same call gives the same bytes.
     let (outcome, again) = compress(&format!("{}B", whole / 2), "again.ply", "--threads 1");
     outcome.ok();
     assert!(read(&again) == read(&ply));
-    // A number of Gaussians.
+    // The size can also be a number of Gaussians.
     let third = rows / 3;
     let (outcome, few) = compress(&third.to_string(), "few.ply", "");
     assert!(outcome.ok().stdout.contains(&format!("training {third} Gaussians")));
     assert_eq!(gaussians(&few).len(), third);
-    // Already small enough: nothing is trained, nothing is lost.
+    // Already small enough: nothing is trained and nothing is lost.
     let (outcome, same) = compress("1MiB", "same.ply", "");
     assert!(!outcome.ok().stdout.contains("training"));
     assert_eq!(read(&same).len(), whole);
 
-    // The format that holds most: what half of a PLY's bytes hold as a whole is written as it is.
+    // `any` picks a format in which the whole model fits half the bytes of the PLY, so nothing is trained.
     let (outcome, any) = compress(&format!("{}B", whole / 2), "any", "--format any");
     let outcome = outcome.ok();
     let found: Vec<_> =
-        files(root.path()).into_keys().filter(|it| it.starts_with("any.")).collect();
+        files(root.path()).into_keys().filter(|name| name.starts_with("any.")).collect();
     let [name] = &found[..] else { panic!("{found:?}: {outcome:?}") };
     assert!(outcome.stdout.contains(name) && !outcome.stdout.contains("training"), "{outcome:?}");
     assert_eq!(gaussians(&root.path().join(name)).len(), rows);
@@ -71,5 +71,5 @@ fn what_is_written_is_no_larger_than_asked() {
     let outcome =
         call(&format!("compress {alone} --to 50 -o {}", text(&root.path().join("x.ply"))));
     outcome.refused("a file alone", &["--scene"]);
-    assert_eq!(files(root.path()).len(), before, "nothing is left behind");
+    assert_eq!(files(root.path()).len(), before, "something is left behind");
 }

@@ -1,4 +1,4 @@
-//! Runs described by a file: what it may say, what wins over it, and what is refused.
+//! Configuration files of runs: accepted keys, precedence of flags, and refused values.
 
 use std::path::Path;
 use std::process::Command;
@@ -12,19 +12,19 @@ const ITERATIONS: u32 = 12;
 
 fn write(folder: &Path, text: &str) -> String {
     let path = folder.join("run.toml");
-    std::fs::write(&path, text).expect("it is written");
+    std::fs::write(&path, text).expect("written");
     path.to_str().expect("temporary paths are UTF-8").to_owned()
 }
 
 #[test]
-fn a_file_describes_a_run_and_flags_win_over_it() {
+fn flags_override_the_configuration_file() {
     let scene = Photographs::colmap_text();
     let (root, by_flags) = scratch();
-    let train = |what: &str, to: &Path| call(&format!("train {what} -o {}", text(to))).ok();
+    let train = |words: &str, to: &Path| call(&format!("train {words} -o {}", text(to))).ok();
     let flags = "-i 12 --budget 250 --sh-degree 1 --seed 5 --knob alpha_min=1/64 --eval";
     let described = format!("{} {flags} --policy-set diet.rho=0.2", text(scene.path()));
     train(&described, &by_flags);
-    // The same from a file, but for the seed, which a flag gives.
+    // The same run from a file, except for the seed, which a flag overrides.
     let file = write(
         root.path(),
         &format!(
@@ -33,7 +33,7 @@ fn a_file_describes_a_run_and_flags_win_over_it() {
             scene.path()
         ),
     );
-    // A run's own file repeats it.
+    // The `config.toml` that a run writes reproduces the run.
     let config = by_flags.join("config.toml");
     for what in [format!("--config {file} --seed 5"), format!("--config {}", text(&config))] {
         let again = root.path().join("again");
@@ -41,23 +41,24 @@ fn a_file_describes_a_run_and_flags_win_over_it() {
         assert!(model(&by_flags, ITERATIONS) == model(&again, ITERATIONS), "{what}");
         assert!(read(&config) == read(&again.join("config.toml")), "{what}");
     }
-    // So does a program without the command line.
+    // The library reproduces it, too.
     let library = root.path().join("library");
-    let mut spec = Partial::read(&config).and_then(Partial::describe).expect("it is sound");
+    let mut spec =
+        Partial::read(&config).and_then(Partial::describe).expect("a valid configuration");
     spec.output.output = Some(library.clone());
     spec.device.backend = densify::render::BackendChoice::Cpu;
-    let run = Run::prepare(&spec).expect("it was prepared before");
-    assert_eq!(run.train(Occupied::Refuse, &Silent).expect("it trains"), library);
+    let run = Run::prepare(&spec).expect("a valid run");
+    assert_eq!(run.train(Occupied::Refuse, &Silent).expect("a trained run"), library);
     assert!(model(&by_flags, ITERATIONS) == model(&library, ITERATIONS));
 }
 
 #[test]
-fn a_run_has_every_option_in_its_file() {
+fn config_toml_contains_every_option_of_a_run() {
     let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
     train(scene.path(), &run, 2, "--budget 250").ok();
     let config = config(&run);
-    // What is not set is what there is nothing to set to.
+    // Options without a value in this run are left out.
     let unset = [
         "test_every",
         "images",
@@ -76,7 +77,7 @@ fn a_run_has_every_option_in_its_file() {
 }
 
 #[test]
-fn files_that_say_what_cannot_be_are_refused_by_key() {
+fn invalid_keys_and_values_are_refused_by_key() {
     let scene = Photographs::colmap_text();
     let cases: [(&str, &[&str]); 12] = [
         ("budgte = 3", &["budgte", "budget"]),
@@ -105,10 +106,10 @@ fn files_that_say_what_cannot_be_are_refused_by_key() {
 }
 
 #[test]
-fn a_log_filter_that_is_not_understood_is_named() {
+fn an_invalid_log_filter_is_reported() {
     let mut program = Command::new(env!("CARGO_BIN_EXE_densify"));
-    let said = program.arg("knobs").env("RUST_LOG", "densify[step{view=3}]=debug").output();
-    let said = said.expect("it starts");
-    let log = String::from_utf8_lossy(&said.stderr);
-    assert!(said.status.success() && log.contains("RUST_LOG is not used"), "{log}");
+    let output = program.arg("knobs").env("RUST_LOG", "densify[step{view=3}]=debug").output();
+    let output = output.expect("the program starts");
+    let log = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && log.contains("RUST_LOG is not used"), "{log}");
 }

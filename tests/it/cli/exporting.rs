@@ -1,4 +1,4 @@
-//! `densify export`: the same model in another file, and what is refused.
+//! `densify export`: models in other formats, and refused calls.
 
 use std::path::Path;
 
@@ -6,7 +6,7 @@ use super::{call, files, gaussians, read, scratch, text, train, write_ply};
 use crate::photographs::Photographs;
 
 #[test]
-fn export_writes_the_model_of_a_run_or_a_file() {
+fn export_reads_runs_and_files() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
     train(scene.path(), &run, 20, "--budget 320 --save-iterations 10 --quiet").ok();
@@ -24,7 +24,7 @@ fn export_writes_the_model_of_a_run_or_a_file() {
     export(&early, &again, "").ok();
     assert!(read(&again) == saved(10));
 
-    // Refused: nothing is written, nothing is lost.
+    // Refused calls write nothing and replace nothing.
     let nowhere = root.path().join("deep/nowhere.ply");
     let (zip, picture) = (root.path().join("nowhere.zip"), scene.file("images/view_00.png"));
     let cases: [(&Path, &Path, &str, &[&str]); 11] = [
@@ -49,7 +49,7 @@ fn export_writes_the_model_of_a_run_or_a_file() {
 }
 
 #[test]
-fn every_format_is_written_compared_and_read_again() {
+fn every_format_is_written_compared_and_read_back() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
     train(scene.path(), &run, 20, "--budget 320 --eval --quiet").ok();
@@ -59,10 +59,10 @@ fn every_format_is_written_compared_and_read_again() {
     let outcome = call_all().ok();
     let line = |name: &str| {
         let found = outcome.stdout.lines().find(|line| line.starts_with(&format!("{name} ")));
-        found.unwrap_or_else(|| panic!("no line of {name}: {outcome:?}")).to_owned()
+        found.unwrap_or_else(|| panic!("no line for {name}: {outcome:?}")).to_owned()
     };
     assert!(line("ply").ends_with("same") && line("glb").ends_with("same"), "{outcome:?}");
-    // What trained scenes have at least; this one has hardly begun.
+    // The minimum for trained scenes; this one has hardly been trained.
     for (name, least) in [("compressed-ply", 45.0), ("spz", 45.0), ("spz-v4", 45.0), ("sog", 42.0)]
     {
         let psnr: f64 = line(name).split_whitespace().last().unwrap().parse().unwrap();
@@ -76,7 +76,7 @@ fn every_format_is_written_compared_and_read_again() {
     for ending in ["glb", "spz", "sog", "compressed.ply"] {
         call(&format!("export {} -o {} --overwrite", text(&at(ending)), text(&again))).ok();
         assert_eq!(read(&again).len(), saved.len(), "{ending}");
-        // What is cut short is refused by name, and nothing is written.
+        // A truncated file is refused by name, and nothing is written.
         let whole = read(&at(ending));
         let (cut, lost) = (root.path().join("cut"), root.path().join("lost.ply"));
         std::fs::write(&cut, &whole[..whole.len() / 2]).unwrap();
@@ -85,7 +85,7 @@ fn every_format_is_written_compared_and_read_again() {
         assert!(!lost.exists());
     }
     call_all().refused("again", &["exists", "--overwrite"]);
-    // A format that has no room for the model is named, and the others are written.
+    // A format that cannot represent the model is named, and the others are written.
     let (remote, others) = (root.path().join("re.mote.ply"), root.path().join("others"));
     let mut model = gaussians(&at("ply"));
     model.means[0][1] = 1e9;
@@ -93,9 +93,10 @@ fn every_format_is_written_compared_and_read_again() {
     let outcome = call(&format!("export {} -o {} --format all", text(&remote), text(&others))).ok();
     assert!(outcome.stdout.contains("not written") && outcome.stdout.contains("of the PLY"));
     let names: Vec<_> = files(&others).into_keys().collect();
-    let expected = ["compressed.ply", "glb", "ply", "sog"].map(|it| format!("re.mote.{it}"));
-    assert!(expected.iter().all(|it| names.contains(it)), "{names:?}");
-    assert!(!names.iter().any(|it| it.ends_with("spz")), "{names:?}");
+    let expected =
+        ["compressed.ply", "glb", "ply", "sog"].map(|extension| format!("re.mote.{extension}"));
+    assert!(expected.iter().all(|name| names.contains(name)), "{names:?}");
+    assert!(!names.iter().any(|name| name.ends_with("spz")), "{names:?}");
     let refused =
         call(&format!("export {} -o {}", text(&remote), text(&root.path().join("x.spz"))));
     refused.refused("remote", &["x.spz", "no room", "choose another format"]);

@@ -1,6 +1,5 @@
-//! Bad input: exit code 2, one message that names file, field or flag and says what to do, and
-//! nothing left behind. What is wrong with data files is in `src/dataset/tests/bad_input.rs`, case by
-//! case.
+//! Invalid input: exit code 2, one message that names the file, field or flag and the remedy, and no files left
+//! behind. Damaged data files are tested case by case beside their readers.
 
 use std::path::Path;
 
@@ -9,12 +8,12 @@ use densify::run::{Budget, ImageCache, Observer, Occupied, Run, RunSpec, Whole};
 use super::{call, files, json, model, resume, scratch, text, train};
 use crate::photographs::Photographs;
 
-/// Trains with more flags, which must be refused with these words.
+/// Trains with additional flags and checks that they are refused with these words.
 fn refused(scene: &Photographs, flags: &str, words: &[&str]) {
     let (root, run) = scratch();
     let budget = if flags.contains("--budget") { "" } else { "--budget 400 " };
     train(scene.path(), &run, 20, &format!("{budget}{flags}")).refused(flags, words);
-    assert!(!run.exists(), "{flags}: it left {:?}", files(root.path()).keys());
+    assert!(!run.exists(), "{flags}: left behind: {:?}", files(root.path()).keys());
 }
 
 #[test]
@@ -65,13 +64,13 @@ fn damaged_datasets_are_refused() {
     refused(&scene, "", &["is not a dataset", "COLMAP"]);
 }
 
-/// The header is sound, so that the fault shows only when the pixels are decoded, in training.
+/// The header is valid, so the damage shows only when training decodes the pixels.
 #[test]
-fn a_photograph_cut_short_ends_the_run() {
+fn a_truncated_photograph_ends_the_run() {
     let scene = Photographs::colmap_text();
     scene.truncate("images/view_03.png", 600);
     refused(&scene, "--quiet", &["images/view_03.png", "cannot decode"]);
-    // What was learned before is kept, and it is said where.
+    // Files saved before are kept, and the message says where.
     let (_root, run) = scratch();
     let flags = "--budget 400 --quiet --save-iterations 1 --seed 4";
     let outcome = train(scene.path(), &run, 20, flags);
@@ -81,7 +80,7 @@ fn a_photograph_cut_short_ends_the_run() {
 }
 
 #[test]
-fn scenes_and_outputs_that_are_not_there_are_refused() {
+fn missing_scenes_and_occupied_outputs_are_refused() {
     let (root, run) = scratch();
     let scene = root.path().join("no-such-folder");
     train(&scene, &run, 20, "").refused("no scene", &["no-such-folder", "check that it exists"]);
@@ -95,7 +94,7 @@ fn scenes_and_outputs_that_are_not_there_are_refused() {
 
     call(&format!("eval {here}")).refused("eval", &["holds no run", "densify train"]);
     let pictures = root.path().join("pictures");
-    let render = |what: &str| call(&format!("render {what} -o {}", text(&pictures)));
+    let render = |words: &str| call(&format!("render {words} -o {}", text(&pictures)));
     render(here).refused("render", &["holds no run"]);
     let ply = root.path().join("model.ply");
     std::fs::write(&ply, "ply\nformat ascii 1.0\nend_header\n").unwrap();
@@ -105,10 +104,10 @@ fn scenes_and_outputs_that_are_not_there_are_refused() {
     assert_eq!(files(root.path()).len(), 2, "something was left behind");
 }
 
-/// Cuts a photograph short once a step is done.
-struct Cutter<'a>(&'a Photographs, u32);
+/// Truncates a photograph after the given step.
+struct TruncateAfter<'a>(&'a Photographs, u32);
 
-impl Observer for Cutter<'_> {
+impl Observer for TruncateAfter<'_> {
     fn step(&self, step: u32, _: f32, _: usize) {
         if step == self.1 {
             self.0.truncate("images/view_03.png", 600);
@@ -117,9 +116,9 @@ impl Observer for Cutter<'_> {
 }
 
 #[test]
-fn a_photograph_lost_late_in_a_run_costs_no_step() {
+fn a_photograph_damaged_during_a_run_costs_no_step() {
     let scene = Photographs::colmap_text();
-    let whole_file = std::fs::read(scene.file("images/view_03.png")).expect("a view");
+    let intact_photograph = std::fs::read(scene.file("images/view_03.png")).expect("a view");
     let (root, whole) = scratch();
     let train = |run: &Path, cut_after: u32| {
         let mut spec = RunSpec::default();
@@ -130,20 +129,20 @@ fn a_photograph_lost_late_in_a_run_costs_no_step() {
         spec.size.image_cache = Some(ImageCache::Bytes(0));
         spec.schedule.iterations = Whole(48);
         let run = Run::prepare(&spec).expect("a run");
-        run.train(Occupied::Refuse, &Cutter(&scene, cut_after))
+        run.train(Occupied::Refuse, &TruncateAfter(&scene, cut_after))
     };
     train(&whole, 0).expect("the whole run");
-    // Decoded ahead are at most the next few views of the fourteen.
+    // Only the next few of the fourteen views are decoded ahead.
     for cut_after in [16, 28] {
         let part = root.path().join(format!("part{cut_after}"));
-        let failure = train(&part, cut_after).expect_err("a photograph is cut short");
+        let failure = train(&part, cut_after).expect_err("a truncated photograph");
         let message = &failure.to_string();
         let step = message.strip_prefix("step ").and_then(|rest| rest.split(':').next());
         let step: u32 = step.and_then(|step| step.parse().ok()).expect(message);
         assert!(step > cut_after && message.contains("--resume"), "{message}");
         let checkpoint = format!("iteration_{}.safetensors", step - 1);
         assert!(failure.code == 2 && message.contains(&checkpoint), "{message}");
-        scene.write("images/view_03.png", &whole_file);
+        scene.write("images/view_03.png", &intact_photograph);
         resume(scene.path(), &part, "").ok();
         assert!(model(&part, 48) == model(&whole, 48), "cut after {cut_after}");
     }

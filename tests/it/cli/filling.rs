@@ -1,4 +1,4 @@
-//! A disk that fills while a model is written: exit code 1, one message with the remedy, and nothing of the file.
+//! A full disk while a model is written: exit code 1, one message with the remedy, and no partial file.
 
 use assert_cmd::Command;
 use densify::data::models::export_formats;
@@ -7,19 +7,19 @@ use densify::train::output::model_path;
 use super::{Outcome, files, outcome_of, read, scratch, text, train};
 use crate::photographs::Photographs;
 
-/// Calls the program where no file may have more than two or four kilobytes, which is what a shell's unit makes of it:
-/// to a writer that is as a disk that is full.
-fn call_where_it_fills(words: &str) -> Outcome {
+/// Calls the program with a file size limit of 2 or 4 KB, depending on the shell's unit. To a writer this looks like a
+/// full disk.
+fn call_on_full_disk(words: &str) -> Outcome {
     let program = env!("CARGO_BIN_EXE_densify");
     let mut command = Command::new("sh");
-    // The signal that tells of it is ignored, as the system has none for a full disk.
+    // SIGXFSZ is ignored, because a full disk raises no signal.
     command.args(["-c", &format!("trap '' XFSZ; ulimit -f 4; exec {program} {words}")]);
     command.env_remove("RUST_LOG").env("NODEVICE_SELECT", "1");
     outcome_of(command)
 }
 
-/// Fails unless the call ended as one must for which there was no room.
-fn ran_full(outcome: &Outcome, case: &str, file: &str) {
+/// Checks exit code and message of a call that ran out of disk space.
+fn assert_disk_full(outcome: &Outcome, case: &str, file: &str) {
     let Outcome { code, stderr, .. } = outcome;
     assert_eq!(*code, Some(1), "{case}: {outcome:?}");
     assert_eq!(stderr.matches("error:").count(), 1, "{case}: {stderr}");
@@ -30,7 +30,7 @@ fn ran_full(outcome: &Outcome, case: &str, file: &str) {
 }
 
 #[test]
-fn nothing_is_left_in_any_format() {
+fn a_full_disk_leaves_no_partial_file_in_any_format() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
     train(scene.path(), &run, 20, "--budget 320 --quiet").ok();
@@ -39,15 +39,15 @@ fn nothing_is_left_in_any_format() {
         let name = format!("full.{}", format.extension);
         let to = root.path().join(&name);
         let words = format!("export {} -o {} --format {}", text(&run), text(&to), format.name);
-        ran_full(&call_where_it_fills(&words), format.name, &name);
+        assert_disk_full(&call_on_full_disk(&words), format.name, &name);
         assert!(files(root.path()) == before, "{}: something is left", format.name);
-        // What was there before stays.
+        // An existing file stays intact.
         std::fs::write(&to, "old").unwrap();
-        ran_full(&call_where_it_fills(&format!("{words} --overwrite")), format.name, &name);
+        assert_disk_full(&call_on_full_disk(&format!("{words} --overwrite")), format.name, &name);
         assert_eq!(read(&to), b"old", "{}", format.name);
         std::fs::remove_file(&to).unwrap();
     }
-    // What is compressed is first written to look at it again.
+    // `compress` first writes a temporary file to measure the result.
     let to = root.path().join("small.spz");
     let model = model_path(&run, 20);
     let words = format!(
@@ -56,6 +56,6 @@ fn nothing_is_left_in_any_format() {
         text(&to),
         text(scene.path())
     );
-    ran_full(&call_where_it_fills(&words), "compress", ".densify-");
+    assert_disk_full(&call_on_full_disk(&words), "compress", ".densify-");
     assert!(files(root.path()) == before, "compress: something is left");
 }

@@ -1,4 +1,4 @@
-//! `densify render --path`: flights as pictures and films.
+//! `densify render --path`: camera paths rendered as frames and videos.
 
 use std::ffi::OsString;
 use std::path::Path;
@@ -16,33 +16,33 @@ fn size(folder: &Path, name: &str) -> (u32, u32) {
 }
 
 #[test]
-fn a_flight_is_rendered_as_pictures_and_as_a_film() {
+fn a_camera_path_is_rendered_as_frames_and_video() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
     run_of(&scene, &run);
     let frames = root.path().join("frames");
-    let film = root.path().join("films/orbit.webp");
+    let video = root.path().join("films/orbit.webp");
     let call_with =
         |more: &str| call(&format!("render {} -o {} {more}", text(&run), text(&frames)));
     let options = "--path orbit --frames 5 --size 31x20 --depth --fps 8";
-    call_with(&format!("{options} --video {}", text(&film))).ok();
+    call_with(&format!("{options} --video {}", text(&video))).ok();
     let names: Vec<String> = files(&frames).into_keys().collect();
     let expected = (0..5).flat_map(|n| ["depth.png", "png"].map(|e| format!("frame_{n:05}.{e}")));
     let expected: Vec<String> = ["depth.json".to_owned()].into_iter().chain(expected).collect();
     assert_eq!(names, expected);
     assert_eq!(size(&frames, "frame_00004.png"), (31, 20));
     let still = |n: u32| image::open(frames.join(format!("frame_{n:05}.png"))).expect("a picture");
-    assert!(still(0) != still(1), "the camera moves");
-    let bytes = std::fs::read(&film).expect("a film");
+    assert!(still(0) != still(1), "the camera does not move");
+    let bytes = std::fs::read(&video).expect("a video");
     let decoder = WebPDecoder::new(std::io::Cursor::new(bytes)).expect("it is WebP");
-    let film = decoder.into_frames().collect_frames().expect("an animation");
-    assert_eq!(film.len(), 5);
-    for (frame, n) in film.iter().zip(0..) {
+    let video = decoder.into_frames().collect_frames().expect("an animation");
+    assert_eq!(video.len(), 5);
+    for (frame, n) in video.iter().zip(0..) {
         assert_eq!(frame.delay().numer_denom_ms(), (125, 1));
         let pixels = image::DynamicImage::from(frame.buffer().clone()).into_rgb8();
-        assert!(pixels == still(n).into_rgb8(), "frame {n} is the picture");
+        assert!(pixels == still(n).into_rgb8(), "video frame {n} differs from its PNG");
     }
-    // Not a frame is rendered for a film that cannot be made.
+    // Invalid options are refused before any frame is rendered.
     for (more, words) in [
         ("--video a.avi --path spiral", [".mp4", ".webp"]),
         ("--path nowhere.json", ["--path", "nowhere.json"]),
@@ -62,14 +62,19 @@ fn a_camera_path_in_a_file_is_in_the_datasets_coordinates() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
     run_of(&scene, &run);
-    // The training cameras of the run's folder, as nerfstudio would save them.
+    // The first training camera of the run, in nerfstudio's format.
     let cameras = json(&run.join("cameras.json"));
     let first = &cameras[0];
     let number = |value: &serde_json::Value| value.as_f64().expect("a number");
     let row = |i: usize| -> [f64; 4] {
-        let turn = &first["rotation"][i];
+        let rotation = &first["rotation"][i];
         // Columns are x right, y down, z forward; nerfstudio's y and z point the other way.
-        [number(&turn[0]), -number(&turn[1]), -number(&turn[2]), number(&first["position"][i])]
+        [
+            number(&rotation[0]),
+            -number(&rotation[1]),
+            -number(&rotation[2]),
+            number(&first["position"][i]),
+        ]
     };
     let pose = [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]].concat();
     let height = number(&first["height"]);
@@ -88,11 +93,11 @@ fn a_camera_path_in_a_file_is_in_the_datasets_coordinates() {
     let open = |path: &Path| image::open(path).expect("a picture").into_rgb8();
     let frame = open(&frames.join("frame_00000.png"));
     let view = open(&views.join(format!("{stem}.png")));
-    assert_eq!(files(&frames).len(), 1, "as many frames as cameras");
+    assert_eq!(files(&frames).len(), 1, "one frame for each camera");
     assert_eq!(frame.dimensions(), view.dimensions());
     let most = frame.iter().zip(view.iter()).map(|(a, b)| a.abs_diff(*b)).max();
     assert!(most.is_some_and(|most| most <= 2), "{most:?}");
-    // A model alone is flown through without its dataset.
+    // A bare model needs no dataset for a camera path.
     let (model, alone) =
         (densify::train::output::model_path(&run, ITERATIONS), root.path().join("alone"));
     let words = format!("render {} -o {} --path {}", text(&model), text(&alone), text(&path));
@@ -101,29 +106,29 @@ fn a_camera_path_in_a_file_is_in_the_datasets_coordinates() {
     let frame = open(&alone.join("frame_00000.png"));
     let most = frame.iter().zip(view.iter()).map(|(a, b)| a.abs_diff(*b)).max();
     assert!(most.is_some_and(|most| most <= 4), "{most:?}");
-    // As long and as large as the file says.
+    // Duration and size come from the file.
     let lasting = serde_json::json!({ "camera_path": [key], "seconds": 0.5, "fps": 8, "render_width": 18,
         "render_height": 10 });
     std::fs::write(&path, lasting.to_string()).unwrap();
-    let film = root.path().join("film.webp");
+    let video = root.path().join("film.webp");
     call(&format!(
         "render {run_text} -o {} --path {} --video {}",
         text(&root.path().join("lasting")),
         text(&path),
-        text(&film)
+        text(&video)
     ))
     .ok();
     assert_eq!(size(&root.path().join("lasting"), "frame_00003.png"), (18, 10));
-    let bytes = std::fs::read(&film).expect("a film");
+    let bytes = std::fs::read(&video).expect("a video");
     let decoder = WebPDecoder::new(std::io::Cursor::new(bytes)).expect("it is WebP");
-    let film = decoder.into_frames().collect_frames().expect("an animation");
-    assert_eq!((film.len(), film[0].delay().numer_denom_ms()), (4, (125, 1)));
+    let video = decoder.into_frames().collect_frames().expect("an animation");
+    assert_eq!((video.len(), video[0].delay().numer_denom_ms()), (4, (125, 1)));
 }
 
-/// A program named ffmpeg takes down how it is called and writes the film; another fails.
+/// A stand-in for ffmpeg records its arguments and writes the video; another one fails.
 #[cfg(unix)]
 #[test]
-fn ffmpeg_is_given_the_pictures_of_this_flight_alone() {
+fn ffmpeg_gets_only_the_frames_of_this_call() {
     use std::os::unix::fs::PermissionsExt;
 
     let scene = Photographs::colmap_text();
@@ -131,10 +136,10 @@ fn ffmpeg_is_given_the_pictures_of_this_flight_alone() {
     run_of(&scene, &run);
     let bin = root.path().join("bin");
     std::fs::create_dir(&bin).unwrap();
-    // A % would be a part of ffmpeg's pattern.
+    // A % in the path must not become part of ffmpeg's pattern.
     let frames = root.path().join("100%d frames");
-    let film = root.path().join("films/a film.mp4");
-    let fly = |more: &[&str]| -> Outcome {
+    let video = root.path().join("films/a film.mp4");
+    let render = |more: &[&str]| -> Outcome {
         let mut command = assert_cmd::Command::new(env!("CARGO_BIN_EXE_densify"));
         command.args(["render", text(&run), "-o", text(&frames), "--path", "orbit"]).args(more);
         let path = std::env::var_os("PATH").unwrap_or_default();
@@ -142,45 +147,47 @@ fn ffmpeg_is_given_the_pictures_of_this_flight_alone() {
         command.args(["--size", "8x6"]).envs([WITHOUT_GPU]).env("PATH", path);
         outcome_of(command)
     };
-    let put = |script: &str| {
+    let install_ffmpeg = |script: &str| {
         let program = bin.join("ffmpeg");
         std::fs::write(&program, format!("#!/bin/sh\n{script}\n")).unwrap();
         std::fs::set_permissions(&program, PermissionsExt::from_mode(0o755)).unwrap();
     };
-    put("exit 127");
-    let alone = ["--frames", "9", "--video", text(&film)];
-    fly(&alone).refused("no ffmpeg", &["--video", "a film.mp4", "install it", ".webp"]);
-    assert!(!frames.exists() && !film.exists());
+    install_ffmpeg("exit 127");
+    let alone = ["--frames", "9", "--video", text(&video)];
+    render(&alone).refused("no ffmpeg", &["--video", "a film.mp4", "install it", ".webp"]);
+    assert!(!frames.exists() && !video.exists());
 
-    fly(&["--frames", "9"]).ok();
+    render(&["--frames", "9"]).ok();
     let log = root.path().join("log");
-    put(&format!(
+    install_ffmpeg(&format!(
         "[ \"$1\" = -version ] && exit 0; pwd > '{0}'; printf '%s\\n' \"$@\" >> '{0}'\n\
          for last; do :; done; printf film > \"$last\"",
         log.display()
     ));
-    fly(&["--frames", "3", "--video", text(&film), "--fps", "12"]).ok();
-    assert_eq!(files(&frames).len(), 9, "pictures of a longer flight are left alone");
-    let said = std::fs::read_to_string(&log).expect("how it was called");
-    let said: Vec<&str> = said.lines().collect();
-    assert_eq!(Path::new(said[0]), frames.canonicalize().unwrap());
+    render(&["--frames", "3", "--video", text(&video), "--fps", "12"]).ok();
+    assert_eq!(files(&frames).len(), 9, "frames of an earlier, longer call are kept");
+    let arguments = std::fs::read_to_string(&log).expect("recorded arguments");
+    let arguments: Vec<&str> = arguments.lines().collect();
+    assert_eq!(Path::new(arguments[0]), frames.canonicalize().unwrap());
     for pair in
         [["-framerate", "12"], ["-frames:v", "3"], ["-start_number", "0"], ["-i", "frame_%05d.png"]]
     {
-        assert!(said.windows(2).any(|words| words == pair), "{pair:?}: {said:?}");
+        assert!(arguments.windows(2).any(|words| words == pair), "{pair:?}: {arguments:?}");
     }
-    assert_eq!(std::fs::read(&film).expect("a film"), b"film");
-    // As readable as any new file.
+    assert_eq!(std::fs::read(&video).expect("a video"), b"film");
+    // The video has the permissions of any new file.
     let mode = |path: &Path| std::fs::metadata(path).unwrap().permissions().mode() & 0o777;
     std::fs::write(root.path().join("new"), "").unwrap();
-    assert_eq!(mode(&film), mode(&root.path().join("new")));
+    assert_eq!(mode(&video), mode(&root.path().join("new")));
 
-    put("[ \"$1\" = -version ] && exit 0; echo 'no room' >&2; echo 'frame 7: bad' >&2; exit 3");
-    let failed = fly(&alone);
+    install_ffmpeg(
+        "[ \"$1\" = -version ] && exit 0; echo 'no room' >&2; echo 'frame 7: bad' >&2; exit 3",
+    );
+    let failed = render(&alone);
     assert_eq!(failed.code, Some(1), "{failed:?}");
     assert!(
         failed.stderr.contains("frame 7: bad") && failed.stderr.contains("100%d frames"),
         "{failed:?}"
     );
-    assert_eq!(std::fs::read(&film).expect("the film before"), b"film");
+    assert_eq!(std::fs::read(&video).expect("the previous video"), b"film");
 }

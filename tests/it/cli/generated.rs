@@ -1,4 +1,4 @@
-//! `densify scenegen` and built-in scenes: what is written is what is trained on.
+//! `densify scenegen` and built-in scenes: written files, training and geometry metrics.
 
 use std::path::Path;
 
@@ -10,22 +10,22 @@ fn load(path: &Path) -> Dataset {
     Dataset::load(path, &LoadOptions::default()).unwrap_or_else(|e| panic!("{e}"))
 }
 
-/// Whether two datasets pose the same cameras and show the same images.
-fn assert_same(a: &Dataset, b: &Dataset, what: &str) {
-    assert_eq!(a.train.len(), b.train.len(), "{what}");
+/// Checks that two datasets have the same cameras and images.
+fn assert_same(a: &Dataset, b: &Dataset, case: &str) {
+    assert_eq!(a.train.len(), b.train.len(), "{case}");
     for (x, y) in a.train.iter().zip(&b.train) {
         let apart = x.camera.centre().distance(y.camera.centre());
         let turned = x.camera.forward().distance(y.camera.forward());
-        assert!(apart < 1e-9 && turned < 1e-9, "{what}: {} by {apart}, {turned}", x.name);
-        assert!((x.camera.fx - y.camera.fx).abs() < 1e-9, "{what}");
+        assert!(apart < 1e-9 && turned < 1e-9, "{case}: {} by {apart}, {turned}", x.name);
+        assert!((x.camera.fx - y.camera.fx).abs() < 1e-9, "{case}");
         let [x, y] = [x, y].map(|view| view.source.load().expect("an image"));
-        assert!(x == y, "{what}");
+        assert!(x == y, "{case}");
     }
 }
 
 #[test]
 #[ignore = "takes minutes: run by .ci/run"]
-fn written_scenes_load_as_the_built_in_ones_through_all_formats() {
+fn written_scenes_match_the_built_in_ones_in_all_formats() {
     let (_root, folder) = scratch();
     call(&format!("scenegen --preset spheres -o {}", text(&folder))).ok();
     let built_in = load(Path::new("scene:spheres"));
@@ -34,46 +34,50 @@ fn written_scenes_load_as_the_built_in_ones_through_all_formats() {
     assert_eq!((written.train.len(), written.test.len()), (30, 10));
     assert_eq!(written.points.len(), built_in.points.len());
     for name in ["transforms_train.json", "transforms_test.json"] {
-        std::fs::remove_file(folder.join(name)).expect("it is there");
+        std::fs::remove_file(folder.join(name)).expect("an existing file");
     }
     let colmap = load(&folder);
-    std::fs::rename(folder.join("sparse"), folder.join("colmap")).expect("it is there");
+    std::fs::rename(folder.join("sparse"), folder.join("colmap")).expect("an existing file");
     let nerfstudio = load(&folder);
     assert_same(&built_in, &nerfstudio, "transforms.json");
     assert_eq!((nerfstudio.test.len(), nerfstudio.points.len()), (10, built_in.points.len()));
     assert_eq!((colmap.train.len(), colmap.points.len()), (40, built_in.points.len()));
-    // Its unit is that of all forty cameras.
+    // COLMAP poses are normalised by all forty cameras, hence the comparison in world coordinates.
     let find = |name: &str| colmap.train.iter().find(|v| v.name.ends_with(name)).expect(name);
     let world = |set: &Dataset, view: &densify::data::dataset::View| {
         set.normalisation.world_from_scene_camera(&view.camera).centre()
     };
     for view in &written.train {
         let name = format!("{}.png", view.name.rsplit('/').next().expect("a name"));
-        let other = find(&format!("train/{name}"));
-        let apart = world(&written, view).distance(world(&colmap, other));
+        let colmap_view = find(&format!("train/{name}"));
+        let apart = world(&written, view).distance(world(&colmap, colmap_view));
         assert!(apart < 1e-9, "{}: {apart}", view.name);
     }
 }
 
 #[test]
-fn built_in_scenes_are_trained_on_and_measured_by_name() {
+fn built_in_scenes_are_trained_and_measured_by_name() {
     let (_root, run) = scratch();
-    let said = train(Path::new("scene:spheres"), &run, 4, "--budget 6k").ok();
-    assert!(said.stdout.contains("30 views"), "{}", said.stdout);
-    let said = call(&format!("eval {}", text(&run))).ok();
-    assert!(said.stdout.contains("PSNR") && said.stdout.contains("Chamfer"), "{}", said.stdout);
+    let stdout = train(Path::new("scene:spheres"), &run, 4, "--budget 6k").ok();
+    assert!(stdout.stdout.contains("30 views"), "{}", stdout.stdout);
+    let stdout = call(&format!("eval {}", text(&run))).ok();
+    assert!(
+        stdout.stdout.contains("PSNR") && stdout.stdout.contains("Chamfer"),
+        "{}",
+        stdout.stdout
+    );
     assert!(json(&run.join("geometry.json"))["ours_4"]["depth"]["rmse"].is_f64());
-    // A cut model has nothing to do with where the scene is.
+    // The message about a truncated model must not mention the scene.
     let model = run.join("point_cloud/iteration_4/point_cloud.ply");
     let whole = std::fs::read(&model).expect("the model");
     std::fs::write(&model, &whole[..5000]).expect("write");
     let outcome = call(&format!("eval {}", text(&run)));
-    outcome.refused("a cut model", &["point_cloud.ply", "export the file again"]);
+    outcome.refused("a truncated model", &["point_cloud.ply", "export the file again"]);
     assert_eq!(outcome.stderr.trim().lines().count(), 1, "{}", outcome.stderr);
 }
 
-/// `thin`, small, in a folder.
-fn wires(folder: &Path) {
+/// Writes a small version of the scene `thin`.
+fn write_thin_scene(folder: &Path) {
     let small = "--size 32 --train 6 --test 2 --points 300 --samples 1";
     call(&format!("scenegen --preset thin -o {} {small}", text(folder))).ok();
 }
@@ -82,78 +86,84 @@ fn wires(folder: &Path) {
 fn written_scenes_are_measured_against_their_files() {
     let (root, run) = scratch();
     let folder = root.path().join("wires");
-    wires(&folder);
-    let said = train(&folder, &run, 6, "--budget 400 --eval -v").ok().stdout;
-    assert!(said.contains("geometry depth RMSE") && said.contains("measuring geometry"), "{said}");
-    let peak = said.split("; peak ").nth(1).and_then(|rest| rest.split(" MiB").next());
+    write_thin_scene(&folder);
+    let stdout = train(&folder, &run, 6, "--budget 400 --eval -v").ok().stdout;
+    assert!(
+        stdout.contains("geometry depth RMSE") && stdout.contains("measuring geometry"),
+        "{stdout}"
+    );
+    let peak = stdout.split("; peak ").nth(1).and_then(|rest| rest.split(" MiB").next());
     if let Some(peak) = peak {
         let promised = json(&run.join("stats/summary.json"))["ledger_bytes"].as_f64();
         let peak: f64 = peak.parse().expect("a size");
         assert!(Some(peak * f64::from(1 << 20)) <= promised, "{peak} MiB of {promised:?}");
     }
-    // What training measures at its end is what `eval` measures.
+    // `eval` reproduces the metrics that training measured at its end.
     let trained = std::fs::read(run.join("geometry.json")).expect("geometry.json");
-    std::fs::remove_file(run.join("geometry.json")).expect("it is there");
-    let said = call(&format!("eval {}", text(&run))).ok().stdout;
+    std::fs::remove_file(run.join("geometry.json")).expect("an existing file");
+    let stdout = call(&format!("eval {}", text(&run))).ok().stdout;
     assert!(trained == std::fs::read(run.join("geometry.json")).expect("geometry.json"));
     for word in ["mean", "depth RMSE", "F-score", "floaters", "thin structures found, 1 px wide"] {
-        assert!(said.contains(word), "{word} is not in {said}");
+        assert!(stdout.contains(word), "{word} is not in {stdout}");
     }
     let measured = json(&run.join("geometry.json"))["ours_6"].clone();
     assert!(measured["centres"]["chamfer"].as_f64() > Some(0.0), "{measured}");
-    // A new run takes the place of the old one with all that was measured of it.
+    // A new run also replaces the metrics of the old one.
     std::fs::write(run.join("geometry.json"), r#"{"ours_1": {}}"#).expect("write");
     train(&folder, &run, 6, "--budget 400 --eval --overwrite").ok();
     let measured = json(&run.join("geometry.json"));
     assert!(measured["ours_1"].is_null() && measured["ours_6"].is_object(), "{measured}");
-    // At half the size files are of no use; the mesh is.
+    // At half size the depth files do not apply, but the mesh does.
     train(&folder, &run, 6, "--budget 400 --eval --overwrite -r 2").ok();
     call(&format!("eval {} --split train", text(&run))).ok();
     let half = json(&run.join("geometry_train.json"))["ours_6"].clone();
     assert!(half["depth"]["coverage"].as_f64() > Some(0.5), "{half}");
-    // What is damaged is named.
+    // A damaged mesh is named.
     std::fs::write(folder.join("mesh.ply"), "ply\n").expect("write");
     call(&format!("eval {}", text(&run))).refused("a damaged mesh", &["mesh.ply", "--overwrite"]);
-    // The run is none the worse for it.
+    // The run is complete nevertheless.
     let other = root.path().join("other");
     train(&folder, &other, 6, "--budget 400 --eval --quiet")
         .refused("a damaged mesh", &["mesh.ply", "the run is complete"]);
     assert_eq!(json(&other.join("stats/summary.json"))["finished"], true);
-    // Without a known surface there is nothing to measure.
-    std::fs::remove_file(folder.join("scene.json")).expect("it is there");
+    // Without a known surface no geometry is measured.
+    std::fs::remove_file(folder.join("scene.json")).expect("an existing file");
     for name in ["geometry.json", "geometry_train.json"] {
-        std::fs::remove_file(run.join(name)).expect("it is there");
+        std::fs::remove_file(run.join(name)).expect("an existing file");
     }
-    let said = call(&format!("eval {}", text(&run))).ok().stdout;
-    assert!(said.contains("PSNR") && !said.contains("Chamfer"), "{said}");
+    let stdout = call(&format!("eval {}", text(&run))).ok().stdout;
+    assert!(stdout.contains("PSNR") && !stdout.contains("Chamfer"), "{stdout}");
     assert!(!run.join("geometry.json").exists() && !run.join("geometry_train.json").exists());
 }
 
 #[test]
-fn limits_on_what_is_not_measured_are_refused_at_once() {
+fn limits_on_unknown_metrics_are_refused_before_evaluation() {
     let (root, run) = scratch();
     let folder = root.path().join("wires");
-    wires(&folder);
+    write_thin_scene(&folder);
     train(&folder, &run, 2, "--budget 400").ok();
-    let said = call(&format!("eval {} --split train --fail-above depth.rsme=1", text(&run)));
-    said.refused("a typo", &["--fail-above", "depth.rsme", "depth.rmse", "thin.0.recall"]);
-    assert!(!said.stdout.contains("PSNR"), "{}", said.stdout);
+    let stdout = call(&format!("eval {} --split train --fail-above depth.rsme=1", text(&run)));
+    stdout.refused("a typo", &["--fail-above", "depth.rsme", "depth.rmse", "thin.0.recall"]);
+    assert!(!stdout.stdout.contains("PSNR"), "{}", stdout.stdout);
     assert!(!run.join("results_train.json").exists());
 }
 
 #[test]
-fn a_surface_that_few_views_see_is_told_of() {
+fn scenegen_reports_surfaces_seen_by_few_views() {
     let (_root, folder) = scratch();
     let small = "--size 24 --test 0 --samples 1 --points 400 --fov 25";
     let room = format!("scenegen --preset room -o {} --overwrite {small}", text(&folder));
-    let said = call(&format!("{room} --train 4")).ok().stdout;
-    assert!(said.contains("note: of 400 points wanted, ") && said.contains("--rig"), "{said}");
-    let said = call(&format!("{room} --train 60").replace("--fov 25", "--fov 80")).ok().stdout;
-    assert!(!said.contains("points wanted"), "{said}");
+    let stdout = call(&format!("{room} --train 4")).ok().stdout;
+    assert!(
+        stdout.contains("note: of 400 points wanted, ") && stdout.contains("--rig"),
+        "{stdout}"
+    );
+    let stdout = call(&format!("{room} --train 60").replace("--fov 25", "--fov 80")).ok().stdout;
+    assert!(!stdout.contains("points wanted"), "{stdout}");
 }
 
 #[test]
-fn bad_input_is_refused_and_leaves_nothing() {
+fn invalid_input_is_refused_and_writes_nothing() {
     let (root, out) = scratch();
     let broken = root.path().join("broken.glb");
     std::fs::write(&broken, b"glTF\x02\0\0\0\xff\xff\xff\xff").expect("write");
@@ -176,22 +186,22 @@ fn bad_input_is_refused_and_leaves_nothing() {
         ("--preset thin --sky none.hdr", &["none.hdr"]),
         (&format!("--preset thin --sky {broken}"), &["broken.glb", "HDR"]),
     ];
-    for (what, words) in cases {
-        call(&format!("scenegen {what} -o {out}")).refused(what, words);
+    for (flags, words) in cases {
+        call(&format!("scenegen {flags} -o {out}")).refused(flags, words);
     }
     call("train scene:nonsense").refused("no such scene", &["nonsense", "spheres"]);
     let left = files(root.path());
     assert_eq!(left.keys().collect::<Vec<_>>(), ["broken.glb"]);
-    // Neither is a folder of something else touched.
+    // A folder with other files is not touched either.
     call(&format!("scenegen --preset thin -o {}", text(root.path())))
         .refused("a full folder", &["--output", "not empty"]);
 }
 
 #[test]
 fn presets_are_listed() {
-    let said = call("scenegen --list").ok().stdout;
+    let stdout = call("scenegen --list").ok().stdout;
     for name in ["spheres", "thin", "chirp", "table", "layers", "room", "glossy", "cornell", "town"]
     {
-        assert!(said.lines().any(|line| line.starts_with(name)), "{name} is not in {said}");
+        assert!(stdout.lines().any(|line| line.starts_with(name)), "{name} is not in {stdout}");
     }
 }

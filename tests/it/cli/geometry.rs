@@ -1,8 +1,7 @@
-//! Policies on scenes whose geometry is known exactly: small views of built-in scenes, 1,000 steps, fixed
-//! seeds. How near a policy comes to the surface.
+//! Geometric accuracy of policies on built-in scenes with known surfaces: small views, 1,000 steps, fixed seeds.
 //!
-//! Bounds are some 20 % beyond what was measured. They hold the policies to what they reach, and say
-//! nothing of how good that is: a thousand steps at 64 px are few.
+//! The bounds are about 20 % above measured values. They catch regressions but do not rank the policies, because a
+//! thousand steps at 64 px are few.
 
 use std::path::PathBuf;
 
@@ -14,17 +13,17 @@ use super::{call, count, json, scratch, text};
 
 const BUDGET: u64 = 800;
 const STEPS: u32 = 1000;
-/// The best hard stop that was found: growth five times as often as by default (the interval's
-/// least for so short a run is 100 steps), and no resets, which a short run does not recover from.
+/// The best settings found for a hard stop at the budget: growth five times as often as by default (the minimum
+/// interval for such a short run is 100 steps), and no opacity resets, from which a short run does not recover.
 const HARD_STOP: &str = "--policy-set vanilla.grow_every=20 --policy-set vanilla.reset_every=0";
 
-/// A built-in scene in a folder.
-struct Known {
+/// A built-in scene written to a temporary folder.
+struct WrittenScene {
     _root: TempDir,
     folder: PathBuf,
 }
 
-/// What came of a run.
+/// The results of a run.
 #[derive(Debug)]
 struct Outcome {
     geometry: Geometry,
@@ -33,8 +32,8 @@ struct Outcome {
     peak: u64,
 }
 
-impl Known {
-    /// 24 views of a scene to train on and 6 held out, and 400 points to start from.
+impl WrittenScene {
+    /// Writes a scene with 24 training views, 6 test views and 400 initial points.
     fn new(name: &str, side: u32) -> Self {
         let (root, folder) = scratch();
         let size = format!("--size {side} --train 24 --test 6 --points 400");
@@ -43,7 +42,7 @@ impl Known {
     }
 
     /// Trains a policy and measures the model.
-    #[expect(clippy::print_stderr, reason = "shown where a test fails or is asked to show it")]
+    #[expect(clippy::print_stderr, reason = "shown if a test fails")]
     fn train(&self, policy: &str, flags: &str) -> Outcome {
         let (_root, run) = scratch();
         let (folder, run_text) = (text(&self.folder), text(&run));
@@ -53,11 +52,11 @@ impl Known {
         ))
         .ok();
         call(&format!("eval {run_text} --backend cpu")).ok();
-        let of = |file: &str| json(&run.join(file))[format!("ours_{STEPS}")].take();
-        let (scores, summary) = (of("results.json"), json(&run.join("stats/summary.json")));
+        let metrics = |file: &str| json(&run.join(file))[format!("ours_{STEPS}")].take();
+        let (scores, summary) = (metrics("results.json"), json(&run.join("stats/summary.json")));
         let score = |name: &str| scores[name].as_f64().expect("a score");
         let outcome = Outcome {
-            geometry: serde_json::from_value(of("geometry.json")).expect("a geometry"),
+            geometry: serde_json::from_value(metrics("geometry.json")).expect("a geometry"),
             psnr: score("PSNR"),
             ssim: score("SSIM"),
             peak: count(&summary, "peak_rows"),
@@ -67,39 +66,40 @@ impl Known {
         outcome
     }
 
-    /// Holds every policy to what is allowed, as shares: depth RMSE of the diagonal, floaters of the rows.
+    /// Checks every policy against limits: depth RMSE relative to the diagonal, floaters as a share of the Gaussians.
     fn check(
         &self,
         depth: impl Fn(&str) -> f64,
         floaters: f64,
         more: impl Fn(&str, &Outcome) -> bool,
     ) {
-        let mut beyond = Vec::new();
+        let mut failures = Vec::new();
         for entry in policies().expect("the registry is sound") {
             let outcome = self.train(entry.name, "");
-            let found = &outcome.geometry;
-            // Before thin wires, `reduced-3dgs` leaves 5.4 % of the pixels empty on some processors.
-            let is_near = found.depth.rmse < depth(entry.name) && found.depth.coverage > 0.93;
-            let is_clean = found.floaters.of_rows < floaters;
-            if !(is_near && is_clean && more(entry.name, &outcome)) {
-                beyond.push((entry.name, outcome));
+            let geometry = &outcome.geometry;
+            // On `thin`, `reduced-3dgs` leaves 5.4 % of the pixels empty on some processors.
+            let is_accurate =
+                geometry.depth.rmse < depth(entry.name) && geometry.depth.coverage > 0.93;
+            let is_clean = geometry.floaters.of_rows < floaters;
+            if !(is_accurate && is_clean && more(entry.name, &outcome)) {
+                failures.push((entry.name, outcome));
             }
         }
-        assert!(beyond.is_empty(), "{beyond:#?}");
+        assert!(failures.is_empty(), "{failures:#?}");
     }
 }
 
 #[test]
 #[ignore = "takes minutes: run by .ci/run"]
 fn spheres() {
-    // They end with a fifth and a half of the budget.
+    // The less accurate policies end with a fifth to half of the budget.
     let depth = |policy: &str| match policy {
         "mini-splatting" => 0.042,
         "reduced-3dgs" => 0.039,
         "eagles" | "lightgaussian" => 0.036,
         _ => 0.033,
     };
-    Known::new("spheres", 64).check(depth, 0.005, |_, _| true);
+    WrittenScene::new("spheres", 64).check(depth, 0.005, |_, _| true);
 }
 
 #[test]
@@ -110,12 +110,12 @@ fn clutter() {
         "diet" => 0.056,
         "taming" => 0.065,
         "lightgaussian" | "reduced-3dgs" => 0.115,
-        // Most of its steps see images of 19 to 60 px, and it ends with half of the budget.
+        // Trains mostly on images of 19 to 60 px and ends with half of the budget.
         "eagles" => 0.155,
         "mini-splatting" => 0.09,
         _ => 0.108,
     };
-    Known::new("table", 64).check(depth, 0.025, |_, _| true);
+    WrittenScene::new("table", 64).check(depth, 0.025, |_, _| true);
 }
 
 #[test]
@@ -126,7 +126,7 @@ fn wires() {
         thin.map_or(0.0, |t| t.recall)
     };
     let is_found = |policy: &str, outcome: &Outcome| {
-        // A third or a fifth of the Gaussians shows less of a wire.
+        // These end with a third or a fifth of the Gaussians and miss more of the wires.
         let least = match policy {
             "lightgaussian" => [0.16, 0.25],
             "mini-splatting" => [0.07, 0.08],
@@ -139,19 +139,18 @@ fn wires() {
         "lightgaussian" | "eagles" => 0.075,
         _ => 0.063,
     };
-    Known::new("thin", 96).check(depth, 0.01, is_found);
+    WrittenScene::new("thin", 96).check(depth, 0.01, is_found);
 }
 
-/// At equal budget, both at it, `diet` is nearer to pictures held out and to the surface than a hard
-/// stop: in the mean over two seeds.
+/// With an equal budget that both exhaust, `diet` beats a hard stop in image quality and depth, averaged over two seeds.
 #[test]
 #[ignore = "takes minutes: run by .ci/run"]
 fn diet_beats_the_hard_stop() {
-    for known in ["spheres", "table"].map(|scene| Known::new(scene, 64)) {
+    for scene in ["spheres", "table"].map(|name| WrittenScene::new(name, 64)) {
         let mean = |policy, flags| {
-            let runs = [0, 1].map(|seed| known.train(policy, &format!("--seed {seed} {flags}")));
+            let runs = [0, 1].map(|seed| scene.train(policy, &format!("--seed {seed} {flags}")));
             assert!(runs.iter().all(|run| run.peak >= BUDGET - BUDGET / 50), "{policy}: {runs:?}");
-            let mean = |of: fn(&Outcome) -> f64| 0.5 * (of(&runs[0]) + of(&runs[1]));
+            let mean = |metric: fn(&Outcome) -> f64| 0.5 * (metric(&runs[0]) + metric(&runs[1]));
             (mean(|o| o.ssim), mean(|o| o.psnr), mean(|o| o.geometry.depth.rmse))
         };
         let (stop, diet) = (mean("vanilla", HARD_STOP), mean("diet", ""));

@@ -1,12 +1,11 @@
-//! Input that is damaged, mistaken, or meant to harm: one message that says what is wrong with what, and
-//! nothing that is half done.
+//! Damaged, mistaken or malicious input: one message that names the file and the fault, and no partial output.
 
 use std::path::Path;
 
 use super::{Outcome, densify, resume, scratch, text, train};
 use crate::photographs::{Photographs, VIEWS, name};
 
-/// The message of a refusal, which is one line without control characters.
+/// Returns the message of a refused call after checking that it is one line without control characters.
 fn refusal(outcome: &Outcome) -> &str {
     outcome.refused("", &[]);
     let line = outcome.stderr.strip_suffix('\n').expect("a line");
@@ -27,7 +26,7 @@ fn jpegs() -> Photographs {
 }
 
 #[test]
-fn a_photograph_whose_end_is_missing_is_damage() {
+fn truncated_jpegs_are_refused() {
     let scene = jpegs();
     let (_root, run) = scratch();
     train(scene.path(), &run, 3, "--budget 300").ok();
@@ -44,7 +43,7 @@ fn a_photograph_whose_end_is_missing_is_damage() {
 }
 
 #[test]
-fn a_camera_far_from_all_others_is_left_out_and_named() {
+fn a_distant_camera_is_left_out_and_named() {
     let scene = Photographs::colmap_text();
     let trained = |flags: &str| {
         let (_root, run) = scratch();
@@ -56,27 +55,28 @@ fn a_camera_far_from_all_others_is_left_out_and_named() {
         assert!(views.keys().eq(["view_00.png", "view_08.png"]), "{views:?}");
         (outcome.stdout, psnr)
     };
-    let (said, usual) = trained("");
-    assert!(!said.contains("far"), "{said}");
+    let (stdout, usual) = trained("");
+    assert!(!stdout.contains("far"), "{stdout}");
     // The last number of a pose is the distance along the optical axis.
     let images = std::fs::read_to_string(scene.file("sparse/0/images.txt")).expect("a text");
     let line = images.lines().find(|line| line.ends_with("view_05.png")).expect("its line");
     let mut words: Vec<&str> = line.split(' ').collect();
     words[7] = "2000";
     scene.replace("sparse/0/images.txt", line, &words.join(" "));
-    let (said, psnr) = trained("");
+    let (stdout, psnr) = trained("");
     assert!(
-        said.contains("cameras far from all others, 1 left out") && said.contains("view_05.png"),
-        "{said}"
+        stdout.contains("cameras far from all others, 1 left out")
+            && stdout.contains("view_05.png"),
+        "{stdout}"
     );
     assert!((psnr - usual).abs() < 2.0, "{psnr} dB, {usual} dB without the camera");
-    let (said, psnr) = trained("--far-cameras keep");
-    assert!(said.contains("view_05.png") && said.contains("kept"), "{said}");
+    let (stdout, psnr) = trained("--far-cameras keep");
+    assert!(stdout.contains("view_05.png") && stdout.contains("kept"), "{stdout}");
     assert!((psnr - usual).abs() < 3.0, "{psnr} dB, {usual} dB without the camera");
 }
 
 #[test]
-fn a_model_that_draws_nothing_is_no_result() {
+fn a_model_that_renders_nothing_is_an_error() {
     let scene = Photographs::colmap_text();
     let points = std::fs::read_to_string(scene.file("sparse/0/points3D.txt")).expect("a text");
     let moved: String = points
@@ -92,13 +92,13 @@ fn a_model_that_draws_nothing_is_no_result() {
     let outcome = train(scene.path(), &run, 30, "--budget 300");
     assert_eq!(outcome.code, Some(1), "{outcome:?}");
     assert!(outcome.stderr.contains("draws nothing in 14 of the last 14 views"), "{outcome:?}");
-    // That all steps are done does not make it one.
+    // Resuming the completed run fails, too.
     let again = resume(scene.path(), &run, "");
     assert!(again.code == Some(1) && again.stderr.contains("draws nothing in 14"), "{again:?}");
 }
 
 #[test]
-fn names_from_files_cannot_command_a_terminal() {
+fn control_characters_in_names_are_escaped() {
     let (_root, run) = scratch();
     let colmap = Photographs::colmap_text();
     colmap.replace("sparse/0/images.txt", &name(0), "view\u{1b}[2J\u{7}.png");
@@ -112,7 +112,7 @@ fn names_from_files_cannot_command_a_terminal() {
 }
 
 #[test]
-fn what_is_mistaken_for_data_is_called_what_it_is() {
+fn files_of_another_kind_are_identified() {
     let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
     let pointer = "version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n";
@@ -130,13 +130,13 @@ fn what_is_mistaken_for_data_is_called_what_it_is() {
     scene.write("sparse/0/images.txt", utf16);
     let outcome = train(scene.path(), &run, 3, "--budget 300");
     assert!(refusal(&outcome).contains("UTF-16"), "{outcome:?}");
-    // Editors put a byte-order mark before a text; it is no part of it.
+    // Some editors write a byte-order mark, which must be ignored.
     scene.write("sparse/0/images.txt", format!("\u{feff}{whole}"));
     train(scene.path(), &run, 3, "--budget 300").ok();
 }
 
 #[test]
-fn what_cannot_be_trained_on_is_refused_with_its_place() {
+fn invalid_cameras_and_missing_images_are_located() {
     let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
     scene.replace("sparse/0/cameras.txt", " 24 20", " 240 20");
@@ -161,27 +161,27 @@ fn archive(name: &str, contents: &[u8]) -> Vec<u8> {
     writer.finish().expect("an archive").into_inner()
 }
 
-/// What photographs and their archives must not bring along: a message with the remedy, and nothing written.
+/// Unusable lenses and malicious archives: a message with the remedy, and nothing is written.
 #[test]
-fn what_lenses_and_archives_must_not_be_is_refused() {
-    let lens = |lens: &str| {
+fn unusable_lenses_and_archives_are_refused() {
+    let with_lens = |lens: &str| {
         let scene = Photographs::colmap_text();
         scene.replace("sparse/0/cameras.txt", "PINHOLE 48 40 52 52 24 20", lens);
         scene
     };
-    let zip = |name: &str, contents: &[u8]| {
+    let with_archive = |name: &str, contents: &[u8]| {
         let scene = Photographs::colmap_text();
         scene.write("scan.zip", archive(name, contents));
         scene
     };
     for (scene, file, words) in [
         (
-            lens("RADIAL 48 40 52 24 20 -3 0"),
+            with_lens("RADIAL 48 40 52 24 20 -3 0"),
             "",
             &["images.txt", "folds over", "largest usable field", "--keep-fov"][..],
         ),
         (
-            lens("OPENCV 48 40 52 52 24 20 nan 0 0 0"),
+            with_lens("OPENCV 48 40 52 52 24 20 nan 0 0 0"),
             "",
             &[
                 "cameras.txt",
@@ -192,12 +192,12 @@ fn what_lenses_and_archives_must_not_be_is_refused() {
             ],
         ),
         (
-            zip("images/zeros.png", &vec![0; 65 << 20]),
+            with_archive("images/zeros.png", &vec![0; 65 << 20]),
             "scan.zip",
             &["scan.zip", "unpacks to more than 64.0 MiB", "unpack it yourself"],
         ),
         (
-            zip("../../out.png", b"?"),
+            with_archive("../../out.png", b"?"),
             "scan.zip",
             &["scan.zip", "../../out.png", "`..`", "pack the folder again"],
         ),
@@ -213,7 +213,7 @@ fn what_lenses_and_archives_must_not_be_is_refused() {
 }
 
 #[test]
-fn how_many_images_have_poses_is_said() {
+fn the_number_of_posed_images_is_reported() {
     let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
     std::fs::copy(scene.file("images/view_01.png"), scene.file("images/extra.png"))
@@ -224,7 +224,7 @@ fn how_many_images_have_poses_is_said() {
 
 #[cfg(unix)]
 #[test]
-fn nothing_is_waited_for_that_is_no_file() {
+fn pipes_and_devices_are_refused_without_waiting() {
     let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
     let outcome = train(scene.path(), &run, 3, "--config /dev/zero");
@@ -241,7 +241,7 @@ fn nothing_is_waited_for_that_is_no_file() {
 
 #[cfg(unix)]
 #[test]
-fn a_mesh_that_is_no_file_is_not_waited_for() {
+fn mesh_pipes_are_refused_without_waiting() {
     let (root, out) = scratch();
     let (gltf, pipe) = (root.path().join("mesh.gltf"), root.path().join("data.bin"));
     let obj = root.path().join("mesh.obj");
@@ -249,7 +249,7 @@ fn a_mesh_that_is_no_file_is_not_waited_for() {
         let made = std::process::Command::new("mkfifo").arg(path).status().expect("mkfifo");
         assert!(made.success());
     }
-    let text_of = serde_json::json!({
+    let document = serde_json::json!({
         "asset": { "version": "2.0" },
         "scenes": [{ "nodes": [0] }],
         "nodes": [{ "mesh": 0 }],
@@ -258,8 +258,8 @@ fn a_mesh_that_is_no_file_is_not_waited_for() {
         "bufferViews": [{ "buffer": 0, "byteLength": 36 }],
         "buffers": [{ "uri": "data.bin", "byteLength": 36 }],
     });
-    let text_of = text_of.to_string();
-    std::fs::write(&gltf, text_of).expect("a mesh");
+    let document = document.to_string();
+    std::fs::write(&gltf, document).expect("a mesh");
     for (mesh, name) in [(&obj, "mesh.obj"), (&gltf, "data.bin")] {
         let outcome = densify(&["scenegen", text(mesh), "-o", text(&out)]);
         let message = refusal(&outcome);

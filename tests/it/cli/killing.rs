@@ -1,5 +1,5 @@
-//! Processes that are killed or told to stop: nothing is lost but the steps since the last checkpoint,
-//! and the end is the same.
+//! Killed and interrupted processes: only the steps since the last checkpoint are lost, and the resumed run ends in
+//! the same bytes.
 //!
 //! `DENSIFY_KILLS=200 cargo test --test it killing` kills 200 times instead of 20.
 
@@ -13,42 +13,42 @@ use serde_json::Value;
 use super::{WITHOUT_GPU, call, files, model, read, records, resume, scratch, text, train};
 use crate::photographs::Photographs;
 
-/// Kills where the environment does not say.
+/// Number of kills without `DENSIFY_KILLS`.
 const KILLS: usize = 20;
 const ITERATIONS: u32 = 120;
-/// Checkpoints at every third step, so that many kills hit the writing of one.
+/// A checkpoint at every third step makes many kills hit the writing of one.
 const FLAGS: &str = "--budget 360 --checkpoint-every 3 --eval --save-iterations 31,77 \
                      --test-iterations 50 --policy-set diet.grow_every=7";
 
-/// When to kill.
+/// The moment at which a process is killed.
 #[derive(Debug, Clone, Copy)]
 enum Moment {
-    /// When the log has so many records.
+    /// The log has this many records.
     Records(usize),
-    /// When a file that is being written is seen for the so-many-th time.
+    /// An unfinished file has been seen this many times.
     Writing(u32),
 }
 
 impl Moment {
-    fn any(rng: &mut ChaCha8Rng) -> Self {
+    fn random(rng: &mut ChaCha8Rng) -> Self {
         match rng.random_range(0..4) {
             0 | 1 => Self::Records(rng.random_range(0..ITERATIONS as usize / 10)),
             _ => Self::Writing(rng.random_range(1..30)),
         }
     }
 
-    /// Looks on until the moment has come, or the child has ended by itself: whether it has come.
+    /// Polls until the moment has come. Returns false if the child ends before.
     fn wait(self, child: &mut Child, run: &Path) -> bool {
         let mut seen = 0;
         while child.try_wait().expect("a child").is_none() {
-            let come = match self {
+            let has_come = match self {
                 Self::Records(wanted) => lines(&run.join("stats/train.jsonl")) >= wanted,
                 Self::Writing(wanted) => {
                     seen += u32::from(is_writing(&run.join("checkpoints")));
                     seen >= wanted
                 }
             };
-            if come {
+            if has_come {
                 return true;
             }
             std::thread::yield_now();
@@ -71,7 +71,7 @@ fn spawn(words: &str) -> Child {
     let mut command = Command::new(env!("CARGO_BIN_EXE_densify"));
     command.args(words.split_whitespace()).env_remove("RUST_LOG");
     command.envs([WITHOUT_GPU]);
-    command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().expect("it starts")
+    command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().expect("the program starts")
 }
 
 /// The words of a call that trains.
@@ -80,7 +80,7 @@ fn arguments(scene: &Photographs, run: &Path, iterations: u32, flags: &str) -> S
     format!("train {scene} -o {run} --sh-degree 1 --quiet --iterations {iterations} {flags}")
 }
 
-/// All that a run must end with, whatever has happened to it.
+/// The results that must not depend on interruptions.
 fn outcome(run: &Path, iterations: u32) -> (Vec<Vec<u8>>, Vec<Value>) {
     let exact =
         ["stats/events.jsonl", "results.json", "per_view.json"].map(|name| read(&run.join(name)));
@@ -95,7 +95,7 @@ fn outcome(run: &Path, iterations: u32) -> (Vec<Vec<u8>>, Vec<Value>) {
 }
 
 #[test]
-fn killed_anywhere_and_resumed_it_ends_in_the_same_bytes() {
+fn a_run_killed_anywhere_resumes_to_the_same_bytes() {
     let kills = std::env::var("DENSIFY_KILLS").ok().and_then(|n| n.parse().ok()).unwrap_or(KILLS);
     let scene = Photographs::colmap_text();
     let (root, whole) = scratch();
@@ -105,25 +105,25 @@ fn killed_anywhere_and_resumed_it_ends_in_the_same_bytes() {
     let (mut killed, mut within_a_write) = (0, 0);
     for number in 0.. {
         let run = root.path().join(format!("run{number}"));
-        // The same call again and again, as a supervisor would do it.
+        // Repeats the same call, like a supervisor.
         let words = arguments(&scene, &run, ITERATIONS, &format!("{FLAGS} --resume"));
         for _ in 0..rng.random_range(1..4) {
             let mut child = spawn(&words);
-            let moment = Moment::any(&mut rng);
+            let moment = Moment::random(&mut rng);
             if moment.wait(&mut child, &run) {
                 child.kill().expect("it can be killed");
                 killed += 1;
                 within_a_write += usize::from(is_writing(&run.join("checkpoints")));
             }
-            let ended = child.wait_with_output().expect("it ends");
-            let said = String::from_utf8_lossy(&ended.stderr);
-            assert!(said.is_empty(), "run {number}, {moment:?}: {said}");
+            let ended = child.wait_with_output().expect("the program ends");
+            let stderr = String::from_utf8_lossy(&ended.stderr);
+            assert!(stderr.is_empty(), "run {number}, {moment:?}: {stderr}");
         }
         call(&words).ok();
         assert!(outcome(&run, ITERATIONS) == expected, "run {number} of seed 11 differs");
         let left = files(&run);
         let hidden = left.keys().find(|name| name.split('/').any(|part| part.starts_with('.')));
-        assert_eq!(hidden, None, "run {number}: something half written is left");
+        assert_eq!(hidden, None, "run {number}: an unfinished file is left");
         std::fs::remove_dir_all(&run).expect("the run");
         if killed >= kills {
             break;
@@ -132,16 +132,16 @@ fn killed_anywhere_and_resumed_it_ends_in_the_same_bytes() {
     assert!(within_a_write > 0, "no kill hit the writing of a checkpoint");
 }
 
-/// Sends signals to a run that has begun, and waits for its end: exit code, message, folder.
+/// Sends signals to a started run and waits for its end. Returns exit code and message.
 #[cfg(unix)]
 fn signalled(scene: &Photographs, run: &Path, signals: &[&str]) -> (Option<i32>, String) {
     let mut child = spawn(&arguments(scene, run, LONG, "--budget 360 --checkpoint-every 0"));
-    assert!(Moment::Records(3).wait(&mut child, run), "it has ended by itself");
+    assert!(Moment::Records(3).wait(&mut child, run), "the run has ended by itself");
     let id = child.id();
-    // By one shell, so that there is next to no time between them.
+    // One shell sends all signals, so that hardly any time passes between them.
     let calls: String = signals.iter().map(|signal| format!("kill {signal} {id};")).collect();
     assert!(Command::new("sh").args(["-c", &calls]).status().expect("a shell").success());
-    let ended = child.wait_with_output().expect("it ends");
+    let ended = child.wait_with_output().expect("the program ends");
     (ended.status.code(), String::from_utf8_lossy(&ended.stderr).into_owned())
 }
 
@@ -156,19 +156,19 @@ fn checkpoints(run: &Path) -> Vec<PathBuf> {
 
 #[cfg(unix)]
 #[test]
-fn a_signal_ends_the_run_in_order_and_it_goes_on() {
+fn a_signal_saves_a_checkpoint_and_the_run_can_be_resumed() {
     let scene = Photographs::colmap_text();
     let (root, whole) = scratch();
     train(scene.path(), &whole, LONG, "--quiet --budget 360 --checkpoint-every 0").ok();
     for (signal, name, code) in [("-INT", "SIGINT", 130), ("-TERM", "SIGTERM", 143)] {
         let run = root.path().join(name);
-        let (ended, said) = signalled(&scene, &run, &[signal]);
-        assert_eq!(ended, Some(code), "{said}");
+        let (ended, stderr) = signalled(&scene, &run, &[signal]);
+        assert_eq!(ended, Some(code), "{stderr}");
         let kept = checkpoints(&run);
         assert_eq!(kept.len(), 1, "{kept:?}");
         let stopped = format!("error: stopped by {name} after step ");
         for words in [&stopped, text(&kept[0]), "--resume"] {
-            assert!(said.contains(words), "{words:?} is not in {said}");
+            assert!(stderr.contains(words), "{words:?} is not in {stderr}");
         }
         let summary = super::json(&run.join("stats/summary.json"));
         let done = summary["iterations"].as_u64().expect("a number");
@@ -182,17 +182,17 @@ fn a_signal_ends_the_run_in_order_and_it_goes_on() {
 
 #[cfg(unix)]
 #[test]
-fn a_run_whose_folder_is_moved_ends_and_writes_no_more() {
+fn a_run_ends_when_its_folder_is_moved() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
     let flags = "--budget 360 --checkpoint-every 20";
     let mut child = spawn(&arguments(&scene, &run, 100_000, flags));
-    assert!(Moment::Records(3).wait(&mut child, &run), "it has ended by itself");
-    std::fs::rename(&run, root.path().join("moved")).expect("a folder that is moved");
-    let ended = child.wait_with_output().expect("it ends");
-    let said = String::from_utf8_lossy(&ended.stderr).into_owned();
-    assert_eq!(ended.status.code(), Some(1), "{said}");
-    assert!(said.contains("was moved, removed or taken by another process"), "{said}");
+    assert!(Moment::Records(3).wait(&mut child, &run), "the run has ended by itself");
+    std::fs::rename(&run, root.path().join("moved")).expect("a moved folder");
+    let ended = child.wait_with_output().expect("the program ends");
+    let stderr = String::from_utf8_lossy(&ended.stderr).into_owned();
+    assert_eq!(ended.status.code(), Some(1), "{stderr}");
+    assert!(stderr.contains("was moved, removed or taken by another process"), "{stderr}");
     assert!(!run.exists(), "something was written");
 }
 
@@ -202,25 +202,25 @@ fn a_run_in_progress_is_neither_resumed_nor_replaced() {
     let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
     let mut child = spawn(&arguments(&scene, &run, 100_000, "--budget 360"));
-    assert!(Moment::Records(3).wait(&mut child, &run), "it has ended by itself");
+    assert!(Moment::Records(3).wait(&mut child, &run), "the run has ended by itself");
     let process = format!("is in use: process {} is training there", child.id());
     for flags in ["", "--overwrite --policy mcmc", "--resume"] {
         train(scene.path(), &run, 5, flags).refused(flags, &[&process]);
     }
     child.kill().expect("it can be killed");
-    child.wait().expect("it ends");
-    // One that is killed while it replaces another leaves nothing once a run has ended there.
+    child.wait().expect("the program ends");
+    // The next complete run removes what a process leaves that is killed while replacing a run.
     let mut child = spawn(&arguments(&scene, &run, 100_000, "--budget 360 --overwrite"));
-    let staged = || {
+    let is_staged = || {
         let staged = densify::train::output::RunFolder::staged(&run);
         staged.iter().any(|path| path.join("stats/train.jsonl").exists())
     };
-    while !staged() {
-        assert!(child.try_wait().expect("a child").is_none(), "it has ended by itself");
+    while !is_staged() {
+        assert!(child.try_wait().expect("a child").is_none(), "the run has ended by itself");
     }
     train(scene.path(), &run, 5, "--overwrite").refused("replacing", &["is in use: process"]);
     child.kill().expect("it can be killed");
-    child.wait().expect("it ends");
+    child.wait().expect("the program ends");
     train(scene.path(), &run, 5, "--budget 360 --overwrite").ok();
     let left = files(&run);
     let hidden = left.keys().find(|name| name.starts_with('.') || name.ends_with(".lock"));
@@ -230,14 +230,14 @@ fn a_run_in_progress_is_neither_resumed_nor_replaced() {
 
 #[cfg(unix)]
 #[test]
-fn a_second_signal_ends_it_at_once() {
+fn a_second_signal_ends_the_run_at_once() {
     let scene = Photographs::colmap_text();
-    // The first may have been acted upon before the second comes, if the machine is busy.
+    // On a busy machine the first signal may take effect before the second arrives, so several attempts are made.
     let at_once = (0..20).any(|_| {
         let (_root, run) = scratch();
-        let (ended, said) = signalled(&scene, &run, &["-INT", "-TERM"]);
-        assert!(matches!(ended, Some(130 | 143)), "{ended:?}: {said}");
-        said.is_empty()
+        let (ended, stderr) = signalled(&scene, &run, &["-INT", "-TERM"]);
+        assert!(matches!(ended, Some(130 | 143)), "{ended:?}: {stderr}");
+        stderr.is_empty()
     });
-    assert!(at_once, "every time the run was ended in order");
+    assert!(at_once, "no second signal ended a run at once");
 }

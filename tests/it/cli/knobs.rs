@@ -1,4 +1,4 @@
-//! Knobs and presets, from the command line to the bytes of a run and back.
+//! Knobs and presets: on the command line, in `config.toml` and in their effect on the model.
 
 use std::path::Path;
 
@@ -10,7 +10,7 @@ use crate::photographs::Photographs;
 
 const ITERATIONS: u32 = 24;
 
-/// Knobs that are not as they are by default.
+/// Knobs with values other than their defaults.
 const CHANGED: &str = "--knob alpha_min=1/64 --knob transmittance_stop=1e-3 --knob param_storage=f16 \
                        --knob moment_storage=both8 --knob pairs_per_row=2";
 
@@ -20,21 +20,21 @@ fn short(scene: &Path, output: &Path, flags: &str) -> Outcome {
 
 #[test]
 fn every_knob_and_preset_is_listed() {
-    let said = densify(&["knobs"]).ok().stdout;
+    let stdout = densify(&["knobs"]).ok().stdout;
     for knob in KNOBS {
-        assert!(said.contains(&format!("  {} ", knob.name)), "{} is not in {said}", knob.name);
-        assert!(said.contains(knob.effect), "{} is not explained", knob.name);
+        assert!(stdout.contains(&format!("  {} ", knob.name)), "{} is not in {stdout}", knob.name);
+        assert!(stdout.contains(knob.effect), "{} is not explained", knob.name);
     }
     for preset in PRESETS {
-        assert!(said.contains(&format!("  {}: {}", preset.name, preset.promise)), "{said}");
+        assert!(stdout.contains(&format!("  {}: {}", preset.name, preset.promise)), "{stdout}");
     }
 }
 
 #[test]
-fn what_cannot_be_is_refused_before_anything_is_written() {
+fn invalid_knobs_and_presets_are_refused_before_writing() {
     let scene = Photographs::colmap_text();
     let (_root, output) = scratch();
-    // What values a knob may have is in `src/knobs/tests.rs`.
+    // The allowed values are tested where knobs are parsed.
     let cases: [(&str, &[&str]); 5] = [
         ("--knob alpha_min=0.5", &["alpha_min", "0.5", "1/32"]),
         ("--knob alpha_min", &["--knob", "NAME=VALUE"]),
@@ -47,12 +47,12 @@ fn what_cannot_be_is_refused_before_anything_is_written() {
     ];
     for (flags, words) in cases {
         short(scene.path(), &output, flags).refused(flags, words);
-        assert!(!output.exists(), "{flags}: something was written");
+        assert!(!output.exists(), "{flags}: the output exists");
     }
 }
 
 #[test]
-fn options_that_are_given_win_over_a_preset() {
+fn explicit_options_override_a_preset() {
     let scene = Photographs::colmap_text();
     let (_root, output) = scratch();
     let flags = "--preset tiny-memory --image-cache 1MiB --knob param_storage=f32";
@@ -61,18 +61,18 @@ fn options_that_are_given_win_over_a_preset() {
     assert_eq!(config["image_cache"].as_integer(), Some(1 << 20));
     let knob = |name: &str| config["knob"][name].as_str();
     assert_eq!([knob("param_storage"), knob("moment_storage")], [Some("f32"), Some("both8")]);
-    // By itself the preset keeps photographs in an eighth of the run, if they fit.
+    // Without the option, the preset caches photographs in up to an eighth of the memory.
     let (_root, output) = scratch();
     short(scene.path(), &output, "--preset tiny-memory").ok();
     let kept = self::config(&output)["image_cache"].as_integer();
-    assert_eq!(kept, Some(9 * 48 * 40 * 3), "all that are trained on");
+    assert_eq!(kept, Some(9 * 48 * 40 * 3), "all training views");
 }
 
 #[test]
-fn a_preset_says_how_long_a_run_is_unless_the_call_does() {
+fn presets_set_the_number_of_iterations_unless_it_is_given() {
     let scene = Photographs::colmap_text();
     let (_root, output) = scratch();
-    // A step beyond the last cannot be saved, and the message names the last.
+    // Saving after the last iteration is refused with a message that names the last.
     let cases = [
         ("", "24000"),
         ("--preset balanced", "24000"),
@@ -87,42 +87,42 @@ fn a_preset_says_how_long_a_run_is_unless_the_call_does() {
         call(&format!("train {scene} -o {output} --save-iterations 30001 {flags}"))
             .refused(flags, &["--save-iterations 30001", &format!("iterations 1 to {last}")]);
     }
-    // What balanced was measured to cost is not that of a run of another length.
-    let said = short(scene.path(), &output, "").ok().stdout;
+    // The measured cost of `balanced` does not apply to a run of another length.
+    let stdout = short(scene.path(), &output, "").ok().stdout;
     let line = format!("preset   none: --iterations {ITERATIONS} is given, and balanced is 24000");
-    assert!(said.contains(&line), "{said}");
+    assert!(stdout.contains(&line), "{stdout}");
 }
 
 #[test]
-fn every_level_does_what_its_class_says() {
+fn every_level_matches_its_exactness_class() {
     let scene = Photographs::colmap_text();
     let (root, base) = scratch();
     short(scene.path(), &base, "").ok();
     let expected = model(&base, ITERATIONS);
     let defaults: String =
         KNOBS.iter().map(|knob| format!(" --knob {}={}", knob.name, knob.default)).collect();
-    let spelled = root.path().join("spelled");
+    let explicit = root.path().join("explicit");
     for flags in [&*defaults, "--preset exact"] {
-        short(scene.path(), &spelled, &format!("{flags} --overwrite")).ok();
-        assert!(expected == model(&spelled, ITERATIONS), "{flags} is not the default");
+        short(scene.path(), &explicit, &format!("{flags} --overwrite")).ok();
+        assert!(expected == model(&explicit, ITERATIONS), "{flags} is not the default");
     }
     let mut changed = 0;
-    // Those of a GPU are tried in `accumulation.rs`.
+    // `accumulation.rs` tests the knobs of a GPU.
     for knob in KNOBS.iter().filter(|knob| knob.only_on != Some(BackendKind::Gpu)) {
         for level in knob.levels {
-            let (what, run) = (format!("--knob {}={level}", knob.name), root.path().join("level"));
-            short(scene.path(), &run, &format!("{what} --overwrite")).ok();
-            let same = model(&run, ITERATIONS) == expected;
-            assert!(same || knob.class != Class::Exact, "{what} is not exact");
-            changed += usize::from(!same);
-            assert_eq!(config(&run)["knob"][knob.name].as_str(), Some(*level), "{what}");
+            let (flag, run) = (format!("--knob {}={level}", knob.name), root.path().join("level"));
+            short(scene.path(), &run, &format!("{flag} --overwrite")).ok();
+            let is_same = model(&run, ITERATIONS) == expected;
+            assert!(is_same || knob.class != Class::Exact, "{flag} is not exact");
+            changed += usize::from(!is_same);
+            assert_eq!(config(&run)["knob"][knob.name].as_str(), Some(*level), "{flag}");
         }
     }
     assert!(changed >= 7, "only {changed} levels change anything");
 }
 
 #[test]
-fn knobs_survive_a_stop_and_cannot_change_in_between() {
+fn resumed_runs_keep_their_knobs() {
     let scene = Photographs::colmap_text();
     let (root, whole) = scratch();
     let flags = format!("{CHANGED} --checkpoint-every 12");
@@ -133,7 +133,7 @@ fn knobs_survive_a_stop_and_cannot_change_in_between() {
         |flags: &str| resume(scene.path(), &part, &format!("--checkpoint-every 12 {flags}"));
     resume("--knob alpha_min=1/32").refused("another value", &["--knob alpha_min", "1/32", "1/64"]);
     resume("--preset exact").refused("a preset", &["--knob alpha_min", "1/255", "1/64"]);
-    // Not given, or given again.
+    // Knobs may be left out or repeated with the same value.
     resume("--knob param_storage=f16 --knob alpha_min=0.015625").ok();
-    assert!(model(&whole, ITERATIONS) == model(&part, ITERATIONS), "another model");
+    assert!(model(&whole, ITERATIONS) == model(&part, ITERATIONS), "the models differ");
 }

@@ -1,4 +1,4 @@
-//! `densify eval`, `render`, `policies` and `selftest`: looking at what was trained, and at what trains.
+//! `densify eval`, `render`, `policies` and `selftest`: commands that inspect models, policies and backends.
 
 use std::path::Path;
 
@@ -13,13 +13,13 @@ pub(super) fn run_of(scene: &Photographs, run: &Path) {
     train(scene.path(), run, ITERATIONS, "--budget 320 --eval --quiet").ok();
 }
 
-/// Fails unless all numbers of two JSON documents agree to `tolerance`, and all else is equal.
-fn agree(a: &serde_json::Value, b: &serde_json::Value, tolerance: f64) {
+/// Checks that two JSON documents are equal, with numbers compared up to `tolerance`.
+fn assert_close(a: &serde_json::Value, b: &serde_json::Value, tolerance: f64) {
     use serde_json::Value::{Number, Object};
     match (a, b) {
         (Object(a), Object(b)) => {
-            assert!(a.keys().eq(b.keys()), "{a:?} has other keys than {b:?}");
-            a.values().zip(b.values()).for_each(|(a, b)| agree(a, b, tolerance));
+            assert!(a.keys().eq(b.keys()), "{a:?} and {b:?} have different keys");
+            a.values().zip(b.values()).for_each(|(a, b)| assert_close(a, b, tolerance));
         }
         (Number(a), Number(b)) => {
             let [a, b] = [a, b].map(|n| n.as_f64().expect("a number"));
@@ -30,17 +30,17 @@ fn agree(a: &serde_json::Value, b: &serde_json::Value, tolerance: f64) {
 }
 
 #[test]
-fn eval_repeats_what_training_measured() {
+fn eval_reproduces_the_scores_of_training() {
     let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
     run_of(&scene, &run);
     let paths = ["results.json", "per_view.json"].map(|name| run.join(name));
     let trained = paths.clone().map(|path| json(&path));
-    paths.iter().for_each(|path| std::fs::remove_file(path).expect("it was there"));
+    paths.iter().for_each(|path| std::fs::remove_file(path).expect("an existing file"));
     let outcome = call(&format!("eval {}", text(&run))).ok();
-    // The model went through its file, in the dataset's own coordinates.
+    // The model file rounds, because it stores the model in the dataset's coordinates.
     for (path, trained) in paths.iter().zip(&trained) {
-        agree(&json(path), trained, 2e-3);
+        assert_close(&json(path), trained, 2e-3);
     }
     for view in [0, 8] {
         assert!(outcome.stdout.contains(&name(view)), "{}", outcome.stdout);
@@ -50,11 +50,11 @@ fn eval_repeats_what_training_measured() {
     call(&format!("eval {} --split train", text(&run))).ok();
     let views = &json(&run.join("per_view_train.json"))["ours_40"]["PSNR"];
     assert_eq!(views.as_object().map(serde_json::Map::len), Some(VIEWS - 2));
-    agree(&json(&run.join("results.json")), &trained[0], 2e-3);
+    assert_close(&json(&run.join("results.json")), &trained[0], 2e-3);
 }
 
-/// A file with weights of AlexNet's shape.
-fn weights(path: &Path) {
+/// Writes arbitrary weights in the shape of AlexNet.
+fn write_weights(path: &Path) {
     let layers = [(1, 0, 64, 3, 11), (2, 3, 192, 64, 5), (3, 6, 384, 192, 3), (4, 8, 256, 384, 3)];
     let layers = layers.into_iter().chain([(5, 10, 256, 256, 3)]);
     let mut arrays: Vec<(String, Vec<usize>)> = Vec::new();
@@ -69,7 +69,7 @@ fn weights(path: &Path) {
     let bytes: Vec<Vec<u8>> = bytes.map(Iterator::collect).collect();
     let views = arrays.iter().zip(&bytes).map(|((name, shape), bytes)| {
         let view = TensorView::new(Dtype::F32, shape.clone(), bytes);
-        (name, view.expect("the shape has as many bytes"))
+        (name, view.expect("bytes that match the shape"))
     });
     safetensors::serialize_to_file(views, None, path).expect("a file is written");
 }
@@ -80,7 +80,7 @@ fn eval_measures_lpips_with_the_users_weights() {
     let (root, run) = scratch();
     run_of(&scene, &run);
     let file = root.path().join("alex.safetensors");
-    weights(&file);
+    write_weights(&file);
     let call_with = |file: &Path, more: &str| {
         call(&format!("eval {} --lpips {} {more}", text(&run), text(file)))
     };
@@ -95,7 +95,7 @@ fn eval_measures_lpips_with_the_users_weights() {
     assert!((mean.unwrap() - 0.5 * (views[0] + views[1])).abs() < 1e-12, "{mean:?}");
     let beyond = call_with(&file, "--fail-above lpips=0");
     assert!(beyond.code == Some(4) && beyond.stderr.contains("lpips is"), "{beyond:?}");
-    // Without the file nothing is new.
+    // Without the weights there is no LPIPS.
     call(&format!("eval {}", text(&run))).ok();
     assert!(json(&run.join("results.json"))["ours_40"].get("LPIPS").is_none());
     let without = call(&format!("eval {} --fail-above lpips=1", text(&run)));
@@ -105,14 +105,14 @@ fn eval_measures_lpips_with_the_users_weights() {
     call_with(&file, "").refused("no weights are in the file", &words);
 }
 
-/// Size of a picture [px].
+/// The size of an image [px].
 fn size(folder: &Path, name: &str) -> (u32, u32) {
     let path = folder.join(name);
     image::image_dimensions(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
 }
 
 #[test]
-fn render_writes_pictures_of_the_views() {
+fn render_writes_images_of_the_views() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
     run_of(&scene, &run);
@@ -120,10 +120,10 @@ fn render_writes_pictures_of_the_views() {
     let all = "--alpha --depth --side-by-side";
     call(&format!("render {} -o {} {all}", text(&run), text(&pictures))).ok();
     let names: Vec<String> = files(&pictures).into_keys().collect();
-    let of = |view: &str| {
+    let maps = |view: &str| {
         ["alpha", "depth", "pair"].map(|kind| format!("{view}.{kind}.png")).into_iter()
     };
-    let mut expected: Vec<String> = of("view_00").chain(of("view_08")).collect();
+    let mut expected: Vec<String> = maps("view_00").chain(maps("view_08")).collect();
     expected.extend(["view_00.png", "view_08.png", "depth.json"].map(str::to_owned));
     expected.sort();
     assert_eq!(names, expected);
@@ -133,11 +133,11 @@ fn render_writes_pictures_of_the_views() {
     assert_eq!(size(&pictures, "view_08.pair.png"), (2 * SIZE.0, SIZE.1));
     let open = |name: &str| image::open(pictures.join(name)).expect("a picture");
     assert!(matches!(open("view_00.depth.png"), image::DynamicImage::ImageLuma16(_)));
-    // Opaque blobs four units away, in the dataset's own units.
+    // The scene has opaque blobs four dataset units away.
     let depth = json(&pictures.join("depth.json"));
     let largest = depth["largest"]["view_00.depth.png"].as_f64().expect("a number");
     assert!((3.0..6.0).contains(&largest), "{largest}");
-    // The pair is photograph and rendering, and they resemble each other.
+    // The pair is the photograph beside the rendering.
     let pair = open("view_00.pair.png").into_rgb8();
     let (photograph, rendering) = (
         image::open(scene.file("images/view_00.png")).unwrap().into_rgb8(),
@@ -163,28 +163,28 @@ fn render_writes_pictures_of_the_views() {
 }
 
 #[test]
-fn a_bare_model_renders_as_its_run() {
+fn a_bare_model_renders_like_its_run() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
     run_of(&scene, &run);
-    let render = |what: &str, to: &str| {
+    let render = |words: &str, to: &str| {
         let to = root.path().join(to);
-        (call(&format!("render {what} -o {}", text(&to))), to)
+        (call(&format!("render {words} -o {}", text(&to))), to)
     };
     let ply = densify::train::output::model_path(&run, ITERATIONS);
     let (ply, dataset) = (text(&ply), text(scene.path()));
-    let (of_run, from_run) = render(text(&run), "a");
-    let (of_file, from_file) = render(&format!("{ply} --scene {dataset} --eval"), "b");
-    of_run.ok();
-    of_file.ok();
-    assert!(files(&from_run) == files(&from_file));
+    let (run_outcome, run_images) = render(text(&run), "a");
+    let (file_outcome, file_images) = render(&format!("{ply} --scene {dataset} --eval"), "b");
+    run_outcome.ok();
+    file_outcome.ok();
+    assert!(files(&run_images) == files(&file_images));
     let (refused, nowhere) = render(ply, "c");
     refused.refused("no cameras", &["--scene"]);
     assert!(!nowhere.exists());
 }
 
 #[test]
-fn the_selftest_prints_its_figures_and_writes_them() {
+fn selftest_prints_and_writes_its_figures() {
     let (root, _) = scratch();
     let file = root.path().join("deep/figures.md");
     let outcome = call(&format!("selftest --backend cpu 1 16 --markdown {}", text(&file))).ok();
@@ -193,7 +193,7 @@ fn the_selftest_prints_its_figures_and_writes_them() {
     {
         assert!(outcome.stdout.contains(words), "{words}: {}", outcome.stdout);
     }
-    let written = std::fs::read_to_string(&file).expect("it was written");
+    let written = std::fs::read_to_string(&file).expect("a written file");
     assert!(written.contains("## native") && written.contains("| 16 | depths"), "{written}");
     call("selftest 99").refused("no such case", &["no case 99", "30"]);
     call("selftest --all --gpu x").refused("two choices", &["--all"]);

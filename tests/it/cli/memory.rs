@@ -1,13 +1,13 @@
-//! `--memory` and `densify plan`: what is promised is kept, plan and train agree, and what fits no
-//! model is refused with what would.
+//! `--memory` and `densify plan`: runs stay within the promised memory, plan and train agree, and limits too small
+//! for any model are refused with the smallest that works.
 
 use std::path::Path;
 
 use densify_policies::registry::{find, policies};
 
 use super::{
-    Outcome, WITHOUT_GPU, call, config, copy_unfinished, count, densify, files, json, model, often,
-    records, scratch, text,
+    Outcome, WITHOUT_GPU, call, config, copy_unfinished, count, densify, files, frequent_edits,
+    json, model, records, scratch, text,
 };
 use crate::photographs::Photographs;
 
@@ -21,7 +21,7 @@ fn train(scene: &Path, run: &Path, flags: &str) -> Outcome {
     call(&format!("train {} -o {} --backend cpu {flags}", text(scene), text(run)))
 }
 
-/// The ledger in what was said.
+/// The memory ledger in the output.
 fn ledger(outcome: &Outcome) -> &str {
     let start = outcome.stdout.find("memory promised").expect("a ledger");
     let table = &outcome.stdout[start..];
@@ -30,14 +30,14 @@ fn ledger(outcome: &Outcome) -> &str {
     &table[..end]
 }
 
-/// The line that says how many rows there may be.
+/// The line with the budget of Gaussians.
 fn budget(outcome: &Outcome) -> &str {
     let mut lines = outcome.stdout.lines();
     lines.find(|line| line.starts_with("budget ")).expect("a budget")
 }
 
 #[test]
-fn plan_says_what_train_promises_and_writes_nothing() {
+fn plan_matches_train_and_writes_nothing() {
     let scene = Photographs::colmap_text();
     let mut cases = vec![
         "--memory 48MiB --eval".to_owned(),
@@ -60,41 +60,41 @@ fn plan_says_what_train_promises_and_writes_nothing() {
             size.replace([',', '.'], "").parse().unwrap_or_else(|e| panic!("{line}: {e}"))
         };
         let lines: Vec<&str> =
-            ledger(&planned).lines().skip(1).filter(|it| !it.ends_with(')')).collect();
+            ledger(&planned).lines().skip(1).filter(|line| !line.ends_with(')')).collect();
         let (total, lines) = lines.split_last().expect("a total");
         assert_eq!(lines.iter().map(|line| tenths(line)).sum::<u64>(), tenths(total), "{flags}");
-        let left = planned.stdout.contains("of --memory\n");
-        assert_eq!(left, flags.contains("--memory"), "{flags}: {}", planned.stdout);
+        let has_remainder = planned.stdout.contains("of --memory\n");
+        assert_eq!(has_remainder, flags.contains("--memory"), "{flags}: {}", planned.stdout);
         assert_eq!(budget(&planned), budget(&trained), "{flags}");
         let summary = json(&run.join("stats/summary.json"));
-        let rows = format!("budget   {}", grouped(count(&summary, "budget")));
+        let rows = format!("budget   {}", with_thousands_separators(count(&summary, "budget")));
         assert!(budget(&planned).starts_with(&rows), "{flags}: {}", budget(&planned));
-        for said in ["Gaussians that --memory", "-r 1 (48x40)", "-r 4 (12x10)", "degree 3"] {
-            assert!(planned.stdout.contains(said), "{flags}: {said:?} in {}", planned.stdout);
+        for words in ["Gaussians that --memory", "-r 1 (48x40)", "-r 4 (12x10)", "degree 3"] {
+            assert!(planned.stdout.contains(words), "{flags}: {words:?} in {}", planned.stdout);
         }
     }
 }
 
-fn grouped(number: u64) -> String {
+fn with_thousands_separators(number: u64) -> String {
     match (number / 1000, number % 1000) {
         (0, rest) => rest.to_string(),
-        (thousands, rest) => format!("{},{rest:03}", grouped(thousands)),
+        (thousands, rest) => format!("{},{rest:03}", with_thousands_separators(thousands)),
     }
 }
 
 #[test]
-fn a_run_takes_no_more_than_it_is_given() {
+fn a_run_stays_within_its_memory_limit() {
     let scene = Photographs::transforms();
     for (memory, policy, preset, points) in [
         (48, "diet", "exact", "17k"),
         (64, "taming", "exact", "30k"),
         (64, "mcmc", "exact", "100k"),
-        // Here the model as f32 would be half of what is promised.
+        // A copy of this model as f32 would be half of the promised memory.
         (256, "diet", "tiny-memory", "245k"),
     ] {
         let (_root, run) = scratch();
-        // Every row is there from the start, and edits come, so that all of the promise is needed.
-        let often = often(find(policy).expect("it is registered"));
+        // Starting with a full budget and editing often needs all of the promised memory.
+        let often = frequent_edits(find(policy).expect("it is registered"));
         let flags = format!("--policy {policy} {often} --preset {preset} --init-points {points}");
         let flags = format!("{flags} --memory {memory}MiB --eval --iterations 12");
         train(scene.path(), &run, &format!("{flags} --test-iterations 3 --checkpoint-every 5"))
@@ -103,7 +103,7 @@ fn a_run_takes_no_more_than_it_is_given() {
         let (budget, promised) = (count(&summary, "budget"), count(&summary, "ledger_bytes"));
         assert_eq!(count(&summary, "memory"), memory * MIB, "{flags}");
         assert!(promised <= memory * MIB, "{flags}: {promised} promised");
-        // As many as fit: a tenth more would not.
+        // The limit is used to at least 90 %.
         assert!(
             budget > 5_000 && promised > memory * MIB * 9 / 10,
             "{flags}: {budget}, {promised}"
@@ -119,12 +119,12 @@ fn a_run_takes_no_more_than_it_is_given() {
     }
 }
 
-/// All that grows with the rows: what lasts, and what an event of the policy takes beside it.
+/// Memory per Gaussian, including the temporary buffers of policy events.
 #[test]
-fn a_row_takes_no_more_than_480_bytes_in_tiny_memory() {
+fn tiny_memory_needs_at_most_480_bytes_per_gaussian() {
     let scene = Photographs::colmap_text();
     for policy in ["vanilla", "diet", "mcmc"] {
-        let [less, more] = ["256MiB", "512MiB"].map(|memory| {
+        let [fewer, more] = ["256MiB", "512MiB"].map(|memory| {
             let flags = format!("--policy {policy} --preset tiny-memory --sh-degree 3");
             let planned = plan(scene.path(), &format!("{flags} --memory {memory}")).ok();
             let rows = budget(&planned).trim_start_matches("budget").trim_start();
@@ -132,13 +132,16 @@ fn a_row_takes_no_more_than_480_bytes_in_tiny_memory() {
                 rows.chars().take_while(|c| *c != ' ').filter(|c| *c != ',').collect();
             rows.parse::<u64>().expect("a number of rows")
         });
-        let bytes = 256.0 * MIB as f64 / (more - less) as f64;
-        assert!(bytes > 300.0 && bytes <= 480.0, "{policy}: {bytes} bytes, {less} and {more} rows");
+        let bytes = 256.0 * MIB as f64 / (more - fewer) as f64;
+        assert!(
+            bytes > 300.0 && bytes <= 480.0,
+            "{policy}: {bytes} bytes, {fewer} and {more} Gaussians"
+        );
     }
 }
 
 #[test]
-fn on_a_gpu_it_bounds_what_is_on_the_device() {
+fn on_a_gpu_the_limit_applies_to_device_memory() {
     let scene = Photographs::colmap_text();
     let mut rows: Vec<(&str, u64)> = Vec::new();
     for device in crate::subject::ways() {
@@ -159,10 +162,10 @@ fn on_a_gpu_it_bounds_what_is_on_the_device() {
         let lines = summary["ledger"]["lines"].as_array().expect("lines");
         let on_device = lines.iter().filter(|line| line["on_device"] == true);
         let bytes: u64 = on_device.map(|line| count(line, "bytes")).sum();
-        // What the backend allocates is the ledger: `what_is_allocated_is_what_the_ledger_says`.
+        // `gpu::ledger` checks that the backend allocates exactly what the ledger says.
         assert!(bytes <= 48 * MIB && bytes > 47 * MIB, "{name}: {bytes}");
         assert!(planned.stdout.contains("on the device"), "{name}: {}", planned.stdout);
-        // Without records more rows fit.
+        // Accumulation without records leaves room for more Gaussians.
         let most = count(&summary, "budget");
         let in_slots = rows.iter().find(|(other, _)| other == name).map(|(_, rows)| *rows);
         let is_in_slots = device.accumulation().is_deterministic();
@@ -172,7 +175,7 @@ fn on_a_gpu_it_bounds_what_is_on_the_device() {
 }
 
 #[test]
-fn the_smaller_of_two_limits_holds() {
+fn the_smaller_of_budget_and_memory_applies() {
     let scene = Photographs::colmap_text();
     let plan = |flags: &str| plan(scene.path(), flags).ok();
     let by_budget = plan("--budget 500 --memory 1GiB");
@@ -180,7 +183,7 @@ fn the_smaller_of_two_limits_holds() {
     let by_memory = plan("--budget 3M --memory 64MiB");
     assert!(budget(&by_memory).ends_with("holds fewer than --budget 3,000,000"));
     assert_eq!(budget(&plan("--memory 64MiB")), budget(&plan("--memory 64MiB --threads 5")));
-    // The degree is lowered for the points of the scene only.
+    // The SH degree is lowered only if the initial points would not fit otherwise.
     assert!(plan("--memory 40MiB").stdout.contains("degree 3,"));
     let lowered = plan("--memory 64MiB --init-points 45k").stdout;
     assert!(!lowered.contains("degree 3,") && lowered.contains("instead of 3"), "{lowered}");
@@ -188,14 +191,14 @@ fn the_smaller_of_two_limits_holds() {
     assert!(kept.contains("degree 3,") && !kept.contains("instead"), "{kept}");
 }
 
-/// The remedies of a refusal, in their order.
+/// The remedies that a refusal lists, in order.
 fn remedies(outcome: &Outcome) -> Vec<String> {
-    let told = outcome.stderr.split("; give ").nth(1).expect("a remedy").trim();
-    told.split(", or ").map(str::to_owned).collect()
+    let listed = outcome.stderr.split("; give ").nth(1).expect("a remedy").trim();
+    listed.split(", or ").map(str::to_owned).collect()
 }
 
-/// The flags of a call after a remedy: `--flag value` is new or in place of another, `no --flag` is gone.
-fn followed(flags: &str, remedy: &str) -> String {
+/// Applies a remedy to flags: `--flag value` is added or replaces another value, `no --flag` removes the flag.
+fn apply_remedy(flags: &str, remedy: &str) -> String {
     let mut all: Vec<(&str, &str)> = Vec::new();
     let mut words = flags.split_whitespace().chain(remedy.split_whitespace());
     while let Some(word) = words.next() {
@@ -210,10 +213,10 @@ fn followed(flags: &str, remedy: &str) -> String {
 }
 
 #[test]
-fn a_memory_that_holds_no_model_is_refused_with_what_fits_and_the_cheapest_comes_first() {
+fn too_little_memory_is_refused_with_remedies_and_the_cheapest_comes_first() {
     let scene = Photographs::colmap_text();
     let plan = |flags: &str| plan(scene.path(), flags);
-    // Photographs cost only time to decode again.
+    // Dropping the image cache comes first, because it costs only decoding time.
     for (flags, second) in [
         ("", "--preset tiny-memory"),
         ("--test-every 5 --sh-degree 3", "--preset tiny-memory"),
@@ -225,24 +228,24 @@ fn a_memory_that_holds_no_model_is_refused_with_what_fits_and_the_cheapest_comes
         let outcome = train(scene.path(), &run, &format!("--memory 1MiB {flags}"));
         outcome.refused(flags, &["--memory 1.0 MiB", "1,000 rows", "give --memory"]);
         assert!(files(root.path()).is_empty(), "{flags}");
-        let [least] = &remedies(&outcome)[..] else { panic!("the program takes more") };
-        plan(&followed(flags, least)).ok();
+        let [least] = &remedies(&outcome)[..] else { panic!("expected one remedy") };
+        plan(&apply_remedy(flags, least)).ok();
         let mib = least.trim_start_matches("--memory ").trim_end_matches("MiB");
         let mib: u64 = mib.parse().unwrap_or_else(|e| panic!("{least}: {e}"));
-        // The most that is too little, to the kibibyte: what is missing is little, whatever a step holds.
-        let (mut little, mut enough) = ((mib - 1) << 10, mib << 10);
-        while enough - little > 1 {
-            let middle = (little + enough) / 2;
+        // Bisects for the largest limit that is too small, in KiB, where every remedy saves enough.
+        let (mut too_small, mut enough) = ((mib - 1) << 10, mib << 10);
+        while enough - too_small > 1 {
+            let middle = (too_small + enough) / 2;
             let fits = plan(&format!("--memory {middle}KiB {flags}")).code == Some(0);
-            *(if fits { &mut enough } else { &mut little }) = middle;
+            *(if fits { &mut enough } else { &mut too_small }) = middle;
         }
-        let flags = format!("--memory {little}KiB {flags}");
+        let flags = format!("--memory {too_small}KiB {flags}");
         let outcome = plan(&flags);
         outcome.refused(&flags, &[least]);
         let all = remedies(&outcome);
         assert_eq!(all[..2], ["--image-cache 0", second], "{flags}: {all:?}");
         for remedy in all {
-            plan(&followed(&flags, &remedy)).ok();
+            plan(&apply_remedy(&flags, &remedy)).ok();
         }
     }
     let refused = |flags: &str, words| plan(flags).refused(flags, words);
@@ -251,12 +254,12 @@ fn a_memory_that_holds_no_model_is_refused_with_what_fits_and_the_cheapest_comes
     refused("--resume", &["--resume"]);
 }
 
-/// Without `--memory` the table is of what was planned, in whole mebibytes.
+/// Without `--memory`, the table uses the planned memory in whole mebibytes.
 #[test]
-fn what_the_table_says_a_memory_holds_it_holds() {
+fn the_table_of_capacities_is_exact() {
     let photographs = Photographs::colmap_text();
     let (photographs, known) = (photographs.path(), Path::new("scene:spheres"));
-    // Rendering a scene for the first time leaves the process larger.
+    // Rendering a scene for the first time makes the process grow, so it is cached first.
     plan(known, "").ok();
     for (scene, flags) in [
         (photographs, "--budget 20k"),
@@ -266,8 +269,8 @@ fn what_the_table_says_a_memory_holds_it_holds() {
         (known, "--budget 20k --preset tiny-memory --eval"),
     ] {
         let planned = plan(scene, flags).ok();
-        let said = planned.stdout.split("Gaussians that --memory ").nth(1).expect("a table");
-        let (memory, table) = said.split_once("MiB").expect("a size");
+        let heading = planned.stdout.split("Gaussians that --memory ").nth(1).expect("a table");
+        let (memory, table) = heading.split_once("MiB").expect("a size");
         let row = table.lines().find(|line| line.starts_with("  degree 3")).expect("a row");
         let rows = row.split_whitespace().nth(2).expect("rows at full size");
         let flags = flags.replace("--budget 20k", "") + &format!(" --memory {memory}MiB");
@@ -279,7 +282,7 @@ fn what_the_table_says_a_memory_holds_it_holds() {
 }
 
 #[test]
-fn a_run_for_a_memory_goes_on_with_what_was_chosen() {
+fn a_run_with_a_memory_limit_resumes_with_its_chosen_sizes() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
     let flags = "--iterations 6 --checkpoint-every 3";
@@ -295,11 +298,11 @@ fn a_run_for_a_memory_goes_on_with_what_was_chosen() {
         ("--memory 49MiB", ["--memory: 51380224 now", "50331648 in that run"]),
         ("--budget 300", ["--budget: 300 now", "in that run"]),
         ("--sh-degree 2", ["--sh-degree: 2 now", "3 in that run"]),
-        // It changes no byte of the result, but is more than was allowed.
+        // This would not change the result, but exceeds the memory limit.
         ("--tile-cap 10M", ["--memory 48.0 MiB", "give --tile-cap"]),
     ] {
         train(scene.path(), &run, &format!("--resume {flags}")).refused(flags, &words);
-        assert!(files(&run) == before, "{flags} touched the run");
+        assert!(files(&run) == before, "{flags} changed the run");
     }
     let part = root.path().join("part");
     copy_unfinished(&run, &part, 6);
@@ -314,10 +317,10 @@ fn a_run_for_a_memory_goes_on_with_what_was_chosen() {
     assert!(model(&part, 6) == model(&run, 6));
 }
 
-/// What is set aside for rows and pairs that never come is not resident.
+/// Memory reserved for Gaussians and pairs that are never created must not become resident.
 #[test]
 #[cfg(target_os = "linux")]
-fn memory_is_taken_as_it_is_needed() {
+fn unused_reservations_are_not_resident() {
     let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
     train(scene.path(), &run, "--budget 400k --init random --init-points 500 --iterations 2").ok();
@@ -326,10 +329,9 @@ fn memory_is_taken_as_it_is_needed() {
     assert!(promised > 400 * MIB && peak < promised / 4, "{peak} of {promised}");
 }
 
-/// What becomes of a run that may have so much address space `[KiB]`: its exit code, what it has said,
-/// and whether it has left anything.
+/// Trains with limited address space `[KiB]`. Returns the exit code, the messages and whether files were written.
 #[cfg(target_os = "linux")]
-fn limited(limit: usize, flags: &str) -> (Option<i32>, String, bool) {
+fn train_with_limit(limit: usize, flags: &str) -> (Option<i32>, String, bool) {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
     let program = env!("CARGO_BIN_EXE_densify");
@@ -341,60 +343,63 @@ fn limited(limit: usize, flags: &str) -> (Option<i32>, String, bool) {
     let mut shell = std::process::Command::new("sh");
     shell.envs((!flags.contains("--gpu")).then_some(WITHOUT_GPU));
     let outcome = shell.args(["-c", &call]).output().expect("a shell");
-    let said = String::from_utf8_lossy(&outcome.stderr).into_owned();
-    (outcome.status.code(), said, !files(root.path()).is_empty())
+    let stderr = String::from_utf8_lossy(&outcome.stderr).into_owned();
+    (outcome.status.code(), stderr, !files(root.path()).is_empty())
 }
 
 /// From far too little to plenty, each limit of the address space ends in a message or in a model.
 #[test]
 #[cfg(target_os = "linux")]
-fn a_system_that_grants_too_little_is_named_and_nothing_is_written() {
+fn a_failed_allocation_is_reported_with_remedies_and_writes_nothing() {
     let (mut refused, mut trained, mut remedies) = (0, 0, 0);
     for limit in (150_000..=1_350_000).step_by(100_000) {
         let flags = "--budget 150k --init random --threads 2 --backend cpu";
-        match limited(limit, flags) {
+        match train_with_limit(limit, flags) {
             (Some(0), _, true) => trained += 1,
-            (Some(3), said, false) => {
-                assert!(said.starts_with("error: "), "{limit}: {said}");
-                refused += usize::from(said.contains("ulimit -v"));
-                for remedy in said.split("; give ").nth(1).iter().flat_map(|it| it.split(", or ")) {
+            (Some(3), stderr, false) => {
+                assert!(stderr.starts_with("error: "), "{limit}: {stderr}");
+                refused += usize::from(stderr.contains("ulimit -v"));
+                for remedy in
+                    stderr.split("; give ").nth(1).iter().flat_map(|list| list.split(", or "))
+                {
                     if remedy.starts_with("--") {
-                        let (code, said, _) = limited(limit, &followed(flags, remedy));
-                        assert_eq!(code, Some(0), "{limit}: {remedy}: {said}");
+                        let (code, stderr, _) =
+                            train_with_limit(limit, &apply_remedy(flags, remedy));
+                        assert_eq!(code, Some(0), "{limit}: {remedy}: {stderr}");
                         remedies += 1;
                     }
                 }
             }
-            other => panic!("{limit} KiB end in {other:?}"),
+            other => panic!("{limit} KiB: {other:?}"),
         }
     }
     assert!(refused >= 3 && trained >= 2, "{refused} refused, {trained} trained");
     assert!(remedies >= 2, "{remedies} remedies");
 }
 
-/// llvmpipe's device memory is the process's own, so that it can be made to run out where the device's
-/// buffers are created. (SwiftShader's code generator ends the process where it gets no memory.)
+/// llvmpipe takes device memory from the process, so an address space limit makes creating device buffers fail.
+/// (SwiftShader's code generator aborts the process when it gets no memory.)
 #[test]
 #[ignore = "takes a minute: run by .ci/run"]
 #[cfg(target_os = "linux")]
-fn a_device_that_runs_out_of_memory_is_named_and_nothing_is_written() {
+fn a_device_out_of_memory_is_reported_and_writes_nothing() {
     let is_llvmpipe = |name: &&str| name.contains("llvmpipe");
     let mut names = crate::subject::devices().iter().map(|device| &device.adapter().name[..]);
     let Some(name) = names.find(is_llvmpipe) else { return };
     let flags = format!("--budget 1500k --tile-cap 100k --gpu '{name}'");
     let mut refused = 0;
     for limit in (1_400_000..=4_400_000).step_by(200_000) {
-        match limited(limit, &flags) {
-            // How much a driver takes for itself is its own affair, and more with more threads.
+        match train_with_limit(limit, &flags) {
+            // The limit at which training succeeds depends on the driver and its number of threads.
             (Some(0), _, true) => {}
-            (Some(3), said, false) => {
-                assert!(said.starts_with("error: "), "{limit} KiB: {said}");
-                refused += usize::from(said.contains("for the training buffers; lower --budget"));
+            (Some(3), stderr, false) => {
+                assert!(stderr.starts_with("error: "), "{limit} KiB: {stderr}");
+                refused += usize::from(stderr.contains("for the training buffers; lower --budget"));
             }
-            other => panic!("{limit} KiB end in {other:?}"),
+            other => panic!("{limit} KiB: {other:?}"),
         }
     }
-    assert!(refused > 0, "the device refused nothing");
-    let (code, said, _) = limited(16_000_000, &flags);
-    assert_eq!(code, Some(0), "{said}");
+    assert!(refused > 0, "the device never ran out of memory");
+    let (code, stderr, _) = train_with_limit(16_000_000, &flags);
+    assert_eq!(code, Some(0), "{stderr}");
 }

@@ -1,4 +1,4 @@
-//! The program as its users meet it: arguments in, exit code, messages and files out.
+//! End-to-end tests of the program: arguments in, exit code, messages and files out.
 
 mod accumulation;
 mod blocks;
@@ -40,7 +40,7 @@ use densify_policies::registry::PolicyEntry;
 use serde_json::Value;
 use tempfile::TempDir;
 
-/// What a call of the program did.
+/// The result of calling the program.
 #[derive(Debug)]
 struct Outcome {
     code: Option<i32>,
@@ -49,14 +49,14 @@ struct Outcome {
 }
 
 impl Outcome {
-    /// The same outcome, if the call succeeded.
+    /// Returns the outcome after checking that the call succeeded.
     #[track_caller]
     fn ok(self) -> Self {
         assert_eq!(self.code, Some(0), "{}{}", self.stdout, self.stderr);
         self
     }
 
-    /// Fails unless the call ended as bad input must: code 2 and one message, with these words.
+    /// Checks that the call was refused: exit code 2 and one message that contains the given words.
     #[track_caller]
     fn refused(&self, case: &str, words: &[&str]) {
         let Self { code, stderr, .. } = self;
@@ -73,9 +73,9 @@ impl Outcome {
 /// Calls the program.
 fn densify(arguments: &[&str]) -> Outcome {
     let mut command = Command::new(env!("CARGO_BIN_EXE_densify"));
-    // A layer of Mesa's Vulkan complains about the environment on stderr, but for this variable.
+    // Without this variable, a Vulkan layer of Mesa prints warnings to stderr.
     command.args(arguments).env_remove("RUST_LOG").env("NODEVICE_SELECT", "1");
-    // The user's cache is left alone; built-in scenes are rendered once for all tests.
+    // Tests share a cache of built-in scenes and do not touch the user's.
     command.env("XDG_CACHE_HOME", env!("CARGO_TARGET_TMPDIR"));
     if !names_an_adapter(arguments) {
         command.envs([WITHOUT_GPU]);
@@ -83,11 +83,11 @@ fn densify(arguments: &[&str]) -> Outcome {
     outcome_of(command)
 }
 
-/// The variable with which `--backend auto` finds no GPU: what a test says of a run that names none holds on the
-/// processor, which repeats to the byte and whose memory is all the process's.
+/// Hides GPUs from `--backend auto`. Tests that name no GPU rely on the CPU backend, which is reproducible byte for byte
+/// and uses no memory outside the process.
 const WITHOUT_GPU: (&str, &str) = ("WGPU_BACKEND", "noop");
 
-/// Whether a call, or the run that it goes on with, names an adapter, or asks for all.
+/// True if the call, or the run that it resumes, names an adapter, or if the command lists them.
 fn names_an_adapter(arguments: &[&str]) -> bool {
     let names_one = |run: &&str| {
         let config = std::fs::read_to_string(Path::new(run).join("config.toml"));
@@ -98,12 +98,12 @@ fn names_an_adapter(arguments: &[&str]) -> bool {
 }
 
 fn outcome_of(mut command: Command) -> Outcome {
-    let output = command.output().expect("it starts");
+    let output = command.output().expect("the program starts");
     let text = |bytes| String::from_utf8(bytes).expect("messages are UTF-8");
     Outcome { code: output.status.code(), stdout: text(output.stdout), stderr: text(output.stderr) }
 }
 
-/// Calls the program where programs are looked for in `path` alone.
+/// Calls the program with a different `PATH`.
 #[cfg(unix)]
 fn call_with_path(words: &str, path: &str) -> Outcome {
     let mut command = Command::new(env!("CARGO_BIN_EXE_densify"));
@@ -111,44 +111,44 @@ fn call_with_path(words: &str, path: &str) -> Outcome {
     outcome_of(command)
 }
 
-/// Puts a program into a folder that does what a shell's `script` says.
+/// Creates an executable shell script in place of another program.
 #[cfg(unix)]
-fn stand_in(folder: &Path, name: &str, script: &str) {
+fn write_program(folder: &Path, name: &str, script: &str) {
     use std::os::unix::fs::PermissionsExt;
 
     let path = folder.join(name);
-    std::fs::write(&path, format!("#!/bin/sh\n{script}\n")).expect("it is written");
-    std::fs::set_permissions(&path, PermissionsExt::from_mode(0o755)).expect("it is ours");
+    std::fs::write(&path, format!("#!/bin/sh\n{script}\n")).expect("a written file");
+    std::fs::set_permissions(&path, PermissionsExt::from_mode(0o755)).expect("changed permissions");
 }
 
-/// Does what Slurm does with the script of an array: runs it for a place.
+/// Runs one task of an array script, like Slurm.
 #[cfg(unix)]
-fn run_place(script: &Path, place: &str) {
+fn run_array_task(script: &Path, index: &str) {
     let mut bash = Command::new("bash");
-    let done = bash.arg(script).envs([WITHOUT_GPU]).env("SLURM_ARRAY_TASK_ID", place).output();
-    let done = done.expect("it starts");
-    assert!(done.status.success(), "{} {place}: {done:?}", script.display());
+    let output = bash.arg(script).envs([WITHOUT_GPU]).env("SLURM_ARRAY_TASK_ID", index).output();
+    let output = output.expect("the program starts");
+    assert!(output.status.success(), "{} {index}: {output:?}", script.display());
 }
 
-/// Calls the program with words separated by spaces.
+/// Calls the program with arguments separated by spaces.
 fn call(words: &str) -> Outcome {
     densify(&words.split_whitespace().collect::<Vec<_>>())
 }
 
-/// A short run. `flags` must not repeat the fixed ones.
+/// Trains a short run. `flags` must not repeat the fixed ones.
 fn train(scene: &Path, output: &Path, iterations: u32, flags: &str) -> Outcome {
     let fixed = format!("--sh-degree 1 --iterations {iterations}");
     call(&format!("train {} -o {} {fixed} {flags}", text(scene), text(output)))
 }
 
-/// Goes on with a run.
+/// Resumes a run.
 fn resume(scene: &Path, run: &Path, flags: &str) -> Outcome {
     call(&format!("train {} -o {} --resume {flags}", text(scene), text(run)))
 }
 
-/// Flags that make a policy act often in a run of some dozen steps. Intervals do not shrink with
-/// the run, so that a policy would do little.
-fn often(policy: &PolicyEntry) -> String {
+/// Flags that make a policy act often. Intervals do not shrink with the run, so a policy would hardly act in a short
+/// one.
+fn frequent_edits(policy: &PolicyEntry) -> String {
     let intervals = policy.parameters().into_iter().filter_map(|(name, default)| {
         let default =
             default.as_integer().filter(|&steps| steps > 0 && name.ends_with("_every"))?;
@@ -161,7 +161,7 @@ fn text(path: &Path) -> &str {
     path.to_str().expect("temporary paths are UTF-8")
 }
 
-/// A place for the output of a test.
+/// A temporary folder and a path in it for the output of a run.
 fn scratch() -> (TempDir, PathBuf) {
     let root = tempfile::tempdir().expect("a temporary folder");
     let run = root.path().join("run");
@@ -172,7 +172,7 @@ fn read(path: &Path) -> Vec<u8> {
     std::fs::read(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
 }
 
-/// The Gaussians of a file.
+/// Reads the Gaussians of a model file.
 fn gaussians(file: &Path) -> densify::core::gaussians::Gaussians {
     densify::data::models::read_model(file).expect("a model").gaussians
 }
@@ -180,15 +180,15 @@ fn gaussians(file: &Path) -> densify::core::gaussians::Gaussians {
 /// Writes a model as PLY.
 fn write_ply(model: &densify::core::gaussians::Gaussians, file: &Path) {
     let mut bytes = Vec::new();
-    densify::data::models::PLY.write(model, &mut bytes).expect("it is written");
-    std::fs::write(file, bytes).expect("it is written");
+    densify::data::models::PLY.write(model, &mut bytes).expect("a written file");
+    std::fs::write(file, bytes).expect("a written file");
 }
 
 fn read_text(path: &Path) -> String {
     String::from_utf8(read(path)).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
 }
 
-/// The options of a run as it has them.
+/// The options that a run has recorded.
 fn config(run: &Path) -> toml::Table {
     read_text(&run.join("config.toml")).parse().expect("config.toml is TOML")
 }
@@ -201,26 +201,30 @@ fn json(path: &Path) -> Value {
     serde_json::from_slice(&read(path)).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
 }
 
-/// The records of a log.
+/// The records of a JSON Lines file.
 fn records(path: &Path) -> Vec<Value> {
     let text = read_text(path);
-    assert!(text.is_empty() || text.ends_with('\n'), "{}: its last line is cut", path.display());
+    assert!(
+        text.is_empty() || text.ends_with('\n'),
+        "{}: the last line is incomplete",
+        path.display()
+    );
     let line = |line| serde_json::from_str(line).unwrap_or_else(|e| panic!("{line}: {e}"));
     text.lines().map(line).collect()
 }
 
-/// All files below a folder with their contents, by path from there.
+/// The contents of all files below a folder, by relative path.
 fn files(folder: &Path) -> BTreeMap<String, Vec<u8>> {
     let mut found = BTreeMap::new();
-    let mut open = vec![folder.to_owned()];
-    while let Some(here) = open.pop() {
+    let mut folders = vec![folder.to_owned()];
+    while let Some(here) = folders.pop() {
         let entries =
             std::fs::read_dir(&here).unwrap_or_else(|e| panic!("{}: {e}", here.display()));
         for path in entries.map(|entry| entry.expect("a folder's entry").path()) {
             if path.is_dir() {
-                open.push(path);
+                folders.push(path);
             } else {
-                let name = path.strip_prefix(folder).expect("found below it");
+                let name = path.strip_prefix(folder).expect("a path below the folder");
                 found.insert(text(name).replace('\\', "/"), read(&path));
             }
         }
@@ -228,8 +232,8 @@ fn files(folder: &Path) -> BTreeMap<String, Vec<u8>> {
     found
 }
 
-/// Copies a run into another folder as a process leaves it that is killed before its last checkpoint:
-/// without what it wrote after the last iteration.
+/// Copies a run without the files written after the last iteration, as if the process had been killed before its last
+/// checkpoint.
 fn copy_unfinished(run: &Path, to: &Path, iterations: u32) {
     let last = format!("iteration_{iterations}");
     for (name, bytes) in files(run).into_iter().filter(|(name, _)| !name.contains(&last)) {

@@ -1,4 +1,4 @@
-//! `densify report`: what is in the file, that it stands for itself, and what is refused.
+//! `densify report`: contents of the HTML file, self-containedness, and refused calls.
 
 use std::path::{Path, PathBuf};
 
@@ -8,27 +8,31 @@ use serde_json::json;
 use super::{Outcome, call, densify, files, json, read, read_text, scratch, text, train};
 use crate::photographs::{Photographs, SIZE, VIEWS};
 
-/// Every address that a page names.
+/// All `src` attributes of a page.
 fn sources(page: &str) -> Vec<&str> {
     page.split("src=\"").skip(1).filter_map(|rest| rest.split('"').next()).collect()
 }
 
-/// Fails where a page refers to anything outside itself, or runs another script than its own.
+/// Checks that a page refers to nothing outside itself and has one script.
 #[track_caller]
-pub(super) fn stands_for_itself(page: &str) {
+pub(super) fn assert_self_contained(page: &str) {
     for word in ["http:", "https:", "url(", "@import", "<link", "<iframe", "<object", "href="] {
         assert!(!page.contains(word), "{word} is in the page");
     }
     for source in sources(page) {
         assert!(source.starts_with("data:image/"), "{}", &source[..source.len().min(80)]);
     }
-    assert_eq!(page.matches("<script").count(), 1, "one script of its own");
-    assert_eq!(page.matches("<img ").count(), sources(page).len(), "a picture from elsewhere");
-    assert!(page.contains("default-src 'none'"), "the browser may fetch something");
+    assert_eq!(page.matches("<script").count(), 1, "number of scripts");
+    assert_eq!(
+        page.matches("<img ").count(),
+        sources(page).len(),
+        "an image without an embedded source"
+    );
+    assert!(page.contains("default-src 'none'"), "the policy lets the browser fetch resources");
 }
 
-/// The bytes of base64 with padding.
-fn decoded(text: &str) -> Vec<u8> {
+/// Decodes padded base64.
+fn decode_base64(text: &str) -> Vec<u8> {
     const SYMBOLS: &str = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
     let mut bytes = Vec::new();
     for four in text.as_bytes().chunks(4) {
@@ -42,10 +46,10 @@ fn decoded(text: &str) -> Vec<u8> {
 
 fn picture(uri: &str) -> RgbImage {
     let (_, data) = uri.split_once(";base64,").expect("base64");
-    image::load_from_memory(&decoded(data)).expect("a picture").into_rgb8()
+    image::load_from_memory(&decode_base64(data)).expect("a picture").into_rgb8()
 }
 
-/// Decibels between two pictures of one size.
+/// PSNR of two images of equal size [dB].
 fn psnr(a: &RgbImage, b: &RgbImage) -> f64 {
     assert_eq!(a.dimensions(), b.dimensions());
     let square = |(a, b): (&u8, &u8)| (f64::from(*a) - f64::from(*b)).powi(2);
@@ -67,8 +71,8 @@ fn run_of(scene: &Path, run: &Path, more: &str) {
     train(scene, run, 40, &format!("--budget 320 --eval --quiet {more}")).ok();
 }
 
-/// Copies a scene to a folder, with its first photograph under another name.
-fn copied(scene: &Photographs, to: PathBuf, renamed: &str) -> PathBuf {
+/// Copies a scene and renames its first photograph.
+fn copy_scene(scene: &Photographs, to: PathBuf, renamed: &str) -> PathBuf {
     for (name, bytes) in files(scene.path()) {
         let path = to.join(name.replace("view_00.png", renamed));
         let text = String::from_utf8(bytes);
@@ -83,15 +87,15 @@ fn copied(scene: &Photographs, to: PathBuf, renamed: &str) -> PathBuf {
 }
 
 #[test]
-fn a_report_holds_what_the_run_arrived_at_and_needs_nothing_else() {
+fn a_report_shows_the_results_and_is_self_contained() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
     run_of(scene.path(), &run, "--test-iterations 10,20,30");
     let file = root.path().join("new/report.html");
-    let said = report(&[&run], &file, "").ok().stdout;
-    assert!(said.contains("report   ") && said.contains("KiB"), "{said}");
+    let stdout = report(&[&run], &file, "").ok().stdout;
+    assert!(stdout.contains("report   ") && stdout.contains("KiB"), "{stdout}");
     let page = read_text(&file);
-    stands_for_itself(&page);
+    assert_self_contained(&page);
     assert!(page.len() < 400_000, "{} bytes of two small views", page.len());
 
     let score = &json(&run.join("results.json"))["ours_40"];
@@ -108,18 +112,17 @@ fn a_report_holds_what_the_run_arrived_at_and_needs_nothing_else() {
         "sh_degree".into(),
         "min_opacity".into(),
     ];
-    // The curves: loss, Gaussians, PSNR with a dot for each measurement, memory with the promise dashed.
+    // The four curves: loss, Gaussians, test PSNR with dots, memory with the promise as a dashed line.
     expected.extend(["Loss", "PSNR of the test views", "what was promised"].map(String::from));
     for words in &expected {
         assert!(page.contains(words.as_str()), "{words} is not in the report");
     }
     assert_eq!(page.matches("<figure class=\"curve\">").count(), 4);
     assert!(page.matches("<circle").count() >= 4 && page.matches("<polyline").count() >= 4);
-    // No place of this machine is told.
+    // The report contains no local paths.
     assert!(!page.contains(text(root.path())) && !page.contains(text(scene.path())));
 
-    // The pictures are the photograph's and the model's: a pair and a window of each for either view held out,
-    // and a turn.
+    // Each of the two test views has a photograph, a rendering and a crop of each; the turntable frames follow.
     let sources = sources(&page);
     assert_eq!(sources.len(), 2 * 4 + 24);
     let pictures = root.path().join("pictures");
@@ -134,21 +137,21 @@ fn a_report_holds_what_the_run_arrived_at_and_needs_nothing_else() {
     assert!(psnr(&rendered, &render) > 32.0, "{}", psnr(&rendered, &render));
     assert_eq!(crop.dimensions(), (SIZE.0 / 4, SIZE.1 / 4));
     let turn: Vec<RgbImage> = sources[8..].iter().map(|uri| picture(uri)).collect();
-    assert!(turn.windows(2).all(|pair| pair[0] != pair[1]), "the turn stands still");
+    assert!(turn.windows(2).all(|pair| pair[0] != pair[1]), "the turntable does not move");
 
-    // The same again, to the byte; and never over a file unasked.
+    // Reports are reproducible byte for byte and replace a file only with `--overwrite`.
     report(&[&run], &file, "").refused("again", &["-o", "exists", "--overwrite"]);
     report(&[&run], &file, "--overwrite --threads 1").ok();
-    assert!(page == read_text(&file), "the same run makes another report");
+    assert!(page == read_text(&file), "the report is not reproducible");
 }
 
 #[cfg(unix)]
 #[test]
-fn names_that_are_markup_stay_names() {
+fn markup_in_names_is_escaped() {
     let evil = "<script>alert(1)<img src=x onerror=alert(2)>\"'&";
     let scene = Photographs::colmap_text();
     let root = tempfile::tempdir().expect("a folder");
-    let scene = copied(&scene, root.path().join(evil), "<i>\"&00.png");
+    let scene = copy_scene(&scene, root.path().join(evil), "<i>\"&00.png");
     let run = root.path().join(format!("run{evil}"));
     densify(&[
         "train",
@@ -178,7 +181,7 @@ fn names_that_are_markup_stay_names() {
         "--quiet",
     ])
     .ok();
-    // What a policy says of itself, and what a file may say that somebody has changed.
+    // Markup in the cause of a policy event and in an edited file.
     let log = run.join("stats/events.jsonl");
     let event = json!({ "step": 20, "before": 1, "removed": 0, "added": 0, "updated": 0, "denied": 0,
         "after": 1, "cause": "</td><script>alert(3)</script>\u{1b}[31m" });
@@ -189,7 +192,7 @@ fn names_that_are_markup_stay_names() {
     let file = root.path().join("report.html");
     report(&[&run, &other], &file, "").ok();
     let page = read_text(&file);
-    stands_for_itself(&page);
+    assert_self_contained(&page);
     for markup in ["<img src=x", "<i>", "<b>", "<u>", "\u{1b}"] {
         assert!(!page.contains(markup), "{markup} is markup in the report");
     }
@@ -204,7 +207,7 @@ fn names_that_are_markup_stay_names() {
 }
 
 #[test]
-fn seeds_are_averaged_policies_compared_and_scenes_told_apart() {
+fn reports_average_seeds_compare_policies_and_separate_scenes() {
     let scene = Photographs::colmap_text();
     let root = tempfile::tempdir().expect("a folder");
     let at = |name: &str| root.path().join(name);
@@ -220,15 +223,16 @@ fn seeds_are_averaged_policies_compared_and_scenes_told_apart() {
     let all: Vec<&Path> = runs.iter().map(PathBuf::as_path).collect();
     report(&all, &file, "").ok();
     let page = read_text(&file);
-    stands_for_itself(&page);
+    assert_self_contained(&page);
     assert!(page.contains("report of 6 runs") && page.contains("Means over seeds"));
-    // The mean of three seeds, with its interval.
-    let of = |run: &Path| json(&run.join("results.json"))["ours_40"]["PSNR"].as_f64().unwrap();
-    let mean = runs[..3].iter().map(|run| of(run)).sum::<f64>() / 3.0;
+    // The mean over three seeds is shown with its interval.
+    let psnr = |run: &Path| json(&run.join("results.json"))["ours_40"]["PSNR"].as_f64().unwrap();
+    let mean = runs[..3].iter().map(|run| psnr(run)).sum::<f64>() / 3.0;
     assert!(page.contains(&format!("{mean:.2} [")), "{mean} is not in the report");
-    let difference = (0..3).map(|seed| of(&runs[3 + seed]) - of(&runs[seed])).sum::<f64>() / 3.0;
+    let difference =
+        (0..3).map(|seed| psnr(&runs[3 + seed]) - psnr(&runs[seed])).sum::<f64>() / 3.0;
     assert!(page.contains(&format!("{difference:+.2} [")), "{difference} is not in the report");
-    // Shown are the first of each policy: over each other, to choose from.
+    // The first run of each policy can be selected for comparison.
     let choices = page
         .split("<select class=\"right\">")
         .nth(1)
@@ -237,16 +241,16 @@ fn seeds_are_averaged_policies_compared_and_scenes_told_apart() {
     assert_eq!(choices.len(), 4, "{choices:?}");
     assert!(choices[1].ends_with("diet0") && choices[2].ends_with("vanilla0"), "{choices:?}");
     assert_eq!(sources(&page).len(), 2 * (3 + 3) + 2 * 24);
-    assert!(page.contains("<td>policy</td><td>diet</td>"), "what differs is not said");
+    assert!(page.contains("<td>policy</td><td>diet</td>"), "the differing option is not listed");
 
-    // Other photographs, and the same read another way, are scenes of their own.
-    let elsewhere = copied(&scene, at("garden"), "view_00.png");
+    // Other photographs, and other splits of the same ones, count as separate scenes.
+    let elsewhere = copy_scene(&scene, at("garden"), "view_00.png");
     run_of(&elsewhere, &at("garden-run"), "");
     train(&elsewhere, &at("garden-all"), 40, "--budget 320 --quiet --test-every 4").ok();
     let file = at("scenes.html");
     report(&[&runs[0], &at("garden-run"), &at("garden-all")], &file, "").ok();
     let page = read_text(&file);
-    stands_for_itself(&page);
+    assert_self_contained(&page);
     for words in
         ["3 runs of 3 scenes", "Views of garden<", "Views of garden, read another way (2)<"]
     {
@@ -260,18 +264,18 @@ fn seeds_are_averaged_policies_compared_and_scenes_told_apart() {
 }
 
 #[test]
-fn runs_without_test_views_show_what_they_trained_on() {
+fn runs_without_test_views_show_training_views() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
     train(scene.path(), &run, 20, "--budget 320 --quiet").ok();
     let file = root.path().join("report.htm");
-    // The dataset has moved meanwhile.
-    let moved = copied(&scene, root.path().join("moved"), "view_00.png");
+    // The dataset is moved after training.
+    let moved = copy_scene(&scene, root.path().join("moved"), "view_00.png");
     drop(scene);
     report(&[&run], &file, "").refused("it has moved", &["--scene"]);
     report(&[&run], &file, &format!("--scene {}", text(&moved))).ok();
     let page = read_text(&file);
-    stands_for_itself(&page);
+    assert_self_contained(&page);
     for words in
         ["No view was held out", &format!("{VIEWS} views trained on"), "second worst", "--eval"]
     {
@@ -281,7 +285,7 @@ fn runs_without_test_views_show_what_they_trained_on() {
 }
 
 #[test]
-fn what_cannot_be_reported_is_said_with_the_remedy() {
+fn invalid_reports_are_refused_with_a_remedy() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
     run_of(scene.path(), &run, "");
@@ -315,33 +319,33 @@ fn what_cannot_be_reported_is_said_with_the_remedy() {
     std::fs::write(run.join("results.json"), r#"{"theirs": {}}"#).expect("scores");
     std::fs::write(&log, sound).expect("a log");
     report(&[&run], &file, "").refused("strange scores", &["results.json", "theirs"]);
-    assert!(!file.exists(), "half a report was written");
+    assert!(!file.exists(), "a report was written");
 }
 
-/// A run that another process writes is reported as far as it has come.
+/// Reports of a run in progress show its last saved state.
 #[cfg(unix)]
 #[test]
-fn a_run_that_is_being_trained_is_reported_as_last_saved() {
+fn a_run_in_progress_is_reported_as_last_saved() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
     run_of(scene.path(), &run, "--save-iterations 20 --test-iterations 20");
     let so_far = root.path().join("so-far");
     super::copy_unfinished(&run, &so_far, 40);
-    // The line that is being written now.
+    // An incomplete last line, as of a log in progress.
     let log = so_far.join("stats/train.jsonl");
     std::fs::write(&log, [&read(&log)[..], b"{\"step\": 50, \"lo"].concat()).expect("a log");
     let lock = std::fs::File::create(so_far.join("densify.lock")).expect("a file");
     lock.lock().expect("a lock");
     let file = root.path().join("report.html");
-    let said = report(&[&so_far], &file, "").ok().stdout;
-    assert!(said.contains("is being trained"), "{said}");
+    let stdout = report(&[&so_far], &file, "").ok().stdout;
+    assert!(stdout.contains("is being trained"), "{stdout}");
     let page = read_text(&file);
     assert!(
         page.contains("is being trained and has reached iteration 40 of 40"),
-        "the reader is not told"
+        "the page does not say that the run is in progress"
     );
     assert!(page.contains("model of iteration 20."));
-    assert!(!page.contains("promise was kept"), "nothing is known of its end");
+    assert!(!page.contains("promise was kept"), "the report judges an unfinished run");
     let score = json(&so_far.join("results.json"))["ours_20"]["PSNR"].as_f64().unwrap();
     assert!(page.contains(&format!("{score:.2} dB")), "{score}");
     std::fs::remove_dir_all(so_far.join("point_cloud")).expect("models");

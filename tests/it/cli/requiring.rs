@@ -1,16 +1,16 @@
-//! What a run leaves out by itself: degrees of colour and rows, and the report of it.
+//! Automatic SH degree and budget, and `requirements.json`, which reports what was left out.
 
 use std::path::Path;
 
 use densify_policies::registry::find;
 use serde_json::Value;
 
-use super::{call, copy_unfinished, json, model, often, resume, scratch, text};
+use super::{call, copy_unfinished, frequent_edits, json, model, resume, scratch, text};
 use crate::photographs::Photographs;
 
 const ITERATIONS: u32 = 400;
 
-/// Trains a scene that is to be found out about. `flags` are words separated by spaces.
+/// Trains a scene. `flags` are separated by spaces.
 fn train(scene: &Path, run: &Path, flags: &str) -> super::Outcome {
     let fixed = format!("--iterations {ITERATIONS} --backend cpu");
     call(&format!("train {} -o {} {fixed} {flags}", text(scene), text(run)))
@@ -25,12 +25,12 @@ fn list<'a>(value: &'a Value, path: &str) -> &'a [Value] {
 }
 
 #[test]
-fn what_is_found_out_survives_a_stop_and_does_not_depend_on_threads() {
+fn automatic_choices_survive_resuming_and_do_not_depend_on_threads() {
     let scene = Photographs::colmap_text();
-    let policy = find("mcmc").expect("it is registered");
+    let policy = find("mcmc").expect("a registered policy");
     let flags = format!(
         "--sh-degree auto --budget auto --policy mcmc {} --init random --init-points 1k",
-        often(policy)
+        frequent_edits(policy)
     );
     let (root, whole) = scratch();
     let outcome =
@@ -38,8 +38,8 @@ fn what_is_found_out_survives_a_stop_and_does_not_depend_on_threads() {
     assert!(outcome.stdout.contains("left out"), "{}", outcome.stdout);
     let found = report(&whole);
     // Too few tracks to decide the degree.
-    let said = "colour   degree 3 (auto): points of a reconstruction decide nothing";
-    assert!(outcome.stdout.contains(said), "{}", outcome.stdout);
+    let line = "colour   degree 3 (auto): points of a reconstruction decide nothing";
+    assert!(outcome.stdout.contains(line), "{}", outcome.stdout);
     assert_eq!((&found["sh_degree_from"], &found["sh_degree"]), (&"undecided".into(), &3.into()));
     let intervals = list(&found, "/rows/intervals");
     assert!(intervals.len() >= 2 && !list(&found, "/rows/removals").is_empty(), "{found}");
@@ -48,7 +48,7 @@ fn what_is_found_out_survives_a_stop_and_does_not_depend_on_threads() {
     let stopped = found["rows"]["stopped"].as_u64().unwrap_or(u64::MAX);
     for interval in intervals {
         assert!(rows(interval) as f64 <= limit.round(), "{found}");
-        // Nothing is concluded where an edit is being recovered from.
+        // Intervals in which the model recovers from an edit decide nothing.
         if interval["settled"] == true && interval["step"].as_u64() < Some(stopped) {
             limit = limit.round() * std::f64::consts::SQRT_2;
         }
@@ -73,7 +73,7 @@ fn what_is_found_out_survives_a_stop_and_does_not_depend_on_threads() {
 
 #[test]
 #[ignore = "takes minutes: run by .ci/run"]
-fn the_degree_of_a_built_in_scene_is_that_of_its_files() {
+fn the_automatic_degree_is_the_same_for_a_built_in_scene_and_its_files() {
     let (_root, folder) = scratch();
     call(&format!("scenegen --preset spheres -o {}", text(&folder))).ok();
     let planned = |flags: &str, start: &str| {
@@ -86,21 +86,21 @@ fn the_degree_of_a_built_in_scene_is_that_of_its_files() {
     assert!(here.starts_with("colour   degree 0 (auto)"), "{here}");
     let folder_text = text(&folder);
     assert_eq!(line(folder_text), here, "transforms beside a model with tracks");
-    // What finding that out takes is given back before anything else is allocated, so that rows are as
-    // many as if it had been known.
+    // Memory of this decision is released before anything else is allocated, so the budget is the same as with a given
+    // degree.
     let rows = |degree: &str| {
         planned(&format!("{folder_text} --sh-degree {degree} --memory 64MiB"), "budget ")
     };
     assert_eq!(rows("auto"), rows("0"));
-    // COLMAP's files alone say the same.
+    // The COLMAP files alone give the same degree.
     for file in ["transforms_train.json", "transforms_test.json"] {
-        std::fs::remove_file(folder.join(file)).expect("it is there");
+        std::fs::remove_file(folder.join(file)).expect("an existing file");
     }
     assert!(line(folder_text).starts_with("colour   degree 0 (auto)"));
 }
 
 #[test]
-fn nothing_is_left_out_unasked() {
+fn nothing_is_left_out_by_default() {
     let scene = Photographs::colmap_text();
     for (flags, said) in [("", "left out nothing\n"), ("--full", "left out nothing (--full)\n")] {
         let (_root, run) = scratch();
@@ -113,7 +113,7 @@ fn nothing_is_left_out_unasked() {
 }
 
 #[test]
-fn contradictions_name_both_sides() {
+fn contradictory_flags_are_both_named() {
     let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
     for (flags, words) in [

@@ -1,8 +1,8 @@
-//! What must not change a byte of the model: threads, the time of day, room for photographs.
+//! Options that must not change a byte of the model: number of threads and size of the image cache.
 
 use densify_policies::registry::policies;
 
-use super::{model, often, scratch, train};
+use super::{frequent_edits, model, scratch, train};
 use crate::photographs::{Photographs, SIZE};
 
 const ITERATIONS: u32 = 60;
@@ -15,23 +15,24 @@ fn trained(scene: &Photographs, flags: &str) -> Vec<u8> {
 }
 
 #[test]
-fn every_policy_gives_the_same_model_at_any_number_of_threads() {
+fn models_do_not_depend_on_the_number_of_threads() {
     let scene = Photographs::colmap_text();
     let registered = policies().expect("the registry is sound");
     assert!(registered.len() >= 2);
     for entry in registered {
-        let (policy, often) = (entry.name, often(entry));
-        let with = |flags: &str| trained(&scene, &format!("--policy {policy} {often} {flags}"));
-        let first = with("--threads 1");
+        let (policy, often) = (entry.name, frequent_edits(entry));
+        let train_with =
+            |flags: &str| trained(&scene, &format!("--policy {policy} {often} {flags}"));
+        let first = train_with("--threads 1");
         for threads in ["--threads 1", "--threads 2", "--threads 5", ""] {
-            assert!(with(threads) == first, "{policy}: {threads:?} changes the model");
+            assert!(train_with(threads) == first, "{policy}: {threads:?} changes the model");
         }
-        assert!(with("--seed 1") != first, "{policy}: the seed changes nothing");
+        assert!(train_with("--seed 1") != first, "{policy}: the seed changes nothing");
     }
 }
 
 #[test]
-fn a_cache_of_two_photographs_is_enough() {
+fn models_do_not_depend_on_the_image_cache() {
     let scene = Photographs::colmap_text();
     let two = 2 * 3 * SIZE.0 * SIZE.1 + 100;
     let small = trained(&scene, &format!("--image-cache {two}"));

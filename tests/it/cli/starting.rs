@@ -1,5 +1,4 @@
-//! `--init MODEL` and `--freeze MODEL`: a run that starts from a model there is already, or beside one that stays as
-//! it is, and what cannot be started from.
+//! `--init MODEL` and `--freeze MODEL`: runs that start from a model or train beside a fixed one, and refused models.
 
 use std::path::Path;
 
@@ -11,33 +10,33 @@ use super::{
 };
 use crate::photographs::Photographs;
 
-/// A policy that does nothing: `vanilla` without growth.
-const STILL: &str = "--policy vanilla --policy-set vanilla.grow_every=0 --policy-set vanilla.reset_every=0 \
+/// Flags for a policy that never edits.
+const NO_EDITS: &str = "--policy vanilla --policy-set vanilla.grow_every=0 --policy-set vanilla.reset_every=0 \
                      --policy-set vanilla.white_reset_at=0";
 
-/// The loss of a run's first step that is recorded.
+/// The first recorded loss of a run.
 fn first_loss(run: &Path) -> f64 {
     records(&run.join("stats/train.jsonl"))[0]["loss"].as_f64().expect("a loss")
 }
 
-fn refused(outcome: &Outcome, root: &Path, words: &[&str]) {
+fn assert_refused(outcome: &Outcome, root: &Path, words: &[&str]) {
     outcome.refused("--init", words);
     assert!(!root.join("no").exists());
 }
 
 #[test]
-fn a_run_goes_on_from_any_model() {
+fn a_run_can_start_from_any_model() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
-    train(scene.path(), &run, 150, &format!("--budget 300 --quiet {STILL}")).ok();
+    train(scene.path(), &run, 150, &format!("--budget 300 --quiet {NO_EDITS}")).ok();
     let ply = model_path(&run, 150);
     let init = |file: &Path, run: &str, flags: &str| {
-        let flags = format!("--init {} --quiet {STILL} {flags}", text(file));
+        let flags = format!("--init {} --quiet {NO_EDITS} {flags}", text(file));
         let run = root.path().join(run);
         (train(scene.path(), &run, 20, &flags), run)
     };
 
-    // It starts where the other ended, and its colours depend on the view from the first step on.
+    // Training starts at the quality of the model, with view-dependent colour from the first step.
     let (outcome, again) = init(&ply, "again", "--budget 300");
     outcome.ok();
     let [from_points, from_model] = [&run, &again].map(|run| first_loss(run));
@@ -45,7 +44,7 @@ fn a_run_goes_on_from_any_model() {
     let rows = |run: &Path, iteration| gaussians(&model_path(run, iteration)).len();
     assert_eq!(rows(&again, 20), rows(&run, 150));
 
-    // So does a file of another format.
+    // Other formats work the same way.
     {
         let spz = root.path().join("model.spz");
         call(&format!("export {} -o {}", text(&run), text(&spz))).ok();
@@ -54,7 +53,7 @@ fn a_run_goes_on_from_any_model() {
         assert!(first_loss(&other) < 1.1 * from_model + 0.01, "{}", first_loss(&other));
     }
 
-    // Stopped before it has a checkpoint, or with one and without the file, it ends in the same bytes.
+    // Resumed from a checkpoint after the file is gone, the run ends in the same bytes.
     let whole = read(&model_path(&again, 20));
     let gone = root.path().join("gone.ply");
     std::fs::copy(&ply, &gone).unwrap();
@@ -74,17 +73,17 @@ fn a_run_goes_on_from_any_model() {
     resume(scene.path(), &part, &format!("--init {}", text(&ply))).refused("another", &["--init"]);
 }
 
-/// Of a finished model the steps of a run from its start would take much at first.
+/// The learning rates of a new run would degrade a finished model at first.
 #[test]
 fn a_finished_model_keeps_its_quality_within_2_percent_of_the_iterations() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
-    train(scene.path(), &run, 300, &format!("--budget 300 --eval --quiet {STILL}")).ok();
-    let own = json(&run.join("results.json"))["ours_300"]["PSNR"].as_f64().unwrap();
+    train(scene.path(), &run, 300, &format!("--budget 300 --eval --quiet {NO_EDITS}")).ok();
+    let initial = json(&run.join("results.json"))["ours_300"]["PSNR"].as_f64().unwrap();
     let after = |rates: &str| {
         let to = root.path().join(rates);
         let flags = format!(
-            "--init {} --init-rates {rates} --budget 300 --eval --quiet --test-iterations 6 {STILL}",
+            "--init {} --init-rates {rates} --budget 300 --eval --quiet --test-iterations 6 {NO_EDITS}",
             text(&model_path(&run, 300))
         );
         train(scene.path(), &to, 300, &flags).ok();
@@ -92,16 +91,16 @@ fn a_finished_model_keeps_its_quality_within_2_percent_of_the_iterations() {
     };
     let (fine, full) = (after("fine"), after("full"));
     assert!(
-        fine > own - 0.1 && full < own - 0.3,
-        "{own}: {fine} with fine steps, {full} with full"
+        fine > initial - 0.1 && full < initial - 0.3,
+        "{initial} dB: {fine} dB with fine rates, {full} dB with full rates"
     );
 }
 
 #[test]
-fn frozen_gaussians_stay_as_they_are_through_a_stop_too() {
+fn frozen_gaussians_never_change_even_when_resumed() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
-    train(scene.path(), &run, 60, &format!("--budget 100 --quiet {STILL}")).ok();
+    train(scene.path(), &run, 60, &format!("--budget 100 --quiet {NO_EDITS}")).ok();
     let ply = model_path(&run, 60);
     let frozen = gaussians(&ply).len();
     let copy = root.path().join("copy.ply");
@@ -114,19 +113,21 @@ fn frozen_gaussians_stay_as_they_are_through_a_stop_too() {
     let after = gaussians(&model_path(&beside, 300));
     let summary = json(&beside.join("stats/summary.json"));
     let rows: Vec<usize> = (0..frozen).collect();
-    // What a file rounds is beyond the last bit of what it was read as.
-    let [was, is] = [gaussians(&ply), after.gather(&rows)];
+    // Writing the file rounds the values.
+    let [expected, found] = [gaussians(&ply), after.gather(&rows)];
     let close = |a: &[f32], b: &[f32]| {
         a.len() == b.len() && a.iter().zip(b).all(|(a, b)| (a - b).abs() <= 2e-6 * a.abs().max(1.0))
     };
-    assert!(close(was.means.as_flattened(), is.means.as_flattened()));
-    assert!(close(was.log_scales.as_flattened(), is.log_scales.as_flattened()));
-    assert!(close(&was.opacity_logits, &is.opacity_logits) && close(&was.sh, &is.sh));
+    assert!(close(expected.means.as_flattened(), found.means.as_flattened()));
+    assert!(close(expected.log_scales.as_flattened(), found.log_scales.as_flattened()));
+    assert!(
+        close(&expected.opacity_logits, &found.opacity_logits) && close(&expected.sh, &found.sh)
+    );
     assert!(after.len() > frozen + 100 && after.len() <= 260, "{} rows", after.len());
     assert!(count(&summary, "peak_rows") <= 260, "{summary}");
     assert!(count(&summary, "peak_bytes") <= count(&summary, "ledger_bytes"), "{summary}");
 
-    // It goes on to the same bytes where the file is gone.
+    // Without the file, the run resumes to the same bytes.
     let whole = read(&model_path(&beside, 300));
     std::fs::remove_dir_all(beside.join("point_cloud/iteration_300")).unwrap();
     std::fs::remove_file(beside.join("checkpoints/iteration_300.safetensors")).unwrap();
@@ -134,73 +135,73 @@ fn frozen_gaussians_stay_as_they_are_through_a_stop_too() {
     resume(scene.path(), &beside, "").ok();
     assert!(read(&model_path(&beside, 300)) == whole);
 
-    // What cannot be.
-    let no = |flags: &str, words: &[&str]| {
+    // Invalid combinations are refused.
+    let refused = |flags: &str, words: &[&str]| {
         let outcome = train(scene.path(), &root.path().join("no"), 2, flags);
         outcome.refused("--freeze", words);
         assert!(!root.path().join("no").exists());
     };
-    no(&format!("--freeze {} --budget {frozen}", text(&ply)), &["leave no room", "--budget"]);
-    no(&format!("--freeze {} --budget auto:200", text(&ply)), &["--budget auto"]);
-    no(&format!("--freeze {}", text(&copy)), &["copy.ply"]);
+    refused(&format!("--freeze {} --budget {frozen}", text(&ply)), &["leave no room", "--budget"]);
+    refused(&format!("--freeze {} --budget auto:200", text(&ply)), &["--budget auto"]);
+    refused(&format!("--freeze {}", text(&copy)), &["copy.ply"]);
     let mut above = gaussians(&ply);
     above.means.iter_mut().for_each(|mean| mean[1] += 1e4);
     write_ply(&above, &copy);
-    no(&format!("--freeze {}", text(&copy)), &["copy.ply", "none of its", "coordinates"]);
+    refused(&format!("--freeze {}", text(&copy)), &["copy.ply", "none of its", "coordinates"]);
     resume(scene.path(), &beside, &format!("--freeze {}", text(&ply)))
         .refused("another", &["--freeze"]);
 }
 
 #[test]
-fn of_too_large_a_model_those_stay_that_show() {
+fn a_model_beyond_the_budget_keeps_its_visible_gaussians() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
-    train(scene.path(), &run, 60, &format!("--budget 300 --quiet {STILL}")).ok();
+    train(scene.path(), &run, 60, &format!("--budget 300 --quiet {NO_EDITS}")).ok();
     let mut large = gaussians(&model_path(&run, 60));
-    let seen = large.len();
-    // As many again that no pixel shows: they are in view, and transparent.
-    let rows: Vec<usize> = (0..seen).collect();
+    let visible_rows = large.len();
+    // Adds as many nearly transparent Gaussians, which contribute to no pixel.
+    let rows: Vec<usize> = (0..visible_rows).collect();
     let mut faint = large.gather(&rows);
     faint.opacity_logits.fill(-9.0);
     large.append(faint);
     let file = root.path().join("large.ply");
     write_ply(&large, &file);
     let cut = root.path().join("cut");
-    let flags = format!("--init {} --budget {seen} {STILL}", text(&file));
+    let flags = format!("--init {} --budget {visible_rows} {NO_EDITS}", text(&file));
     let outcome = train(scene.path(), &cut, 1, &flags).ok();
-    let said = format!("{seen} Gaussians beyond the budget left out");
-    assert!(outcome.stdout.contains(&said), "{outcome:?}");
-    // One step changes little: those that stay are the visible ones.
+    let message = format!("{visible_rows} Gaussians beyond the budget left out");
+    assert!(outcome.stdout.contains(&message), "{outcome:?}");
+    // One step changes little, so the kept Gaussians must be opaque.
     let visible = |logit: &&f32| **logit > -8.0;
     let kept = gaussians(&model_path(&cut, 1));
-    assert_eq!(kept.opacity_logits.iter().filter(visible).count(), seen);
+    assert_eq!(kept.opacity_logits.iter().filter(visible).count(), visible_rows);
     let summary = json(&cut.join("stats/summary.json"));
-    assert!(count(&summary, "peak_rows") <= seen as u64);
+    assert!(count(&summary, "peak_rows") <= visible_rows as u64);
     assert!(count(&summary, "peak_bytes") <= count(&summary, "ledger_bytes"), "{summary}");
 }
 
 #[test]
-fn what_cannot_be_started_from_is_refused_or_named() {
+fn unsuitable_models_are_refused_or_reported() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
-    train(scene.path(), &run, 60, &format!("--budget 300 --quiet {STILL}")).ok();
+    train(scene.path(), &run, 60, &format!("--budget 300 --quiet {NO_EDITS}")).ok();
     let file = model_path(&run, 60);
     let start = |file: &Path, flags: &str| {
         let flags = format!("--budget 300 --init {} {flags}", text(file));
         train(scene.path(), &root.path().join("no"), 2, &flags)
     };
     let absent = root.path().join("absent.ply");
-    refused(&start(&absent, ""), root.path(), &["--init", "absent.ply"]);
+    assert_refused(&start(&absent, ""), root.path(), &["--init", "absent.ply"]);
     let photograph = scene.file("images/view_00.png");
-    refused(&start(&photograph, ""), root.path(), &["--init", "view_00.png"]);
+    assert_refused(&start(&photograph, ""), root.path(), &["--init", "view_00.png"]);
     let saved = text(&file).to_owned();
-    refused(&start(&run, ""), root.path(), &["--init", "meta.json", &saved]);
-    refused(&start(&file, "--init-points 9"), root.path(), &["--init-points 9", "random"]);
+    assert_refused(&start(&run, ""), root.path(), &["--init", "meta.json", &saved]);
+    assert_refused(&start(&file, "--init-points 9"), root.path(), &["--init-points 9", "random"]);
     let cut = root.path().join("cut.ply");
     std::fs::write(&cut, &read(&file)[..2_000]).unwrap();
-    refused(&start(&cut, ""), root.path(), &["--init", "cut.ply"]);
+    assert_refused(&start(&cut, ""), root.path(), &["--init", "cut.ply"]);
 
-    // In other coordinates: far away no view shows it; turned about it shows the wrong things.
+    // Models in other coordinates: this one is outside all views.
     let moved = |name: &str, map: fn([f32; 3]) -> [f32; 3]| {
         let mut model = gaussians(&file);
         for mean in &mut model.means {
@@ -211,29 +212,29 @@ fn what_cannot_be_started_from_is_refused_or_named() {
         path
     };
     let above = moved("above.ply", |[x, y, z]| [x, y + 1e4, z]);
-    refused(&start(&above, ""), root.path(), &["above.ply", "0 of its", "coordinates"]);
+    assert_refused(&start(&above, ""), root.path(), &["above.ply", "0 of its", "coordinates"]);
     assert!(!files(root.path()).keys().any(|name| name.starts_with("no/")));
-    // So far away that some camera looks there is as good as out of view.
+    // A very distant model counts as out of view, even if a camera faces it.
     let far = moved("far.ply", |[x, y, z]| [x + 1e4, y, z]);
-    refused(&start(&far, ""), root.path(), &["far.ply", "of its", "coordinates"]);
-    // In view, and nothing like the photographs; whatever the model is taken for, nothing is written.
+    assert_refused(&start(&far, ""), root.path(), &["far.ply", "of its", "coordinates"]);
+    // A model in view that does not resemble the photographs is refused by every command.
     let before = files(root.path());
     let tenfold = moved("tenfold.ply", |mean| mean.map(|v| 10.0 * v));
     let expected = ["tenfold.ply", "nothing of the photographs", "coordinates"];
-    refused(&start(&tenfold, ""), root.path(), &expected);
+    assert_refused(&start(&tenfold, ""), root.path(), &expected);
     let small = root.path().join("small.ply");
-    let on = format!("--scene {} --test-every 2 --backend cpu", text(scene.path()));
-    let compress = format!("compress {} --to 50 -o {} {on}", text(&tenfold), text(&small));
+    let dataset = format!("--scene {} --test-every 2 --backend cpu", text(scene.path()));
+    let compress = format!("compress {} --to 50 -o {} {dataset}", text(&tenfold), text(&small));
     call(&compress).refused("compress", &expected);
     std::fs::remove_file(&tenfold).unwrap();
     assert!(files(root.path()) == before);
-    // So little like them that it may be elsewhere.
+    // A model with little resemblance gets a warning.
     let below = moved("below.ply", |[x, y, z]| [x, y + 2.0, z]);
     let doubt = "may not be those of the dataset";
     for words in [
         format!("train {} -o {} -i 2 --init {}", text(scene.path()), text(&small), text(&below)),
-        format!("eval {} {on}", text(&below)),
-        format!("export {} -o {} {on}", text(&below), text(&root.path().join("again.ply"))),
+        format!("eval {} {dataset}", text(&below)),
+        format!("export {} -o {} {dataset}", text(&below), text(&root.path().join("again.ply"))),
     ] {
         let outcome = call(&words).ok();
         assert!(outcome.stdout.contains(doubt), "{words}: {outcome:?}");

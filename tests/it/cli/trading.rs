@@ -1,4 +1,4 @@
-//! `densify trade`: what knobs cost and buy.
+//! `densify trade`: measures the effect of knobs on quality, time and memory.
 
 use std::path::Path;
 
@@ -12,17 +12,17 @@ fn trade(scene: &Path, output: &Path, more: &str) -> Outcome {
 }
 
 #[test]
-fn every_level_is_measured_once_and_in_the_table() {
+fn every_level_is_measured_once_and_listed() {
     let scene = Photographs::colmap_text();
     let (_root, output) = scratch();
     let knobs = "alpha_min:1/32,sh_degree:1,tile_cap,transmittance_stop:1e-3:1e-2";
     let call = format!("--knobs {knobs} --seeds 2 -- --sh-degree 0");
-    let said = trade(scene.path(), &output, &call).ok().stdout;
-    assert!(said.contains("[16/16]") && said.contains("alpha_min=1/32"), "{said}");
+    let stdout = trade(scene.path(), &output, &call).ok().stdout;
+    assert!(stdout.contains("[16/16]") && stdout.contains("alpha_min=1/32"), "{stdout}");
     let all = records(&output.join("trade.jsonl"));
     let find = |knob: &str, level: &str, seed: u64| {
-        let is_it = |r: &&Value| r["factor"] == knob && r["level"] == level && r["seed"] == seed;
-        all.iter().find(is_it).unwrap_or_else(|| panic!("{knob}={level}, {seed}: {all:?}"))
+        let matches = |r: &&Value| r["factor"] == knob && r["level"] == level && r["seed"] == seed;
+        all.iter().find(matches).unwrap_or_else(|| panic!("{knob}={level}, {seed}: {all:?}"))
     };
     for seed in 0..2 {
         let base = find("", "", seed);
@@ -30,13 +30,13 @@ fn every_level_is_measured_once_and_in_the_table() {
             base["psnr"].as_f64() > Some(5.0) && base["ssim"].is_f64() && base["flip"].is_f64()
         );
         assert!(base["seconds"].as_f64() > Some(0.0) && base["ledger_bytes"].is_u64(), "{base}");
-        // Exact knobs change nothing, others do.
+        // Only exact knobs leave the model unchanged.
         assert_eq!(find("tile_cap", "250", seed)["model"], base["model"]);
         assert_ne!(find("alpha_min", "1/32", seed)["model"], base["model"]);
         assert_ne!(find("sh_degree", "1", seed)["model"], base["model"]);
     }
-    assert_ne!(find("", "", 0)["model"], find("", "", 1)["model"], "the seeds do nothing");
-    // All but the knob are as with the preset `exact`.
+    assert_ne!(find("", "", 0)["model"], find("", "", 1)["model"], "the seeds have no effect");
+    // All other settings are those of the preset `exact`.
     let spec = |knob: &str, level: &str| find(knob, level, 0)["spec"].clone();
     assert_eq!(spec("", "")["preset"], "exact");
     let changed = spec("alpha_min", "1/32");
@@ -52,18 +52,18 @@ fn every_level_is_measured_once_and_in_the_table() {
     let picture = read(&output.join(picture.expect("a plot")));
     assert!(picture.starts_with(b"<svg"));
     let page = read_text(&output.join("trade.html"));
-    super::reporting::stands_for_itself(&page);
+    super::reporting::assert_self_contained(&page);
     assert!(page.contains("<td>alpha_min</td>") && page.contains("src=\"data:image/svg+xml"));
 
-    // Again: nothing runs, and nothing changes.
+    // Repeating the call trains nothing and changes no file.
     let before = files(&output);
-    let said = trade(scene.path(), &output, &call).ok().stdout;
-    assert_eq!(said.matches("done before").count(), 16, "{said}");
-    assert!(before == files(&output), "a study that was complete has changed");
+    let stdout = trade(scene.path(), &output, &call).ok().stdout;
+    assert_eq!(stdout.matches("done before").count(), 16, "{stdout}");
+    assert!(before == files(&output), "a complete study was changed");
 }
 
 #[test]
-fn bad_studies_are_refused_before_anything_runs() {
+fn invalid_studies_are_refused_before_any_run() {
     let scene = Photographs::colmap_text();
     let (_root, output) = scratch();
     for (more, words) in [
@@ -76,6 +76,6 @@ fn bad_studies_are_refused_before_anything_runs() {
         ("-- --seed 3", ["--seed", "study"]),
     ] {
         trade(scene.path(), &output, more).refused(more, &words);
-        assert!(!output.exists(), "{more}: something was written");
+        assert!(!output.exists(), "{more}: the output exists");
     }
 }

@@ -1,11 +1,11 @@
-//! `densify train`: what a run leaves behind, and that its numbers hold.
+//! `densify train`: the files of a run and the consistency of its figures.
 
 use std::path::Path;
 
 use densify_policies::registry::{find, policies};
 use serde_json::Value;
 
-use super::{Outcome, config, count, files, json, model, often, records, scratch, train};
+use super::{Outcome, config, count, files, frequent_edits, json, model, records, scratch, train};
 use crate::photographs::{POINTS, Photographs, VIEWS};
 
 const ITERATIONS: u32 = 100;
@@ -15,7 +15,7 @@ fn number(value: &Value, key: &str) -> f64 {
     value[key].as_f64().unwrap_or_else(|| panic!("no number {key} in {value}"))
 }
 
-/// Fails unless every file is there that DESIGN and users expect, and nothing else.
+/// Checks that the run folder contains exactly the documented files.
 fn check_tree(run: &Path) {
     let mut names: Vec<String> = files(run).into_keys().collect();
     let board = names.iter().position(|name| name.starts_with("events.out.tfevents."));
@@ -40,7 +40,7 @@ fn check_tree(run: &Path) {
     assert_eq!(config(run)["budget"].as_integer(), Some(BUDGET as i64));
 }
 
-/// Fails unless rows stay within the budget in every event, and follow from one to the next.
+/// Checks that every event stays within the budget and starts from the row count of the previous one.
 fn check_events(run: &Path, summary: &Value) {
     let events = records(&run.join("stats/events.jsonl"));
     assert!(!events.is_empty(), "the policy did nothing in {ITERATIONS} steps");
@@ -80,18 +80,18 @@ fn check_summary(run: &Path, policy: &str, held_out: u64) -> Value {
     summary
 }
 
-/// Fails unless the run has learned, the test views too.
+/// Checks that the loss has fallen and the test PSNR is high enough.
 fn check_loss(run: &Path, policy: &str, least_psnr: f64) {
     let log = records(&run.join("stats/train.jsonl"));
     assert_eq!(log.len(), ITERATIONS as usize / 10);
     assert_eq!(count(&log[log.len() - 1], "step"), u64::from(ITERATIONS));
     let loss: Vec<f64> = log.iter().map(|record| number(record, "loss")).collect();
-    // `mini-splatting` draws its model anew in between, and again has little time: it must learn from then on.
+    // `mini-splatting` resamples the model midway, so progress is measured from the worst loss.
     let worst = loss.iter().copied().fold(loss[0], f64::max);
     let first = if policy == "mini-splatting" { worst } else { loss[0] };
     let last = loss[loss.len() - 1];
-    // `vanilla` has reset opacities in between, so that it has little time to recover. `eagles` begins with
-    // small images, whose loss is small.
+    // `vanilla` resets opacities midway and has little time to recover. `eagles` starts with small images, whose
+    // loss is low.
     let is_comparable = policy != "eagles";
     assert!(!is_comparable || last < 0.9 * first, "{policy}: the loss went {loss:?}");
     assert!(log.iter().all(|record| count(record, "rows") <= BUDGET));
@@ -102,7 +102,7 @@ fn check_loss(run: &Path, policy: &str, least_psnr: f64) {
 
 fn check(scene: &Photographs, policy: &str, flags: &str, least_psnr: f64) -> Outcome {
     let (_root, run) = scratch();
-    let often = often(find(policy).expect("it is registered"));
+    let often = frequent_edits(find(policy).expect("a registered policy"));
     let flags = format!("--budget {BUDGET} --policy {policy} {often} --eval {flags}");
     let outcome = train(scene.path(), &run, ITERATIONS, &flags).ok();
     check_tree(&run);
@@ -113,7 +113,7 @@ fn check(scene: &Photographs, policy: &str, flags: &str, least_psnr: f64) -> Out
 }
 
 #[test]
-fn photographs_of_colmap_are_trained_on() {
+fn every_policy_trains_on_a_colmap_dataset() {
     let scene = Photographs::colmap_text();
     for policy in policies().expect("the registry is sound").iter().map(|entry| entry.name) {
         let least_psnr = match policy {
@@ -122,10 +122,10 @@ fn photographs_of_colmap_are_trained_on() {
             _ => 18.0,
         };
         let outcome = check(&scene, policy, "", least_psnr);
-        for said in ["promised in all", "360 rows", "test     PSNR", "300 points"] {
-            assert!(outcome.stdout.contains(said), "{policy}: {said:?} in {}", outcome.stdout);
+        for words in ["promised in all", "360 rows", "test     PSNR", "300 points"] {
+            assert!(outcome.stdout.contains(words), "{policy}: {words:?} in {}", outcome.stdout);
         }
-        // An edit is one line of the log.
+        // Each edit is one line of the log.
         let edits = outcome.stderr.lines().filter(|line| line.contains("denied="));
         assert!(edits.clone().count() > 0, "{}", outcome.stderr);
         for key in ["step=", "before=", "removed=", "added=", "after=", "cause="] {
@@ -135,7 +135,7 @@ fn photographs_of_colmap_are_trained_on() {
 }
 
 #[test]
-fn transparent_photographs_without_points_are_trained_on() {
+fn training_works_with_transparency_and_without_points() {
     let scene = Photographs::transforms();
     for (policy, least_psnr) in [("diet", 18.0), ("vanilla", 16.0)] {
         let quiet = check(&scene, policy, "--background white --quiet", least_psnr);
@@ -144,12 +144,12 @@ fn transparent_photographs_without_points_are_trained_on() {
 }
 
 #[test]
-fn more_points_than_the_budget_are_subsampled_and_it_is_said() {
+fn points_beyond_the_budget_are_subsampled_and_reported() {
     let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
     let outcome = train(scene.path(), &run, 3, "--budget 100").ok();
-    let told = format!("{} points beyond the budget", POINTS - 100);
-    assert!(outcome.stdout.contains(&told), "{}", outcome.stdout);
+    let message = format!("{} points beyond the budget", POINTS - 100);
+    assert!(outcome.stdout.contains(&message), "{}", outcome.stdout);
     assert!(outcome.stdout.contains("100 Gaussians from 300 points"), "{}", outcome.stdout);
     let summary = json(&run.join("stats/summary.json"));
     assert_eq!(count(&summary, "peak_rows"), 100);
@@ -167,7 +167,7 @@ fn a_budget_of_one_row_trains() {
 }
 
 #[test]
-fn a_run_is_replaced_only_when_asked_and_as_a_whole() {
+fn overwriting_needs_a_flag_and_replaces_the_whole_run() {
     let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
     train(scene.path(), &run, 2, "--budget 300").ok();
@@ -175,7 +175,7 @@ fn a_run_is_replaced_only_when_asked_and_as_a_whole() {
     let before = files(&run);
     train(scene.path(), &run, 3, "--budget 300")
         .refused("occupied", &["another run", "--overwrite"]);
-    assert!(files(&run) == before, "the refused run touched the first one");
+    assert!(files(&run) == before, "the refused call changed the existing run");
     train(scene.path(), &run, 3, "--budget 300 --overwrite").ok();
     let after = files(&run);
     assert!(after.contains_key("point_cloud/iteration_3/point_cloud.ply"));
@@ -185,7 +185,7 @@ fn a_run_is_replaced_only_when_asked_and_as_a_whole() {
 }
 
 #[test]
-fn view_dependent_colour_steps_as_often_as_the_policy_says() {
+fn the_policy_sets_the_cadence_of_view_dependent_colour() {
     let scene = Photographs::colmap_text();
     let trained = |flags: &str| {
         let (_root, run) = scratch();
@@ -200,7 +200,7 @@ fn view_dependent_colour_steps_as_often_as_the_policy_says() {
 }
 
 #[test]
-fn the_model_is_replaced_within_the_budget() {
+fn reinitialisation_stays_within_the_budget() {
     let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
     let flags = "--budget 330 --eval --policy-set diet.reinit_at=30";
@@ -211,7 +211,7 @@ fn the_model_is_replaced_within_the_budget() {
     assert_eq!(count(replaced, "removed"), count(replaced, "before"));
     let views = (VIEWS - 2) as u64;
     let after = count(replaced, "after");
-    // ⌊0.8 · 330⌋ = 264 points, as many of each view; a few pixels show no surface.
+    // ⌊0.8 · 330⌋ = 264 points, equally many of each view; a few pixels show no surface.
     assert!(after <= 264 / views * views && after > 200, "{replaced}");
     let summary = json(&run.join("stats/summary.json"));
     assert_eq!(count(&summary, "extra_forwards"), views);

@@ -1,5 +1,5 @@
-//! `densify view`: the page over a plain connection, what it refuses, and how it ends. One piece, as all tests share the
-//! page that is being served and its replies.
+//! `densify view`: the server over plain TCP, refused requests, and shutdown. One file, because all tests share the
+//! helpers `Page` and `Reply`.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
@@ -13,19 +13,19 @@ use serde_json::{Value, json};
 use super::{WITHOUT_GPU, call, json, scratch, text, train};
 use crate::photographs::{Photographs, SIZE};
 
-/// A page that is being served.
+/// A running program that serves the viewer page.
 pub(super) struct Page {
     pub(super) program: Child,
-    pub(super) said: BufReader<ChildStdout>,
+    pub(super) stdout: BufReader<ChildStdout>,
     /// Address and port.
     pub(super) place: String,
-    /// What the path begins with and ends in: `/`, or `/` and a secret and `/`.
+    /// Base path of all requests: `/` or `/SECRET/`.
     pub(super) path: String,
-    /// What it said before.
+    /// Output before the line with the address.
     before: String,
 }
 
-/// What came back.
+/// An HTTP reply.
 #[derive(Debug)]
 pub(super) struct Reply {
     pub(super) status: u16,
@@ -38,10 +38,10 @@ impl Reply {
         String::from_utf8_lossy(&self.body).into_owned()
     }
 
-    /// A line of the head.
+    /// The value of a header.
     pub(super) fn header(&self, name: &str) -> Option<&str> {
         let mut lines = self.head.lines().filter_map(|line| line.split_once(": "));
-        lines.find(|(it, _)| *it == name).map(|(_, value)| value)
+        lines.find(|(key, _)| *key == name).map(|(_, value)| value)
     }
 
     pub(super) fn picture(&self) -> RgbImage {
@@ -53,11 +53,11 @@ impl Reply {
 
 impl Page {
     fn open(words: &str) -> Self {
-        Self::of(&format!("view {words} --port 0 --backend cpu"))
+        Self::start(&format!("view {words} --port 0 --backend cpu"))
     }
 
-    /// The page of a command.
-    pub(super) fn of(command: &str) -> Self {
+    /// Starts a command that serves a page and waits for its address.
+    pub(super) fn start(command: &str) -> Self {
         let mut program = Command::new(env!("CARGO_BIN_EXE_densify"))
             .envs([WITHOUT_GPU])
             .args(command.split_whitespace())
@@ -66,33 +66,33 @@ impl Page {
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
             .spawn()
-            .expect("it starts");
-        let mut said = BufReader::new(program.stdout.take().expect("a pipe"));
+            .expect("the program starts");
+        let mut stdout = BufReader::new(program.stdout.take().expect("a pipe"));
         let (mut line, mut before) = (String::new(), String::new());
         while !line.starts_with("page ") {
             before.push_str(&line);
             line.clear();
-            let length = said.read_line(&mut line).expect("text");
-            assert!(length > 0, "it has ended: {:?}", program.wait());
+            let length = stdout.read_line(&mut line).expect("text");
+            assert!(length > 0, "the program has ended: {:?}", program.wait());
         }
         let url = line.trim_start_matches("page").trim();
         let rest = url.strip_prefix("http://").expect("an address");
         let (place, path) = rest.split_once('/').expect("a path");
-        Self { program, said, place: place.to_owned(), path: format!("/{path}"), before }
+        Self { program, stdout, place: place.to_owned(), path: format!("/{path}"), before }
     }
 
     pub(super) fn connect(&self) -> TcpStream {
-        let stream = TcpStream::connect(&self.place).expect("it listens");
+        let stream = TcpStream::connect(&self.place).expect("a connection");
         stream.set_read_timeout(Some(Duration::from_secs(60))).expect("a time");
         stream
     }
 
-    /// Sends bytes, and reads until the connection ends.
+    /// Sends bytes and reads until the connection is closed.
     pub(super) fn send(&self, request: &[u8]) -> Reply {
-        self.try_send(request).expect("it listens, reads and answers")
+        self.try_send(request).expect("a reply")
     }
 
-    /// The same; nothing where the page has ended.
+    /// Like `send`; returns `None` if the program has ended.
     fn try_send(&self, request: &[u8]) -> Option<Reply> {
         let mut stream = TcpStream::connect(&self.place).ok()?;
         stream.set_read_timeout(Some(Duration::from_secs(60))).ok()?;
@@ -113,33 +113,33 @@ impl Page {
     }
 
     fn post(&self, more: &str, body: &str) -> Reply {
-        self.try_post("frame", more, body).expect("it answers")
+        self.try_post("frame", more, body).expect("a reply")
     }
 
-    /// Asks for something of the page; nothing where it has ended.
-    pub(super) fn try_post(&self, what: &str, more: &str, body: &str) -> Option<Reply> {
+    /// Posts JSON to an endpoint; returns `None` if the program has ended.
+    pub(super) fn try_post(&self, endpoint: &str, more: &str, body: &str) -> Option<Reply> {
         let Self { place, path, .. } = self;
         let request = format!(
-            "POST {path}{what} HTTP/1.1\r\nHost: {place}\r\nConnection: close\r\n\
+            "POST {path}{endpoint} HTTP/1.1\r\nHost: {place}\r\nConnection: close\r\n\
              Content-Type: application/json\r\nContent-Length: {}\r\n{more}\r\n{body}",
             body.len()
         );
         self.try_send(request.as_bytes())
     }
 
-    pub(super) fn frame(&self, wish: &Value) -> Reply {
-        self.post("", &wish.to_string())
+    pub(super) fn frame(&self, request: &Value) -> Reply {
+        self.post("", &request.to_string())
     }
 
-    /// Ends it as Ctrl-C does; returns what else it said.
+    /// Ends the program like Ctrl-C and returns its remaining output.
     #[cfg(unix)]
     fn end(mut self) -> String {
         let pid = self.program.id().to_string();
         let sent = Command::new("kill").args(["-INT", &pid]).status().expect("a shell's program");
         assert!(sent.success());
         let mut rest = String::new();
-        self.said.read_to_string(&mut rest).expect("text");
-        assert_eq!(self.program.wait().expect("it ends").code(), Some(0));
+        self.stdout.read_to_string(&mut rest).expect("text");
+        assert_eq!(self.program.wait().expect("the program ends").code(), Some(0));
         rest
     }
 }
@@ -155,13 +155,13 @@ fn run_of(scene: &Photographs, run: &Path) {
     train(scene.path(), run, 40, "--budget 320 --eval --quiet").ok();
 }
 
-/// The view of a split, at most so large.
-pub(super) fn wish(kind: &str, split: &str, number: usize, size: (u32, u32)) -> Value {
+/// A request for a view of a split with a maximum size.
+pub(super) fn frame_request(kind: &str, split: &str, number: usize, size: (u32, u32)) -> Value {
     let view = json!({ "split": split, "number": number });
     json!({ "page": "test", "kind": kind, "width": size.0, "height": size.1, "view": view })
 }
 
-/// Decibels between two pictures of one size.
+/// PSNR of two images of equal size [dB].
 fn psnr(a: &RgbImage, b: &RgbImage) -> f64 {
     assert_eq!(a.dimensions(), b.dimensions());
     let squares = a.iter().zip(b.iter()).map(|(a, b)| f64::from(a.abs_diff(*b)).powi(2));
@@ -170,7 +170,7 @@ fn psnr(a: &RgbImage, b: &RgbImage) -> f64 {
 }
 
 #[test]
-fn the_picture_of_a_camera_is_that_which_render_writes() {
+fn frames_match_the_images_of_render() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
     run_of(&scene, &run);
@@ -179,79 +179,83 @@ fn the_picture_of_a_camera_is_that_which_render_writes() {
     let page = Page::open(text(&run));
     let described: Value = serde_json::from_slice(&page.get("/scene").body).expect("JSON");
     assert_eq!(described["views"]["test"][1]["name"], "view_08.png");
-    let first = page.frame(&wish("render", "test", 0, SIZE)).picture();
+    let first = page.frame(&frame_request("render", "test", 0, SIZE)).picture();
     for (number, name) in [(0, "view_00"), (1, "view_08")] {
-        let found = page.frame(&wish("render", "test", number, SIZE));
+        let found = page.frame(&frame_request("render", "test", number, SIZE));
         let written = image::open(pictures.join(format!("{name}.png"))).expect("a PNG").into_rgb8();
-        let near = psnr(&found.picture(), &written);
-        assert!(near >= 38.0, "{name}: {near} dB");
-        // The photograph is as near to its file, and resembles the render less.
+        let similarity = psnr(&found.picture(), &written);
+        assert!(similarity >= 38.0, "{name}: {similarity} dB");
+        // The photograph matches its file.
         let file = image::open(scene.file(&format!("images/{name}.png"))).expect("a PNG");
-        let shown = page.frame(&wish("photograph", "test", number, (4000, 1000))).picture();
-        let near = psnr(&shown, &file.into_rgb8());
-        assert!(near >= 38.0, "{name}: the photograph is {near} dB from its file");
-        // From the same place by its pose alone: these cameras have their principal point in the middle.
+        let shown =
+            page.frame(&frame_request("photograph", "test", number, (4000, 1000))).picture();
+        let similarity = psnr(&shown, &file.into_rgb8());
+        assert!(similarity >= 38.0, "{name}: the photograph is {similarity} dB from its file");
+        // A free camera with the same pose, because the principal points are central.
         let at = &described["views"]["test"][number];
         let camera = json!({ "camera_to_world": at["camera_to_world"], "fov": at["fov"] });
         let free = json!({ "page": "test", "kind": "render", "width": SIZE.0, "height": SIZE.1, "camera": camera });
-        let near = psnr(&page.frame(&free).picture(), &written);
-        assert!(near >= 36.0, "{name}: {near} dB by its pose");
+        let similarity = psnr(&page.frame(&free).picture(), &written);
+        assert!(similarity >= 36.0, "{name}: {similarity} dB by its pose");
     }
     let sizes = [((24, 99), (24, 20)), ((96, 80), (96, 80))];
     for (wanted, size) in sizes {
-        assert_eq!(page.frame(&wish("render", "train", 0, wanted)).picture().dimensions(), size);
+        assert_eq!(
+            page.frame(&frame_request("render", "train", 0, wanted)).picture().dimensions(),
+            size
+        );
     }
     let all = described["kinds"].as_array().expect("kinds").iter();
     let kinds: Vec<&str> = all.filter_map(|kind| kind["kind"].as_str()).collect();
-    // When rows were made no file says; the page says so. When they were edited the run's checkpoint does.
+    // No file records the age of Gaussians, so that kind is listed as missing. Edits come from the checkpoint.
     let lacking = described["lacking"].as_array().expect("what lacks");
     assert_eq!((kinds.len(), lacking.len()), (13, 1), "{described}");
-    assert_eq!(page.frame(&wish("row_age", "test", 0, SIZE)).status, 400);
+    assert_eq!(page.frame(&frame_request("row_age", "test", 0, SIZE)).status, 400);
     let mut seen: Vec<Vec<u8>> = Vec::new();
     for kind in kinds {
-        let reply = page.frame(&wish(kind, "test", 0, SIZE));
+        let reply = page.frame(&frame_request(kind, "test", 0, SIZE));
         assert_eq!(reply.picture().dimensions(), SIZE, "{kind}");
         let has_range = !matches!(kind, "render" | "photograph" | "opacity" | "rows");
         assert_eq!(reply.header("X-Range").is_some(), has_range, "{kind}");
         if kind == "row_edit" {
-            assert_eq!(reply.header("X-Range"), Some("0 40"), "none was edited in 40 steps");
+            assert_eq!(reply.header("X-Range"), Some("0 40"), "the range of edits in 40 steps");
         }
-        assert!(!seen.contains(&reply.body), "{kind} is as another");
+        assert!(!seen.contains(&reply.body), "{kind} equals another kind");
         seen.push(reply.body);
     }
-    // The mean difference is the FLIP that training measured of this view.
-    let difference = page.frame(&wish("difference", "test", 0, SIZE));
+    // The mean difference is the FLIP score of this view.
+    let difference = page.frame(&frame_request("difference", "test", 0, SIZE));
     let mean = difference.header("X-Mean").expect("a mean");
     let flip = json(&run.join("per_view.json"))["ours_40"]["FLIP"]["view_00.png"].clone();
     let apart = (mean.parse::<f64>().expect("a number") - flip.as_f64().expect("a number")).abs();
     assert!(apart < 2e-3, "{mean} is not {flip}");
-    // What training alone knows is measured in the training views, some at a time, until all are.
+    // Training statistics are measured from the training views, a few per request.
     let measured = |kind: &str| {
-        let reply = page.frame(&wish(kind, "test", 0, SIZE));
+        let reply = page.frame(&frame_request(kind, "test", 0, SIZE));
         let (seen, all) =
-            reply.header("X-Measured").and_then(|it| it.split_once(' ')).expect("how many");
+            reply.header("X-Measured").and_then(|value| value.split_once(' ')).expect("how many");
         (seen == all, all.parse::<usize>().expect("a number"), reply.body)
     };
     let train = described["views"]["train"].as_array().expect("views").len();
     while !measured("row_gradient").0 {}
     let (is_whole, all, gradient) = measured("row_gradient");
     assert_eq!((is_whole, all), (true, train));
-    assert!(gradient == measured("row_gradient").2, "it goes on measuring");
+    assert!(gradient == measured("row_gradient").2, "measuring did not stop");
     let (is_whole, _, weight) = measured("row_weight");
     assert!(is_whole && weight != gradient);
-    // The model is as it was.
-    assert!(psnr(&page.frame(&wish("render", "test", 0, SIZE)).picture(), &first) > 99.0);
+    // Measuring has not changed the model.
+    assert!(psnr(&page.frame(&frame_request("render", "test", 0, SIZE)).picture(), &first) > 99.0);
     #[cfg(unix)]
     assert_eq!(page.end().trim(), "Ctrl-C ends it");
 }
 
 #[test]
-fn what_a_stranger_sends_is_refused_and_changes_nothing() {
+fn foreign_and_malformed_requests_are_refused_without_effect() {
     let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
     run_of(&scene, &run);
     let page = Page::open(text(&run));
-    let sound = wish("render", "test", 0, SIZE);
+    let sound = frame_request("render", "test", 0, SIZE);
     let first = page.frame(&sound).picture();
     let place = &page.place;
     let refused = |reply: &Reply, status: u16, word: &str| {
@@ -274,12 +278,12 @@ fn what_a_stranger_sends_is_refused_and_changes_nothing() {
     }
     refused(&page.send(b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n"), 400, "no HTTP");
     refused(&page.send(format!("GET /{} HTTP/1.1\r\n", "a".repeat(9000)).as_bytes()), 431, "long");
-    // Guests that say nothing, or do not end, keep nobody out.
+    // Idle and incomplete connections do not block others.
     let mut idle: Vec<TcpStream> = (0..1000).map(|_| page.connect()).collect();
     for stream in idle.iter_mut().step_by(3) {
         let _ = stream.write_all(b"POST /frame HTTP/1.1\r\nHost: local");
     }
-    assert!(page.frame(&sound).picture() == first, "it is the same picture");
+    assert!(page.frame(&sound).picture() == first, "the frame has changed");
     let page_text = page.get("/").text();
     assert!(page_text.contains("<title>densify view</title>"), "{page_text}");
     #[cfg(unix)]
@@ -287,7 +291,7 @@ fn what_a_stranger_sends_is_refused_and_changes_nothing() {
 }
 
 #[test]
-fn a_network_sees_the_page_only_with_its_secret() {
+fn on_a_network_the_page_needs_its_secret_path() {
     let page = Page::open("tests/fuzz/corpus/ply/twelve.ply --host 0.0.0.0");
     let secret = page.path.trim_matches('/').to_owned();
     assert_eq!(secret.len(), 32, "{}", page.path);
@@ -296,7 +300,7 @@ fn a_network_sees_the_page_only_with_its_secret() {
     assert_eq!(page.get(&format!("/{}/scene", "0".repeat(32))).status, 404);
     let described: Value =
         serde_json::from_slice(&page.get(&format!("/{secret}/scene")).body).expect("JSON");
-    // A model without cameras: a start from its bounds, and nothing that needs a photograph.
+    // Without cameras, the initial camera comes from the bounds, and kinds that need a photograph are missing.
     assert!(described["start"]["fov"].is_number(), "{described}");
     let kinds = described["kinds"].as_array().expect("kinds");
     assert!(kinds.iter().all(|kind| kind["needs_photograph"] == false), "{described}");
@@ -306,12 +310,12 @@ fn a_network_sees_the_page_only_with_its_secret() {
         json!({ "page": "a", "kind": "render", "width": 64, "height": 48, "camera": camera });
     let picture = page.frame(&free).picture();
     let (least, most) = picture.iter().fold((255, 0), |(a, b), &v| (a.min(v), b.max(v)));
-    assert!(most - least > 20, "the model is in the picture");
-    assert_eq!(page.frame(&wish("render", "test", 0, (9, 9))).status, 400);
+    assert!(most - least > 20, "the frame does not show the model");
+    assert_eq!(page.frame(&frame_request("render", "test", 0, (9, 9))).status, 400);
 }
 
 #[test]
-fn a_scene_without_a_model_shows_its_points_and_two_runs_are_compared() {
+fn scenes_show_their_points_and_two_runs_can_be_compared() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
     let page = Page::open(&format!("{} --eval", text(scene.path())));
@@ -319,24 +323,24 @@ fn a_scene_without_a_model_shows_its_points_and_two_runs_are_compared() {
     assert!(described["models"][0]["name"].as_str().expect("a name").ends_with("its points"));
     let points = described["points"]["positions"].as_array().map_or(0, Vec::len);
     assert!(points > 100, "{points}");
-    page.frame(&wish("render", "test", 0, SIZE)).picture();
+    page.frame(&frame_request("render", "test", 0, SIZE)).picture();
     run_of(&scene, &run);
-    // Folders of one name are told apart.
+    // Runs in folders of the same name get distinct names.
     let other = root.path().join("above/run");
     train(scene.path(), &other, 4, "--budget 320 --eval --quiet").ok();
     let page = Page::open(&format!("{} {}", text(&run), text(&other)));
     let described: Value = serde_json::from_slice(&page.get("/scene").body).expect("JSON");
     let name = |model: usize| described["models"][model]["name"].as_str().expect("a name");
     assert!(name(1).starts_with("above/run") && name(0).contains("/run"), "{described}");
-    let of = |model: u32| {
-        let mut wish = wish("render", "test", 0, SIZE);
-        wish["model"] = model.into();
-        page.frame(&wish)
+    let frame = |model: u32| {
+        let mut request = frame_request("render", "test", 0, SIZE);
+        request["model"] = model.into();
+        page.frame(&request)
     };
-    assert!(psnr(&of(0).picture(), &of(1).picture()) < 35.0, "two models, two pictures");
-    assert_eq!(of(2).status, 400);
+    assert!(psnr(&frame(0).picture(), &frame(1).picture()) < 35.0, "both models look the same");
+    assert_eq!(frame(2).status, 400);
     assert!(!page.before.contains("note"), "{}", page.before);
-    // Of another scene, or with other views held out, it is said.
+    // A different scene or split is reported.
     let elsewhere = Photographs::colmap_text();
     for (scene, flags, words) in
         [(&elsewhere, "--eval", "another scene"), (&scene, "", "other views")]
@@ -348,7 +352,7 @@ fn a_scene_without_a_model_shows_its_points_and_two_runs_are_compared() {
 }
 
 #[test]
-fn what_cannot_be_shown_is_said_with_the_remedy() {
+fn invalid_calls_are_refused_with_a_remedy() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
     run_of(&scene, &run);
@@ -358,7 +362,7 @@ fn what_cannot_be_shown_is_said_with_the_remedy() {
     let empty = root.path().join("empty");
     std::fs::create_dir(&empty).expect("a folder");
     let stopped = root.path().join("stopped");
-    // Stopped before it had saved a model.
+    // A run that was stopped before it saved a model.
     super::copy_unfinished(&run, &stopped, u32::MAX);
     std::fs::remove_dir_all(stopped.join("point_cloud")).expect("the models");
     let model = densify::train::output::model_path(&run, 40);
@@ -386,14 +390,14 @@ fn what_cannot_be_shown_is_said_with_the_remedy() {
     }
 }
 
-/// A run that another process writes is shown as it was last saved, or refused with a word.
+/// A run in progress is shown as last saved, or refused if nothing is saved.
 #[cfg(unix)]
 #[test]
-fn a_run_that_is_being_trained_is_shown_as_last_saved() {
+fn a_run_in_progress_is_shown_as_last_saved() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
     run_of(&scene, &run);
-    // What a process that trains holds.
+    // The lock that a training process holds.
     let lock = std::fs::File::create(run.join("densify.lock")).expect("a file");
     lock.lock().expect("a lock");
     let page = Page::open(text(&run));
@@ -402,7 +406,7 @@ fn a_run_that_is_being_trained_is_shown_as_last_saved() {
         "{}",
         page.before
     );
-    page.frame(&wish("render", "test", 0, SIZE)).picture();
+    page.frame(&frame_request("render", "test", 0, SIZE)).picture();
     page.end();
     let unsaved = root.path().join("unsaved");
     super::copy_unfinished(&run, &unsaved, 40);

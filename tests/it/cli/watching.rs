@@ -1,4 +1,4 @@
-//! `train --view`: the page of a run in training, its orders, and that the run is the same with it.
+//! `train --view`: progress and orders of the live page; viewing does not affect training.
 
 use std::io::Read;
 use std::net::TcpStream;
@@ -7,22 +7,22 @@ use std::thread;
 
 use serde_json::{Value, json};
 
-use super::view::{Page, wish};
+use super::view::{Page, frame_request};
 use super::{call, count, json, model, read, read_text, records, resume, scratch, text, train};
 use crate::photographs::{Photographs, SIZE};
 
-/// Enough that a run does not end before it can be paused.
+/// Enough iterations to pause a run before its end.
 const ITERATIONS: u32 = 1_500;
 
 fn watched(scene: &Path, run: &Path, flags: &str) -> Page {
     let fixed = format!("--sh-degree 1 --iterations {ITERATIONS} --budget 320 --backend cpu");
-    Page::of(&format!("train {} -o {} --view {fixed} {flags}", text(scene), text(run)))
+    Page::start(&format!("train {} -o {} --view {fixed} {flags}", text(scene), text(run)))
 }
 
 impl Page {
-    fn order(&self, what: &str) {
-        let reply = self.try_post("order", "", &json!({ "order": what }).to_string());
-        let reply = reply.expect("it answers");
+    fn order(&self, order: &str) {
+        let reply = self.try_post("order", "", &json!({ "order": order }).to_string());
+        let reply = reply.expect("a reply");
         assert_eq!(reply.status, 200, "{}", reply.text());
     }
 
@@ -31,11 +31,11 @@ impl Page {
         serde_json::from_slice(&reply.body).unwrap_or_else(|e| panic!("{e}: {}", reply.text()))
     }
 
-    /// Waits until the run is paused after the last step that it was told to take; returns that.
-    fn paused(&self) -> u64 {
+    /// Waits until the run is paused and returns its step.
+    fn wait_for_pause(&self) -> u64 {
         loop {
             let now = self.progress();
-            // A step that was ordered is counted before it is taken.
+            // An ordered step is counted before it is taken.
             if now["state"] == "paused" && self.progress()["step"] == now["step"] {
                 return count(&now, "step");
             }
@@ -43,18 +43,18 @@ impl Page {
         }
     }
 
-    /// Waits for the end of the program; returns its exit code and what it said.
-    fn ended(mut self) -> (Option<i32>, String) {
-        let mut said = String::new();
-        self.said.read_to_string(&mut said).expect("text");
+    /// Waits for the end of the program; returns its exit code and output.
+    fn wait_for_end(mut self) -> (Option<i32>, String) {
+        let mut output = String::new();
+        self.stdout.read_to_string(&mut output).expect("text");
         let mut errors = self.program.stderr.take().expect("a pipe");
-        errors.read_to_string(&mut said).expect("text");
-        (self.program.wait().expect("it ends").code(), said)
+        errors.read_to_string(&mut output).expect("text");
+        (self.program.wait().expect("the program ends").code(), output)
     }
 }
 
-/// A camera that goes around the scene, as who looks moves it.
-fn moving(at: u32) -> Value {
+/// A request while the camera orbits the scene.
+fn moving_request(at: u32) -> Value {
     let (sine, cosine) = (f64::from(at) * 0.1).sin_cos();
     let pose = [
         [cosine, 0.0, sine, 4.0 * sine],
@@ -67,9 +67,9 @@ fn moving(at: u32) -> Value {
 }
 
 #[test]
-fn a_run_is_the_same_to_the_byte_with_viewers_and_without() {
+fn viewers_do_not_change_a_byte_of_the_run() {
     let scene = Photographs::colmap_text();
-    // A policy that looks at signals, one that adds noise, and one that renders views of its own.
+    // A policy that reads signals, one that adds noise, and one that renders auxiliary views.
     for policy in ["diet", "mcmc", "taming"] {
         let flags =
             format!("--policy {policy} --eval --test-iterations 500 --checkpoint-every 600");
@@ -81,42 +81,42 @@ fn a_run_is_the_same_to_the_byte_with_viewers_and_without() {
             &format!("--budget 320 --quiet --backend cpu {flags}"),
         )
         .ok();
-        let (_root, seen) = scratch();
-        let page = watched(scene.path(), &seen, &flags);
+        let (_root, viewed) = scratch();
+        let page = watched(scene.path(), &viewed, &flags);
         page.order("pause");
-        let first = page.paused();
-        assert!(first < u64::from(ITERATIONS), "it has ended before it could be paused");
-        // A model that rests looks the same twice, and another after a step.
-        let look = || page.frame(&wish("render", "test", 0, SIZE)).body;
-        let before = look();
-        assert!(before == look(), "{policy}: the model changes while it rests");
+        let first = page.wait_for_pause();
+        assert!(first < u64::from(ITERATIONS), "the run has ended before it could be paused");
+        // A paused model does not change; a step changes it.
+        let frame = || page.frame(&frame_request("render", "test", 0, SIZE)).body;
+        let before = frame();
+        assert!(before == frame(), "{policy}: the paused model changes");
         page.order("step");
         while count(&page.progress(), "step") == first {
             thread::yield_now();
         }
-        assert_eq!(page.paused(), first + 1, "{policy}: one step is not one");
-        assert!(before != look(), "{policy}: a step changes nothing");
+        assert_eq!(page.wait_for_pause(), first + 1, "{policy}: not exactly one step");
+        assert!(before != frame(), "{policy}: a step changes nothing");
         page.order("checkpoint");
-        let kept = seen.join(format!("checkpoints/iteration_{}.safetensors", first + 1));
+        let kept = viewed.join(format!("checkpoints/iteration_{}.safetensors", first + 1));
         while !kept.is_file() {
             thread::yield_now();
         }
         page.order("continue");
-        // From here on somebody looks all the time, in every way.
+        // From here on, frames of every kind are requested until the run ends.
         let mut pictures = 0;
         let mut kinds = vec!["render", "depth", "opacity", "count", "difference", "photograph"];
         kinds.extend(["rows", "row_opacity", "row_size", "row_shape", "row_age", "row_edit"]);
-        // What the policy itself measures.
+        // Kinds that the policy measures.
         kinds.extend((policy != "mcmc").then_some("row_gradient"));
         kinds.extend((policy == "diet").then_some("row_weight"));
         for at in 0.. {
-            let wish = match at % 3 {
-                0 => wish(kinds[at as usize / 3 % kinds.len()], "test", 1, SIZE),
-                _ => moving(at),
+            let request = match at % 3 {
+                0 => frame_request(kinds[at as usize / 3 % kinds.len()], "test", 1, SIZE),
+                _ => moving_request(at),
             };
-            match page.try_post("frame", "", &wish.to_string()) {
+            match page.try_post("frame", "", &request.to_string()) {
                 Some(reply) if reply.status == 200 => {
-                    // No picture is larger than those that the run promised room for.
+                    // No frame exceeds the size that the memory promise covers.
                     let (width, height) = reply.picture().dimensions();
                     assert!(width <= SIZE.0 && height <= SIZE.1, "{width}x{height}");
                     pictures += 1;
@@ -124,14 +124,20 @@ fn a_run_is_the_same_to_the_byte_with_viewers_and_without() {
                 _ => break,
             }
         }
-        assert!(pictures > 100, "{policy}: {pictures} pictures were seen");
-        let (code, said) = page.ended();
-        assert_eq!(code, Some(0), "{said}");
-        assert!(model(&seen, ITERATIONS) == model(&alone, ITERATIONS), "{policy}: another model");
+        assert!(pictures > 100, "{policy}: only {pictures} frames");
+        let (code, output) = page.wait_for_end();
+        assert_eq!(code, Some(0), "{output}");
+        assert!(
+            model(&viewed, ITERATIONS) == model(&alone, ITERATIONS),
+            "{policy}: the models differ"
+        );
         let same =
             ["stats/events.jsonl", "results.json", "per_view.json", "config.toml", "cameras.json"];
         for name in same {
-            assert!(read(&seen.join(name)) == read(&alone.join(name)), "{policy}: another {name}");
+            assert!(
+                read(&viewed.join(name)) == read(&alone.join(name)),
+                "{policy}: {name} differs"
+            );
         }
         let losses = |run: &Path| -> Vec<Value> {
             records(&run.join("stats/train.jsonl"))
@@ -139,9 +145,9 @@ fn a_run_is_the_same_to_the_byte_with_viewers_and_without() {
                 .map(|step| step["loss"].clone())
                 .collect()
         };
-        assert_eq!(losses(&seen), losses(&alone), "{policy}: other losses");
-        // All that was looked at had room in what was promised.
-        let summary = json(&seen.join("stats/summary.json"));
+        assert_eq!(losses(&viewed), losses(&alone), "{policy}: the losses differ");
+        // Viewing stayed within the promised memory.
+        let summary = json(&viewed.join("stats/summary.json"));
         let lines = summary["ledger"]["lines"].as_array().expect("lines");
         for what in ["the page", "a picture for the page"] {
             assert!(lines.iter().any(|line| line["what"] == what), "{what} is not in the ledger");
@@ -153,7 +159,7 @@ fn a_run_is_the_same_to_the_byte_with_viewers_and_without() {
 }
 
 #[test]
-fn the_page_says_how_training_goes() {
+fn the_page_reports_progress() {
     let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
     let page = watched(scene.path(), &run, "--eval --test-iterations 100");
@@ -161,7 +167,7 @@ fn the_page_says_how_training_goes() {
         thread::yield_now();
     }
     page.order("pause");
-    let step = page.paused();
+    let step = page.wait_for_pause();
     let now = page.progress();
     assert_eq!((&now["last"], &now["budget"]), (&ITERATIONS.into(), &320.into()), "{now}");
     let points = now["points"].as_array().expect("points");
@@ -187,52 +193,55 @@ fn the_page_says_how_training_goes() {
         .filter_map(|kind| kind["kind"].as_str())
         .collect();
     assert_eq!(kinds.len(), 14, "{kinds:?}");
-    assert!(described["points"]["positions"].as_array().is_some_and(|it| !it.is_empty()));
+    assert!(
+        described["points"]["positions"].as_array().is_some_and(|positions| !positions.is_empty())
+    );
     let range = |kind: &str| {
-        let reply = page.frame(&wish(kind, "test", 0, SIZE));
+        let reply = page.frame(&frame_request(kind, "test", 0, SIZE));
         let range = reply.header("X-Range").expect("a range").to_owned();
         let (least, most) = range.split_once(' ').expect("two numbers");
         [least, most].map(|end| end.parse::<f64>().expect("a number"))
     };
-    // Some rows are as old as the run, and some were edited since.
+    // Some Gaussians are as old as the run, and some were edited later.
     let [age, edit] = ["row_age", "row_edit"].map(|kind| range(kind)[1]);
     assert!(edit <= age && age <= step as f64 && age > 0.0, "{age} {edit} {step}");
     let [least, most] = range("row_gradient");
     assert!(0.0 < least && least < most && most < 1.0, "{least} {most}");
 
-    // What the policy does not measure is not shown, and it is said why.
+    // Kinds that the policy does not measure are missing, with the reason.
     let (_root, other) = scratch();
     let quiet = watched(scene.path(), &other, "--policy mcmc --eval");
     let described: Value =
         serde_json::from_slice(&quiet.get(&format!("{}scene", quiet.path)).body).expect("JSON");
     let lacking: Vec<&Value> = described["lacking"].as_array().into_iter().flatten().collect();
-    let says = |lacking: &&Value| lacking["why"].as_str().is_some_and(|why| why.contains("mcmc"));
-    assert!(lacking.len() == 2 && lacking.iter().all(says), "{lacking:?}");
-    let refused = quiet.frame(&wish("row_gradient", "test", 0, SIZE));
+    let names_policy =
+        |lacking: &&Value| lacking["why"].as_str().is_some_and(|why| why.contains("mcmc"));
+    assert!(lacking.len() == 2 && lacking.iter().all(names_policy), "{lacking:?}");
+    let refused = quiet.frame(&frame_request("row_gradient", "test", 0, SIZE));
     assert!(refused.status == 400 && refused.text().contains("mcmc"), "{}", refused.text());
     drop(quiet);
 
-    // Stopped, it leaves a checkpoint, and goes on to the same end.
+    // A stopped run leaves a checkpoint and resumes to the same model.
     page.order("stop");
-    let (code, said) = page.ended();
-    assert_eq!(code, Some(130), "{said}");
+    let (code, output) = page.wait_for_end();
+    assert_eq!(code, Some(130), "{output}");
     let words = format!("stopped by the page after step {step}");
-    assert!(said.contains(&words) && said.contains("--resume"), "{said}");
+    assert!(output.contains(&words) && output.contains("--resume"), "{output}");
     let (_root, whole) = scratch();
     let flags = "--budget 320 --eval --test-iterations 100 --quiet --backend cpu";
     train(scene.path(), &whole, ITERATIONS, flags).ok();
     resume(scene.path(), &run, "--quiet").ok();
-    assert!(model(&run, ITERATIONS) == model(&whole, ITERATIONS), "it ends another way");
+    assert!(model(&run, ITERATIONS) == model(&whole, ITERATIONS), "the models differ");
 }
 
 #[test]
-fn strangers_stop_no_run_and_idle_guests_slow_none() {
+fn foreign_requests_and_idle_connections_do_not_affect_training() {
     let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
     let page = watched(scene.path(), &run, "");
     assert_eq!(page.path.trim_matches('/').len(), 32, "{}", page.path);
     page.order("pause");
-    let step = page.paused();
+    let step = page.wait_for_pause();
     let stop = json!({ "order": "stop" }).to_string();
     let sent = |path: &str, more: &str| {
         let whole = format!("{path}order");
@@ -255,10 +264,10 @@ fn strangers_stop_no_run_and_idle_guests_slow_none() {
         assert_eq!(sent(path, &more), status, "{path} {more}");
     }
     for order in ["{}", "{\"order\": \"explode\"}", "{\"order\": \"stop\", \"path\": \"/\"}"] {
-        assert_eq!(page.try_post("order", "", order).expect("it answers").status, 400, "{order}");
+        assert_eq!(page.try_post("order", "", order).expect("a reply").status, 400, "{order}");
     }
     assert_eq!(page.get(&format!("{}order", page.path)).status, 405);
-    // Nor is what is no request, or too long for one.
+    // Malformed and oversized requests are refused, too.
     let place = &page.place;
     let head = format!("POST {}order HTTP/1.1\r\nHost: {place}\r\n{json}", page.path);
     for (request, status) in [
@@ -274,17 +283,17 @@ fn strangers_stop_no_run_and_idle_guests_slow_none() {
     assert_eq!(
         (&now["state"], count(&now, "step")),
         (&"paused".into(), step),
-        "a stranger was heard"
+        "a foreign request took effect"
     );
-    // A thousand guests who say nothing take no more than was promised, and training goes on to its end.
+    // A thousand idle connections stay within the promised memory, and training completes.
     let idle: Vec<TcpStream> = (0..1000).map(|_| page.connect()).collect();
     page.order("continue");
-    let (code, said) = page.ended();
+    let (code, output) = page.wait_for_end();
     drop(idle);
-    assert_eq!(code, Some(0), "{said}");
+    assert_eq!(code, Some(0), "{output}");
     let (_root, alone) = scratch();
     train(scene.path(), &alone, ITERATIONS, "--budget 320 --quiet --backend cpu").ok();
-    assert!(model(&run, ITERATIONS) == model(&alone, ITERATIONS), "another model");
+    assert!(model(&run, ITERATIONS) == model(&alone, ITERATIONS), "the models differ");
     let summary = super::json(&run.join("stats/summary.json"));
     if let Some(peak) = summary["peak_bytes"].as_u64() {
         assert!(peak <= count(&summary, "ledger_bytes"), "{summary}");
@@ -292,7 +301,7 @@ fn strangers_stop_no_run_and_idle_guests_slow_none() {
 }
 
 #[test]
-fn a_page_that_cannot_be_served_is_refused_before_anything_is_written() {
+fn invalid_addresses_are_refused_before_writing() {
     let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
     let taken = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
@@ -306,12 +315,12 @@ fn a_page_that_cannot_be_served_is_refused_before_anything_is_written() {
         train(scene.path(), &run, 40, &flag).refused(&flag, &words);
         assert!(!run.exists(), "{flag}");
     }
-    // The plan counts it.
+    // `plan` includes the memory of the page.
     let plan = |flag: &str| {
         call(&format!("plan {} --budget 320 --backend cpu {flag}", text(scene.path()))).ok().stdout
     };
     assert!(plan("--view").contains("the page") && !plan("").contains("the page"));
-    // It is of this call, not of the run.
+    // The option is not recorded in the run.
     train(scene.path(), &run, 10, "--budget 320 --view --quiet --backend cpu").ok();
     assert!(!read_text(&run.join("config.toml")).contains("\nview = "));
 }
