@@ -1,4 +1,4 @@
-//! `densify plan`: what a run would take, without the run.
+//! `densify plan`: the memory that a run would need, without training.
 
 use clap::ArgMatches;
 
@@ -8,7 +8,7 @@ use super::train::{Follower, TrainArgs};
 use densify_run::failure::Failure;
 use densify_run::plan;
 
-/// Prints the ledger of a run, and what else its memory could hold. Writes nothing.
+/// Prints the ledger of a run, and the models that would fit the same memory. Writes nothing.
 pub(super) fn run(
     args: &TrainArgs,
     matches: &ArgMatches,

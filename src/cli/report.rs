@@ -14,13 +14,13 @@ use densify_report::ReportOptions;
 use densify_run::DeviceSpec;
 use densify_run::failure::Failure;
 
-/// Writes what a run, or several, arrived at as one HTML file.
+/// Writes the results of one or more runs as one HTML file.
 ///
-/// The file needs nothing beside it and loads nothing: it can be mailed, and opens in any browser. It holds the
-/// scores, the worst and the best views held out with a slider between photograph and render, a turn around the
-/// scene, curves of loss, Gaussians, PSNR and memory, the edits, what was left out, and the settings. Of several
-/// runs, those that differ by their seed alone are averaged, with 95 % intervals from three on; the first of each
-/// are shown, over each other where they are of the same scene.
+/// The file is self-contained and loads nothing: it can be mailed, and opens in any browser. It holds the
+/// scores, the worst and the best held-out views with a slider between photograph and render, a turn around the
+/// scene, curves of loss, Gaussians, PSNR and memory, the edits, what was left out, and the settings. Runs that
+/// differ only in their seed are averaged, with 95 % intervals from three runs on; the first of each group is
+/// shown, and groups of the same scene share their diagrams.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct ReportArgs {
@@ -36,7 +36,7 @@ pub(super) struct ReportArgs {
     /// Saved iteration of the runs `[default: the last of each]`
     #[arg(long, value_name = "N")]
     iteration: Option<u32>,
-    /// Folder or ZIP archive of the dataset, where it is no longer where it was
+    /// Folder or ZIP archive of the dataset, if it has moved
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
     #[command(flatten)]
@@ -44,8 +44,7 @@ pub(super) struct ReportArgs {
 }
 
 const EXAMPLES: &str = "\
-Paths of this machine are not in the file, but the names of the runs' folders, of the dataset's and of its
-photographs are.
+The file has no paths of this machine, but it has the names of the run folders, the dataset and the photographs.
 
 Examples:
   densify report output/garden-diet -o garden.html

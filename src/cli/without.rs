@@ -1,4 +1,4 @@
-//! In place of the commands that need a feature which this program was built without: their refusals.
+//! Replaces commands whose cargo feature this program was built without: they only print an error.
 
 use std::ffi::OsString;
 
@@ -7,7 +7,7 @@ use clap::Args;
 use super::console::Console;
 use densify_run::failure::Failure;
 
-/// Why `what` cannot be done.
+/// The error for an option or command that needs a missing feature.
 pub(super) fn without(feature: &str, what: &str) -> String {
     format!(
         "{what}: this program was built without the feature `{feature}` of the crate densify; add it to the \
@@ -15,7 +15,7 @@ pub(super) fn without(feature: &str, what: &str) -> String {
     )
 }
 
-/// Not in this program, which was built without the feature that it needs.
+/// Not available: this program was built without the feature that it needs.
 #[derive(Debug, Args)]
 pub(super) struct Absent {
     /// Whatever is given
@@ -23,7 +23,7 @@ pub(super) struct Absent {
     words: Vec<OsString>,
 }
 
-/// Defines what `cli` calls of a module whose commands need a feature.
+/// Defines the items of a command's module that the parent module uses.
 macro_rules! absent {
     ($module:ident, $feature:literal, $($run:ident($args:ident $(, $more:ty)*) $command:literal),*) => {
         #[cfg(not(feature = $feature))]

@@ -1,4 +1,4 @@
-//! In place of the page of a run in training, in a program that was built without the feature `view`: its refusal.
+//! Replaces the live page of a run in a program built without the feature `view`: refuses `--view`.
 
 use super::Follower;
 use crate::console::Console;
@@ -6,10 +6,10 @@ use crate::without::without;
 use densify_run::failure::Failure;
 use densify_run::{Companion, Occupied, Run};
 
-/// Never used: [`open`] fails before.
+/// Never used, because [`open`] fails first.
 pub(super) const COMPANION: Companion = Companion { reserve: |_, _| {}, points: 0 };
 
-/// Never made.
+/// Never constructed.
 pub(super) enum Page {}
 
 pub(super) fn open(_: u16) -> Result<Page, Failure> {
