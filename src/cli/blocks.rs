@@ -1,4 +1,4 @@
-//! `densify blocks`: a large scene in blocks, each of which is a run.
+//! `densify blocks`: trains a large scene as blocks, each a run of its own.
 
 use std::fmt::Write as _;
 use std::path::PathBuf;
@@ -6,8 +6,8 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand};
 
 use super::console::Console;
-use super::export::{check_output, format_of};
-use super::flags::words;
+use super::export::{check_output, format_from_extension};
+use super::flags::parse_words;
 use super::threads;
 use super::train::Follower;
 use densify_blocks as blocks;
@@ -15,7 +15,6 @@ use densify_blocks::{
     Block, BlockPlan, Grid, PlanOptions, Size, Task, TaskState, merge, plan, status, submit,
 };
 use densify_core::memory::Bytes;
-use densify_core::numbers;
 use densify_core::numbers::grouped;
 use densify_launch::{Engine, SubmissionArgs};
 use densify_run::failure::Failure;
@@ -23,9 +22,9 @@ use densify_run::{ByteCount, Fraction, Rows, Threads, Whole};
 
 /// Trains a large scene in blocks, on one machine or on a cluster, and merges them.
 ///
-/// The ground is divided into cells of equal work. A coarse run covers the whole scene; each block then starts from its
-/// part of the coarse model, with its surroundings frozen, and trains its share of the Gaussians. The
-/// merged model never exceeds the requested size, and the memory of every task is known before it starts.
+/// The ground is divided into cells of equal work. A coarse run sees the whole scene; each block then starts from its
+/// part of the coarse model, with everything else in its views frozen around it, and trains its share of the Gaussians.
+/// The merged model never has more than was asked for, and the memory of every task is known before it starts.
 #[derive(Debug, Args)]
 pub(super) struct BlocksArgs {
     #[command(subcommand)]
@@ -73,8 +72,8 @@ struct PlanArgs {
     /// Width of the margin around its cell that a block also trains, as a share of the usual width of a cell
     #[arg(long, value_name = "FRACTION", default_value = "0.1")]
     margin: Fraction,
-    /// Options of `densify train` for every run, after `--`. --iterations is that of one run over the whole scene;
-    /// each block trains a share of it, in proportion to its views
+    /// Options of `densify train` for every run, after `--`; --iterations is for one run over the whole scene, and each
+    /// block trains a share of them in proportion to its share of the views
     #[arg(last = true, value_name = "TRAIN OPTIONS")]
     train: Vec<String>,
 }
@@ -92,7 +91,7 @@ struct SubmitArgs {
     /// Folder of the plan
     #[arg(value_name = "DIR")]
     folder: PathBuf,
-    /// Scheduler that runs the tasks
+    /// Engine that starts them
     #[arg(long, value_name = "ENGINE", default_value = "local")]
     engine: Engine,
     #[command(flatten)]
@@ -121,7 +120,7 @@ struct StatusArgs {
     folder: PathBuf,
 }
 
-/// Merges the blocks into one model, which takes from each block the Gaussians inside its cell.
+/// Merges the blocks into one model, with the Gaussians of each block that lie in its cell.
 #[derive(Debug, Args)]
 struct MergeArgs {
     /// Folder of the plan
@@ -162,17 +161,17 @@ fn run_plan(args: &PlanArgs, console: &Console) -> Result<(), Failure> {
         grid: args.blocks,
         coarse_rows: args.coarse_rows.map(|rows| rows.0),
         margin: args.margin.0,
-        given: words(&args.train, "densify blocks plan ... --")?,
+        given: parse_words(&args.train, "densify blocks plan ... --")?,
     };
     threads::limit(options.given.clone().describe().ok().and_then(|spec| spec.device.threads));
     let blocks = plan(&options, console)?;
-    console.result(table(&blocks));
+    console.result(format_table(&blocks));
     console.result(format_args!("everything in {}", args.output.display()));
     Ok(())
 }
 
-/// Table of the tasks, with size, iterations and memory.
-fn table(blocks: &BlockPlan) -> String {
+/// One row per task: its size, its share of the work, and its memory.
+fn format_table(blocks: &Blocks) -> String {
     let mut text = String::new();
     let mut row = |cells: [String; 7]| {
         let [task, rows, trained, views, iterations, work, memory] = cells;
@@ -232,25 +231,25 @@ fn run_task(args: &RunArgs, console: &Console) -> Result<(), Failure> {
 }
 
 fn run_status(args: &StatusArgs, console: &Console) -> Result<(), Failure> {
-    let blocks = BlockPlan::read(&args.folder)?;
-    let mut counts = [0; 2];
+    let blocks = Blocks::read(&args.folder)?;
+    let (mut complete, mut left) = (0, 0);
     for (task, state) in status(&args.folder, &blocks) {
-        counts[usize::from(state == TaskState::Complete)] += 1;
-        let of = blocks.iterations(task);
+        *(if state == State::Complete { &mut complete } else { &mut left }) += 1;
+        let last = blocks.iterations(task);
         let state = match state {
-            TaskState::Waiting => "waiting".to_owned(),
-            TaskState::Running(step) => format!("running, saved {step} of {of} steps"),
-            TaskState::Stopped(step) => format!("stopped, saved {step} of {of} steps"),
-            TaskState::Complete => "complete".to_owned(),
+            State::Waiting => "waiting".to_owned(),
+            State::Running(step) => format!("running, saved {step} of {last} steps"),
+            State::Stopped(step) => format!("stopped, saved {step} of {last} steps"),
+            State::Complete => "complete".to_owned(),
         };
         console.result(format_args!("{:<14} {state}", blocks.name(task)));
     }
-    console.result(format_args!("{} complete, {} to go", counts[1], counts[0]));
+    console.result(format_args!("{complete} complete, {left} to go"));
     Ok(())
 }
 
 fn run_merge(args: &MergeArgs, console: &Console) -> Result<(), Failure> {
-    let format = format_of(&args.output)?;
+    let format = format_from_extension(&args.output)?;
     check_output(&args.output, args.overwrite)?;
     let blocks = BlockPlan::read(&args.folder)?;
     let merged = merge(&args.folder, &blocks, &args.output, format, args.partial, console)?;
@@ -261,7 +260,7 @@ fn run_merge(args: &MergeArgs, console: &Console) -> Result<(), Failure> {
         "{} ({}): {} Gaussians, {}",
         args.output.display(),
         format.name,
-        numbers::grouped(merged.rows),
+        grouped(merged.rows),
         Bytes(merged.bytes)
     ));
     Ok(())

@@ -1,18 +1,16 @@
 //! `densify compress`: a smaller model or file, at the least loss.
 
 use std::path::PathBuf;
-use std::str::FromStr;
 
 use clap::{ArgMatches, Args};
 
 use super::console::Console;
-use super::export::{check_output, format_of};
-use super::render::{RenderingArgs, refuse_options_of_a_file};
+use super::export::{check_output, format_from_extension};
+use super::render::{RenderingArgs, refuse_scene_options};
 use super::threads;
 use super::train::Follower;
 use densify_compress::{Attempt, Compressed, Options, Target, compress, file};
-use densify_core::numbers;
-use densify_core::numbers::{grouped, percent};
+use densify_core::numbers::{self, grouped, percent};
 use densify_data::models::{Format, compress_formats, find};
 use densify_run::failure::Failure;
 use densify_run::finished::{is_model, model_file};
@@ -20,11 +18,11 @@ use densify_run::{RunConfig, Whole};
 
 /// Reduces a trained model to a number of Gaussians, or to a file size.
 ///
-/// Prunes the Gaussians that contribute least to the training views, at most half of them at a time, and trains the
-/// rest in between. For a file, it also tries lower degrees of colour and, where the format has it, coarser colour,
-/// which leave room for more Gaussians, and keeps the file that reproduces the training views best. Held-out views
-/// are measured too, but decide nothing. The printed table is the curve of size against quality: the whole model, the
-/// model after each pruning, and each attempt at the requested size.
+/// Prunes the Gaussians that contribute least to the training views, at most half of them at once, and trains the others
+/// on in between. For a file it tries the model's SH degree and lower ones, and coarser colour where the format has
+/// it, which leave room for more Gaussians, and keeps the attempt whose file reproduces the training views best. Held-out
+/// views are measured too, but decide nothing. The table that it prints is the curve of size against quality: the whole
+/// model, the file after each pruning on the way, and the attempts at the final size.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct CompressArgs {
@@ -32,9 +30,9 @@ pub(super) struct CompressArgs {
     #[arg(value_name = "RUN_OR_MODEL")]
     model: PathBuf,
     /// Most bytes of the file, such as 5MiB or 800kB, or a number of Gaussians, such as 20k
-    #[arg(long, value_name = "SIZE|ROWS")]
-    to: Size,
-    /// File to write; its extension selects the format, as for `densify export`
+    #[arg(long, value_name = "SIZE|ROWS", value_parser = parse_target)]
+    to: Target,
+    /// File to write; its extension says in which format, as for `densify export`
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     /// Format of the file, or any: the one that holds most Gaussians, whose extension is added to FILE
@@ -69,28 +67,19 @@ Examples:
   densify compress output/garden-diet --to 20k -o small.ply
   densify compress others.ply --scene data/garden --to 800kB -o garden.spz";
 
-/// Name for the format that holds the most Gaussians.
+/// Stands for the format that holds the most Gaussians.
 const ANY: &str = "any";
 
-/// Value of `--to`.
-#[derive(Debug, Clone, Copy)]
-struct Size(Target);
-
-impl FromStr for Size {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        let is_bytes = text.trim_end().ends_with(['b', 'B']);
-        let target = if is_bytes {
-            numbers::bytes(text).map(Target::Bytes)
-        } else {
-            numbers::rows(text).map(Target::Rows)
-        };
-        let wrong = |error| {
-            format!("{error}; give a size such as 5MiB, or a number of Gaussians such as 20k")
-        };
-        target.map(Self).map_err(wrong)
-    }
+/// Parses the value of `--to`.
+fn parse_target(text: &str) -> Result<Target, String> {
+    let target = if text.trim_end().ends_with(['b', 'B']) {
+        numbers::bytes(text).map(Target::Bytes)
+    } else {
+        numbers::rows(text).map(Target::Rows)
+    };
+    target.map_err(|error| {
+        format!("{error}; give a size such as 5MiB, or a number of Gaussians such as 20k")
+    })
 }
 
 pub(super) fn run(
@@ -98,7 +87,7 @@ pub(super) fn run(
     matches: &ArgMatches,
     console: &Console,
 ) -> Result<(), Failure> {
-    let formats = formats(args)?;
+    let formats = candidate_formats(args)?;
     for format in &formats {
         check_output(&file(&args.output, &formats, format), args.overwrite)?;
     }
@@ -113,7 +102,7 @@ pub(super) fn run(
         };
         (scene, data.clone(), *near, None)
     } else {
-        refuse_options_of_a_file(matches)?;
+        refuse_scene_options(matches)?;
         let config = RunConfig::read(&args.model)?;
         let scene = args.scene.clone().unwrap_or_else(|| config.scene_path());
         let model = config.spec.schedule.exposure_model;
@@ -127,7 +116,7 @@ pub(super) fn run(
         exposure,
         near,
         device: device.clone(),
-        to: args.to.0,
+        to: args.to,
         iterations: args.iterations.0,
         seed: args.seed,
         formats: &formats,
@@ -137,48 +126,46 @@ pub(super) fn run(
     follower.listen();
     threads::limit(device.threads);
     let compressed = compress(&options, &follower)?;
-    console.result(table(&compressed));
+    console.result(format_table(&compressed));
     let format = compressed.attempts[compressed.best].format;
     console.result(format_args!("{} ({format})", compressed.file.display()));
     Ok(())
 }
 
 /// The formats to choose from.
-fn formats(args: &CompressArgs) -> Result<Vec<&'static Format>, Failure> {
+fn candidate_formats(args: &CompressArgs) -> Result<Vec<&'static Format>, Failure> {
     match args.format.as_deref() {
         Some(ANY) => Ok(compress_formats()),
         Some(name) => {
             let wrong = |error| Failure::input(format!("--format: {error}, {ANY}"));
             Ok(vec![find(name).map_err(wrong)?])
         }
-        None => Ok(vec![format_of(&args.output)?]),
+        None => Ok(vec![format_from_extension(&args.output)?]),
     }
 }
 
-/// The curve of size against quality: the whole model, each intermediate size, and the attempts at the final size.
-fn table(compressed: &Compressed) -> String {
-    let Compressed { whole, stages, attempts, best, .. } = compressed;
+/// The curve of size against quality: the whole model, each pruning on the way, and the attempts at the final size.
+fn format_table(compressed: &Compressed) -> String {
+    let Compressed { whole, way, attempts, best, .. } = compressed;
     let mut text = format!(
         "\n{:<10} {:>10} {:>7} {:>14} {:>13} {:>11} {:>11}",
         "", "Gaussians", "degree", "format", "bytes", "train [dB]", "test [dB]"
     );
-    let mut line = |name: &str, attempt: &Attempt, of_whole: &str| {
-        let test = attempt.test_psnr.map_or_else(|| "–".to_owned(), |test| format!("{test:.2}"));
-        let bytes = grouped(usize::try_from(attempt.bytes).unwrap_or(usize::MAX));
+    let mut line = |name: &str, attempt: &Attempt, share: &str| {
+        let Attempt { rows, sh_degree, format, bytes, train, test } = attempt;
+        let test = test.map_or_else(|| "–".to_owned(), |test| format!("{test:.2}"));
+        let bytes = grouped(usize::try_from(*bytes).unwrap_or(usize::MAX));
+        let rows = grouped(*rows);
         text += &format!(
-            "\n{name:<10} {:>10} {:>7} {:>14} {bytes:>13} {:>11.2} {test:>11}{of_whole}",
-            grouped(attempt.rows),
-            attempt.sh_degree,
-            attempt.format,
-            attempt.train_psnr
+            "\n{name:<10} {rows:>10} {sh_degree:>7} {format:>14} {bytes:>13} {train:>11.2} {test:>11}{share}"
         );
     };
     line("whole PLY", whole, "");
-    let others = attempts
-        .iter()
-        .enumerate()
-        .map(|(place, attempt)| (if place == *best { "written" } else { "tried" }, attempt));
-    for (name, attempt) in stages.iter().map(|attempt| ("on the way", attempt)).chain(others) {
+    let others = attempts.iter().enumerate().map(|(place, attempt)| {
+        let name = if place == *best { "written" } else { "tried" };
+        (name, attempt)
+    });
+    for (name, attempt) in way.iter().map(|attempt| ("on the way", attempt)).chain(others) {
         let share = percent(attempt.bytes as f64 / whole.bytes as f64);
         line(name, attempt, &format!("  {share} of the PLY"));
     }
@@ -190,13 +177,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn sizes_are_bytes_and_numbers_are_gaussians() {
-        let of = |text: &str| text.parse::<Size>().map(|size| size.0);
-        assert_eq!(of("5MiB"), Ok(Target::Bytes(5 << 20)));
-        assert_eq!(of("800kB"), Ok(Target::Bytes(800_000)));
-        assert_eq!(of("20k"), Ok(Target::Rows(20_000)));
+    fn target_is_bytes_with_a_unit_and_gaussians_without() {
+        assert_eq!(parse_target("5MiB"), Ok(Target::Bytes(5 << 20)));
+        assert_eq!(parse_target("800kB"), Ok(Target::Bytes(800_000)));
+        assert_eq!(parse_target("20k"), Ok(Target::Rows(20_000)));
         for wrong in ["", "much", "-3", "0"] {
-            assert!(of(wrong).is_err_and(|error| error.contains("20k")), "{wrong}");
+            assert!(parse_target(wrong).is_err_and(|error| error.contains("20k")), "{wrong}");
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Standard output and standard error, side by side with a progress bar.
+//! Standard output and standard error, with a progress bar below them.
 
 use std::cell::RefCell;
 use std::fmt;
@@ -14,36 +14,38 @@ use densify_core::spelling::Spelling;
 use densify_run::Observer;
 use densify_run::failure::{Failure, OTHER};
 
-/// Default of `RUST_LOG`: the log of densify and its policies.
+/// Default filter of the log; `RUST_LOG` overrides it.
 const LOG_FILTER: &str = "warn,densify=info,densify_policies=info";
 
-/// Where a command writes.
+/// The output of a command.
 #[derive(Debug)]
 pub(super) struct Console {
-    quiet: bool,
-    bars: MultiProgress,
-    /// The first failure to write to standard output.
+    /// Only results and errors are shown.
+    pub(super) quiet: bool,
+    /// The progress bars; lines are printed above them.
+    pub(super) bars: MultiProgress,
+    /// The first error in writing to standard output.
     broken: RefCell<Option<io::Error>>,
 }
 
 impl Console {
-    /// A console for this process; sets up the log. A quiet one shows only results and errors.
+    /// A console for this process; also sets up the log.
     pub(super) fn new(quiet: bool) -> Self {
         let bars = MultiProgress::new();
         let wanted = std::env::var("RUST_LOG").ok().filter(|_| !quiet);
-        let (wanted, mistake) = match wanted.map(|text| text.parse::<Targets>()) {
+        let (filter, mistake) = match wanted.map(|text| text.parse::<Targets>()) {
             Some(Err(mistake)) => (None, Some(mistake)),
             parsed => (parsed.and_then(Result::ok), None),
         };
-        let usual = if quiet { "error" } else { LOG_FILTER };
-        let filter = wanted.or_else(|| usual.parse().ok()).unwrap_or_default();
-        let above = bars.clone();
+        let default = if quiet { "error" } else { LOG_FILTER };
+        let filter = filter.or_else(|| default.parse().ok()).unwrap_or_default();
+        let log_bars = bars.clone();
         let lines = tracing_subscriber::fmt::layer()
-            .with_writer(move || LogLine(above.clone()))
+            .with_writer(move || LogLine(log_bars.clone()))
             .with_ansi(io::stderr().is_terminal() && std::env::var_os("NO_COLOR").is_none())
             .with_target(false)
             .without_time();
-        // An outside program may have set up a log of its own; it stays.
+        // Keeps the log of a host program that has set one up.
         let _ = tracing_subscriber::registry().with(lines).with(filter).try_init();
         if let Some(mistake) = mistake {
             tracing::warn!("RUST_LOG is not used: {mistake}; write a level, or TARGET=LEVEL,…");
@@ -51,31 +53,21 @@ impl Console {
         Self { quiet, bars, broken: RefCell::new(None) }
     }
 
-    /// True if only results and errors are shown.
-    pub(super) fn is_quiet(&self) -> bool {
-        self.quiet
-    }
-
-    /// The progress bars, above which lines are printed.
-    pub(super) fn bars(&self) -> &MultiProgress {
-        &self.bars
-    }
-
-    /// A line of information on standard output; nothing when quiet.
+    /// Prints a line of information on standard output; nothing when quiet.
     pub(super) fn say(&self, line: impl fmt::Display) {
         if !self.quiet {
             self.result(line);
         }
     }
 
-    /// A result on standard output.
+    /// Prints a result on standard output.
     pub(super) fn result(&self, line: impl fmt::Display) {
         let written = self.bars.suspend(|| {
             let mut out = io::stdout().lock();
             writeln!(out, "{}", files::lines(&line.to_string())).and_then(|()| out.flush())
         });
         match written {
-            // A closed pipe is no failure: its reader has seen enough.
+            // A closed pipe is not a failure.
             Err(error) if error.kind() != io::ErrorKind::BrokenPipe => {
                 self.broken.borrow_mut().get_or_insert(error);
             }
@@ -83,24 +75,21 @@ impl Console {
         }
     }
 
-    /// Fails if anything could not be written.
+    /// Fails if a line could not be written.
     pub(super) fn finish(&self) -> Result<(), Failure> {
-        match self.broken.take() {
-            None => Ok(()),
-            Some(error) => {
-                Err(Failure::new(OTHER, format!("cannot write to standard output: {error}")))
-            }
-        }
+        self.broken.take().map_or(Ok(()), |error| {
+            Err(Failure::new(OTHER, format!("cannot write to standard output: {error}")))
+        })
     }
 
-    /// A line of progress on standard error; nothing when quiet.
+    /// Prints a line of progress on standard error; nothing when quiet.
     pub(super) fn progress(&self, line: impl fmt::Display) {
         if !self.quiet {
             let _ = writeln!(io::stderr().lock(), "{line}");
         }
     }
 
-    /// An error message on standard error.
+    /// Prints an error on standard error.
     pub(super) fn error(&self, failure: &Failure) {
         let message = files::lines(&failure.words(Spelling::Terminal));
         self.bars.suspend(|| {

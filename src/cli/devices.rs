@@ -1,4 +1,4 @@
-//! `densify devices`: the GPU adapters and their limits.
+//! `densify devices`: lists the GPU adapters and their limits.
 
 use clap::Args;
 
@@ -20,8 +20,8 @@ use densify_run::failure::Failure;
 pub(super) struct DevicesArgs {}
 
 pub(super) fn run(_: &DevicesArgs, console: &Console) -> Result<(), Failure> {
-    let all = adapters();
-    for adapter in &all {
+    let adapters = adapters();
+    for adapter in &adapters {
         let kind = match adapter.kind {
             AdapterKind::Discrete => "graphics card",
             AdapterKind::Integrated => "integrated GPU",
@@ -33,25 +33,21 @@ pub(super) fn run(_: &DevicesArgs, console: &Console) -> Result<(), Failure> {
         console.result(format_args!("  {kind}; {}, {}", adapter.interface, adapter.driver));
         let largest = adapter.largest_binding.min(adapter.largest_buffer);
         console.result(format_args!("  largest buffer  {}", Bytes(largest)));
-        let budgets = (0..=MAX_SH_DEGREE).map(|degree| {
-            format!("{} at degree {degree}", grouped(adapter.largest_budget(degree) as usize))
-        });
-        let budgets: Vec<_> = budgets.collect();
+        let budgets: Vec<_> = (0..=MAX_SH_DEGREE)
+            .map(|degree| (degree, grouped(adapter.largest_budget(degree) as usize)))
+            .map(|(degree, rows)| format!("{rows} at degree {degree}"))
+            .collect();
         console.result(format_args!("  largest budget  {}", budgets.join(", ")));
-        let own = adapter.accumulation();
-        let others = adapter.accumulations.iter().filter(|way| **way != own);
+        let default = adapter.accumulation();
+        let others = adapter.accumulations.iter().filter(|method| **method != default);
         let others: Vec<_> = others.map(ToString::to_string).collect();
-        let note = if others.is_empty() {
-            String::new()
-        } else {
-            format!("; on request, {}", others.join(", "))
-        };
-        console.result(format_args!("  accumulation    {own}{note}"));
+        let note = if others.is_empty() { "" } else { "; if asked for, " };
+        console.result(format_args!("  accumulation    {default}{note}{}", others.join(", ")));
         for missing in &adapter.missing {
             console.result(format_args!("  cannot be used: {missing}"));
         }
     }
-    if all.is_empty() {
+    if adapters.is_empty() {
         console.result("There is no adapter; the native backend trains on the processor.");
     }
     Ok(())

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use clap::{ArgMatches, Args};
 
 use super::console::Console;
-use super::render::{Named, RenderingArgs};
+use super::render::{ModelArgument, RenderingArgs};
 use densify_core::numbers::{grouped, percent};
 use densify_inspect::{Bound, Limit, LimitError, Limits, measured_values};
 use densify_run::RunConfig;
@@ -23,9 +23,9 @@ use densify_train::output::{write_geometry, write_scores};
 ///
 /// Prints the scores of each view and their mean, and writes those of a run to results.json and
 /// per_view.json in its folder (results_train.json and per_view_train.json for the views trained on). For a
-/// file of Gaussian splats it writes nothing, and measures every 8th photograph if neither the dataset nor
-/// an option selects the views. If the geometry is known (built-in scenes, and those that `densify scenegen`
-/// wrote), it also measures how far the Gaussians are from it: a second table, and geometry.json
+/// file of Gaussian splats nothing is written, and every 8th photograph is measured unless the dataset or an
+/// option says which. Where the geometry is known (built-in scenes, and those that `densify scenegen`
+/// wrote), also measures how well the Gaussians match it: a second table, and geometry.json
 /// (geometry_train.json).
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
@@ -74,7 +74,7 @@ Examples:
 pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> Result<(), Failure> {
     let model = &args.model;
     let limits = Limits { lowest: &args.fail_below, highest: &args.fail_above };
-    // A folder without config.toml is no run.
+    // A folder without config.toml is not a run, whatever else it holds.
     let run = if is_model(model) {
         None
     } else {
@@ -84,11 +84,11 @@ pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> R
     rendering.data.eval |= rendering.data.test_every.is_none();
     let lpips = args.lpips.as_deref().map(Lpips::open).transpose();
     let lpips = lpips.map_err(|e| Failure::input(format!("--lpips: {e}")))?;
-    let named = Named { model, scene: args.scene.as_deref(), iteration: args.iteration };
-    let mut opened = named.open(&rendering, geometry::needs(), matches, console)?;
+    let argument = ModelArgument { model, scene: args.scene.as_deref(), iteration: args.iteration };
+    let mut opened = argument.open(&rendering, geometry::needs(), matches, console)?;
     let views = opened.views(args.split)?;
     let knows_geometry = opened.dataset.surface_bytes.is_some();
-    limits.check_keys(knows_geometry, lpips.is_some()).map_err(in_options)?;
+    limits.check_keys(knows_geometry, lpips.is_some()).map_err(in_option_names)?;
     let background = opened.data.background.fixed();
     let width = opened.dataset.train.iter().chain(&opened.dataset.test);
     let width = width.map(|view| view.name.chars().count()).max().unwrap_or(0).max(6);
@@ -117,16 +117,16 @@ pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> R
     }
     let geometry = opened.geometry(&views, &|| false)?;
     if let Some(measured) = &geometry {
-        console.result(table(measured));
+        console.result(format_table(measured));
         if let Some((_, iteration)) = run {
             write_geometry(model, args.split, iteration, measured)?;
         }
     }
-    limits.check(&measured_values(&mean, geometry.as_ref())).map_err(in_options)
+    limits.check(&measured_values(&mean, geometry.as_ref())).map_err(in_option_names)
 }
 
-/// The error, with the options to change.
-fn in_options(error: LimitError) -> Failure {
+/// The failure, with the names of the options.
+fn in_option_names(error: LimitError) -> Failure {
     let code = match error {
         LimitError::Unknown { .. } => INPUT,
         LimitError::Exceeded(_) => LIMIT,
@@ -138,8 +138,8 @@ fn in_options(error: LimitError) -> Failure {
     Failure::new(code, message)
 }
 
-/// The geometric measurements as lines; lengths as percentages of the diagonal.
-fn table(geometry: &Geometry) -> String {
+/// The geometric measurements, one per line; lengths as percentages of the diagonal.
+fn format_table(geometry: &Geometry) -> String {
     let Geometry { depth, normal_error, centres, floaters, thin, redundancy } = geometry;
     let plain = |value: f64, unit: &str| {
         if value.is_finite() { format!("{value:.2}{unit}") } else { "–".into() }

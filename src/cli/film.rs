@@ -1,7 +1,6 @@
 //! `densify render --path`: the options of a camera path and its film.
 
 use std::path::{Path, PathBuf};
-use std::str::FromStr;
 
 use clap::Args;
 
@@ -26,10 +25,10 @@ pub(super) struct FilmArgs {
     /// Number of frames `[default: 120; for a file, its seconds times its fps, or one per camera]`
     #[arg(long, value_name = "N", requires = "path", value_parser = clap::value_parser!(u32).range(1..=i64::from(MOST_FRAMES)))]
     frames: Option<u32>,
-    /// Width and height of the frames, such as 640x480 `[default: those of the file, or of the first photograph]`
-    #[arg(long, value_name = "WxH", requires = "path")]
-    size: Option<Size>,
-    /// Frames per second of the film `[default: those of the file, or 30]`
+    /// Width and height of the frames, such as 640x480 `[default: those of the file, else of the first photograph]`
+    #[arg(long, value_name = "WxH", requires = "path", value_parser = parse_size)]
+    size: Option<(u32, u32)>,
+    /// Frames per second of the film `[default: those of the file, else 30]`
     #[arg(long, value_name = "N", requires = "video", value_parser = clap::value_parser!(u32).range(1..=1000))]
     fps: Option<u32>,
     /// Also write a film: .mp4 (needs the program ffmpeg) or .webp (lossless, by densify itself)
@@ -37,23 +36,16 @@ pub(super) struct FilmArgs {
     video: Option<PathBuf>,
 }
 
-/// Width and height `[px]`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Size(u32, u32);
-
-impl FromStr for Size {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        let sides = text.split_once('x').map(|(width, height)| [width, height].map(str::parse));
-        match sides {
-            Some([Ok(width), Ok(height)])
-                if [width, height].iter().all(|side| (1..=MAX_SIDE).contains(side)) =>
-            {
-                Ok(Self(width, height))
-            }
-            _ => Err(format!("give WIDTHxHEIGHT, such as 640x480, each from 1 to {MAX_SIDE}")),
+/// Parses width and height `[px]`.
+fn parse_size(text: &str) -> Result<(u32, u32), String> {
+    let sides = text.split_once('x').map(|(width, height)| [width, height].map(str::parse));
+    match sides {
+        Some([Ok(width), Ok(height)])
+            if [width, height].iter().all(|side| (1..=MAX_SIDE).contains(side)) =>
+        {
+            Ok((width, height))
         }
+        _ => Err(format!("give WIDTHxHEIGHT, such as 640x480, each from 1 to {MAX_SIDE}")),
     }
 }
 
@@ -68,11 +60,11 @@ pub(super) fn run(
 ) -> Result<(), Failure> {
     let options = FilmOptions {
         frames: args.frames,
-        size: args.size.map(|Size(width, height)| (width, height)),
+        size: args.size,
         fps: args.fps,
         video: args.video.as_deref(),
     };
-    let film = Film::make(route, options, output, channels, source).map_err(in_options)?;
+    let film = Film::make(route, options, output, channels, source).map_err(in_option_names)?;
     console.result(format_args!("{} frames in {}", film.frames, output.display()));
     if let Some(video) = &args.video {
         console.result(format_args!("film in {}", video.display()));
@@ -80,8 +72,8 @@ pub(super) fn run(
     Ok(())
 }
 
-/// The error, with the options to change.
-fn in_options(error: FilmError) -> Failure {
+/// The failure, with the names of the options.
+fn in_option_names(error: FilmError) -> Failure {
     match error {
         FilmError::Path(error) => Failure::input(format!("--path: {error}")),
         FilmError::NoSize => {

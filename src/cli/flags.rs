@@ -1,4 +1,4 @@
-//! The options of a run as flags: their defaults in the help, and which of them a call gives.
+//! The options of a run as flags: shows their defaults in the help, and finds which were given.
 
 use std::ffi::OsString;
 
@@ -9,33 +9,32 @@ use toml::{Table, Value};
 use densify_run::failure::Failure;
 use densify_run::{Partial, RunSpec};
 
-/// Gives every option of a run in `command` the default that [`RunSpec`] has for it.
+/// Gives every option of a run in `command` its default in [`RunSpec`].
 pub(super) fn with_defaults(command: Command) -> Command {
     let defaults = RunSpec::default().table().unwrap_or_default();
     command.mut_args(|arg| {
         let default = defaults.get(arg.get_id().as_str());
         match default.filter(|_| arg.get_default_values().is_empty()) {
             None | Some(Value::Array(_) | Value::Table(_)) => arg,
-            Some(Value::Boolean(_)) => shown(arg, "false").hide_default_value(true),
-            Some(Value::String(text)) => shown(arg, text),
-            Some(other) => shown(arg, &other.to_string()),
+            Some(Value::Boolean(_)) => with_default(arg, "false").hide_default_value(true),
+            Some(Value::String(text)) => with_default(arg, text),
+            Some(other) => with_default(arg, &other.to_string()),
         }
     })
 }
 
-fn shown(arg: Arg, default: &str) -> Arg {
+fn with_default(arg: Arg, default: &str) -> Arg {
     arg.required(false).default_value(default.to_owned())
 }
 
-/// The options of a run that a call gives: those that clap found on the command line.
+/// The options of a run that were given on the command line.
 pub(super) fn given(matches: &ArgMatches, spec: &RunSpec) -> Result<Partial, Failure> {
     Partial::given(spec, |name| matches.value_source(name) == Some(ValueSource::CommandLine))
 }
 
-/// The options of a run in words like those after `densify train`, but for the scene; `of` is the command that has
-/// them.
-pub(super) fn words(words: &[String], of: &'static str) -> Result<Partial, Failure> {
-    let command = Command::new(of).no_binary_name(true).disable_help_flag(true);
+/// Parses the options of `densify train` that follow another `command`; the scene is not among them.
+pub(super) fn parse_words(words: &[String], command: &'static str) -> Result<Partial, Failure> {
+    let command = Command::new(command).no_binary_name(true).disable_help_flag(true);
     let command = with_defaults(RunSpec::augment_args(command));
     let usage =
         |error: clap::Error| Failure::input(error.to_string().trim().trim_start_matches("error: "));
@@ -45,7 +44,7 @@ pub(super) fn words(words: &[String], of: &'static str) -> Result<Partial, Failu
     given(&matches, &spec)
 }
 
-/// Fails where `--policy-set` among these flags names another policy than that of the run.
+/// Fails if `--policy-set` names a policy other than that of the run.
 pub(super) fn check_policy(flags: &Partial, spec: &RunSpec) -> Result<(), Failure> {
     let policy = &spec.density.policy;
     let set = flags.get("policy_set").and_then(Value::as_table);
@@ -58,9 +57,9 @@ pub(super) fn check_policy(flags: &Partial, spec: &RunSpec) -> Result<(), Failur
     }
 }
 
-/// The table of docs/options.md: every option of a run, as the help has it.
+/// The text of docs/options.md: every option of a run with its help.
 #[cfg(test)]
-pub(super) fn markdown() -> String {
+fn options_markdown() -> String {
     use std::fmt::Write as _;
 
     use densify_run::{OPTIONS, OnResume};
@@ -76,9 +75,9 @@ pub(super) fn markdown() -> String {
         let Some(arg) = command.get_arguments().find(|arg| arg.get_id() == option.name) else {
             continue;
         };
-        let own = arg.get_help_heading().unwrap_or_default();
-        if own != heading {
-            heading = own;
+        let next = arg.get_help_heading().unwrap_or_default();
+        if next != heading {
+            heading = next;
             let _ = write!(
                 text,
                 "\n## {heading}\n\n| option | default | what it is | with --resume |\n|---|---|---|---|\n"
@@ -113,9 +112,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_what_is_given_is_given() {
-        let given = ["--near", "0.04", "--eval", "--knob", "alpha_min=1/64", "--lr=opacity=0.05"];
-        let found = words(&given.map(str::to_owned), "train").unwrap();
+    fn only_given_options_are_parsed() {
+        let options = ["--near", "0.04", "--eval", "--knob", "alpha_min=1/64", "--lr=opacity=0.05"];
+        let found = parse_words(&options.map(str::to_owned), "train").unwrap();
         let names: Vec<&str> = found.iter().map(|(name, _)| name).collect();
         assert_eq!(names, ["eval", "knob", "lr", "near"]);
         let spec = found.describe().unwrap();
@@ -126,11 +125,11 @@ mod tests {
     fn the_options_table_is_current() {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/options.md");
         if std::env::var_os("DENSIFY_WRITE_DOCS").is_some() {
-            std::fs::write(&path, markdown()).unwrap();
+            std::fs::write(&path, options_markdown()).unwrap();
         }
-        let there = std::fs::read_to_string(&path).unwrap_or_default();
+        let current = std::fs::read_to_string(&path).unwrap_or_default();
         assert!(
-            there == markdown(),
+            current == options_markdown(),
             "docs/options.md is out of date: DENSIFY_WRITE_DOCS=1 cargo t options_table"
         );
     }

@@ -1,4 +1,4 @@
-//! `densify knobs`: the settings that trade accuracy for speed or memory.
+//! `densify knobs`: lists the settings that trade speed or memory for accuracy.
 
 use clap::Args;
 
@@ -14,15 +14,12 @@ use densify_run::knobs::{Class, KNOBS, Knob, Measured, PRESETS};
 pub(super) struct KnobsArgs {}
 
 pub(super) fn run(_: &KnobsArgs, console: &Console) -> Result<(), Failure> {
-    for class in [Class::Exact, Class::Bounded] {
-        let promise = match class {
-            Class::Exact => "the same bits",
-            Class::Bounded => "a numerical error",
-        };
+    for (class, promise) in [(Class::Exact, "the same bits"), (Class::Bounded, "a numerical error")]
+    {
         console.result(format_args!("{class}: {promise}"));
         for knob in KNOBS.iter().filter(|knob| knob.class == class) {
             console.result(format_args!("  {:<18}  {}", knob.name, knob.effect));
-            console.result(format_args!("  {:<18}  {}", "", facts(knob)));
+            console.result(format_args!("  {:<18}  {}", "", describe_values(knob)));
         }
     }
     console.result("presets: --preset NAME, knobs that go together");
@@ -35,8 +32,8 @@ pub(super) fn run(_: &KnobsArgs, console: &Console) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Default, domain and backends of a knob.
-fn facts(knob: &Knob) -> String {
+/// The default, the valid values, and the backend if only one has the knob.
+fn describe_values(knob: &Knob) -> String {
     let unit = if knob.unit.is_empty() { String::new() } else { format!(" {}", knob.unit) };
     let on =
         knob.only_on.map_or_else(String::new, |only| format!("; {} backend only", only.name()));

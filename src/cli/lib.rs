@@ -1,11 +1,10 @@
-//! The command line: arguments → validated options → run. The only place that prints.
+//! The command line: arguments → validated options → run. No other crate prints.
 //!
-//! One file per subcommand. Exit codes: 0 for success, 2 for bad input or usage, 3 where device or
-//! memory do not suffice, 4 where `eval` has found a limit exceeded, 130 and 143 for a run that SIGINT or
-//! SIGTERM has ended, 1 for anything else. An error is one message that names file, field or flag and the
-//! remedy.
+//! There is one file per subcommand. Exit codes: 0 success; 2 bad input or usage; 3 the device or the memory is
+//! insufficient; 4 `eval` found a limit exceeded; 130 and 143 SIGINT or SIGTERM ended the run; 1 anything else. An
+//! error is one message that names the file, field or flag and the remedy.
 //!
-//! A program that adds policies of its own is two lines; there this package is called `densify::cli`:
+//! A program with its own policies takes two lines:
 //!
 //! ```no_run
 //! // use my_policies as _;   // linked, therefore registered
@@ -129,12 +128,13 @@ enum Command {
     View(Box<view::ViewArgs>),
 }
 
-/// Runs the command line of this process. For `main` functions, here and in other crates.
+/// Runs the command line of this process, for the `main` function of any program.
+#[must_use]
 pub fn run() -> ExitCode {
     ExitCode::from(run_with(std::env::args_os()))
 }
 
-/// Runs a command line, the program's name first; returns the exit code.
+/// Runs a command line that begins with the program's name; returns the exit code.
 fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) -> u8 {
     let parsed = command().try_get_matches_from(arguments).and_then(|matches| {
         let arguments = Arguments::from_arg_matches(&matches)?;
@@ -143,14 +143,14 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
     let (matches, arguments) = match parsed {
         Ok(parsed) => parsed,
         Err(help_or_error) => {
-            // A closed pipe is no failure.
+            // A closed pipe is not a failure.
             let _ = help_or_error.print();
             return u8::try_from(help_or_error.exit_code()).unwrap_or(failure::INPUT);
         }
     };
     let quiet = match &arguments.command {
         Command::Train(train) | Command::Plan(train) => train.quiet,
-        // Its runs are internal, and it names the device itself.
+        // The runs of the selftest are not the user's, and it prints the device itself.
         Command::Selftest(_) => true,
         _ => false,
     };
@@ -184,7 +184,7 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
     }
 }
 
-/// The command line, with the defaults of a run's options in the commands that have them.
+/// The parser, with the defaults of a run's options filled in for every command that takes such options.
 fn command() -> clap::Command {
     const WITH_RUN_OPTIONS: [&str; 9] =
         ["train", "plan", "compress", "eval", "export", "render", "report", "selftest", "view"];
@@ -198,12 +198,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_arguments_are_consistent() {
+    fn arguments_are_consistent() {
         command().debug_assert();
     }
 
     #[test]
-    fn every_option_is_explained() {
+    fn every_option_has_help() {
         for command in command().get_subcommands() {
             for argument in command.get_arguments() {
                 let (id, name) = (argument.get_id(), command.get_name());

@@ -1,4 +1,4 @@
-//! `densify plan`: the memory of a run, without running it.
+//! `densify plan`: the memory that a run would need, without training.
 
 use clap::ArgMatches;
 
@@ -8,7 +8,7 @@ use super::train::{Follower, TrainArgs};
 use densify_run::failure::Failure;
 use densify_run::plan;
 
-/// Prints the ledger of a run, and the alternatives that fit the same memory. Writes nothing.
+/// Prints the ledger of a run, and the models that would fit the same memory. Writes nothing.
 pub(super) fn run(
     args: &TrainArgs,
     matches: &ArgMatches,

@@ -1,4 +1,4 @@
-//! `densify policies`: the registered policies and their manual pages.
+//! `densify policies`: lists the registered policies and prints their manual pages.
 
 use clap::Args;
 use densify_policies::registry::{find, policies};
@@ -32,9 +32,9 @@ pub(super) fn run(args: &PoliciesArgs, console: &Console) -> Result<(), Failure>
         }
         return Ok(());
     }
-    let all = policies()?;
-    let width = all.iter().map(|entry| entry.name.len()).max().unwrap_or(0);
-    for entry in all {
+    let entries = policies()?;
+    let width = entries.iter().map(|entry| entry.name.len()).max().unwrap_or(0);
+    for entry in entries {
         console.result(format_args!("{:width$}  {}", entry.name, entry.summary));
         console.result(format_args!("{:width$}  {} ({})", "", entry.source, entry.location()));
     }

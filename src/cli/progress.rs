@@ -1,4 +1,4 @@
-//! Progress of training: a bar on a terminal, otherwise a line now and then.
+//! Progress of training: a bar on a terminal, occasional lines elsewhere.
 
 use std::fmt;
 use std::io::{IsTerminal, stderr};
@@ -9,18 +9,18 @@ use indicatif::{ProgressBar, ProgressState, ProgressStyle};
 use super::console::Console;
 use densify_core::numbers::{duration, grouped};
 
-/// Time between two lines where there is no terminal.
-const LINE: Duration = Duration::from_secs(30);
-/// Time between two redraws of the bar's text.
-const REDRAW: Duration = Duration::from_millis(100);
-/// Weight of the newest step in the loss shown: views differ, so single steps jump.
-const NEWEST: f32 = 0.05;
+/// Interval between lines without a terminal.
+const LINE_INTERVAL: Duration = Duration::from_secs(30);
+/// Interval between redraws of the bar.
+const REDRAW_INTERVAL: Duration = Duration::from_millis(100);
+/// Weight of the newest step in the displayed loss, which is smoothed because views differ.
+const LOSS_SMOOTHING: f32 = 0.05;
 
 /// Progress of a run.
 pub(super) struct Progress<'a> {
     console: &'a Console,
     bar: Option<ProgressBar>,
-    /// Steps done by earlier processes.
+    /// Steps done before this process resumed the run.
     done: u32,
     iterations: u32,
     budget: usize,
@@ -32,17 +32,17 @@ pub(super) struct Progress<'a> {
 impl<'a> Progress<'a> {
     /// Progress from `done` steps towards `iterations`; silent on a quiet console.
     pub(super) fn new(console: &'a Console, done: u32, iterations: u32, budget: usize) -> Self {
-        let bar = (!console.is_quiet() && stderr().is_terminal()).then(|| {
+        let bar = (!console.quiet && stderr().is_terminal()).then(|| {
             let style = ProgressStyle::with_template(
                 "{bar:24.cyan/dim} {pos}/{len}  {speed}  {msg}  {eta} left",
             )
             .unwrap_or_else(|_| ProgressStyle::default_bar())
             .with_key("speed", |state: &ProgressState, out: &mut dyn fmt::Write| {
-                // The bar's own buffer; writing to it does not fail.
+                // Writing to the bar's own buffer does not fail.
                 let _ = write!(out, "{:.1} it/s", state.per_sec());
             });
             let bar = ProgressBar::new(u64::from(iterations)).with_style(style);
-            let bar = console.bars().add(bar.with_position(u64::from(done)));
+            let bar = console.bars.add(bar.with_position(u64::from(done)));
             bar.reset_eta();
             bar
         });
@@ -50,19 +50,19 @@ impl<'a> Progress<'a> {
         Self { console, bar, done, iterations, budget, started: now, drawn: now, loss: None }
     }
 
-    /// Counts a step.
+    /// Reports a step that is done.
     pub(super) fn step(&mut self, step: u32, loss: f32, rows: usize) {
-        let smooth = self.loss.map_or(loss, |before| before + NEWEST * (loss - before));
+        let smooth = self.loss.map_or(loss, |before| before + LOSS_SMOOTHING * (loss - before));
         self.loss = Some(smooth);
         let text =
             || format!("loss {smooth:.4}  rows {} of {}", grouped(rows), grouped(self.budget));
         if let Some(bar) = &self.bar {
-            if self.drawn.elapsed() >= REDRAW || step == self.iterations {
+            if self.drawn.elapsed() >= REDRAW_INTERVAL || step == self.iterations {
                 bar.set_message(text());
                 bar.set_position(u64::from(step));
                 self.drawn = Instant::now();
             }
-        } else if self.drawn.elapsed() >= LINE || step == self.iterations {
+        } else if self.drawn.elapsed() >= LINE_INTERVAL || step == self.iterations {
             self.drawn = Instant::now();
             let elapsed = self.started.elapsed().as_secs_f64().max(1e-9);
             let speed = f64::from(step - self.done) / elapsed;

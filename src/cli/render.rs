@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use clap::parser::ValueSource;
 use clap::{ArgMatches, Args};
 use densify_policies::policy::Needs;
 
@@ -17,12 +18,12 @@ use densify_train::evaluate::Split;
 
 /// Renders a trained scene to PNG files.
 ///
-/// Renders the held-out views, or those trained on, of a run or of any file of Gaussian splats
+/// Renders the views held out, or those trained on, of a run or of any file of Gaussian splats
 /// (which needs --scene for the cameras); or with --path a camera path through the scene, and a film of it.
 ///
-/// Depth is Σ α·T·z along each ray, in the dataset's own units: for opaque surfaces, their
+/// Depth is Σ α·T·z along each ray, in the dataset's own units: opaque surfaces show their
 /// distance along the optical axis. It is written in 16 bits, where 65535 stands for the largest
-/// depth of the picture, which depth.json records.
+/// depth of the picture, which is in depth.json.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct RenderArgs {
@@ -57,7 +58,7 @@ pub(super) struct RenderArgs {
     rendering: RenderingArgs,
 }
 
-/// Options for rendering a model, and the dataset of a model without one.
+/// The device to render on, and the dataset options for a file, which has none of its own.
 #[derive(Debug, Clone, Args)]
 pub(super) struct RenderingArgs {
     /// Nearest distance to a camera at which Gaussians of a file are drawn, as a fraction of the
@@ -90,18 +91,21 @@ pub(super) fn run(
             "--side-by-side: a camera path has no photographs; leave it out",
         ));
     }
-    let named =
-        Named { model: &args.model, scene: args.scene.as_deref(), iteration: args.iteration };
+    let argument = ModelArgument {
+        model: &args.model,
+        scene: args.scene.as_deref(),
+        iteration: args.iteration,
+    };
     let path = args.film.path.as_ref();
-    // A camera path in a file brings its cameras with it.
+    // A camera path from a file needs no dataset.
     if let Some(route @ CameraRoute::File(_)) = path
         && args.scene.is_none()
         && is_model(&args.model)
     {
-        let source = named.alone(&args.rendering, console)?;
+        let source = argument.open_without_dataset(&args.rendering, console)?;
         return film::run(&args.film, route, &args.output, channels, source, console);
     }
-    let mut opened = named.open(&args.rendering, Needs::default(), matches, console)?;
+    let mut opened = argument.open(&args.rendering, Needs::default(), matches, console)?;
     if let Some(route) = path {
         return film::run(&args.film, route, &args.output, channels, opened.into(), console);
     }
@@ -123,14 +127,14 @@ pub(super) fn run(
     Ok(())
 }
 
-/// Fails if an option is given that the run decides.
-pub(super) fn refuse_options_of_a_file(matches: &ArgMatches) -> Result<(), Failure> {
+/// Fails if an option was given that only a file needs, because a run has its own value.
+pub(super) fn refuse_scene_options(matches: &ArgMatches) -> Result<(), Failure> {
     let scene = DataSpec::augment_args(clap::Command::new("scene"));
     let names = scene.get_arguments().map(|argument| argument.get_id().as_str()).chain(["near"]);
-    let given = names
+    match names
         .into_iter()
-        .find(|name| matches.value_source(name) == Some(clap::parser::ValueSource::CommandLine));
-    match given {
+        .find(|name| matches.value_source(name) == Some(ValueSource::CommandLine))
+    {
         None => Ok(()),
         Some(name) => Err(Failure::input(format!(
             "--{} is for a file with --scene DIR (a run brings its own); name the dataset of a file, or leave it out",
@@ -139,15 +143,15 @@ pub(super) fn refuse_options_of_a_file(matches: &ArgMatches) -> Result<(), Failu
     }
 }
 
-/// A run, or a model with its dataset, as named on the command line.
-pub(super) struct Named<'a> {
+/// The model that a command line names: a run, or a file with its dataset.
+pub(super) struct ModelArgument<'a> {
     pub(super) model: &'a Path,
     pub(super) scene: Option<&'a Path>,
     pub(super) iteration: Option<u32>,
 }
 
-impl Named<'_> {
-    /// Opens the run or model; a model is rendered with the given options.
+impl ModelArgument<'_> {
+    /// Opens the model with its dataset; for a file, `rendering` has the options of the dataset.
     pub(super) fn open(
         &self,
         rendering: &RenderingArgs,
@@ -157,7 +161,7 @@ impl Named<'_> {
     ) -> Result<Opened, Failure> {
         let is_run = !is_model(self.model);
         if is_run {
-            refuse_options_of_a_file(matches)?;
+            refuse_scene_options(matches)?;
         }
         let machine = open_machine(&rendering.device, console)?;
         if is_run {
@@ -177,8 +181,12 @@ impl Named<'_> {
         open(&model, scene, data.clone(), (near.0, machine), needs, console)
     }
 
-    /// Opens a model without a dataset.
-    fn alone(&self, rendering: &RenderingArgs, console: &Console) -> Result<FilmSource, Failure> {
+    /// Opens a file without a dataset.
+    fn open_without_dataset(
+        &self,
+        rendering: &RenderingArgs,
+        console: &Console,
+    ) -> Result<FilmSource, Failure> {
         let machine = open_machine(&rendering.device, console)?;
         let model = model_file(self.model, self.iteration)?;
         let (backend, normalisation, sh_degree) =

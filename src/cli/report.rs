@@ -17,10 +17,10 @@ use densify_run::failure::Failure;
 /// Writes the results of one or more runs as one HTML file.
 ///
 /// The file is self-contained and loads nothing: it can be mailed, and opens in any browser. It holds the
-/// scores, the worst and best held-out views with a slider between photograph and render, a turn around the
+/// scores, the worst and the best held-out views with a slider between photograph and render, a turn around the
 /// scene, curves of loss, Gaussians, PSNR and memory, the edits, what was left out, and the settings. Runs that
-/// differ only by seed are averaged, with 95 % intervals from three on; the first of each group
-/// is shown, with a slider between runs of the same scene.
+/// differ only in their seed are averaged, with 95 % intervals from three runs on; the first of each group is
+/// shown, and groups of the same scene share their diagrams.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct ReportArgs {
@@ -44,8 +44,7 @@ pub(super) struct ReportArgs {
 }
 
 const EXAMPLES: &str = "\
-Paths of this machine are not in the file, but the names of the runs' folders, of the dataset's and of its
-photographs are.
+The file has no paths of this machine, but it has the names of the run folders, the dataset and the photographs.
 
 Examples:
   densify report output/garden-diet -o garden.html

@@ -11,7 +11,7 @@ use image::{DynamicImage, RgbaImage};
 
 use super::console::Console;
 use super::threads;
-use densify_core::numbers;
+use densify_core::numbers::grouped;
 use densify_run::Threads;
 use densify_run::failure::Failure;
 use densify_train::pictures::write_png;
@@ -55,7 +55,7 @@ pub(super) struct ScenegenArgs {
     #[arg(long, value_name = "N", help_heading = "Cameras")]
     test: Option<u32>,
     /// Image size in pixels: 400, or 640x480 `[default: 256, or as the built-in scene says]`
-    #[arg(long, value_name = "SIZE", help_heading = "Cameras", value_parser = size)]
+    #[arg(long, value_name = "SIZE", help_heading = "Cameras", value_parser = parse_size)]
     size: Option<(u32, u32)>,
     /// Horizontal field of view in degrees
     #[arg(long, value_name = "DEGREES", help_heading = "Cameras")]
@@ -78,10 +78,10 @@ pub(super) struct ScenegenArgs {
     /// Samples along each side of a pixel: 4 makes 16
     #[arg(long, value_name = "N", help_heading = "Light", default_value_t = 4)]
     samples: u32,
-    /// Ambient occlusion with this many rays per pixel
+    /// Sample occlusion of the sky, with this many rays per pixel
     #[arg(long, value_name = "RAYS", help_heading = "Light", value_parser = clap::value_parser!(u32).range(1..=65_536))]
     ao: Option<u32>,
-    /// One bounce of indirect light with this many rays per pixel
+    /// Sample light that is reflected once between surfaces, with this many rays per pixel
     #[arg(long, value_name = "RAYS", help_heading = "Light", conflicts_with = "ao", value_parser = clap::value_parser!(u32).range(1..=65_536))]
     bounce: Option<u32>,
     /// Environment light: an equirectangular .hdr or .exr image, +y up and +x in its middle, in
@@ -91,7 +91,7 @@ pub(super) struct ScenegenArgs {
     /// Let light pass through surfaces: no shadows
     #[arg(long, help_heading = "Light")]
     no_shadows: bool,
-    /// Make all materials diffuse, so that their look does not depend on the direction of view
+    /// Make all materials diffuse: colours do not depend on the viewing direction
     #[arg(long, help_heading = "Light")]
     lambert: bool,
     /// Factor on all light [default: 1; automatic with --sky and for meshes with lights of their own]
@@ -108,10 +108,10 @@ pub(super) struct ScenegenArgs {
     /// Standard deviation of their coordinates, as a share of the scene's diagonal
     #[arg(long, value_name = "SHARE", help_heading = "Points", default_value_t = 0.001)]
     point_noise: f64,
-    /// Share of the points that are outliers
+    /// Share of them at random places
     #[arg(long, value_name = "SHARE", help_heading = "Points", default_value_t = 0.02)]
     outliers: f64,
-    /// Share of space without points, in patches of 2 % of the diagonal
+    /// Share of space, in patches of 2 % of the diagonal, without points
     #[arg(long, value_name = "SHARE", help_heading = "Points", default_value_t = 0.0)]
     dropout: f64,
     /// Put no points on thin structures
@@ -136,7 +136,7 @@ Examples:
   densify scenegen mesh.glb -o data/mesh --sky studio.hdr --ao 64
   densify scenegen mesh.glb --contact-sheet look.png";
 
-/// Spelling of [`RigKind`] on the command line.
+/// [`RigKind`] on the command line.
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum RigArg {
     /// Rings around the scene
@@ -166,7 +166,7 @@ impl From<RigArg> for RigKind {
     }
 }
 
-fn size(text: &str) -> Result<(u32, u32), String> {
+fn parse_size(text: &str) -> Result<(u32, u32), String> {
     let wrong = |_| format!("`{text}` is no image size; write it as 400 or 640x480");
     let (width, height) = text.split_once('x').unwrap_or((text, text));
     Ok((width.parse().map_err(wrong)?, height.parse().map_err(wrong)?))
@@ -231,7 +231,7 @@ pub(super) fn run(args: &ScenegenArgs, console: &Console) -> Result<(), Failure>
     }
     threads::limit(args.threads);
     let scene = Scene::prepare(&source, &args.options())?;
-    describe(&scene, console);
+    print_scene(&scene, console);
     if let Some(path) = &args.contact_sheet {
         let (width, height, rgba) = contact_sheet(&scene);
         let sheet = RgbaImage::from_raw(width, height, rgba).unwrap_or_default();
@@ -251,7 +251,7 @@ pub(super) fn run(args: &ScenegenArgs, console: &Console) -> Result<(), Failure>
     console.result(format_args!(
         "{} views and {} points in {}",
         written.views,
-        numbers::grouped(written.points),
+        grouped(written.points),
         output.display()
     ));
     let wanted = args.points as f64 * (1.0 - args.dropout);
@@ -260,14 +260,14 @@ pub(super) fn run(args: &ScenegenArgs, console: &Console) -> Result<(), Failure>
             "note: of {} points wanted, {:.0} % were found where three views see the surface; to see more \
              of it, add views (--train), widen --fov, or choose another --rig (inside for rooms); or train \
              with --init random",
-            numbers::grouped(args.points),
+            grouped(args.points),
             100.0 * written.points as f64 / args.points as f64
         ));
     }
     Ok(())
 }
 
-fn describe(scene: &Scene, console: &Console) {
+fn print_scene(scene: &Scene, console: &Console) {
     for note in &scene.model.notes {
         console.say(format_args!("note: {note}"));
     }
@@ -275,7 +275,7 @@ fn describe(scene: &Scene, console: &Console) {
     console.say(format_args!(
         "scene    {}: {} triangles",
         scene.name,
-        numbers::grouped(scene.model.triangles.len())
+        grouped(scene.model.triangles.len())
     ));
     console.say(format_args!(
         "views    {} to train on, {} held out, {}x{} px",
@@ -294,7 +294,7 @@ mod tests {
     use densify_run::failure::OTHER;
 
     #[test]
-    fn a_contact_sheet_is_written_whole_or_not_at_all() {
+    fn contact_sheets_are_written_atomically() {
         let root = tempfile::tempdir().unwrap();
         let sheet = root.path().join("sheet.png");
         let words = ["scenegen", "--preset", "spheres", "--size", "8", "--samples", "1"];
@@ -318,11 +318,11 @@ mod tests {
     }
 
     #[test]
-    fn sizes_are_read() {
-        assert_eq!(size("400"), Ok((400, 400)));
-        assert_eq!(size("640x480"), Ok((640, 480)));
+    fn sizes_are_parsed() {
+        assert_eq!(parse_size("400"), Ok((400, 400)));
+        assert_eq!(parse_size("640x480"), Ok((640, 480)));
         for bad in ["", "x", "640x", "-1", "640x480x3", "1.5"] {
-            assert!(size(bad).unwrap_err().contains("640x480"), "{bad}");
+            assert!(parse_size(bad).unwrap_err().contains("640x480"), "{bad}");
         }
     }
 }

@@ -13,7 +13,7 @@ use densify_run::DeviceSpec;
 use densify_run::failure::{Failure, OTHER};
 use densify_selftest::{Case, Finding, Subject, SubjectReport, cases, markdown, table};
 
-/// Compares this machine with a float64 renderer in the numerically hardest cases.
+/// Compares this machine with a float64 renderer in numerically hard cases.
 ///
 /// Needles, thousands of layers, saturated opacities, images of one pixel, rows that hold NaN: images,
 /// gradients, losses and optimiser steps are compared with those of a second renderer, which
@@ -27,14 +27,14 @@ pub(super) struct SelftestArgs {
     /// Only these cases, by number
     #[arg(value_name = "CASE")]
     only: Vec<u8>,
-    /// Also run the cases that take minutes: half a million rows as large as the image, which need
+    /// Also run the parts of cases that take minutes: half a million rows as large as the image, which takes
     /// some 800 MiB, and runs of 30,000 steps
     #[arg(long)]
     long: bool,
     /// Write the table as Markdown
     #[arg(long, value_name = "FILE")]
     markdown: Option<PathBuf>,
-    /// Test every backend: the processor and all adapters, including software drivers
+    /// Test every backend: the processor, and all adapters, software drivers included
     #[arg(long, conflicts_with_all = ["backend", "gpu"])]
     all: bool,
     #[command(flatten)]
@@ -49,13 +49,13 @@ Examples:
   densify selftest --all --long --markdown selftest.md
                                                 on all of them, in full, into a file";
 
-/// Some cases need equal bits twice, for which a GPU must accumulate deterministically.
-const SUMS: Option<Accumulation> = Some(Accumulation::Slots);
+/// Some cases compare the bits of two runs; on a GPU no other accumulation reproduces them.
+const ACCUMULATION: Option<Accumulation> = Some(Accumulation::Slots);
 
 pub(super) fn run(args: &SelftestArgs, console: &Console) -> Result<(), Failure> {
-    let chosen = chosen(&args.only)?;
+    let selected = select_cases(&args.only)?;
     let mut tested: Vec<SubjectReport> = Vec::new();
-    for subject in subjects(args)? {
+    for subject in open_subjects(args)? {
         console.result(format_args!(
             "densify {} on {}: {}, {}",
             env!("CARGO_PKG_VERSION"),
@@ -63,25 +63,25 @@ pub(super) fn run(args: &SelftestArgs, console: &Console) -> Result<(), Failure>
             std::env::consts::OS,
             std::env::consts::ARCH
         ));
-        let mut here = SubjectReport { subject: subject.name(), cases: Vec::new() };
-        for &case in &chosen {
+        let mut report = SubjectReport { subject: subject.name(), cases: Vec::new() };
+        for &case in &selected {
             let findings = case.run(&subject, args.long);
             console.result(table(&case, &findings));
-            here.cases.push((case, findings));
+            report.cases.push((case, findings));
         }
-        tested.push(here);
+        tested.push(report);
     }
     if let Some(path) = &args.markdown {
         let text = markdown(&tested);
         write_atomically(path, |out| out.write_all(text.as_bytes()))?;
     }
-    let count = verdict(&tested)?;
+    let count = check_tolerances(&tested)?;
     console.result(format_args!("All {count} figures are within their tolerances."));
     Ok(())
 }
 
-/// Returns the number of figures if all are within their tolerances.
-fn verdict(tested: &[SubjectReport]) -> Result<usize, Failure> {
+/// Counts the figures; fails unless all are within their tolerances.
+fn check_tolerances(tested: &[SubjectReport]) -> Result<usize, Failure> {
     let findings: Vec<&Finding> = tested.iter().flat_map(SubjectReport::findings).collect();
     let failed = findings.iter().filter(|finding| !finding.passes()).count();
     let count = findings.len();
@@ -97,8 +97,8 @@ fn verdict(tested: &[SubjectReport]) -> Result<usize, Failure> {
     ))
 }
 
-/// The backends to test.
-fn subjects(args: &SelftestArgs) -> Result<Vec<Subject>, Failure> {
+/// Opens the backends to test.
+fn open_subjects(args: &SelftestArgs) -> Result<Vec<Subject>, Failure> {
     let native = Subject::Native {
         instructions: InstructionSet::default(),
         threads: args.device.threads.map(|threads| threads.0 as usize),
@@ -112,15 +112,17 @@ fn subjects(args: &SelftestArgs) -> Result<Vec<Subject>, Failure> {
     }
     let mut subjects = vec![native];
     for adapter in adapters().into_iter().filter(|adapter| adapter.missing.is_empty()) {
-        let device =
-            GpuDevice::open(&AdapterChoice { name: Some(adapter.name), accumulation: SUMS })?;
+        let device = GpuDevice::open(&AdapterChoice {
+            name: Some(adapter.name),
+            accumulation: ACCUMULATION,
+        })?;
         subjects.push(Subject::Gpu(device));
     }
     Ok(subjects)
 }
 
-/// The cases with these numbers; without numbers, all.
-fn chosen(only: &[u8]) -> Result<Vec<Case>, Failure> {
+/// The cases with these numbers, or all.
+fn select_cases(only: &[u8]) -> Result<Vec<Case>, Failure> {
     let numbers: Vec<u8> = cases().iter().map(|case| case.number).collect();
     if let Some(unknown) = only.iter().find(|number| !numbers.contains(number)) {
         let numbers: Vec<String> = numbers.iter().map(u8::to_string).collect();
@@ -138,11 +140,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn cases_are_chosen_by_number() {
-        assert_eq!(chosen(&[]).unwrap().len(), cases().len());
-        let two: Vec<u8> = chosen(&[13, 7]).unwrap().iter().map(|case| case.number).collect();
+    fn cases_are_selected_by_number() {
+        assert_eq!(select_cases(&[]).unwrap().len(), cases().len());
+        let two: Vec<u8> = select_cases(&[13, 7]).unwrap().iter().map(|case| case.number).collect();
         assert_eq!(two, [7, 13]);
-        let refused = chosen(&[7, 4]).unwrap_err();
+        let refused = select_cases(&[7, 4]).unwrap_err();
         assert!(refused.to_string().contains("no case 4") && refused.code == 2, "{refused:?}");
     }
 
@@ -159,9 +161,9 @@ mod tests {
             let findings = errors.iter().map(|&error| finding(error)).collect();
             vec![SubjectReport { subject: "native".into(), cases: vec![(cases()[0], findings)] }]
         };
-        assert_eq!(verdict(&tested(&[0.0, 1e-5])).unwrap(), 2);
+        assert_eq!(check_tolerances(&tested(&[0.0, 1e-5])).unwrap(), 2);
         for wrong in [1.1e-5, f64::NAN, f64::INFINITY] {
-            let failure = verdict(&tested(&[0.0, wrong])).unwrap_err();
+            let failure = check_tolerances(&tested(&[0.0, wrong])).unwrap_err();
             assert_eq!(failure.code, OTHER);
             assert!(failure.to_string().starts_with("1 of 2 figures"), "{failure}");
         }

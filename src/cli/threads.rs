@@ -4,17 +4,17 @@ use densify_run::failure::Failure;
 use densify_run::finished::Machine;
 use densify_run::{DeviceSpec, Observer, Threads};
 
-/// Limits rayon's global pool, which reads datasets and measures models, to the threads that the user allows. Only a
-/// command may do so: the pool belongs to the process, not to the library.
+/// Limits rayon's global pool, which reads datasets and measures models, to the number of threads from the command line.
+/// Only a command may do so: the pool belongs to the process, not to the library.
 pub(super) fn limit(threads: Option<Threads>) {
     if let Some(threads) = threads {
-        // It fails only if the pool is already in use; its size is fixed then.
+        // Fails only if the pool is already in use, which keeps its size.
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads.0 as usize);
         let _ = pool.build_global();
     }
 }
 
-/// Opens the device to render on, with as many threads as the user allows.
+/// Opens the device to render on, and limits the threads.
 pub(super) fn open_machine(
     device: &DeviceSpec,
     observer: &dyn Observer,

@@ -7,7 +7,7 @@ use clap::{ArgMatches, Args};
 
 use super::console::Console;
 use super::interrupt::Interrupts;
-use super::render::{RenderingArgs, refuse_options_of_a_file};
+use super::render::{RenderingArgs, refuse_scene_options};
 use super::threads::open_machine;
 use densify_core::numbers::grouped;
 use densify_run::failure::Failure;
@@ -23,10 +23,10 @@ use densify_view::{FIRST_PORT, ListenAddress, Server, ViewOptions};
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct ViewArgs {
-    /// Folder that `densify train` wrote, a file of Gaussian splats, or a dataset (or scene:NAME), whose
-    /// points are shown
+    /// Folder that `densify train` wrote, a file of Gaussian splats, or a dataset (or scene:NAME), whose points are
+    /// shown
     #[arg(value_name = "RUN|MODEL|SCENE")]
-    what: PathBuf,
+    path: PathBuf,
     /// Another run or model of the same scene, to compare with
     #[arg(value_name = "RUN|MODEL")]
     other: Option<PathBuf>,
@@ -60,16 +60,16 @@ Examples:
 
 pub(super) fn run(args: &ViewArgs, matches: &ArgMatches, console: &Console) -> Result<(), Failure> {
     const _: () = assert!(FIRST_PORT == 8080, "the help says so");
-    if view::is_run(&args.what) {
-        refuse_options_of_a_file(matches)?;
+    if view::is_run(&args.path) {
+        refuse_scene_options(matches)?;
     }
-    // The port first: it fails immediately if at all, while a model may take long to read.
+    // Bind the port first: a failure shows at once, and a model may take long to read.
     let address = ListenAddress { host: args.host, port: args.port, needs_token: false };
     let server = Server::open(address)?;
     let RenderingArgs { near, device, data } = &args.rendering;
     let machine = open_machine(device, console)?;
     let options = ViewOptions {
-        path: &args.what,
+        path: &args.path,
         other: args.other.as_deref(),
         dataset: args.scene.clone(),
         iteration: args.iteration,
@@ -80,7 +80,7 @@ pub(super) fn run(args: &ViewArgs, matches: &ArgMatches, console: &Console) -> R
     for (name, rows) in scene.models() {
         console.say(format_args!("model    {name}: {} Gaussians", grouped(rows)));
     }
-    // From here on, a signal stops the server in order instead of killing the process.
+    // From here on, a signal ends the page cleanly instead of killing the process.
     let interrupts = Interrupts::listen();
     console.result(format_args!("page     {}", server.url()));
     if server.is_public() {

@@ -1,4 +1,4 @@
-//! Stands in for commands whose feature was not built: each is refused by name.
+//! Replaces commands whose cargo feature this program was built without: they only print an error.
 
 use std::ffi::OsString;
 
@@ -7,7 +7,7 @@ use clap::Args;
 use super::console::Console;
 use densify_run::failure::Failure;
 
-/// The refusal of `what`, with the name of the missing feature.
+/// The error for an option or command that needs a missing feature.
 pub(super) fn without(feature: &str, what: &str) -> String {
     format!(
         "{what}: this program was built without the feature `{feature}` of the crate densify; add it to the \
@@ -15,7 +15,7 @@ pub(super) fn without(feature: &str, what: &str) -> String {
     )
 }
 
-/// Not available: this program was built without the necessary feature.
+/// Not available: this program was built without the feature that it needs.
 #[derive(Debug, Args)]
 pub(super) struct Absent {
     /// Ignored
@@ -23,7 +23,7 @@ pub(super) struct Absent {
     words: Vec<OsString>,
 }
 
-/// Defines the functions that `cli` calls in a module whose feature is missing.
+/// Defines the items of a command's module that the parent module uses.
 macro_rules! absent {
     ($module:ident, $feature:literal, $($run:ident($args:ident $(, $more:ty)*) $command:literal),*) => {
         #[cfg(not(feature = $feature))]

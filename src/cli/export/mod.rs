@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use clap::{ArgMatches, Args};
 
 use super::console::Console;
-use super::render::{RenderingArgs, refuse_options_of_a_file};
+use super::render::{RenderingArgs, refuse_scene_options};
 use super::threads::open_machine;
 use densify_core::files::{FileError, write_atomically};
 use densify_core::gaussians::Gaussians;
@@ -18,16 +18,16 @@ use densify_inspect::Reference;
 use densify_run::RunConfig;
 use densify_run::failure::{Failure, INPUT};
 use densify_run::finished::{model_file, read_model};
-use table::Line;
+use table::WrittenFile;
 
-/// Name for all formats together.
+/// Stands for every format.
 const ALL: &str = "all";
 
 /// Writes a trained model in another format, or in all.
 ///
 /// The model keeps the coordinates of the dataset. A file appears only when it is complete. With
-/// --format all or --scene, prints the size of each format; with --scene also the PSNR between renders of
-/// each file, read back, and renders of the model itself, over the held-out views.
+/// --format all, or --scene, prints what each format takes; with --scene also how near the pictures of
+/// each, read back, are to those of the model itself, over the held-out views.
 #[derive(Debug, Args)]
 #[command(after_help = after_help())]
 pub(super) struct ExportArgs {
@@ -77,9 +77,9 @@ pub(super) fn run(
     let source = model_file(&args.model, args.iteration)?;
     let is_run = source != args.model;
     if is_run || args.scene.is_none() {
-        refuse_options_of_a_file(matches)?;
+        refuse_scene_options(matches)?;
     }
-    let files = files(args)?;
+    let files = output_files(args)?;
     for (_, path) in &files {
         check_output(path, args.overwrite)?;
     }
@@ -88,12 +88,12 @@ pub(super) fn run(
         None => None,
         Some(scene) => Some(open_reference(args, is_run, scene, &model, console)?),
     };
-    let mut lines = Vec::new();
+    let mut written = Vec::new();
     let mut unfit = None;
     for (format, path) in &files {
         match write(format, path, &model) {
             Ok(()) => {}
-            // Other formats may hold the model.
+            // Another format may be able to hold the model.
             Err(failure) if failure.code == INPUT && files.len() > 1 => {
                 console.say(format_args!("note: not written: {failure}"));
                 unfit = unfit.or(Some(failure));
@@ -111,18 +111,19 @@ pub(super) fn run(
             path.display(),
             format.name
         ));
-        lines.push(Line::of(format.name, path, psnr)?);
+        let bytes = path.metadata().map_err(FileError::io("read", path))?.len();
+        written.push(WrittenFile { format: format.name, bytes, psnr });
     }
-    if let Some(failure) = unfit.filter(|_| lines.is_empty()) {
+    if let Some(failure) = unfit.filter(|_| written.is_empty()) {
         return Err(failure);
     }
-    if reference.is_some() || lines.len() > 1 {
-        console.result(table::table(&lines, model.len()));
+    if reference.is_some() || written.len() > 1 {
+        console.result(table::format(&written, model.len()));
     }
     Ok(())
 }
 
-/// The model itself, with which the written files are compared.
+/// The original model, for comparison with the files.
 fn open_reference(
     args: &ExportArgs,
     is_run: bool,
@@ -140,8 +141,8 @@ fn open_reference(
     Reference::open(&args.model, model, scene, data, (near, machine), console)
 }
 
-/// Formats, each with its file.
-fn files(args: &ExportArgs) -> Result<Vec<(&'static Format, PathBuf)>, Failure> {
+/// The formats to write, each with its file.
+fn output_files(args: &ExportArgs) -> Result<Vec<(&'static Format, PathBuf)>, Failure> {
     match args.format.as_deref() {
         Some(ALL) => {
             if args.output.exists() && !args.output.is_dir() {
@@ -150,7 +151,7 @@ fn files(args: &ExportArgs) -> Result<Vec<(&'static Format, PathBuf)>, Failure> 
                     "-o: {output} is no folder; with --format {ALL} name a folder"
                 )));
             }
-            let stem = stem(&args.model);
+            let stem = output_stem(&args.model);
             let file =
                 |format: &'static Format| args.output.join(format!("{stem}.{}", format.extension));
             Ok(export_formats().into_iter().map(|format| (format, file(format))).collect())
@@ -160,15 +161,12 @@ fn files(args: &ExportArgs) -> Result<Vec<(&'static Format, PathBuf)>, Failure> 
                 find(name).map_err(|error| Failure::input(format!("--format: {error}, {ALL}")))?;
             Ok(vec![(format, args.output.clone())])
         }
-        None => {
-            let format = format_of(&args.output)?;
-            Ok(vec![(format, args.output.clone())])
-        }
+        None => Ok(vec![(format_from_extension(&args.output)?, args.output.clone())]),
     }
 }
 
-/// Name of a model's files: that of its run, or of its file without the extension.
-fn stem(model: &Path) -> String {
+/// The name of a model's files: that of its run, or of its file without the extension.
+fn output_stem(model: &Path) -> String {
     let name = model.file_name().unwrap_or("model".as_ref()).to_string_lossy().into_owned();
     if model.is_dir() {
         return name;
@@ -181,15 +179,15 @@ fn stem(model: &Path) -> String {
     if end == 0 { "model".to_owned() } else { name[..end].to_owned() }
 }
 
-/// The format that belongs to the extension of an output.
-pub(super) fn format_of(output: &Path) -> Result<&'static Format, Failure> {
+/// The format that matches the extension of an output file.
+pub(super) fn format_from_extension(output: &Path) -> Result<&'static Format, Failure> {
     find_by_extension(output)
         .map_err(|error| Failure::input(format!("-o: {error}, and name it with --format NAME")))
 }
 
 fn write(format: &Format, path: &Path, model: &Gaussians) -> Result<(), Failure> {
     write_atomically(path, |out| format.write(model, out)).map_err(|error| match error {
-        // A limit of the format, not an error of the disk.
+        // The format cannot hold the model; the disk is not at fault.
         FileError::Io { source, .. } if is_unfit(&source) => {
             Failure::input(format!("{}: {source}", path.display()))
         }
@@ -197,14 +195,14 @@ fn write(format: &Format, path: &Path, model: &Gaussians) -> Result<(), Failure>
     })
 }
 
-/// Fails if the output exists and may not be replaced.
+/// Fails if the output would replace something that it must not.
 pub(super) fn check_output(path: &Path, overwrite: bool) -> Result<(), Failure> {
     let path_text = path.display();
     match path.symlink_metadata() {
         Ok(_) if path.is_dir() => {
             Err(Failure::input(format!("-o: {path_text} is a folder; name a file")))
         }
-        // Replacing a device or a pipe would remove it for everyone else.
+        // Renaming a file over a device or a pipe would remove it for other programs.
         Ok(_) if path.exists() && !path.is_file() => {
             Err(Failure::input(format!("-o: {path_text} is a device or a pipe; name a file")))
         }

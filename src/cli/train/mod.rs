@@ -46,8 +46,7 @@ pub(super) struct TrainArgs {
     /// Show the run in the browser while it trains: serves a page on this machine alone, with the model,
     /// curves and edits, and buttons that pause, save and stop the run (default port: the first free one from 8080
     /// on). From another machine: ssh -L 8080:127.0.0.1:8080 NAME, then the whole printed address. Its pictures are
-    /// no larger than the largest photograph. The page does not change the result, but its memory counts towards
-    /// --memory
+    /// no larger than the largest photograph. The page does not change the run, but takes part of --memory
     #[arg(
         long, value_name = "PORT", num_args = 0..=1, require_equals = true, default_missing_value = "0",
         help_heading = "Output"
@@ -74,12 +73,12 @@ Examples:
   densify train data/garden --view            and look at it meanwhile";
 
 impl TrainArgs {
-    /// The page of this run, if requested, and its observer.
+    /// The host of the run: its observer, and the memory of the page if there is one.
     pub(super) fn host<'a>(&self, follower: &'a Follower<'_>) -> Host<'a> {
         Host { companion: self.view.map(|_| page::COMPANION), ..Host::new(follower) }
     }
 
-    /// The run that the file and flags of this call describe, with the checkpoint to continue from, if any.
+    /// The run that the flags and the file of `--config` describe, with the checkpoint to resume from.
     pub(super) fn describe(
         &self,
         matches: &ArgMatches,
@@ -110,12 +109,12 @@ pub(super) fn run(
     if occupied != Occupied::Resume {
         RunFolder::check(&spec.output_folder()?, args.overwrite)?;
     }
-    // The port first: it fails immediately if at all, while a scene may take long to read.
+    // Bind the port first: a failure shows at once, and a scene may take long to read.
     let page = args.view.map(page::open).transpose()?;
     threads::limit(spec.device.threads);
     let run = Run::prepare_on(&spec, resumed, args.host(&follower))?;
     if occupied != Occupied::Resume {
-        announce_preset(&spec, console)?;
+        print_preset(&spec, console)?;
     }
     follower.listen();
     match page {
@@ -124,24 +123,24 @@ pub(super) fn run(
     }
 }
 
-/// Prints the measured cost and gain of the preset, if the run is as long as the measured ones.
-fn announce_preset(spec: &RunSpec, console: &Console) -> Result<(), Failure> {
+/// Prints the measured cost and gain of the preset; they hold only for the preset's number of iterations.
+fn print_preset(spec: &RunSpec, console: &Console) -> Result<(), Failure> {
     let name = spec.schedule.preset.as_deref().unwrap_or(densify_run::knobs::DEFAULT_PRESET);
     let preset = densify_run::knobs::preset(name).map_err(Failure::input)?;
     let iterations = spec.schedule.iterations.0.to_string();
     match preset.levels.iter().find(|(name, _)| *name == "iterations") {
-        Some((_, own)) if *own != iterations => console.say(format_args!(
-            "preset   none: --iterations {iterations} is given, and {name} is {own} iterations"
+        Some((_, of_preset)) if *of_preset != iterations => console.say(format_args!(
+            "preset   none: --iterations {iterations} is given, and {name} is {of_preset} iterations"
         )),
         _ => console.say(format_args!("preset   {preset}")),
     }
     Ok(())
 }
 
-/// Prints a run's progress, and stops the run at a signal.
+/// Shows a run on the console, and stops it on a signal.
 pub(super) struct Follower<'a> {
     console: &'a Console,
-    /// True if details are printed too.
+    /// Show details too.
     verbose: bool,
     progress: RefCell<Option<Progress<'a>>>,
     interrupts: RefCell<Option<Interrupts>>,
@@ -157,7 +156,7 @@ impl<'a> Follower<'a> {
         }
     }
 
-    /// From here on, a signal stops the run in order.
+    /// From here on, a signal stops the run cleanly.
     pub(crate) fn listen(&self) {
         *self.interrupts.borrow_mut() = Some(Interrupts::listen());
     }

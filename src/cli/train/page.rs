@@ -1,4 +1,4 @@
-//! The browser page of a run in training.
+//! The live page of a run.
 
 use std::net::Ipv4Addr;
 

@@ -1,7 +1,7 @@
-//! Faults of the disk and of the device have the consequences that `docs/errors.md` promises.
+//! Faults of the disk and the device: the tests of what `docs/errors.md` promises.
 
 use std::io::ErrorKind;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use clap::FromArgMatches;
 use tempfile::TempDir;
@@ -16,7 +16,7 @@ use densify_train::output::model_path;
 
 const OPERATIONS: [Operation; 5] =
     [Operation::Create, Operation::Write, Operation::Flush, Operation::Sync, Operation::Rename];
-/// A full disk and a broken one.
+/// A full disk, and a broken one.
 const KINDS: [ErrorKind; 2] = [ErrorKind::StorageFull, ErrorKind::Other];
 
 struct Case {
@@ -47,8 +47,8 @@ impl Case {
         run(&TrainArgs::from_arg_matches(matches).unwrap(), matches, &Console::new(true))
     }
 
-    /// Trains with a fault and returns the result; panics if the fault never occurred.
-    fn fault(
+    /// Trains with a fault; returns the exit code and the message. Fails if the fault never occurred.
+    fn train_with_fault(
         &self,
         operation: Operation,
         file: &'static str,
@@ -57,19 +57,19 @@ impl Case {
     ) -> (u8, String) {
         let fault = Fault { operation, file, spared, kind };
         let (done, met) = with_fault(Some(fault), || self.train(""));
-        assert!(met > 0, "{fault:?} was not met");
-        self.nothing_half_written();
+        assert!(met > 0, "{fault:?} did not occur");
+        self.check_no_temporary_files();
         done.map_or_else(|failure| (failure.code, failure.to_string()), |()| (0, String::new()))
     }
 
-    fn nothing_half_written(&self) {
-        let mut open = vec![self.root.path().to_owned()];
-        while let Some(folder) = open.pop() {
+    fn check_no_temporary_files(&self) {
+        let mut folders = vec![self.root.path().to_owned()];
+        while let Some(folder) = folders.pop() {
             for path in std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()) {
                 let name = path.file_name().unwrap().to_string_lossy().into_owned();
                 assert!(!name.starts_with('.'), "{} is left", path.display());
                 if path.is_dir() {
-                    open.push(path);
+                    folders.push(path);
                 }
             }
         }
@@ -77,32 +77,26 @@ impl Case {
 
     fn checkpoints(&self) -> Vec<String> {
         let entries = std::fs::read_dir(self.run().join("checkpoints")).into_iter().flatten();
-        let mut names: Vec<String> =
-            entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
-        names.sort();
-        names
-            .iter()
-            .map(|name| name.replace("iteration_", "").replace(".safetensors", ""))
-            .collect()
+        let names = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap());
+        let mut steps: Vec<String> =
+            names.map(|name| name.replace("iteration_", "").replace(".safetensors", "")).collect();
+        steps.sort();
+        steps
     }
 
     fn model(&self) -> Vec<u8> {
         std::fs::read(model_path(&self.run(), 12)).unwrap()
     }
 
-    fn clear(&self) {
+    fn remove_run(&self) {
         if self.run().exists() {
             std::fs::remove_dir_all(self.run()).unwrap();
         }
     }
 }
 
-fn is_there(folder: &Path, name: &str) -> bool {
-    folder.join(name).exists()
-}
-
 #[test]
-fn a_run_that_cannot_begin_to_write_leaves_nothing() {
+fn a_run_whose_first_files_fail_leaves_nothing() {
     let case = Case::new();
     let files = [
         (Operation::Create, "run", 0),
@@ -114,7 +108,7 @@ fn a_run_that_cannot_begin_to_write_leaves_nothing() {
     ];
     for (operation, file, spared) in files {
         for kind in KINDS {
-            let (code, message) = case.fault(operation, file, spared, kind);
+            let (code, message) = case.train_with_fault(operation, file, spared, kind);
             assert_eq!(code, OTHER, "{message}");
             assert!(message.contains(file) && message.contains("cannot"), "{message}");
             assert!(message.contains(&std::io::Error::from(kind).to_string()), "{message}");
@@ -124,7 +118,7 @@ fn a_run_that_cannot_begin_to_write_leaves_nothing() {
 }
 
 #[test]
-fn a_checkpoint_that_cannot_be_written_costs_nothing_but_itself() {
+fn a_failed_checkpoint_does_not_harm_the_run() {
     let case = Case::new();
     case.train("").unwrap();
     let expected = case.model();
@@ -134,23 +128,31 @@ fn a_checkpoint_that_cannot_be_written_costs_nothing_but_itself() {
             (ErrorKind::StorageFull, "iteration_8.safetensors", ["12", "4"]),
             (ErrorKind::Other, "iteration_12.safetensors", ["4", "8"]),
         ] {
-            case.clear();
-            assert_eq!(case.fault(operation, step, 0, kind), (0, String::new()), "{operation:?}");
+            case.remove_run();
+            assert_eq!(
+                case.train_with_fault(operation, step, 0, kind),
+                (0, String::new()),
+                "{operation:?}"
+            );
             assert_eq!(case.checkpoints(), left, "{operation:?}");
             assert!(case.model() == expected);
         }
     }
-    // The logs that a checkpoint refers to must be on disk before it.
+    // A checkpoint must reach the disk after the logs that it refers to.
     for log in ["stats/train.jsonl", "stats/events.jsonl", ".densify"] {
-        case.clear();
-        assert_eq!(case.fault(Operation::Sync, log, 0, KINDS[1]), (0, String::new()), "{log}");
+        case.remove_run();
+        assert_eq!(
+            case.train_with_fault(Operation::Sync, log, 0, KINDS[1]),
+            (0, String::new()),
+            "{log}"
+        );
         assert!(case.checkpoints().is_empty(), "{log}");
         assert!(case.model() == expected);
     }
 }
 
 #[test]
-fn what_stops_a_run_leaves_what_it_goes_on_from() {
+fn a_run_stopped_by_the_disk_can_be_resumed() {
     let case = Case::new();
     case.train("").unwrap();
     let expected = case.model();
@@ -160,29 +162,29 @@ fn what_stops_a_run_leaves_what_it_goes_on_from() {
         (&OPERATIONS, "results.json", 0, &["4", "8"]),
         (&OPERATIONS, "stats/summary.json", 0, &["12", "8"]),
         (&[Operation::Write], "stats/train.jsonl", 0, &["4", "8"]),
-        // The first is the file's head, the others the records of step 10 and the scores of step 12.
+        // The first write is the header; the others are the records of step 10 and the scores of step 12.
         (&[Operation::Write], ".densify", 1, &["4", "8"]),
         (&[Operation::Write], ".densify", 2, &["4", "8"]),
     ];
     for (operations, file, spared, left) in faults {
         for (&operation, kind) in operations.iter().zip(KINDS.iter().copied().cycle()) {
-            case.clear();
-            let (code, message) = case.fault(operation, file, spared, kind);
-            let what = format!("{operation:?} {file}: {message}");
-            assert_eq!(code, OTHER, "{what}");
+            case.remove_run();
+            let (code, message) = case.train_with_fault(operation, file, spared, kind);
+            let context = format!("{operation:?} {file}: {message}");
+            assert_eq!(code, OTHER, "{context}");
             let system = std::io::Error::from(kind).to_string();
             for words in [file, "cannot write", &system, "was written until then is in"] {
-                assert!(message.contains(words), "{words:?} is not in: {what}");
+                assert!(message.contains(words), "{words:?} is not in: {context}");
             }
-            assert_eq!(case.checkpoints(), left, "{what}");
-            case.train("--resume").unwrap_or_else(|e| panic!("{what}: {e}"));
-            assert!(case.model() == expected, "{what}");
-            assert!(is_there(&case.run(), "stats/summary.json"), "{what}");
+            assert_eq!(case.checkpoints(), left, "{context}");
+            case.train("--resume").unwrap_or_else(|e| panic!("{context}: {e}"));
+            assert!(case.model() == expected, "{context}");
+            assert!(case.run().join("stats/summary.json").exists(), "{context}");
         }
     }
 }
 
-/// The adapters that are software drivers.
+/// Names of the software drivers, which every machine that runs the GPU tests has.
 #[expect(clippy::print_stderr, reason = "a skipped test must say so")]
 fn software_drivers() -> Vec<String> {
     let names: Vec<String> = adapters()
@@ -199,7 +201,7 @@ fn software_drivers() -> Vec<String> {
 }
 
 #[test]
-fn a_device_that_is_lost_leaves_what_the_run_goes_on_from() {
+fn a_run_stopped_by_a_lost_device_can_be_resumed() {
     for driver in software_drivers() {
         let case = Case::new();
         let name = driver.split(' ').next().unwrap();
@@ -208,31 +210,31 @@ fn a_device_that_is_lost_leaves_what_the_run_goes_on_from() {
         let expected = case.model();
         let (mut before, mut after) = (0, 0);
         for checks in [1, 40, 80, 120, 160, 240] {
-            case.clear();
+            case.remove_run();
             let (done, lost) = with_device_lost_after(checks, || case.train(&on_gpu));
             if !lost {
                 assert!(done.is_ok() && after > 0, "{driver}: {checks} checks are too many");
                 continue;
             }
             let Err(failure) = done else {
-                // Lost while the last checkpoint was written: everything else is there by then.
+                // Lost while the last checkpoint was written, after all other files.
                 assert!(case.model() == expected, "{driver}: {checks}");
                 continue;
             };
             let (code, message) = (failure.code, failure.to_string());
-            let what = format!("{driver}, {checks} checks: {message}");
-            assert_eq!(code, DEVICE, "{what}");
-            assert!(message.contains("was lost") && message.contains(&driver), "{what}");
-            case.nothing_half_written();
+            let context = format!("{driver}, {checks} checks: {message}");
+            assert_eq!(code, DEVICE, "{context}");
+            assert!(message.contains("was lost") && message.contains(&driver), "{context}");
+            case.check_no_temporary_files();
             let kept = case.checkpoints();
             match kept.last() {
                 None => before += 1,
                 Some(step) => {
                     after += 1;
                     let words = format!("iteration_{step}.safetensors; go on with: ");
-                    assert!(message.contains(&words), "{what}");
-                    case.train("--resume").unwrap_or_else(|e| panic!("{what}: {e}"));
-                    assert!(case.model() == expected, "{what}");
+                    assert!(message.contains(&words), "{context}");
+                    case.train("--resume").unwrap_or_else(|e| panic!("{context}: {e}"));
+                    assert!(case.model() == expected, "{context}");
                 }
             }
         }
@@ -246,7 +248,7 @@ fn short_writes_are_continued() {
     case.train("").unwrap();
     let expected = case.model();
     let events = std::fs::read(case.run().join("stats/events.jsonl")).unwrap();
-    case.clear();
+    case.remove_run();
     with_fault(None, || case.train("")).0.unwrap();
     assert!(case.model() == expected);
     assert!(std::fs::read(case.run().join("stats/events.jsonl")).unwrap() == events);
@@ -256,7 +258,7 @@ fn short_writes_are_continued() {
 }
 
 #[test]
-fn input_faults_have_code_2_and_write_nothing() {
+fn a_file_in_place_of_the_run_folder_is_refused_and_kept() {
     let case = Case::new();
     std::fs::write(case.run(), "a file").unwrap();
     for flags in ["", "--overwrite", "--resume"] {

@@ -1,4 +1,4 @@
-//! Refuses `train --view` in a program that was built without the feature `view`.
+//! Replaces the live page of a run in a program built without the feature `view`: refuses `--view`.
 
 use super::Follower;
 use crate::console::Console;
@@ -6,7 +6,7 @@ use crate::without::without;
 use densify_run::failure::Failure;
 use densify_run::{Companion, Occupied, Run};
 
-/// Never called: [`open`] fails before.
+/// Never used, because [`open`] fails first.
 pub(super) const COMPANION: Companion = Companion { reserve: |_, _| {}, points: 0 };
 
 /// Never constructed.
