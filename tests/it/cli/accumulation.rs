@@ -6,7 +6,7 @@ use densify::render::gpu::GpuDevice;
 
 use super::{Outcome, config, copy_unfinished, densify, model, scratch, text};
 use crate::photographs::Photographs;
-use crate::subject::{devices, ways};
+use crate::subject::{devices, devices_by_accumulation};
 
 const ITERATIONS: u32 = 8;
 
@@ -18,7 +18,7 @@ fn run(scene: &Path, output: &Path, flags: &[&str]) -> Outcome {
 #[test]
 fn the_accumulation_method_is_used_and_kept_on_resume() {
     let scene = Photographs::colmap_text();
-    for device in ways() {
+    for device in devices_by_accumulation() {
         let (root, whole) = scratch();
         let (gpu, method) = (["--gpu", &*device.adapter().name], device.accumulation());
         let knob = format!("accumulation={method}");
