@@ -72,7 +72,7 @@ fn all_needs() -> Needs {
 
 #[test]
 fn frozen_rows_never_change() {
-    let all_needs = all_needs();
+    let everything = all_needs();
     on_each(all(), |subject| {
         let storages = storages();
         let storages = match subject {
@@ -80,7 +80,7 @@ fn frozen_rows_never_change() {
             Subject::Gpu(_) => &storages[..1],
         };
         for &storage in storages {
-            for needs in [&Needs::default(), &all_needs] {
+            for needs in [&Needs::default(), &everything] {
                 let setup = setup(FROZEN, storage, needs.clone());
                 let mut backend = make_with(subject, &model(), setup);
                 let before = backend.download().expect("a model");

@@ -42,9 +42,9 @@ pub(crate) fn devices() -> &'static [GpuDevice] {
 pub(crate) fn atomics() -> &'static [GpuDevice] {
     static DEVICES: OnceLock<Vec<GpuDevice>> = OnceLock::new();
     DEVICES.get_or_init(|| {
-        let ways = [Accumulation::SubgroupCas, Accumulation::SubgroupAtomics];
+        let methods = [Accumulation::SubgroupCas, Accumulation::SubgroupAtomics];
         let all = usable();
-        all.iter().flat_map(|a| ways.into_iter().filter_map(|way| open(a, way))).collect()
+        all.iter().flat_map(|a| methods.into_iter().filter_map(|method| open(a, method))).collect()
     })
 }
 

@@ -98,7 +98,7 @@ fn devices_lists_the_accumulation_methods() {
         let line = entry.into_iter().find_map(|line| line.strip_prefix("  accumulation    "));
         let line = line.expect("a line");
         assert!(line.starts_with(adapter.accumulation().name()), "{listed}");
-        let ways = &adapter.accumulations;
-        assert!(ways.iter().all(|method| line.contains(method.name())), "{listed}");
+        let methods = &adapter.accumulations;
+        assert!(methods.iter().all(|method| line.contains(method.name())), "{listed}");
     }
 }

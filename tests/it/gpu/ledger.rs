@@ -5,7 +5,7 @@ use densify::render::{Backend, Setup};
 use densify::selftest::scenes;
 use densify_policies::policy::{AuxColumn, AuxRequest, ErrorScore, MaskTerm, Needs, Signal};
 
-use crate::subject::{GREY, ways};
+use crate::subject::{GREY, devices_by_accumulation};
 
 #[test]
 fn device_allocations_match_the_ledger() {
@@ -38,7 +38,7 @@ fn device_allocations_match_the_ledger() {
         ),
     ];
     for (device, (needs, numbers)) in
-        ways().flat_map(|device| asked.iter().map(move |asked| (device, asked)))
+        devices_by_accumulation().flat_map(|device| asked.iter().map(move |asked| (device, asked)))
     {
         let camera = scenes::camera(40, 30, 32);
         let model = scenes::cloud(20, 3, &camera, 42);

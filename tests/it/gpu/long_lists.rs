@@ -7,7 +7,7 @@ use densify::render::gpu::GpuDevice;
 use densify::render::{Accumulation, ImageGradient, Shortcuts};
 use densify::run::failure::Failure;
 
-use crate::subject::{GREY, class, make_with, ways};
+use crate::subject::{GREY, class, devices_by_accumulation, make_with};
 use densify::selftest::compare::{Table, relative_error};
 use densify::selftest::{Differentiable, Setup, Subject, scenes};
 
@@ -58,7 +58,7 @@ fn a_list_too_long_to_render_is_an_error() {
     let camera = scenes::camera(16, 16, 71);
     let model = pile(300_000, &camera);
     let expected = faint(&Subject::NATIVE, &model).render(&camera, GREY, 0).expect("a small image");
-    for device in ways() {
+    for device in devices_by_accumulation() {
         let found = backend(&model, device).render(&camera, GREY, 0).map_err(Failure::from);
         let more = device.accumulation() != Accumulation::Slots;
         if !ended_early(&found, device, more) {
@@ -83,7 +83,7 @@ fn a_list_too_long_to_differentiate_is_an_error() {
     let (_, expected) = faint(&Subject::NATIVE, &model)
         .differentiate(&camera, GREY, 0, &upstream)
         .expect("a small image");
-    for device in ways() {
+    for device in devices_by_accumulation() {
         let found = backend(&model, device).differentiate(&camera, GREY, 0, &upstream);
         let found = found.map_err(Failure::from);
         if device.accumulation() != Accumulation::Slots && ended_early(&found, device, true) {
