@@ -171,7 +171,7 @@ fn run_plan(args: &PlanArgs, console: &Console) -> Result<(), Failure> {
 }
 
 /// One row per task: its size, its share of the work, and its memory.
-fn format_table(blocks: &Blocks) -> String {
+fn format_table(blocks: &BlockPlan) -> String {
     let mut text = String::new();
     let mut row = |cells: [String; 7]| {
         let [task, rows, trained, views, iterations, work, memory] = cells;
@@ -231,16 +231,16 @@ fn run_task(args: &RunArgs, console: &Console) -> Result<(), Failure> {
 }
 
 fn run_status(args: &StatusArgs, console: &Console) -> Result<(), Failure> {
-    let blocks = Blocks::read(&args.folder)?;
+    let blocks = BlockPlan::read(&args.folder)?;
     let (mut complete, mut left) = (0, 0);
     for (task, state) in status(&args.folder, &blocks) {
-        *(if state == State::Complete { &mut complete } else { &mut left }) += 1;
+        *(if state == TaskState::Complete { &mut complete } else { &mut left }) += 1;
         let last = blocks.iterations(task);
         let state = match state {
-            State::Waiting => "waiting".to_owned(),
-            State::Running(step) => format!("running, saved {step} of {last} steps"),
-            State::Stopped(step) => format!("stopped, saved {step} of {last} steps"),
-            State::Complete => "complete".to_owned(),
+            TaskState::Waiting => "waiting".to_owned(),
+            TaskState::Running(step) => format!("running, saved {step} of {last} steps"),
+            TaskState::Stopped(step) => format!("stopped, saved {step} of {last} steps"),
+            TaskState::Complete => "complete".to_owned(),
         };
         console.result(format_args!("{:<14} {state}", blocks.name(task)));
     }

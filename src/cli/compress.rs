@@ -146,18 +146,18 @@ fn candidate_formats(args: &CompressArgs) -> Result<Vec<&'static Format>, Failur
 
 /// The curve of size against quality: the whole model, each pruning on the way, and the attempts at the final size.
 fn format_table(compressed: &Compressed) -> String {
-    let Compressed { whole, way, attempts, best, .. } = compressed;
+    let Compressed { whole, stages, attempts, best, .. } = compressed;
     let mut text = format!(
         "\n{:<10} {:>10} {:>7} {:>14} {:>13} {:>11} {:>11}",
         "", "Gaussians", "degree", "format", "bytes", "train [dB]", "test [dB]"
     );
     let mut line = |name: &str, attempt: &Attempt, share: &str| {
-        let Attempt { rows, sh_degree, format, bytes, train, test } = attempt;
-        let test = test.map_or_else(|| "–".to_owned(), |test| format!("{test:.2}"));
+        let Attempt { rows, sh_degree, format, bytes, train_psnr, test_psnr } = attempt;
+        let test_psnr = test_psnr.map_or_else(|| "–".to_owned(), |test| format!("{test:.2}"));
         let bytes = grouped(usize::try_from(*bytes).unwrap_or(usize::MAX));
         let rows = grouped(*rows);
         text += &format!(
-            "\n{name:<10} {rows:>10} {sh_degree:>7} {format:>14} {bytes:>13} {train:>11.2} {test:>11}{share}"
+            "\n{name:<10} {rows:>10} {sh_degree:>7} {format:>14} {bytes:>13} {train_psnr:>11.2} {test_psnr:>11}{share}"
         );
     };
     line("whole PLY", whole, "");
@@ -165,7 +165,7 @@ fn format_table(compressed: &Compressed) -> String {
         let name = if place == *best { "written" } else { "tried" };
         (name, attempt)
     });
-    for (name, attempt) in way.iter().map(|attempt| ("on the way", attempt)).chain(others) {
+    for (name, attempt) in stages.iter().map(|attempt| ("on the way", attempt)).chain(others) {
         let share = percent(attempt.bytes as f64 / whole.bytes as f64);
         line(name, attempt, &format!("  {share} of the PLY"));
     }

@@ -1,41 +1,41 @@
-//! The documents name only files, headings, flags and symbols that exist; they stay short; and every study that they
-//! link is a complete table.
+//! Checks that documents name only existing files, headings, flags and symbols, stay short, and link only complete
+//! studies.
 
 use std::collections::BTreeSet;
 use std::path::Path;
 
-/// Folders of the project. Files directly in its root belong to it too; other folders there are a user's.
+/// Folders of the project. Files in the root belong to it too; other folders in the root do not.
 const FOLDERS: [&str; 10] = [
     ".cargo", ".ci", ".github", "benches", "docs", "policies", "scenegen", "shaders", "src",
     "tests",
 ];
 /// Generated from the options of a run: neither counted nor searched.
 const GENERATED: &str = "docs/options.md";
-/// Documents about the code: a name in them that ends in a slash is one of its folders.
+/// Documents about the code, in which a name that ends in a slash must be a folder.
 const ABOUT_CODE: [&str; 3] = ["ARCHITECTURE.md", "CONTRIBUTING.md", "docs/numerics.md"];
-/// A file with one of these endings is one of the project's wherever a document names it.
+/// A name with one of these extensions must be a file of the project.
 const CODE: [&str; 4] = [".rs", ".wgsl", ".py", ".sh"];
-/// Files whose words count as names that exist.
+/// Files whose words count as existing names.
 const WORDS_FROM: [&str; 6] = [".rs", ".wgsl", ".py", ".sh", ".js", ".toml"];
 /// This file, whose examples do not exist.
 const THIS: &str = "tests/it/documents.rs";
-/// A name with one of these parts stands for others.
+/// Parts that mark a name as a placeholder.
 const PLACEHOLDERS: [&str; 4] = ["NAME", "FORMAT", "*", "…"];
-/// Names that may be used although no source file has them.
+/// Names that are allowed although no source file contains them.
 const EXEMPT: [&str; 7] = [
     // Notation for transforms.
     "a_from_b",
     "camera_from_world",
-    // The recipe of a policy writes it.
+    // Created by the recipe for a new policy.
     "tests/conformance.rs",
-    // The program composes these names.
+    // Composed by the program.
     "images_4",
     "images_8",
     "ours_ITERATION",
-    // Of the Vulkan loader.
+    // Variables of the Vulkan loader.
     "VK_DRIVER_FILES",
 ];
-/// Limits on the words of all documents together, and of single ones.
+/// Word limits of all documents together and of single ones.
 const MOST_WORDS: usize = 16_000;
 const MOST_WORDS_OF: [(&str, usize); 2] = [("README.md", 1_300), ("ARCHITECTURE.md", 1_800)];
 
@@ -58,13 +58,13 @@ fn entries(folder: &str) -> Vec<(String, bool)> {
     named.collect()
 }
 
-/// The files of the project, and the names in its source.
+/// The files of the project and the names in its source.
 #[derive(Default)]
 struct Tree {
     /// Paths from the root, with `/`.
     files: BTreeSet<String>,
     folders: BTreeSet<String>,
-    /// The words of each source file, comments left out.
+    /// The words of each source file without comments.
     words: Vec<BTreeSet<String>>,
     /// Words of any source file that begin with `--`.
     flags: BTreeSet<String>,
@@ -104,7 +104,7 @@ impl Tree {
         }
     }
 
-    /// The documents that people write, each with its text.
+    /// All hand-written documents with their text.
     fn documents(&self) -> Vec<(&str, String)> {
         let written = self.files.iter().filter(|path| path.ends_with(".md") && *path != GENERATED);
         written.map(|path| (path.as_str(), read(path))).collect()
@@ -115,12 +115,12 @@ impl Tree {
         self.words.iter().any(|words| names.iter().all(|&name| words.contains(name)))
     }
 
-    /// True if everything that a code span names exists. Spans without names always do.
+    /// True if everything that a code span names exists.
     fn has(&self, document: &str, span: &str) -> bool {
         let mut flags =
             span.split(is_no_flag).filter(|word| word.len() > 2 && word.starts_with("--"));
         let is_flag = |flag: &str| {
-            // The command line's flags are fields: `--sh-degree` is `sh_degree`.
+            // Flags are declared as fields: `--sh-degree` is `sh_degree`.
             let field = flag.trim_start_matches('-').replace('-', "_");
             self.flags.contains(flag) || self.knows(&[field.as_str()])
         };
@@ -214,7 +214,7 @@ fn prose(text: &str) -> impl Iterator<Item = &str> {
     })
 }
 
-/// Headings as links name them.
+/// The anchors of all headings.
 fn headings(text: &str) -> impl Iterator<Item = String> {
     let headings = prose(text).filter(|line| line.starts_with('#'));
     headings.map(|line| {
@@ -236,7 +236,7 @@ fn links(text: &str) -> impl Iterator<Item = &str> {
     targets.filter(|target| !target.contains("://"))
 }
 
-/// Words that begin with a folder of the project, those in code blocks too.
+/// Words that begin with a folder of the project, including those in code blocks.
 fn paths(text: &str) -> impl Iterator<Item = &str> {
     let ends_word = |c: char| c.is_whitespace() || "`()[]{}<>,;:#\"'|*".contains(c);
     let is_path = |word: &&str| {
@@ -255,7 +255,7 @@ fn missing(tree: &Tree, document: &str, text: &str) -> Vec<String> {
 }
 
 #[test]
-fn what_documents_name_exists() {
+fn names_in_documents_exist() {
     let tree = Tree::of_project();
     let found = tree.documents();
     assert!(found.iter().any(|(path, _)| *path == "docs/data.md"), "the search finds too little");
@@ -265,7 +265,7 @@ fn what_documents_name_exists() {
 }
 
 #[test]
-fn names_that_do_not_exist_are_found() {
+fn missing_names_are_detected() {
     let tree = Tree::of_project();
     let has = |text: &str| missing(&tree, "docs/data.md", text).is_empty();
     for existing in [
@@ -290,8 +290,7 @@ fn names_that_do_not_exist_are_found() {
     }
 }
 
-/// A study is a table below lines with its question, its conclusion and the command that renews it. A document that
-/// links it tells users the decision.
+/// A study is a table below its question, its conclusion and its command. Some document must link it.
 #[test]
 fn studies_are_complete_and_linked() {
     let tree = Tree::of_project();
@@ -321,7 +320,7 @@ fn studies_are_complete_and_linked() {
     }
 }
 
-/// Whoever adds to a document at its limit must cut something: readers have no more time.
+/// Readers have limited time: adding to a document at its limit means cutting elsewhere.
 #[test]
 fn documents_stay_short() {
     for (path, most) in MOST_WORDS_OF {

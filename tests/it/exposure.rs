@@ -1,5 +1,5 @@
-//! Exposures of photographs on every backend: what a step learns of one, and of the rows, against the float64
-//! renderer and central differences; and that nothing is done, or held, where there is none.
+//! Exposures of photographs on every backend: gradients against the float64 renderer and central differences, and no
+//! effect or memory without exposures.
 
 use densify::core::camera::Camera;
 use densify::core::colour::ColourTransform;
@@ -15,7 +15,7 @@ use densify_policies::policy::{ErrorMode, Needs};
 
 use crate::subject::{GREY, all, make_with, normalised, repeatable, step_input};
 
-/// Half the distance between two evaluations of the loss.
+/// Step of the central difference, to either side.
 const STEP: f64 = 1e-6;
 const SOME: ColourTransform = ColourTransform {
     matrix: [[1.2, 0.05, -0.1], [0.02, 0.7, 0.15], [-0.05, 0.1, 1.3]],
@@ -28,7 +28,7 @@ struct Scene {
     target: Image8,
 }
 
-/// Rows that leave much of the background to be seen, or the same before a transparent photograph.
+/// Gaussians that leave much of the background visible, optionally with a transparent photograph.
 fn scene(with_alpha: bool) -> Scene {
     let camera = scenes::camera(37, 29, 61);
     let model = normalised(scenes::cloud(14, 1, &camera, 62));
@@ -46,15 +46,15 @@ impl Scene {
         View { camera: &self.camera, background: [0.0; 3], sh_degree: 1 }
     }
 
-    /// The photograph on the background.
+    /// The photograph composited on the background.
     fn truth(&self) -> Vec<f64> {
         let (width, height) = self.size();
         let at = |pixel: usize| self.target.composited(pixel % width, pixel / width, GREY);
         (0..width * height).flat_map(at).map(f64::from).collect()
     }
 
-    /// What the photograph is compared with: the foreground with the exposure, on the background.
-    fn shown(&self, foreground: &[f64], alpha: &[f64], exposure: &[f64; 12]) -> Vec<f64> {
+    /// The image compared with the photograph: the exposed foreground on the background.
+    fn exposed(&self, foreground: &[f64], alpha: &[f64], exposure: &[f64; 12]) -> Vec<f64> {
         let pixel = |(colour, alpha): (&[f64; 3], &f64)| -> [f64; 3] {
             std::array::from_fn(|i| {
                 let row = &exposure[3 * i..3 * i + 3];
@@ -66,7 +66,7 @@ impl Scene {
     }
 }
 
-/// Matrix and offset, one after the other.
+/// The matrix followed by the offset.
 fn numbers(transform: &ColourTransform) -> [f64; 12] {
     let all: Vec<f64> =
         transform.matrix.concat().into_iter().chain(transform.offset).map(f64::from).collect();
@@ -87,8 +87,8 @@ fn step(
     backend.train_step(&input).expect("a small image is rendered")
 }
 
-/// The gradients of the geometry that the optimiser has seen in its first step: a tenth of them is its first
-/// moment. Shape: [rows, 11].
+/// The gradients of the geometry in the first step, recovered from the first moment, which is a tenth of them.
+/// Shape: [rows, 11].
 fn gradients(backend: &dyn Differentiable) -> Vec<[f64; 11]> {
     let names = ["moments.first", "device.first rows"];
     let state = backend.state();
@@ -101,7 +101,7 @@ fn gradients(backend: &dyn Differentiable) -> Vec<[f64; 11]> {
 }
 
 #[test]
-fn gradients_are_those_of_the_float64_renderer_and_of_differences() {
+fn gradients_match_the_reference_and_central_differences() {
     let mut table = Table::new("exposures against central differences");
     for with_alpha in [false, true] {
         let scene = scene(with_alpha);
@@ -110,7 +110,7 @@ fn gradients_are_those_of_the_float64_renderer_and_of_differences() {
         let image = render(&model, scene.view(), &Rules::STANDARD);
         let (truth, at) = (scene.truth(), numbers(&SOME));
         let compared = |exposure: &[f64; 12]| {
-            loss(&scene.shown(&image.rgb, &image.alpha, exposure), &truth, width, height)
+            loss(&scene.exposed(&image.rgb, &image.alpha, exposure), &truth, width, height)
         };
         let differences: Vec<f64> = (0..12)
             .map(|i| {
@@ -122,7 +122,7 @@ fn gradients_are_those_of_the_float64_renderer_and_of_differences() {
                 (moved(STEP) - moved(-STEP)) / (2.0 * STEP)
             })
             .collect();
-        // By the chain rule: of the foreground's colours and of its alpha.
+        // Chain rule to the colours and alpha of the foreground.
         let by_shown = compared(&at).gradient;
         let by_shown = by_shown.as_chunks::<3>().0;
         let rgb = by_shown.iter().flat_map(|g| -> [f64; 3] {
@@ -141,13 +141,13 @@ fn gradients_are_those_of_the_float64_renderer_and_of_differences() {
         for subject in all() {
             let mut backend = backend(&subject, &scene);
             let output = step(&mut *backend, &scene, Some(&SOME));
-            let what = format!("{}, alpha {with_alpha}", subject.name());
+            let case = format!("{}, alpha {with_alpha}", subject.name());
             let off = (f64::from(output.loss) - compared(&at).loss).abs();
-            table.check(&what, "loss", off, 1e-5);
+            table.check(&case, "loss", off, 1e-5);
             let found = output.exposure.expect("a gradient");
             let found: Vec<f32> = found.matrix.concat().into_iter().chain(found.offset).collect();
             let tolerance = 10.0 * subject.gradient_tolerance();
-            table.check(&what, "exposure", relative_error(&found, &differences), tolerance);
+            table.check(&case, "exposure", relative_error(&found, &differences), tolerance);
             let rows = gradients(&*backend);
             let class = |first: usize, count: usize| -> Vec<f64> {
                 rows.iter().flat_map(|row| row[first..first + count].to_vec()).collect()
@@ -157,16 +157,16 @@ fn gradients_are_those_of_the_float64_renderer_and_of_differences() {
                 ("log_scales", class(3, 3)),
                 ("opacity_logits", class(10, 1)),
             ] {
-                table.check(&what, name, relative_error(&found, by_row.class(name)), tolerance);
+                table.check(&case, name, relative_error(&found, by_row.class(name)), tolerance);
             }
         }
     }
     table.finish();
 }
 
-/// The identity changes nothing, and no exposure is none; without room for exposures there is less memory.
+/// The identity equals no exposure, and a backend without room for exposures needs less memory.
 #[test]
-fn without_an_exposure_a_step_is_what_it_was() {
+fn the_identity_exposure_changes_nothing() {
     let scene = scene(true);
     for subject in repeatable() {
         let run = |exposures: bool, exposure: Option<&ColourTransform>| {
@@ -187,7 +187,7 @@ fn without_an_exposure_a_step_is_what_it_was() {
 }
 
 #[test]
-fn exposures_repeat_at_any_number_of_threads() {
+fn exposures_do_not_depend_on_the_number_of_threads() {
     let scene = scene(false);
     let run = |threads: usize| {
         let Subject::Native { instructions, .. } = Subject::NATIVE else { unreachable!() };
@@ -199,10 +199,10 @@ fn exposures_repeat_at_any_number_of_threads() {
     assert!((2..5).all(|threads| run(threads) == one));
 }
 
-/// An auxiliary view and a candidate know the photograph's exposure: the loss is that of the step that follows,
-/// and the candidate's colour is the scene's.
+/// Auxiliary views and candidates apply the exposure: the observed loss is that of the next step, and candidates have
+/// the colour of the scene.
 #[test]
-fn views_are_measured_and_candidates_coloured_with_the_exposure() {
+fn auxiliary_views_and_candidates_apply_the_exposure() {
     let mut scene = scene(false);
     scene.target.rgb.fill(128);
     let candidates = CandidateRequest {

@@ -1,5 +1,4 @@
-//! Frozen rows: whatever a step or a plan does to the others, these keep their bits, and they have no memory for
-//! what only training needs.
+//! Frozen rows: steps and plans never change a bit of them, and they need no memory for training.
 
 use densify::core::budget::RowBudget;
 use densify::core::camera::Camera;
@@ -13,16 +12,16 @@ use densify_policies::policy::{Cadence, LossTerms, MaskTerm, Needs, NoiseTerm, S
 use crate::subject::{all, make_with, on_each, repeatable, saved, step_input, storages};
 
 const ROWS: usize = 190;
-/// Rows of a task of the native backend, which has memory for whole tasks.
+/// Rows per task of the native backend, which allocates memory for whole tasks.
 const TASK: usize = 128;
-/// A task, a block of the next, and a part of another.
+/// One task, a block of the next and part of another block.
 const FROZEN: usize = TASK + 21;
 
 fn view() -> Camera {
     scenes::camera(41, 33, 81)
 }
 
-/// Quaternions have any length, and some sizes and opacities are beyond what a step confines them to.
+/// Includes quaternions of any length, and sizes and opacities beyond the range to which steps confine them.
 fn model() -> Gaussians {
     let mut model = scenes::cloud(ROWS, 1, &view(), 82);
     for row in [3, 18] {
@@ -59,8 +58,8 @@ fn bits(model: &Gaussians, rows: std::ops::Range<usize>) -> Vec<Vec<u32>> {
     rows.map(row).collect()
 }
 
-/// Everything that has memory for each row.
-fn all_of_it() -> Needs {
+/// Needs that allocate all optional memory per row.
+fn all_needs() -> Needs {
     let mask = MaskTerm { start: 1.0, rate: 0.2, weight: 1.0, threshold: 0.72 };
     let signals = [Signal::VisibleCount, Signal::ScreenGradient, Signal::Age, Signal::Mask];
     Needs {
@@ -74,8 +73,8 @@ fn all_of_it() -> Needs {
 }
 
 #[test]
-fn nothing_changes_them() {
-    let all_of_it = all_of_it();
+fn frozen_rows_never_change() {
+    let everything = all_needs();
     on_each(all(), |subject| {
         let storages = storages();
         let storages = match subject {
@@ -83,7 +82,7 @@ fn nothing_changes_them() {
             Subject::Gpu(_) => &storages[..1],
         };
         for &storage in storages {
-            for needs in [&Needs::default(), &all_of_it] {
+            for needs in [&Needs::default(), &everything] {
                 let setup = setup(FROZEN, storage, needs.clone());
                 let mut backend = make_with(subject, &model(), setup);
                 let before = backend.download().expect("a model");
@@ -105,19 +104,21 @@ fn nothing_changes_them() {
                 let [was, is] = [&before, &after].map(|model| bits(model, 0..FROZEN));
                 assert!(was == is, "{storage:?}");
                 let [was, is] = [&before, &after].map(|model| bits(model, FROZEN..ROWS - 2));
-                assert!(was.iter().zip(&is).all(|(was, is)| was != is), "{storage:?}: they rest");
+                assert!(
+                    was.iter().zip(&is).all(|(was, is)| was != is),
+                    "{storage:?}: other rows did not change"
+                );
             }
         }
     });
 }
 
-/// Rows step as they do where none is frozen, as long as all are where they would be; and so do their moments, ages,
-/// masks and signals. Of frozen rows these are 0.
+/// Other rows, their moments, ages, masks and signals change as if no row were frozen. Those of frozen rows stay 0.
 #[test]
-fn the_others_step_as_ever() {
-    // The derivatives of terms are means over the rows that train.
-    let needs = Needs { loss_terms: LossTerms::default(), noise: None, mask: None, ..all_of_it() };
-    // Some that no view shows, and that do not decay.
+fn other_rows_train_as_usual() {
+    // Loss terms are averaged over the rows that train.
+    let needs = Needs { loss_terms: LossTerms::default(), noise: None, mask: None, ..all_needs() };
+    // Some rows are invisible and do not decay.
     let mut model = model();
     let behind = (view().centre() - 2.0 * view().forward()).as_vec3().to_array();
     (0..ROWS).step_by(3).for_each(|row| model.means[row] = behind);
@@ -133,7 +134,8 @@ fn the_others_step_as_ever() {
             backend.apply(&plan.compile().after_frozen(frozen), 5, 2).expect("a plan is applied");
             let (model, state) = saved(&*backend);
             let signals = backend.take_signals(needs.signals).expect("signals");
-            let column = |signal| signals.get(signal).expect("it was asked for")[FROZEN..].to_vec();
+            let column =
+                |signal| signals.get(signal).expect("a requested signal")[FROZEN..].to_vec();
             let columns = [Signal::VisibleCount, Signal::ScreenGradient, Signal::Age].map(column);
             assert!(columns.iter().all(|column| column.iter().any(|value| *value > 0.0)));
             (bits(&model, FROZEN..ROWS), state, columns)
@@ -143,7 +145,7 @@ fn the_others_step_as_ever() {
         for (free, frozen) in free.1.iter().zip(&frozen.1) {
             assert_eq!((&free.name, &free.shape), (&frozen.name, &frozen.shape));
             let [free_rows, frozen_rows] = [free, frozen].map(|tensor| by_rows(&tensor.values));
-            // Bands that the model does not have are arrays without numbers.
+            // Arrays of missing SH bands are empty.
             if free.shape[0] == ROWS && !free_rows.is_empty() {
                 assert!(free_rows[FROZEN..] == frozen_rows[FROZEN..], "{}", free.name);
                 let rests = |row: &Vec<u32>| row.iter().all(|value| *value == 0);
@@ -164,32 +166,32 @@ fn by_rows(values: &Values) -> Vec<Vec<u32>> {
     all.chunks(width).map(<[u32]>::to_vec).collect()
 }
 
-/// What a row takes that never changes is what the ledger loses where it is frozen.
+/// Freezing rows saves their training memory in the ledger.
 #[test]
-fn they_have_no_memory_for_training() {
-    let of = |subject: &Subject, frozen: usize| {
-        make_with(subject, &model(), setup(frozen, Storage::default(), all_of_it()))
+fn frozen_rows_have_no_memory_for_training() {
+    let total = |subject: &Subject, frozen: usize| {
+        make_with(subject, &model(), setup(frozen, Storage::default(), all_needs()))
             .ledger()
             .total()
     };
-    // At degree 1, 23 parameters: two moments and a waiting gradient of each. Ages of two kinds, two sums of
-    // signals, a mask with two moments.
+    // Degree 1 has 23 parameters, each with two moments and an accumulated gradient. In addition: two ages, two signal
+    // sums, and a mask with two moments.
     let numbers = 3 * 23 + 2 + 3;
-    let native = |frozen: usize| of(&Subject::NATIVE, frozen);
+    let native = |frozen: usize| total(&Subject::NATIVE, frozen);
     assert_eq!(native(0) - native(TASK), (TASK * (4 * numbers + 2 * 2)) as u64);
-    assert_eq!(native(TASK), native(FROZEN), "whole tasks are left out");
+    assert_eq!(native(TASK), native(FROZEN), "memory is saved for whole tasks only");
     on_each(all(), |subject| {
         let Subject::Gpu(_) = subject else { return };
-        // Padding of the geometry, three times; the gradient of a row in the view at hand.
+        // Three times the padding of the geometry, and the gradient of a row in the current view.
         let bytes = 4 * (numbers + 3 + 1 + 20);
         let padding = 16 * 16;
-        let saved = of(subject, 0) - of(subject, FROZEN);
+        let saved = total(subject, 0) - total(subject, FROZEN);
         assert!(saved.abs_diff((FROZEN * bytes) as u64) < padding, "{saved} of {}", FROZEN * bytes);
     });
 }
 
 #[test]
-fn what_is_unsound_behind_them_is_found() {
+fn non_finite_rows_after_frozen_ones_are_found() {
     on_each(repeatable(), |subject| {
         let setup = setup(FROZEN, Storage::default(), Needs::default());
         let mut broken = model();
@@ -200,7 +202,9 @@ fn what_is_unsound_behind_them_is_found() {
         let first = names.iter().find(|name| name.contains("first")).expect("moments");
         let mut moments = backend.save(first).expect("moments");
         let width = moments.shape[1];
-        let Values::F32(values) = &mut moments.values else { panic!("{first} has no numbers") };
+        let Values::F32(values) = &mut moments.values else {
+            panic!("{first} is not an f32 array")
+        };
         values[(FROZEN + 7) * width] = f32::NAN;
         backend.restore(moments).expect("they are taken back");
         let unsound = |row: usize, array, kind| NonFinite { row: row as u32, array, kind };

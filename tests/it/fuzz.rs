@@ -1,5 +1,4 @@
-//! A short run of the fuzzer: the files of the corpora and damaged copies of them go through the readers, the same
-//! copies in every run.
+//! A short, reproducible fuzzing run: all readers get the files of the corpora and damaged copies of them.
 
 use std::collections::BTreeSet;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -15,7 +14,7 @@ mod formats;
 
 use formats::targets;
 
-/// Damaged copies of each file.
+/// Number of damaged copies of each file.
 const COPIES: u64 = 150;
 
 /// The files of a target's corpus, by name.
@@ -60,7 +59,7 @@ const WORDS: [&[u8]; 12] = [
 ];
 const INTEGERS: [u64; 8] = [0, 1, u64::MAX, 1 << 31, (1 << 31) - 1, 1 << 32, 1 << 62, 0x7ff8 << 48];
 
-/// Damages one place.
+/// Damages a file in one place.
 fn damage(bytes: &mut Vec<u8>, draws: &mut Draws) {
     let at = draws.below(bytes.len());
     let end = (at + 1 + draws.below(16)).min(bytes.len());
@@ -98,7 +97,7 @@ fn damage(bytes: &mut Vec<u8>, draws: &mut Draws) {
 }
 
 #[test]
-fn damaged_files_are_refused_or_read() {
+fn damaged_files_never_cause_a_panic() {
     let mut failures = Vec::new();
     for target in targets() {
         let target_name = target.name;
@@ -107,7 +106,7 @@ fn damaged_files_are_refused_or_read() {
             for copy in 0..=COPIES {
                 let mut bytes = file.clone();
                 let mut draws = Draws(ChaCha8Rng::seed_from_u64(copy));
-                // The first copy is whole.
+                // The first copy is undamaged.
                 for _ in 0..copy.min(1 + copy % 4) {
                     damage(&mut bytes, &mut draws);
                 }
@@ -115,7 +114,10 @@ fn damaged_files_are_refused_or_read() {
                     Ok(accepts) if copy > 0 => accepted += u64::from(accepts),
                     Ok(accepts) => {
                         let is_fault = name.starts_with("fault");
-                        assert!(accepts || is_fault, "{target_name}/{name} is not accepted whole");
+                        assert!(
+                            accepts || is_fault,
+                            "{target_name}/{name} is not accepted undamaged"
+                        );
                     }
                     Err(_) => {
                         let to = Path::new(env!("CARGO_TARGET_TMPDIR"));
@@ -132,12 +134,12 @@ fn damaged_files_are_refused_or_read() {
             "{target_name} accepts no damaged copy"
         );
     }
-    assert!(failures.is_empty(), "these end in a panic: {failures:#?}");
+    assert!(failures.is_empty(), "these cause a panic: {failures:#?}");
 }
 
 /// A new format fails here until it has a corpus.
 #[test]
-fn every_format_has_a_corpus_and_every_corpus_a_format() {
+fn formats_and_corpora_correspond() {
     let names: Vec<&str> = targets().iter().map(|target| target.name).collect();
     let unique: BTreeSet<String> = names.iter().map(|&name| name.to_owned()).collect();
     assert_eq!(unique.len(), names.len(), "two targets have the same name: {names:?}");

@@ -1,4 +1,4 @@
-//! The walls of the house as tests: what must not depend on what, where the compiler does not see it.
+//! Architecture tests: dependency rules that the compiler does not enforce.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -13,7 +13,7 @@ fn read(path: &Path) -> String {
     std::fs::read_to_string(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
 }
 
-/// All files below a folder, with `/`, from the root.
+/// All files below a folder, as paths from the root with `/`.
 fn files(folder: &str) -> Vec<String> {
     let entries = std::fs::read_dir(root().join(folder)).expect("a folder of the project");
     let mut found = Vec::new();
@@ -28,12 +28,12 @@ fn files(folder: &str) -> Vec<String> {
     found
 }
 
-/// The places below `src` whose code, without comments and unit tests, has one of these words; paths that
-/// `may` are left out.
-fn found_in(words: &[String], may: impl Fn(&str) -> bool) -> Vec<String> {
+/// Lines below `src`, without comments and unit tests, that contain one of these words. Paths for which `allowed` holds
+/// are skipped.
+fn lines_with(words: &[String], allowed: impl Fn(&str) -> bool) -> Vec<String> {
     let mut found = Vec::new();
     for path in files("src") {
-        if !path.ends_with(".rs") || path.ends_with("tests.rs") || may(&path) {
+        if !path.ends_with(".rs") || path.ends_with("tests.rs") || allowed(&path) {
             continue;
         }
         let text = read(&root().join(&path));
@@ -48,9 +48,9 @@ fn found_in(words: &[String], may: impl Fn(&str) -> bool) -> Vec<String> {
 #[test]
 fn only_the_gpu_backend_names_wgpu() {
     let wgpu = ["wgpu::".to_owned()];
-    let found = found_in(&wgpu, |path| path.starts_with("src/render/gpu"));
+    let found = lines_with(&wgpu, |path| path.starts_with("src/render/gpu"));
     assert!(found.is_empty(), "{found:#?}");
-    assert!(!found_in(&wgpu, |_| false).is_empty(), "the search finds nothing at all");
+    assert!(!lines_with(&wgpu, |_| false).is_empty(), "the search is broken");
 }
 
 #[test]
@@ -58,7 +58,7 @@ fn the_trainer_names_no_policy() {
     let all = policies().expect("the registry is sound");
     let words = |name: &str| [format!("\"{name}\""), format!("densify_policies::{name}")];
     let words: Vec<String> = all.iter().flat_map(|entry| words(entry.name)).collect();
-    let found = found_in(&words, |path| !path.starts_with("src/train/trainer"));
+    let found = lines_with(&words, |path| !path.starts_with("src/train/trainer"));
     assert!(!words.is_empty() && found.is_empty(), "{found:#?}");
 }
 
@@ -72,18 +72,18 @@ fn every_shader_has_a_native_file_of_the_same_name() {
         files(folder).into_iter().filter_map(inside).collect()
     };
     let mut shaders = names("shaders", ".wgsl");
-    // Texts that stages share.
+    // Code shared by stages.
     shaders.retain(|name| !name.starts_with("shared/"));
-    // A stage in two ways has one native file.
+    // A stage with two variants has one native file.
     for two in ["rasterize_bwd", "observe"] {
         assert!(shaders.contains(two) && shaders.remove(&format!("{two}_atomic")), "{two}");
     }
     assert!(shaders.len() >= 9, "{shaders:?}");
     let native = names("src/render/cpu", ".rs");
-    assert!(shaders.is_subset(&native), "no native twin: {:?}", shaders.difference(&native));
+    assert!(shaders.is_subset(&native), "no native counterpart: {:?}", shaders.difference(&native));
 }
 
-/// The packages of the workspace, lowest layer first. A package names only those of lower layers.
+/// The packages of the workspace, lowest layer first. A package may depend only on lower layers.
 const LAYERS: [&[(&str, &str)]; 9] = [
     &[
         ("densify-core", "src/core"),
@@ -110,7 +110,7 @@ const LAYERS: [&[(&str, &str)]; 9] = [
     &[("densify", ".")],
 ];
 
-/// The packages that a package names; what others need it cannot name.
+/// The workspace packages that a package depends on directly.
 fn dependencies(folder: &str) -> Vec<String> {
     let manifest: toml::Table = read(&root().join(folder).join("Cargo.toml")).parse().unwrap();
     let named = manifest.get("dependencies").and_then(toml::Value::as_table);
@@ -118,13 +118,16 @@ fn dependencies(folder: &str) -> Vec<String> {
 }
 
 #[test]
-fn packages_name_only_those_below_them() {
+fn packages_depend_only_on_lower_layers() {
     let mut below: BTreeSet<&str> = BTreeSet::new();
     let mut named = 0;
     for layer in LAYERS {
         for (package, folder) in layer {
             for name in dependencies(folder).iter().filter(|name| name.starts_with("densify")) {
-                assert!(below.contains(&**name), "{package} names {name}, which is not below it");
+                assert!(
+                    below.contains(&**name),
+                    "{package} depends on {name}, which is not in a lower layer"
+                );
                 named += 1;
             }
         }
@@ -171,7 +174,7 @@ fn unsafe_code_is_forbidden_everywhere() {
     }
 }
 
-/// The modules of the packages that are larger than a screen, lowest first. None names a later one.
+/// The modules of the larger packages, lowest first. A module may use only earlier ones.
 const MODULES: [(&str, &[&str]); 5] = [
     (
         "src/core",
@@ -265,7 +268,7 @@ fn named_modules(code: &str) -> BTreeSet<String> {
 }
 
 #[test]
-fn modules_name_only_those_above_them_in_the_list() {
+fn modules_use_only_earlier_modules() {
     let mut checked = 0;
     for (folder, order) in MODULES {
         let place = |name: &str| order.iter().position(|module| *module == name);
@@ -282,7 +285,7 @@ fn modules_name_only_those_above_them_in_the_list() {
                 code.lines().filter(|line| !line.trim_start().starts_with("//")).collect();
             for name in named_modules(&code.join("\n")) {
                 if let Some(there) = place(&name) {
-                    assert!(there <= here, "{path} names {name}, which is above {module}");
+                    assert!(there <= here, "{path} uses {name}, which is listed after {module}");
                     checked += usize::from(there < here);
                 }
             }

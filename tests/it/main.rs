@@ -1,15 +1,15 @@
-//! The integration tests: one binary, so that it links once.
+//! The integration tests, in one binary to link only once.
 //!
-//! Most run once on each of the backends of `subject`: the native one with every instruction set, and every adapter.
-//! `central` checks the float64 renderer of `densify::selftest` by central differences, and `oracle` holds it and the
-//! backends against stored float64 renders; `extremes` runs the cases of the selftest and says where every extreme is
-//! tested; `exposure` is of photographs that are exposed differently; `agreement` holds every backend to the native
-//! one; `properties` are of any scene; `sameness` and `resuming` compare bits; `edits` applies any plan to a backend
-//! and to a plain vector; `frozen` is about rows that never change, `painted` about rows drawn in other colours;
-//! `undeclared` is about what takes no bytes;
-//! `spatial` is a policy that reads and edits where rows are. `cli` runs the program on photographs of a small scene,
-//! and holds policies to surfaces that are known; `fuzz` damages files; `gpu` is what only the GPU backend has;
-//! `invariants` keeps the walls of ARCHITECTURE.md standing, and `documents` keeps the documents true and short.
+//! Most tests run on every backend of `subject`: the native one with every instruction set, and every GPU adapter.
+//!
+//! - Reference: `central` checks the float64 renderer by central differences; `oracle` compares it and the backends
+//!   with stored float64 renders; `extremes` runs the selftest and lists the tests of every extreme.
+//! - Backends: `agreement` compares them with the native one; `properties` tests arbitrary scenes; `sameness` and
+//!   `resuming` compare bits; `exposure`, `frozen`, `painted` and `undeclared` test single features; `gpu` tests what
+//!   only the GPU backend has.
+//! - Policies: `edits` applies random plans to a backend and to a plain vector; `spatial` is a policy with spatial rules.
+//! - Program: `cli` runs it on a small scene and on scenes with known surfaces; `fuzz` damages input files.
+//! - Project: `invariants` enforces the dependency rules of ARCHITECTURE.md; `documents` checks the documents.
 
 mod agreement;
 mod aux_views;

@@ -1,4 +1,4 @@
-//! Rows in other colours than their own: drawn as if they had these, and nothing that training depends on changes.
+//! Rendering Gaussians in substitute colours, without affecting training.
 
 use densify::core::gaussians::rgb_to_dc;
 use densify::selftest::{Setup, scenes};
@@ -9,7 +9,7 @@ const ROWS: usize = 37;
 const DEGREE: u8 = 2;
 
 #[test]
-fn rows_are_drawn_in_the_colours_given_and_keep_their_own() {
+fn painted_rendering_uses_the_given_colours_and_keeps_the_model() {
     on_each(repeatable(), |subject| {
         let view = scenes::camera(33, 25, 71);
         let model = scenes::cloud(ROWS, DEGREE, &view, 72);
@@ -22,7 +22,8 @@ fn rows_are_drawn_in_the_colours_given_and_keep_their_own() {
         let share = |row: usize| row as f32 / ROWS as f32;
         let colours: Vec<[f32; 3]> =
             (0..ROWS).map(|row| [share(row), 0.5, 1.0 - share(row)]).collect();
-        let painted = backend.inspect().and_then(|it| it.render_painted(&view, GREY, &colours));
+        let painted =
+            backend.inspect().and_then(|inspector| inspector.render_painted(&view, GREY, &colours));
         let painted = painted.expect("a rendering");
 
         let mut flat = before.0.clone().with_degree(0);
@@ -33,7 +34,7 @@ fn rows_are_drawn_in_the_colours_given_and_keep_their_own() {
         for (found, expected) in painted.rgb.iter().zip(&expected.rgb) {
             assert!((found - expected).abs() < 2e-6, "{found}, expected {expected}");
         }
-        assert_ne!(bits(&painted), own, "the colours are not those that were given");
+        assert_ne!(bits(&painted), own, "the given colours have no effect");
         assert_eq!((painted.alpha, painted.depth), (expected.alpha, expected.depth));
         assert_eq!(saved(&*backend), before, "the model has changed");
         assert_eq!(bits(&backend.render(&view, GREY, DEGREE).expect("a rendering")), own);

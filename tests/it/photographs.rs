@@ -1,5 +1,5 @@
-//! A small scene to photograph, and its photographs on disk in the formats that are read: a ring of
-//! cameras around a few Gaussians, rendered by the library.
+//! A small test dataset: a ring of cameras around a few Gaussians, rendered by the library and written to disk in
+//! several dataset formats.
 
 use std::f64::consts::TAU;
 use std::path::{Path, PathBuf};
@@ -16,24 +16,24 @@ use tempfile::TempDir;
 use crate::subject::make;
 use densify::selftest::{Subject, scenes};
 
-/// Views taken.
+/// Number of views.
 pub(crate) const VIEWS: usize = 14;
 /// Width and height [px].
 pub(crate) const SIZE: (u32, u32) = (48, 40);
-/// Points of the reconstruction.
+/// Number of points of the reconstruction.
 pub(crate) const POINTS: usize = 300;
 const FOCAL: f64 = 52.0;
 const BLOBS: usize = 24;
 
-/// What a camera saw.
+/// A rendered photograph.
 struct Shot {
     camera: Camera,
-    /// On black. Shape: [height, width, 3].
+    /// Colour on black. Shape: [height, width, 3].
     rgb: Vec<f32>,
     alpha: Vec<f32>,
 }
 
-/// A dataset in a folder of its own, removed when dropped.
+/// A dataset in a temporary folder, which is removed on drop.
 pub(crate) struct Photographs {
     folder: TempDir,
 }
@@ -56,7 +56,7 @@ fn blobs() -> Gaussians {
     model
 }
 
-/// Points on the blobs, in their colours: (position, colour).
+/// Points on the blobs: (position, colour).
 fn points() -> Vec<([f64; 3], [u8; 3])> {
     let model = blobs();
     let mut rng = ChaCha8Rng::seed_from_u64(6);
@@ -125,7 +125,7 @@ impl Photographs {
         made
     }
 
-    /// A COLMAP model in text.
+    /// A COLMAP text model.
     pub(crate) fn colmap_text() -> Self {
         let made = Self::with_images();
         let (width, height) = SIZE;
@@ -160,7 +160,7 @@ impl Photographs {
         made
     }
 
-    /// Saves a view with its transparency, and describes it.
+    /// Saves a view with transparency and returns its entry.
     fn frame(&self, split: &str, view: usize) -> serde_json::Value {
         let Shot { camera, rgb, alpha } = &shots()[view];
         let pixel = |x: u32, y: u32| {

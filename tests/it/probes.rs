@@ -1,6 +1,5 @@
-//! `--budget auto` measures along the run, and leaves the model, and all that its future depends on,
-//! as they were: after measurements from which nothing follows, a run has the same bits as one that
-//! measured nothing.
+//! `--budget auto` measures during training without affecting it: if no decision follows, the run has the same bits as
+//! one without measurements.
 
 use densify::core::gaussians::Gaussians;
 use densify::data::dataset::{Dataset, LoadOptions};
@@ -18,11 +17,11 @@ use crate::photographs::Photographs;
 use crate::subject::{devices, make_with, saved, storages};
 
 const ROWS: usize = 60;
-/// The probes are measured at step 100, and at step 200 also without the rows of least weight.
+/// Probes are measured at step 100, and at step 200 also without the rows of lowest weight.
 const ITERATIONS: u32 = 250;
 const MEASURED_AT: u32 = 200;
 
-/// Edits nothing.
+/// A policy that never edits.
 struct Idle;
 
 impl DensityPolicy for Idle {
@@ -41,7 +40,7 @@ fn needs() -> Needs {
     Needs { signals: growth_signals(), ..Needs::default() }
 }
 
-/// The bits of a run from which it goes on, after [`MEASURED_AT`] steps with or without measurements.
+/// The state of a run after [`MEASURED_AT`] steps with or without measurements.
 fn bits(backend: Box<dyn Backend>, dataset: &Dataset, measures: bool) -> (Gaussians, Vec<Tensor>) {
     let scene = SceneInfo {
         extent: 1.0,

@@ -1,4 +1,4 @@
-//! What holds for any scene, camera and size.
+//! Properties of arbitrary scenes, cameras and image sizes.
 
 use densify::core::camera::Camera;
 use densify::core::gaussians::{Gaussians, sh_coefficients};
@@ -11,14 +11,14 @@ use proptest::test_runner::{TestCaseResult, TestRunner};
 
 use crate::subject::{GREY, bits, cases_on, class, make_with, on_each, repeatable};
 
-/// A row: position in the camera's axes as shares of the image and depth, log-scales, quaternion,
-/// opacity logit, and what its colours are drawn from.
+/// A Gaussian: position in camera space as image fractions and depth, log-scales, quaternion, opacity logit and the seed
+/// of its colours.
 type Row = ([f64; 3], [f32; 3], [f32; 4], f32, f32);
 
 fn row() -> impl Strategy<Value = Row> {
     (
         [-0.5..1.5_f64, -0.5..1.5_f64, -2.0..20.0_f64],
-        // From far below a pixel to far beyond the image.
+        // From much smaller than a pixel to much larger than the image.
         prop::array::uniform3(-12.0..3.0_f32),
         prop::array::uniform4(-1e3..1e3_f32),
         -12.0..12.0_f32,
@@ -27,7 +27,7 @@ fn row() -> impl Strategy<Value = Row> {
 }
 
 fn view() -> impl Strategy<Value = Camera> {
-    // The longest image is for the cases of the selftest.
+    // The selftest covers very long images.
     (0..SIZES.len() - 1, any::<u64>())
         .prop_map(|(size, seed)| scenes::camera(SIZES[size].0, SIZES[size].1, seed))
 }
@@ -35,7 +35,7 @@ fn view() -> impl Strategy<Value = Camera> {
 fn model(camera: &Camera, sh_degree: u8, rows: &[Row]) -> Gaussians {
     let mut model = Gaussians { sh_degree, ..Gaussians::default() };
     for (i, ([u, v, z], scale, quat, logit, shade)) in rows.iter().enumerate() {
-        // No two at one depth, where the order of the rows would count.
+        // Depths are distinct, because the row order breaks ties.
         let z = z + 1e-3 * i as f64;
         let x = (u * f64::from(camera.width) - camera.cx) / camera.fx * z;
         let y = (v * f64::from(camera.height) - camera.cy) / camera.fy * z;
@@ -57,7 +57,7 @@ fn render(
     backend.render(camera, background, model.sh_degree).expect("a small image is rendered")
 }
 
-/// Depths as a backend has them: rows at the same one are drawn in their order.
+/// Depths as backends compute them. Rows of equal depth are blended in row order.
 fn depths(model: &Gaussians, camera: &Camera) -> Vec<f64> {
     let depth = |mean: &[f32; 3]| camera.project(mean.map(f64::from).into()).1;
     let mut depths: Vec<f64> = model.means.iter().map(depth).collect();
@@ -65,13 +65,13 @@ fn depths(model: &Gaussians, camera: &Camera) -> Vec<f64> {
     depths
 }
 
-/// The repeatable backends; SwiftShader is left out, which takes seconds a case.
+/// The deterministic backends without SwiftShader, which takes seconds per case.
 fn fast() -> Vec<Subject> {
     let is_slow = |subject: &Subject| subject.name().contains("SwiftShader");
     repeatable().into_iter().filter(|subject| !is_slow(subject)).collect()
 }
 
-/// Checks that something holds of any such input.
+/// Checks a property on every backend with random inputs.
 fn for_any<S: Strategy>(inputs: &S, check: impl Fn(&Subject, S::Value) -> TestCaseResult) {
     on_each(fast(), |subject| {
         let mut runner = TestRunner::new(cases_on(subject, 24));
@@ -81,7 +81,7 @@ fn for_any<S: Strategy>(inputs: &S, check: impl Fn(&Subject, S::Value) -> TestCa
 }
 
 #[test]
-fn any_finite_scene_is_rendered_in_any_order_and_in_any_bands() {
+fn rendering_is_finite_and_independent_of_row_order_and_bands() {
     let rows = prop::collection::vec(row(), 0..60);
     let inputs = (view(), 0..=3_u8, rows, 0..60_usize, 1..400_usize);
     for_any(&inputs, |subject, (camera, degree, rows, by, cap)| {
@@ -114,7 +114,7 @@ fn any_finite_scene_is_rendered_in_any_order_and_in_any_bands() {
 }
 
 #[test]
-fn what_is_not_seen_changes_nothing_and_the_background_enters_linearly() {
+fn hidden_rows_change_nothing_and_the_background_is_linear() {
     let rows = prop::collection::vec(row(), 0..40);
     let inputs = (view(), rows, prop::array::uniform3(0.0..1.0_f32), 0..3_usize);
     for_any(&inputs, |subject, (camera, rows, background, place)| {

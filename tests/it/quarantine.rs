@@ -1,6 +1,5 @@
-//! Rows that hold a number that is not finite: every one is found, none is lost sight of, and no other row
-//! notices. That a gradient which cannot be squared is found in a moment is in case 25 of the
-//! [selftest](densify::selftest).
+//! Non-finite rows: every one is found and stays marked, and other rows are not affected. Case 25 of the
+//! [selftest](densify::selftest) covers gradients whose square overflows.
 
 use densify::core::gaussians::{Gaussians, ModelArray};
 use densify::render::{Backend, NonFinite, NumberKind, Storage, Values};
@@ -25,8 +24,8 @@ fn unsound(row: usize, slot: usize) -> NonFinite {
     NonFinite { row: row as u32, array, kind: NumberKind::Parameter }
 }
 
-/// Row i has its number i poisoned.
-fn every_parameter_that_is_none_is_found(subject: &Subject, storage: Storage) {
+/// Poisons parameter i of row i.
+fn every_non_finite_parameter_is_found(subject: &Subject, storage: Storage) {
     let model = scenes::cloud(SLOTS + 3, 3, &scenes::camera(33, 30, 71), 72);
     let audit = |model: &Gaussians| {
         let setup = Setup { storage, ..Setup::default() };
@@ -35,7 +34,7 @@ fn every_parameter_that_is_none_is_found(subject: &Subject, storage: Storage) {
     assert!(audit(&model).is_empty());
     for value in POISON {
         let mut poisoned = model.clone();
-        // Beyond f16, and no reason to be removed.
+        // Too large for f16, but finite, so not a reason for removal.
         *slot_mut(&mut poisoned, SLOTS + 1, 20) = -1e30;
         (0..SLOTS).for_each(|slot| *slot_mut(&mut poisoned, slot, slot) = value);
         let expected: Vec<NonFinite> = (0..SLOTS).map(|slot| unsound(slot, slot)).collect();
@@ -43,8 +42,8 @@ fn every_parameter_that_is_none_is_found(subject: &Subject, storage: Storage) {
     }
 }
 
-/// Row i has the moment of its number i poisoned, in each array of moments.
-fn every_moment_that_is_none_is_found(subject: &Subject) {
+/// Poisons moment i of row i in each array of moments.
+fn every_non_finite_moment_is_found(subject: &Subject) {
     let model = scenes::cloud(SLOTS + 3, 3, &scenes::camera(33, 30, 71), 72);
     let mut backend = make(subject, &model);
     let names: Vec<String> = backend.state().into_iter().map(|array| array.name).collect();
@@ -53,14 +52,16 @@ fn every_moment_that_is_none_is_found(subject: &Subject) {
         let sound = backend.save(name).expect("moments");
         let mut poisoned = sound.clone();
         let numbers = sound.shape[1];
-        let Values::F32(values) = &mut poisoned.values else { panic!("{name} holds no numbers") };
+        let Values::F32(values) = &mut poisoned.values else {
+            panic!("{name} is not an f32 array")
+        };
         (0..numbers).for_each(|row| values[row * numbers + row] = POISON[row % 4]);
-        backend.restore(poisoned).expect("they are taken back");
+        backend.restore(poisoned).expect("a restored array");
         let found = backend.audit().expect("an audit");
         let rows: Vec<usize> = found.iter().map(|u| u.row as usize).collect();
         assert_eq!(rows, (0..numbers).collect::<Vec<_>>(), "{name}");
         assert!(found.iter().all(|u| u.kind == NumberKind::Moment), "{name}");
-        backend.restore(sound).expect("they are taken back");
+        backend.restore(sound).expect("a restored array");
         assert!(backend.audit().expect("an audit").is_empty(), "{name}");
         seen += numbers;
     }
@@ -68,20 +69,20 @@ fn every_moment_that_is_none_is_found(subject: &Subject) {
 }
 
 #[test]
-fn every_number_that_is_none_is_found() {
+fn every_non_finite_value_is_found() {
     on_each(repeatable(), |subject| {
-        every_parameter_that_is_none_is_found(subject, Storage::default());
-        every_moment_that_is_none_is_found(subject);
+        every_non_finite_parameter_is_found(subject, Storage::default());
+        every_non_finite_moment_is_found(subject);
     });
     for storage in storages() {
-        every_parameter_that_is_none_is_found(&Subject::NATIVE, storage);
+        every_non_finite_parameter_is_found(&Subject::NATIVE, storage);
     }
 }
 
-/// A poisoned parameter stays so in training, the other rows train as if there were no such row, and
-/// the model is sound when it is gone.
+/// Training keeps a poisoned parameter, other rows train as if its row did not exist, and removing the row makes the
+/// model finite again.
 #[test]
-fn the_others_train_as_if_it_were_not_there() {
+fn non_finite_rows_do_not_affect_others() {
     let camera = scenes::camera(33, 30, 73);
     let model = scenes::cloud(24, 3, &camera, 74);
     let target = scenes::target(&camera);
@@ -94,7 +95,7 @@ fn the_others_train_as_if_it_were_not_there() {
     };
     on_each(repeatable(), |subject| {
         let without = train(&mut *make(subject, &remove(&model, POISONED)));
-        // A number of each class.
+        // One number of each class.
         for slot in [1, 4, 8, 10, 12, 40] {
             let mut poisoned = model.clone();
             *slot_mut(&mut poisoned, POISONED, slot) = f32::NAN;

@@ -1,4 +1,4 @@
-//! What a checkpoint holds of a backend is all that its future depends on.
+//! A checkpoint contains all backend state that future steps depend on.
 
 use densify::render::{Backend, StepInput, Storage, Tensor, Values};
 use densify_policies::policy::{
@@ -12,11 +12,11 @@ use densify::core::camera::Camera;
 use densify::core::gaussians::Gaussians;
 use densify::selftest::{Differentiable, Setup, Subject, scenes};
 
-/// Steps before the state is taken: with sums over several steps, no step is due, and all have some that wait.
+/// Steps before saving. With accumulation, no update is due and all classes have pending gradients.
 const BEFORE: u32 = 7;
 
-/// All signals, with sums over several steps.
-fn in_batches() -> Needs {
+/// All signals and gradients accumulated over several steps.
+fn with_accumulation() -> Needs {
     let signals = Signal::ALL.into_iter().filter(|signal| *signal != Signal::Mask).collect();
     Needs {
         signals,
@@ -35,7 +35,7 @@ fn in_batches() -> Needs {
     }
 }
 
-/// All signals, with masks, which bear no sums over several steps.
+/// All signals and masks, which cannot be combined with accumulation.
 fn with_masks() -> Needs {
     Needs {
         signals: Signal::ALL.into(),
@@ -65,7 +65,7 @@ fn step(backend: &mut dyn Backend, needs: &Needs, camera: &Camera, number: u32) 
     backend.train_step(&input).expect("a small image is rendered");
 }
 
-/// Four more steps, with a new epoch among them, and everything that can be seen of the backend.
+/// Takes four more steps, including a new epoch, and returns the observable state of the backend.
 fn future(backend: &mut dyn Backend, needs: &Needs) -> impl PartialEq + std::fmt::Debug + use<> {
     let camera = scenes::camera(48, 40, 51);
     for i in BEFORE + 1..BEFORE + 5 {
@@ -77,7 +77,7 @@ fn future(backend: &mut dyn Backend, needs: &Needs) -> impl PartialEq + std::fmt
     let signals = backend.take_signals(needs.signals).expect("signals");
     let candidates = backend.candidates().to_vec();
     let bits = |s: Signal| -> Vec<u32> {
-        signals.get(s).expect("it was asked for").iter().map(|v| v.to_bits()).collect()
+        signals.get(s).expect("a requested signal").iter().map(|v| v.to_bits()).collect()
     };
     let columns: Vec<_> = needs.signals.iter().map(|s| (s, bits(s))).collect();
     (backend.download().expect("the model"), columns, candidates)
@@ -92,14 +92,14 @@ fn is_zero(tensor: &Tensor) -> bool {
 }
 
 #[test]
-fn a_backend_that_took_back_its_state_has_the_same_future() {
+fn a_restored_backend_continues_identically() {
     let camera = scenes::camera(48, 40, 51);
     let model = scenes::cloud(200, 3, &camera, 52);
-    let in_batches: fn() -> Needs = in_batches;
-    let stored = storages().map(|storage| (Subject::NATIVE, (storage, 0, in_batches)));
-    // With frozen rows too: a task of the native backend, and a part of another.
+    let with_accumulation: fn() -> Needs = with_accumulation;
+    let stored = storages().map(|storage| (Subject::NATIVE, (storage, 0, with_accumulation)));
+    // Frozen rows: one task of the native backend and part of another.
     let all = repeatable().into_iter().flat_map(|subject| {
-        let setups = [(0, in_batches), (141, with_masks)];
+        let setups = [(0, with_accumulation), (141, with_masks)];
         setups.map(|(frozen, needs)| (subject.clone(), (Storage::default(), frozen, needs)))
     });
     for (subject, setup) in all.chain(stored) {
@@ -120,17 +120,17 @@ fn a_backend_that_took_back_its_state_has_the_same_future() {
         let without = |left_out: &str| {
             let mut backend = backend(&subject, setup, &model);
             for tensor in state.iter().filter(|t| t.name != left_out) {
-                backend.restore(tensor.clone()).expect("it is this backend's");
+                backend.restore(tensor.clone()).expect("an array of this backend");
             }
             future(&mut *backend, &needs)
         };
         let masks = if needs.mask.is_some() { ", with masks" } else { "" };
         let name = format!("{}, {:?}, {} frozen{masks}", subject.name(), setup.0, setup.1);
         assert!(without("") == expected, "{name}");
-        // None of it is idle.
-        let told: Vec<&Tensor> = state.iter().filter(|t| !is_zero(t)).collect();
-        assert!(told.len() > 8, "{name}: only {} arrays say anything", told.len());
-        for tensor in told {
+        // Leaving out any non-zero array must make a difference.
+        let nonzero: Vec<&Tensor> = state.iter().filter(|t| !is_zero(t)).collect();
+        assert!(nonzero.len() > 8, "{name}: only {} non-zero arrays", nonzero.len());
+        for tensor in nonzero {
             assert!(without(&tensor.name) != expected, "{name}: {}", tensor.name);
         }
 
@@ -139,7 +139,11 @@ fn a_backend_that_took_back_its_state_has_the_same_future() {
             Some(_) => name.contains("mask"),
             None => name.contains("waiting") || name.contains("summed"),
         };
-        let special = state.iter().find(|t| is_of_needs(&t.name)).expect("what the needs add");
-        assert!(other.restore(special.clone()).is_err(), "{name}: a run without took it");
+        let special =
+            state.iter().find(|t| is_of_needs(&t.name)).expect("an array that the needs add");
+        assert!(
+            other.restore(special.clone()).is_err(),
+            "{name}: a backend without these needs accepted it"
+        );
     }
 }

@@ -1,6 +1,5 @@
-//! What must not change a single bit of a repeatable backend: threads, the room for tile lists and records,
-//! running twice; for the order of rows, and rows that are not seen, see `properties`. Sums in any order
-//! stay near to those.
+//! Bit-exactness of deterministic backends: results do not depend on threads, the room for tile lists and records, or
+//! earlier runs. `properties` covers row order and hidden rows. Accumulation by atomics stays close to these results.
 
 use densify::core::camera::Camera;
 use densify::core::gaussians::Gaussians;
@@ -15,7 +14,7 @@ use crate::subject::{
     GREY, atomics, class, devices, make, make_with, repeatable, saved, step_input, storages, wide,
 };
 
-/// An image with its gradients, and a model after some steps with what each of them said.
+/// An image with its gradients, the model after some steps, and their outputs.
 type Run = (Vec<u32>, Gaussians, Vec<StepOutput>);
 
 fn differentiate(
@@ -28,7 +27,7 @@ fn differentiate(
     outcome.expect("a small image is rendered")
 }
 
-/// The statistics of rows that are numbers.
+/// The numeric statistics of rows.
 fn statistics(gradient: &ModelGradient) -> [&[f32]; 5] {
     [
         gradient.mean2d.as_flattened(),
@@ -48,7 +47,7 @@ fn bits((image, gradient): &(Rendering, ModelGradient)) -> Vec<u32> {
     all.flatten().map(|v| v.to_bits()).chain(counts).collect()
 }
 
-/// Trains after a look.
+/// Renders once, then trains.
 fn run(backend: &mut dyn Differentiable, camera: &Camera) -> Run {
     let degree = backend.sh_degree();
     let seen = bits(&differentiate(backend, camera, degree));
@@ -58,12 +57,12 @@ fn run(backend: &mut dyn Differentiable, camera: &Camera) -> Run {
     (seen, backend.download().expect("a model"), outputs)
 }
 
-/// The same but for the number of bands.
+/// Clears the number of bands, which may differ.
 fn without_bands((seen, model, outputs): Run) -> Run {
     (seen, model, outputs.into_iter().map(|output| StepOutput { bands: 1, ..output }).collect())
 }
 
-/// However parameters are stored, and where depths are equal.
+/// Covers all kinds of parameter storage and equal depths.
 #[test]
 fn threads_change_nothing() {
     let camera = scenes::camera(150, 90, 31);
@@ -103,7 +102,7 @@ fn bands_change_nothing() {
     }
 }
 
-/// Records that do not fit are made in parts: within a band, and within a tile.
+/// Records that do not fit are processed in parts: within a band and within a tile.
 #[test]
 fn room_for_records_changes_nothing() {
     let camera = scenes::camera(140, 120, 32);
@@ -131,7 +130,7 @@ fn running_twice_changes_nothing() {
             let setup = Setup { tile_cap, ..Setup::default() };
             let mut backend = make_with(&subject, &model, setup);
             let first = differentiate(&mut *backend, &camera, 3);
-            // Another view in between, of another size, leaves nothing behind.
+            // A view of another size in between must have no effect.
             let _ = differentiate(&mut *backend, &other, 1);
             let second = differentiate(&mut *backend, &camera, 3);
             assert!(bits(&first) == bits(&second), "{name}");
@@ -142,10 +141,9 @@ fn running_twice_changes_nothing() {
     }
 }
 
-/// With room for few records at a time, rows that were removed leave nothing behind in which the rest
-/// would find its own.
+/// With room for few records, those of removed rows must not be taken for those of remaining ones.
 #[test]
-fn rows_that_are_gone_have_no_records() {
+fn removed_rows_leave_no_records() {
     let camera = scenes::camera(64, 48, 11);
     let model = scenes::cloud(400, 2, &camera, 12);
     let with = |record_cap| {
@@ -158,14 +156,13 @@ fn rows_that_are_gone_have_no_records() {
         run(&mut *backend, &camera);
         saved(&*backend)
     };
-    // Enough for all records of the ten rows that stay, not for the slots of those that went.
+    // Enough records for the ten remaining rows, but not for the slots of the removed ones.
     assert!(with(200) == with(1 << 20));
 }
 
-/// Sums start at 0 with every pass, go on over bands, and start again where a pass is taken again because
-/// its bands did not do.
+/// Sums start at 0 with every pass, continue over bands, and restart if a pass is repeated with more bands.
 #[test]
-fn atomic_sums_are_those_of_slots_with_any_cap() {
+fn atomic_accumulation_matches_slots_at_any_cap() {
     let camera = scenes::camera(70, 90, 32);
     let model = scenes::cloud(150, 1, &camera, 42);
     let Some(slots) = devices().first() else { return };

@@ -1,5 +1,5 @@
-//! Shortcuts of the backends: with other limits of blending they are held to the reference with these
-//! limits, forward and backward.
+//! Blending limits: backends with non-default limits are compared with the reference under the same limits, forward and
+//! backward.
 
 use densify::core::camera::Camera;
 use densify::core::gaussians::Gaussians;
@@ -10,10 +10,10 @@ use densify::selftest::compare::{Limits, Table, class, compare_images, relative_
 use densify::selftest::reference::{CLASSES, Image, Model, Rules, View, blend, project};
 use densify::selftest::{Setup, scenes};
 
-/// Gradients, as elsewhere, against the largest of their class.
+/// Tolerance of gradients relative to the largest of their class.
 const GRADIENT: f64 = 1e-4;
 
-/// Translucent rows in front of each other, of which many pixels see enough to stop.
+/// Overlapping translucent Gaussians, at which many pixels stop blending early.
 fn scene() -> (Gaussians, Camera) {
     let camera = scenes::camera(52, 41, 5);
     let mut model = scenes::cloud(160, 1, &camera, 8);
@@ -23,7 +23,7 @@ fn scene() -> (Gaussians, Camera) {
     (model, camera)
 }
 
-/// What the reference renders with these rules, and what it differentiates.
+/// Image and gradients of the reference under these rules.
 fn truth(
     model: &Gaussians,
     camera: &Camera,
@@ -40,7 +40,7 @@ fn truth(
 }
 
 #[test]
-fn other_limits_of_blending_are_those_of_forward_and_backward_pass() {
+fn blending_limits_apply_to_both_passes() {
     let (model, camera) = scene();
     let mut table = Table::new("limits of blending");
     let standard = truth(&model, &camera, &Rules::STANDARD).0;
@@ -55,7 +55,7 @@ fn other_limits_of_blending_are_those_of_forward_and_backward_pass() {
         };
         let (image, gradient, upstream) = truth(&model, &camera, &rules);
         let is_standard = shortcuts == Shortcuts::default();
-        assert_eq!(image.rgb == standard.rgb, is_standard, "the limits do nothing here");
+        assert_eq!(image.rgb == standard.rgb, is_standard, "the limits have no effect");
         let upstream = scenes::narrowed(&upstream);
         for subject in all() {
             let mut backend = make_with(&subject, &model, Setup { shortcuts, ..Setup::default() });
@@ -63,7 +63,7 @@ fn other_limits_of_blending_are_those_of_forward_and_backward_pass() {
             let (rendering, measured) = outcome.expect("a small image is rendered");
             let name = subject.name();
             let case = format!("{name}, {alpha_min:.4}, {transmittance_min:e}");
-            // A decision that is taken otherwise may be worth the faintest splat.
+            // A threshold decided differently may change the result by the faintest splat.
             let step = 1.5 * f64::from(alpha_min.max(transmittance_min).max(1.0 / 255.0));
             let limits = Limits { step, ..Limits::CPU };
             let outcome = compare_images(&rendering.rgb, &image.rgb, &image.boundary, limits);

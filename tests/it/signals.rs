@@ -1,5 +1,5 @@
-//! The signals that training accumulates, against the reference's loss gradient. One piece, as
-//! all tests share the views and their references.
+//! Compares the signals of training with the loss gradients of the reference. One file, because all tests share the
+//! views and their references.
 
 use densify::core::camera::Camera;
 use densify::core::gaussians::{Gaussians, dc_to_rgb};
@@ -20,15 +20,15 @@ use densify::selftest::reference::{
 };
 use densify::selftest::{Differentiable, Setup, Subject, scenes};
 
-/// A quarter of the loss's gradient jumps with the sign of render − target, and a few pixels are
-/// near a step, so this is the tolerance of gradients, doubled.
+/// Twice the tolerance of gradients: the L1 part of the gradient jumps with the sign of render − target, and a few
+/// pixels are near a threshold.
 const TOLERANCE: f64 = 2e-4;
-/// The tolerance of a backend: a GPU's functions are less accurate.
+/// The tolerance of a backend; functions of GPUs are less accurate.
 fn tolerance(subject: &Subject) -> f64 {
     if matches!(subject, Subject::Gpu(_)) { 5.0 * TOLERANCE } else { TOLERANCE }
 }
 
-/// The share of its pixels that a row may gain or lose at the step of alpha.
+/// The share of its pixels that a row may gain or lose at the alpha threshold.
 const FLIPPED: f64 = 1e-3;
 const BACKGROUND: [f32; 3] = [0.1, 0.3, 0.2];
 
@@ -38,13 +38,13 @@ struct Views {
     targets: Vec<Image8>,
 }
 
-/// Two views of one cloud, of different size.
+/// Two views of one cloud with different image sizes.
 fn views() -> Views {
     let first = scenes::camera(45, 37, 61);
     let mut second = Camera { width: 38, height: 50, ..first };
     second.translation.x += 0.3;
     let cameras = vec![first, scenes::rounded(&second)];
-    // Rounded where training would round: a step of length zero normalises quaternions.
+    // A step of length zero normalises quaternions with the rounding of training.
     let model = normalised(scenes::cloud(21, 2, &first, 62));
     let target = |camera: &Camera| scenes::noisy((camera.width, camera.height), 0.0, 63).1;
     let mut targets: Vec<_> = cameras.iter().map(target).collect();
@@ -52,11 +52,11 @@ fn views() -> Views {
     Views { model, cameras, targets }
 }
 
-/// The reference's rendering of one view, and its training loss.
+/// Rendering and training loss of one view by the reference.
 fn rendering_and_loss(model: &Model, view: View<'_>, target: &Image8) -> (Image, Loss) {
     let image = render(model, view, &Rules::STANDARD);
     let truth: Vec<f64> = target.rgb.iter().map(|&v| f64::from(v) / 255.0).collect();
-    // What is masked agrees, so far as it is.
+    // Masks reduce the error in proportion.
     let mask = |i: usize| target.mask.as_ref().map_or(1.0, |mask| f64::from(mask[i / 3]) / 255.0);
     let pairs = image.rgb.iter().zip(&truth).enumerate();
     let seen: Vec<f64> = pairs.map(|(i, (x, y))| y + mask(i) * (x - y)).collect();
@@ -67,8 +67,8 @@ fn rendering_and_loss(model: &Model, view: View<'_>, target: &Image8) -> (Image,
     (image, loss)
 }
 
-/// The reference's gradient of the training loss of one view, each row's weighted error, and the share of
-/// the pixels that it dominates.
+/// For one view by the reference: the gradient of the training loss, the weighted error of each row, and the share of
+/// pixels that each row dominates.
 pub(crate) fn reference(
     model: &Gaussians,
     view: View<'_>,
@@ -98,7 +98,7 @@ fn norm(values: impl IntoIterator<Item = f64>) -> f64 {
     values.into_iter().map(|v| v * v).sum::<f64>().sqrt()
 }
 
-/// One view's contribution to a signal, where views count in full from a depth on. Shape: [rows].
+/// Contribution of one view to a signal. From `full_depth` on, views have full weight. Shape: [rows].
 fn contribution(
     signal: Signal,
     (gradient, errors, dominated): &(Gradient, Vec<f64>, Vec<f64>),
@@ -125,11 +125,11 @@ fn contribution(
                 Signal::WeightMax => s.max_weight,
                 Signal::WeightSum => s.sum_weight,
                 Signal::PixelCount => f64::from(s.pixels),
-                // Unless it is declared otherwise, the score is the same.
+                // The default score is the same.
                 Signal::WeightedError | Signal::ErrorScore => error,
                 Signal::WeightMaxRoot => s.max_weight.sqrt(),
                 Signal::Support => f64::from(u8::from(s.max_weight >= f64::from(SUPPORT_WEIGHT))),
-                // Of the smallest, the inverse.
+                // Minima are compared as inverses.
                 Signal::DepthMin => seen / depth,
                 Signal::PixelSizeMin => seen * focal / depth,
                 Signal::DominantPixels => dominated,
@@ -150,7 +150,7 @@ fn collect(
     collect_with(subject, views, wanted, needs)
 }
 
-/// The same with these needs.
+/// Like `collect`, with the given needs.
 fn collect_with(
     subject: &Subject,
     views: &Views,
@@ -171,7 +171,7 @@ fn collect_with(
 }
 
 #[test]
-fn every_signal_whatever_else_is_asked_for() {
+fn every_signal_matches_in_any_combination() {
     let views = views();
     let seen = views.cameras.iter().zip(&views.targets);
     let gradients: Vec<_> = seen
@@ -191,8 +191,8 @@ fn every_signal_whatever_else_is_asked_for() {
     let mut of_first = depths(&views.cameras[0]);
     of_first.sort_by(f64::total_cmp);
     let middle = of_first[of_first.len() / 2] as f32;
-    // Alone, beside the others that cost nothing, and all together: a backend keeps only what is asked
-    // for, and must not lose its place. And where near views weigh less, by screen and colour only.
+    // Each signal alone, with the free ones, and with all others, because backends store only requested signals. Also
+    // with reduced weights of near views, for screen and colour gradients only.
     let mut requests =
         vec![(base.clone(), 0.0), (everything.clone(), 0.0), (everything.clone(), middle)];
     for &signal in &everything {
@@ -219,17 +219,17 @@ fn every_signal_whatever_else_is_asked_for() {
                         *sum = if is_sum { *sum + part } else { part.max(*sum) };
                     }
                 }
-                let what = format!("{} signals, full from {full_depth}", request.len());
+                let case = format!("{} signals, full from {full_depth}", request.len());
                 let error = relative_error(&column, &expected);
                 let flips = if signal == Signal::PixelCount { FLIPPED } else { 0.0 };
-                table.check(&what, &format!("{signal:?}"), error, tolerance(&subject) + flips);
+                table.check(&case, &format!("{signal:?}"), error, tolerance(&subject) + flips);
             }
         }
         table.finish();
     }
 }
 
-/// 8-neighbour Laplacian of the luma of a pixel, clipped, borders repeated.
+/// Clipped 8-neighbour Laplacian of the luma at a pixel, with repeated borders.
 fn edge(target: &Image8, pixel: usize) -> f64 {
     let (width, height) = (i64::from(target.width), i64::from(target.height));
     let luma = |x: i64, y: i64| {
@@ -242,7 +242,7 @@ fn edge(target: &Image8, pixel: usize) -> f64 {
     (9.0 * luma(x, y) - around.map(|(x, y)| luma(x, y)).sum::<f64>()).clamp(0.0, 255.0)
 }
 
-/// The error of a pixel from its parts.
+/// The pixel error from its L1 and SSIM parts.
 fn mixed([absolute, dissimilar]: [f64; 2], map: ErrorMap) -> f64 {
     match map {
         ErrorMap::Loss => 0.8 * absolute + 0.2 * dissimilar,
@@ -251,13 +251,13 @@ fn mixed([absolute, dissimilar]: [f64; 2], map: ErrorMap) -> f64 {
     }
 }
 
-/// Each row's score of one view, by the definition of [`ErrorScore`].
+/// The [`ErrorScore`] of each row in one view, from its definition.
 fn scores(model: &Gaussians, view: View<'_>, target: &Image8, score: &ErrorScore) -> Vec<f64> {
     let model = Model::from(model);
     let (image, loss) = rendering_and_loss(&model, view, target);
     let edges: Vec<f64> = (0..image.alpha.len()).map(|pixel| edge(target, pixel)).collect();
     let mean = edges.iter().sum::<f64>() / edges.len() as f64;
-    assert!(mean > 1.0, "the image has edges");
+    assert!(mean > 1.0, "the image has no edges");
     let [power, weight, footprint, view_power] =
         [score.power, score.edge, score.footprint, score.view_power].map(f64::from);
     let splats = project(&model, view, &Rules::STANDARD);
@@ -274,7 +274,7 @@ fn scores(model: &Gaussians, view: View<'_>, target: &Image8, score: &ErrorScore
 }
 
 #[test]
-fn error_scores_weigh_pixels_sizes_and_views() {
+fn error_scores_match_their_definition() {
     let views = views();
     for subject in all() {
         let mut table = Table::new(&format!("error scores, {}", subject.name()));
@@ -307,17 +307,17 @@ fn error_scores_weigh_pixels_sizes_and_views() {
                 }
             }
             let error = relative_error(&columns[0], &expected);
-            let what = format!("{score:?}");
-            // The error's own inaccuracy counts as often as its power says.
+            let case = format!("{score:?}");
+            // The exponent multiplies the relative inaccuracy of the error.
             let tolerance = tolerance(&subject) * f64::from(score.power);
-            table.check(&what, "ErrorScore", error, tolerance);
+            table.check(&case, "ErrorScore", error, tolerance);
         }
         table.finish();
     }
 }
 
 #[test]
-fn the_largest_weight_lasts_until_the_end_of_the_next_epoch() {
+fn the_largest_weight_covers_the_previous_epoch() {
     let views = views();
     for subject in all() {
         let (mut backend, columns) = collect(&subject, &views, &[Signal::WeightMax], 0.0);
@@ -330,14 +330,14 @@ fn the_largest_weight_lasts_until_the_end_of_the_next_epoch() {
             signals.get(Signal::WeightMax).expect("a requested signal").to_vec()
         };
         assert!(columns[0].iter().any(|&w| w > 0.1));
-        assert!(now(true) == columns[0], "the previous epoch counts");
-        assert!(now(true).iter().all(|&w| w.to_bits() == 0), "the one before does not");
+        assert!(now(true) == columns[0], "the previous epoch is ignored");
+        assert!(now(true).iter().all(|&w| w.to_bits() == 0), "an earlier epoch still counts");
     }
 }
 
-/// To the last bit, however parameters are stored, and of rows that an edit has moved.
+/// Bit for bit, for all kinds of storage and for rows moved by an edit.
 #[test]
-fn attributes_are_the_parameters_of_the_rows() {
+fn attribute_signals_equal_the_parameters() {
     let views = views();
     let wanted = SignalSet::from([
         Signal::Age,
@@ -358,28 +358,28 @@ fn attributes_are_the_parameters_of_the_rows() {
         plan.prune_all([0, 3]);
         backend.apply(&plan.compile(), 1, 1).expect("a plan is applied");
         let signals = backend.take_signals(wanted).expect("signals can be taken");
-        let of = |signal| signals.get(signal).expect("it was declared");
+        let column = |signal| signals.get(signal).expect("a declared signal");
         let model = backend.download().expect("a model");
-        let what = format!("{}, {storage:?}", subject.name());
+        let case = format!("{}, {storage:?}", subject.name());
         assert_eq!(model.len(), views.model.len() - 2);
-        assert!(of(Signal::Position) == model.means.as_flattened(), "positions: {what}");
-        assert!(of(Signal::LogScale) == model.log_scales.as_flattened(), "scales: {what}");
-        assert!(of(Signal::Orientation) == model.quats.as_flattened(), "orientations: {what}");
+        assert!(column(Signal::Position) == model.means.as_flattened(), "positions: {case}");
+        assert!(column(Signal::LogScale) == model.log_scales.as_flattened(), "scales: {case}");
+        assert!(column(Signal::Orientation) == model.quats.as_flattened(), "orientations: {case}");
         let dc = (0..model.len()).flat_map(|row| model.sh_of(row)[..3].to_vec());
-        assert!(dc.map(dc_to_rgb).eq(of(Signal::Colour).iter().copied()), "colours: {what}");
-        assert!(of(Signal::Age).iter().all(|&age| age > 0.5), "ages: {what}");
+        assert!(dc.map(dc_to_rgb).eq(column(Signal::Colour).iter().copied()), "colours: {case}");
+        assert!(column(Signal::Age).iter().all(|&age| age > 0.5), "ages: {case}");
         backend.give_back(signals);
     }
 }
 
-/// Signals lie where a step sums gradients: whether they are given back or not, and however many they
-/// are, the steps after them and an image beside them are the same to the bit.
+/// Signals are returned in the buffer of gradient sums. Neither giving it back nor the number of columns may affect
+/// later steps or images.
 #[test]
-fn what_is_lent_for_signals_changes_nothing() {
+fn lending_buffers_for_signals_changes_nothing() {
     let views = views();
     let declared = SignalSet::from([Signal::ScreenGradient, Signal::WeightMax]);
     let present = declared.with(Signal::Age).with(Signal::ScaleMax);
-    // More columns than a step has sums.
+    // More columns than the buffer of a step has room for.
     let many = SignalSet::from(Signal::ALL);
     let run = |subject: &Subject, read: Option<SignalSet>, gives_back: bool| {
         let needs = Needs { signals: declared, ..Needs::default() };
@@ -397,8 +397,8 @@ fn what_is_lent_for_signals_changes_nothing() {
             }
         }
         let signals = backend.take_signals(declared).expect("signals");
-        let of = |signal| signals.get(signal).expect("it was declared").to_vec();
-        let columns = [of(Signal::ScreenGradient), of(Signal::WeightMax)];
+        let column = |signal| signals.get(signal).expect("a declared signal").to_vec();
+        let columns = [column(Signal::ScreenGradient), column(Signal::WeightMax)];
         (backend.download().expect("a model"), image.expect("four").rgb, columns)
     };
     for subject in repeatable() {

@@ -1,7 +1,7 @@
-//! A policy with spatial rules, written against the public interface and run by the trainer on every
-//! backend: it reads where rows are and how they look, and what it plans is what becomes of them.
+//! A policy with spatial rules, written against the public interface and run by the trainer on every backend. It reads
+//! positions and appearance, and the test checks that its plan is carried out.
 
-#![expect(clippy::float_cmp, reason = "positions are carried to the last bit")]
+#![expect(clippy::float_cmp, reason = "positions must match bit for bit")]
 
 use std::sync::Arc;
 
@@ -27,11 +27,11 @@ use densify_policies::rng::PolicyRng;
 use crate::signals::reference;
 use crate::subject::{make_with, normalised, on_each, repeatable};
 
-/// The event.
+/// The step of the event.
 const STEP: u32 = 3;
-/// By how much rows outside of the box move.
+/// Displacement of rows outside the box.
 const SHIFT: f32 = 0.25;
-/// A quarter turn about the first axis, and two halves along the second axis.
+/// A quarter turn about the first axis and two offspring along the second axis.
 const HALVES: Placement = Placement::Axes([0.0, 0.5, 0.0]);
 const HALVED: ScaleRule = ScaleRule::Axes([1.0, 0.5, 1.0]);
 const QUARTER: [f32; 4] = [1.0, 1.0, 0.0, 0.0];
@@ -81,7 +81,7 @@ impl DensityPolicy for Spatial {
             let [x, y, z] = *position;
             let mean_error = errors[row as usize] / weights[row as usize].max(1e-6);
             let (position, colour) = (Some([x + SHIFT, y, z]), Some([*red, *green, mean_error]));
-            // The plan counts what it refuses.
+            // The plan counts refused edits.
             let _ = match x > self.left {
                 true => plan.grow(row, split),
                 false => plan.update(row, Update { position, colour, ..Update::NONE }),
@@ -93,7 +93,7 @@ impl DensityPolicy for Spatial {
 }
 
 #[test]
-fn it_conforms() {
+fn policy_conforms() {
     let entry = PolicyEntry::new::<Spatial>("spatial", "for tests", "nowhere", "", (file!(), 1));
     check_policy(&entry).unwrap_or_else(|report| panic!("{report}"));
 }
@@ -116,7 +116,7 @@ impl ViewSource for One {
     }
 }
 
-/// The model after the event, and the rows refused, of a run in which the optimiser stands still.
+/// The model after the event and the number of refused rows, with zero learning rates.
 fn trained(policy: Spatial, backend: Box<dyn Backend>, camera: &Camera) -> (Gaussians, usize) {
     let budget = backend.budget();
     let scene = scene_of(budget);
@@ -153,11 +153,11 @@ fn trained(policy: Spatial, backend: Box<dyn Backend>, camera: &Camera) -> (Gaus
 }
 
 #[test]
-fn rows_are_split_moved_and_painted_where_they_are() {
+fn rows_are_split_moved_and_painted_by_position() {
     let camera = scenes::camera(45, 37, 31);
     let mut model = normalised(scenes::cloud(30, 1, &camera, 32));
     for (mean, i) in model.means.iter_mut().zip(0_u8..) {
-        // In front of the camera, each at a depth of its own.
+        // In front of the camera at distinct depths.
         *mean = scenes::world(&camera, [0.05 * f64::from(i) - 0.7, 0.0, 3.0 + 0.02 * f64::from(i)]);
     }
     let spatial = Spatial { left: model.means[12][0] };
@@ -172,7 +172,7 @@ fn rows_are_split_moved_and_painted_where_they_are() {
         let setup = Setup { budget: (28 + inside.len()).into(), needs, ..Setup::default() };
         let (after, denied) = trained(spatial, make_with(subject, &model, setup), &camera);
         assert_eq!((after.len(), denied), (28 + inside.len(), 2));
-        // Where a row stands now: after the children of those before it.
+        // The new index of a row, after the children of earlier rows.
         let mut next = 0;
         for row in 0..30 {
             let place = next;
@@ -183,7 +183,7 @@ fn rows_are_split_moved_and_painted_where_they_are() {
                 let [red, green, blue] = [0, 1, 2].map(|c| dc_to_rgb(after.sh_of(place)[c]));
                 assert!((red - dc_to_rgb(dc[0])).abs() + (green - dc_to_rgb(dc[1])).abs() < 1e-5);
                 let mean_error = mean_error(row);
-                assert!(mean_error > 0.01, "row {row} is not seen");
+                assert!(mean_error > 0.01, "row {row} is not visible");
                 assert!(
                     (f64::from(blue) - mean_error).abs() < 2e-3 * mean_error,
                     "row {row}: a mean error of {blue}, not {mean_error}"
@@ -201,7 +201,7 @@ fn rows_are_split_moved_and_painted_where_they_are() {
             for part in [place, next] {
                 assert!(close(after.log_scales[part], [a, b - 2.0_f32.ln(), c]), "row {part}");
                 let off = [0, 1, 2].map(|i| f64::from(after.means[part][i] - model.means[row][i]));
-                // Half a deviation along the second axis, which the turn makes the third.
+                // Half a standard deviation along the second axis, which the rotation turns into the third.
                 let was = column(model.quats[row], 1);
                 let along: f64 = (0..3).map(|i| off[i] * was[i]).sum();
                 assert!((along.abs() - 0.5 * f64::from(b).exp()).abs() < 1e-5, "row {part}");
@@ -228,7 +228,7 @@ fn close(a: [f32; 3], b: [f32; 3]) -> bool {
     a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-5 * (1.0 + b.abs()))
 }
 
-/// An axis of an orientation, in scene coordinates.
+/// An axis of a rotation in scene coordinates.
 fn column(quat: [f32; 4], axis: usize) -> [f64; 3] {
     let [w, x, y, z] = quat.map(f64::from);
     let turn = glam::DQuat::from_xyzw(x, y, z, w).normalize();

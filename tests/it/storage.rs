@@ -1,17 +1,15 @@
-//! Parameters and moments in fewer bits: training is as good. That it repeats at any number of threads is
-//! in `sameness`, that it goes on to the same bits in `resuming`, that the audit sees what is no number in
-//! `quarantine`, and what a row takes in `cli/memory.rs`.
+//! Training quality with parameters and moments in fewer bits. Related tests: `sameness` for reproducibility, `resuming`
+//! for checkpoints, `quarantine` for non-finite values, and `cli/memory.rs` for memory.
 
 use densify::render::Storage;
 use densify::selftest::{Setup, Subject, scenes};
 
 use crate::subject::{GREY, make, make_with, photograph, step_input, storages};
 
-/// The loss falls as it does with f32, to a twentieth. At its end it wanders with the rounding. That
-/// small steps are not lost, as they would be by rounding to the nearest, follows from what
-/// `cpu/narrow/tests.rs` holds number by number: that rounding is fair, and draws are independent.
+/// The loss falls to a twentieth, as with f32, and then fluctuates with the rounding. Stochastic rounding keeps small
+/// steps that rounding to nearest would lose; `cpu/narrow/tests.rs` checks it number by number.
 #[test]
-fn training_is_as_good() {
+fn narrow_storage_trains_as_well_as_f32() {
     let camera = scenes::camera(64, 48, 11);
     let truth = scenes::cloud(400, 2, &camera, 12);
     let mut model = truth.clone();

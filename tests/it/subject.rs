@@ -1,8 +1,8 @@
-//! The backends under test: the native one with every instruction set of the machine, and every adapter in
-//! every way that it adds up gradients.
+//! The backends under test: the native one with every instruction set of the machine, and every GPU adapter with every
+//! accumulation method.
 //!
-//! Where there is no adapter, not even a software driver, this is said and only the native backend is
-//! tested, unless `DENSIFY_REQUIRE_GPU` is set. `VK_DRIVER_FILES` chooses drivers, several if need be.
+//! Without any adapter, even a software driver, only the native backend is tested and a message is printed, unless
+//! `DENSIFY_REQUIRE_GPU` is set. `VK_DRIVER_FILES` selects drivers.
 
 use std::sync::OnceLock;
 
@@ -32,28 +32,28 @@ pub(crate) fn natives() -> Vec<Subject> {
     all.map(|instructions| Subject::Native { instructions, threads: None }).collect()
 }
 
-/// The adapters, opened once, with sums in slots.
+/// All adapters with accumulation in slots, opened once.
 pub(crate) fn devices() -> &'static [GpuDevice] {
     static DEVICES: OnceLock<Vec<GpuDevice>> = OnceLock::new();
     DEVICES.get_or_init(|| usable().iter().filter_map(|a| open(a, Accumulation::Slots)).collect())
 }
 
-/// The adapters with sums in any order, in each way that they have; ways that they lack are said.
+/// All adapters with each supported atomic method; unsupported ones are reported.
 pub(crate) fn atomics() -> &'static [GpuDevice] {
     static DEVICES: OnceLock<Vec<GpuDevice>> = OnceLock::new();
     DEVICES.get_or_init(|| {
-        let ways = [Accumulation::SubgroupCas, Accumulation::SubgroupAtomics];
+        let methods = [Accumulation::SubgroupCas, Accumulation::SubgroupAtomics];
         let all = usable();
-        all.iter().flat_map(|a| ways.into_iter().filter_map(|way| open(a, way))).collect()
+        all.iter().flat_map(|a| methods.into_iter().filter_map(|method| open(a, method))).collect()
     })
 }
 
-/// The adapters in every way that they add up gradients.
-pub(crate) fn ways() -> impl Iterator<Item = &'static GpuDevice> {
+/// All adapters with every supported accumulation method.
+pub(crate) fn devices_by_accumulation() -> impl Iterator<Item = &'static GpuDevice> {
     devices().iter().chain(atomics())
 }
 
-/// The backends whose runs give the same bits twice.
+/// The deterministic backends.
 pub(crate) fn repeatable() -> Vec<Subject> {
     let mut all = natives();
     all.extend(devices().iter().cloned().map(Subject::Gpu));
@@ -67,7 +67,7 @@ pub(crate) fn all() -> Vec<Subject> {
     all
 }
 
-/// All backends but the native one as it is by default, with which they are compared.
+/// All backends except the default native one, with which they are compared.
 pub(crate) fn others() -> Vec<Subject> {
     let is_default =
         |s: &Subject| matches!(s, Subject::Native { instructions: InstructionSet::Best, .. });
@@ -77,7 +77,7 @@ pub(crate) fn others() -> Vec<Subject> {
 #[expect(clippy::print_stderr, reason = "a skipped test must say so")]
 fn usable() -> Vec<AdapterSummary> {
     let mut usable: Vec<_> = adapters().into_iter().filter(|a| a.missing.is_empty()).collect();
-    // Fast ones first: SwiftShader is slow.
+    // Fast adapters first: SwiftShader is slow.
     usable.sort_by_key(|adapter| adapter.name.contains("SwiftShader"));
     if usable.is_empty() {
         let needed = std::env::var_os("DENSIFY_REQUIRE_GPU").is_some();
@@ -87,7 +87,7 @@ fn usable() -> Vec<AdapterSummary> {
     usable
 }
 
-/// Opens an adapter. What it does not have is refused, and skipped; llvmpipe has everything.
+/// Opens an adapter. Returns `None` if it lacks the accumulation method; llvmpipe supports all.
 #[expect(clippy::print_stderr, reason = "a skipped test must say so")]
 fn open(adapter: &AdapterSummary, accumulation: Accumulation) -> Option<GpuDevice> {
     let name = Some(adapter.name.clone());
@@ -97,13 +97,13 @@ fn open(adapter: &AdapterSummary, accumulation: Accumulation) -> Option<GpuDevic
         assert_eq!(device.accumulation(), accumulation);
         return Some(device);
     }
-    let refusal = opened.expect_err("it lacks what is asked for");
+    let refusal = opened.expect_err("an unsupported method");
     assert!(!adapter.name.contains("llvmpipe"), "{refusal}");
     eprintln!("skipped: {refusal}");
     None
 }
 
-/// Calls a check with each of the backends, and says which is next, which shows where a check fails.
+/// Runs a check on each backend and prints its name, which locates failures.
 #[expect(clippy::print_stderr, reason = "shown only where a test fails")]
 pub(crate) fn on_each(subjects: Vec<Subject>, mut check: impl FnMut(&Subject)) {
     for subject in subjects {
@@ -112,7 +112,7 @@ pub(crate) fn on_each(subjects: Vec<Subject>, mut check: impl FnMut(&Subject)) {
     }
 }
 
-/// The ways in which the native backend can store parameters and moments, the default first.
+/// All kinds of parameter and moment storage of the native backend, the default first.
 pub(crate) fn storages() -> [Storage; 4] {
     use {MomentStorage as Moments, ParameterStorage as Parameters};
     let both = [Moments::F32, Moments::Both8];
@@ -121,12 +121,12 @@ pub(crate) fn storages() -> [Storage; 4] {
     [a, b, c, d]
 }
 
-/// A backend for a model.
+/// Creates a backend for a model.
 pub(crate) fn make(subject: &Subject, model: &Gaussians) -> Box<dyn Differentiable> {
     make_with(subject, model, Setup::default())
 }
 
-/// A backend with room for more, or that collects something.
+/// Creates a backend with a specific setup.
 pub(crate) fn make_with(
     subject: &Subject,
     model: &Gaussians,
@@ -135,8 +135,8 @@ pub(crate) fn make_with(
     subject.backend_with(model, setup).expect("a small model fits")
 }
 
-/// How proptest is set up for a backend: as many cases as `PROPTEST_CASES` says, or so many; on devices an eighth, as
-/// software drivers take forty times as long.
+/// The proptest configuration of a backend: `PROPTEST_CASES` or `default` cases; an eighth on devices, because software
+/// drivers take forty times as long.
 pub(crate) fn cases_on(subject: &Subject, default: u32) -> ProptestConfig {
     let base = ProptestConfig { failure_persistence: None, ..ProptestConfig::default() };
     let is_set = std::env::var_os("PROPTEST_CASES").is_some();
@@ -145,7 +145,7 @@ pub(crate) fn cases_on(subject: &Subject, default: u32) -> ProptestConfig {
     ProptestConfig { cases, ..base }
 }
 
-/// A training step towards an image, at the degree of the model.
+/// The input of a training step towards an image, at the degree of the model.
 pub(crate) fn step_input<'a>(
     step: u32,
     camera: &'a Camera,
@@ -168,7 +168,7 @@ pub(crate) fn step_input<'a>(
     }
 }
 
-/// The model with quaternions of length 1, as training leaves them.
+/// Normalises the quaternions of a model, as training does.
 pub(crate) fn normalised(mut model: Gaussians) -> Gaussians {
     for quat in &mut model.quats {
         let norm = quat.iter().map(|v| v * v).sum::<f32>().sqrt();
@@ -177,20 +177,20 @@ pub(crate) fn normalised(mut model: Gaussians) -> Gaussians {
     model
 }
 
-/// The camera turned around and far off: it sees nothing of what the camera sees.
+/// A distant camera facing away, which sees nothing of the view of `camera`.
 pub(crate) fn turned_away(camera: &Camera) -> Camera {
     let turn = DMat3::from_diagonal(DVec3::new(-1.0, 1.0, -1.0));
     let translation = turn * camera.translation - DVec3::new(0.0, 0.0, 1000.0);
     Camera { rotation: turn * camera.rotation, translation, ..*camera }
 }
 
-/// A rendering as a photograph.
+/// Converts a rendering to a photograph.
 pub(crate) fn photograph(image: &Rendering) -> Image8 {
     let rgb = image.rgb.iter().map(|x| (x.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
     Image8 { width: image.width, height: image.height, rgb, alpha: None, mask: None }
 }
 
-/// What a run goes on from: the model, and the arrays beside it.
+/// The state that a checkpoint saves: the model and the other arrays.
 pub(crate) fn saved(backend: &dyn Backend) -> (Gaussians, Vec<Tensor>) {
     let save = |array: StateArray| backend.save(&array.name).expect("an array of the state");
     let arrays = backend.state().into_iter().map(save).collect();
@@ -203,7 +203,7 @@ pub(crate) fn bits(image: &Rendering) -> Vec<u32> {
     all.map(|v| v.to_bits()).collect()
 }
 
-/// Numbers in `f64`.
+/// Converts numbers to `f64`.
 pub(crate) fn wide(values: &[f32]) -> Vec<f64> {
     values.iter().copied().map(f64::from).collect()
 }

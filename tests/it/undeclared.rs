@@ -1,4 +1,4 @@
-//! What takes bytes when a policy declares it takes none otherwise.
+//! Optional signals and features need memory only if a policy declares them.
 
 use std::iter;
 
@@ -12,23 +12,23 @@ use densify_policies::policy::{
 use crate::subject::devices;
 
 #[test]
-fn what_is_not_declared_takes_no_bytes() {
+fn undeclared_features_need_no_memory() {
     let none = Needs::default;
     let mask = MaskTerm { start: 1.0, rate: 0.01, weight: 5e-4, threshold: 0.01 };
-    let of = |signals: &[Signal]| Needs { signals: signals.iter().copied().collect(), ..none() };
+    let needs = |signals: &[Signal]| Needs { signals: signals.iter().copied().collect(), ..none() };
     let edges = ErrorScore { edge: 1.0, ..ErrorScore::default() };
     let declared = [
         Needs { mask: Some(mask), ..none() },
         Needs { cadence: Cadence { all: 2, sh_rest: 2 }, ..none() },
         Needs { aux: Some(AuxRequest { points: 3, ..AuxRequest::default() }), ..none() },
-        of(&[Signal::WeightMaxRoot]),
-        of(&[Signal::Support]),
-        of(&[Signal::DepthMin]),
-        of(&[Signal::DominantPixels]),
-        of(&[Signal::ErrorScore]),
+        needs(&[Signal::WeightMaxRoot]),
+        needs(&[Signal::Support]),
+        needs(&[Signal::DepthMin]),
+        needs(&[Signal::DominantPixels]),
+        needs(&[Signal::ErrorScore]),
     ];
-    // Beside the sums of errors, edges take their own.
-    let with_edges = Needs { error_score: edges, ..of(&[Signal::ErrorScore]) };
+    // Edges need sums in addition to those of errors.
+    let with_edges = Needs { error_score: edges, ..needs(&[Signal::ErrorScore]) };
     let promise = |device: Option<&GpuDevice>, needs: &Needs| {
         let needs = needs.clone();
         let setup = Setup { largest_image: (41, 33), needs, ..Setup::new(20) };
@@ -44,15 +44,15 @@ fn what_is_not_declared_takes_no_bytes() {
         for needs in &declared {
             assert!(promise(device, needs) > least, "{name}: {needs:?}");
         }
-        let error = promise(device, &of(&[Signal::ErrorScore]));
+        let error = promise(device, &needs(&[Signal::ErrorScore]));
         assert!(promise(device, &with_edges) > error, "{name}: edges");
-        // Of what steps compute anyway, and of numbers of the run, nothing is kept.
+        // Values that steps compute anyway, and numbers of the run, need no memory.
         let free = Needs {
             noise: Some(NoiseTerm { strength: 1.0, sharpness: 100.0, opacity: 0.005 }),
             loss_terms: LossTerms { opacity: 0.01, scale: 0.01 },
             error_score: edges,
             ..none()
         };
-        assert_eq!(promise(device, &free), least, "{name}: numbers take bytes");
+        assert_eq!(promise(device, &free), least, "{name}: free signals need memory");
     }
 }

@@ -3,7 +3,6 @@
 use std::path::Path;
 
 use super::words::model_name;
-use crate::spec::Budget;
 use densify_core::memory::Bytes;
 use densify_core::numbers::grouped;
 use densify_core::spelling::Spelling;
@@ -87,23 +86,23 @@ pub(crate) fn learn_exposures(s: Spelling) -> String {
     format!("{} learns exposures all the same", s.text("exposure", "on"))
 }
 
-/// The budget and the reason for it. `solved`: the memory given, and true if it limits the rows.
+/// The budget and the reason for it. `most`: the most rows that the user allows, if given; `solved`: the memory given,
+/// and true if it limits the rows.
 pub(crate) fn budget(
     s: Spelling,
     rows: usize,
-    asked: Option<Budget>,
+    is_auto: bool,
+    most: Option<usize>,
     solved: Option<(u64, bool)>,
 ) -> String {
     let rows = grouped(rows);
     let memory = solved.map_or_else(String::new, |(bytes, _)| s.text("memory", Bytes(bytes)));
-    let reason = match (solved, asked, asked.and_then(Budget::most)) {
-        (None, None, _) => {
+    let reason = match (solved, is_auto, most) {
+        (None, false, None) => {
             format!(" (default; choose with {} or {})", s.option("budget"), s.option("memory"))
         }
-        (None, Some(Budget::Auto(_)), _) => {
-            " at most (auto: as many as improve the model)".to_owned()
-        }
-        (None, Some(Budget::Rows(_)), _) => String::new(),
+        (None, true, _) => " at most (auto: as many as improve the model)".to_owned(),
+        (None, false, Some(_)) => String::new(),
         (Some((_, true)), _, Some(given)) => {
             format!(": {memory} holds fewer than {}", s.text("budget", grouped(given)))
         }

@@ -90,7 +90,10 @@ impl Size {
         let RunSize { rows, sh_degree, tile_cap, image_cache, .. } = self.setting;
         let solved = self.solved.as_ref();
         let limit = solved.map(|(memory, fit)| (*memory, fit.by_memory));
-        let mut lines = vec![notes::budget(spelling, rows, case.spec.size.budget, limit)];
+        let given = case.spec.size.budget;
+        let is_auto = matches!(given, Some(Budget::Auto(_)));
+        let most = given.and_then(Budget::most);
+        let mut lines = vec![notes::budget(spelling, rows, is_auto, most, limit)];
         let Some((memory, fit)) = solved else { return lines };
         let memory = Bytes(*memory);
         lines.push(format!(

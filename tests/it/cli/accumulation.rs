@@ -6,7 +6,7 @@ use densify::render::gpu::GpuDevice;
 
 use super::{Outcome, config, copy_unfinished, densify, model, scratch, text};
 use crate::photographs::Photographs;
-use crate::subject::{devices, ways};
+use crate::subject::{devices, devices_by_accumulation};
 
 const ITERATIONS: u32 = 8;
 
@@ -18,7 +18,7 @@ fn run(scene: &Path, output: &Path, flags: &[&str]) -> Outcome {
 #[test]
 fn the_accumulation_method_is_used_and_kept_on_resume() {
     let scene = Photographs::colmap_text();
-    for device in ways() {
+    for device in devices_by_accumulation() {
         let (root, whole) = scratch();
         let (gpu, method) = (["--gpu", &*device.adapter().name], device.accumulation());
         let knob = format!("accumulation={method}");
@@ -98,7 +98,7 @@ fn devices_lists_the_accumulation_methods() {
         let line = entry.into_iter().find_map(|line| line.strip_prefix("  accumulation    "));
         let line = line.expect("a line");
         assert!(line.starts_with(adapter.accumulation().name()), "{listed}");
-        let ways = &adapter.accumulations;
-        assert!(ways.iter().all(|method| line.contains(method.name())), "{listed}");
+        let methods = &adapter.accumulations;
+        assert!(methods.iter().all(|method| line.contains(method.name())), "{listed}");
     }
 }

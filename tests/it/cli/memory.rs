@@ -144,7 +144,7 @@ fn tiny_memory_needs_at_most_480_bytes_per_gaussian() {
 fn on_a_gpu_the_limit_applies_to_device_memory() {
     let scene = Photographs::colmap_text();
     let mut rows: Vec<(&str, u64)> = Vec::new();
-    for device in crate::subject::ways() {
+    for device in crate::subject::devices_by_accumulation() {
         let (root, run) = scratch();
         let name = &device.adapter().name;
         let knob = format!("accumulation={}", device.accumulation());

@@ -1,4 +1,4 @@
-//! Any calls of a plan, sensible or not.
+//! Proptest strategies for calls of an edit plan, valid or not.
 
 use densify_policies::plan::{
     Decay, EditPlan, NO_ROTATION, Offspring, OpacityRule, ParentFate, Placement, Reset, ScaleRule,
@@ -9,7 +9,7 @@ use proptest::prelude::*;
 
 use super::{ROWS, SIGNALS};
 
-/// One call.
+/// One call of an edit plan.
 #[derive(Debug, Clone)]
 pub(super) enum Call {
     Prune(u32),
@@ -18,7 +18,7 @@ pub(super) enum Call {
     Append(Seed),
     Decay(Decay),
     Clamp(f32),
-    /// Of all signals, or of some.
+    /// Resets all signals or some.
     Reset(Option<SignalSet>),
 }
 
@@ -67,7 +67,7 @@ fn offspring() -> impl Strategy<Value = Offspring> {
 }
 
 pub(super) fn call() -> impl Strategy<Value = Call> {
-    // Some beyond the last row, whatever the plan before has left.
+    // Some rows are out of range for any number of rows.
     let row = || 0..ROWS as u32 + 12;
     let maybe = || prop::option::of(prop::array::uniform3(-0.5_f32..1.5));
     let degree = prop::option::of(0..2_u8);
@@ -111,7 +111,7 @@ pub(super) fn call() -> impl Strategy<Value = Call> {
     ]
 }
 
-/// Enters a call; returns whether the plan took it.
+/// Makes a call; returns true if the plan accepted it.
 pub(super) fn enter(plan: &mut EditPlan, call: &Call) -> bool {
     let done = match *call {
         Call::Prune(row) => plan.prune(row),

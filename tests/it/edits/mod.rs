@@ -1,11 +1,10 @@
-//! Any plans, one after the other, on the backend and on a plain vector of Gaussians that follows
-//! the words of the plan's documentation: parameters, moments, ages and signals go where they
-//! should, and the rows never exceed the budget. What is remembered of when rows were made and edited goes along.
+//! Applies random plans in sequence to a backend and to a plain vector of Gaussians that implements the documented
+//! semantics. Parameters, moments, ages, signals and the history of rows must agree, and the budget must hold.
 //!
-//! Moments cannot be read. They show in a step that sees nothing: without a gradient a row moves by
-//! what its moments still hold, and by its age. A twin that is not edited tells how far.
+//! Moments cannot be read directly. They show in a step without visible Gaussians, where a row moves only by its moments
+//! and age. An unedited twin provides the expected movement.
 
-#![expect(clippy::float_cmp, reason = "rows are carried to the last bit")]
+#![expect(clippy::float_cmp, reason = "rows must match bit for bit")]
 
 mod calls;
 mod plain;
@@ -28,7 +27,7 @@ use plain::{Row, execute};
 
 const ROWS: usize = 37;
 const SEED: u64 = 9;
-/// Signals whose sums are carried along, and age.
+/// Signals that edits must move with their rows: sums and age.
 const SIGNALS: [Signal; 6] = [
     Signal::ScreenGradient,
     Signal::WeightMax,
@@ -37,7 +36,7 @@ const SIGNALS: [Signal; 6] = [
     Signal::DepthMin,
     Signal::WeightSum,
 ];
-/// The number of views in which a row was seen.
+/// The number of views in which a row was visible.
 const SEEN: usize = 3;
 const SAME: Update = Update { keep_moments: false, ..Update::NONE };
 
@@ -56,7 +55,7 @@ fn step(backend: &mut dyn Backend, camera: &Camera, step: u32) -> usize {
     backend.train_step(&input).expect("a small image is rendered").visible
 }
 
-/// A backend with a past: moments, signals, and rows of different ages.
+/// A trained backend with moments, signals and rows of different ages.
 fn trained(subject: &Subject, budget: usize) -> Box<dyn Differentiable> {
     let model = scenes::cloud(ROWS, 1, &view(), 72);
     let setup = Setup { budget: budget.into(), needs: needs(), ..Setup::default() };
@@ -75,14 +74,14 @@ fn trained(subject: &Subject, budget: usize) -> Box<dyn Differentiable> {
 fn rows(backend: &mut dyn Backend) -> Vec<Row> {
     let model = backend.download().expect("a model");
     let signals = backend.take_signals(needs().signals).expect("signals are there");
-    let of = |signal, row: usize| signals.get(signal).expect("it was asked for")[row];
+    let value = |signal, row: usize| signals.get(signal).expect("a requested signal")[row];
     let row = |row: usize| Row {
         mean: model.means[row],
         log_scale: model.log_scales[row],
         quat: model.quats[row],
         logit: model.opacity_logits[row],
         sh: model.sh_of(row).to_vec(),
-        signals: SIGNALS.map(|signal| of(signal, row)),
+        signals: SIGNALS.map(|signal| value(signal, row)),
         moments: Some(row),
         opacity_rests: false,
         sh_rests_from: usize::MAX,
@@ -92,21 +91,21 @@ fn rows(backend: &mut dyn Backend) -> Vec<Row> {
     (0..model.len()).map(row).collect()
 }
 
-/// What is not edited, before and after a step that sees nothing.
+/// The rows of the unedited twin before and after a step without visible Gaussians.
 fn twin(subject: &Subject) -> [Vec<Row>; 2] {
     let mut backend = trained(subject, ROWS);
     let before = rows(&mut *backend);
-    assert_eq!(step(&mut *backend, &turned_away(&view()), 4), 0, "the camera sees something");
+    assert_eq!(step(&mut *backend, &turned_away(&view()), 4), 0, "some Gaussians are visible");
     [before, rows(&mut *backend)]
 }
 
-/// Where a step leaves the logit of an opacity that edits have brought beyond what is safe.
+/// The logit after a step, which confines opacities to the safe range.
 fn confined(logit: f32) -> f32 {
     logit.clamp(-9.2, 9.2)
 }
 
-/// Fails unless two values agree but for the rounding of a few operations.
-fn near(what: &str, row: usize, found: &[f32], expected: &[f32]) {
+/// Checks that values agree up to the rounding of a few operations.
+fn assert_close(what: &str, row: usize, found: &[f32], expected: &[f32]) {
     let close = |(a, b): (&f32, &f32)| (a - b).abs() <= 2e-6 * (1.0 + a.abs().max(b.abs()));
     let agree = found.len() == expected.len() && found.iter().zip(expected).all(close);
     assert!(agree, "{what} of row {row}: {found:?}, expected {expected:?}");
@@ -115,22 +114,22 @@ fn near(what: &str, row: usize, found: &[f32], expected: &[f32]) {
 fn check_rows(found: &[Row], expected: &[Row]) {
     assert_eq!(found.len(), expected.len());
     for (i, (found, expected)) in found.iter().zip(expected).enumerate() {
-        near("quat", i, &found.quat, &expected.quat);
+        assert_close("quat", i, &found.quat, &expected.quat);
         assert_eq!(found.signals, expected.signals, "{SIGNALS:?} of row {i}");
-        near("mean", i, &found.mean, &expected.mean);
-        near("log-scale", i, &found.log_scale, &expected.log_scale);
-        // What is left of an opacity that decays is known as well as what it was.
+        assert_close("mean", i, &found.mean, &expected.mean);
+        assert_close("log-scale", i, &found.log_scale, &expected.log_scale);
+        // A decayed opacity has the same relative accuracy as before.
         let opacity = |row: &Row| 1.0 / (1.0 + (-f64::from(row.logit)).exp());
         let off = (opacity(found) - opacity(expected)).abs();
         if !expected.has_decayed || off > 2e-7 {
-            near("logit", i, &[found.logit], &[expected.logit]);
+            assert_close("logit", i, &[found.logit], &[expected.logit]);
         }
-        near("sh", i, &found.sh, &expected.sh);
+        assert_close("sh", i, &found.sh, &expected.sh);
     }
 }
 
-/// Fails unless a step that sees nothing moves each row as it moves the row of the twin that has
-/// the same moments and age, and no other row at all.
+/// Checks that a step without visible Gaussians moves each row like the twin's row with the same moments and age, and
+/// no row with zero moments.
 fn check_movement(twin: &[Vec<Row>; 2], before: &[Row], after: &[Row], expected: &[Row]) {
     let [twin_before, twin_after] = twin;
     for (i, expected) in expected.iter().enumerate() {
@@ -139,19 +138,19 @@ fn check_movement(twin: &[Vec<Row>; 2], before: &[Row], after: &[Row], expected:
         let Some(same) = expected.moments else {
             assert_eq!((from.mean, from.log_scale), (to.mean, to.log_scale), "newborn row {i}");
             assert_eq!((confined(from.logit), &from.sh), (to.logit, &to.sh), "newborn row {i}");
-            near("quat", i, &to.quat, &from.quat);
+            assert_close("quat", i, &to.quat, &from.quat);
             continue;
         };
         let (was, is) = (&twin_before[same], &twin_after[same]);
-        assert!(was.mean != is.mean, "row {same} has no moments, so that it shows nothing");
-        assert_eq!(to.quat, is.quat, "row {i}, once {same}");
+        assert!(was.mean != is.mean, "row {same} of the twin has no moments to compare");
+        assert_eq!(to.quat, is.quat, "row {i}, twin row {same}");
         let moved = |x: f32, was: f32, is: f32| x + (is - was);
-        // Exact, but for rows that an update has put elsewhere.
+        // Exact, except for rows that an update has moved.
         let follows = |what, from: &[f32], to: &[f32], was: &[f32], is: &[f32]| {
             let same = from == was;
             let moves =
                 from.iter().zip(was.iter().zip(is)).map(|(x, (was, is))| moved(*x, *was, *is));
-            near(what, i, to, &moves.collect::<Vec<_>>());
+            assert_close(what, i, to, &moves.collect::<Vec<_>>());
             assert!(!same || to == is, "{what} of row {i}");
         };
         follows("mean", &from.mean, &to.mean, &was.mean, &is.mean);
@@ -160,10 +159,10 @@ fn check_movement(twin: &[Vec<Row>; 2], before: &[Row], after: &[Row], expected:
         follows("sh", &upto(from), &upto(to), &upto(was), &upto(is));
         assert_eq!(from.sh[moving..], to.sh[moving..], "dropped colour of row {i}");
         let scale = |a: usize| moved(from.log_scale[a], was.log_scale[a], is.log_scale[a]);
-        near("log-scale", i, &to.log_scale, &[0, 1, 2].map(scale));
+        assert_close("log-scale", i, &to.log_scale, &[0, 1, 2].map(scale));
         let logit = moved(from.logit, was.logit, is.logit);
         let logit = if expected.opacity_rests { from.logit } else { logit };
-        near("logit", i, &[to.logit], &[confined(logit)]);
+        assert_close("logit", i, &[to.logit], &[confined(logit)]);
     }
 }
 
@@ -171,7 +170,7 @@ fn check_plans(subject: &Subject, twin: &[Vec<Row>; 2], spare: usize, plans: &[V
     let budget = ROWS + spare;
     let mut backend = trained(subject, budget);
     let mut expected = rows(&mut *backend);
-    // As if no two had been edited in the same step.
+    // Start with distinct steps for every row.
     let steps: Vec<u32> = expected.iter().map(|row| row.steps[1]).collect();
     let mut history = RowHistory::from_edits(&steps, budget);
     for (event, calls) in (4..).zip(plans) {
@@ -184,8 +183,8 @@ fn check_plans(subject: &Subject, twin: &[Vec<Row>; 2], spare: usize, plans: &[V
         assert!(backend.rows() <= backend.budget());
         expected = execute(expected, &taken, budget, (&PolicyRng::new(SEED, event), event));
         check_rows(&rows(&mut *backend), &expected);
-        let of = |at: usize| expected.iter().map(|row| row.steps[at]).collect::<Vec<u32>>();
-        assert_eq!([history.created(), history.edited()], [of(0), of(1)]);
+        let steps = |at: usize| expected.iter().map(|row| row.steps[at]).collect::<Vec<u32>>();
+        assert_eq!([history.created(), history.edited()], [steps(0), steps(1)]);
     }
     let before = rows(&mut *backend);
     assert_eq!(step(&mut *backend, &turned_away(&view()), 9), 0);
@@ -193,7 +192,7 @@ fn check_plans(subject: &Subject, twin: &[Vec<Row>; 2], spare: usize, plans: &[V
 }
 
 #[test]
-fn any_plans_do_to_the_backend_what_they_do_to_a_plain_vector() {
+fn random_plans_match_the_plain_vector() {
     for subject in repeatable() {
         let twin = twin(&subject);
         let plans = prop::collection::vec(prop::collection::vec(call(), 0..40), 1..4);
@@ -206,7 +205,7 @@ fn any_plans_do_to_the_backend_what_they_do_to_a_plain_vector() {
     }
 }
 
-/// That a plan keeps these rules is held in `policies/src/ops/tests.rs`; a backend relies on none.
+/// `policies/src/ops/tests.rs` checks that plans keep these rules; backends check them again.
 #[test]
 fn a_corrupted_plan_stops_the_run() {
     type Corruption = (&'static str, fn(&mut RowOps));

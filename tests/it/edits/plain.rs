@@ -1,4 +1,4 @@
-//! The plain vector: one struct per row, executed by the words of the plan's documentation.
+//! The plain vector: one struct per row and a direct implementation of the documented semantics of plans.
 
 use densify_policies::plan::{
     Decay, MIN_DECAYED_OPACITY, Offspring, OpacityRule, ParentFate, Placement, ScaleRule, Seed,
@@ -10,7 +10,7 @@ use glam::{DQuat, DVec3};
 use super::calls::Call;
 use super::{SEEN, SIGNALS};
 
-/// One row as the plain vector has it.
+/// One row of the plain vector.
 #[derive(Debug, Clone)]
 pub(super) struct Row {
     pub(super) mean: [f32; 3],
@@ -21,13 +21,13 @@ pub(super) struct Row {
     pub(super) signals: [f32; SIGNALS.len()],
     /// The row of the twin that has the same moments; `None` if they are zero.
     pub(super) moments: Option<usize>,
-    /// Whether the opacity's moments are zero, whatever the others are.
+    /// True if the moments of the opacity are zero, regardless of the others.
     pub(super) opacity_rests: bool,
-    /// Coefficients from here on have zero moments, whatever the others have.
+    /// The first SH coefficient from which on moments are zero, regardless of the others.
     pub(super) sh_rests_from: usize,
-    /// Whether the opacity has decayed.
+    /// True if the opacity has decayed.
     pub(super) has_decayed: bool,
-    /// When the row was made, and edited last.
+    /// Steps at which the row was created and last edited.
     pub(super) steps: [u32; 2],
 }
 
@@ -80,7 +80,7 @@ impl Row {
         };
     }
 
-    fn wither(&mut self, how: Decay) {
+    fn decay(&mut self, how: Decay) {
         if how.opacity > 0.0 {
             let least = f64::from(MIN_DECAYED_OPACITY);
             let left = logit((sigmoid(self.logit) - f64::from(how.opacity)).max(least));
@@ -90,16 +90,16 @@ impl Row {
         self.rescale(ScaleRule::Uniform(1.0 - how.scale));
     }
 
-    /// Zero moments, age 0, no past.
-    fn reborn(mut self) -> Self {
+    /// Resets moments, age and history.
+    fn newborn(mut self) -> Self {
         self.moments = None;
         self.signals = SIGNALS.map(empty);
         self
     }
 
-    /// The child of this number of a parent in the slot `slot`.
+    /// The child `number` of a parent in slot `slot`.
     fn child(&self, slot: u32, number: u32, how: &Offspring, rng: &PolicyRng) -> Self {
-        let mut child = self.clone().reborn();
+        let mut child = self.clone().newborn();
         let axis = longest(self.log_scale);
         let offset = match how.placement {
             Placement::Offset(_) if number == 0 => DVec3::ZERO,
@@ -137,7 +137,7 @@ impl Row {
         self.sh[..3].copy_from_slice(&colour.map(|c| (c - 0.5) / densify::core::sh::C0));
     }
 
-    fn sown(seed: &Seed) -> Self {
+    fn from_seed(seed: &Seed) -> Self {
         let mut sown = Self {
             mean: seed.position,
             log_scale: seed.scales.map(f32::ln),
@@ -156,12 +156,12 @@ impl Row {
     }
 }
 
-/// The signal of a row that no view has seen since.
+/// The initial value of a signal.
 fn empty(signal: Signal) -> f32 {
     if signal.kind() == SignalKind::Minimum { f32::INFINITY } else { 0.0 }
 }
 
-/// Executes accepted calls of a step on the plain vector.
+/// Applies the accepted calls of a step to the plain vector.
 pub(super) fn execute(
     model: Vec<Row>,
     calls: &[Call],
@@ -202,9 +202,9 @@ pub(super) fn execute(
                     updated.paint(colour);
                 }
                 slots[*row as usize] =
-                    Some(if how.keep_moments { updated } else { updated.reborn() });
+                    Some(if how.keep_moments { updated } else { updated.newborn() });
             }
-            Call::Append(seed) => seeds.push(new(Row::sown(seed))),
+            Call::Append(seed) => seeds.push(new(Row::from_seed(seed))),
             Call::Decay(how) => decay = Some(*how),
             Call::Clamp(max) => clamp = clamp.min(*max),
             Call::Reset(signals) => {
@@ -219,7 +219,7 @@ pub(super) fn execute(
     assert!(model.len() <= budget, "{} rows, budget {budget}", model.len());
     for row in &mut model {
         if let Some(how) = decay.filter(|how| !how.seen_only || row.signals[SEEN] > 0.0) {
-            row.wither(how);
+            row.decay(how);
         }
         if clamp < 1.0 {
             row.logit = row.logit.min(logit(f64::from(clamp)));

@@ -1,21 +1,21 @@
-//! What is allocated on a device is what the ledger says.
+//! Compares the memory allocated on a device with the ledger.
 
 use densify::render::gpu::GpuBackend;
 use densify::render::{Backend, Setup};
 use densify::selftest::scenes;
 use densify_policies::policy::{AuxColumn, AuxRequest, ErrorScore, MaskTerm, Needs, Signal};
 
-use crate::subject::{GREY, ways};
+use crate::subject::{GREY, devices_by_accumulation};
 
 #[test]
-fn what_is_allocated_is_what_the_ledger_says() {
+fn device_allocations_match_the_ledger() {
     let needs = |signals: &[Signal]| Needs {
         signals: signals.iter().copied().collect(),
         ..Needs::default()
     };
     let mask = MaskTerm { start: 1.0, rate: 0.01, weight: 5e-4, threshold: 0.01 };
     let columns = vec![AuxColumn::PixelCount, AuxColumn::MapSum];
-    // A number of each pair for the error, one more for the weight of scores, and for attributes none.
+    // One number per pair for the error, another for the weight of scores, none for attributes.
     let asked = [
         (needs(&[]), 9),
         (needs(&[Signal::WeightedError]), 10),
@@ -38,7 +38,7 @@ fn what_is_allocated_is_what_the_ledger_says() {
         ),
     ];
     for (device, (needs, numbers)) in
-        ways().flat_map(|device| asked.iter().map(move |asked| (device, asked)))
+        devices_by_accumulation().flat_map(|device| asked.iter().map(move |asked| (device, asked)))
     {
         let camera = scenes::camera(40, 30, 32);
         let model = scenes::cloud(20, 3, &camera, 42);
@@ -56,9 +56,9 @@ fn what_is_allocated_is_what_the_ledger_says() {
         assert_eq!(&device.memory_plan(model.sh_degree, &options), gpu.ledger());
         gpu.render(&camera, GREY, 1).expect("a rendering");
         assert_eq!(gpu.allocated_bytes(), promised);
-        // Only slots take records.
-        let of_pairs = gpu.ledger().lines.iter().filter(|line| line.what.contains("per entry"));
-        let records: u64 = of_pairs.map(|line| line.bytes).sum();
+        // Only accumulation in slots needs records.
+        let pair_lines = gpu.ledger().lines.iter().filter(|line| line.what.contains("per entry"));
+        let records: u64 = pair_lines.map(|line| line.bytes).sum();
         let is_in_slots = device.accumulation().is_deterministic();
         assert_eq!(
             records,

@@ -1,5 +1,5 @@
-//! Tiles with so many splats that some drivers do not go through all of them: llvmpipe ends all loops of an
-//! invocation after 65,535 rounds together, without a word. What comes then must be an error, not a model.
+//! Tiles with more splats than some drivers process: llvmpipe silently ends the loops of an invocation after 65,535
+//! iterations in total. The backend must report an error instead of a wrong model.
 
 use densify::core::camera::Camera;
 use densify::core::gaussians::Gaussians;
@@ -7,11 +7,11 @@ use densify::render::gpu::GpuDevice;
 use densify::render::{Accumulation, ImageGradient, Shortcuts};
 use densify::run::failure::Failure;
 
-use crate::subject::{GREY, class, make_with, ways};
+use crate::subject::{GREY, class, devices_by_accumulation, make_with};
 use densify::selftest::compare::{Table, relative_error};
 use densify::selftest::{Differentiable, Setup, Subject, scenes};
 
-/// Rows one behind the other, each of which all pixels of one tile take; what is behind all is still seen.
+/// Gaussians in a line, each covering all pixels of a tile; the last one is still visible.
 fn pile(rows: usize, camera: &Camera) -> Gaussians {
     let mut model = Gaussians::default();
     let opacity = 5.0 / rows as f32;
@@ -28,7 +28,7 @@ fn name(device: &GpuDevice) -> String {
     format!("{}, {}", device.adapter().name, device.accumulation())
 }
 
-/// A backend that blends faint rows too.
+/// A backend that also blends faint Gaussians.
 fn faint(subject: &Subject, model: &Gaussians) -> Box<dyn Differentiable> {
     let shortcuts = Shortcuts { alpha_min: 1e-6, ..Shortcuts::default() };
     make_with(subject, model, Setup { shortcuts, ..Setup::default() })
@@ -38,32 +38,32 @@ fn backend(model: &Gaussians, device: &GpuDevice) -> Box<dyn Differentiable> {
     faint(&Subject::Gpu(device.clone()), model)
 }
 
-/// Holds that a driver that breaks off is found out, and that llvmpipe, which does, is.
-fn is_broken_off<T>(result: &Result<T, Failure>, device: &GpuDevice, more: bool) -> bool {
+/// Returns true if the driver ended its loops early. Checks that this is reported, and that llvmpipe does it.
+fn ended_early<T>(result: &Result<T, Failure>, device: &GpuDevice, more: bool) -> bool {
     let Err(error) = result else {
         let breaks_off = device.adapter().name.contains("llvmpipe");
-        assert!(!breaks_off, "{} has gone through all of them", name(device));
+        assert!(!breaks_off, "{} processed the whole list", name(device));
         return false;
     };
-    let told = error.to_string();
+    let message = error.to_string();
     for word in [&*device.adapter().name, "ends loops before they", "--backend cpu"] {
-        assert!(told.contains(word), "{word} is not in {told}");
+        assert!(message.contains(word), "{word} is not in {message}");
     }
-    assert_eq!(told.contains("--knob accumulation=slots"), more, "{told}");
+    assert_eq!(message.contains("--knob accumulation=slots"), more, "{message}");
     true
 }
 
 #[test]
-fn a_list_too_long_to_be_drawn_is_an_error() {
+fn a_list_too_long_to_render_is_an_error() {
     let camera = scenes::camera(16, 16, 71);
     let model = pile(300_000, &camera);
     let expected = faint(&Subject::NATIVE, &model).render(&camera, GREY, 0).expect("a small image");
-    for device in ways() {
+    for device in devices_by_accumulation() {
         let found = backend(&model, device).render(&camera, GREY, 0).map_err(Failure::from);
         let more = device.accumulation() != Accumulation::Slots;
-        if !is_broken_off(&found, device, more) {
+        if !ended_early(&found, device, more) {
             let mut table = Table::new(&format!("300,000 rows in a tile, {}", name(device)));
-            let found = found.expect("it has gone through all").rgb;
+            let found = found.expect("a complete rendering").rgb;
             let error = found.iter().zip(&expected.rgb).map(|(a, b)| (a - b).abs());
             table.check("image", "rgb", error.fold(0.0, f32::max).into(), 1e-3);
             table.finish();
@@ -72,7 +72,7 @@ fn a_list_too_long_to_be_drawn_is_an_error() {
 }
 
 #[test]
-fn a_list_too_long_to_be_differentiated_is_an_error() {
+fn a_list_too_long_to_differentiate_is_an_error() {
     let camera = scenes::camera(16, 16, 72);
     let model = pile(30_000, &camera);
     let upstream = ImageGradient {
@@ -83,14 +83,14 @@ fn a_list_too_long_to_be_differentiated_is_an_error() {
     let (_, expected) = faint(&Subject::NATIVE, &model)
         .differentiate(&camera, GREY, 0, &upstream)
         .expect("a small image");
-    for device in ways() {
+    for device in devices_by_accumulation() {
         let found = backend(&model, device).differentiate(&camera, GREY, 0, &upstream);
         let found = found.map_err(Failure::from);
-        if device.accumulation() != Accumulation::Slots && is_broken_off(&found, device, true) {
+        if device.accumulation() != Accumulation::Slots && ended_early(&found, device, true) {
             continue;
         }
         let mut table = Table::new(&format!("30,000 rows in a tile, {}", name(device)));
-        let (_, found) = found.expect("slots go through so many");
+        let (_, found) = found.expect("accumulation in slots");
         for name in ["means", "opacity_logits", "sh"] {
             let expected = class(&expected, name).iter().copied().map(f64::from);
             let expected: Vec<f64> = expected.collect();

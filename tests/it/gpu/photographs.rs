@@ -1,4 +1,4 @@
-//! Photographs that stay on the device.
+//! The cache of photographs on the device.
 
 use densify::core::camera::Camera;
 use densify::core::gaussians::Gaussians;
@@ -9,7 +9,7 @@ use densify::render::{Backend, KeptPhotographs, Setup, StepInput};
 use crate::subject::{devices, step_input};
 use densify::selftest::scenes;
 
-/// A view of this size, with a random image.
+/// A view of the given size with a random image.
 fn view(size: (u32, u32), seed: u64) -> (Camera, Image8) {
     (scenes::camera(size.0, size.1, 60), scenes::noisy(size, 0.0, seed).1)
 }
@@ -29,7 +29,7 @@ fn step(backend: &mut GpuBackend, step: u32, view: usize, (camera, target): &(Ca
 }
 
 #[test]
-fn to_keep_photographs_changes_nothing_but_memory() {
+fn cached_photographs_change_only_memory() {
     let mut views = [view((41, 27), 1), view((30, 30), 2), view((41, 30), 3), view((17, 5), 4)];
     let plane =
         |seed, size| scenes::noisy(size, 0.0, seed).1.rgb[..(size.0 * size.1) as usize].to_vec();
@@ -43,7 +43,7 @@ fn to_keep_photographs_changes_nothing_but_memory() {
             let mut backend = backend(device, &model, count, with_masks);
             for number in 0..12 {
                 let view = number * 7 % 4;
-                // As in a run that goes from coarse to fine.
+                // Image sizes grow, as in coarse-to-fine training.
                 let images = if number < 6 { &coarse } else { &views };
                 step(&mut backend, number as u32 + 1, view, &images[view]);
             }
@@ -58,15 +58,15 @@ fn to_keep_photographs_changes_nothing_but_memory() {
             (9, true, 9 * (4 * 1230 + 1232)),
         ] {
             let (found, taken) = run(count, with_masks);
-            assert!(found == expected, "{count} kept, with masks: {with_masks}");
+            assert!(found == expected, "{count} cached, with masks: {with_masks}");
             assert_eq!(taken - least, u64::next_multiple_of(bytes, 16), "{count}, {with_masks}");
         }
     }
 }
 
-/// A view has one image, so that another one shows whether the one before was kept.
+/// Passing a different image for the same view shows whether the first one was cached.
 #[test]
-fn what_is_kept_is_not_uploaded_again() {
+fn cached_photographs_are_not_uploaded_again() {
     let (camera, first) = view((41, 30), 1);
     let (_, second) = view((41, 30), 2);
     let model = scenes::cloud(40, 0, &camera, 9);
@@ -75,7 +75,7 @@ fn what_is_kept_is_not_uploaded_again() {
         let run = |count, order: [&(Camera, Image8); 3]| {
             let mut backend = backend(device, &model, count, false);
             for (number, view) in (1..).zip(order) {
-                // The third step is of a view for which there is no room.
+                // The cache has no room for the view of the third step.
                 step(&mut backend, number, usize::from(number == 3), view);
             }
             backend.download().expect("a model")

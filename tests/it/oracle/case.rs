@@ -1,4 +1,4 @@
-//! Reads the cases: `*.safetensors` with an `index.json` beside them.
+//! Reads the stored cases: `*.safetensors` files and `index.json`.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -10,7 +10,7 @@ use safetensors::{Dtype, SafeTensors};
 
 use densify::selftest::reference::Upstream;
 
-/// One scene with everything that is stored about it.
+/// One scene and its stored results.
 #[derive(Debug)]
 pub(super) struct Case {
     pub(super) name: String,
@@ -18,12 +18,12 @@ pub(super) struct Case {
     pub(super) model: Gaussians,
     pub(super) cameras: Vec<Camera>,
     pub(super) background: [f32; 3],
-    /// What the same arithmetic loses in `f32`, by quantity, relative to the largest value.
+    /// Relative error of the same computation in `f32`, by quantity.
     floors: BTreeMap<String, f64>,
     arrays: BTreeMap<String, Vec<f64>>,
 }
 
-/// Which images a stored loss weighs.
+/// The images that contribute to a stored loss.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Part {
     Colour,
@@ -35,7 +35,7 @@ pub(super) enum Part {
 impl Part {
     pub(super) const ALL: [Self; 4] = [Self::Colour, Self::Alpha, Self::Depth, Self::Full];
 
-    /// The part's name in the names of arrays.
+    /// The name of this part in array names.
     pub(super) fn key(self) -> &'static str {
         match self {
             Self::Colour => "color",
@@ -84,7 +84,7 @@ impl Case {
         }
     }
 
-    /// A stored array of our convention.
+    /// A stored array that follows our conventions.
     pub(super) fn expected(&self, key: &str) -> &[f64] {
         self.array(&format!("gsplat.{key}"))
     }
@@ -93,7 +93,7 @@ impl Case {
         self.arrays.get(key).unwrap_or_else(|| panic!("{}: no array {key}", self.name))
     }
 
-    /// One camera's part of a stored array whose first axis is the camera.
+    /// The part of one camera in an array whose first axis is the camera.
     pub(super) fn of_camera(&self, key: &str, camera: usize) -> &[f64] {
         self.split(self.expected(key), camera)
     }
@@ -103,7 +103,7 @@ impl Case {
         &values[camera * n..(camera + 1) * n]
     }
 
-    /// Whether no decision in a pixel is close. Shape: [height, width].
+    /// True for pixels that are not near a threshold of the renderer. Shape: [height, width].
     pub(super) fn decided(&self, camera: usize) -> Vec<bool> {
         self.split(self.array("pixel_ok"), camera).iter().map(|&ok| ok > 0.0).collect()
     }
@@ -122,8 +122,8 @@ impl Case {
         }
     }
 
-    /// Ten times what `f32` loses in this quantity. Where that was not measured, the largest
-    /// loss of the same parameter class, of another loss, or else of any gradient, stands in.
+    /// Ten times the `f32` error of this quantity. If it was not measured, the largest error of the same parameter class
+    /// in another loss is used, or else of any gradient.
     pub(super) fn tolerance(&self, key: &str) -> f64 {
         let class = key.rsplit('.').next().unwrap_or(key);
         let largest = |of: &dyn Fn(&str) -> bool| {
@@ -139,7 +139,7 @@ impl Case {
 fn numbers(dtype: Dtype, data: &[u8]) -> Vec<f64> {
     fn each<const N: usize>(data: &[u8], read: impl Fn([u8; N]) -> f64) -> Vec<f64> {
         let (chunks, rest) = data.as_chunks::<N>();
-        assert!(rest.is_empty(), "a tensor ends within a number");
+        assert!(rest.is_empty(), "a tensor with a partial number");
         chunks.iter().map(|&bytes| read(bytes)).collect()
     }
     match dtype {
@@ -151,7 +151,7 @@ fn numbers(dtype: Dtype, data: &[u8]) -> Vec<f64> {
     }
 }
 
-/// Inputs are stored as `f32`, so nothing is lost here.
+/// Inputs are stored as `f32`, so the conversion is exact.
 fn model(arrays: &BTreeMap<String, Vec<f64>>, sh_degree: u8) -> Gaussians {
     let values = |key: &str| -> Vec<f32> { arrays[key].iter().map(|&v| v as f32).collect() };
     fn rows<const N: usize>(values: &[f32]) -> Vec<[f32; N]> {

@@ -1,6 +1,6 @@
-//! The float64 renderer and every backend against stored float64 renders and gradients of small scenes:
-//! the renderer to 1e-9; the backends' images to 2e-5 (1e-4 on a GPU) where no decision is close, their
-//! gradients and statistics to ten (twenty) times what float32 arithmetic loses.
+//! Compares the float64 renderer and every backend with stored float64 renders and gradients of small scenes.
+//! Tolerances: 1e-9 for the renderer; 2e-5 (1e-4 on a GPU) for images of backends away from thresholds; ten (twenty) times the error
+//! of float32 arithmetic for their gradients and statistics.
 
 mod case;
 
@@ -14,12 +14,12 @@ use densify::selftest::{Subject, scenes};
 use crate::subject::{all, class, make, wide};
 use case::{Case, Part, cases};
 
-/// Of two computations in float64 in different order, needles of 1000:1 among them.
+/// For float64 computations in a different order, including needles of 1000:1.
 const EXACT: f64 = 1e-9;
 
-/// What one camera sees of a case, and the gradients of a part of its loss.
+/// Images of one camera and gradients of part of the loss.
 struct Seen {
-    /// By the names of the stored arrays.
+    /// Keyed by the names of the stored arrays.
     images: [(&'static str, Vec<f64>); 3],
     /// In the order of [`CLASSES`].
     classes: Vec<Vec<f64>>,
@@ -40,7 +40,7 @@ fn by_reference(case: &Case, camera: usize, part: Part) -> Seen {
     let upstream = case.upstream(camera, part);
     let (image, gradient) =
         differentiate(&Model::from(&case.model), view(case, camera), &Rules::STANDARD, &upstream);
-    // It calls a pixel close more rarely than the stored mask, which is wider.
+    // The stored mask of pixels near a threshold is wider than that of the renderer.
     let close = image.boundary.iter().zip(case.decided(camera));
     assert!(close.into_iter().all(|(close, decided)| !(*close && decided)), "{}", case.name);
     let flat = |of: fn(&ScreenGradient) -> Vec<f64>| gradient.screen.iter().flat_map(of).collect();
@@ -77,7 +77,7 @@ fn by_backend(subject: &Subject, case: &Case, camera: usize, part: Part) -> Seen
     }
 }
 
-/// Compares all that was seen of all cases, with tolerances by quantity for gradients and statistics.
+/// Compares the results of all cases, with separate tolerances for gradients and statistics.
 fn check(
     what: &str,
     see: impl Fn(&Case, usize, Part) -> Seen,
@@ -92,7 +92,7 @@ fn check(
                 let error = relative_error(measured, expected);
                 table.check(&case.name, key, error, tolerance(case, key));
             };
-            // Stored gradients of parameters are sums over cameras, those on the screen are per camera.
+            // Stored parameter gradients are summed over cameras; screen gradients are per camera.
             let mut sums: Vec<Vec<f64>> = Vec::new();
             let cameras = 0..case.cameras.len();
             let views: Vec<Seen> = cameras.map(|camera| see(case, camera, part)).collect();
@@ -130,7 +130,7 @@ fn check(
     table.finish();
 }
 
-/// Images where no decision is close: absolute differences, of depth against the deepest pixel.
+/// Compares images away from thresholds by absolute difference; depth relative to the deepest pixel.
 fn check_images(table: &mut Table, case: &Case, camera: usize, seen: &Seen, tolerance: f64) {
     let decided = case.decided(camera);
     for (key, measured) in &seen.images {
@@ -147,8 +147,8 @@ fn check_images(table: &mut Table, case: &Case, camera: usize, seen: &Seen, tole
     }
 }
 
-/// Stored statistics leave out pixels with a close decision; those that are held to them cannot. So
-/// each lies between the stored value and that value plus what those pixels could add.
+/// Stored statistics omit pixels near a threshold, but computed ones cannot. Each must lie between the stored value and
+/// that value plus the largest possible contribution of the omitted pixels.
 fn check_statistics(table: &mut Table, case: &Case, camera: usize, seen: &Seen, tolerance: f64) {
     let splats = project(&Model::from(&case.model), view(case, camera), &Rules::STANDARD);
     let spare = leeway(&splats, &by_depth(&splats), view(case, camera), &case.decided(camera));
@@ -175,8 +175,7 @@ fn the_reference_reproduces_every_stored_array() {
 #[test]
 fn every_backend_reproduces_every_stored_array() {
     for subject in all() {
-        // Twice as much where a product may be rounded before it is added: without fused
-        // multiply-add.
+        // Twice the tolerance without fused multiply-add, which rounds products before adding.
         let tens = match subject {
             Subject::Gpu(_) | Subject::Native { instructions: InstructionSet::Scalar, .. } => 2.0,
             Subject::Native { .. } => 1.0,
