@@ -67,7 +67,7 @@ fn options_markdown() -> String {
     let command = with_defaults(RunSpec::augment_args(Command::new("train")));
     let mut text = String::from(
         "# Options of `densify train`\n\nThis table is generated from the description of a run \
-         (`src/run/spec/mod.rs`); `cargo test options_table` says how to renew it. In a file for `--config` an \
+         (`src/run/spec/mod.rs`); `cargo t options_table` says how to renew it. In a file for `--config` an \
          option has the name of its flag, with `_` for `-`: `tile_cap = 100000`.\n",
     );
     let mut heading = "";

@@ -40,7 +40,7 @@ pub fn targets() -> Vec<Target> {
         photographs: &[],
         accepts: accepts_model,
     });
-    let datasets = dataset_formats().into_iter().map(|format| Target {
+    let datasets = dataset_formats().iter().map(|format| Target {
         name: format.name,
         file: format.file.to_owned(),
         photographs: &["images/0.png", "images/1.png"],

@@ -9,9 +9,14 @@ use tempfile::TempDir;
 use super::*;
 use densify_core::files::disk::{Fault, Operation, with_fault};
 use densify_fixtures::Made;
-use densify_render::AdapterKind;
-use densify_render::gpu::{adapters, with_device_lost_after};
-use densify_run::failure::{DEVICE, INPUT, OTHER};
+#[cfg(feature = "gpu")]
+use densify_render::{
+    AdapterKind,
+    gpu::{adapters, with_device_lost_after},
+};
+#[cfg(feature = "gpu")]
+use densify_run::failure::DEVICE;
+use densify_run::failure::{INPUT, OTHER};
 use densify_train::output::model_path;
 
 const OPERATIONS: [Operation; 5] =
@@ -185,6 +190,7 @@ fn a_run_stopped_by_the_disk_can_be_resumed() {
 }
 
 /// Names of the software drivers, which every machine that runs the GPU tests has.
+#[cfg(feature = "gpu")]
 #[expect(clippy::print_stderr, reason = "a skipped test must say so")]
 fn software_drivers() -> Vec<String> {
     let names: Vec<String> = adapters()
@@ -200,6 +206,7 @@ fn software_drivers() -> Vec<String> {
     names
 }
 
+#[cfg(feature = "gpu")]
 #[test]
 fn a_run_stopped_by_a_lost_device_can_be_resumed() {
     for driver in software_drivers() {

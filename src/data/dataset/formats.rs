@@ -1,5 +1,5 @@
-//! The registry of dataset formats. A new format is one file that defines a [`DatasetFormat`], its line in
-//! [`formats`], and a folder of example files in `tests/fuzz/corpus` with the format's name.
+//! The registry of dataset formats. A new format is one file that defines a [`DatasetFormat`], its line
+//! in [`formats`], and a folder of example files in `tests/fuzz/corpus` with the format's name.
 
 use super::paths::Root;
 use super::{LoadError, LoadOptions, Scene, colmap, realitycapture, transforms};
@@ -20,8 +20,8 @@ pub struct DatasetFormat {
 }
 
 /// All formats, in the order in which they are tried.
-pub fn formats() -> [&'static DatasetFormat; 4] {
-    [&transforms::SPLIT_FORMAT, &colmap::FORMAT, &transforms::FORMAT, &realitycapture::FORMAT]
+pub fn formats() -> &'static [&'static DatasetFormat] {
+    &[&transforms::SPLIT_FORMAT, &colmap::FORMAT, &transforms::FORMAT, &realitycapture::FORMAT]
 }
 
 /// Reads a folder by the first format that recognises it.
@@ -37,6 +37,10 @@ pub(super) fn read_scene(root: &Root, options: &LoadOptions) -> Result<Scene, Lo
     Err(LoadError::Data(format!(
         "{} is not a dataset: it has neither the files of {}; name a folder or ZIP archive with one of these",
         root.path().display(),
-        formats().map(|format| format!("{} ({})", format.title, format.files)).join(" nor of ")
+        formats()
+            .iter()
+            .map(|f| format!("{} ({})", f.title, f.files))
+            .collect::<Vec<_>>()
+            .join(" nor of ")
     )))
 }
