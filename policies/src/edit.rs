@@ -303,7 +303,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bad_field_of_an_offspring_is_named() {
+    fn a_bad_field_of_offspring_is_named() {
         let clone = crate::adc::clone_at([0.0; 3]);
         assert_eq!(clone.bad_field(), None);
         assert_eq!(Offspring { children: 0, ..clone }.bad_field(), Some("children"));

@@ -48,6 +48,7 @@ pub use nearest::Nearest;
 pub use panorama::Panorama;
 pub use points::{InitPoints, PointCollector, PointOptions};
 pub use presets::{PRESETS, Preset, PresetSpec};
+pub use resource::data_uri;
 pub use rig::{Rig, RigKind, Survey};
 pub use scene::{Generated, Options, Scene, Source, Split, View, generate};
 pub use shade::Ambient;

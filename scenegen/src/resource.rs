@@ -8,7 +8,7 @@ use std::io::{Cursor, Read};
 use std::path::{Path, PathBuf};
 
 use base64::Engine as _;
-use base64::alphabet::STANDARD;
+use base64::alphabet::{STANDARD, URL_SAFE};
 use base64::engine::{DecodePaddingMode, GeneralPurpose, GeneralPurposeConfig};
 use image::{ImageFormat, ImageReader, Limits};
 
@@ -183,14 +183,13 @@ fn percent_decoded(text: &str) -> Option<String> {
     String::from_utf8(bytes).ok()
 }
 
-/// The bytes of a base64 `data:` URI, with or without padding; `None` for other URIs.
-pub(crate) fn data_uri(uri: &str) -> Option<Vec<u8>> {
-    const BASE64: GeneralPurpose = GeneralPurpose::new(
-        &STANDARD,
-        GeneralPurposeConfig::new().with_decode_padding_mode(DecodePaddingMode::Indifferent),
-    );
+/// The bytes of a base64 `data:` URI (RFC 4648, sections 4 and 5), with or without padding; `None` for other URIs.
+pub fn data_uri(uri: &str) -> Option<Vec<u8>> {
+    const PADDING: GeneralPurposeConfig =
+        GeneralPurposeConfig::new().with_decode_padding_mode(DecodePaddingMode::Indifferent);
     let (head, body) = uri.strip_prefix("data:")?.split_once(',')?;
-    head.ends_with(";base64").then(|| BASE64.decode(body).ok()).flatten()
+    let alphabet = if body.contains(['-', '_']) { URL_SAFE } else { STANDARD };
+    head.ends_with(";base64").then(|| GeneralPurpose::new(&alphabet, PADDING).decode(body).ok())?
 }
 
 /// The folder that holds a file.
@@ -290,6 +289,8 @@ mod tests {
     fn base64_is_read_with_and_without_padding() {
         assert_eq!(data_uri("data:x/y;base64,Zm9vYg==").expect("data"), b"foob");
         assert_eq!(data_uri("data:;base64,Zm9vYmE").expect("data"), b"fooba");
+        assert_eq!(data_uri("data:;base64,-_8=").expect("URL-safe letters"), [251, 255]);
+        assert_eq!(data_uri("data:;base64,+/8=").expect("data"), [251, 255]);
         assert_eq!(data_uri("data:;base64,Zm*v"), None);
         assert_eq!(data_uri("data:text/plain,abc"), None);
     }

@@ -41,8 +41,7 @@
 //! ## Differences from the published code
 //!
 //! - **`sums`.** The published values of `sum` and `sum_more`, 5 and 20, give 1,500 + 375 optimiser steps in the second
-//!   half of 30,000
-//!   iterations, but 350 + 88 in a run of 7,000. By default (`"scaled"`) both are multiplied by
+//!   half of 30,000 iterations, but 350 + 88 in a run of 7,000. By default (`"scaled"`) both are multiplied by
 //!   iterations / 30,000 and rounded, at least 1, so that a short run has about as many optimiser steps if
 //!   it has enough iterations; 7,000 gives 1 and 5. `"fixed"` uses the same values in a run of any length.
 //! - The published code splits, then prunes. A plan has one edit per Gaussian: if a Gaussian is drawn and
@@ -362,8 +361,7 @@ impl Igs {
 }
 
 /// The smallest value that is not below the interpolated `share` quantile. Equal values are never separated: all of
-/// them are below
-/// the limit, or none.
+/// them are below the limit, or none.
 fn limit_of_share(mut values: Vec<f32>, share: f64) -> f32 {
     if values.is_empty() {
         return 0.0;

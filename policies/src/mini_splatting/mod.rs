@@ -41,8 +41,7 @@
 //! then prunes; here the budget is the peak. Sampling keeps `sample_share` of the Gaussians that dominate a
 //! pixel (many dominate none), and the cut keeps `cut_mass` of the importance. With a budget of 8,000, runs of
 //! 7,000 steps at half size ended at 9 to 22 % of it, on average 15 % over six scenes. When comparing policies, also
-//! compare
-//! at equal final numbers of Gaussians.
+//! compare at equal final numbers of Gaussians.
 //!
 //! ## Differences from the published code
 //!

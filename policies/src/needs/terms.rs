@@ -33,8 +33,7 @@ impl LossTerms {
 /// Kheradmand et al. 2024, section 3.2): Δμ = Σ·ξ · σ(−`sharpness`·(o − `opacity`)) · `strength` · λ,
 /// with Σ the row's covariance, ξ ~ N(0, I), o its opacity, σ the logistic function and λ the learning rate
 /// of the means at that step `[scene units]`, without the trainer's increase in short runs (that increase serves only
-/// to follow
-/// gradients further).
+/// to follow gradients further).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct NoiseTerm {
     /// Strength of the noise `[1 / scene units²]`, >= 0.

@@ -27,9 +27,8 @@
 //!
 //! The budget bounds growth and is never exceeded. Nothing grows after the prunes, so a run ends below
 //! the budget, by an amount that depends on the scene; when comparing policies, also compare at equal final numbers.
-//! With a budget of 8,000
-//! and 2,000 steps at half size, the defaults kept 97 % of the grown model on room256 and 87 % on cup, the
-//! light variant 34 % and 11 %.
+//! With a budget of 8,000 and 2,000 steps at half size, the defaults kept 97 % of the grown model on room256 and 87 % on
+//! cup, the light variant 34 % and 11 %.
 //!
 //! ## Differences from the paper
 //!

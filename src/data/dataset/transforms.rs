@@ -3,6 +3,7 @@
 //!
 //! Poses are `world_from_camera` with OpenGL axes (x right, y up, looking along −z). Intrinsics are
 //! at the top level or in the frame; those in the frame take precedence.
+//! One file, because both layouts share the fields of a frame.
 
 use std::collections::HashSet;
 use std::fmt::Display;

@@ -205,3 +205,15 @@ fn policies_may_change_the_initial_opacity_and_scale() {
     let tenth = 0.1_f32.ln();
     assert_eq!(model.log_scales[1], [tenth, 1.0 + tenth, -2.0 + tenth]);
 }
+
+#[test]
+#[ignore = "needs real photographs: set DENSIFY_SHARED"]
+fn real_points_of_shared_datasets_become_rows() {
+    use densify_data::dataset::{Dataset, LoadOptions};
+    for name in ["room256", "cup", "office", "beercan"] {
+        let data = Dataset::load(&densify_fixtures::shared(name), &LoadOptions::default()).unwrap();
+        let (model, report) = initialise(&data.points, 4000, 3, 0).unwrap();
+        assert_eq!((model.len(), report.rows), (4000, 4000), "{name}");
+        assert!(model.log_scales.iter().all(|log| log[0] > -12.0 && log[0] < 5.0), "{name}");
+    }
+}

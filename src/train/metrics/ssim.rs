@@ -232,6 +232,18 @@ mod tests {
     }
 
     #[test]
+    fn one_pixel_has_a_closed_form() {
+        // The window sees the pixel with weight w and zeros elsewhere: μ = w·x, E[x²] = w·x².
+        let w = window()[RADIUS].powi(2);
+        let (x, y) = (f64::from(0.75_f32), 51.0 / 255.0);
+        let (c1, c2) = (0.01_f64.powi(2), 0.03_f64.powi(2));
+        let expected = (2.0 * w * w * x * y + c1) * (2.0 * (w - w * w) * x * y + c2)
+            / ((w * w * (x * x + y * y) + c1) * ((w - w * w) * (x * x + y * y) + c2));
+        let measured = ssim(&[0.75; 3], &flat(1, 1, 51), [0.0; 3]).unwrap();
+        assert!((measured - expected).abs() < 1e-13, "{measured} for {expected}");
+    }
+
+    #[test]
     fn flat_images_a_hair_apart_stay_below_one() {
         // Half an ulp of f32 from 153/255. The textbook formula in f32 reports 1.0000046 here.
         let target = flat(64, 64, 153);

@@ -315,6 +315,21 @@ fn frames_override_the_intrinsics_at_the_top() {
 }
 
 #[test]
+fn distorted_cameras_become_pinholes() {
+    let made = Made::colmap_txt();
+    made.replace(
+        "sparse/0/cameras.txt",
+        "PINHOLE 20 12 15 16 10 6",
+        "OPENCV 20 12 15 16 10 6 0.05 -0.01 0.001 0.002",
+    );
+    let data = load(&made);
+    let view = &data.train[0];
+    assert!(view.source.undistortion.is_some());
+    assert!((view.camera.fx - 15.0).abs() > 1e-3);
+    assert_eq!(view.source.load().unwrap().rgb, [0, 100, 200].repeat(20 * 12));
+}
+
+#[test]
 fn missing_frames_and_bad_points_are_noted() {
     let made = Made::transforms(|_| ());
     std::fs::remove_file(made.file("images/b.png")).unwrap();

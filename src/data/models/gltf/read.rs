@@ -4,9 +4,6 @@ use std::collections::BTreeMap;
 use std::io::Read;
 use std::path::Path;
 
-use base64::Engine as _;
-use base64::alphabet::STANDARD;
-use base64::engine::{DecodePaddingMode, GeneralPurpose, GeneralPurposeConfig};
 use serde::Deserialize;
 use serde_json::Value;
 
@@ -20,12 +17,6 @@ use crate::models::unpack::read_exactly;
 use crate::models::{siblings, spz};
 use densify_core::files::most_unpacked;
 use densify_core::gaussians::{Gaussians, MAX_SH_DEGREE, sh_coefficients, sigmoid};
-
-/// Base64 (RFC 4648, section 4), with or without padding.
-const BASE64: GeneralPurpose = GeneralPurpose::new(
-    &STANDARD,
-    GeneralPurposeConfig::new().with_decode_padding_mode(DecodePaddingMode::Indifferent),
-);
 
 /// The extension of splats in SPZ.
 const SPZ: &str = "KHR_gaussian_splatting_compression_spz_2";
@@ -174,9 +165,9 @@ fn read(
 
 /// The bytes of a buffer outside the binary chunk.
 fn buffer(path: &Path, uri: &str) -> Result<Vec<u8>, LoadError> {
-    if let Some(data) = uri.strip_prefix("data:") {
-        let bytes = data.split_once(";base64,").and_then(|(_, text)| BASE64.decode(text).ok());
-        return bytes.ok_or_else(|| LoadError::damaged(path, "buffers", "data that is not base64"));
+    if uri.starts_with("data:") {
+        return densify_scenegen::data_uri(uri)
+            .ok_or_else(|| LoadError::damaged(path, "buffers", "data that is not base64"));
     }
     let mut bytes = Vec::new();
     let mut file = siblings::open(path, "buffers", uri)?;

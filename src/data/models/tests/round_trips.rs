@@ -78,8 +78,10 @@ fn formats_in_f32_keep_every_bit() {
     {
         for degree in 0..=3 {
             let mut model = plausible(rows, degree);
+            if let Some(first) = model.means.first_mut() {
+                *first = [-0.0, f32::MIN_POSITIVE / 4.0, f32::MAX];
+            }
             if rows > 6 {
-                model.means[3] = [-0.0, f32::MIN_POSITIVE / 4.0, f32::MAX];
                 (model.opacity_logits[4], model.opacity_logits[5]) = (17.5, -40.0);
                 model.log_scales[6] = [-30.0, 3e-5, 12.0];
             }
