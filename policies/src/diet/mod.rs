@@ -209,22 +209,13 @@ impl ConfiguredPolicy for Diet {
     fn new(params: DietParams, scene: &SceneInfo) -> PolicyResult<Self> {
         params.check()?;
         let compensates = params.rho_c > 0.0;
+        let DietParams { grow_from, grow_until, grow_every, prune_every, insert_every, .. } =
+            params;
+        let DietParams { compensate_from: from, compensate_until: until, .. } = params;
         Ok(Self {
-            grow: Window {
-                from: params.grow_from,
-                until: params.grow_until,
-                every: params.grow_every,
-            },
-            prune: Window {
-                from: params.grow_from,
-                until: params.grow_until.max(params.compensate_until),
-                every: params.prune_every,
-            },
-            insert: Window {
-                from: params.compensate_from,
-                until: params.compensate_until,
-                every: if compensates { params.insert_every } else { 0 },
-            },
+            grow: Window { from: grow_from, until: grow_until, every: grow_every },
+            prune: Window { until: grow_until.max(until), from: grow_from, every: prune_every },
+            insert: Window { from, until, every: if compensates { insert_every } else { 0 } },
             protected_age: params.protect.min(scene.train_views) as f32,
             surface: Vec::new(),
             fresh: Vec::new(),

@@ -14,10 +14,7 @@ fn run(event: &Event, set: &str) -> Outcome {
 /// prune them.
 fn event(step: u32, views: &[&[f32]]) -> Event {
     let rows = views[0].len();
-    let mut event = Event::new(step, rows, rows)
-        .with_all(Signal::VisibleCount, 4.0)
-        .with_all(Signal::Opacity, 0.5)
-        .with_all(Signal::ScaleMax, 0.05);
+    let mut event = Event::small_rows(step, rows, rows);
     let view = |weights: &&[f32]| View {
         columns: vec![(AuxColumn::WeightMax, weights.to_vec())],
         ..View::default()

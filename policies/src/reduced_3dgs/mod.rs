@@ -156,9 +156,7 @@ impl DensityPolicy for Reduced {
     }
 
     fn plan(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
-        if self.growth.is_due(now.step) {
-            self.growth.plan(now, rng, plan)?;
-        }
+        self.growth.plan(now, rng, plan)?;
         if self.prunes_at(now.step) {
             self.prune(now, rng, plan)?;
             plan.reset(Reset::Only(SignalSet::default().with(Signal::PixelSizeMin)));

@@ -14,10 +14,7 @@ fn run(event: &Event, set: &str) -> Outcome {
 fn event(step: u32, xs: &[f32]) -> Event {
     let means: Vec<f32> = xs.iter().flat_map(|&x| [x, 0.0, 0.0]).collect();
     let upright = [1.0, 0.0, 0.0, 0.0].repeat(xs.len());
-    Event::new(step, xs.len(), xs.len())
-        .with_all(Signal::VisibleCount, 4.0)
-        .with_all(Signal::Opacity, 0.5)
-        .with_all(Signal::ScaleMax, 0.05)
+    Event::small_rows(step, xs.len(), xs.len())
         .with(Signal::Position, &means)
         .with(Signal::Orientation, &upright)
         .with_all(Signal::LogScale, (1.0_f32 / 3.0).ln())

@@ -11,11 +11,8 @@ fn run(event: &Event, set: &str) -> Outcome {
 /// Small rows of opacity 0.5 with a screen gradient of 1 in four views; all statistics are the same in the only
 /// auxiliary view, which has a loss of 0.02.
 fn event(step: u32, rows: usize, budget: usize) -> Event {
-    let mut event = Event::new(step, rows, budget)
-        .with_all(Signal::VisibleCount, 4.0)
+    let mut event = Event::small_rows(step, rows, budget)
         .with_all(Signal::ScreenGradient, 4.0)
-        .with_all(Signal::Opacity, 0.5)
-        .with_all(Signal::ScaleMax, 0.05)
         .with_all(Signal::ScaleProduct, 1e-4);
     let columns = AuxColumn::ALL.map(|column| (column, vec![2.0; rows])).to_vec();
     event.views = vec![View { loss: 0.02, columns, points: Vec::new() }];

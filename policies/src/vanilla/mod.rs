@@ -146,13 +146,8 @@ impl ConfiguredPolicy for Vanilla {
         in_range("min_opacity", params.min_opacity, 0.0..=1.0)?;
         in_range("max_scale", params.max_scale, (Excluded(0.0), Unbounded))?;
         let VanillaParams { grow_from: from, grow_until: until, grow_every: every, .. } = params;
-        let resets = OpacityResets::new(
-            params.reset_every,
-            until,
-            params.white_reset_at,
-            params.reset_opacity,
-            scene,
-        )?;
+        let VanillaParams { reset_every, white_reset_at, reset_opacity, .. } = params;
+        let resets = OpacityResets::new(reset_every, until, white_reset_at, reset_opacity, scene)?;
         Ok(Self { grow: Window { from, until, every }, resets, params })
     }
 }
