@@ -286,10 +286,8 @@ fn every_fault_is_found() {
 #[test]
 fn a_report_names_the_policy_and_the_step() {
     let report = report("reads undeclared").unwrap_err().to_string();
-    assert!(
-        report
-            .starts_with("policy `faulty` (tests.rs:1) does not conform:\n- failed: it reads only")
-    );
+    let start = "policy `faulty` (tests.rs:1) does not conform:\n- failed: it reads only";
+    assert!(report.starts_with(start), "{report}");
     assert!(report.contains("an empty model") && report.contains("step 5"), "{report}");
     assert!(report.contains("ScreenGradientAbs"), "{report}");
 }

@@ -147,7 +147,9 @@
 
 // Over 400 lines, of which a third is the manual page; growth, compensation and pruning meet in `plan`.
 
-use crate::adc::{PruneLimits, Window, add_colour_gradient, mean_over_views, spare_one};
+use crate::adc::{
+    GROWTH_SIGNALS, PruneLimits, Window, add_colour_gradient, mean_over_views, spare_one,
+};
 use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::plan::{EditPlan, Reset};
 use crate::policy::{
@@ -226,12 +228,7 @@ impl ConfiguredPolicy for Diet {
 
 impl DensityPolicy for Diet {
     fn needs(&self, scene: &SceneInfo) -> Needs {
-        let mut signals = SignalSet::from([
-            Signal::VisibleCount,
-            Signal::ScreenGradient,
-            Signal::Opacity,
-            Signal::ScaleMax,
-        ]);
+        let mut signals = SignalSet::from(GROWTH_SIGNALS);
         if self.params.importance == Importance::Epochs {
             signals = signals.with(Signal::WeightMax);
         }

@@ -244,11 +244,8 @@ fn a_conserving_clone_shares_its_opacity() {
         .with(Signal::Opacity, &[0.75, 0.5]);
     let done = run(&event, "clone_opacity = \"conserve\"");
     let offspring = done.offspring()[0];
-    assert_eq!(
-        (offspring.parent, offspring.opacity),
-        (ParentFate::BecomesChild, OpacityRule::Conserved)
-    );
-    assert_eq!(offspring.siblings(), 2);
+    assert_eq!((offspring.parent, offspring.siblings()), (ParentFate::BecomesChild, 2));
+    assert_eq!(offspring.opacity, OpacityRule::Conserved);
     // o′ = 0.5, so 0.75 / (1 − 0.25/√2).
     let ScaleRule::Uniform(scale) = offspring.scale else { panic!("{offspring:?}") };
     assert!((scale - 0.911_053).abs() < 1e-5, "{scale}");

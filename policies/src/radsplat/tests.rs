@@ -54,10 +54,8 @@ fn prunes_come_after_growth_and_scale_with_the_run() {
     let growth = due_steps("radsplat", "", &scene);
     assert_eq!((growth.len(), growth[143]), (146, 14_900));
     let policy = build("radsplat", "", &scene);
-    assert_eq!(
-        [14_900, 16_000, 24_000].map(|s| policy.aux_views(s, 9, 9)),
-        [0, u32::MAX, u32::MAX]
-    );
+    let views = [14_900, 16_000, 24_000].map(|step| policy.aux_views(step, 9, 9));
+    assert_eq!(views, [0, u32::MAX, u32::MAX]);
     assert_eq!(policy.needs(&scene).aux.unwrap().columns, [AuxColumn::WeightMax]);
 }
 

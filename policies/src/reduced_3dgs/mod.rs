@@ -137,15 +137,10 @@ impl ConfiguredPolicy for Reduced {
 impl DensityPolicy for Reduced {
     fn needs(&self, scene: &SceneInfo) -> Needs {
         let growth = self.growth.needs(scene);
-        let shape = SignalSet::from([
-            Signal::Position,
-            Signal::LogScale,
-            Signal::Orientation,
-            Signal::PixelSizeMin,
-        ]);
+        let shape = [Signal::Position, Signal::LogScale, Signal::Orientation, Signal::PixelSizeMin];
         let opacity = self.params.opacity_term as f32;
         Needs {
-            signals: growth.signals.union(shape),
+            signals: growth.signals.union(shape.into()),
             loss_terms: LossTerms { opacity, ..LossTerms::default() },
             ..growth
         }

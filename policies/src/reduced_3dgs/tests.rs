@@ -107,10 +107,8 @@ fn invisible_rows_are_pruned_after_growth() {
     assert_eq!((at(15_000), at(30_000)), (vec![0], vec![0]));
     // During growth vanilla prunes below 0.005.
     assert_eq!(at(14_000), [0, 1]);
-    assert_eq!(
-        run(&Event { step: 14_000, ..event }, "faint_opacity = 0.0\ngrow_every = 0").pruned,
-        [0; 0]
-    );
+    let early = Event { step: 14_000, ..event };
+    assert!(run(&early, "faint_opacity = 0.0\ngrow_every = 0").pruned.is_empty());
 }
 
 #[test]

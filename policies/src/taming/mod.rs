@@ -85,8 +85,8 @@
 use std::ops::Bound::{Excluded, Unbounded};
 
 use crate::adc::{
-    OpacityResets, PruneLimits, Window, clone_at, concave_curve, mean_over_views, spare_one,
-    split_by,
+    GROWTH_SIGNALS, OpacityResets, PruneLimits, Window, clone_at, concave_curve, mean_over_views,
+    spare_one, split_by,
 };
 use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::parameters::in_range;
@@ -161,13 +161,7 @@ impl DensityPolicy for Taming {
         let map = PixelMap { error: params.error_weight as f32, edge: params.edge_weight as f32 };
         let sh_rest = Some(Rate::constant(params.sh_rest));
         Needs {
-            signals: SignalSet::from([
-                Signal::VisibleCount,
-                Signal::ScreenGradient,
-                Signal::Opacity,
-                Signal::ScaleMax,
-                Signal::ScaleProduct,
-            ]),
+            signals: SignalSet::from(GROWTH_SIGNALS).with(Signal::ScaleProduct),
             aux: Some(AuxRequest { map, columns: AuxColumn::ALL.to_vec(), points: 0 }),
             cadence: Cadence { all: 1, sh_rest: params.sh_every },
             rates: RateOverrides { sh_rest, ..RateOverrides::default() },

@@ -223,10 +223,8 @@ fn views_and_cadence_follow_the_parameters() {
     let needs = policy.needs(&scene);
     assert_eq!(policy.cadence(1), Cadence { all: 1, sh_rest: 5 });
     assert_eq!(needs.cadence, policy.cadence(1));
-    assert_eq!(
-        needs.rates,
-        RateOverrides { sh_rest: Some(Rate::constant(0.5)), ..RateOverrides::default() }
-    );
+    let sh_rest = Some(Rate::constant(0.5));
+    assert_eq!(needs.rates, RateOverrides { sh_rest, ..RateOverrides::default() });
     assert_eq!(needs.aux.unwrap().map, PixelMap { error: 3.0, edge: 50.0 });
 }
 

@@ -60,13 +60,13 @@ use std::ops::Bound::{Excluded, Unbounded};
 use serde::{Deserialize, Serialize};
 
 use crate::adc::{
-    OpacityResets, PruneLimits, Window, clone_at, concave_curve, mean_over_views, spare_one,
-    split_by,
+    GROWTH_SIGNALS, OpacityResets, PruneLimits, Window, clone_at, concave_curve, mean_over_views,
+    spare_one, split_by,
 };
 use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::parameters::in_range;
 use crate::plan::{EditPlan, Reset};
-use crate::policy::{DensityPolicy, Needs, PolicyResult, SceneInfo, Signal, SignalSet, Snapshot};
+use crate::policy::{DensityPolicy, Needs, PolicyResult, SceneInfo, Signal, Snapshot};
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
 use crate::sample::largest;
@@ -154,13 +154,7 @@ impl ConfiguredPolicy for Vanilla {
 
 impl DensityPolicy for Vanilla {
     fn needs(&self, _scene: &SceneInfo) -> Needs {
-        let signals = SignalSet::from([
-            Signal::VisibleCount,
-            Signal::ScreenGradient,
-            Signal::Opacity,
-            Signal::ScaleMax,
-        ]);
-        Needs { signals, ..Needs::default() }
+        Needs { signals: GROWTH_SIGNALS.into(), ..Needs::default() }
     }
 
     fn is_due(&self, step: u32) -> bool {
