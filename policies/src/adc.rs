@@ -13,6 +13,10 @@ use crate::plan::{
 use crate::policy::{PolicyResult, SceneInfo, Signal, Snapshot};
 use crate::sample::top_k;
 
+/// Signals read by growth by screen gradient and by pruning by opacity and size.
+pub(crate) const GROWTH_SIGNALS: [Signal; 4] =
+    [Signal::VisibleCount, Signal::ScreenGradient, Signal::Opacity, Signal::ScaleMax];
+
 /// A schedule: the multiples of `every` with `from` < step < `until`; none if `every` is 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Window {

@@ -336,11 +336,8 @@ mod tests {
     fn a_bad_field_of_a_seed_is_named() {
         assert_eq!(SEED.bad_field(), None);
         for bad in not_positive() {
-            assert_eq!(
-                Seed { scales: [0.1, bad, 0.1], ..SEED }.bad_field(),
-                Some("scales"),
-                "{bad}"
-            );
+            let scales = [0.1, bad, 0.1];
+            assert_eq!(Seed { scales, ..SEED }.bad_field(), Some("scales"), "{bad}");
             assert_eq!(Seed { opacity: bad, ..SEED }.bad_field(), Some("opacity"), "{bad}");
         }
         for bad in NOT_FINITE {
@@ -374,19 +371,13 @@ mod tests {
         assert_eq!(Update::restart(0.1, 1.0).bad_field(), Some("opacity"));
         assert_eq!(Update::NONE.bad_field(), None);
         let wrong = |update: Update| update.bad_field();
-        assert_eq!(
-            wrong(Update { opacity: OpacityRule::Conserved, ..Update::NONE }),
-            Some("opacity")
-        );
+        let opacity = OpacityRule::Conserved;
+        assert_eq!(wrong(Update { opacity, ..Update::NONE }), Some("opacity"));
         assert_eq!(wrong(Update { scale: ScaleRule::Uniform(0.0), ..Update::NONE }), Some("scale"));
         for bad in NOT_FINITE {
-            let three = Some([0.0, 0.0, bad]);
-            assert_eq!(
-                wrong(Update { position: three, ..Update::NONE }),
-                Some("position"),
-                "{bad}"
-            );
-            assert_eq!(wrong(Update { colour: three, ..Update::NONE }), Some("colour"), "{bad}");
+            let position = Some([0.0, 0.0, bad]);
+            assert_eq!(wrong(Update { position, ..Update::NONE }), Some("position"), "{bad}");
+            assert_eq!(wrong(Update { colour: position, ..Update::NONE }), Some("colour"), "{bad}");
         }
         assert_eq!(wrong(Update { colour: Some([-1.5, 0.0, 2.0]), ..Update::NONE }), None);
         let beyond = Some([0.0, 2.0 * COLOUR_MAX, 0.0]);

@@ -100,6 +100,14 @@ impl Event {
         }
     }
 
+    /// Rows of opacity 0.5 and size 0.05 (small, as the extent is 10), seen by four views.
+    pub(crate) fn small_rows(step: u32, rows: usize, budget: usize) -> Self {
+        Self::new(step, rows, budget)
+            .with_all(Signal::VisibleCount, 4.0)
+            .with_all(Signal::Opacity, 0.5)
+            .with_all(Signal::ScaleMax, 0.05)
+    }
+
     pub(crate) fn with(mut self, signal: Signal, values: &[f32]) -> Self {
         assert_eq!(values.len(), self.rows * signal.width());
         self.signals.retain(|(given, _)| *given != signal);

@@ -213,11 +213,8 @@ mod tests {
             let mut all: Vec<f64> = others.map(|(_, b)| square(b)).collect();
             all.sort_by(f64::total_cmp);
             let expected = all[..3].iter().sum::<f64>() / 3.0;
-            assert!(
-                (found[i] - expected).abs() <= 1e-12 * expected,
-                "{i}: {} {expected}",
-                found[i]
-            );
+            let found = found[i];
+            assert!((found - expected).abs() <= 1e-12 * expected, "{i}: {found} {expected}");
         }
     }
 
@@ -246,10 +243,8 @@ mod tests {
                 assert_eq!(squares, expected, "{k} neighbours of {i}");
                 assert_eq!(together[i], expected, "{k} neighbours of {i}, all together");
                 for other in found {
-                    assert_eq!(
-                        square(a, &points[other.index as usize]).to_bits(),
-                        other.square.to_bits()
-                    );
+                    let expected = square(a, &points[other.index as usize]);
+                    assert_eq!(other.square.to_bits(), expected.to_bits());
                 }
                 let mut places: Vec<u32> = found.iter().map(|other| other.index).collect();
                 places.sort_unstable();

@@ -155,42 +155,26 @@ mod tests {
         let rng = PolicyRng::new(9, 600);
         let u = |rng: PolicyRng, row: u32, purpose| rng.uniform(row, purpose);
         let select = Purpose::Select;
-        let found = [
-            ("rows", joint_deviation(|i| (u(rng, 2 * i, select), u(rng, 2 * i + 1, select)))),
-            (
-                "steps",
-                joint_deviation(|i| (u(rng, i, select), u(PolicyRng::new(9, 601), i, select))),
-            ),
-            (
-                "step by step",
-                joint_deviation(|i| {
-                    let at = |step| u(PolicyRng::new(9, step), 5, select);
-                    (at(2 * i), at(2 * i + 1))
-                }),
-            ),
-            (
-                "seeds",
-                joint_deviation(|i| (u(rng, i, select), u(PolicyRng::new(10, 600), i, select))),
-            ),
-            (
-                "high halves of seeds",
-                joint_deviation(|i| {
-                    (u(rng, i, select), u(PolicyRng::new(9 + (1 << 32), 600), i, select))
-                }),
-            ),
-            ("purposes", joint_deviation(|i| (u(rng, i, select), u(rng, i, Purpose::Place)))),
-            (
-                "purposes",
-                joint_deviation(|i| (u(rng, i, Purpose::Noise), u(rng, i, Purpose::Place))),
-            ),
-            (
-                "counters",
-                joint_deviation(|i| {
-                    let at = |counter| unit_open(rng.bits(i, select, counter)[0]);
-                    (at(0), at(1))
-                }),
-            ),
+        type Pair<'a> = (&'a str, &'a dyn Fn(u32) -> (f32, f32));
+        let other =
+            |seed, step| move |i| (u(rng, i, select), u(PolicyRng::new(seed, step), i, select));
+        let pairs: [Pair<'_>; 8] = [
+            ("rows", &|i| (u(rng, 2 * i, select), u(rng, 2 * i + 1, select))),
+            ("steps", &other(9, 601)),
+            ("step by step", &|i| {
+                let at = |step| u(PolicyRng::new(9, step), 5, select);
+                (at(2 * i), at(2 * i + 1))
+            }),
+            ("seeds", &other(10, 600)),
+            ("high halves of seeds", &other(9 + (1 << 32), 600)),
+            ("purposes", &|i| (u(rng, i, select), u(rng, i, Purpose::Place))),
+            ("purposes", &|i| (u(rng, i, Purpose::Noise), u(rng, i, Purpose::Place))),
+            ("counters", &|i| {
+                let at = |counter| unit_open(rng.bits(i, select, counter)[0]);
+                (at(0), at(1))
+            }),
         ];
+        let found = pairs.map(|(name, pair)| (name, joint_deviation(pair)));
         let bad: Vec<_> = found.iter().filter(|(_, deviation)| deviation.abs() > 5.0).collect();
         assert!(bad.is_empty(), "{bad:?}");
     }

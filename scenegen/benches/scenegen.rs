@@ -38,8 +38,7 @@ fn mesh(count: usize) -> Model {
         for j in 0..sectors {
             let at = i * (sectors + 1) + j;
             let below = at + sectors + 1;
-            triangles.push([at, at + 1, below]);
-            triangles.push([at + 1, below + 1, below]);
+            triangles.extend([[at, at + 1, below], [at + 1, below + 1, below]]);
         }
     }
     let mut model = Model::default();
@@ -48,16 +47,16 @@ fn mesh(count: usize) -> Model {
 }
 
 /// Best of five runs over all rays, in millions of rays per second.
-fn speed(rays: usize, mut run: impl FnMut()) -> f64 {
+fn speed<T>(rays: &[T], cast: impl Fn(&T)) -> f64 {
     let best = (0..5)
         .map(|_| {
             let start = Instant::now();
-            run();
+            rays.iter().for_each(&cast);
             start.elapsed()
         })
         .min()
         .unwrap_or(Duration::MAX);
-    rays as f64 / best.as_secs_f64() / 1e6
+    rays.len() as f64 / best.as_secs_f64() / 1e6
 }
 
 fn main() {
@@ -87,41 +86,28 @@ fn main() {
             .map(|d| Ray::new_inf(Vec3A::from(eye.as_vec3()), Vec3A::from(d.normalize().as_vec3())))
             .collect();
         let start = Instant::now();
-        let wide = build_cwbvh_from_tris(
-            &triangles,
-            BvhBuildParams::medium_build(),
-            &mut Duration::default(),
-        );
+        let (params, mut time) = (BvhBuildParams::medium_build, Duration::default());
+        let wide = build_cwbvh_from_tris(&triangles, params(), &mut time);
         let wide_built = start.elapsed();
-        let binary = build_bvh2_from_tris(
-            &triangles,
-            BvhBuildParams::medium_build(),
-            &mut Duration::default(),
-        );
+        let binary = build_bvh2_from_tris(&triangles, params(), &mut time);
         let in_order = |order: &[u32]| -> Vec<Triangle> {
             order.iter().map(|&i| triangles[i as usize]).collect()
         };
         let (wide_order, binary_order) =
             (in_order(&wide.primitive_indices), in_order(&binary.primitive_indices));
 
-        let ours = speed(rays.len(), || {
-            for direction in &directions {
-                black_box(surface.cast(eye, *direction, f64::INFINITY));
-            }
+        let ours = speed(&directions, |direction| {
+            black_box(surface.cast(eye, *direction, f64::INFINITY));
         });
-        let cwbvh = speed(rays.len(), || {
-            for ray in &rays {
-                let mut hit = RayHit::none();
-                wide.ray_traverse(*ray, &mut hit, |ray, id| wide_order[id].intersect(ray));
-                black_box(hit);
-            }
+        let cwbvh = speed(&rays, |ray| {
+            let mut hit = RayHit::none();
+            wide.ray_traverse(*ray, &mut hit, |ray, id| wide_order[id].intersect(ray));
+            black_box(hit);
         });
-        let bvh2 = speed(rays.len(), || {
-            for ray in &rays {
-                let mut hit = RayHit::none();
-                binary.ray_traverse(*ray, &mut hit, |ray, id| binary_order[id].intersect(ray));
-                black_box(hit);
-            }
+        let bvh2 = speed(&rays, |ray| {
+            let mut hit = RayHit::none();
+            binary.ray_traverse(*ray, &mut hit, |ray, id| binary_order[id].intersect(ray));
+            black_box(hit);
         });
         println!(
             "{:9}  {ours:12.2}  {cwbvh:5.2}  {bvh2:4.2}  {:11.0}%  {:8.2} s  {:9.2} s",

@@ -226,12 +226,11 @@ impl Lighting {
         sampling: &mut Sampling,
     ) -> Vec3 {
         let ray = secondary_ray(point, direction, f32::MAX);
+        let solid = |slot, at: &Intersection| shaded.is_solid(slot, at);
         if !bounce {
-            let solid = |slot, at: &Intersection| shaded.is_solid(slot, at);
             let occluded = shaded.surface.occluder(&ray, solid).is_some();
             return if occluded { Vec3::ZERO } else { self.sky.radiance(direction) };
         }
-        let solid = |slot, at: &Intersection| shaded.is_solid(slot, at);
         let Some(hit) = shaded.surface.closest(&ray, None, None, solid) else {
             return self.sky.radiance(direction);
         };

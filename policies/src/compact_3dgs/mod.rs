@@ -169,9 +169,7 @@ impl DensityPolicy for Compact {
     }
 
     fn plan(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
-        if self.growth.is_due(now.step) {
-            self.growth.plan(now, rng, plan)?;
-        }
+        self.growth.plan(now, rng, plan)?;
         if !self.prunes_at(now.step) {
             return Ok(());
         }

@@ -10,11 +10,7 @@ fn run(event: &Event, set: &str) -> Outcome {
 
 /// Rows of opacity 0.5 with these masks; the growth rules neither densify nor prune them.
 fn event(step: u32, masks: &[f32]) -> Event {
-    Event::new(step, masks.len(), masks.len())
-        .with_all(Signal::VisibleCount, 4.0)
-        .with_all(Signal::Opacity, 0.5)
-        .with_all(Signal::ScaleMax, 0.05)
-        .with(Signal::Mask, masks)
+    Event::small_rows(step, masks.len(), masks.len()).with(Signal::Mask, masks)
 }
 
 #[test]

@@ -147,7 +147,9 @@
 
 // Over 400 lines, of which a third is the manual page; growth, compensation and pruning meet in `plan`.
 
-use crate::adc::{PruneLimits, Window, add_colour_gradient, mean_over_views, spare_one};
+use crate::adc::{
+    GROWTH_SIGNALS, PruneLimits, Window, add_colour_gradient, mean_over_views, spare_one,
+};
 use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::plan::{EditPlan, Reset};
 use crate::policy::{
@@ -209,22 +211,13 @@ impl ConfiguredPolicy for Diet {
     fn new(params: DietParams, scene: &SceneInfo) -> PolicyResult<Self> {
         params.check()?;
         let compensates = params.rho_c > 0.0;
+        let DietParams { grow_from, grow_until, grow_every, prune_every, insert_every, .. } =
+            params;
+        let DietParams { compensate_from: from, compensate_until: until, .. } = params;
         Ok(Self {
-            grow: Window {
-                from: params.grow_from,
-                until: params.grow_until,
-                every: params.grow_every,
-            },
-            prune: Window {
-                from: params.grow_from,
-                until: params.grow_until.max(params.compensate_until),
-                every: params.prune_every,
-            },
-            insert: Window {
-                from: params.compensate_from,
-                until: params.compensate_until,
-                every: if compensates { params.insert_every } else { 0 },
-            },
+            grow: Window { from: grow_from, until: grow_until, every: grow_every },
+            prune: Window { until: grow_until.max(until), from: grow_from, every: prune_every },
+            insert: Window { from, until, every: if compensates { insert_every } else { 0 } },
             protected_age: params.protect.min(scene.train_views) as f32,
             surface: Vec::new(),
             fresh: Vec::new(),
@@ -235,12 +228,7 @@ impl ConfiguredPolicy for Diet {
 
 impl DensityPolicy for Diet {
     fn needs(&self, scene: &SceneInfo) -> Needs {
-        let mut signals = SignalSet::from([
-            Signal::VisibleCount,
-            Signal::ScreenGradient,
-            Signal::Opacity,
-            Signal::ScaleMax,
-        ]);
+        let mut signals = SignalSet::from(GROWTH_SIGNALS);
         if self.params.importance == Importance::Epochs {
             signals = signals.with(Signal::WeightMax);
         }

@@ -16,10 +16,7 @@ fn run(event: &Event, set: &str) -> Outcome {
 /// importance i/100.
 fn event(step: u32, rows: usize, budget: usize) -> Event {
     let importance: Vec<f32> = (0..rows).map(|row| row as f32 / 100.0).collect();
-    Event::new(step, rows, budget)
-        .with_all(Signal::VisibleCount, 4.0)
-        .with_all(Signal::Opacity, 0.5)
-        .with_all(Signal::ScaleMax, 0.05)
+    Event::small_rows(step, rows, budget)
         .with_all(Signal::Age, 1000.0)
         .with(Signal::WeightMax, &importance)
 }
@@ -247,11 +244,8 @@ fn a_conserving_clone_shares_its_opacity() {
         .with(Signal::Opacity, &[0.75, 0.5]);
     let done = run(&event, "clone_opacity = \"conserve\"");
     let offspring = done.offspring()[0];
-    assert_eq!(
-        (offspring.parent, offspring.opacity),
-        (ParentFate::BecomesChild, OpacityRule::Conserved)
-    );
-    assert_eq!(offspring.siblings(), 2);
+    assert_eq!((offspring.parent, offspring.siblings()), (ParentFate::BecomesChild, 2));
+    assert_eq!(offspring.opacity, OpacityRule::Conserved);
     // o′ = 0.5, so 0.75 / (1 − 0.25/√2).
     let ScaleRule::Uniform(scale) = offspring.scale else { panic!("{offspring:?}") };
     assert!((scale - 0.911_053).abs() < 1e-5, "{scale}");

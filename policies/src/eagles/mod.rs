@@ -183,9 +183,7 @@ impl DensityPolicy for Eagles {
     }
 
     fn plan(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
-        if self.growth.is_due(now.step) {
-            self.growth.plan(now, rng, plan)?;
-        }
+        self.growth.plan(now, rng, plan)?;
         if !self.prunes.is_due(now.step) {
             return Ok(());
         }

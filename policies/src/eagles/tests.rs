@@ -12,11 +12,7 @@ fn run(event: &Event, set: &str) -> Outcome {
 
 /// Rows with this influence; the growth rules neither densify nor prune them.
 fn event(step: u32, influence: &[f32]) -> Event {
-    Event::new(step, influence.len(), influence.len())
-        .with_all(Signal::VisibleCount, 4.0)
-        .with_all(Signal::Opacity, 0.5)
-        .with_all(Signal::ScaleMax, 0.05)
-        .with(Signal::WeightSum, influence)
+    Event::small_rows(step, influence.len(), influence.len()).with(Signal::WeightSum, influence)
 }
 
 #[test]

@@ -96,7 +96,7 @@ use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::plan::{EditPlan, Reset};
 use crate::policy::{
     AuxColumn, AuxRequest, AuxView, Cadence, DensityPolicy, Needs, PixelMap, PolicyResult, Rate,
-    RateOverrides, SceneInfo, Signal, SignalSet, Snapshot,
+    RateOverrides, SceneInfo, Signal, Snapshot,
 };
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
@@ -169,17 +169,10 @@ impl ConfiguredPolicy for Igs {
 impl DensityPolicy for Igs {
     fn needs(&self, _scene: &SceneInfo) -> Needs {
         let params = &self.params;
+        let map = PixelMap { error: 0.0, edge: 1.0 };
         Needs {
-            signals: SignalSet::from([
-                Signal::VisibleCount,
-                Signal::ScreenGradientAbs,
-                Signal::Opacity,
-            ]),
-            aux: Some(AuxRequest {
-                map: PixelMap { error: 0.0, edge: 1.0 },
-                columns: vec![AuxColumn::MapSum],
-                points: 0,
-            }),
+            signals: [Signal::VisibleCount, Signal::ScreenGradientAbs, Signal::Opacity].into(),
+            aux: Some(AuxRequest { map, columns: vec![AuxColumn::MapSum], points: 0 }),
             cadence: Cadence { all: self.sums[0].max(self.sums[1]), sh_rest: 1 },
             rates: RateOverrides {
                 mean: Some(Rate { start: params.mean_start, end: params.mean_end }),

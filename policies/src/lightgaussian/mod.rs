@@ -87,8 +87,7 @@ use crate::parameters::StepParameter::{self, Step};
 use crate::parameters::extended;
 use crate::plan::EditPlan;
 use crate::policy::{
-    AuxColumn, AuxRequest, AuxView, DensityPolicy, Needs, PixelMap, PolicyResult, SceneInfo,
-    Signal, Snapshot,
+    AuxColumn, AuxRequest, AuxView, DensityPolicy, Needs, PolicyResult, SceneInfo, Signal, Snapshot,
 };
 use crate::prune::{OverViews, Victims};
 use crate::registry::ConfiguredPolicy;
@@ -139,11 +138,7 @@ impl DensityPolicy for LightGaussian {
         }
         Needs {
             signals: growth.signals.with(Signal::ScaleProduct),
-            aux: Some(AuxRequest {
-                map: PixelMap::default(),
-                columns: vec![self.column()],
-                points: 0,
-            }),
+            aux: Some(AuxRequest { columns: vec![self.column()], ..AuxRequest::default() }),
             ..growth
         }
     }
@@ -163,9 +158,7 @@ impl DensityPolicy for LightGaussian {
     }
 
     fn plan(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
-        if self.growth.is_due(now.step) {
-            self.growth.plan(now, rng, plan)?;
-        }
+        self.growth.plan(now, rng, plan)?;
         let share = self.share_at(now.step);
         if share > 0.0 {
             let count = (share * now.rows() as f64).floor() as usize;

@@ -15,11 +15,7 @@ fn run(event: &Event, set: &str) -> Outcome {
 
 /// Rows of opacity 0.5 and volume 1 and no view; the growth rules neither densify nor prune them.
 fn event(step: u32, rows: usize) -> Event {
-    Event::new(step, rows, rows)
-        .with_all(Signal::VisibleCount, 4.0)
-        .with_all(Signal::Opacity, 0.5)
-        .with_all(Signal::ScaleMax, 0.05)
-        .with_all(Signal::ScaleProduct, 1.0)
+    Event::small_rows(step, rows, rows).with_all(Signal::ScaleProduct, 1.0)
 }
 
 /// A view in which rows are blended into these numbers of pixels, with these sums of blend weights.

@@ -61,10 +61,8 @@ fn the_dead_are_relocated_to_the_only_living_row() {
     assert_eq!((&done.pruned, &done.split), (&vec![0, 2, 3], &vec![1]));
     let family = done.offspring()[0];
     assert_eq!((family.children, family.siblings()), (3, 4));
-    assert_eq!(
-        (family.placement, family.opacity),
-        (Placement::Offset([0.0; 3]), OpacityRule::Conserved)
-    );
+    assert_eq!(family.placement, Placement::Offset([0.0; 3]));
+    assert_eq!(family.opacity, OpacityRule::Conserved);
     let ScaleRule::Uniform(scale) = family.scale else { panic!("{family:?}") };
     assert!((f64::from(scale) - share(0.5, 4, 0.005).1).abs() < 1e-6);
     assert_eq!(done.ops.counts, EditCounts { removed: 3, added: 3, updated: 1, denied: 0 });

@@ -16,10 +16,7 @@ fn run(event: &Event, set: &str) -> Outcome {
 /// importance rise from row to row.
 fn event(step: u32, rows: usize, budget: usize) -> Event {
     let rising: Vec<f32> = (1..=rows).map(|row| row as f32 / 100.0).collect();
-    Event::new(step, rows, budget)
-        .with_all(Signal::VisibleCount, 4.0)
-        .with_all(Signal::Opacity, 0.5)
-        .with_all(Signal::ScaleMax, 0.05)
+    Event::small_rows(step, rows, budget)
         .with_all(Signal::Age, 1000.0)
         .with(Signal::ScreenGradientAbs, &rising)
         .with(Signal::WeightMax, &rising)

@@ -153,6 +153,7 @@ impl DensityPolicy for MiniSplatting {
         let growth = self.growth.needs(scene);
         let rebuilds = self.params.first_reinit_at > 0 || self.params.second_reinit_at > 0;
         let most = self.reinit_rows(scene.budget);
+        let opacity = Some(Rate::constant(self.params.opacity_rate));
         let aux = AuxRequest {
             map: PixelMap::default(),
             columns: vec![AuxColumn::WeightSum, AuxColumn::PixelCount, AuxColumn::DominantPixels],
@@ -161,10 +162,7 @@ impl DensityPolicy for MiniSplatting {
         Needs {
             signals: growth.signals.with(Signal::DominantPixels).with(Signal::Position),
             aux: Some(aux),
-            rates: RateOverrides {
-                opacity: Some(Rate::constant(self.params.opacity_rate)),
-                ..RateOverrides::default()
-            },
+            rates: RateOverrides { opacity, ..RateOverrides::default() },
             detailed_edits: true,
             ..growth
         }

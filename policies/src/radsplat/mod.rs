@@ -73,8 +73,7 @@ use crate::parameters::StepParameter::{self, Step};
 use crate::parameters::{extended, in_range};
 use crate::plan::EditPlan;
 use crate::policy::{
-    AuxColumn, AuxRequest, AuxView, DensityPolicy, Needs, PixelMap, PolicyResult, SceneInfo,
-    Snapshot,
+    AuxColumn, AuxRequest, AuxView, DensityPolicy, Needs, PolicyResult, SceneInfo, Snapshot,
 };
 use crate::prune::{OverViews, Victims};
 use crate::registry::ConfiguredPolicy;
@@ -140,8 +139,7 @@ impl ConfiguredPolicy for RadSplat {
 
 impl DensityPolicy for RadSplat {
     fn needs(&self, scene: &SceneInfo) -> Needs {
-        let aux =
-            AuxRequest { map: PixelMap::default(), columns: vec![AuxColumn::WeightMax], points: 0 };
+        let aux = AuxRequest { columns: vec![AuxColumn::WeightMax], ..AuxRequest::default() };
         Needs { aux: Some(aux), ..self.growth.needs(scene) }
     }
 
@@ -159,9 +157,7 @@ impl DensityPolicy for RadSplat {
     }
 
     fn plan(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
-        if self.growth.is_due(now.step) {
-            self.growth.plan(now, rng, plan)?;
-        }
+        self.growth.plan(now, rng, plan)?;
         if !self.prunes_at(now.step) {
             return Ok(());
         }

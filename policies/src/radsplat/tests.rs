@@ -14,10 +14,7 @@ fn run(event: &Event, set: &str) -> Outcome {
 /// prune them.
 fn event(step: u32, views: &[&[f32]]) -> Event {
     let rows = views[0].len();
-    let mut event = Event::new(step, rows, rows)
-        .with_all(Signal::VisibleCount, 4.0)
-        .with_all(Signal::Opacity, 0.5)
-        .with_all(Signal::ScaleMax, 0.05);
+    let mut event = Event::small_rows(step, rows, rows);
     let view = |weights: &&[f32]| View {
         columns: vec![(AuxColumn::WeightMax, weights.to_vec())],
         ..View::default()
@@ -57,10 +54,8 @@ fn prunes_come_after_growth_and_scale_with_the_run() {
     let growth = due_steps("radsplat", "", &scene);
     assert_eq!((growth.len(), growth[143]), (146, 14_900));
     let policy = build("radsplat", "", &scene);
-    assert_eq!(
-        [14_900, 16_000, 24_000].map(|s| policy.aux_views(s, 9, 9)),
-        [0, u32::MAX, u32::MAX]
-    );
+    let views = [14_900, 16_000, 24_000].map(|step| policy.aux_views(step, 9, 9));
+    assert_eq!(views, [0, u32::MAX, u32::MAX]);
     assert_eq!(policy.needs(&scene).aux.unwrap().columns, [AuxColumn::WeightMax]);
 }
 

@@ -138,15 +138,10 @@ impl ConfiguredPolicy for Reduced {
 impl DensityPolicy for Reduced {
     fn needs(&self, scene: &SceneInfo) -> Needs {
         let growth = self.growth.needs(scene);
-        let shape = SignalSet::from([
-            Signal::Position,
-            Signal::LogScale,
-            Signal::Orientation,
-            Signal::PixelSizeMin,
-        ]);
+        let shape = [Signal::Position, Signal::LogScale, Signal::Orientation, Signal::PixelSizeMin];
         let opacity = self.params.opacity_term as f32;
         Needs {
-            signals: growth.signals.union(shape),
+            signals: growth.signals.union(shape.into()),
             loss_terms: LossTerms { opacity, ..LossTerms::default() },
             ..growth
         }
@@ -157,9 +152,7 @@ impl DensityPolicy for Reduced {
     }
 
     fn plan(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
-        if self.growth.is_due(now.step) {
-            self.growth.plan(now, rng, plan)?;
-        }
+        self.growth.plan(now, rng, plan)?;
         if self.prunes_at(now.step) {
             self.prune(now, rng, plan)?;
             plan.reset(Reset::Only(SignalSet::default().with(Signal::PixelSizeMin)));

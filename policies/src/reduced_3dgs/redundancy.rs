@@ -211,12 +211,8 @@ mod tests {
         let turned = rotate_back([half, 0.0, 0.0, half], [0.0, 3.0, 5.0]);
         let expected = [3.0, 0.0, 5.0];
         assert!((0..3).all(|k| (turned[k] - expected[k]).abs() < 1e-6), "{turned:?}");
-        assert!(
-            rotate_back(UPRIGHT, [1.0, 2.0, 3.0])
-                .iter()
-                .zip(1..)
-                .all(|(x, k)| (x - f64::from(k)).abs() < 1e-12)
-        );
+        let same = rotate_back(UPRIGHT, [1.0, 2.0, 3.0]);
+        assert!(same.iter().zip(1..).all(|(x, k)| (x - f64::from(k)).abs() < 1e-12));
     }
 
     fn redundancy(xs: &[f32], half_axes: &[[f32; 3]], pixels: &[f32], most: usize) -> Vec<f32> {

@@ -41,12 +41,7 @@ impl DensityPolicy for Idle {
     fn is_due(&self, step: u32) -> bool {
         step.is_multiple_of(self.0.every)
     }
-    fn plan(
-        &mut self,
-        _now: &Snapshot<'_>,
-        _rng: &PolicyRng,
-        _plan: &mut EditPlan,
-    ) -> PolicyResult {
+    fn plan(&mut self, _: &Snapshot<'_>, _: &PolicyRng, _: &mut EditPlan) -> PolicyResult {
         Ok(())
     }
 }

@@ -85,8 +85,8 @@
 use std::ops::Bound::{Excluded, Unbounded};
 
 use crate::adc::{
-    OpacityResets, PruneLimits, Window, clone_at, concave_curve, mean_over_views, spare_one,
-    split_by,
+    GROWTH_SIGNALS, OpacityResets, PruneLimits, Window, clone_at, concave_curve, mean_over_views,
+    spare_one, split_by,
 };
 use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::parameters::in_range;
@@ -149,13 +149,8 @@ impl ConfiguredPolicy for Taming {
         in_range("sh_every", params.sh_every.into(), 1.0..=1000.0)?;
         in_range("sh_rest", params.sh_rest, (Excluded(0.0), Unbounded))?;
         let TamingParams { grow_from: from, grow_until: until, grow_every: every, .. } = params;
-        let resets = OpacityResets::new(
-            params.reset_every,
-            until,
-            params.white_reset_at,
-            params.reset_opacity,
-            scene,
-        )?;
+        let TamingParams { reset_every, white_reset_at, reset_opacity, .. } = params;
+        let resets = OpacityResets::new(reset_every, until, white_reset_at, reset_opacity, scene)?;
         Ok(Self { grow: Window { from, until, every }, resets, score: Score::default(), params })
     }
 }
@@ -163,27 +158,13 @@ impl ConfiguredPolicy for Taming {
 impl DensityPolicy for Taming {
     fn needs(&self, _scene: &SceneInfo) -> Needs {
         let params = &self.params;
+        let map = PixelMap { error: params.error_weight as f32, edge: params.edge_weight as f32 };
+        let sh_rest = Some(Rate::constant(params.sh_rest));
         Needs {
-            signals: SignalSet::from([
-                Signal::VisibleCount,
-                Signal::ScreenGradient,
-                Signal::Opacity,
-                Signal::ScaleMax,
-                Signal::ScaleProduct,
-            ]),
-            aux: Some(AuxRequest {
-                map: PixelMap {
-                    error: params.error_weight as f32,
-                    edge: params.edge_weight as f32,
-                },
-                columns: AuxColumn::ALL.to_vec(),
-                points: 0,
-            }),
+            signals: SignalSet::from(GROWTH_SIGNALS).with(Signal::ScaleProduct),
+            aux: Some(AuxRequest { map, columns: AuxColumn::ALL.to_vec(), points: 0 }),
             cadence: Cadence { all: 1, sh_rest: params.sh_every },
-            rates: RateOverrides {
-                sh_rest: Some(Rate::constant(params.sh_rest)),
-                ..RateOverrides::default()
-            },
+            rates: RateOverrides { sh_rest, ..RateOverrides::default() },
             ..Needs::default()
         }
     }

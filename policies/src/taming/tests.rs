@@ -11,11 +11,8 @@ fn run(event: &Event, set: &str) -> Outcome {
 /// Small rows of opacity 0.5 with a screen gradient of 1 in four views; all statistics are the same in the only
 /// auxiliary view, which has a loss of 0.02.
 fn event(step: u32, rows: usize, budget: usize) -> Event {
-    let mut event = Event::new(step, rows, budget)
-        .with_all(Signal::VisibleCount, 4.0)
+    let mut event = Event::small_rows(step, rows, budget)
         .with_all(Signal::ScreenGradient, 4.0)
-        .with_all(Signal::Opacity, 0.5)
-        .with_all(Signal::ScaleMax, 0.05)
         .with_all(Signal::ScaleProduct, 1e-4);
     let columns = AuxColumn::ALL.map(|column| (column, vec![2.0; rows])).to_vec();
     event.views = vec![View { loss: 0.02, columns, points: Vec::new() }];
@@ -226,10 +223,8 @@ fn views_and_cadence_follow_the_parameters() {
     let needs = policy.needs(&scene);
     assert_eq!(policy.cadence(1), Cadence { all: 1, sh_rest: 5 });
     assert_eq!(needs.cadence, policy.cadence(1));
-    assert_eq!(
-        needs.rates,
-        RateOverrides { sh_rest: Some(Rate::constant(0.5)), ..RateOverrides::default() }
-    );
+    let sh_rest = Some(Rate::constant(0.5));
+    assert_eq!(needs.rates, RateOverrides { sh_rest, ..RateOverrides::default() });
     assert_eq!(needs.aux.unwrap().map, PixelMap { error: 3.0, edge: 50.0 });
 }
 

@@ -60,13 +60,13 @@ use std::ops::Bound::{Excluded, Unbounded};
 use serde::{Deserialize, Serialize};
 
 use crate::adc::{
-    OpacityResets, PruneLimits, Window, clone_at, concave_curve, mean_over_views, spare_one,
-    split_by,
+    GROWTH_SIGNALS, OpacityResets, PruneLimits, Window, clone_at, concave_curve, mean_over_views,
+    spare_one, split_by,
 };
 use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::parameters::in_range;
 use crate::plan::{EditPlan, Reset};
-use crate::policy::{DensityPolicy, Needs, PolicyResult, SceneInfo, Signal, SignalSet, Snapshot};
+use crate::policy::{DensityPolicy, Needs, PolicyResult, SceneInfo, Signal, Snapshot};
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
 use crate::sample::largest;
@@ -146,26 +146,15 @@ impl ConfiguredPolicy for Vanilla {
         in_range("min_opacity", params.min_opacity, 0.0..=1.0)?;
         in_range("max_scale", params.max_scale, (Excluded(0.0), Unbounded))?;
         let VanillaParams { grow_from: from, grow_until: until, grow_every: every, .. } = params;
-        let resets = OpacityResets::new(
-            params.reset_every,
-            until,
-            params.white_reset_at,
-            params.reset_opacity,
-            scene,
-        )?;
+        let VanillaParams { reset_every, white_reset_at, reset_opacity, .. } = params;
+        let resets = OpacityResets::new(reset_every, until, white_reset_at, reset_opacity, scene)?;
         Ok(Self { grow: Window { from, until, every }, resets, params })
     }
 }
 
 impl DensityPolicy for Vanilla {
     fn needs(&self, _scene: &SceneInfo) -> Needs {
-        let signals = SignalSet::from([
-            Signal::VisibleCount,
-            Signal::ScreenGradient,
-            Signal::Opacity,
-            Signal::ScaleMax,
-        ]);
-        Needs { signals, ..Needs::default() }
+        Needs { signals: GROWTH_SIGNALS.into(), ..Needs::default() }
     }
 
     fn is_due(&self, step: u32) -> bool {

@@ -10,11 +10,7 @@ fn run(event: &Event, set: &str) -> Outcome {
 
 /// Rows of opacity 0.5 and size 0.05 (small, as the extent is 10), seen by four views.
 fn event(step: u32, gradient_sums: &[f32], budget: usize) -> Event {
-    Event::new(step, gradient_sums.len(), budget)
-        .with(Signal::ScreenGradient, gradient_sums)
-        .with_all(Signal::VisibleCount, 4.0)
-        .with_all(Signal::Opacity, 0.5)
-        .with_all(Signal::ScaleMax, 0.05)
+    Event::small_rows(step, gradient_sums.len(), budget).with(Signal::ScreenGradient, gradient_sums)
 }
 
 #[test]

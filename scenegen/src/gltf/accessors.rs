@@ -81,11 +81,8 @@ impl<'a> Buffers<'a> {
         let bytes =
             range.and_then(|(offset, length)| buffer.get(offset..offset.checked_add(length)?));
         bytes.ok_or_else(|| {
-            fault(
-                path,
-                name,
-                format!("bytes {offset} to {offset} + {length} lie beyond its buffer"),
-            )
+            let problem = format!("bytes {offset} to {offset} + {length} lie beyond its buffer");
+            fault(path, name, problem)
         })
     }
 
@@ -95,15 +92,13 @@ impl<'a> Buffers<'a> {
             return Err(fault(self.path, name(), "there is no such buffer"));
         };
         if self.read[index].is_none() {
-            let bytes: Cow<'a, [u8]> = match &buffer.uri {
-                Some(uri) => self.uri(&name(), uri)?.into(),
-                None => match self.blob.filter(|_| index == 0) {
-                    Some(blob) => blob.into(),
-                    None => {
-                        let problem = "it has neither a URI nor a binary chunk";
-                        return Err(fault(self.path, name(), problem));
-                    }
-                },
+            let bytes: Cow<'a, [u8]> = match (&buffer.uri, self.blob.filter(|_| index == 0)) {
+                (Some(uri), _) => self.uri(&name(), uri)?.into(),
+                (None, Some(blob)) => blob.into(),
+                (None, None) => {
+                    let problem = "it has neither a URI nor a binary chunk";
+                    return Err(fault(self.path, name(), problem));
+                }
             };
             let declared = buffer.byte_length.0;
             if (bytes.len() as u64) < declared {

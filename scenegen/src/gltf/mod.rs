@@ -208,11 +208,8 @@ fn refuse_required(path: &Path, text: &[u8]) -> Result<(), Error> {
         serde_json::from_slice(text).map_err(|e| fault(path, "JSON", e.to_string()))?;
     if head.asset.version.split('.').next() != Some("2") {
         let version: String = head.asset.version.chars().take(20).collect();
-        return Err(Error::unsupported(
-            path,
-            &format!("glTF version {version}"),
-            "export it as glTF 2.0",
-        ));
+        let feature = format!("glTF version {version}");
+        return Err(Error::unsupported(path, &feature, "export it as glTF 2.0"));
     }
     let known = |name: &str| SUPPORTED.contains(&name) || APPEARANCE.contains(&name);
     if let Some(name) = head.extensions_required.iter().find(|name| !known(name)) {
@@ -348,11 +345,8 @@ impl Reader<'_> {
             };
             let values = buffers.floats(index.value(), sizes, element)?;
             if values.count() != count {
-                let problem = format!(
-                    "accessor {} has {} elements, POSITION {count}",
-                    index.value(),
-                    values.count()
-                );
+                let (index, found) = (index.value(), values.count());
+                let problem = format!("accessor {index} has {found} elements, POSITION {count}");
                 return Err(fault(self.path, format!("{element} {semantic:?}"), problem));
             }
             Ok(Some(values))
@@ -428,10 +422,8 @@ impl Reader<'_> {
         let down = forward.cross(right).normalize_or_zero();
         let right = down.cross(forward);
         if !(yfov > 0.0 && yfov < std::f64::consts::PI) || right.length_squared() < 0.5 {
-            return Err(self.fault(
-                format!("camera {index}"),
-                "its field of view or its node's axes are invalid",
-            ));
+            let problem = "its field of view or its node's axes are invalid";
+            return Err(self.fault(format!("camera {index}"), problem));
         }
         self.model.cameras.push(FileCamera {
             name: camera.name.clone().unwrap_or_else(|| format!("camera {index}")),
@@ -462,12 +454,8 @@ impl Reader<'_> {
                     light.spot.as_ref().map_or((0.0, std::f32::consts::FRAC_PI_4), |s| {
                         (s.inner_cone_angle, s.outer_cone_angle)
                     });
-                LightKind::Spot {
-                    position,
-                    direction,
-                    cos_inner: inner.cos(),
-                    cos_outer: outer.cos(),
-                }
+                let (cos_inner, cos_outer) = (inner.cos(), outer.cos());
+                LightKind::Spot { position, direction, cos_inner, cos_outer }
             }
             Checked::Invalid => return Err(self.fault(element, "its type is unknown")),
         };
@@ -499,11 +487,9 @@ fn local(node: &json::Node) -> DAffine3 {
         let q = DQuat::from_array(q.0.map(f64::from));
         if q.length_squared() > 0.0 { q.normalize() } else { DQuat::IDENTITY }
     });
-    DAffine3::from_scale_rotation_translation(
-        vector(node.scale, DVec3::ONE),
-        rotation,
-        vector(node.translation, DVec3::ZERO),
-    )
+    let scale = vector(node.scale, DVec3::ONE);
+    let translation = vector(node.translation, DVec3::ZERO);
+    DAffine3::from_scale_rotation_translation(scale, rotation, translation)
 }
 
 /// Triangles of a list, strip or fan, counter-clockwise; the order is reversed if the node mirrors them.

@@ -142,10 +142,8 @@ impl Rig {
             }
         }
         if !(self.fov > 0.5 && self.fov < 170.0) {
-            return Err(Error::option(
-                "--fov",
-                format!("{} degrees is not between 0.5 and 170", self.fov),
-            ));
+            let problem = format!("{} degrees is not between 0.5 and 170", self.fov);
+            return Err(Error::option("--fov", problem));
         }
         if !(self.radius > 0.0 && self.radius <= 1e3) {
             let problem = format!("{} is not above 0 and at most 1000", self.radius);

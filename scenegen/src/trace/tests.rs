@@ -66,34 +66,16 @@ fn lights_have_the_expected_irradiance() {
     let at = DVec3::new(0.0, 2.0, 0.0);
     let down = DVec3::NEG_Y;
     // Irradiance straight below: I / d², cut off beyond the range and outside the cone.
-    let point = |range| Light {
-        kind: LightKind::Point { position: at },
-        intensity: Vec3::splat(3.0),
-        range,
+    let light = |kind, intensity, range| Light { kind, intensity: Vec3::splat(intensity), range };
+    let point = |range| light(LightKind::Point { position: at }, 3.0, range);
+    let spot = |direction: DVec3| {
+        let (direction, cos_inner, cos_outer) = (direction.normalize(), 0.98, 0.9);
+        light(LightKind::Spot { position: at, direction, cos_inner, cos_outer }, 3.0, f64::INFINITY)
     };
-    let spot = |direction: DVec3| Light {
-        kind: LightKind::Spot {
-            position: at,
-            direction: direction.normalize(),
-            cos_inner: 0.98,
-            cos_outer: 0.9,
-        },
-        intensity: Vec3::splat(3.0),
-        range: f64::INFINITY,
-    };
-    let area = Light {
-        kind: LightKind::Area {
-            corner: at - DVec3::new(0.01, 0.0, 0.01),
-            u: 0.02 * DVec3::X,
-            v: 0.02 * DVec3::Z,
-        },
-        intensity: Vec3::splat(3.0 / 0.0004),
-        range: f64::INFINITY,
-    };
-    let away = Light {
-        kind: LightKind::Area { corner: at, u: 0.02 * DVec3::Z, v: 0.02 * DVec3::X },
-        ..area
-    };
+    let (u, v) = (0.02 * DVec3::X, 0.02 * DVec3::Z);
+    let corner = at - DVec3::new(0.01, 0.0, 0.01);
+    let area = light(LightKind::Area { corner, u, v }, 3.0 / 0.0004, f64::INFINITY);
+    let away = Light { kind: LightKind::Area { corner: at, u: v, v: u }, ..area };
     let cases = [
         (point(f64::INFINITY), 0.75),
         (point(1.9), 0.0),

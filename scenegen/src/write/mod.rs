@@ -47,10 +47,10 @@ pub fn write(
     let replaces = holds_scene(target, overwrite)?;
     let parent = folder_of(target);
     fs::create_dir_all(parent).map_err(Error::write(parent))?;
-    let folder = tempfile::Builder::new()
-        .prefix(".densify-scene-")
-        .tempdir_in(parent)
-        .map_err(Error::write(parent))?;
+    let folder_beside = |prefix: &str| {
+        tempfile::Builder::new().prefix(prefix).tempdir_in(parent).map_err(Error::write(parent))
+    };
+    let folder = folder_beside(".densify-scene-")?;
     let root = folder.path();
     let mut collector = scene.point_collector();
     for (number, view) in scene.views.iter().enumerate() {
@@ -68,10 +68,7 @@ pub fn write(
     write_rest(scene, root, &points)?;
     make_readable(root)?;
     if replaces {
-        let old = tempfile::Builder::new()
-            .prefix(".densify-old-")
-            .tempdir_in(parent)
-            .map_err(Error::write(parent))?;
+        let old = folder_beside(".densify-old-")?;
         let aside = old.path().join("scene");
         fs::rename(target, &aside).map_err(Error::write(target))?;
         if let Err(error) = fs::rename(folder.path(), target) {
