@@ -66,17 +66,19 @@ pub fn is_unfit(error: &io::Error) -> bool {
     error.raw_os_error().is_none() && error.kind() == io::ErrorKind::InvalidInput
 }
 
+/// The error of a format that cannot hold the model.
+pub(super) fn unfit(problem: impl Into<String>) -> io::Error {
+    io::Error::new(io::ErrorKind::InvalidInput, problem.into())
+}
+
 impl Format {
     /// A writer of one file.
     ///
     /// # Errors
     /// When densify does not write the format.
     pub fn open_writer(&self) -> io::Result<Box<dyn ModelWriter>> {
-        let unfit = || {
-            let problem = format!("densify does not write {}; choose another format", self.name);
-            io::Error::new(io::ErrorKind::InvalidInput, problem)
-        };
-        self.writer.map(|make| make()).ok_or_else(unfit)
+        let problem = || format!("densify does not write {}; choose another format", self.name);
+        self.writer.map(|make| make()).ok_or_else(|| unfit(problem()))
     }
 
     /// [`ModelWriter::held_bytes`] of this format; 0 if densify does not write it.

@@ -8,6 +8,7 @@ use zip::ZipArchive;
 use zip::result::ZipError;
 
 use super::unpack::{read_exactly, read_to_end};
+use super::write::unfit;
 use crate::error::LoadError;
 use densify_core::files::most_unpacked;
 
@@ -67,12 +68,8 @@ impl<'a> ZipWriter<'a> {
 
     /// Adds a file.
     pub(super) fn add(&mut self, name: &str, bytes: &[u8]) -> io::Result<()> {
-        let too_large = |_| {
-            io::Error::new(
-                io::ErrorKind::InvalidInput,
-                "an archive has at most 4 GiB; choose another format, such as ply",
-            )
-        };
+        let too_large =
+            |_| unfit("an archive has at most 4 GiB; choose another format, such as ply");
         let size = u32::try_from(bytes.len()).map_err(too_large)?;
         let offset = u32::try_from(self.offset).map_err(too_large)?;
         let mut checksum = Crc::new();

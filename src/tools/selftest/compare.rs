@@ -65,9 +65,9 @@ pub fn compare_images(
         if worst.abs() <= limits.interior {
             largest = largest.max(worst.abs());
         } else if !on_boundary || worst.is_nan() {
+            let most = limits.interior;
             return Err(format!(
-                "pixel {p} differs by {worst:e}, {:e} allowed where no threshold is close",
-                limits.interior
+                "pixel {p} differs by {worst:e}, {most:e} allowed where no threshold is close"
             ));
         } else if worst.abs() > limits.step {
             return Err(format!(

@@ -86,17 +86,13 @@ pub(super) fn worst(case: u8, table: &Table) -> Vec<Finding> {
             None => found.push(finding),
         }
     }
-    let failed = table.messages().map(|message| Finding {
-        case,
-        kind: "failed".into(),
-        place: message.into(),
-        error: f64::NAN,
-        tolerance: 0.0,
-    });
-    found.extend(failed);
+    let failed = |place: &str| {
+        let (kind, place) = ("failed".into(), place.into());
+        Finding { case, kind, place, error: f64::NAN, tolerance: 0.0 }
+    };
+    found.extend(table.messages().map(failed));
     if found.is_empty() {
-        let (kind, place) = ("failed".into(), "nothing was compared".into());
-        found.push(Finding { case, kind, place, error: f64::NAN, tolerance: 0.0 });
+        found.push(failed("nothing was compared"));
     }
     found
 }

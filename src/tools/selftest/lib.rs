@@ -21,8 +21,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 
 pub use cases::cases;
 use densify_render::BackendError;
-pub use densify_render::Differentiable;
-pub use densify_render::Setup;
+pub use densify_render::{Differentiable, Setup};
 pub use findings::{Finding, SubjectReport};
 pub use report::{markdown, table};
 pub use subject::Subject;

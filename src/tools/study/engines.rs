@@ -5,8 +5,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 
 use super::planned_run::PlannedRun;
-use densify_launch as launch;
-use densify_launch::{Batch, Engine, Job, Stage, Submission, SubmissionArgs, utf8};
+use densify_launch::{self as launch, Batch, Engine, Job, Stage, Submission, SubmissionArgs, utf8};
 use densify_run::failure::Failure;
 use densify_run::{Host, Observer, Partial, RunSpec, host_bytes};
 
@@ -65,8 +64,9 @@ pub(super) fn submit(
     let done = runs.iter().filter(|run| is_done(run)).count();
     observer.say(format_args!("runs     {done} of {} done", runs.len()));
     let is_scheduled = !matches!(submission.engine, Engine::Local) && !submission.dry_run;
-    if let Some(jobs) =
-        launch::submitted_jobs(&folder).filter(|_| is_scheduled && !submission.again)
+    if is_scheduled
+        && !submission.again
+        && let Some(jobs) = launch::submitted_jobs(&folder)
     {
         observer.say(format_args!(
             "handed in before, as job {jobs}: call again when that has ended, with --again if it has failed (logs in {})",
@@ -87,13 +87,12 @@ pub(super) fn submit(
         if !submission.dry_run {
             run.write(&folder)?;
         }
-        let threads = spec.device.threads.map(|threads| threads.0);
+        let all_threads = || rayon::current_num_threads().try_into().unwrap_or(1);
         jobs.push(Job {
             name: run.name(),
             index,
             memory: promised_bytes(run, &spec, &mut known_memory)?,
-            threads: threads
-                .unwrap_or_else(|| rayon::current_num_threads().try_into().unwrap_or(1)),
+            threads: spec.device.threads.map_or_else(all_threads, |threads| threads.0),
             may_have_fewer_threads: false,
         });
     }

@@ -23,17 +23,13 @@ impl Journal {
             Err(e) => return Err(Failure::input(format!("{}: {e}", path.display()))),
         };
         let whole = text.rfind('\n').map_or("", |end| &text[..end]);
-        let mut outcomes = Vec::new();
-        for (i, line) in whole.lines().enumerate() {
-            outcomes.push(serde_json::from_str(line).map_err(|e| {
-                Failure::input(format!(
-                    "{}, line {}: {e}; delete the line, and its run runs again",
-                    path.display(),
-                    i + 1
-                ))
-            })?);
-        }
-        Ok(Self { path: path.to_owned(), outcomes })
+        let outcomes = (1..).zip(whole.lines()).map(|(number, line)| {
+            serde_json::from_str(line).map_err(|e| {
+                let place = format!("{}, line {number}", path.display());
+                Failure::input(format!("{place}: {e}; delete the line, and its run runs again"))
+            })
+        });
+        Ok(Self { path: path.to_owned(), outcomes: outcomes.collect::<Result<_, _>>()? })
     }
 
     /// The outcome of the run with this description, by this version of densify.
@@ -41,8 +37,8 @@ impl Journal {
         self.outcomes.iter().rev().find(|run| run.is_of(spec))
     }
 
-    /// Adds an outcome and writes the file.
-    pub(super) fn add(&mut self, outcome: Outcome) -> Result<(), FileError> {
+    /// Adds an outcome, writes the file, and returns the outcome.
+    pub(super) fn add(&mut self, outcome: Outcome) -> Result<&Outcome, FileError> {
         self.outcomes.push(outcome);
         write_atomically(&self.path, |out| {
             for outcome in &self.outcomes {
@@ -50,6 +46,7 @@ impl Journal {
                 out.write_all(b"\n")?;
             }
             Ok(())
-        })
+        })?;
+        Ok(&self.outcomes[self.outcomes.len() - 1])
     }
 }

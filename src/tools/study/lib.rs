@@ -88,11 +88,7 @@ impl<'a> Study<'a> {
             self.observer.say(format_args!("[{number}/{count}] {run}{done}"));
             let outcome = match known {
                 Some(outcome) => outcome,
-                None => {
-                    let outcome = run.train(self.output)?;
-                    self.journal.add(outcome.clone())?;
-                    outcome
-                }
+                None => self.journal.add(run.train(self.output)?)?.clone(),
             };
             let (factor, level) = (run.factor.clone(), run.level.clone());
             outcomes.push(Outcome { factor, level, ..outcome });
@@ -106,7 +102,7 @@ impl<'a> Study<'a> {
         for run in runs {
             if self.journal.outcome(&run.spec).is_none() {
                 match run.recorded(self.output) {
-                    Some(outcome) => self.journal.add(outcome)?,
+                    Some(outcome) => _ = self.journal.add(outcome)?,
                     None => has_open = true,
                 }
             }

@@ -9,8 +9,7 @@ use toml::Value;
 
 use super::outcome::Outcome;
 use super::process;
-use densify_core::files;
-use densify_core::files::write_atomically;
+use densify_core::files::{self, write_atomically};
 use densify_data::dataset::{GroundTruth, builtin};
 use densify_run::Partial;
 use densify_run::failure::{Failure, OTHER};

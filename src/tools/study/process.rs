@@ -37,9 +37,9 @@ pub(super) fn evaluate(spec: &Partial, folder: &Path) -> Result<(), Failure> {
 }
 
 fn wait_for(command: &mut Command) -> Result<(), Failure> {
-    let output = command.stdin(Stdio::null()).stdout(Stdio::null()).output();
+    let not_started = |error| Failure::new(OTHER, format!("cannot start a run: {error}"));
     let output =
-        output.map_err(|error| Failure::new(OTHER, format!("cannot start a run: {error}")))?;
+        command.stdin(Stdio::null()).stdout(Stdio::null()).output().map_err(not_started)?;
     if output.status.success() {
         return Ok(());
     }

@@ -95,10 +95,8 @@ fn describe_without_points(scene: &Scene) -> Value {
         let ahead = first.map_or(DVec3::ZERO, |camera| camera.centre() + camera.forward());
         (up, if looks_inward { focus } else { ahead })
     };
-    let models = scene
-        .models
-        .iter()
-        .map(|model| json!({ "name": model.name, "rows": model.rows, "degree": model.sh_degree }));
+    let models = scene.models.iter();
+    let models = models.map(|m| json!({ "name": m.name, "rows": m.rows, "degree": m.sh_degree }));
     let is_available = |kind: &PictureKind| scene.unavailable.iter().all(|(k, _)| k != kind);
     let kinds = PictureKind::ALL.into_iter().filter(is_available);
     let unavailable = scene.unavailable.iter();
@@ -150,12 +148,8 @@ mod tests {
 
     #[test]
     fn cameras_have_the_format_of_camera_paths() {
-        let key = Keyframe::looking_at(
-            DVec3::new(1.0, 2.0, 3.0),
-            DVec3::new(-4.0, 0.5, 9.0),
-            DVec3::Z,
-            0.8,
-        );
+        let (centre, target) = (DVec3::new(1.0, 2.0, 3.0), DVec3::new(-4.0, 0.5, 9.0));
+        let key = Keyframe::looking_at(centre, target, DVec3::Z, 0.8);
         let described = pose(&key.camera((300, 200)));
         let numbers: Vec<f64> =
             serde_json::from_value(described["camera_to_world"].clone()).unwrap();

@@ -158,11 +158,7 @@ fn random_token() -> Result<String, Failure> {
 mod tests {
     use super::*;
 
-    fn open(
-        host: impl Into<IpAddr>,
-        port: Option<u16>,
-        needs_token: bool,
-    ) -> Result<Server, Failure> {
+    fn open(host: Ipv4Addr, port: Option<u16>, needs_token: bool) -> Result<Server, Failure> {
         Server::open(ListenAddress { host: host.into(), port, needs_token })
     }
 
@@ -170,18 +166,15 @@ mod tests {
         open(host, Some(0), false).unwrap()
     }
 
-    fn request(path: &str, host: &str, origin: Option<&str>) -> Request {
-        Request::get(path, host, origin)
+    fn authorised(listener: &Server, request: &Request) -> Result<String, u16> {
+        listener.authorise(request).map(str::to_owned).map_err(|error| error.status)
     }
 
     #[test]
     fn only_this_machine_and_this_page_may_send_requests() {
         let listener = listener(Ipv4Addr::LOCALHOST);
         let ask = |host: &str, origin: Option<&str>| {
-            listener
-                .authorise(&request("/scene", host, origin))
-                .map(str::to_owned)
-                .map_err(|error| error.status)
+            authorised(&listener, &Request::get("/scene", host, origin))
         };
         for host in ["localhost", "LOCALHOST:8080", "127.0.0.1:1", "[::1]:8080", "127.9.9.9"] {
             assert_eq!(ask(host, None), Ok("scene".to_owned()), "{host}");
@@ -206,9 +199,9 @@ mod tests {
             let request = Request {
                 method: Method::Post,
                 content_type: content_type.map(str::to_owned),
-                ..request("/frame", "localhost", None)
+                ..Request::get("/frame", "localhost", None)
             };
-            listener.authorise(&request).map(str::to_owned).map_err(|error| error.status)
+            authorised(&listener, &request)
         };
         assert_eq!(post(Some("application/json")), Ok("frame".to_owned()));
         assert_eq!(post(Some("text/plain")), Err(415));
@@ -223,8 +216,7 @@ mod tests {
         assert_eq!(token.len(), 32);
         let url = one.url();
         assert!(url.starts_with("http://127.0.0.1:") && url.ends_with(&format!("/{token}/")));
-        let ask =
-            |path: &str| one.authorise(&request(path, "any.example", None)).map(str::to_owned).ok();
+        let ask = |path: &str| authorised(&one, &Request::get(path, "any.example", None)).ok();
         assert_eq!(ask(&format!("/{token}/frame")).as_deref(), Some("frame"));
         assert_eq!(ask(&format!("/{token}/")).as_deref(), Some(""));
         let wrong = format!("/{}/", "0".repeat(32));
@@ -239,12 +231,7 @@ mod tests {
         let listener = open(Ipv4Addr::LOCALHOST, Some(0), true).unwrap();
         assert!(!listener.is_public());
         let token = listener.token.clone().unwrap();
-        let ask = |path: &str, host: &str| {
-            listener
-                .authorise(&request(path, host, None))
-                .map(str::to_owned)
-                .map_err(|error| error.status)
-        };
+        let ask = |path: &str, host: &str| authorised(&listener, &Request::get(path, host, None));
         assert_eq!(ask(&format!("/{token}/order"), "localhost:8080"), Ok("order".to_owned()));
         assert_eq!(ask("/order", "localhost:8080"), Err(404));
         assert_eq!(ask(&format!("/{token}/order"), "evil.example"), Err(403));

@@ -125,10 +125,8 @@ impl Server {
             let _close = CloseOnDrop(&queue);
             let (queue, routes) = (&queue, &routes);
             let no_thread = |error| {
-                Failure::new(
-                    OTHER,
-                    format!("--view: the system cannot start a thread for the page: {error}"),
-                )
+                let problem = "--view: the system cannot start a thread for the page";
+                Failure::new(OTHER, format!("{problem}: {error}"))
             };
             let encoder = encoder::start(scope, queue, &scene).map_err(no_thread)?;
             let server = thread::Builder::new().stack_size(STACK).spawn_scoped(scope, move || {

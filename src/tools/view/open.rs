@@ -4,9 +4,8 @@ use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DVec3};
 
-use super::picture_kind::PictureKind;
+use super::picture_kind::PictureKind::{RowAge, RowEdit, RowGradient, RowWeight};
 use super::scene::{LoadedScene, ModelInfo, NO_MODEL, Scene};
-use densify_core::camera::Camera;
 use densify_core::camera_path::Keyframe;
 use densify_core::gaussians::{Gaussians, logit};
 use densify_data::dataset::normalise::{EXTENT, Normalisation};
@@ -185,10 +184,8 @@ fn scene_without_cameras(
     data: &DataSpec,
 ) -> Result<LoadedScene, Failure> {
     if model.is_empty() {
-        let path = path.display();
-        return Err(Failure::input(format!(
-            "{path} contains no Gaussians: there is nothing to show"
-        )));
+        let problem = format!("{} contains no Gaussians: there is nothing to show", path.display());
+        return Err(Failure::input(problem));
     }
     let normalisation = Normalisation::fit_model(model);
     let views = [Vec::new(), Vec::new()];
@@ -199,8 +196,7 @@ fn scene_without_cameras(
     let turn = DMat3::from_rotation_x(-0.25);
     let centre = turn * DVec3::new(0.0, 0.0, -2.5);
     let key = Keyframe::looking_at(centre, DVec3::ZERO, DVec3::NEG_Y, FOV);
-    let camera: Camera = key.camera((1024, 768));
-    scene.start = Some(camera);
+    scene.start = Some(key.camera((1024, 768)));
     Ok(LoadedScene { scene, backends: Vec::new() })
 }
 
@@ -212,32 +208,18 @@ fn scene_of_points(
     data: &DataSpec,
     near: f64,
 ) -> Result<LoadedScene, Failure> {
-    let cameras = || dataset.train.iter().map(|view| view.camera).collect::<Vec<Camera>>();
+    let cameras = || dataset.train.iter().map(|view| view.camera).collect::<Vec<_>>();
     let is_random = dataset.points.is_empty();
-    let random = if is_random {
-        random_points(RANDOM_POINTS, &cameras(), false, 0)
-    } else {
-        PointCloud::default()
-    };
-    let points = if is_random { &random } else { &dataset.points };
+    let random = is_random.then(|| random_points(RANDOM_POINTS, &cameras(), false, 0));
+    let points = random.as_ref().unwrap_or(&dataset.points);
     let (mut model, _) = initialise(points, MAX_POINTS, 0, 0)?;
     model.opacity_logits.fill(logit(POINT_OPACITY));
     model.log_scales.as_flattened_mut().iter_mut().for_each(|scale| *scale += POINT_SCALE.ln());
-    let name = name_of(path);
-    let name = if is_random {
-        format!("{name}: random points, as it has none of its own")
-    } else {
-        format!("{name}: its points")
-    };
+    let kind = if is_random { "random points, as it has none of its own" } else { "its points" };
+    let name = format!("{}: {kind}", name_of(path));
     let mut loaded = scene_of_dataset(machine, path, dataset, data);
-    let training_only = [
-        PictureKind::RowGradient,
-        PictureKind::RowWeight,
-        PictureKind::RowAge,
-        PictureKind::RowEdit,
-    ];
     loaded.add_model_in_scene(name, &model, near, None)?;
-    loaded.scene.mark_unavailable(&training_only, NO_MODEL);
+    loaded.scene.mark_unavailable(&[RowGradient, RowWeight, RowAge, RowEdit], NO_MODEL);
     Ok(loaded)
 }
 

@@ -5,8 +5,7 @@ use serde::Deserialize;
 use super::http::Response;
 use super::picture_kind::PictureKind;
 use super::scene::Scene;
-use densify_core::camera_path;
-use densify_core::camera_path::Keyframe;
+use densify_core::camera_path::{self, Keyframe};
 use densify_train::evaluate::Split;
 
 /// Longest side of a picture `[px]`.
@@ -157,9 +156,7 @@ mod tests {
         let (_folder, mut scene) = scene_of_one_view();
         scene.mark_unavailable(&[PictureKind::Count], "on a GPU");
         scene.mark_unavailable(&[PictureKind::RowAge], "trains");
-        let model =
-            || ModelInfo { name: "a".into(), rows: 1, sh_degree: 0, near: 0.1, checkpoint: None };
-        scene.models = vec![model(), model()];
+        scene.models = vec![ModelInfo::sample(1), ModelInfo::sample(1)];
         scene
     }
 
@@ -199,8 +196,7 @@ mod tests {
     fn invalid_requests_are_refused_with_the_reason() {
         let scene = scene();
         let pose = |at: usize, value: f64| {
-            let mut pose =
-                [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0];
+            let mut pose = glam::DMat4::IDENTITY.to_cols_array();
             pose[at] = value;
             json!({ "camera": { "camera_to_world": pose, "fov": 50 } })
         };

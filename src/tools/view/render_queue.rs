@@ -206,15 +206,19 @@ mod tests {
         PictureRequest::of_view(page, PictureKind::Render, (8, 8), number)
     }
 
+    fn wait_until(queue: &RenderQueue, is_reached: impl Fn(&Jobs) -> bool) {
+        while !is_reached(&queue.lock()) {
+            thread::yield_now();
+        }
+    }
+
     #[test]
     fn a_full_queue_refuses_requests() {
         let queue = RenderQueue::new(Some(1), 1);
         assert!(queue.next_within(Duration::ZERO).is_none());
         thread::scope(|scope| {
             let first = scope.spawn(|| queue.submit(picture_request("a", 0)));
-            while queue.lock().waiting.is_empty() {
-                thread::yield_now();
-            }
+            wait_until(&queue, |jobs| !jobs.waiting.is_empty());
             assert_eq!(queue.submit(picture_request("b", 0)).unwrap_err(), RenderError::QueueFull);
             // A newer request of the waiting pane takes its place.
             let second = scope.spawn(|| queue.submit(picture_request("a", 1)));
@@ -239,9 +243,7 @@ mod tests {
                     queue.submit(picture_request(page, 0)).map(|picture| picture.jpeg)
                 })
             });
-            while queue.lock().waiting.len() < 2 {
-                thread::yield_now();
-            }
+            wait_until(&queue, |jobs| jobs.waiting.len() >= 2);
             let job = queue.next_within(Duration::ZERO).unwrap();
             assert!(queue.next_within(Duration::ZERO).is_none(), "two active jobs");
             let (first, second) = match (&*job.request.pane.0, replies) {
@@ -270,15 +272,10 @@ mod tests {
     fn only_the_newest_request_of_a_pane_is_kept_and_none_starves() {
         let queue = RenderQueue::new(None, 1);
         let failed = || RenderError::Failed("made".into());
-        let waiting = |count: usize| {
-            while queue.lock().waiting.len() < count {
-                thread::yield_now();
-            }
-        };
+        let waiting = |count: usize| wait_until(&queue, |jobs| jobs.waiting.len() >= count);
         let newest_is = |number: usize| {
-            while queue.lock().waiting[0].request != picture_request("a", number) {
-                thread::yield_now();
-            }
+            let newest = picture_request("a", number);
+            wait_until(&queue, |jobs| jobs.waiting[0].request == newest);
         };
         thread::scope(|scope| {
             let submit = |page, number| {

@@ -1,7 +1,6 @@
 //! Routes requests to responses. No path names a file: everything served is built in or rendered on request.
 
-use std::sync::Arc;
-use std::sync::LazyLock;
+use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant};
 
 use serde::Deserialize;
@@ -108,26 +107,18 @@ impl Routes<'_> {
 /// The response with a picture, its data in the headers. `held` is the time from request to response here, waiting
 /// included, so that the page can tell it from the latency of the network.
 fn picture_response(picture: EncodedPicture, held: Duration) -> Response {
-    let EncodedPicture {
-        jpeg,
-        size: (width, height),
-        range,
-        mean,
-        distance,
-        measured_views,
-        milliseconds,
-    } = picture;
-    let mut response = Response::ok("image/jpeg", jpeg)
+    let (width, height) = picture.size;
+    let mut response = Response::ok("image/jpeg", picture.jpeg)
         .with_header("X-Size", format!("{width}x{height}"))
-        .with_header("X-Milliseconds", format!("{milliseconds:.1}"))
+        .with_header("X-Milliseconds", format!("{:.1}", picture.milliseconds))
         .with_header("X-Held", format!("{:.1}", 1e3 * held.as_secs_f64()));
-    if let Some(range) = range {
+    if let Some(range) = picture.range {
         response = response.with_header("X-Range", format!("{} {}", range.start, range.end));
     }
-    if let Some([seen, all]) = measured_views {
+    if let Some([seen, all]) = picture.measured_views {
         response = response.with_header("X-Measured", format!("{seen} {all}"));
     }
-    let numbers = [("X-Mean", mean), ("X-Distance", distance)];
+    let numbers = [("X-Mean", picture.mean), ("X-Distance", picture.distance)];
     for (name, value) in numbers.into_iter().filter_map(|(name, value)| Some((name, value?))) {
         response = response.with_header(name, value);
     }
@@ -153,13 +144,7 @@ mod tests {
         let points = PointCloud::default();
         let (machine, normalisation) = (Machine::default(), Normalisation::IDENTITY);
         let mut scene = Scene::new(machine, "a".into(), normalisation, [0.0; 3], none(), points);
-        scene.models.push(ModelInfo {
-            name: "a".into(),
-            rows: 1,
-            sh_degree: 0,
-            near: 0.1,
-            checkpoint: None,
-        });
+        scene.models.push(ModelInfo::sample(1));
         let queue = RenderQueue::new(None, 1);
         queue.close();
         let run_status = RunStatus::default();

@@ -156,8 +156,7 @@ mod tests {
             model.opacity_logits[row] = logit(0.8);
         }
         let backend = Device::default().backend(&model, &Setup::new(2)).expect("a backend");
-        let info =
-            ModelInfo { name: "a".into(), rows: 2, sh_degree: 0, near: 0.1, checkpoint: None };
+        let info = ModelInfo::sample(2);
         let mut measured = RowMeasurements::new(&scene, &info, &*backend).expect("a backend");
         assert_eq!(measured.progress(), [0, 2]);
         let positive = |values: &[f32]| values.iter().filter(|&&value| value > 0.0).count();

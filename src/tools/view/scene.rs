@@ -41,6 +41,14 @@ pub(super) struct ModelInfo {
     pub(super) checkpoint: Option<PathBuf>,
 }
 
+#[cfg(test)]
+impl ModelInfo {
+    /// A model of degree 0.
+    pub(super) fn sample(rows: usize) -> Self {
+        Self { name: "a".into(), rows, sh_degree: 0, near: 0.1, checkpoint: None }
+    }
+}
+
 /// A scene with the backends that render its models.
 pub struct LoadedScene {
     pub(super) scene: Scene,

@@ -104,9 +104,9 @@ mod tests {
 
     #[test]
     fn sizes_that_disagree_are_refused() {
-        let size = |part, found, expected| {
-            Err(MetricError::Size { part, found, expected, width: 2, height: 2 })
-        };
+        let (width, height) = (2, 2);
+        let size =
+            |part, found, expected| Err(MetricError::Size { part, found, expected, width, height });
         let mut image = target(2, 2, 0);
         assert_eq!(psnr(&[0.0; 11], &image, [0.0; 3]), size("render", 11, 12));
         image.alpha = Some(vec![0; 3]);

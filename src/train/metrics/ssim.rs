@@ -37,12 +37,8 @@ pub fn ssim(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Result<f
         let map = block_map(&pair, &window, rows.start, rows.end);
         let pixels = rows.start * pair.width..rows.end * pair.width;
         pixels.zip(map.chunks_exact(3)).fold([0.0; 2], |sum, (p, ssim)| {
-            let weight = pair.weight(p);
-            if weight > 0.0 {
-                [sum[0] + weight * ssim.iter().sum::<f64>(), sum[1] + weight]
-            } else {
-                sum
-            }
+            let (weight, ssim) = (pair.weight(p), ssim.iter().sum::<f64>());
+            if weight > 0.0 { [sum[0] + weight * ssim, sum[1] + weight] } else { sum }
         })
     });
     let [similarity, weight] = total(&sums)?;
@@ -178,10 +174,8 @@ mod tests {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let n = (3 * width * height) as usize;
         let rgb: Vec<u8> = (0..n).map(|_| rng.random()).collect();
-        let rendered = rgb
-            .iter()
-            .map(|&v| f32::from(v) / 255.0 + noise * (rng.random::<f32>() - 0.5))
-            .collect();
+        let noisy = |&v: &u8| f32::from(v) / 255.0 + noise * (rng.random::<f32>() - 0.5);
+        let rendered = rgb.iter().map(noisy).collect();
         (rendered, Image8 { width, height, rgb, alpha: None, mask: None })
     }
 
@@ -212,11 +206,8 @@ mod tests {
                 let expected = textbook(&clamped(&rendered), &unpacked(&target), w, h);
                 let pair = Pair::new(&rendered, &target, [0.0; 3]).unwrap();
                 let blocks = (0..h).step_by(BLOCK);
-                let map: Vec<f64> = blocks
-                    .flat_map(|y| block_map(&pair, &window(), y, (y + BLOCK).min(h)))
-                    .collect();
-                let worst =
-                    map.iter().zip(&expected).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+                let map = blocks.flat_map(|y| block_map(&pair, &window(), y, (y + BLOCK).min(h)));
+                let worst = map.zip(&expected).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
                 assert!(worst < 1e-12, "{width}x{height}, noise {noise}: {worst:e}");
                 let measured = ssim(&rendered, &target, [0.0; 3]).unwrap();
                 let difference = (measured - mean(&expected)).abs();
@@ -264,15 +255,11 @@ mod tests {
         assert_eq!(ssim(&rendered, &target, [0.0; 3]), Ok(before));
 
         // With the ignored pixels equal to the target's, the mask only chooses what is averaged.
-        let x: Vec<f64> = clamped(&rendered)
-            .iter()
-            .zip(unpacked(&target))
-            .enumerate()
-            .map(|(i, (&x, y))| if mask[i / 3] == 0 { y } else { x })
-            .collect();
-        let map = textbook(&x, &unpacked(&target), 20, 20);
-        let counted: Vec<f64> =
-            map.iter().enumerate().filter(|(i, _)| mask[i / 3] != 0).map(|(_, &v)| v).collect();
+        let (mut x, y) = (clamped(&rendered), unpacked(&target));
+        let is_masked = |i: usize| mask[i / 3] == 0;
+        (0..1200).filter(|&i| is_masked(i)).for_each(|i| x[i] = y[i]);
+        let map = textbook(&x, &y, 20, 20);
+        let counted: Vec<f64> = (0..1200).filter(|&i| !is_masked(i)).map(|i| map[i]).collect();
         assert!((before - mean(&counted)).abs() < 1e-13);
 
         target.mask = Some(vec![0; 400]);
@@ -284,14 +271,11 @@ mod tests {
         let (rendered, mut target) = noisy(14, 12, 0.3, 6);
         let alpha: Vec<u8> = (0..168).map(|p| (p * 3 % 256) as u8).collect();
         let background = [0.25_f32, 0.5, 1.0];
-        let y: Vec<f64> = unpacked(&target)
-            .iter()
-            .enumerate()
-            .map(|(i, v)| {
-                let a = f64::from(alpha[i / 3]) / 255.0;
-                a * v + (1.0 - a) * f64::from(background[i % 3])
-            })
-            .collect();
+        let mut y = unpacked(&target);
+        for (i, v) in y.iter_mut().enumerate() {
+            let a = f64::from(alpha[i / 3]) / 255.0;
+            *v = a * *v + (1.0 - a) * f64::from(background[i % 3]);
+        }
         let expected = mean(&textbook(&clamped(&rendered), &y, 14, 12));
         target.alpha = Some(alpha);
         let measured = ssim(&rendered, &target, background).unwrap();
@@ -301,13 +285,10 @@ mod tests {
     #[test]
     fn the_same_bits_at_any_thread_count() {
         let (rendered, target) = noisy(50, 170, 0.4, 7);
-        let bits: Vec<u64> = [1, 2, 5]
-            .into_iter()
-            .map(|threads| {
-                let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-                pool.install(|| ssim(&rendered, &target, [0.0; 3])).unwrap().to_bits()
-            })
-            .collect();
-        assert!(bits.iter().all(|&b| b == bits[0]), "{bits:?}");
+        let bits = [1, 2, 5].map(|threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| ssim(&rendered, &target, [0.0; 3])).unwrap().to_bits()
+        });
+        assert_eq!(bits, [bits[0]; 3]);
     }
 }

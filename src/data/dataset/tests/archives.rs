@@ -8,6 +8,7 @@ use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipWriter};
 
 use super::super::*;
+use super::{assert_noted, write_mask};
 use densify_fixtures::Made;
 
 /// An archive in its own folder.
@@ -169,9 +170,7 @@ fn the_unpacked_folder_lives_as_long_as_a_view() {
 #[test]
 fn masks_and_points_are_read_from_the_archive() {
     let made = Made::colmap_txt();
-    std::fs::create_dir(made.file("masks")).unwrap();
-    let mask = image::GrayImage::from_fn(20, 12, |x, _| [if x < 10 { 0 } else { 255 }].into());
-    mask.save(made.file("masks/b.png")).unwrap();
+    write_mask(&made.file("masks/b.png"), |x| if x < 10 { 0 } else { 255 });
     let archive = Packed::of(&pack(&files(made.path()), "a/b/", CompressionMethod::Stored));
     let data = archive.load().unwrap();
     let source = &data.train[1].source;
@@ -181,7 +180,7 @@ fn masks_and_points_are_read_from_the_archive() {
     let made = Made::transforms(|json| json["test_filenames"] = serde_json::json!(["x.png"]));
     made.replace("points.ply", "\n3 0 0.5", "\nnan 0 0.5");
     let data = Packed::of(&packed(&made)).load().unwrap();
-    assert!(data.notes.iter().any(|note| note.contains("1 of 200")), "{:?}", data.notes);
+    assert_noted(&data, "1 of 200");
 }
 
 #[test]
@@ -230,8 +229,8 @@ fn unsafe_archives_are_refused() {
     refused("twice", &twice, "images/b.png, another file has this name");
     std::fs::remove_dir_all(made.file("x")).unwrap();
     made.write("imagez", b"?");
-    let folder = packed(&made).into_iter().collect::<Vec<_>>();
-    refused("a file and a folder", &renamed(&folder, "imagez", "images"), "images, this name");
+    let both = renamed(&packed(&made), "imagez", "images");
+    refused("a file and a folder", &both, "images, this name");
 
     let mut writer = ZipWriter::new(Cursor::new(Vec::new()));
     writer.add_symlink("images", "/etc", SimpleFileOptions::default()).unwrap();

@@ -5,7 +5,7 @@ use std::num::NonZeroU32;
 use serde_json::Value;
 
 use super::super::*;
-use super::refused;
+use super::{edits_are_refused, refused};
 use densify_fixtures::{Made, image};
 
 /// A text, its replacement, and words of the message.
@@ -54,20 +54,12 @@ const POINTS: &[Replacement] = &[(" 3 20 30", " 300 20 30", "points3D.txt, line 
 
 #[test]
 fn masks_to_invert_must_be_there() {
-    let options = LoadOptions { invert_masks: true, ..LoadOptions::default() };
-    refused(
-        "no mask",
-        &Made::colmap_txt(),
-        &options,
-        "images.txt, no photograph has a mask, inverted: true",
-    );
-    let options = LoadOptions { mask_mode: MaskMode::Background, ..LoadOptions::default() };
-    refused(
-        "nothing to carve",
-        &Made::colmap_txt(),
-        &options,
-        "images.txt, no photograph has a mask, inverted: false",
-    );
+    let inverts = LoadOptions { invert_masks: true, ..LoadOptions::default() };
+    let carves = LoadOptions { mask_mode: MaskMode::Background, ..LoadOptions::default() };
+    for (options, words) in [(inverts, "inverted: true"), (carves, "inverted: false")] {
+        let words = format!("images.txt, no photograph has a mask, {words}");
+        refused("no mask", &Made::colmap_txt(), &options, &words);
+    }
 }
 
 #[test]
@@ -81,45 +73,50 @@ fn colmap_text() {
             refused(&format!("{file}: {new}"), &made, &LoadOptions::default(), words);
         }
     }
-    type Edit = (&'static str, fn(&Made), &'static str);
-    let cases: [Edit; 11] = [
-        ("no cameras", |m| m.remove("sparse/0/cameras.txt"), "cameras.txt, check that it exists"),
-        ("no points", |m| m.remove("sparse/0/points3D.txt"), "points3D.txt"),
-        ("zero images", |m| m.write("sparse/0/images.txt", "# none\n"), "images.txt, no image"),
-        (
-            "no image",
-            |m| m.remove("images/b.png"),
-            "images.txt, image b.png, images/b.png, RestoreOrImagesFolder",
-        ),
-        (
-            "other size",
-            |m| image(&m.file("images/b.png"), (20, 20), 0),
-            "images/b.png, 20x20, 20x12",
-        ),
-        ("not an image", |m| m.write("images/b.png", "hello"), "images/b.png, decode"),
-        (
-            "mask",
-            |m| image(&m.file("masks/b.png.png"), (12, 20), 0),
-            "masks/b.png.png, 12x20, 20x12",
-        ),
-        ("bad points", |m| three_points(m, ["nan", "-inf", "inf"]), "points3D.txt, 3 of 200"),
-        ("far points", |m| three_points(m, ["1e300", "1e300", "-1e300"]), "points3D.txt, 3 of 200"),
-        ("not UTF-8", |m| m.patch("sparse/0/points3D.txt", |b| b[20] = 0xff), "points3D.txt"),
-        (
-            "a name",
-            |m| {
-                m.patch("sparse/0/images.txt", |b| {
-                    *b.iter_mut().rfind(|b| **b == b'p').unwrap() = 0xff
-                })
-            },
-            "images.txt, UTF-8, rename the image",
-        ),
-    ];
-    for (case, edit, words) in cases {
-        let made = Made::colmap_txt();
-        edit(&made);
-        refused(case, &made, &LoadOptions::default(), words);
-    }
+    edits_are_refused(
+        Made::colmap_txt,
+        &[
+            (
+                "no cameras",
+                |m| m.remove("sparse/0/cameras.txt"),
+                "cameras.txt, check that it exists",
+            ),
+            ("no points", |m| m.remove("sparse/0/points3D.txt"), "points3D.txt"),
+            ("zero images", |m| m.write("sparse/0/images.txt", "# none\n"), "images.txt, no image"),
+            (
+                "no image",
+                |m| m.remove("images/b.png"),
+                "images.txt, image b.png, images/b.png, RestoreOrImagesFolder",
+            ),
+            (
+                "other size",
+                |m| image(&m.file("images/b.png"), (20, 20), 0),
+                "images/b.png, 20x20, 20x12",
+            ),
+            ("not an image", |m| m.write("images/b.png", "hello"), "images/b.png, decode"),
+            (
+                "mask",
+                |m| image(&m.file("masks/b.png.png"), (12, 20), 0),
+                "masks/b.png.png, 12x20, 20x12",
+            ),
+            ("bad points", |m| three_points(m, ["nan", "-inf", "inf"]), "points3D.txt, 3 of 200"),
+            (
+                "far points",
+                |m| three_points(m, ["1e300", "1e300", "-1e300"]),
+                "points3D.txt, 3 of 200",
+            ),
+            ("not UTF-8", |m| m.patch("sparse/0/points3D.txt", |b| b[20] = 0xff), "points3D.txt"),
+            (
+                "a name",
+                |m| {
+                    m.patch("sparse/0/images.txt", |b| {
+                        *b.iter_mut().rfind(|b| **b == b'p').unwrap() = 0xff
+                    })
+                },
+                "images.txt, UTF-8, rename the image",
+            ),
+        ],
+    );
 }
 
 /// Replaces the x coordinates of three of the 200 points.
@@ -252,12 +249,29 @@ fn transforms() {
         set(json, "/camera_angle_x", "4.0");
     });
     refused("angle", &made, &options, "intrinsics, fx");
-    let made = Made::transforms(|_| ());
-    made.patch("transforms.json", |b| *b.iter_mut().find(|b| **b == b'a').unwrap() = 0xff);
-    refused("not UTF-8", &made, &options, "transforms.json, save it as UTF-8");
-    let made = Made::transforms(|_| ());
-    made.replace("transforms.json", "15.0", "NaN");
-    refused("NaN", &made, &options, "transforms.json, line 1, NaN and Infinity, remove the frame");
+    const JSON: &str = "transforms.json";
+    edits_are_refused(
+        || Made::transforms(|_| ()),
+        &[
+            (
+                "not UTF-8",
+                |m| m.patch(JSON, |b| *b.iter_mut().find(|b| **b == b'a').unwrap() = 0xff),
+                "transforms.json, save it as UTF-8",
+            ),
+            (
+                "NaN",
+                |m| m.replace(JSON, "15.0", "NaN"),
+                "transforms.json, line 1, NaN and Infinity, remove the frame",
+            ),
+            ("deep", |m| m.write(JSON, "[".repeat(100_000)), "transforms.json, JSON"),
+            ("points", |m| m.replace("points.ply", "vertex 200", "vertex 201"), "points.ply"),
+            (
+                "no image at all",
+                |m| std::fs::remove_dir_all(m.file("images")).unwrap(),
+                "transforms.json, no image",
+            ),
+        ],
+    );
     for (number, is_named) in [("-Infinity", true), ("Infinity", true), ("Nan", false)] {
         let made = Made::transforms(|_| ());
         made.replace("transforms.json", "15.0", number);
@@ -268,14 +282,6 @@ fn transforms() {
     std::fs::write(&file, "<html>404</html>").unwrap();
     let message = Dataset::load(&file, &options).unwrap_err().to_string();
     assert!(message.contains("scan.zip") && message.contains("no ZIP archive"), "{message}");
-    made.write("transforms.json", "[".repeat(100_000));
-    refused("deep", &made, &options, "transforms.json, JSON");
-    let made = Made::transforms(|_| ());
-    made.replace("points.ply", "vertex 200", "vertex 201");
-    refused("points", &made, &options, "points.ply");
-    let made = Made::transforms(|_| ());
-    std::fs::remove_dir_all(made.file("images")).unwrap();
-    refused("no image at all", &made, &options, "transforms.json, no image");
 }
 
 #[test]

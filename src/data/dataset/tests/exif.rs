@@ -7,7 +7,7 @@ use ::exif::experimental::Writer;
 use ::exif::{Field, In, Rational, Tag, Value};
 
 use super::super::*;
-use super::{load, refused};
+use super::{assert_noted, load, refused, write_mask};
 use densify_fixtures::{self, Made, NAMES, SIZE};
 
 /// Exposure time `[s]`, f-number and sensitivity (ISO) of a photograph.
@@ -28,8 +28,8 @@ fn turned(orientation: u16) -> Vec<(Tag, Value)> {
 
 /// Writes these fields into a PNG file, after its header.
 fn write_exif(path: &Path, fields: Vec<(Tag, Value)>) {
-    let fields = fields.into_iter().map(|(tag, value)| Field { tag, ifd_num: In::PRIMARY, value });
-    let fields: Vec<Field> = fields.collect();
+    let field = |(tag, value)| Field { tag, ifd_num: In::PRIMARY, value };
+    let fields: Vec<Field> = fields.into_iter().map(field).collect();
     let mut writer = Writer::new();
     fields.iter().for_each(|field| writer.push_field(field));
     let mut bytes = Cursor::new(Vec::new());
@@ -181,18 +181,13 @@ fn a_photograph_that_lies_on_its_side_for_its_camera_is_turned() {
         assert_eq!((image.width, image.height), SIZE);
         assert_eq!(image.rgb[..3], left, "{orientation}");
         assert_ne!(image.rgb[57..60], left, "{orientation}");
-        let is_noted =
-            |note: &Note| note.contains("1 photographs lie on") && note.contains("b.png");
-        assert!(data.notes.iter().any(is_noted), "{:?}", data.notes);
+        assert_noted(&data, "1 photographs lie on, b.png");
         // Turning takes the picture twice.
         let bytes = view.source.working_bytes();
         assert!(bytes >= 2 * 3 * u64::from(SIZE.0 * SIZE.1), "{bytes}");
         assert!(data.train[0].source.header.turn.is_none());
         // Its mask is that of the turned picture.
-        std::fs::create_dir(made.file("masks")).unwrap();
-        image::GrayImage::from_pixel(SIZE.0, SIZE.1, [9].into())
-            .save(made.file("masks/b.png"))
-            .unwrap();
+        write_mask(&made.file("masks/b.png"), |_| 9);
         let data = load(&made);
         assert_eq!(data.train[1].source.load().unwrap().mask.unwrap()[0], 9);
     }

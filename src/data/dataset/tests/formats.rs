@@ -4,12 +4,8 @@ use std::num::NonZeroU32;
 use std::path::PathBuf;
 
 use super::super::*;
-use super::{load, load_with};
+use super::{assert_noted, load, load_with, names, write_mask};
 use densify_fixtures::{Made, NAMES, SIZE, image};
-
-fn names(views: &[View]) -> Vec<&str> {
-    views.iter().map(|view| view.name.as_str()).collect()
-}
 
 #[test]
 fn all_formats_agree() {
@@ -118,7 +114,7 @@ fn resolutions() {
         let first = |view: &View| view.source.load().unwrap().rgb[0];
         assert_eq!(data.train.iter().map(first).collect::<Vec<_>>(), [0, 7, 7]);
         assert!(data.train.iter().all(|view| view.camera.width == 10));
-        assert!(data.notes.iter().any(|note| note.contains("images_2")), "{:?}", data.notes);
+        assert_noted(&data, "images_2");
         // Not for another divisor.
         assert_eq!(first(&load_with(&made, &options(Resolution::Divisor(4))).train[1]), 40);
     }
@@ -160,13 +156,9 @@ fn masks_are_found() {
             "elsewhere/m.png",
         ),
     ] {
-        std::fs::create_dir_all(made.file(mask).parent().unwrap()).unwrap();
-        image::GrayImage::from_fn(20, 12, |x, _| [if x < 10 { 0 } else { 255 }].into())
-            .save(made.file(mask))
-            .unwrap();
+        write_mask(&made.file(mask), |x| if x < 10 { 0 } else { 255 });
         let data = load(&made);
-        let is_noted = |note: &Note| note.contains("1 of 3 photographs have a mask");
-        assert!(data.notes.iter().any(is_noted), "{mask}: {:?}", data.notes);
+        assert_noted(&data, "1 of 3 photographs have a mask");
         assert_eq!(data.train[0].source.load().unwrap().mask, None, "{mask}");
         let found = data.train[1].source.load().unwrap().mask.unwrap();
         assert_eq!((found[0], found[19]), (0, 255), "{mask}");
@@ -187,13 +179,9 @@ fn masks_are_found() {
 fn masks_of_no_photograph_are_named() {
     for file in ["masks/other.png", "images/masks/b.png", "segmentation/other.png"] {
         let made = Made::colmap_txt();
-        std::fs::create_dir_all(made.file(file).parent().unwrap()).unwrap();
         image(&made.file(file), SIZE, 200);
         let folder = file.rsplit_once('/').unwrap().0;
-        let notes = load(&made).notes;
-        let is_noted =
-            |note: &Note| note.contains(folder) && note.contains("the mask of no photograph");
-        assert!(notes.iter().any(is_noted), "{file}: {notes:?}");
+        assert_noted(&load(&made), &format!("{folder}, the mask of no photograph"));
     }
     assert!(!load(&Made::colmap_txt()).notes.iter().any(|note| note.contains("mask")));
 }
@@ -201,13 +189,8 @@ fn masks_of_no_photograph_are_named() {
 /// In masks of instant-ngp every value but black hides pixels.
 #[test]
 fn dynamic_masks_are_found_beside_photographs() {
-    for (made, mask) in [
-        (Made::colmap_txt(), "images/dynamic_mask_b.png"),
-        (Made::transforms(|_| ()), "images/dynamic_mask_b.png"),
-    ] {
-        image::GrayImage::from_fn(20, 12, |x, _| [if x < 10 { 0 } else { 1 }].into())
-            .save(made.file(mask))
-            .unwrap();
+    for made in [Made::colmap_txt(), Made::transforms(|_| ())] {
+        write_mask(&made.file("images/dynamic_mask_b.png"), |x| u8::from(x >= 10));
         for (invert_masks, expected) in [(false, (255, 0)), (true, (0, 1))] {
             let options = LoadOptions { invert_masks, ..LoadOptions::default() };
             let data = load_with(&made, &options);
@@ -238,7 +221,7 @@ fn masks_are_found_in_the_folder_that_is_named() {
         std::fs::rename(made.file("images"), made.file("moved")).unwrap();
         masks.iter().for_each(|mask| image(&made.file(mask), SIZE, 200));
         // All but black is hidden by this one.
-        image::GrayImage::new(SIZE.0, SIZE.1).save(made.file(masks[9])).unwrap();
+        write_mask(&made.file(masks[9]), |_| 0);
         let options = LoadOptions { images: Some("moved".into()), ..LoadOptions::default() };
         for mask in masks {
             let data = load_with(&made, &options);
@@ -336,8 +319,8 @@ fn missing_frames_and_bad_points_are_noted() {
     made.replace("points.ply", "\n3 0 0.5", "\nnan 0 0.5");
     let data = load(&made);
     assert_eq!((data.train.len(), data.points.len()), (2, 199));
-    assert!(data.notes.iter().any(|note| note.contains("images/b.png")), "{:?}", data.notes);
-    assert!(data.notes.iter().any(|note| note.contains("1 of 200 points")), "{:?}", data.notes);
+    assert_noted(&data, "images/b.png");
+    assert_noted(&data, "1 of 200 points");
 }
 
 #[test]

@@ -3,7 +3,7 @@
 use glam::DVec3;
 
 use super::super::*;
-use super::{load_with, refused};
+use super::{assert_noted, load_with, names, refused, write_mask};
 use densify_fixtures::{Made, NAMES, SIZE};
 
 const PINHOLE: &str = "PINHOLE 20 12 15 16 10 6";
@@ -70,11 +70,9 @@ fn views_of_one_photograph_share_its_file_and_split() {
         let stem = name.trim_end_matches(".png");
         ["front", "left", "right", "up", "down"].map(|face| format!("{stem}@{face}.png")).to_vec()
     };
-    let names = |views: &[View]| views.iter().map(|view| view.name.clone()).collect::<Vec<_>>();
     assert_eq!(names(&data.train), faces("b.png"));
     assert_eq!(names(&data.test), [faces("a.png"), faces("c.png")].concat());
-    let is_note = |note: &Note| note.contains("3 photographs") && note.contains("5 views");
-    assert!(data.notes.iter().any(is_note));
+    assert_noted(&data, "3 photographs, 5 views");
     // All views are from one place, at right angles to the front.
     let front = &data.train[0].camera;
     for view in &data.train[1..] {
@@ -148,24 +146,18 @@ fn cropping_is_noted_and_can_be_avoided() {
     // If the distortion folds over within the image, the image is used up to the fold.
     let folding = colmap("RADIAL 20 12 15 10 6 -3 0");
     let kept = load_with(&folding, &LoadOptions { keep_fov: true, ..LoadOptions::default() });
-    assert!(kept.notes.iter().any(|note| note.contains("beyond what")), "{:?}", kept.notes);
+    assert_noted(&kept, "beyond what");
 }
 
 #[test]
 fn views_that_a_mask_hides_are_named_and_left_out() {
-    let grey = |made: &Made, name: &str, weight: fn(u32) -> u8| {
-        std::fs::create_dir_all(made.file("masks")).unwrap();
-        let mask = image::GrayImage::from_fn(SIZE.0, SIZE.1, |x, _| [weight(x)].into());
-        mask.save(made.file(&format!("masks/{name}"))).unwrap();
-    };
     let options = LoadOptions {
         split: Split::Every(std::num::NonZeroU32::new(2).unwrap()),
         ..LoadOptions::default()
     };
-    let names = |views: &[View]| views.iter().map(|view| view.name.clone()).collect::<Vec<_>>();
     // One photograph is hidden; the others are split as if it counted.
     let made = Made::colmap_txt();
-    grey(&made, "a.png", |_| 0);
+    write_mask(&made.file("masks/a.png"), |_| 0);
     let data = load_with(&made, &options);
     assert_eq!(names(&data.train), ["b.png"]);
     assert_eq!(names(&data.test), ["c.png"]);
@@ -173,15 +165,15 @@ fn views_that_a_mask_hides_are_named_and_left_out() {
         data.notes.iter().any(|note| note.contains("masks hide") && note.contains(name))
     };
     assert!(is_noted(&data, "a.png") && !is_noted(&data, "b.png"), "{:?}", data.notes);
-    for name in ["b.png", "c.png"] {
-        grey(&made, name, |_| 0);
+    for name in ["masks/b.png", "masks/c.png"] {
+        write_mask(&made.file(name), |_| 0);
     }
     refused("all hidden", &made, &options, "all 3, InvertMasks(true)");
     let inverted = LoadOptions { invert_masks: true, ..options.clone() };
     assert_eq!(load_with(&made, &inverted).train.len(), 1);
     // One face of a wide photograph is hidden by masking its left half.
     let made = colmap("OPENCV_FISHEYE 20 12 6 6 10 6 0 0 0 0");
-    grey(&made, "b.png", |x| if x < 10 { 0 } else { 255 });
+    write_mask(&made.file("masks/b.png"), |x| if x < 10 { 0 } else { 255 });
     let data = load_with(&made, &options);
     let faces = ["front", "right", "up", "down"].map(|face| format!("b@{face}.png"));
     assert_eq!(names(&data.train), faces);

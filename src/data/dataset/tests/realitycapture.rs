@@ -3,7 +3,7 @@
 use glam::DVec3;
 
 use super::super::*;
-use super::{load, refused};
+use super::{assert_noted, edits_are_refused, load, names, refused};
 use densify_fixtures::{Made, SIZE, image};
 
 const TABLE: &str = "cameras.csv";
@@ -116,20 +116,17 @@ fn names_may_have_commas_spaces_and_other_scripts_and_lie_in_images() {
     // A table without cameras is ignored.
     made.write("notes.csv", "a,b\n1,2\n");
     let data = load(&made);
-    let names: Vec<&str> = data.train.iter().map(|view| view.name.as_str()).collect();
-    assert_eq!(names, ["Küche, Süd (1).png", "b.png", "c.png"]);
+    assert_eq!(names(&data.train), ["Küche, Süd (1).png", "b.png", "c.png"]);
     // A missing photograph is skipped.
     made.remove("images/c.png");
     let data = load(&made);
     assert_eq!(data.train.len(), 2);
-    let is_noted = |note: &Note| note.contains("1 of 3 photographs") && note.contains("c.png");
-    assert!(data.notes.iter().any(is_noted), "{:?}", data.notes);
+    assert_noted(&data, "1 of 3 photographs, c.png");
 }
 
 #[test]
 fn damaged_tables_are_refused_by_line_and_column() {
-    type Edit = (&'static str, &'static str, &'static str);
-    let cases: [Edit; 11] = [
+    for (old, new, words) in [
         (",27,", ",wide,", "cameras.csv, line 3: f, \"wide\" is not a number, export"),
         (",27,", ",,", "cameras.csv, line 3: f, \"\" is not a number"),
         (",27,", ",0,", "cameras.csv, line 3 (images/a.png), fx"),
@@ -141,28 +138,32 @@ fn damaged_tables_are_refused_by_line_and_column() {
         ("images/b.png,", "images/b.png,nan", "line 4: x, not a number"),
         ("images/b.png", "../b.png", "cameras.csv, line 4: name, `..`"),
         ("images/b.png", "/b.png", "cameras.csv, line 4: name, absolute"),
-    ];
-    for (old, new, words) in cases {
+    ] {
         let made = Made::realitycapture();
         made.replace(TABLE, old, new);
         refused(new, &made, &LoadOptions::default(), words);
     }
-    type Change = (&'static str, fn(&Made), &'static str);
-    let cases: [Change; 6] = [
-        ("two", |m| m.write("d.csv", std::fs::read(m.file(TABLE)).unwrap()), "cameras.csv, d.csv"),
-        ("no names", |m| m.replace(TABLE, "#name", "#label"), "is not a dataset, .csv"),
-        ("only names", |m| m.write(TABLE, "#name,x,y,alt,heading,pitch,roll,f\n"), "no image"),
-        (
-            "no photographs",
-            |m| std::fs::remove_dir_all(m.file("images")).unwrap(),
-            "cameras.csv, no image, a.png, AddOrImagesFolder",
-        ),
-        ("not an image", |m| m.write("images/b.png", "hello"), "images/b.png, decode"),
-        ("a far-off camera", |m| m.replace(TABLE, "images/a.png,", "images/a.png,1e308"), "line 3"),
-    ];
-    for (case, edit, words) in cases {
-        let made = Made::realitycapture();
-        edit(&made);
-        refused(case, &made, &LoadOptions::default(), words);
-    }
+    edits_are_refused(
+        Made::realitycapture,
+        &[
+            (
+                "two",
+                |m| m.write("d.csv", std::fs::read(m.file(TABLE)).unwrap()),
+                "cameras.csv, d.csv",
+            ),
+            ("no names", |m| m.replace(TABLE, "#name", "#label"), "is not a dataset, .csv"),
+            ("only names", |m| m.write(TABLE, "#name,x,y,alt,heading,pitch,roll,f\n"), "no image"),
+            (
+                "no photographs",
+                |m| std::fs::remove_dir_all(m.file("images")).unwrap(),
+                "cameras.csv, no image, a.png, AddOrImagesFolder",
+            ),
+            ("not an image", |m| m.write("images/b.png", "hello"), "images/b.png, decode"),
+            (
+                "a far-off camera",
+                |m| m.replace(TABLE, "images/a.png,", "images/a.png,1e308"),
+                "line 3",
+            ),
+        ],
+    );
 }

@@ -71,11 +71,8 @@ impl ModelWriter for CompressedPlyWriter {
             for channel in 0..3 {
                 for &value in sh[3..].iter().skip(channel).step_by(3) {
                     let place = self.open.len() + self.bands.len() % (sh.len() - 3);
-                    self.bands.push(if value == 0.0 {
-                        127 + (place % 2) as u8
-                    } else {
-                        band(value)
-                    });
+                    let byte = if value == 0.0 { 127 + (place % 2) as u8 } else { band(value) };
+                    self.bands.push(byte);
                 }
             }
             if self.open.len() == CHUNK {

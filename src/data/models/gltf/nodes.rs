@@ -23,16 +23,14 @@ pub(super) struct Node {
 
 impl Node {
     fn matrix(&self) -> DMat4 {
-        self.matrix.map_or_else(
-            || {
-                DMat4::from_scale_rotation_translation(
-                    self.scale.map_or(DVec3::ONE, DVec3::from),
-                    self.rotation.map_or(DQuat::IDENTITY, DQuat::from_array),
-                    self.translation.map_or(DVec3::ZERO, DVec3::from),
-                )
-            },
-            |columns| DMat4::from_cols_array(&columns),
-        )
+        match &self.matrix {
+            Some(columns) => DMat4::from_cols_array(columns),
+            None => DMat4::from_scale_rotation_translation(
+                self.scale.map_or(DVec3::ONE, DVec3::from),
+                self.rotation.map_or(DQuat::IDENTITY, DQuat::from_array),
+                self.translation.map_or(DVec3::ZERO, DVec3::from),
+            ),
+        }
     }
 }
 

@@ -135,11 +135,8 @@ fn read(
     let mut primitives = 0;
     let roots = document.scenes.get(document.scene).map(|scene| scene.nodes.as_slice());
     for (mesh, transform) in nodes::placed_meshes(path, &document.nodes, roots)? {
-        let mesh = document.meshes.get(mesh);
-        for primitive in &mesh
-            .ok_or_else(|| LoadError::damaged(path, "nodes", "there is no such mesh"))?
-            .primitives
-        {
+        let no_mesh = || LoadError::damaged(path, "nodes", "there is no such mesh");
+        for primitive in &document.meshes.get(mesh).ok_or_else(no_mesh)?.primitives {
             let Some(extension) = primitive.extensions.get(SPLATS) else { continue };
             primitives += 1;
             let mut part = splats(&buffers, primitive, extension)?;
@@ -200,10 +197,11 @@ fn splats(
         None => Ok(None),
         Some(&accessor) => buffers.numbers(name, accessor, width).map(Some),
     };
+    let missing =
+        |name: &str| LoadError::damaged(path, "attributes", format!("there is no {name}"));
     let needed = |name: &str, width: usize| {
         let name = if name == "POSITION" { name.to_owned() } else { format!("{SPLATS}:{name}") };
-        let missing = || LoadError::damaged(path, "attributes", format!("there is no {name}"));
-        attribute(&name, width)?.ok_or_else(missing)
+        attribute(&name, width)?.ok_or_else(|| missing(&name))
     };
     let (means, quats) = (needed("POSITION", 3)?, needed("ROTATION", 4)?);
     let (scales, opacities) = (needed("SCALE", 3)?, needed("OPACITY", 1)?);
@@ -215,10 +213,7 @@ fn splats(
     for degree in 0..=sh_degree {
         for n in 0..=2 * degree {
             let name = coefficient(degree, n);
-            let found = attribute(&name, 3)?;
-            bands.push(found.ok_or_else(|| {
-                LoadError::damaged(path, "attributes", format!("there is no {name}"))
-            })?);
+            bands.push(attribute(&name, 3)?.ok_or_else(|| missing(&name))?);
         }
     }
     let count = opacities.len();
@@ -239,17 +234,13 @@ fn splats(
         // If another program has changed the standard's values, densify's own are stale.
         let log_scale = log_scales.as_ref().map(|logs| three(logs));
         let logit = logits.as_ref().map(|logits| logits[row]);
+        let logit = logit.filter(|&logit| sigmoid(logit).to_bits() == opacity.to_bits());
         let fits = |log: &[f32; 3]| log.map(|x| x.exp().to_bits()) == scale.map(f32::to_bits);
         rows.push(Row {
             mean: three(&means),
             log_scale: log_scale.filter(fits).unwrap_or_else(|| scale.map(log_of_scale)),
             quat: [quats[4 * row + 3], quats[4 * row], quats[4 * row + 1], quats[4 * row + 2]],
-            opacity_logit: match logit
-                .filter(|&logit| sigmoid(logit).to_bits() == opacity.to_bits())
-            {
-                Some(logit) => logit,
-                None => quantised_logit(opacity),
-            },
+            opacity_logit: logit.unwrap_or_else(|| quantised_logit(opacity)),
             sh: &sh,
         });
     }
@@ -260,8 +251,7 @@ fn splats(
 fn join(whole: &mut SplatFile, part: SplatFile) {
     let degree = whole.gaussians.sh_degree.max(part.gaussians.sh_degree);
     let more = part.gaussians.with_degree(degree);
-    let all = std::mem::take(&mut whole.gaussians).with_degree(degree);
-    whole.gaussians = all;
+    whole.gaussians = std::mem::take(&mut whole.gaussians).with_degree(degree);
     whole.gaussians.append(more);
     whole.dropped += part.dropped;
     whole.repaired += part.repaired;

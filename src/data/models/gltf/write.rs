@@ -6,6 +6,7 @@ use std::io::{self, Write};
 use serde_json::{Value, json};
 
 use super::layout::{HALF_TURN, LOG_SCALE, MAGIC, OPACITY_LOGIT, SHAPES, SPLATS, coefficient};
+use crate::models::write::unfit;
 use crate::models::{ModelWriter, Shape};
 use densify_core::gaussians::{Gaussians, sh_coefficients, sigmoid};
 
@@ -38,8 +39,9 @@ impl ModelWriter for GlbWriter {
 
     fn begin(&mut self, Shape { rows, sh_degree }: Shape, _out: &mut dyn Write) -> io::Result<()> {
         if self.held_bytes(Shape { rows, sh_degree }) > u64::from(u32::MAX - (1 << 16)) {
-            let problem = "a GLB has at most 4 GiB; choose another format, such as ply or sog";
-            return Err(io::Error::new(io::ErrorKind::InvalidInput, problem));
+            return Err(unfit(
+                "a GLB has at most 4 GiB; choose another format, such as ply or sog",
+            ));
         }
         self.sh_degree = sh_degree;
         let colours = std::iter::repeat_n(3, sh_coefficients(sh_degree));

@@ -4,15 +4,8 @@ use std::path::Path;
 
 use super::read::read;
 use crate::models::PLY;
-use crate::models::tests::{model, saved};
+use crate::models::tests::{model, saved, written};
 use crate::points::read_points;
-use densify_core::gaussians::Gaussians;
-
-fn written(model: &Gaussians) -> Vec<u8> {
-    let mut bytes = Vec::new();
-    PLY.write(model, &mut bytes).unwrap();
-    bytes
-}
 
 /// The same splat in ascii and big endian, properties shuffled, of other types, with others
 /// and a list between, behind another element.
@@ -62,13 +55,13 @@ fn damaged_rows_are_dropped_up_to_one_percent() {
     few.means[3][1] = f32::NAN;
     few.sh[5 * 12 + 4] = f32::INFINITY;
     few.quats[9] = [0.0; 4];
-    let (_folder, path) = saved("file.ply", written(&few));
+    let (_folder, path) = saved("file.ply", written(PLY, &few).unwrap());
     let found = read(&path).unwrap();
     assert_eq!((found.dropped, found.repaired, found.gaussians.len()), (2, 1, 198));
     assert_eq!(found.gaussians.sh_of(3), few.sh_of(4));
     assert_eq!(found.gaussians.quats[7], [1.0, 0.0, 0.0, 0.0]);
     few.opacity_logits[20] = f32::NAN;
-    let (_folder, path) = saved("file.ply", written(&few));
+    let (_folder, path) = saved("file.ply", written(PLY, &few).unwrap());
     let message = read(&path).unwrap_err().to_string();
     assert!(message.contains("3 of 200") && message.contains("file.ply"), "{message}");
 }
@@ -79,7 +72,7 @@ fn infinite_opacities_and_flat_gaussians_are_read() {
     let mut model = model(10, 0);
     (model.opacity_logits[0], model.opacity_logits[1]) = (f32::INFINITY, f32::NEG_INFINITY);
     model.log_scales[2][1] = f32::NEG_INFINITY;
-    let (_folder, path) = saved("file.ply", written(&model));
+    let (_folder, path) = saved("file.ply", written(PLY, &model).unwrap());
     let found = read(&path).unwrap();
     assert_eq!((found.dropped, found.gaussians.len()), (0, 10));
     let [opaque, transparent, other, ..] = found.gaussians.opacity_logits[..] else {
@@ -92,7 +85,7 @@ fn infinite_opacities_and_flat_gaussians_are_read() {
 
 #[test]
 fn other_ply_files_are_refused_with_the_reason() {
-    let good = String::from_utf8_lossy(&written(&model(1, 0))).into_owned();
+    let good = String::from_utf8_lossy(&written(PLY, &model(1, 0)).unwrap()).into_owned();
     let header = |from: &str, to: &str| {
         assert!(good.contains(from));
         good.replacen(from, to, 1)
@@ -127,7 +120,7 @@ fn other_ply_files_are_refused_with_the_reason() {
 /// Cut or damaged anywhere: an error or a model, never a panic or a huge allocation.
 #[test]
 fn damaged_files_never_panic() {
-    let whole = written(&model(3, 1));
+    let whole = written(PLY, &model(3, 1)).unwrap();
     for at in 0..whole.len() {
         let (_folder, path) = saved("file.ply", &whole[..at]);
         assert!(read(&path).is_err(), "cut at {at}");
@@ -152,7 +145,7 @@ fn shared_splats_of_other_programs_load() {
         if path.ends_with("train-1000.ply") {
             assert_eq!((file.gaussians.len(), file.gaussians.sh_degree), (1000, 3));
             // The original's layout: ours, byte for byte.
-            assert!(written(&file.gaussians) == std::fs::read(&path).unwrap());
+            assert!(written(PLY, &file.gaussians).unwrap() == std::fs::read(&path).unwrap());
         }
     }
 }

@@ -7,6 +7,8 @@
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
+use Predictor::{Above, Left, Mean, Select};
+
 /// Symbols of each channel's code; green shares its code with the lengths of references, which are not used.
 const SYMBOLS: [usize; 4] = [280, 256, 256, 256];
 /// Symbols of the code of distances.
@@ -67,13 +69,7 @@ impl Bits {
 pub(super) fn encode(rgba: &[u8], (width, height): (usize, usize)) -> Vec<u8> {
     let pixels = rgba.as_chunks::<4>().0;
     let is_opaque = pixels.iter().all(|pixel| pixel[3] == 255);
-    let predictors = [
-        None,
-        Some(Predictor::Left),
-        Some(Predictor::Above),
-        Some(Predictor::Mean),
-        Some(Predictor::Select),
-    ];
+    let predictors = [None, Some(Left), Some(Above), Some(Mean), Some(Select)];
     let candidates = predictors.into_iter().flat_map(|predictor| {
         [false, true].map(|subtracts_green| Transforms { subtracts_green, predictor })
     });
@@ -151,12 +147,12 @@ fn residuals(pixels: &[[u8; 4]], width: usize, transforms: Transforms) -> Vec<[u
         _ => {
             let (left, above) = (at(place - 1), at(place - width));
             match predictor {
-                Predictor::Left => left,
-                Predictor::Above => above,
-                Predictor::Mean => {
+                Left => left,
+                Above => above,
+                Mean => {
                     std::array::from_fn(|i| ((u16::from(left[i]) + u16::from(above[i])) / 2) as u8)
                 }
-                Predictor::Select => {
+                Select => {
                     let corner = at(place - width - 1);
                     let distance = |pixel: &[u8; 4]| -> u32 {
                         pixel.iter().zip(corner).map(|(a, b)| u32::from(a.abs_diff(b))).sum()
@@ -219,20 +215,12 @@ fn put_lengths(to: &mut Bits, lengths: &[u8]) {
     let mut rest = lengths;
     while let Some(&length) = rest.first() {
         let zeros = rest.iter().take_while(|length| **length == 0).count().min(138);
-        let run = match zeros {
-            0..3 => {
-                tokens.push((length.into(), 0, 0));
-                1
-            }
-            3..11 => {
-                tokens.push((17, zeros as u64 - 3, 3));
-                zeros
-            }
-            _ => {
-                tokens.push((18, zeros as u64 - 11, 7));
-                zeros
-            }
+        let (run, token) = match zeros {
+            0..3 => (1, (length.into(), 0, 0)),
+            3..11 => (zeros, (17, zeros as u64 - 3, 3)),
+            _ => (zeros, (18, zeros as u64 - 11, 7)),
         };
+        tokens.push(token);
         rest = &rest[run..];
     }
     let mut counts = [0; 19];
@@ -284,16 +272,10 @@ fn huffman(counts: &[u32]) -> Vec<u8> {
         (parents[a.1], parents[b.1]) = (pair, pair);
         heap.push(Reverse((a.0 + b.0, pair)));
     }
-    let depth = |symbol: usize| {
-        std::iter::successors(Some(symbol), |&node| {
-            Some(parents[node]).filter(|&up| up != usize::MAX)
-        })
-        .count()
-            - 1
-    };
-    (0..counts.len())
-        .map(|symbol| if counts[symbol] > 0 { depth(symbol) as u8 } else { 0 })
-        .collect()
+    let parent = |&node: &usize| Some(parents[node]).filter(|&up| up != usize::MAX);
+    let depth = |symbol: usize| std::iter::successors(Some(symbol), parent).count() - 1;
+    let length = |symbol: usize| if counts[symbol] > 0 { depth(symbol) as u8 } else { 0 };
+    (0..counts.len()).map(length).collect()
 }
 
 /// The words of a canonical code with these lengths, ordered by length, then symbol; the first bit is the lowest.

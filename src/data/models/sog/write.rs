@@ -10,6 +10,7 @@ use super::layout::{FIRST_LARGEST, META, PALETTE_WIDTH};
 use super::palette::{self, Palette};
 use super::picture::{Picture, side};
 use crate::models::quantise::{MAX_LOG_SCALE, smallest_three};
+use crate::models::write::unfit;
 use crate::models::zip::ZipWriter;
 use crate::models::{Format, ModelWriter, Shape};
 use densify_core::gaussians::{Gaussians, sh_coefficients, sigmoid};
@@ -57,10 +58,9 @@ impl ModelWriter for SogWriter {
 
     fn begin(&mut self, Shape { rows, sh_degree }: Shape, _out: &mut dyn Write) -> io::Result<()> {
         if rows == 0 || rows > MAX_SIDE * (MAX_SIDE / 4 * 4) {
-            let problem = format!(
+            return Err(unfit(format!(
                 "SOG holds 1 to 268 million Gaussians, not {rows}; choose another format, such as ply"
-            );
-            return Err(io::Error::new(io::ErrorKind::InvalidInput, problem));
+            )));
         }
         self.sh_degree = sh_degree;
         self.means.reserve_exact(rows);

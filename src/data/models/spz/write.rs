@@ -4,9 +4,10 @@
 use std::io::{self, Write};
 
 use super::VARIANTS;
-use super::containers::{self, Array};
+use super::containers::{self, Array, GZIP_MEMORY, frames_bytes};
 use super::layout::COLOUR;
 use crate::models::quantise::smallest_three;
+use crate::models::write::unfit;
 use crate::models::{Format, ModelWriter, Shape};
 use densify_core::gaussians::{Gaussians, sh_coefficients, sigmoid};
 
@@ -47,12 +48,7 @@ impl ModelWriter for SpzWriter {
         let bands = 3 * (sh_coefficients(sh_degree) - 1);
         let held = (rows * (12 + 4 + 1 + 3 + 3 + 4 + bands)) as u64;
         let arrays = [9, 1, 3, 3, 4, bands].map(|bytes| rows * bytes);
-        let compressor = if self.is_in_frames {
-            containers::frames_bytes(&arrays)
-        } else {
-            containers::GZIP_MEMORY
-        };
-        held + compressor
+        held + if self.is_in_frames { frames_bytes(&arrays) } else { GZIP_MEMORY }
     }
 
     fn wants_spatial_order(&self) -> bool {
@@ -65,9 +61,9 @@ impl ModelWriter for SpzWriter {
 
     fn begin(&mut self, Shape { rows, sh_degree }: Shape, _out: &mut dyn Write) -> io::Result<()> {
         if u32::try_from(rows).is_err() {
-            let problem =
-                "SPZ counts rows in 32 bits; export fewer, or choose another format, such as ply";
-            return Err(io::Error::new(io::ErrorKind::InvalidInput, problem));
+            return Err(unfit(
+                "SPZ counts rows in 32 bits; export fewer, or choose another format, such as ply",
+            ));
         }
         self.sh_degree = sh_degree;
         self.positions.reserve_exact(rows);
@@ -143,10 +139,9 @@ impl SpzWriter {
         let reach = self.positions.as_flattened().iter().fold(0f32, |most, v| most.max(v.abs()));
         let room = POSITION_BITS - 1 - reach.max(1e-6).log2().floor() as i32;
         if room < 0 {
-            let problem = format!(
+            return Err(unfit(format!(
                 "SPZ has no room for coordinates up to {reach:e}; choose another format, such as glb"
-            );
-            return Err(io::Error::new(io::ErrorKind::InvalidInput, problem));
+            )));
         }
         let wanted = match self.sizes.len() / 2 {
             0 => i32::from(MIN_FRACTIONAL_BITS),

@@ -37,6 +37,11 @@ fn piece(whole: &Gaussians, rows: Range<usize>) -> Gaussians {
     whole.gather(&rows.collect::<Vec<_>>())
 }
 
+pub(crate) fn written(format: &Format, model: &Gaussians) -> io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    format.write(model, &mut bytes).map(|()| bytes)
+}
+
 /// A file with these contents in a folder of its own.
 pub(crate) fn saved(name: &str, contents: impl AsRef<[u8]>) -> (tempfile::TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
@@ -167,8 +172,7 @@ fn the_writer_of_ply_holds_what_it_promises() {
 fn the_ply_layout_is_that_of_the_original_trainer() {
     let mut one = model(1, 1);
     one.sh = (0..12u8).map(f32::from).collect();
-    let mut bytes = Vec::new();
-    PLY.write(&one, &mut bytes).unwrap();
+    let bytes = written(PLY, &one).unwrap();
     let header_end = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
     let header = std::str::from_utf8(&bytes[..header_end]).unwrap();
     let names: Vec<&str> =

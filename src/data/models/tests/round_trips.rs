@@ -7,8 +7,8 @@ use std::path::Path;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::{piece, saved};
-use crate::models::{Format, Shape, export_formats, find, find_by_extension, read_model};
+use super::{piece, saved, written};
+use crate::models::{Shape, export_formats, find, find_by_extension, read_model};
 use densify_core::gaussians::{Gaussians, sh_coefficients, sigmoid};
 
 /// A model as training makes them: in a few units, most Gaussians small, colours that depend little on direction.
@@ -27,11 +27,6 @@ fn plausible(rows: usize, sh_degree: u8) -> Gaussians {
         model.sh.extend((3..3 * sh_coefficients(sh_degree)).map(|_| value(0.3)));
     }
     model
-}
-
-fn written(format: &Format, model: &Gaussians) -> io::Result<Vec<u8>> {
-    let mut bytes = Vec::new();
-    format.write(model, &mut bytes).map(|()| bytes)
 }
 
 fn read(bytes: &[u8]) -> Gaussians {

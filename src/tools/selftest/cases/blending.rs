@@ -1,6 +1,6 @@
 //! Opacities at the thresholds of the renderer, thousands of faint layers, and opaque rows in front of them.
 
-use super::{GREY, UPRIGHT, straight};
+use super::{GREY, UPRIGHT, shade, straight};
 use crate::compare::class;
 use crate::reference::{CLASSES, Model, Rules, View, render};
 use crate::scenes;
@@ -51,8 +51,7 @@ pub(super) fn layers(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let mut model = Gaussians::default();
         for row in 0..rows {
             let z = 1.0 + row as f32 / rows as f32;
-            let shade = |k: usize| ((row * 7 + k * 5) % 11) as f32 * 0.1 - 0.5;
-            scenes::push(&mut model, [0.0, 0.0, z], [0.3 * z; 3], UPRIGHT, logit, shade);
+            scenes::push(&mut model, [0.0, 0.0, z], [0.3 * z; 3], UPRIGHT, logit, shade(row));
         }
         let label = format!("{rows} layers");
         trial.check(&label, &model, &camera, GREY, 0)?;
@@ -85,9 +84,8 @@ fn side_by_side(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let z = 1.0 + row as f32 / 100_000.0;
         let (x, y) = ((row % 16) as f64 - 7.3, (row / 16 % 16) as f64 - 7.8);
         let place = [x / camera.fx, y / camera.fy].map(|at| at as f32 * z);
-        let shade = |k: usize| ((row * 7 + k * 5) % 11) as f32 * 0.1 - 0.5;
         let scale = 0.4 * z / camera.fx as f32;
-        scenes::push(&mut model, [place[0], place[1], z], [scale; 3], UPRIGHT, -5.0, shade);
+        scenes::push(&mut model, [place[0], place[1], z], [scale; 3], UPRIGHT, -5.0, shade(row));
     }
     trial.check("100000 Gaussians side by side", &model, &camera, GREY, 0)?;
     Ok(())
@@ -100,10 +98,9 @@ pub(super) fn behind_opaque(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let mut model = Gaussians::default();
         for row in 0..41_u8 {
             let z = 1.0 + 0.02 * f32::from(row);
-            let shade = |k: usize| ((usize::from(row) * 7 + k * 5) % 11) as f32 * 0.1 - 0.5;
             let logit = if row == 0 { logit(opacity) } else { -3.0 };
             let place = [0.02 * z, -0.01 * z, z];
-            scenes::push(&mut model, place, [0.4 * z; 3], UPRIGHT, logit, shade);
+            scenes::push(&mut model, place, [0.4 * z; 3], UPRIGHT, logit, shade(row.into()));
         }
         trial.check(&format!("opacity {opacity} in front of 40"), &model, &camera, GREY, 0)?;
     }
@@ -117,9 +114,7 @@ pub(super) fn logits(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let label = format!("logit {logit}");
         let camera = scenes::camera(40, 30, 17);
         let mut model = scenes::cloud(12, 0, &camera, 30 + seed as u64);
-        for opacity in model.opacity_logits.iter_mut().step_by(2) {
-            *opacity = logit;
-        }
+        model.opacity_logits.iter_mut().step_by(2).for_each(|opacity| *opacity = logit);
         trial.check(&label, &model, &camera, GREY, 0)?;
 
         // A single row on a pixel's centre: alpha is the opacity, and the gradient its derivative.

@@ -47,9 +47,9 @@ fn extreme_coefficients(trial: &mut Trial<'_>) -> Result<(), BackendError> {
 /// Colours at the ends of the range have gradients.
 fn black_and_white_learn(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = scenes::camera(24, 24, 24);
-    let pixels = (camera.width * camera.height) as usize;
     let (width, height) = (camera.width, camera.height);
-    let grey = Image8 { width, height, rgb: vec![128; 3 * pixels], alpha: None, mask: None };
+    let rgb = vec![128; 3 * (width * height) as usize];
+    let grey = Image8 { width, height, rgb, alpha: None, mask: None };
     for (label, colour) in [("black", 0), ("white", 255)] {
         let positions = (0..12_u8).map(|i| {
             let at = f64::from(i);
@@ -64,10 +64,8 @@ fn black_and_white_learn(trial: &mut Trial<'_>) -> Result<(), BackendError> {
             step(&mut *backend, number, &camera, &grey, [0.5; 3], 0)?;
         }
         let after = backend.download()?;
-        let moved = model.sh.iter().zip(&after.sh).filter(|(a, b)| {
-            // Grey is 0.
-            b.abs() < a.abs() - 0.05
-        });
+        // Grey is 0.
+        let moved = model.sh.iter().zip(&after.sh).filter(|(a, b)| b.abs() < a.abs() - 0.05);
         let dead = model.sh.len() - moved.count();
         trial.count(&format!("{label} points"), "colours that did not learn in 200 steps", dead);
     }

@@ -56,10 +56,9 @@ pub(super) fn camera_at_mean(trial: &mut Trial<'_>) -> Result<(), BackendError> 
     for (label, offset) in [("0", 0.0), ("1e-20", 1e-20_f32), ("0.001", 1e-3)] {
         let camera = straight(33, 30);
         let mut model = scenes::cloud(10, 2, &camera, 34);
-        for (row, direction) in
-            [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].iter().enumerate()
-        {
-            model.means[row] = direction.map(|d: f32| d * offset);
+        for row in 0..3 {
+            model.means[row] = [0.0; 3];
+            model.means[row][row] = offset;
             model.log_scales[row] = [0.7, 0.0, 2.0];
         }
         let label = format!("{label} from the camera");

@@ -9,6 +9,7 @@ use crate::scenes;
 use crate::subject::Subject;
 use crate::trial::{Trial, count_broken, step};
 use crate::values::SIZES;
+use densify_core::camera::Camera;
 use densify_core::gaussians::Gaussians;
 use densify_core::image::Image8;
 use densify_render::{BackendError, Differentiable};
@@ -36,15 +37,14 @@ fn expected(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Loss {
     let weight = |plane: &Option<Vec<u8>>, p: usize| {
         plane.as_ref().map_or(1.0, |plane| f64::from(plane[p]) / 255.0)
     };
-    let truth: Vec<f64> = (0..rendered.len())
-        .map(|i| {
-            let alpha = weight(&target.alpha, i / 3);
-            alpha * f64::from(target.rgb[i]) / 255.0 + (1.0 - alpha) * f64::from(background[i % 3])
-        })
-        .collect();
-    let masked: Vec<f64> = (0..rendered.len())
-        .map(|i| truth[i] + weight(&target.mask, i / 3) * (f64::from(rendered[i]) - truth[i]))
-        .collect();
+    let truth = |i: usize| {
+        let alpha = weight(&target.alpha, i / 3);
+        alpha * f64::from(target.rgb[i]) / 255.0 + (1.0 - alpha) * f64::from(background[i % 3])
+    };
+    let truth: Vec<f64> = (0..rendered.len()).map(truth).collect();
+    let masked =
+        |i: usize| truth[i] + weight(&target.mask, i / 3) * (f64::from(rendered[i]) - truth[i]);
+    let masked: Vec<f64> = (0..rendered.len()).map(masked).collect();
     let mut loss = loss(&masked, &truth, target.width as usize, target.height as usize);
     for (i, gradient) in loss.gradient.iter_mut().enumerate() {
         *gradient *= weight(&target.mask, i / 3);
@@ -63,12 +63,11 @@ fn check(
     let expected = expected(rendered, target, background);
     let (found, gradient) = backend.loss(&scenes::opaque(rendered, target), target, background)?;
     let (value_tolerance, gradient_tolerance) = tolerances(trial.subject);
-    let scalars = [
+    for (quantity, found, expected) in [
         ("loss", found.loss, expected.loss),
         ("L1", found.l1, expected.l1),
         ("SSIM", found.ssim, expected.ssim),
-    ];
-    for (quantity, found, expected) in scalars {
+    ] {
         trial.record(label, quantity, (f64::from(found) - expected).abs(), value_tolerance);
     }
     let error = relative_error(&gradient, &expected.gradient);
@@ -81,14 +80,13 @@ pub(super) fn uniform_photographs(trial: &mut Trial<'_>) -> Result<(), BackendEr
     let mut backend = trial.subject.backend(&Gaussians::default())?;
     let (noisy, photograph) = scenes::noisy(SIZE, 0.2, 23);
     let transparent = Image8 { alpha: Some(vec![0; photograph.rgb.len() / 3]), ..photograph };
-    let targets = [
+    for (label, target) in [
         ("black", flat_image(0)),
         ("white", flat_image(255)),
         ("grey", flat_image(128)),
         ("transparent", transparent),
-    ];
-    for (label, target) in &targets {
-        check(trial, &mut *backend, label, &noisy, target)?;
+    ] {
+        check(trial, &mut *backend, label, &noisy, &target)?;
     }
     for value in [0, 1, 153, 255] {
         let (label, target) = (format!("equal to {value}"), flat_image(value));
@@ -107,8 +105,7 @@ pub(super) fn uniform_photographs(trial: &mut Trial<'_>) -> Result<(), BackendEr
     // An empty view that equals its photograph moves no row.
     let camera = scenes::camera(48, 40, 25);
     let model = scenes::cloud(10, 0, &camera, 26);
-    let away =
-        densify_core::camera::Camera { translation: glam::DVec3::new(0.0, 0.0, -1e3), ..camera };
+    let away = Camera { translation: glam::DVec3::new(0.0, 0.0, -1e3), ..camera };
     let mut backend = trial.subject.backend(&model)?;
     let output = step(&mut *backend, 1, &away, &flat_image(255), [1.0; 3], 0)?;
     let mut moved = usize::from(backend.download()?.means != model.means);
@@ -131,26 +128,24 @@ pub(super) fn flat_and_similar(trial: &mut Trial<'_>) -> Result<(), BackendError
     let (width, pixels) = (target.width as usize, target.rgb.len() / 3);
     let ramp: Vec<u8> = (0..pixels).map(|p| (p % 256) as u8).collect();
     let half: Vec<u8> = (0..pixels).map(|p| if p % width < width / 2 { 255 } else { 0 }).collect();
-    let planes = [
+    for (label, alpha, mask) in [
         ("coverage", Some(&ramp), None),
         ("mask", None, Some(&half)),
         ("soft mask", None, Some(&ramp)),
         ("coverage and mask", Some(&ramp), Some(&half)),
-    ];
-    for (label, alpha, mask) in planes {
+    ] {
         let target = Image8 { alpha: alpha.cloned(), mask: mask.cloned(), ..target.clone() };
         check(trial, &mut *backend, label, &rendered, &target)?;
     }
     let n = target.rgb.len();
     let mut rng = ChaCha8Rng::seed_from_u64(24);
     let noisy: Vec<f32> = (0..n).map(|_| 0.9 + 1e-3 * rng.random_range(-1.0_f32..1.0)).collect();
-    let pairs = [
+    for (label, rendered, value) in [
         ("0.6 + 1e-3", vec![0.601; n], 153),
         ("0.9 with noise 1e-3", noisy, 230),
         ("black on white", vec![0.0; n], 255),
         ("beyond 1", vec![1.2; n], 255),
-    ];
-    for (label, rendered, value) in pairs {
+    ] {
         check(trial, &mut *backend, label, &rendered, &flat_image(value))?;
     }
     // Almost equal: SSIM stays at 1.

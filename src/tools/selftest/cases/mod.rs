@@ -12,6 +12,8 @@ mod sizes;
 mod training;
 mod world;
 
+use glam::{DMat3, DVec3};
+
 use super::Case;
 use densify_core::camera::Camera;
 
@@ -57,15 +59,14 @@ pub fn cases() -> &'static [Case] {
 /// A camera at the origin that looks along z, with a focal length of 64 px.
 fn straight(width: u32, height: u32) -> Camera {
     Camera {
-        width,
-        height,
-        fx: 64.0,
-        fy: 64.0,
-        cx: 0.5 * f64::from(width),
-        cy: 0.5 * f64::from(height),
-        rotation: glam::DMat3::IDENTITY,
-        translation: glam::DVec3::ZERO,
+        translation: DVec3::ZERO,
+        ..Camera::centred((width, height), (64.0, 64.0), DMat3::IDENTITY, DVec3::ZERO)
     }
+}
+
+/// Coefficients of band 0 that differ between rows and channels.
+fn shade(row: usize) -> impl Fn(usize) -> f32 {
+    move |k| ((row * 7 + k * 5) % 11) as f32 * 0.1 - 0.5
 }
 
 /// Coefficients of band 0 that differ between channels.

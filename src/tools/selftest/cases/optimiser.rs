@@ -56,14 +56,13 @@ pub(super) fn moments(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let label = format!("gradient {gradient:e}");
         let expected = if row == OVERFLOWING as usize { 0.0 } else { expected_step(gradient) };
         let sh = after.sh_of(row);
-        let moved = [
+        for (moved, rate) in [
             (0.5 - after.means[row][1], mean),
             (-1.0 - after.log_scales[row][2], log_scale),
             (0.5 - after.opacity_logits[row], opacity),
             (0.5 - sh[1], sh_dc),
             (0.5 - sh[40], sh_rest),
-        ];
-        for (moved, rate) in moved {
+        ] {
             let length = f64::from(moved / rate);
             trial.record(&label, "step, in learning rates", (length - expected).abs(), 5e-3);
         }

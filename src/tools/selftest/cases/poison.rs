@@ -47,11 +47,8 @@ pub(super) fn poisoned(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         trial.count(&label, "bits of other Gaussians and of pixels changed", different);
         let found: Vec<usize> = backend.audit()?.iter().map(|u| u.row as usize).collect();
         let expected: Vec<usize> = (SOUND..SOUND + SLOTS).collect();
-        trial.count(
-            &label,
-            "Gaussians missed or wrongly reported by the audit",
-            usize::from(found != expected),
-        );
+        let is_wrong = usize::from(found != expected);
+        trial.count(&label, "Gaussians missed or wrongly reported by the audit", is_wrong);
     }
     // Finite numbers may be rendered, and change the image; all results stay finite.
     for value in EXTREMES {
@@ -65,12 +62,8 @@ pub(super) fn poisoned(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         for name in CLASSES {
             let all = class(&gradient, name);
             let per_row = all.len() / extreme.len();
-            let sound = &all[..per_row * (SOUND - 1)];
-            trial.count(
-                &label,
-                "NaN or infinity in the gradients of others",
-                count_broken(&[sound]),
-            );
+            let broken = count_broken(&[&all[..per_row * (SOUND - 1)]]);
+            trial.count(&label, "NaN or infinity in the gradients of others", broken);
             for slot in 0..SLOTS {
                 let row = SOUND - 1 + slot;
                 let own = &all[row * per_row..(row + 1) * per_row];

@@ -2,14 +2,13 @@
 
 use densify_policies::plan::EditPlan;
 
-use super::{GREY, UPRIGHT, flat_colour, straight};
+use super::{GREY, UPRIGHT, flat_colour, shade, straight};
 use crate::compare::class;
 use crate::reference::CLASSES;
 use crate::scenes;
 use crate::trial::{Trial, count_broken, step};
 use densify_core::gaussians::Gaussians;
-use densify_render::BackendError;
-use densify_render::Setup;
+use densify_render::{BackendError, Setup};
 
 const BACKGROUND: [f32; 3] = [0.25, 0.5, 0.75];
 
@@ -33,11 +32,8 @@ pub(super) fn no_row(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let output = step(&mut *backend, 1, &camera, &target, BACKGROUND, 2)?;
     backend.apply(&EditPlan::new(0, 3).compile(), 1, 1)?;
     let unsound = backend.audit()?.len() + count_broken(&[&[output.loss, output.ssim]]);
-    trial.count(
-        "0 Gaussians",
-        "Gaussians or broken numbers after a step and an edit",
-        backend.rows() + unsound,
-    );
+    let broken = backend.rows() + unsound;
+    trial.count("0 Gaussians", "Gaussians or broken numbers after a step and an edit", broken);
     Ok(())
 }
 
@@ -57,8 +53,7 @@ pub(super) fn duplicates(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     for rows in [2_usize, 3, 10_000] {
         let mut model = Gaussians::default();
         for row in 0..rows {
-            let shade = |k: usize| ((row * 7 + k * 5) % 11) as f32 * 0.1 - 0.5;
-            scenes::push(&mut model, place, [0.3, 0.2, 0.4], UPRIGHT, -2.0, shade);
+            scenes::push(&mut model, place, [0.3, 0.2, 0.4], UPRIGHT, -2.0, shade(row));
         }
         trial.check(&format!("{rows} Gaussians"), &model, &camera, GREY, 0)?;
     }
@@ -74,11 +69,8 @@ pub(super) fn invisible(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let upstream = scenes::narrowed(&scenes::upstream(&camera, 1));
     let (image, gradient) = backend.differentiate(&camera, BACKGROUND, 1, &upstream)?;
     trial.count("all Gaussians", "pixels other than the background", count_drawn(&image));
-    let pulled = |name: &&str| class(&gradient, name).iter().filter(|g| **g != 0.0).count();
-    trial.count(
-        "all Gaussians",
-        "gradients of invisible Gaussians",
-        CLASSES.iter().map(pulled).sum(),
-    );
+    let gradients = CLASSES.iter().flat_map(|name| class(&gradient, name));
+    let pulled = gradients.filter(|g| **g != 0.0).count();
+    trial.count("all Gaussians", "gradients of invisible Gaussians", pulled);
     trial.train("all Gaussians", &mut *backend, &camera, BACKGROUND, 1)
 }

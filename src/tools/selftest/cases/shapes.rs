@@ -23,9 +23,7 @@ pub(super) fn ordinary(trial: &mut Trial<'_>) -> Result<(), BackendError> {
 /// A cloud in which every second row has log-scales `value`.
 fn cloud_of_scale(camera: &Camera, value: f32) -> Gaussians {
     let mut model = scenes::cloud(12, 0, camera, 30);
-    for scales in model.log_scales.iter_mut().step_by(2) {
-        *scales = [value; 3];
-    }
+    model.log_scales.iter_mut().step_by(2).for_each(|scales| *scales = [value; 3]);
     model
 }
 
@@ -102,11 +100,8 @@ pub(super) fn needles(trial: &mut Trial<'_>) -> Result<(), BackendError> {
             let label = format!("{sigma_px} px, turn {turn}");
             let model = needle(sigma_px, turn);
             let (measured, expected) = trial.check(&label, &model, &camera, GREY, 0)?;
-            let found = by_covariance(
-                &model,
-                measured.log_scales[0].map(f64::from),
-                measured.quats[0].map(f64::from),
-            );
+            let log_scales = measured.log_scales[0].map(f64::from);
+            let found = by_covariance(&model, log_scales, measured.quats[0].map(f64::from));
             let exact = by_covariance(&model, expected.log_scales[0], expected.quats[0]);
             trial.record(&label, "by covariance", relative_error(&found, &exact), 1e-3);
         }
@@ -152,8 +147,8 @@ pub(super) fn outside_frustum(trial: &mut Trial<'_>) -> Result<(), BackendError>
     let camera = scenes::camera(34, 28, 12);
     for times in [1.0, 1.1, 1.2, 1.5, 2.0, 5.0, 20.0] {
         let mut model = Gaussians { sh_degree: 1, ..Gaussians::default() };
-        for (row, [x, y]) in [[1.0, 0.1], [-0.2, 1.0], [-1.0, -1.0], [1.0, -0.7]].iter().enumerate()
-        {
+        let corners = [[1.0, 0.1], [-0.2, 1.0], [-1.0, -1.0], [1.0, -0.7]];
+        for (row, [x, y]) in corners.into_iter().enumerate() {
             let z = 2.0 + 0.4 * row as f64;
             let side = z * times * 0.5;
             let mean = scenes::world(&camera, [x * side, y * side, z]);

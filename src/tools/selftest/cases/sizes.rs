@@ -1,6 +1,6 @@
 //! Awkward image sizes, extreme lenses, and rows that fill the image.
 
-use super::{GREY, UPRIGHT, straight};
+use super::{GREY, UPRIGHT, shade, straight};
 use crate::reference::{Model, Rules, View, blend, project};
 use crate::scenes;
 use crate::trial::{Trial, count_broken, step};
@@ -8,8 +8,7 @@ use crate::values::{LARGE_SIZES, SIZES};
 use densify_core::camera::Camera;
 use densify_core::gaussians::Gaussians;
 use densify_core::memory::resident;
-use densify_render::BackendError;
-use densify_render::Setup;
+use densify_render::{BackendError, Setup};
 
 const BACKGROUNDS: [[f32; 3]; 3] = [[0.0; 3], [1.0; 3], [0.2, 0.7, 0.4]];
 
@@ -91,8 +90,7 @@ pub(super) fn large_rows(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let mut model = Gaussians::default();
         for row in 0..rows {
             let z = 1.0 + row as f32 * 1e-6;
-            let shade = |k: usize| ((row * 7 + k * 5) % 11) as f32 * 0.1 - 0.5;
-            scenes::push(&mut model, [0.0, 0.0, z], [100.0 * z; 3], UPRIGHT, -2.0, shade);
+            scenes::push(&mut model, [0.0, 0.0, z], [100.0 * z; 3], UPRIGHT, -2.0, shade(row));
         }
         model
     };
@@ -115,11 +113,8 @@ pub(super) fn large_rows(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let held = after.saturating_sub(before) as f64 / backend.ledger().total() as f64;
         trial.record(&label, "memory used, relative to the ledger", held, 1.1);
     }
-    trial.count(
-        &label,
-        "entries miscounted",
-        output.entries.abs_diff(rows as u64 * TILES) as usize,
-    );
+    let miscounted = output.entries.abs_diff(rows as u64 * TILES) as usize;
+    trial.count(&label, "entries miscounted", miscounted);
     trial.count(&label, "images in a single band", usize::from(output.bands < 2));
     let broken = backend.audit()?.len() + usize::from(!output.loss.is_finite());
     trial.count(&label, "NaN or infinity", broken);

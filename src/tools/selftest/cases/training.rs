@@ -15,8 +15,7 @@ use densify_core::gaussians::Gaussians;
 use densify_core::image::{Image8, SharedImage};
 use densify_data::dataset::PointCloud;
 use densify_data::views::{ViewError, ViewSource};
-use densify_render::BackendError;
-use densify_render::Setup;
+use densify_render::{BackendError, Setup};
 use densify_train::init::initialise;
 use densify_train::schedule::{Background, RateOptions};
 use densify_train::trainer::{OnNan, TrainOptions, Trainer};
@@ -48,8 +47,6 @@ impl ViewSource for Photographs {
     fn image(&self, view: usize) -> Result<SharedImage, ViewError> {
         Ok(self.images[view].clone())
     }
-
-    fn prefetch(&self, _: &[usize]) {}
 }
 
 /// Cameras on a circle around the origin that look at it.
@@ -91,8 +88,7 @@ fn photographs() -> Result<Photographs, BackendError> {
     for camera in &cameras {
         let image = native.render(camera, [0.0; 3], 0)?;
         let rgb = image.rgb.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
-        let (width, height) = (SIDE, SIDE);
-        images.push(Arc::new(Image8 { width, height, rgb, alpha: None, mask: None }));
+        images.push(Arc::new(Image8 { width: SIDE, height: SIDE, rgb, alpha: None, mask: None }));
     }
     Ok(Photographs { cameras, images })
 }

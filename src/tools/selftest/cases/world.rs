@@ -80,11 +80,10 @@ pub(super) fn placements(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let different = there.iter().zip(&here).filter(|(a, b)| a.to_bits() != b.to_bits()).count();
         trial.count(&format!("scale 2^{power}"), "bits that differ", different);
     }
-    let turns = [
+    for (label, turn) in [
         ("yzx", DMat3::from_cols(DVec3::Y, DVec3::Z, DVec3::X)),
         ("zxy", DMat3::from_cols(DVec3::Z, DVec3::X, DVec3::Y)),
-    ];
-    for (label, turn) in turns {
+    ] {
         let there = render_placed(trial, turn, |p| p)?;
         // 100 dB: sums of three products in another order.
         let label = format!("axes {label}");

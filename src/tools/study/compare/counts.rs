@@ -3,7 +3,7 @@
 //! Budgets bound the peak, and policies are compared at equal budgets. Some policies end far below their peak, which
 //! matters if the cost of storage or display is more important than that of training.
 
-use super::{Outcome, at, scenes_and_budgets};
+use super::{Outcome, at};
 use crate::difference::mean;
 use crate::distinct;
 use crate::text_table::{TextTable, or_dash};
@@ -38,9 +38,8 @@ pub(super) fn add_tables(document: &mut Document, outcomes: &[Outcome], policies
          budget is compared at equal peak above, and by what it ends with here.",
     );
     for budget in budgets(outcomes) {
-        let all = scenes_and_budgets(outcomes);
-        let scenes = all.iter().filter(|(_, other)| *other == budget).map(|(scene, _)| *scene);
-        let scenes: Vec<&str> = scenes.collect();
+        let scenes =
+            distinct(outcomes.iter().filter(|run| run.budget == budget).map(|run| &*run.scene));
         let title =
             |count| scenes.iter().map(move |scene| Column::text(&format!("{scene}, {count}")));
         let columns = title("at the end").chain(title("peak"));
@@ -88,14 +87,8 @@ mod tests {
     use super::*;
     use crate::outcome::sample;
 
-    fn run(
-        policy: &str,
-        scene: &str,
-        budget: usize,
-        seed: u32,
-        [rows, peak_rows]: [usize; 2],
-    ) -> Outcome {
-        let scene = scene.to_owned();
+    fn run(policy: &str, scene: &str, budget: usize, seed: u32, rows: [usize; 2]) -> Outcome {
+        let (scene, [rows, peak_rows]) = (scene.to_owned(), rows);
         Outcome { scene, budget, rows, peak_rows, ..sample(policy, "", seed, 30.0) }
     }
 

@@ -19,8 +19,7 @@ use super::difference::{Difference, Pair};
 use super::outcome::Outcome;
 use super::planned_run::PlannedRun;
 use super::{EngineArgs, Finished, Study, distinct, labels, shared_options};
-use densify_core::numbers;
-use densify_core::numbers::grouped;
+use densify_core::numbers::{self, grouped};
 use densify_run::failure::Failure;
 use densify_run::{Observer, Partial};
 use policy_variant::PolicyVariant;
@@ -279,12 +278,9 @@ mod tests {
         let names = || registered.iter().map(|entry| entry.name.to_owned());
         let without = |left_out: &str| names().filter(|name| name != left_out).collect::<Vec<_>>();
         assert_eq!(expanded("all"), Ok(names().collect()));
-        let vanilla = "vanilla".to_owned();
-        assert_eq!(
-            expanded("vanilla,all"),
-            Ok([vec![vanilla.clone()], without("vanilla")].concat())
-        );
-        assert_eq!(expanded("all,vanilla"), Ok([without("vanilla"), vec![vanilla]].concat()));
+        let (vanilla, others) = (vec!["vanilla".to_owned()], without("vanilla"));
+        assert_eq!(expanded("vanilla,all"), Ok([&*vanilla, &others].concat()));
+        assert_eq!(expanded("all,vanilla"), Ok([&*others, &vanilla].concat()));
         // A policy with parameters is an additional one.
         let with = expanded("diet:rho=0,all").expect("they are known");
         assert_eq!((with[0].as_str(), with[1..].to_vec()), ("diet:rho=0", names().collect()));

@@ -123,8 +123,8 @@ pub(super) fn format(outcomes: &[Outcome], policies: &[String]) -> String {
             standing.difference.map(format).unwrap_or_default(),
         ];
         for (standings, score) in [&ssim, &flip] {
-            cells.push(number_or_dash(standings[index].mean, score.digits));
-            cells.push(standings[index].rank());
+            let Standing { mean, .. } = standings[index];
+            cells.extend([number_or_dash(mean, score.digits), standings[index].rank()]);
         }
         cells.extend([kept.len().to_string(), over]);
         table.row(cells);
@@ -142,10 +142,6 @@ mod tests {
         Outcome { scene: scene.into(), ..sample(policy, "1000", seed, psnr) }
     }
 
-    fn names(names: &[&str]) -> Vec<String> {
-        names.iter().copied().map(String::from).collect()
-    }
-
     #[test]
     fn ranks_are_by_paired_difference_and_less_error_is_better() {
         // b is better by 1 in all three seeds, c worse by 1; d like b.
@@ -153,7 +149,7 @@ mod tests {
         let all: Vec<Outcome> = (0..3)
             .flat_map(|seed| gain.map(|(policy, gain)| run(policy, "room", seed, 30.0 + gain)))
             .collect();
-        let policies = names(&["a", "b", "c", "d"]);
+        let policies = ["a", "b", "c", "d"].map(String::from);
         for score in &SCORES {
             let ranks = score.standings(&all, &policies).iter().map(|s| s.rank).collect::<Vec<_>>();
             assert_eq!(ranks, [Some(3), Some(1), Some(4), Some(1)], "{}", score.title);
@@ -181,15 +177,10 @@ rank  policy  PSNR [dB]  from a                  SSIM  rank    FLIP  rank  runs
     fn a_scene_without_one_policy_does_not_change_its_rank() {
         // b is better by 1 in the scene where it kept its budget, and broke it in the scene that is easy for both. By its
         // mean of 31 it would rank behind a with 35.
-        let mut broken = run("b", "easy", 0, 42.0);
-        broken.peak_rows = 1001;
-        let all = [
-            run("a", "hard", 0, 30.0),
-            run("a", "easy", 0, 40.0),
-            run("b", "hard", 0, 31.0),
-            broken,
-        ];
-        let policies = names(&["a", "b"]);
+        let broken = Outcome { peak_rows: 1001, ..run("b", "easy", 0, 42.0) };
+        let [a, b] = [run("a", "hard", 0, 30.0), run("b", "hard", 0, 31.0)];
+        let all = [a, run("a", "easy", 0, 40.0), b, broken];
+        let policies = ["a", "b"].map(String::from);
         let ranks = SCORES[0].standings(&all, &policies).iter().map(|s| s.rank).collect::<Vec<_>>();
         assert_eq!(ranks, [Some(2), Some(1)]);
         let text = format(&all, &policies);
@@ -201,10 +192,10 @@ rank  policy  PSNR [dB]  from a                  SSIM  rank    FLIP  rank  runs
     fn what_broke_every_budget_has_no_rank() {
         let broken = Outcome { peak_rows: 1001, ..run("b", "room", 0, 99.0) };
         let all = [broken, run("a", "room", 0, 30.0), run("c", "room", 0, 29.0)];
-        let text = table(&all, &names(&["a", "b", "c"])).to_string();
+        let text = table(&all, &["a", "b", "c"].map(String::from)).to_string();
         assert!(text.contains("| b | not ranked: no pair kept its budget | – | – |"), "{text}");
         assert!(text.contains("| c | -1.00, one run | 0 of 1 | 2 |"), "{text}");
-        let text = format(&all, &names(&["b", "a", "c"]));
+        let text = format(&all, &["b", "a", "c"].map(String::from));
         // Without runs of the first policy there are no differences.
         let mut ranked = text.lines().skip(1).filter(|line| !line.trim_start().starts_with('–'));
         assert_eq!(ranked.next(), None, "{text}");

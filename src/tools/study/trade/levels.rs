@@ -56,9 +56,7 @@ pub(super) fn factors(
         for name in names {
             match checked_factor(study, train, name, &[]) {
                 Ok(factor) => factors.push(factor),
-                Err(failure) => {
-                    observer.say(format_args!("note: {name} is left out: {failure}"));
-                }
+                Err(error) => observer.say(format_args!("note: {name} is left out: {error}")),
             }
         }
         return Ok(factors);

@@ -104,14 +104,12 @@ fn draw_points(
     for point in points {
         let at = (point.seconds, point.psnr);
         let filled = colour(point.peak, peaks).filled();
-        let radius = if point.is_optimal { 6 } else { 4 };
-        let ink =
-            if point.is_optimal { BLACK.to_rgba() } else { RGBColor(120, 120, 120).to_rgba() };
-        let label =
-            Text::new(point.name.clone(), (9, -5), ("sans-serif", 11).into_font().color(&ink));
-        chart.draw_series(std::iter::once(
-            EmptyElement::at(at) + Circle::new((0, 0), radius, filled) + label,
-        ))?;
+        let (radius, ink) =
+            if point.is_optimal { (6, BLACK) } else { (4, RGBColor(120, 120, 120)) };
+        let font = ("sans-serif", 11).into_font().color(&ink);
+        let label = Text::new(point.name.clone(), (9, -5), font);
+        let element = EmptyElement::at(at) + Circle::new((0, 0), radius, filled) + label;
+        chart.draw_series([element])?;
     }
     draw_scale(area, peaks)
 }

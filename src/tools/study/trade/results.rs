@@ -69,19 +69,16 @@ impl Results {
         self.runs(knob, level).filter_map(|run| Some((run, base(run)?))).collect()
     }
 
-    fn differences<'a>(&'a self, knob: &str, level: &str, measure: Measure) -> Vec<Pair<'a>> {
-        let pair = |(run, base): (&'a Outcome, &Outcome)| {
-            let difference = measure(run)? - measure(base)?;
-            Some(Pair { scene: &run.scene, seed: run.seed, difference })
-        };
-        self.pairs(knob, level).into_iter().filter_map(pair).collect()
-    }
-
     fn effect(&self, factor: &Factor, level: &str) -> Option<Effect> {
         let name = &*factor.name;
-        let difference =
-            |measure: Measure| Difference::new(&self.differences(name, level, measure));
         let pairs = self.pairs(name, level);
+        let difference = |measure: Measure| {
+            let pairs = pairs.iter().filter_map(|(run, base)| {
+                let difference = measure(run)? - measure(base)?;
+                Some(Pair { scene: &run.scene, seed: run.seed, difference })
+            });
+            Difference::new(&pairs.collect::<Vec<_>>())
+        };
         let identical = pairs.iter().filter(|(run, base)| run.model == base.model).count();
         Some(Effect {
             factor: factor.clone(),
@@ -103,9 +100,8 @@ impl Results {
         level: &str,
         measure: Measure,
     ) -> Option<f64> {
-        let values: Option<Vec<f64>> =
-            self.runs(knob, level).filter(|run| run.scene == scene).map(measure).collect();
-        mean(values?)
+        let runs = self.runs(knob, level).filter(|run| run.scene == scene);
+        mean(runs.map(measure).collect::<Option<Vec<f64>>>()?)
     }
 
     /// Mean peak memory of the runs with a factor at a level in a scene `[MiB]`.

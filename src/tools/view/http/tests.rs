@@ -60,6 +60,12 @@ fn read_one(mut stream: &TcpStream, body: usize) -> String {
     String::from_utf8(bytes).unwrap()
 }
 
+/// Requests `/a`, which the server finds.
+fn get(stream: &mut TcpStream) {
+    stream.write_all(GET.as_bytes()).unwrap();
+    assert!(read_one(stream, 3).contains(" 200 "));
+}
+
 #[test]
 fn a_connection_answers_one_request_after_another() {
     with_server(|connect| {
@@ -115,9 +121,7 @@ fn invalid_requests_get_a_short_error_and_the_next_connection_is_served() {
             assert!(text.starts_with(&format!("HTTP/1.1 {status} ")), "{request}: {text}");
             assert!(text.len() < 900, "{text}");
         }
-        let mut stream = connect();
-        stream.write_all(GET.as_bytes()).unwrap();
-        assert!(read_one(&stream, 3).contains(" 200 "));
+        get(&mut connect());
     });
 }
 
@@ -125,8 +129,7 @@ fn invalid_requests_get_a_short_error_and_the_next_connection_is_served() {
 fn a_thousand_idle_connections_keep_nobody_out() {
     with_server(|connect| {
         let mut known = connect();
-        known.write_all(GET.as_bytes()).unwrap();
-        read_one(&known, 3);
+        get(&mut known);
         // Some send nothing, others an incomplete request.
         let idle: Vec<TcpStream> = (0..1000)
             .map(|number| {
@@ -137,12 +140,9 @@ fn a_thousand_idle_connections_keep_nobody_out() {
                 stream
             })
             .collect();
-        let mut stream = connect();
-        stream.write_all(GET.as_bytes()).unwrap();
-        assert!(read_one(&stream, 3).contains(" 200 "));
+        get(&mut connect());
         // A connection that has sent a request stays open.
-        known.write_all(GET.as_bytes()).unwrap();
-        assert!(read_one(&known, 3).contains(" 200 "));
+        get(&mut known);
         let mut closed = 0;
         for mut stream in &idle {
             stream.set_nonblocking(true).unwrap();

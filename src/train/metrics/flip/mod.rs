@@ -248,9 +248,8 @@ fn responses(
     let width = pair.width;
     let radius = filters.radius();
     // The rows within the kernels' radius; the outermost row is repeated beyond the border.
-    let lines = first..last + 2 * radius;
     let mut planes = [const { Vec::new() }; 3];
-    for line in lines {
+    for line in first..last + 2 * radius {
         let y = line.saturating_sub(radius).min(pair.height - 1);
         for p in y * width..(y + 1) * width {
             let channels = opponents([0, 1, 2].map(|c| linear(value(pair, p, c, render))));
@@ -270,8 +269,7 @@ fn responses(
     // Luminance in [0, 1]; derivatives ignore an offset.
     let luminance: Vec<f64> = planes[0].iter().map(|y| (y + 16.0) / 116.0).collect();
     let [smooth, first_derivative, second_derivative] = &filters.feature;
-    let along = [smooth, first_derivative, second_derivative]
-        .map(|kernel| across(&luminance, width, kernel));
+    let along = filters.feature.each_ref().map(|kernel| across(&luminance, width, kernel));
     let derivative = |x: usize, kernel: &[f64]| {
         let mut sum = vec![0.0; rows * width];
         add_down(&mut sum, &along[x], width, kernel, radius);
@@ -279,15 +277,14 @@ fn responses(
     };
     let edges = [derivative(1, smooth), derivative(0, first_derivative)];
     let points = [derivative(2, smooth), derivative(0, second_derivative)];
-    (0..rows * width)
-        .map(|i| {
-            let rgb = rgb_of_opponents([0, 1, 2].map(|c| filtered[c][i]));
-            PixelResponse {
-                colour: hunt_adjusted_lab(rgb.map(|v| v.clamp(0.0, 1.0))),
-                features: [&edges, &points].map(|[x, y]| x[i].hypot(y[i])),
-            }
-        })
-        .collect()
+    let response = |i: usize| {
+        let rgb = rgb_of_opponents([0, 1, 2].map(|c| filtered[c][i]));
+        PixelResponse {
+            colour: hunt_adjusted_lab(rgb.map(|v| v.clamp(0.0, 1.0))),
+            features: [&edges, &points].map(|[x, y]| x[i].hypot(y[i])),
+        }
+    };
+    (0..rows * width).map(response).collect()
 }
 
 /// Channel `c` of pixel `p`, sRGB-encoded. Masked pixels of the render have the value of the target.

@@ -3,16 +3,11 @@
 use super::*;
 
 fn target(width: u32, height: u32, value: impl Fn(f64, f64, f64) -> f64) -> Image8 {
-    let mut rgb = Vec::new();
-    for y in 0..height {
-        for x in 0..width {
-            for c in 0..3 {
-                let value = value(f64::from(x), f64::from(y), f64::from(c));
-                rgb.push((255.0 * value).round() as u8);
-            }
-        }
-    }
-    Image8 { width, height, rgb, alpha: None, mask: None }
+    let rgb = (0..3 * width * height).map(|i| {
+        let (x, y, c) = (i / 3 % width, i / 3 / width, i % 3);
+        (255.0 * value(x.into(), y.into(), c.into())).round() as u8
+    });
+    Image8 { width, height, rgb: rgb.collect(), alpha: None, mask: None }
 }
 
 fn as_render(image: &Image8) -> Vec<f32> {

@@ -1,7 +1,7 @@
 //! Measures the weights of rows in the training views, and whether their positions are empty.
 
 use densify_policies::policy::{AuxColumn, AuxRequest};
-use densify_scenegen::{Camera as RayCamera, GBuffer};
+use densify_scenegen::GBuffer;
 use glam::DVec3;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
@@ -70,13 +70,12 @@ impl Visibility {
                 *empty += u32::from(sees_through(&world, &g_buffer, place));
             });
             let surface = ground.truth.surface();
-            samples.par_iter_mut().filter(|(_, views)| *views < MIN_VIEWS).for_each(
-                |(at, views)| {
-                    *views += u32::from(
-                        in_image(&ray_camera, *at) && !surface.blocked(ray_camera.centre, *at),
-                    );
-                },
-            );
+            let open = samples.par_iter_mut().filter(|(_, views)| *views < MIN_VIEWS);
+            open.for_each(|(at, views)| {
+                let (pixel, depth) = ray_camera.project(*at);
+                let is_shown = depth > 0.0 && ray_camera.contains(pixel);
+                *views += u32::from(is_shown && !surface.blocked(ray_camera.centre, *at));
+            });
         }
         let enough = samples.into_iter().filter(|(_, views)| *views >= MIN_VIEWS);
         visibility.samples = enough.map(|(place, _)| place).collect();
@@ -91,15 +90,10 @@ impl Visibility {
         camera: &Camera,
         request: &AuxRequest,
     ) -> Result<(), densify_render::BackendError> {
-        let pixels = camera.width as usize * camera.height as usize;
+        let Camera { width, height, .. } = *camera;
+        let pixels = width as usize * height as usize;
         // The requested weights do not depend on the target.
-        let target = Image8 {
-            width: camera.width,
-            height: camera.height,
-            rgb: vec![0; 3 * pixels],
-            alpha: None,
-            mask: None,
-        };
+        let target = Image8 { width, height, rgb: vec![0; 3 * pixels], alpha: None, mask: None };
         let output = backend.observe(&AuxInput {
             step: 1,
             view: 0,
@@ -167,11 +161,6 @@ fn sees_through(camera: &Camera, g_buffer: &GBuffer, place: DVec3) -> bool {
     }
     let shown = g_buffer.depth[pixel.y as usize * g_buffer.width as usize + pixel.x as usize];
     shown <= 0.0 || depth < f64::from(shown)
-}
-
-fn in_image(camera: &RayCamera, place: DVec3) -> bool {
-    let (pixel, depth) = camera.project(place);
-    depth > 0.0 && camera.contains(pixel)
 }
 
 /// Samples of uniform density on the triangles, in the order of the triangles.
