@@ -1,12 +1,13 @@
 //! Readers of everything that other programs write, datasets and models of Gaussian splats in all formats, and the
 //! writers of model formats. This layer knows no backend and no run.
 //!
-//! Its modules in order, each using only those before it: `error`, `ply`, [`points`], [`models`], [`dataset`],
+//! Its modules in order, each using only those before it: `error`, `picture_file`, `ply`, [`points`], [`models`], [`dataset`],
 //! [`track_colours`] and [`views`].
 
 pub mod dataset;
 mod error;
 pub mod models;
+mod picture_file;
 mod ply;
 pub mod points;
 pub mod track_colours;

@@ -195,7 +195,10 @@ const MODULES: [(&str, &[&str]); 5] = [
             "camera_path",
         ],
     ),
-    ("src/data", &["error", "ply", "models", "points", "dataset", "track_colours", "views"]),
+    (
+        "src/data",
+        &["error", "picture_file", "ply", "models", "points", "dataset", "track_colours", "views"],
+    ),
     (
         "src/render",
         &[

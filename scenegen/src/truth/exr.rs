@@ -19,7 +19,7 @@ pub(super) fn read<const N: usize>(
 ) -> Result<Option<[Vec<f32>; N]>, Error> {
     let bytes = fs::read(path).map_err(Error::io(path))?;
     let bad = |element: &str, problem: String| Error::malformed(path, element, problem, REMEDY);
-    let meta = MetaData::read_from_buffered(Cursor::new(&bytes), false);
+    let meta = MetaData::read_from_buffered(Cursor::new(&*bytes), false);
     let meta = meta.map_err(|error| bad("header", error.to_string()))?;
     let [header] = &meta.headers[..] else {
         return Err(bad("header", format!("it has {} layers instead of one", meta.headers.len())));
@@ -48,7 +48,7 @@ pub(super) fn read<const N: usize>(
         .first_valid_layer()
         .all_attributes()
         .non_parallel()
-        .from_buffered(Cursor::new(&bytes));
+        .from_buffered(Cursor::new(&*bytes));
     let image = image.map_err(|error| bad("pixels", error.to_string()))?;
     let mut all = channels.map(|_| Vec::new());
     for (values, name) in all.iter_mut().zip(channels) {

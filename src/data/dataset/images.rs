@@ -3,13 +3,13 @@
 //! Files are untrusted: sides, pixels and decoded bytes are checked before anything is allocated.
 
 use std::fs::File;
-use std::io::{BufReader, Cursor, Read, Seek};
+use std::io::{BufRead, BufReader, Cursor, Read, Seek};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use image::error::ImageFormatHint;
 use image::metadata::Orientation;
-use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits};
+use image::{DynamicImage, ImageDecoder, ImageFormat, Limits};
 
 use super::LoadError;
 pub use super::image_cache::{ImageCache, ImageDemand};
@@ -18,6 +18,7 @@ pub use super::mask::{Hides, Mask};
 use super::options::MaskMode;
 pub use super::source_file::SourceFile;
 use super::undistort::Undistortion;
+use crate::picture_file;
 use densify_core::files;
 use densify_core::image::Window;
 use densify_core::image::resample;
@@ -241,11 +242,11 @@ fn header_of(path: &Path, file: &mut File) -> Result<ImageHeader, LoadError> {
     if let Some(problem) = files::wrong_kind(&start) {
         return Err(LoadError::malformed(path, "the image", problem, "put the image there"));
     }
-    let header = match parse_header(ImageReader::new(Cursor::new(&start)), file_bytes) {
+    let header = match parse_header(Cursor::new(&start), file_bytes) {
         // The header may follow a long preview or colour profile.
         Err(_) if file_bytes > HEADER_BYTES => {
             file.rewind().map_err(LoadError::io(path))?;
-            parse_header(ImageReader::new(BufReader::new(file)), file_bytes)
+            parse_header(BufReader::new(file), file_bytes)
         }
         header => header,
     }
@@ -262,11 +263,11 @@ fn header_of(path: &Path, file: &mut File) -> Result<ImageHeader, LoadError> {
     Ok(header)
 }
 
-fn parse_header<R: std::io::BufRead + Seek>(
-    reader: ImageReader<R>,
+fn parse_header(
+    input: impl BufRead + Seek,
     file_bytes: u64,
 ) -> Result<ImageHeader, image::ImageError> {
-    let mut reader = reader.with_guessed_format().map_err(image::ImageError::IoError)?;
+    let mut reader = picture_file::reader(input).map_err(image::ImageError::IoError)?;
     // Other crates of the build may enable more decoders.
     if let Some(format) = reader.format().filter(|format| !FORMATS.contains(format)) {
         let hint = ImageFormatHint::Exact(format);
@@ -298,9 +299,7 @@ pub(super) fn decode_checked(
 }
 
 fn decode_file(path: &Path, file: File) -> Result<DynamicImage, LoadError> {
-    let mut reader = ImageReader::new(BufReader::new(file))
-        .with_guessed_format()
-        .map_err(LoadError::io(path))?;
+    let mut reader = picture_file::reader(BufReader::new(file)).map_err(LoadError::io(path))?;
     if reader.format() == Some(ImageFormat::Jpeg) {
         let mut bytes = Vec::new();
         let mut input = reader.into_inner().take(MAX_FILE_BYTES);

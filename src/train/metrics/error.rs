@@ -59,9 +59,6 @@ pub enum EvaluateError {
     /// The model or its signals cannot be copied from the device.
     #[error(transparent)]
     Model(#[from] BackendError),
-    /// The model has more rows than the neighbour search supports.
-    #[error("{0} rows are too many for the neighbour search")]
-    TooManyRows(usize),
     /// The caller has stopped the evaluation.
     #[error("stopped before all views were measured")]
     Stopped,

@@ -3,7 +3,7 @@
 use std::io::{Cursor, Read};
 use std::path::Path;
 
-use image::{ImageDecoder, ImageFormat, ImageReader};
+use image::{ImageDecoder, ImageFormat};
 use serde::Deserialize;
 
 use super::layout::{CODEBOOK, FIRST_LARGEST, META, PALETTE_WIDTH};
@@ -12,6 +12,7 @@ use crate::models::quantise::{from_smallest_three, quantised_logit};
 use crate::models::rows::{Row, Rows, SplatFile};
 use crate::models::zip::ZipReader;
 use crate::models::{ModelFile, siblings};
+use crate::picture_file;
 use densify_core::files::most_unpacked;
 use densify_core::gaussians::sh_coefficients;
 
@@ -190,8 +191,7 @@ fn quaternion(bytes: [usize; 3], alpha: u8) -> [f32; 4] {
 /// Decodes a WebP or PNG after checking its size.
 fn decode(path: &Path, name: &str, bytes: &[u8], length: u64) -> Result<Picture, LoadError> {
     let bad = |problem: String| LoadError::damaged(path, name, problem);
-    let reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format();
-    let reader = reader.map_err(|error| bad(error.to_string()))?;
+    let reader = picture_file::reader(Cursor::new(bytes)).map_err(|e| bad(e.to_string()))?;
     if !matches!(reader.format(), Some(ImageFormat::WebP | ImageFormat::Png)) {
         return Err(bad("it is neither WebP nor PNG".into()));
     }

@@ -13,7 +13,7 @@ pub(super) fn errors(
     ground: &KnownScene<'_>,
 ) -> Result<CentreErrors, EvaluateError> {
     let diagonal = ground.diagonal();
-    let finder = Finder::new(rows)?;
+    let finder = Finder::new(rows);
     let to_centres: Vec<f64> =
         visibility.samples.par_iter().map(|&sample| finder.distance(sample) / diagonal).collect();
     let to_mesh: Vec<(f64, f64)> = rows

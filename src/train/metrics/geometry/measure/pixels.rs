@@ -41,7 +41,7 @@ impl<'a> Pixels<'a> {
         Ok(Self {
             rows,
             ground,
-            finder: Finder::new(rows)?,
+            finder: Finder::new(rows),
             surface: 0,
             covered: 0,
             squares: 0.0,

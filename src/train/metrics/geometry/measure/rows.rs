@@ -1,13 +1,11 @@
 //! The rows of a model in world coordinates, with their distances from the surface.
 
-use std::num::NonZeroUsize;
-
 use glam::{DMat3, DQuat, DVec3};
-use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rayon::prelude::*;
+use rstar::RTree;
+use rstar::primitives::GeomWithData;
 
 use super::KnownScene;
-use crate::metrics::EvaluateError;
 use densify_core::gaussians::{Gaussians, sigmoid};
 
 /// Opacity above which a row counts as part of the surface.
@@ -58,47 +56,34 @@ impl Rows {
 
 /// Finds solid rows near a point.
 pub(super) struct Finder {
-    tree: Option<ImmutableKdTree<f64, 3>>,
-    /// Row of each entry of the tree.
-    rows: Vec<usize>,
+    /// Centres with their rows.
+    tree: RTree<GeomWithData<[f64; 3], usize>>,
 }
 
 impl Finder {
-    pub(super) fn new(rows: &Rows) -> Result<Self, EvaluateError> {
-        let solid: Vec<usize> = (0..rows.len())
-            .filter(|&row| rows.opacities[row] > SOLID && rows.centres[row].is_finite())
-            .collect();
-        let places: Vec<[f64; 3]> = solid.iter().map(|&row| rows.centres[row].to_array()).collect();
-        let tree = if places.is_empty() {
-            None
-        } else {
-            let tree = ImmutableKdTree::new_from_slice(&places);
-            Some(tree.map_err(|_| EvaluateError::TooManyRows(places.len()))?)
-        };
-        Ok(Self { tree, rows: solid })
+    pub(super) fn new(rows: &Rows) -> Self {
+        let solid = (0..rows.len())
+            .filter(|&row| rows.opacities[row] > SOLID && rows.centres[row].is_finite());
+        let places = solid.map(|row| GeomWithData::new(rows.centres[row].to_array(), row));
+        Self { tree: RTree::bulk_load(places.collect()) }
     }
 
     /// Distance to the nearest solid centre; infinite if there is none.
     pub(super) fn distance(&self, place: DVec3) -> f64 {
-        let Some(tree) = &self.tree else { return f64::INFINITY };
-        let query = place.to_array();
-        let found =
-            tree.query(&query).nearest_n::<SquaredEuclidean<f64>>(NonZeroUsize::MIN).execute();
-        found.iter().map(|hit| hit.distance.sqrt()).fold(f64::INFINITY, f64::min)
+        let nearest = self.tree.nearest_neighbor(place.to_array());
+        nearest.map_or(f64::INFINITY, |hit| DVec3::from(*hit.geom()).distance(place))
     }
 
     /// The shortest axis of the densest solid row at a point, among those with the nearest centres.
     pub(super) fn normal(&self, rows: &Rows, place: DVec3) -> Option<DVec3> {
-        let tree = self.tree.as_ref()?;
-        let query = place.to_array();
-        let count = NonZeroUsize::new(NEIGHBOURS.min(self.rows.len()))?;
-        let found = tree.query(&query).nearest_n::<SquaredEuclidean<f64>>(count).execute();
         let exponent = |row: usize| {
             let local = rows.axes[row].transpose() * (place - rows.centres[row]) / rows.scales[row];
             f64::from(rows.opacities[row]).ln() - 0.5 * local.length_squared()
         };
-        let near = found.iter().map(|hit| self.rows[hit.item as usize]);
-        let row = near.max_by(|&a, &b| exponent(a).total_cmp(&exponent(b)).then(b.cmp(&a)))?;
+        let near = self.tree.nearest_neighbor_iter(place.to_array()).take(NEIGHBOURS);
+        let row = near
+            .map(|hit| hit.data)
+            .max_by(|&a, &b| exponent(a).total_cmp(&exponent(b)).then(b.cmp(&a)))?;
         let scale = rows.scales[row];
         let shortest = (0..3).min_by(|&a, &b| scale[a].total_cmp(&scale[b]))?;
         Some(rows.axes[row].col(shortest))
