@@ -5,6 +5,8 @@
 //
 // Sums and sorts are exact and have a fixed order: no result depends on timing. An entry's index
 // before the sort is its slot: the slots of a row are contiguous, in the order of its tiles.
+//
+// One file, because counting, emitting and sorting share the state and the counters.
 
 @group(0) @binding(1) var<storage, read_write> state: State;
 // Workgroup counts of indirect dispatches, three numbers each; see ARGS_*.

@@ -375,9 +375,10 @@ mod tests {
         assert_eq!(wrong(Update { opacity, ..Update::NONE }), Some("opacity"));
         assert_eq!(wrong(Update { scale: ScaleRule::Uniform(0.0), ..Update::NONE }), Some("scale"));
         for bad in NOT_FINITE {
-            let position = Some([0.0, 0.0, bad]);
-            assert_eq!(wrong(Update { position, ..Update::NONE }), Some("position"), "{bad}");
-            assert_eq!(wrong(Update { colour: position, ..Update::NONE }), Some("colour"), "{bad}");
+            let three = Some([0.0, 0.0, bad]);
+            let position = Update { position: three, ..Update::NONE };
+            assert_eq!(wrong(position), Some("position"), "{bad}");
+            assert_eq!(wrong(Update { colour: three, ..Update::NONE }), Some("colour"), "{bad}");
         }
         assert_eq!(wrong(Update { colour: Some([-1.5, 0.0, 2.0]), ..Update::NONE }), None);
         let beyond = Some([0.0, 2.0 * COLOUR_MAX, 0.0]);

@@ -28,40 +28,73 @@ fn every_registered_policy_conforms() {
     }
 }
 
-/// The faults of a [`Faulty`] policy, and the checks that find them.
-const FAULTS: [(&str, Option<Check>); 28] = [
-    ("none", None),
-    ("reads undeclared", Some(Check::ReadsOnlyDeclared)),
-    ("reads undeclared if present", Some(Check::ReadsOnlyDeclared)),
-    ("reads undeclared candidates", Some(Check::ReadsOnlyDeclared)),
-    ("uses its own randomness", Some(Check::IsDeterministic)),
-    ("restores nothing", Some(Check::RestoresState)),
-    ("accepts any state", Some(Check::RejectsForeignState)),
-    ("panics on nan", Some(Check::NeverFails)),
-    ("fails when refused", Some(Check::NeverFails)),
-    ("prunes all", Some(Check::LeavesARow)),
-    ("replaces the plan", Some(Check::KeepsPlan)),
-    ("has random needs", Some(Check::IsDeterministic)),
-    ("wants views at random", Some(Check::IsDeterministic)),
-    ("wants views undeclared", Some(Check::RequestsConsistently)),
-    ("reads undeclared column", Some(Check::ReadsOnlyDeclared)),
-    ("reads undeclared points", Some(Check::ReadsOnlyDeclared)),
-    ("saves only part", Some(Check::RestoresState)),
-    ("declares nan", Some(Check::DeclaresValidNumbers)),
-    ("has undeclared cadence", Some(Check::DeclaresValidNumbers)),
-    ("has nan terms late", Some(Check::DeclaresValidNumbers)),
-    ("shrinks images too far", Some(Check::DeclaresValidNumbers)),
-    // Depends on state that it does not save.
-    ("shrinks images unsaved", Some(Check::RestoresState)),
-    ("never edits", Some(Check::Edits)),
-    // Prunes one row in a thousand, chosen by the system's clock.
-    ("reads the clock", Some(Check::IsDeterministic)),
-    ("panics on many rows", Some(Check::NeverFails)),
-    // Counts events of models above 1,000 rows, and does not save the count.
-    ("forgets many rows", Some(Check::RestoresState)),
-    // Panics if its update with the row's own position is refused.
-    ("trusts positions", Some(Check::NeverFails)),
-    ("updates undeclared", Some(Check::DeclaresEdits)),
+/// The fault of a [`Faulty`] policy.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+enum Fault {
+    #[default]
+    None,
+    ReadsUndeclared,
+    ReadsUndeclaredIfPresent,
+    ReadsUndeclaredCandidates,
+    UsesItsOwnRandomness,
+    RestoresNothing,
+    AcceptsAnyState,
+    PanicsOnNan,
+    FailsWhenRefused,
+    PrunesAll,
+    ReplacesThePlan,
+    HasRandomNeeds,
+    WantsViewsAtRandom,
+    WantsViewsUndeclared,
+    ReadsUndeclaredColumn,
+    ReadsUndeclaredPoints,
+    SavesOnlyPart,
+    DeclaresNan,
+    HasUndeclaredCadence,
+    HasNanTermsLate,
+    ShrinksImagesTooFar,
+    /// Depends on state that it does not save.
+    ShrinksImagesUnsaved,
+    NeverEdits,
+    /// Prunes one row in a thousand, chosen by the system's clock.
+    ReadsTheClock,
+    PanicsOnManyRows,
+    /// Counts events of models above 1,000 rows, and does not save the count.
+    ForgetsManyRows,
+    /// Panics if its update with the row's own position is refused.
+    TrustsPositions,
+    UpdatesUndeclared,
+}
+
+const FAULTS: [(Fault, Option<Check>); 28] = [
+    (Fault::None, None),
+    (Fault::ReadsUndeclared, Some(Check::ReadsOnlyDeclared)),
+    (Fault::ReadsUndeclaredIfPresent, Some(Check::ReadsOnlyDeclared)),
+    (Fault::ReadsUndeclaredCandidates, Some(Check::ReadsOnlyDeclared)),
+    (Fault::UsesItsOwnRandomness, Some(Check::IsDeterministic)),
+    (Fault::RestoresNothing, Some(Check::RestoresState)),
+    (Fault::AcceptsAnyState, Some(Check::RejectsForeignState)),
+    (Fault::PanicsOnNan, Some(Check::NeverFails)),
+    (Fault::FailsWhenRefused, Some(Check::NeverFails)),
+    (Fault::PrunesAll, Some(Check::LeavesARow)),
+    (Fault::ReplacesThePlan, Some(Check::KeepsPlan)),
+    (Fault::HasRandomNeeds, Some(Check::IsDeterministic)),
+    (Fault::WantsViewsAtRandom, Some(Check::IsDeterministic)),
+    (Fault::WantsViewsUndeclared, Some(Check::RequestsConsistently)),
+    (Fault::ReadsUndeclaredColumn, Some(Check::ReadsOnlyDeclared)),
+    (Fault::ReadsUndeclaredPoints, Some(Check::ReadsOnlyDeclared)),
+    (Fault::SavesOnlyPart, Some(Check::RestoresState)),
+    (Fault::DeclaresNan, Some(Check::DeclaresValidNumbers)),
+    (Fault::HasUndeclaredCadence, Some(Check::DeclaresValidNumbers)),
+    (Fault::HasNanTermsLate, Some(Check::DeclaresValidNumbers)),
+    (Fault::ShrinksImagesTooFar, Some(Check::DeclaresValidNumbers)),
+    (Fault::ShrinksImagesUnsaved, Some(Check::RestoresState)),
+    (Fault::NeverEdits, Some(Check::Edits)),
+    (Fault::ReadsTheClock, Some(Check::IsDeterministic)),
+    (Fault::PanicsOnManyRows, Some(Check::NeverFails)),
+    (Fault::ForgetsManyRows, Some(Check::RestoresState)),
+    (Fault::TrustsPositions, Some(Check::NeverFails)),
+    (Fault::UpdatesUndeclared, Some(Check::DeclaresEdits)),
 ];
 
 /// Shared state that makes policies nondeterministic.
@@ -75,13 +108,13 @@ fn next_call() -> u64 {
 #[serde(deny_unknown_fields, default)]
 struct Params {
     every: u32,
-    fault: String,
+    fault: Fault,
 }
 
 /// A policy with state: every third event prunes the faintest row; the others clone two rows, one by
 /// gradient and one at random, and rewrite the first row. It conforms except for its fault.
 struct Faulty {
-    fault: String,
+    fault: Fault,
     events: u64,
     /// Hash of the numbers seen in auxiliary views.
     seen: u64,
@@ -98,7 +131,7 @@ impl ConfiguredPolicy for Faulty {
 }
 
 impl Faulty {
-    fn has(&self, fault: &str) -> bool {
+    fn has(&self, fault: Fault) -> bool {
         self.fault == fault
     }
 }
@@ -107,17 +140,17 @@ impl DensityPolicy for Faulty {
     fn needs(&self, _scene: &SceneInfo) -> Needs {
         let mut signals =
             SignalSet::from([Signal::Opacity, Signal::ScreenGradient, Signal::Position]);
-        if self.has("has random needs") && next_call().is_multiple_of(2) {
+        if self.has(Fault::HasRandomNeeds) && next_call().is_multiple_of(2) {
             signals = signals.with(Signal::Age);
         }
-        let detailed_edits = !self.has("updates undeclared");
+        let detailed_edits = !self.has(Fault::UpdatesUndeclared);
         let mut needs = Needs { signals, detailed_edits, ..Needs::default() };
-        if !self.has("wants views undeclared") {
+        if !self.has(Fault::WantsViewsUndeclared) {
             let columns = vec![AuxColumn::Depth];
-            let points = if self.has("reads undeclared points") { 0 } else { 2 };
+            let points = if self.has(Fault::ReadsUndeclaredPoints) { 0 } else { 2 };
             needs.aux = Some(AuxRequest { columns, points, ..AuxRequest::default() });
         }
-        if self.has("declares nan") {
+        if self.has(Fault::DeclaresNan) {
             needs.loss_terms.opacity = f32::NAN;
         }
         needs.cadence.all = 3;
@@ -131,18 +164,18 @@ impl DensityPolicy for Faulty {
 
     fn cadence(&self, step: u32) -> Cadence {
         let all = if step > 100 { 3 } else { 1 };
-        let sh_rest = if self.has("has undeclared cadence") && step > 90 { 2 } else { 1 };
+        let sh_rest = if self.has(Fault::HasUndeclaredCadence) && step > 90 { 2 } else { 1 };
         Cadence { all: if sh_rest > 1 { 0 } else { all }, sh_rest }
     }
 
     fn loss_terms(&self, step: u32, declared: LossTerms) -> LossTerms {
-        let is_wrong = self.has("has nan terms late") && step > 90;
+        let is_wrong = self.has(Fault::HasNanTermsLate) && step > 90;
         LossTerms { scale: if is_wrong { f32::NAN } else { 0.0 }, ..declared }
     }
 
     fn resolution(&self, step: u32) -> f64 {
-        let is_too_far = self.has("shrinks images too far") && step > 90;
-        let is_other = self.has("shrinks images unsaved") && self.unsaved > 2;
+        let is_too_far = self.has(Fault::ShrinksImagesTooFar) && step > 90;
+        let is_other = self.has(Fault::ShrinksImagesUnsaved) && self.unsaved > 2;
         if is_too_far {
             0.4
         } else if is_other {
@@ -153,12 +186,12 @@ impl DensityPolicy for Faulty {
     }
 
     fn aux_views(&self, step: u32, _rows: usize, _budget: usize) -> u32 {
-        let at_random = self.has("wants views at random") && next_call().is_multiple_of(2);
+        let at_random = self.has(Fault::WantsViewsAtRandom) && next_call().is_multiple_of(2);
         if at_random || step.is_multiple_of(10) { 2 } else { 0 }
     }
 
     fn observe(&mut self, view: &AuxView<'_>) -> PolicyResult {
-        if self.has("reads undeclared column") {
+        if self.has(Fault::ReadsUndeclaredColumn) {
             view.column(AuxColumn::Radius)?;
         }
         let bits = |x: f32| u64::from(x.to_bits());
@@ -173,19 +206,19 @@ impl DensityPolicy for Faulty {
 
     fn plan(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
         self.events += 1;
-        if self.has("shrinks images unsaved") {
+        if self.has(Fault::ShrinksImagesUnsaved) {
             self.unsaved += 1;
         }
         let opacity = now.signal(Signal::Opacity)?;
         let gradient = now.signal(Signal::ScreenGradient)?;
         let rows: Vec<u32> = (0..now.rows() as u32).collect();
-        if self.has("replaces the plan") {
+        if self.has(Fault::ReplacesThePlan) {
             let needs = self.needs(now.scene);
             *plan = EditPlan::new(now.rows(), plan.budget() + 1).allowing(&needs);
         }
-        match self.fault.as_str() {
-            "never edits" => return Ok(()),
-            "reads the clock" => {
+        match self.fault {
+            Fault::NeverEdits => return Ok(()),
+            Fault::ReadsTheClock => {
                 let now_ns = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
                 let chosen = now_ns.subsec_nanos() % (now.rows() as u32).max(1);
                 for row in (0..now.rows() as u32 / 1000).map(|i| (chosen + i) % now.rows() as u32) {
@@ -193,8 +226,8 @@ impl DensityPolicy for Faulty {
                 }
                 return Ok(());
             }
-            "panics on many rows" => assert!(now.rows() <= 1000, "too many rows"),
-            "forgets many rows" if now.rows() > 1000 => {
+            Fault::PanicsOnManyRows => assert!(now.rows() <= 1000, "too many rows"),
+            Fault::ForgetsManyRows if now.rows() > 1000 => {
                 let _ = plan.prune(self.unsaved % 1000);
                 self.unsaved += 1;
                 return Ok(());
@@ -202,60 +235,60 @@ impl DensityPolicy for Faulty {
             _ => {}
         }
         if self.events.is_multiple_of(3) {
-            let keep = if self.has("prunes all") { 0 } else { 1 };
+            let keep = if self.has(Fault::PrunesAll) { 0 } else { 1 };
             for row in smallest(rows, opacity, now.rows().saturating_sub(keep).min(1)) {
                 let _ = plan.prune(row);
             }
             return Ok(());
         }
-        if self.has("panics on nan") {
+        if self.has(Fault::PanicsOnNan) {
             assert!(gradient.iter().all(|g| !g.is_nan()), "a gradient is not a number");
         }
         let mut by_chance: Vec<f32> =
             rows.iter().map(|&row| rng.uniform(row ^ self.seen as u32, Purpose::Select)).collect();
         let mut by_gradient = gradient.to_vec();
-        if self.has("reads undeclared") {
+        if self.has(Fault::ReadsUndeclared) {
             by_gradient = now.signal(Signal::ScreenGradientAbs)?.to_vec();
         }
-        if self.has("reads undeclared if present") {
+        if self.has(Fault::ReadsUndeclaredIfPresent) {
             let better = now.signals.get(Signal::ScreenGradientAbs);
             by_gradient = better.unwrap_or(gradient).to_vec();
         }
-        if self.has("reads undeclared candidates") {
+        if self.has(Fault::ReadsUndeclaredCandidates) {
             by_gradient.truncate(now.candidates.len());
         }
-        if self.has("uses its own randomness") {
+        if self.has(Fault::UsesItsOwnRandomness) {
             for chance in &mut by_chance {
                 *chance = (next_call() % 7) as f32;
             }
         }
         for row in top_k(&by_gradient, 1).into_iter().chain(top_k(&by_chance, 1)) {
             let grown = plan.grow(row, clone_at([0.0; 3]));
-            if self.has("fails when refused") {
+            if self.has(Fault::FailsWhenRefused) {
                 grown.map_err(|refused| PolicyError::Other(refused.to_string()))?;
             }
         }
         let position = now.positions()?.first().copied();
         if let Err(Refused::BadValue(field)) = plan.update(0, Update { position, ..Update::NONE }) {
-            assert!(field == "position" && !self.has("trusts positions"), "a bad {field}");
+            assert!(field == "position" && !self.has(Fault::TrustsPositions), "a bad {field}");
         }
         Ok(())
     }
 
     fn save(&self) -> PolicyState {
-        if self.has("saves only part") {
+        if self.has(Fault::SavesOnlyPart) {
             return serde_json::json!({ "events": self.events, "seen": 0 });
         }
         serde_json::json!({ "events": self.events, "seen": self.seen })
     }
 
     fn restore(&mut self, state: PolicyState) -> PolicyResult {
-        if self.has("restores nothing") && state["events"].is_u64() {
+        if self.has(Fault::RestoresNothing) && state["events"].is_u64() {
             return Ok(());
         }
         match state["events"].as_u64() {
             Some(events) => self.events = events,
-            None if self.has("accepts any state") => {}
+            None if self.has(Fault::AcceptsAnyState) => {}
             None => return Err(PolicyError::State("no `events`".to_owned())),
         }
         self.seen = state["seen"].as_u64().unwrap_or_default();
@@ -264,9 +297,9 @@ impl DensityPolicy for Faulty {
 }
 
 /// The report on a policy with this fault.
-fn report(fault: &str) -> Result<(), Report> {
+fn report(fault: Fault) -> Result<(), Report> {
     let entry = PolicyEntry::new::<Faulty>("faulty", "for tests", "nowhere", "", ("tests.rs", 1));
-    check_policy_with(&entry, &Table::try_from(Params { every: 0, fault: fault.into() }).unwrap())
+    check_policy_with(&entry, &Table::try_from(Params { every: 0, fault }).unwrap())
 }
 
 #[test]
@@ -277,7 +310,7 @@ fn every_fault_is_found() {
         let found = report.as_ref().err().map_or(&[][..], |report| &report.failures);
         let is_found = |check| found.iter().any(|(failed, _)| *failed == check);
         if !expected.map_or(found.is_empty(), is_found) {
-            missed.push(format!("{fault}: {report:?}"));
+            missed.push(format!("{fault:?}: {report:?}"));
         }
     }
     assert!(missed.is_empty(), "{}", missed.join("\n"));
@@ -285,9 +318,11 @@ fn every_fault_is_found() {
 
 #[test]
 fn a_report_names_the_policy_and_the_step() {
-    let report = report("reads undeclared").unwrap_err().to_string();
-    let start = "policy `faulty` (tests.rs:1) does not conform:\n- failed: it reads only";
-    assert!(report.starts_with(start), "{report}");
+    let report = report(Fault::ReadsUndeclared).unwrap_err().to_string();
+    assert!(
+        report
+            .starts_with("policy `faulty` (tests.rs:1) does not conform:\n- failed: it reads only")
+    );
     assert!(report.contains("an empty model") && report.contains("step 5"), "{report}");
     assert!(report.contains("ScreenGradientAbs"), "{report}");
 }
@@ -321,7 +356,12 @@ impl DensityPolicy for Unbuildable {
     fn is_due(&self, _step: u32) -> bool {
         false
     }
-    fn plan(&mut self, _: &Snapshot<'_>, _: &PolicyRng, _: &mut EditPlan) -> PolicyResult {
+    fn plan(
+        &mut self,
+        _now: &Snapshot<'_>,
+        _rng: &PolicyRng,
+        _plan: &mut EditPlan,
+    ) -> PolicyResult {
         Ok(())
     }
 }

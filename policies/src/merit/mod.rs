@@ -123,10 +123,10 @@ impl ConfiguredPolicy for Merit {
 
 impl DensityPolicy for Merit {
     fn needs(&self, scene: &SceneInfo) -> Needs {
+        let gradient = self.params.gradient.signal();
         let mut signals =
-            SignalSet::from([Signal::VisibleCount, Signal::Opacity, Signal::WeightMax]);
+            SignalSet::from([Signal::VisibleCount, Signal::Opacity, Signal::WeightMax, gradient]);
         for (is_read, signal) in [
-            (true, self.params.gradient.signal()),
             (self.params.colour_weight > 0.0, Signal::ColourGradient),
             (self.params.small > 0.0, Signal::ScaleMax),
             (self.protected_age > 0.0, Signal::Age),

@@ -1,6 +1,6 @@
 //! Executes a compiled edit plan on the device, in place: encodes its operations as words, in chunks of fixed size,
-//! and dispatches them. `shaders/apply.wgsl` documents the encoding. One file,
-//! because encoding and dispatch must agree on chunks and order.
+//! and dispatches them. `shaders/apply.wgsl` documents the encoding. One file, because
+//! encoding and dispatch must agree on chunks and order.
 
 use densify_policies::plan::{
     Decay, OpacityRule, ParentFate, Placement, RowOps, ScaleRule, Update,

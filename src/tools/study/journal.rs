@@ -37,8 +37,8 @@ impl Journal {
         self.outcomes.iter().rev().find(|run| run.is_of(spec))
     }
 
-    /// Adds an outcome, writes the file, and returns the outcome.
-    pub(super) fn add(&mut self, outcome: Outcome) -> Result<&Outcome, FileError> {
+    /// Adds an outcome and writes the file.
+    pub(super) fn add(&mut self, outcome: Outcome) -> Result<(), FileError> {
         self.outcomes.push(outcome);
         write_atomically(&self.path, |out| {
             for outcome in &self.outcomes {
@@ -46,7 +46,6 @@ impl Journal {
                 out.write_all(b"\n")?;
             }
             Ok(())
-        })?;
-        Ok(&self.outcomes[self.outcomes.len() - 1])
+        })
     }
 }

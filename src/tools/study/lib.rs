@@ -88,7 +88,11 @@ impl<'a> Study<'a> {
             self.observer.say(format_args!("[{number}/{count}] {run}{done}"));
             let outcome = match known {
                 Some(outcome) => outcome,
-                None => self.journal.add(run.train(self.output)?)?.clone(),
+                None => {
+                    let outcome = run.train(self.output)?;
+                    self.journal.add(outcome.clone())?;
+                    outcome
+                }
             };
             let (factor, level) = (run.factor.clone(), run.level.clone());
             outcomes.push(Outcome { factor, level, ..outcome });
@@ -102,7 +106,7 @@ impl<'a> Study<'a> {
         for run in runs {
             if self.journal.outcome(&run.spec).is_none() {
                 match run.recorded(self.output) {
-                    Some(outcome) => _ = self.journal.add(outcome)?,
+                    Some(outcome) => self.journal.add(outcome)?,
                     None => has_open = true,
                 }
             }

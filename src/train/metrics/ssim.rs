@@ -37,8 +37,12 @@ pub fn ssim(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Result<f
         let map = block_map(&pair, &window, rows.start, rows.end);
         let pixels = rows.start * pair.width..rows.end * pair.width;
         pixels.zip(map.chunks_exact(3)).fold([0.0; 2], |sum, (p, ssim)| {
-            let (weight, ssim) = (pair.weight(p), ssim.iter().sum::<f64>());
-            if weight > 0.0 { [sum[0] + weight * ssim, sum[1] + weight] } else { sum }
+            let weight = pair.weight(p);
+            if weight > 0.0 {
+                [sum[0] + weight * ssim.iter().sum::<f64>(), sum[1] + weight]
+            } else {
+                sum
+            }
         })
     });
     let [similarity, weight] = total(&sums)?;

@@ -3,7 +3,7 @@
 //!
 //! A halving is linear in the rows of its cluster, so the fit takes O(n log n) for n rows. Nothing is random.
 
-use std::cmp::Reverse;
+use std::cmp::Ordering;
 use std::collections::BinaryHeap;
 
 /// Iterations per halving.
@@ -17,13 +17,10 @@ pub(super) struct Palette {
     pub(super) labels: Vec<u32>,
 }
 
-/// The rows of one entry, as a range in the ordered list of all rows. Ties go to the first cluster in the list, so that
-/// the result is reproducible.
-#[derive(PartialEq, Eq, PartialOrd, Ord)]
+/// The rows of one entry, as a range in the ordered list of all rows.
 struct Cluster {
-    /// The bits of the error, which is never negative, so that they are in its order.
-    error: u64,
-    start: Reverse<usize>,
+    error: f64,
+    start: usize,
     end: usize,
 }
 
@@ -42,12 +39,13 @@ impl Palette {
         clusters.push(all.cluster(&order, 0, order.len()));
         let mut sides = Vec::new();
         while clusters.len() < entries {
-            let Some(Cluster { error, start: Reverse(start), end }) = clusters.pop() else { break };
-            let middle = if error > 0 { all.halve(&mut order[start..end], &mut sides) } else { 0 };
+            let Some(Cluster { error, start, end }) = clusters.pop() else { break };
+            let middle =
+                if error > 0.0 { all.halve(&mut order[start..end], &mut sides) } else { 0 };
             if middle == 0 || middle == end - start {
                 // The rows are equal, so they cannot be halved.
-                clusters.push(Cluster { error: 0, start: Reverse(start), end });
-                if error > 0 {
+                clusters.push(Cluster { error: 0.0, start, end });
+                if error > 0.0 {
                     continue;
                 }
                 break;
@@ -56,11 +54,11 @@ impl Palette {
             clusters.push(all.cluster(&order, start + middle, end));
         }
         let mut clusters = clusters.into_vec();
-        clusters.sort_by_key(|cluster| cluster.start.0);
+        clusters.sort_by_key(|cluster| cluster.start);
         let mut labels = vec![0; order.len()];
         let mut found = Vec::with_capacity(clusters.len() * width);
         for (label, cluster) in clusters.iter().enumerate() {
-            let rows = &order[cluster.start.0..cluster.end];
+            let rows = &order[cluster.start..cluster.end];
             found.extend(all.mean(rows).into_iter().map(|value| value as f32));
             for &row in rows {
                 labels[row as usize] = label as u32;
@@ -105,8 +103,7 @@ impl Rows<'_> {
             let apart = self.row(*row).iter().zip(&mean).map(|(&v, m)| (f64::from(v) - m).powi(2));
             self.weight(*row) * apart.sum::<f64>()
         };
-        let error = rows.iter().map(square).fold(0.0, |sum, square| sum + square);
-        Cluster { error: error.to_bits(), start: Reverse(start), end }
+        Cluster { error: rows.iter().map(square).sum(), start, end }
     }
 
     /// Moves the rows of the lower half before those of the other; returns their number.
@@ -157,6 +154,27 @@ impl Rows<'_> {
         count
     }
 }
+
+impl Ord for Cluster {
+    fn cmp(&self, other: &Self) -> Ordering {
+        // Ties go to the first cluster in the list, so that the result is reproducible.
+        self.error.total_cmp(&other.error).then(other.start.cmp(&self.start))
+    }
+}
+
+impl PartialOrd for Cluster {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+impl PartialEq for Cluster {
+    fn eq(&self, other: &Self) -> bool {
+        self.cmp(other) == Ordering::Equal
+    }
+}
+
+impl Eq for Cluster {}
 
 #[cfg(test)]
 mod tests {

@@ -94,15 +94,15 @@ fn choose_window(
     views: &DatasetViews,
     background: [f32; 3],
 ) -> Result<Option<(usize, Window)>, Failure> {
-    let (mut best, mut most) = (None, 0);
+    let mut best: Option<(u64, usize, Window)> = None;
     for view in 0..views.count() {
-        let picture = photograph(&*image(views, view)?, background);
-        let (edges, window) = Window::with_most_edges(&picture);
-        if best.is_none() || edges > most {
-            (best, most) = (Some((view, window)), edges);
+        let (edges, window) =
+            Window::with_most_edges(&photograph(&*image(views, view)?, background));
+        if best.is_none_or(|(most, ..)| edges > most) {
+            best = Some((edges, view, window));
         }
     }
-    Ok(best)
+    Ok(best.map(|(_, view, window)| (view, window)))
 }
 
 /// Crops a picture and enlarges the crop by an integer factor.
