@@ -98,7 +98,7 @@ fn record(rows: usize, size: u32, needs: Needs) -> Option<Step> {
     backend.record_tasks();
     let (camera, target) = (steps::camera(size), steps::target(size));
     let mut steps = Vec::new();
-    // With enough steps, a task interrupted by the system is not the median.
+    // With this many steps, an interruption by the system does not affect a task's median.
     for step in 1..=steps::count(rows).max(17) {
         if let Err(error) = backend.train_step(&steps::input(step, &camera, &target)) {
             println!("{error}");
@@ -111,7 +111,7 @@ fn record(rows: usize, size: u32, needs: Needs) -> Option<Step> {
     Some(Step::median(steps))
 }
 
-/// Prints a line per name of regions.
+/// Prints one line per region name.
 fn print_regions(step: &Step) {
     let total = step.total();
     let mut names: Vec<&str> = Vec::new();

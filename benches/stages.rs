@@ -19,7 +19,8 @@ use densify::render::{AdapterChoice, AdapterKind, Backend, BackendError, Setup};
 use pulp::{Arch, Simd, WithSimd};
 use steps::{median, ms};
 
-/// Multiply-adds on twelve independent vectors; two units with a latency of four cycles need eight.
+/// Multiply-adds on twelve independent vectors; two units with a latency of four cycles need eight to
+/// stay busy.
 struct MultiplyAdds {
     rounds: u32,
 }

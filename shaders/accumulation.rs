@@ -29,7 +29,7 @@ impl Accumulation {
         }
     }
 
-    /// The kind with this value of the knob.
+    /// The kind that has this name.
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|accumulation| accumulation.name() == name)
     }

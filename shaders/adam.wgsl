@@ -1,4 +1,4 @@
-// Stage 7: Adam with a bias correction by each row's age; src/render/cpu/adam.rs.
+// Stage 7: Adam with a bias correction by each row's age, its number of steps; as in src/render/cpu/adam.rs.
 // The coefficients of colour come first: one kernel per band, one parameter per invocation, so that
 // reads are coalesced. Their gradient, the basis at the view direction times dL/dcolour, is computed
 // here and never stored. The geometry comes last, one row per invocation, together with the loss
@@ -11,8 +11,8 @@
 @group(0) @binding(3) var<storage, read_write> first: array<f32>;
 @group(0) @binding(4) var<storage, read_write> second: array<f32>;
 @group(0) @binding(5) var<storage, read_write> waiting: array<f32>;
-// Lower half: steps of all parameters but bands 1-3; upper half: steps of bands 1-3, if they have
-// a schedule of their own.
+// Number of steps of each row, as two halves of a word. Lower half: of all parameters but bands 1-3; upper half: of
+// bands 1-3, if they have a schedule of their own.
 @group(0) @binding(6) var<storage, read_write> ages: array<u32>;
 // See project_bwd.wgsl.
 @group(0) @binding(7) var<storage, read> gradient: array<vec4<f32>>;
@@ -51,7 +51,7 @@ fn take_gradient(own: u32, g: f32, steps: bool, waited: bool) -> f32 {
     return g;
 }
 
-// Steps parameter `at`, whose moments are at `own`.
+// Applies an optimiser step to parameter `at`, whose moments are at `own`.
 fn step(at: u32, own: u32, g: f32, rate: f32, correction: vec2<f32>) {
     let m = first[own] * BETA1 + g * (1.0 - BETA1);
     let v = second[own] * BETA2 + g * g * (1.0 - BETA2);
@@ -60,7 +60,7 @@ fn step(at: u32, own: u32, g: f32, rate: f32, correction: vec2<f32>) {
     params[at] -= m * correction.x * rate / (sqrt(v) * correction.y + EPSILON);
 }
 
-// An age after one more step; ages fill half a word.
+// The age after one more step, which saturates, as an age has 16 bits.
 fn next_age(age: u32) -> u32 {
     return min(age + 1u, 0xffffu);
 }
@@ -90,11 +90,11 @@ fn basis_of(k: u32, d: vec3<f32>) -> f32 {
     }
 }
 
-// One band; now.a: its first coefficient, now.b: its number of coefficients.
+// One band; launch.a: its first coefficient, launch.b: its number of coefficients.
 @compute @workgroup_size(256)
 fn adam_band(@builtin(global_invocation_id) id: vec3<u32>) {
     let at = index_of(id);
-    let width = 3u * now.b;
+    let width = 3u * launch.b;
     let row = at / width;
     if row < frame.frozen.x || row >= frame.model.x || state.short != 0u {
         return;
@@ -103,15 +103,15 @@ fn adam_band(@builtin(global_invocation_id) id: vec3<u32>) {
     let own_at = at - frame.frozen.x * width;
     let k = (at - row * width) / 3u;
     let channel = (at - row * width) % 3u;
-    let is_rest = now.a > 0u;
+    let is_rest = launch.a > 0u;
     let steps = is_set(select(MAIN_STEPS, REST_STEPS, is_rest));
     let waited = is_set(select(MAIN_WAITED, REST_WAITED, is_rest));
     let rate = select(frame.more_rates.x, frame.more_rates.y, is_rest);
-    let apart = is_rest && is_set(REST_AGES);
-    let age = next_age(select(ages[own] & 0xffffu, ages[own] >> 16u, apart));
+    let has_rest_age = is_rest && is_set(REST_AGES);
+    let age = next_age(select(ages[own] & 0xffffu, ages[own] >> 16u, has_rest_age));
     let correction = bias[min(age, MATURE)];
     let d = gradient[5u * own + 4u].xyz;
-    let g = basis_of(now.a + k, d) * gradient[5u * own + 3u][channel];
+    let g = basis_of(launch.a + k, d) * gradient[5u * own + 3u][channel];
     let sum = take_gradient(own_at, g, steps, waited);
     if steps {
         step(at, own_at, sum, rate, correction);
@@ -133,7 +133,7 @@ fn adam_geometry(@builtin(global_invocation_id) id: vec3<u32>) {
     let base = 12u * row;
     var add = array<f32, 11>();
     if is_set(TERMS) {
-        // e^x / (1 + e^x)² for x <= 0, and it is even: nothing cancels at either end.
+        // The sigmoid's derivative e^x / (1 + e^x)² is even; evaluated for x <= 0, nothing cancels.
         let e = exp_exact(-abs(params[base + 10u]));
         add[10] = e / ((1.0 + e) * (1.0 + e)) * frame.more_rates.z;
         for (var k = 3u; k < 6u; k++) {
@@ -170,7 +170,7 @@ fn adam_geometry(@builtin(global_invocation_id) id: vec3<u32>) {
 fn confine(base: u32) {
     let q = vec4(params[base + 6u], params[base + 7u], params[base + 8u], params[base + 9u]);
     let norm2 = dot(q, q);
-    // A quaternion this short has lost its direction, and is reset to no rotation. Here and below,
+    // A quaternion this short has lost its direction, and is reset to the identity. Here and below,
     // NaN stays NaN, for the audit to find.
     var unit = q / sqrt(norm2);
     if below(norm2, 1e-12) {

@@ -1,6 +1,6 @@
-// Stage 9: executes a compiled plan in place, in chunks of operations; src/render/cpu/apply.rs.
+// Stage 9: executes a compiled plan in place, in chunks of operations, as in src/render/cpu/apply.rs.
 // Pass 1 writes families, updates and seeds, no row twice; pass 2 moves rows from the end into holes
-// and sorts the rows. Each buffer is edited by itself; buffers without frozen rows start at the first
+// and sorts the rows. Each buffer is edited separately; buffers without frozen rows start at the first
 // row that is not frozen.
 
 // Words per operation.
@@ -17,22 +17,22 @@ const WORDS: u32 = 20u;
 @group(0) @binding(7) var<storage, read_write> waiting_rows: array<f32>;
 @group(0) @binding(8) var<storage, read> signals: array<f32>;
 
-// The operation of an invocation, and which of its row's numbers it works on. now.a: operations,
-// now.b: numbers per row, now.c: stride of rows, now.d: stride of the numbers of a row.
+// The operation of an invocation, and the index of the number that it edits. launch.a: number of operations,
+// launch.b: numbers per row, launch.c: stride of rows, launch.d: stride of the numbers of a row.
 fn operation_of(id: vec3<u32>) -> vec2<u32> {
     let i = index_of(id);
-    return vec2(i / now.b, i % now.b);
+    return vec2(i / launch.b, i % launch.b);
 }
 
 fn place_of(row: u32, number: u32) -> u32 {
-    return row * now.c + number * now.d;
+    return row * launch.c + number * launch.d;
 }
 
 // Operations (from, to): copies row `from` to `to`, or clears `to` if `from` is NONE.
 @compute @workgroup_size(256)
 fn copy_rows(@builtin(global_invocation_id) id: vec3<u32>) {
     let op = operation_of(id);
-    if op.x >= now.a {
+    if op.x >= launch.a {
         return;
     }
     let source = ops[2u * op.x];
@@ -48,7 +48,7 @@ fn copy_rows(@builtin(global_invocation_id) id: vec3<u32>) {
 @compute @workgroup_size(256)
 fn swap_rows(@builtin(global_invocation_id) id: vec3<u32>) {
     let op = operation_of(id);
-    if op.x >= now.a {
+    if op.x >= launch.a {
         return;
     }
     let a = place_of(ops[2u * op.x], op.y);
@@ -65,8 +65,8 @@ fn longest(s: vec3<f32>) -> u32 {
     return best;
 }
 
-// Log-scales after the rule at ops[at], which is followed by three terms. 0: the first is added to
-// all; 1: the first to the longest, the second to the others; 2: each to its own axis; 3: all are set
+// Log-scales after the rule at ops[at], which three terms follow. Rule 0: the first term is added to
+// all; 1: the first is added to the longest, the second to the others; 2: each to its own axis; 3: all are set
 // to the first.
 fn scales_of(s: vec3<f32>, at: u32) -> vec3<f32> {
     let rule = ops[at];
@@ -91,7 +91,7 @@ fn logit_of(opacity: f32, complement: f32) -> f32 {
     return log(opacity) - log(complement);
 }
 
-// A logit after a rule. 0: unchanged; 1: set to `value`; 2: opacity times `value`; 3: `value` siblings
+// A logit after a rule. Rule 0: unchanged; 1: set to `value`; 2: opacity times `value`; 3: `value` siblings
 // together transmit as much light as the parent.
 fn logit_after(logit: f32, rule: u32, value: f32) -> f32 {
     let opacity = sigmoid(logit);
@@ -153,7 +153,7 @@ fn put(row: u32, mean: vec3<f32>, log_scale: vec3<f32>, quat: vec4<f32>, logit: 
     rows[base + 10u] = logit;
 }
 
-// Families; now.a: their number, now.b: seed, now.c: step. Words of an operation: parent; index in
+// Families; launch.a: their number, launch.b: seed, launch.c: step. Words of an operation: parent; index in
 // `ops` of the first child's row; number of children; index of the first child in its family; 1 if the
 // parent is overwritten by child 0; placement (0: offset, 1: sampled, 2: along the longest axis,
 // 3: along all axes) and three numbers for it; scale rule and three numbers; opacity rule and its
@@ -161,7 +161,7 @@ fn put(row: u32, mean: vec3<f32>, log_scale: vec3<f32>, quat: vec4<f32>, logit: 
 @compute @workgroup_size(256)
 fn breed(@builtin(global_invocation_id) id: vec3<u32>) {
     let i = index_of(id);
-    if i >= now.a {
+    if i >= launch.a {
         return;
     }
     let op = i * WORDS;
@@ -193,7 +193,7 @@ fn offset_of(op: u32, child: u32, parent: u32, log_scale: vec3<f32>, quat: vec4<
             return vec3(real(op + 6u), real(op + 7u), real(op + 8u));
         }
         case 1u: {
-            let xi = normal3(parent, now.c, now.b, PURPOSE_PLACE, child);
+            let xi = normal3(parent, launch.c, launch.b, PURPOSE_PLACE, child);
             let scale = vec3(exp_exact(log_scale.x), exp_exact(log_scale.y), exp_exact(log_scale.z));
             return rotate(quat, scale * xi);
         }
@@ -211,12 +211,12 @@ fn offset_of(op: u32, child: u32, parent: u32, log_scale: vec3<f32>, quat: vec4<
     }
 }
 
-// Updates; now.a: their number. Words of an operation: row; scale rule and three numbers; opacity rule
+// Updates; launch.a: their number. Words of an operation: row; scale rule and three numbers; opacity rule
 // and its number; 1 if the mean is set; the mean; 1 if band 0 is set; its three coefficients; unused ×5.
 @compute @workgroup_size(256)
 fn rewrite(@builtin(global_invocation_id) id: vec3<u32>) {
     let i = index_of(id);
-    if i >= now.a {
+    if i >= launch.a {
         return;
     }
     let op = i * WORDS;
@@ -235,12 +235,12 @@ fn rewrite(@builtin(global_invocation_id) id: vec3<u32>) {
     rows[base + 10u] = logit_after(rows[base + 10u], ops[op + 5u], real(op + 6u));
 }
 
-// Seeds; now.a: their number. Words of an operation: row; mean; log-scales; quaternion; logit; three
+// Seeds; launch.a: their number. Words of an operation: row; mean; log-scales; quaternion; logit; three
 // coefficients of band 0; unused ×5. The other coefficients have been cleared.
 @compute @workgroup_size(256)
 fn sow(@builtin(global_invocation_id) id: vec3<u32>) {
     let i = index_of(id);
-    if i >= now.a {
+    if i >= launch.a {
         return;
     }
     let op = i * WORDS;
@@ -253,22 +253,22 @@ fn sow(@builtin(global_invocation_id) id: vec3<u32>) {
     }
 }
 
-// Opacities decay down to this.
+// Opacities do not decay below this.
 const OPACITY_LEAST: f32 = 2e-4;
 
-// Decays opacities and scales; now.a: rows, now.b: bits of the amount subtracted from opacities,
-// now.c: bits of the logarithm of the factor of scales, now.d: start of the per-row counts of views in
+// Decays opacities and scales; launch.a: number of rows, launch.b: bits of the amount subtracted from opacities,
+// launch.c: bits of the logarithm of the factor of scales, launch.d: start of the per-row counts of views in
 // `signals` if only rows seen by a view decay, or else NONE. ops[0]: the first row that is not frozen.
 @compute @workgroup_size(256)
 fn decay(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = index_of(id);
-    if row < ops[0] || row >= now.a {
+    if row < ops[0] || row >= launch.a {
         return;
     }
-    if now.d != NONE && !(signals[now.d + row - ops[0]] > 0.0) {
+    if launch.d != NONE && !(signals[launch.d + row - ops[0]] > 0.0) {
         return;
     }
-    let loss = bitcast<f32>(now.b);
+    let loss = bitcast<f32>(launch.b);
     let base = 12u * row;
     let logit = rows[base + 10u];
     // Values that are not finite are left for the audit to find.
@@ -278,24 +278,24 @@ fn decay(@builtin(global_invocation_id) id: vec3<u32>) {
         rows[base + 10u] = min(logit, logit_of(left, sigmoid(-logit) + (opacity - left)));
     }
     for (var k = 0u; k < 3u; k++) {
-        rows[base + 3u + k] += bitcast<f32>(now.c);
+        rows[base + 3u + k] += bitcast<f32>(launch.c);
     }
 }
 
-// Caps all opacities and clears their moments; now.a: rows, now.b: bits of the largest logit,
-// now.c: 1 if there are waiting gradients to clear. ops[0]: the first row that is not frozen.
+// Caps all opacities and clears their moments; launch.a: number of rows, launch.b: bits of the largest logit,
+// launch.c: 1 if there are waiting gradients to clear. ops[0]: the first row that is not frozen.
 @compute @workgroup_size(256)
 fn clamp_opacity(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = index_of(id);
-    if row < ops[0] || row >= now.a {
+    if row < ops[0] || row >= launch.a {
         return;
     }
     let at = 12u * row + 10u;
-    rows[at] = min(rows[at], bitcast<f32>(now.b));
+    rows[at] = min(rows[at], bitcast<f32>(launch.b));
     let own = at - 12u * ops[0];
     first_rows[own] = 0.0;
     second_rows[own] = 0.0;
-    if now.c != 0u {
+    if launch.c != 0u {
         waiting_rows[own] = 0.0;
     }
 }

@@ -1,4 +1,4 @@
-// Finds rows with a number that is not finite; src/render/audit.rs. Numbers are read as bits:
+// Finds rows with a number that is not finite; see src/render/audit.rs. Numbers are read as bits:
 // WGSL may assume that there is no NaN. One row per invocation.
 
 // Per row: 0, or 1 + the index of its first number that is not finite.
@@ -7,18 +7,18 @@
 
 const NOT_FINITE: u32 = 0x7f800000u;
 
-// now.a: rows; now.b: numbers per row; now.c: index of the first number; now.d: the first row that has
-// numbers.
+// launch.a: number of rows; launch.b: numbers per row; launch.c: index of the first number among a row's parameters;
+// launch.d: the first row that has numbers.
 @compute @workgroup_size(256)
 fn audit(@builtin(global_invocation_id) id: vec3<u32>) {
     let own = index_of(id);
-    let row = own + now.d;
-    if row >= now.a || marks[row] != 0u {
+    let row = own + launch.d;
+    if row >= launch.a || marks[row] != 0u {
         return;
     }
-    for (var k = 0u; k < now.b; k++) {
-        if (numbers[own * now.b + k] & NOT_FINITE) == NOT_FINITE {
-            marks[row] = now.c + k + 1u;
+    for (var k = 0u; k < launch.b; k++) {
+        if (numbers[own * launch.b + k] & NOT_FINITE) == NOT_FINITE {
+            marks[row] = launch.c + k + 1u;
             return;
         }
     }

@@ -1,5 +1,5 @@
-// The pixels of a view with the largest errors, and surface points of given pixels, one per invocation;
-// src/render/cpu/candidates.rs.
+// Finds the surface points of given pixels, one pixel per invocation, and the pixels of a view with the largest
+// errors; see src/render/cpu/candidates.rs.
 
 @group(0) @binding(1) var<storage, read> state: State;
 @group(0) @binding(2) var<storage, read> list: array<u32>;
@@ -13,26 +13,26 @@
 @group(0) @binding(8) var<storage, read_write> points: array<vec4<f32>>;
 
 
-// now.a: the band, now.b: number of pixels, now.c: the surface is at the largest blend weight (0) or at
-// transmittance 1/2 (1), now.d: index of the first in `points`.
+// launch.a: the band, launch.b: number of pixels, launch.c: the surface is at the largest blend weight (0) or at
+// transmittance 1/2 (1), launch.d: index in `points` of the first pixel's point.
 @compute @workgroup_size(256)
 fn surface(@builtin(global_invocation_id) id: vec3<u32>) {
     let i = index_of(id);
-    if i >= now.b {
+    if i >= launch.b {
         return;
     }
     let pixel = vec2(pixels[i] % frame.image.x, pixels[i] / frame.image.x);
     let tile = pixel.y / TILE * frame.image.z + pixel.x / TILE;
-    if tile < state.cuts[now.a] || tile >= state.cuts[now.a + 1u] {
+    if tile < state.cuts[launch.a] || tile >= state.cuts[launch.a + 1u] {
         return;
     }
     let at = vec2<f32>(pixel) + 0.5;
-    let row = surface_row(tile, at, now.c == 1u);
+    let row = surface_row(tile, at, launch.c == 1u);
     var point = vec4(0.0);
     if row != NONE {
         point = closest_approach(row, at);
     }
-    points[now.d + i] = point;
+    points[launch.d + i] = point;
 }
 
 fn surface_row(tile: u32, at: vec2<f32>, is_median: bool) -> u32 {
@@ -96,8 +96,8 @@ fn closest_approach(row: u32, at: vec2<f32>) -> vec4<f32> {
 @group(0) @binding(9) var<storage, read> finish: array<vec2<u32>>;
 // The error per pixel, or three planes of its gradient.
 @group(0) @binding(10) var<storage, read> map: array<f32>;
-// The leading digits, found so far, of the least selected error; the number of pixels still to select
-// among those with these digits; the number of pixels written. Then a histogram of the next digit.
+// The known leading digits of the smallest error to be selected; the number of pixels still to
+// select among those with these digits; the number of pixels written. Then a histogram of the next digit.
 @group(0) @binding(11) var<storage, read_write> selection: array<atomic<u32>>;
 // The number of selected pixels; then, in no particular order, bits of the error and index of each.
 @group(0) @binding(12) var<storage, read_write> worst: array<vec2<u32>>;
@@ -109,21 +109,22 @@ const COUNTS: u32 = 4u;
 var<workgroup> counts: array<atomic<u32>, 256>;
 
 // Bits of a pixel's error, which sort like the errors; 0 for a pixel that cannot be a candidate.
-// now.c: bits of the least alpha, now.d: 1 if the map is the gradient.
+// launch.c: bits of the smallest alpha allowed, launch.d: 1 if the map is the gradient.
 fn key_of(pixel: u32) -> u32 {
     let size = frame.image.x * frame.image.y;
-    if pixel >= size || !(1.0 - bitcast<f32>(finish[pixel].x) >= bitcast<f32>(now.c)) {
+    if pixel >= size || !(1.0 - bitcast<f32>(finish[pixel].x) >= bitcast<f32>(launch.c)) {
         return 0u;
     }
     var error = map[pixel];
-    if now.d == 1u {
+    if launch.d == 1u {
         let g = vec3(error, map[size + pixel], map[2u * size + pixel]);
         error = sqrt(g.x * g.x + g.y * g.y + g.z * g.z);
     }
     return select(0u, bitcast<u32>(error), error > 0.0);
 }
 
-// Counts the digits that follow those found; now.a: their lowest bit, now.b: 1 for the first digit.
+// Histogram of the next digit of the errors that begin with the known digits; launch.a: the digit's lowest bit,
+// launch.b: 1 for the first digit.
 @compute @workgroup_size(256)
 fn count_errors(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -132,9 +133,9 @@ fn count_errors(
     atomicStore(&counts[lane], 0u);
     workgroupBarrier();
     let key = key_of(group_of(id) * GROUP + lane);
-    // The first digit is a case of its own: WGSL does not shift by 32 bits.
-    if key != 0u && (now.b == 1u || key >> (now.a + 8u) == atomicLoad(&selection[0])) {
-        atomicAdd(&counts[(key >> now.a) % DIGITS], 1u);
+    // The first digit is a special case: WGSL cannot shift by 32 bits.
+    if key != 0u && (launch.b == 1u || key >> (launch.a + 8u) == atomicLoad(&selection[0])) {
+        atomicAdd(&counts[(key >> launch.a) % DIGITS], 1u);
     }
     workgroupBarrier();
     let count = atomicLoad(&counts[lane]);
@@ -143,15 +144,15 @@ fn count_errors(
     }
 }
 
-// now.a: 0: starts a selection of now.b pixels; 1: finds the next digit; 2: stores the number written.
+// launch.a: 0: starts a selection of launch.b pixels; 1: finds the next digit; 2: stores the number written.
 @compute @workgroup_size(256)
 fn narrow(@builtin(local_invocation_index) lane: u32) {
     if lane == 0u {
-        if now.a == 0u {
+        if launch.a == 0u {
             atomicStore(&selection[0], 0u);
-            atomicStore(&selection[1], now.b);
+            atomicStore(&selection[1], launch.b);
             atomicStore(&selection[2], 0u);
-        } else if now.a == 1u {
+        } else if launch.a == 1u {
             var wanted = atomicLoad(&selection[1]);
             var digit = DIGITS - 1u;
             for (; digit > 0u; digit--) {
@@ -171,14 +172,14 @@ fn narrow(@builtin(local_invocation_index) lane: u32) {
     atomicStore(&selection[COUNTS + lane], 0u);
 }
 
-// Writes every pixel whose error is at least the least selected one; now.b: capacity.
+// Writes every pixel whose error is at least the smallest one selected; launch.b: capacity.
 @compute @workgroup_size(256)
 fn write_worst(@builtin(global_invocation_id) id: vec3<u32>) {
     let pixel = index_of(id);
     let key = key_of(pixel);
     if key != 0u && key >= atomicLoad(&selection[0]) {
         let place = atomicAdd(&selection[2], 1u);
-        if place < now.b {
+        if place < launch.b {
             worst[1u + place] = vec2(key, pixel);
         }
     }

@@ -1,4 +1,4 @@
-// Applies the exposure of the current photograph before the loss, and backpropagates through it;
+// Applies the exposure of the current photograph before the loss, and backpropagates through it, as in
 // src/render/cpu/exposure.rs. A group handles 256 consecutive pixels, and an invocation of the
 // backward kernel four of them.
 
@@ -33,7 +33,7 @@ fn expose(@builtin(global_invocation_id) id: vec3<u32>) {
     canvas[at] = vec4(exposed, canvas[at].w);
 }
 
-// The sum of `reduced`, for the first invocation.
+// The sum of `reduced`; valid in the first invocation.
 fn reduced_sum(lane: u32) -> mat4x4<f32> {
     workgroupBarrier();
     for (var half = ADDERS / 2u; half > 0u; half /= 2u) {
@@ -45,7 +45,7 @@ fn reduced_sum(lane: u32) -> mat4x4<f32> {
     return reduced[0];
 }
 
-// dL/dpixel before the exposure, and the sums of the group.
+// dL/dpixel with respect to the image before the exposure, and the sums of the group.
 @compute @workgroup_size(64)
 fn expose_bwd(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -78,7 +78,7 @@ fn expose_bwd(
     }
 }
 
-// One group: the sums of the image.
+// The sums over the image; a single group.
 @compute @workgroup_size(64)
 fn total_exposure(@builtin(local_invocation_index) lane: u32) {
     let groups = (frame.image.x * frame.image.y + GROUP - 1u) / GROUP;

@@ -1,5 +1,5 @@
-//! The WGSL kernels of the GPU backend: one file per stage, named as the file of the native backend, and the table of the
-//! texts that make up each shader module.
+//! The WGSL kernels of the GPU backend: one file per stage, with the same name as the native backend's, and
+//! the table of the texts that make up each shader module.
 
 mod accumulation;
 
@@ -31,7 +31,7 @@ enum On {
     Slots,
     /// Devices that accumulate gradients by atomics.
     Atomics,
-    /// All devices; the invocations of a tile share splats through subgroups if there are any.
+    /// All devices; the invocations of a tile share splats through subgroups where these are available.
     Tiles,
     /// All devices.
     All,
@@ -40,7 +40,7 @@ enum On {
 /// A shader module.
 #[derive(Debug)]
 pub struct Stage {
-    /// Name of the WGSL file, and of the native backend's file.
+    /// Name of the WGSL file, and of the native backend's file for the same stage.
     pub name: &'static str,
     on: On,
     texts: &'static [&'static str],

@@ -1,8 +1,8 @@
-// Stage 4: 0.8·L1 + 0.2·(1 − SSIM) and its gradient, one tile per group; src/render/cpu/loss/.
-// SSIM is rewritten, exactly, in terms of e = rendering − target and of the mean of x·y, which gives
-// both variances. The 11×11 window is separable; pixels outside the image are zero. An invocation sums
-// eight neighbouring windows at once, which together read 18 values instead of 8 × 11, since reading
-// costs more than adding.
+// Stage 4: 0.8·L1 + 0.2·(1 − SSIM) and its gradient, one tile per group, as in src/render/cpu/loss/.
+// SSIM is rewritten, exactly, in terms of e = x − y, the difference of rendering x and target y, and of the
+// mean of x·y, from which the sum of both variances follows. The 11×11 window is separable; pixels outside the image
+// are zero. An invocation sums eight neighbouring windows at once, which together read 18 values instead of 8 × 11,
+// since reading costs more than adding.
 
 @group(0) @binding(1) var<storage, read_write> state: State;
 @group(0) @binding(2) var<storage, read> canvas: array<vec4<f32>>;
@@ -35,7 +35,7 @@ const WITH_ERROR: u32 = 4u;
 const BY_PIXEL: u32 = 8u;
 const EXPOSED: u32 = 16u;
 
-// Weights of value k, of 18, in the eight windows centred on values 5 to 12, computed from those of value
+// Weights of value k (of 18) in the eight windows centred on values 5 to 12, computed from those of value
 // k − 1: this reads the table once instead of eight times.
 fn next_weights(before: mat2x4<f32>, k: u32) -> mat2x4<f32> {
     var weights = array<f32, 11>(
@@ -67,11 +67,11 @@ fn difference(pixel: vec2<i32>, channel: u32) -> vec2<f32> {
     var target_value = f32((word >> (8u * channel)) & 0xffu) * (1.0 / 255.0);
     if (frame.draw.w & HAS_ALPHA) != 0u {
         let a = f32(word >> 24u) * (1.0 / 255.0);
-        var behind = frame.background[channel];
+        var background = frame.background[channel];
         if (frame.draw.w & EXPOSED) != 0u {
-            behind = exposure[3][channel];
+            background = exposure[3][channel];
         }
-        target_value = a * target_value + (1.0 - a) * behind;
+        target_value = a * target_value + (1.0 - a) * background;
     }
     return vec2((canvas[at][channel] - target_value) * weight_of(at), target_value);
 }
@@ -87,7 +87,7 @@ var<workgroup> around: array<vec2<f32>, 676>;
 var<workgroup> rows: array<vec4<f32>, 416>;
 var<workgroup> reduced: array<vec2<f32>, GROUP>;
 
-// Eight neighbouring pixels in a line of a tile.
+// Eight neighbouring pixels of a tile in the same line.
 struct Eight {
     // Column of the first, and their line, relative to the tile's corner [px].
     column: u32,
@@ -106,17 +106,17 @@ fn eight_of(corner: vec2<u32>, i: u32) -> Eight {
     return Eight(column, line, y * frame.image.x + x, there);
 }
 
-// Coordinates of pixel i of a tile with its margin; they may be outside the image.
+// Coordinates of pixel i of a tile with its margin; the pixel may be outside the image.
 fn pixel_around(corner: vec2<u32>, i: u32) -> vec2<i32> {
     return vec2<i32>(corner) + vec2(i32(i % SIDE), i32(i / SIDE)) - REACH;
 }
 
 // The first pixel of the ith run of eight windows in a column, in a tile with its margin.
-fn eighth_of(i: u32) -> u32 {
+fn first_of_run(i: u32) -> u32 {
     return i / SIDE * 8u * SIDE + i % SIDE;
 }
 
-// Stores the sums of four windows below one another, up to four for each, in `rows`.
+// Stores the sums of four windows below one another, up to four sums for each window, in `rows`.
 fn store_four(first: u32, a: vec4<f32>, b: vec4<f32>, c: vec4<f32>, d: vec4<f32>) {
     let of_window = transpose(mat4x4(a, b, c, d));
     rows[first] = of_window[0];
@@ -138,19 +138,19 @@ fn store_eight(
 }
 
 // SSIM at four pixels, and its derivatives with respect to the window's means.
-struct Similar {
+struct Ssim {
     ssim: vec4<f32>,
     by_e: vec4<f32>,
     by_ee: vec4<f32>,
     by_ey: vec4<f32>,
 }
 
-fn similar(
+fn ssim_of(
     mu_e: vec4<f32>,
     mu_y: vec4<f32>,
     mean_ee: vec4<f32>,
     mean_xy: vec4<f32>,
-) -> Similar {
+) -> Ssim {
     let mu_x = mu_e + mu_y;
     let var_e = max(mean_ee - mu_e * mu_e, vec4(0.0));
     let variances = max(2.0 * (mean_xy - mu_x * mu_y) + var_e, vec4(0.0));
@@ -161,7 +161,7 @@ fn similar(
     let by_luminance = -2.0 * mu_e * inv_a * (1.0 - mu_e * mu_x * inv_a);
     let two_ve_bb = 2.0 * var_e * inv_b * inv_b;
     let by_contrast = 2.0 * mu_e * contrast * inv_b - mu_y * two_ve_bb;
-    return Similar(
+    return Ssim(
         luminance * contrast,
         contrast * by_luminance + luminance * by_contrast,
         -(luminance * contrast * inv_b),
@@ -170,7 +170,7 @@ fn similar(
 }
 
 // SSIM, its derivatives, and the sums of the tile. Bits of the weights of |e| and of 1 − SSIM: in the
-// error (now.a, now.b) and in the error for row scores (now.c, now.d).
+// error (launch.a, launch.b) and in the error for row scores (launch.c, launch.d).
 @compute @workgroup_size(256)
 fn similarity(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -183,8 +183,8 @@ fn similarity(
     let corner = corner_of(tile);
     let size = frame.image.x * frame.image.y;
     var sums = vec2(0.0);
-    var wrong = mat2x4<f32>();
-    var lost = mat2x4<f32>();
+    var pixel_error = mat2x4<f32>();
+    var score_error = mat2x4<f32>();
     for (var channel = 0u; channel < 3u; channel++) {
         workgroupBarrier();
         for (var i = lane; i < SIDE * SIDE; i += GROUP) {
@@ -192,7 +192,7 @@ fn similarity(
         }
         workgroupBarrier();
         for (var i = lane; i < COLUMNS; i += GROUP) {
-            let first = eighth_of(i);
+            let first = first_of_run(i);
             var e = mat2x4<f32>();
             var y = mat2x4<f32>();
             var ee = mat2x4<f32>();
@@ -228,10 +228,10 @@ fn similarity(
                 xy += w * here.w;
             }
             for (var half = 0u; half < 2u; half++) {
-                let found = similar(e[half], y[half], ee[half], xy[half]);
+                let found = ssim_of(e[half], y[half], ee[half], xy[half]);
                 let n = 4u * half;
                 let centre = first + 5u * SIDE + 5u + n;
-                let off = abs(vec4(
+                let abs_e = abs(vec4(
                     around[centre].x,
                     around[centre + 1u].x,
                     around[centre + 2u].x,
@@ -239,12 +239,12 @@ fn similarity(
                 ));
                 let there = vec4(n, n + 1u, n + 2u, n + 3u) < vec4(eight.inside);
                 let counts = select(vec4(0.0), vec4(1.0), there);
-                sums += vec2(dot(counts, off), dot(counts, found.ssim));
-                wrong[half] +=
-                    off * bitcast<f32>(now.a) + (1.0 - found.ssim) * bitcast<f32>(now.b);
+                sums += vec2(dot(counts, abs_e), dot(counts, found.ssim));
+                pixel_error[half] +=
+                    abs_e * bitcast<f32>(launch.a) + (1.0 - found.ssim) * bitcast<f32>(launch.b);
                 if (frame.draw.w & BY_PIXEL) != 0u {
-                    lost[half] +=
-                        off * bitcast<f32>(now.c) + (1.0 - found.ssim) * bitcast<f32>(now.d);
+                    score_error[half] +=
+                        abs_e * bitcast<f32>(launch.c) + (1.0 - found.ssim) * bitcast<f32>(launch.d);
                 }
                 for (var p = 0u; p < 4u; p++) {
                     if n + p < eight.inside {
@@ -260,14 +260,14 @@ fn similarity(
     if lane < LINES && (frame.draw.w & WITH_ERROR) != 0u {
         let eight = eight_of(corner, lane);
         for (var p = 0u; p < eight.inside; p++) {
-            error[eight.place + p] = wrong[p / 4u][p % 4u] * (1.0 / 3.0);
+            error[eight.place + p] = pixel_error[p / 4u][p % 4u] * (1.0 / 3.0);
         }
     }
     if lane < LINES && (frame.draw.w & BY_PIXEL) != 0u {
         let eight = eight_of(corner, lane);
         for (var p = 0u; p < eight.inside; p++) {
             let to = 3u * size + eight.place + p;
-            gradient[to] = weighed(lost[p / 4u][p % 4u] * (1.0 / 3.0), to + size);
+            gradient[to] = score_contribution(score_error[p / 4u][p % 4u] * (1.0 / 3.0), to + size);
         }
     }
     reduced[lane] = sums;
@@ -278,7 +278,7 @@ fn similarity(
 }
 
 // A pixel's contribution to row scores, from its error; `place`: index of its edge weight.
-fn weighed(error: f32, place: u32) -> f32 {
+fn score_contribution(error: f32, place: u32) -> f32 {
     var map = error;
     if frame.score.x != 1.0 {
         map = pow(max(error, 0.0), frame.score.x);
@@ -317,7 +317,7 @@ fn pixel_gradient(
     for (var channel = 0u; channel < 3u; channel++) {
         workgroupBarrier();
         for (var i = lane; i < COLUMNS; i += GROUP) {
-            let first = eighth_of(i);
+            let first = first_of_run(i);
             let top = pixel_around(corner, first);
             var x = mat2x4<f32>();
             var y = mat2x4<f32>();
@@ -367,7 +367,7 @@ fn pixel_gradient(
     }
 }
 
-// The means over the image; a single group.
+// The mean |e| and SSIM of the image; a single group.
 @compute @workgroup_size(256)
 fn total(@builtin(local_invocation_index) lane: u32) {
     var sums = vec2(0.0);

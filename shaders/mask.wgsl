@@ -1,10 +1,10 @@
-// Learned masks: one logit per row, trained so that rows that matter little are masked out;
+// Learned masks: one logit per row, trained so that rows that matter little are masked out, as in
 // src/render/cpu/mask.rs. One row per invocation, before the geometry steps.
 
 @group(0) @binding(1) var<storage, read> state: State;
 // The geometry: twelve numbers per row.
 @group(0) @binding(2) var<storage, read_write> rows: array<f32>;
-// Change of each mask's logit since its start; its two moments.
+// Change of each mask's logit since its start; then the logit's two moments.
 @group(0) @binding(3) var<storage, read_write> mask_offsets: array<f32>;
 @group(0) @binding(4) var<storage, read_write> mask_moments: array<f32>;
 @group(0) @binding(5) var<storage, read> ages: array<u32>;
@@ -12,8 +12,8 @@
 @group(0) @binding(6) var<storage, read> gradient: array<vec4<f32>>;
 @group(0) @binding(7) var<storage, read> bias: array<vec2<f32>>;
 
-// Bits of: the initial logit of masks (now.a), the step size (now.b), the derivative of the loss term
-// with respect to a row's mask (now.c), the logit of the threshold (now.d).
+// Bits of: the initial logit of masks (launch.a), the step size (launch.b), the derivative of the loss term
+// with respect to a row's mask (launch.c), the logit of the threshold (launch.d).
 @compute @workgroup_size(256)
 fn step_masks(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = index_of(id);
@@ -21,21 +21,21 @@ fn step_masks(@builtin(global_invocation_id) id: vec3<u32>) {
         return;
     }
     let own = row - frame.frozen.x;
-    let start = bitcast<f32>(now.a);
+    let start = bitcast<f32>(launch.a);
     let opacity_at = 12u * row + 10u;
     let g_opacity = gradient[5u * own + 2u].z;
     let g_scales = gradient[5u * own].w + gradient[5u * own + 1u].x + gradient[5u * own + 1u].y;
     let by_factor = g_opacity / sigmoid(-rows[opacity_at]) + g_scales;
     let m = start + mask_offsets[own];
-    let g = (by_factor + bitcast<f32>(now.c)) * sigmoid(m) * sigmoid(-m);
+    let g = (by_factor + bitcast<f32>(launch.c)) * sigmoid(m) * sigmoid(-m);
     let first = mask_moments[2u * own] * BETA1 + g * (1.0 - BETA1);
     let second = mask_moments[2u * own + 1u] * BETA2 + g * g * (1.0 - BETA2);
     let correction = bias[min((ages[own] & 0xffffu) + 1u, MATURE)];
-    let step = first * correction.x * bitcast<f32>(now.b) / (sqrt(second) * correction.y + EPSILON);
+    let step = first * correction.x * bitcast<f32>(launch.b) / (sqrt(second) * correction.y + EPSILON);
     mask_offsets[own] -= step;
     mask_moments[2u * own] = first;
     mask_moments[2u * own + 1u] = second;
-    if start + mask_offsets[own] <= bitcast<f32>(now.d) {
+    if start + mask_offsets[own] <= bitcast<f32>(launch.d) {
         rows[opacity_at] = -LOGIT_MAX;
     }
 }

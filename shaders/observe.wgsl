@@ -1,9 +1,9 @@
-// Sums over the pixels into which a row is blended, front to back, for auxiliary views;
+// Auxiliary views: sums over the pixels into which each row is blended, front to back, as in
 // src/render/cpu/observe.rs. One record per entry, as in rasterize_bwd.wgsl.
 
-// The pixel map.
+// The pixel map; see `PixelMap` in the policies.
 @group(0) @binding(6) var<storage, read> map: array<f32>;
-// Per slot: the columns of `splat_sums`.
+// One record per slot: the values of `splat_sums`.
 @group(0) @binding(7) var<storage, read_write> records: array<f32>;
 
 // An invocation's contribution to the sums of loaded splat i, the kth of a round.
@@ -25,7 +25,7 @@ fn store_splat(
     }
 }
 
-// now.a: the band.
+// launch.a: the band of tiles that this launch handles.
 @compute @workgroup_size(64)
 fn replay(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -40,7 +40,7 @@ fn replay(
     var pixels = Open(vec4(1.0), quad.inside);
     let begin = tile_starts[tile];
     let end = tile_starts[tile + 1u];
-    var has_ended = true;
+    var completed = true;
     var first = begin;
     for (; first < end; first += BATCH) {
         let count = min(BATCH, end - first);
@@ -61,9 +61,9 @@ fn replay(
             }
             wait_for_all();
         }
-        has_ended &= base >= count;
+        completed &= base >= count;
     }
-    expect_end(has_ended && first >= end);
+    expect_end(completed && first >= end);
 }
 
 @group(0) @binding(8) var<storage, read> depths: array<u32>;
@@ -71,7 +71,7 @@ fn replay(
 @group(0) @binding(10) var<storage, read> all_records: array<f32>;
 @group(0) @binding(11) var<storage, read_write> row_sums: array<f32>;
 
-// Sums a row's records in order; now.a: the band.
+// Sums a row's records in order; launch.a: the band.
 @compute @workgroup_size(256)
 fn gather_columns(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = index_of(id);
@@ -79,7 +79,7 @@ fn gather_columns(@builtin(global_invocation_id) id: vec3<u32>) {
         return;
     }
     var totals = array<f32, COLUMNS>();
-    if now.a > 0u {
+    if launch.a > 0u {
         for (var f = 0u; f < COLUMNS; f++) {
             totals[f] = row_sums[row * COLUMNS + f];
         }

@@ -1,6 +1,6 @@
-// The sums of observe.wgsl, added directly to those of rows by atomics, as in rasterize_bwd_atomic.wgsl.
+// The sums of observe.wgsl, but added with atomics straight to each row's sums, as in rasterize_bwd_atomic.wgsl.
 
-// The pixel map.
+// The pixel map; see `PixelMap` in the policies.
 @group(0) @binding(6) var<storage, read> map: array<f32>;
 
 // The subgroup's contribution to the sums of splat i of the `count` loaded ones.
@@ -16,7 +16,7 @@ fn add_splat(
         return;
     }
     var columns = splat_sums(loaded_splat(i), quad, map_here, pixels);
-    // The second counts pixels.
+    // The second column is the number of pixels.
     if subgroupAny(columns[1] > 0.0) {
         var sums = array<f32, FIELDS>();
         for (var f = 0u; f < COLUMNS; f++) {
@@ -26,7 +26,7 @@ fn add_splat(
     }
 }
 
-// now.a: the band.
+// launch.a: the band of tiles that this launch handles.
 @compute @workgroup_size(64)
 fn replay_atomic(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -41,10 +41,10 @@ fn replay_atomic(
     let map_here = map_at(quad);
     var pixels = Open(vec4(1.0), quad.inside);
     let end = tile_starts[tile + 1u];
-    var has_ended = true;
+    var completed = true;
     var first = tile_starts[tile];
     for (; first < end; first += m.members) {
-        if largest_of_all(m, u32(any(pixels.goes_on))) == 0u {
+        if largest_of_all(m, u32(any(pixels.unfinished))) == 0u {
             break;
         }
         let count = min(m.members, end - first);
@@ -59,7 +59,7 @@ fn replay_atomic(
             add_splat(i + 2u, count, m, quad, map_here, &pixels);
             add_splat(i + 3u, count, m, quad, map_here, &pixels);
         }
-        has_ended &= i >= count;
+        completed &= i >= count;
     }
-    expect_end(has_ended && (first >= end || !any(pixels.goes_on)));
+    expect_end(completed && (first >= end || !any(pixels.unfinished)));
 }

@@ -1,6 +1,6 @@
-// Stage 1: rows to splats, one row per invocation; src/render/cpu/project.rs.
+// Stage 1: projects rows to splats, one row per invocation, as in src/render/cpu/project.rs.
 
-// Three per row: mean and l1, shear | l3, log2 of the opacity, depth, unused | colour, unused.
+// Three vectors per row: mean, l1, shear | l3, log2 of the opacity, depth, unused | colour, unused.
 @group(0) @binding(6) var<storage, read_write> splats: array<vec4<f32>>;
 // The tiles that the row's ellipse touches: columns x0 | x1 << 16, rows y0 | y1 << 16, a bit for each
 // of 8 × 4 blocks of tiles starting at (x0, y0), and the log2 of a block's width | height << 16.
@@ -11,7 +11,7 @@
 // Slack for the bounds of an ellipse [px]; see src/render/cpu/footprint.rs.
 const SLACK: f32 = 0.02;
 
-// True if the splat's extent contains the centre of any pixel; these go from 1/2 to size − 1/2.
+// True if the splat's extent contains the centre of any pixel; pixel centres range from 1/2 to size − 1/2.
 fn reaches(centre: f32, half: f32, size: u32) -> bool {
     return centre + half >= 0.5 && centre - half <= f32(size) - 0.5;
 }
@@ -39,7 +39,7 @@ fn project(@builtin(global_invocation_id) id: vec3<u32>) {
         return;
     }
     let log2_opacity = log2_sigmoid(row.logit);
-    // Fall of the exponent from the centre to alpha 1/255; <= 0 if the centre is below that.
+    // Decrease of the exponent from the centre to where alpha is ALPHA_MIN; <= 0 if even the centre is fainter.
     let reach = log2_opacity + LOG2_REACH;
     if reach <= 0.0 {
         return;
@@ -49,12 +49,12 @@ fn project(@builtin(global_invocation_id) id: vec3<u32>) {
         return;
     }
     let factor = conic(g);
-    let radius = sqrt(reach) * (1.0 / FOLD);
+    let radius = sqrt(reach) * (1.0 / EXPONENT_SCALE);
     let half_width = radius * sqrt(g.cov.x);
     let half_height = radius * sqrt(g.cov.z);
     let u = g.ratio.x * frame.lens.x + frame.lens.z;
     let v = g.ratio.y * frame.lens.y + frame.lens.w;
-    // The determinant of a row about 4e9 px wide overflows f32, and the factors are then not finite.
+    // The determinant of a row about 4e9 px wide overflows f32; its conic factors are then not finite.
     sound = below(g.det, LARGEST) && below(half_width, LARGEST) && below(half_height, LARGEST)
         && below(u, LARGEST) && below(v, LARGEST) && below(factor.x, LARGEST)
         && below(factor.y, LARGEST);
@@ -68,8 +68,8 @@ fn project(@builtin(global_invocation_id) id: vec3<u32>) {
     if !(below(raw.x, COLOUR_MAX) && below(raw.y, COLOUR_MAX) && below(raw.z, COLOUR_MAX)) {
         return;
     }
-    let l1 = factor.x * FOLD;
-    let l3 = factor.z * FOLD;
+    let l1 = factor.x * EXPONENT_SCALE;
+    let l3 = factor.z * EXPONENT_SCALE;
     splats[3u * i] = vec4(u, v, l1, factor.y);
     splats[3u * i + 1u] = vec4(l3, log2_opacity, g.p.z, 0.0);
     splats[3u * i + 2u] = vec4(max(raw, vec3(0.0)), 0.0);
@@ -93,7 +93,7 @@ fn project(@builtin(global_invocation_id) id: vec3<u32>) {
     while ((y1 - y0) >> high) >= 4u {
         high++;
     }
-    // In folded units the ellipse is u² + z² <= reach, u = l1·(dx − shear·dy), z = l3·dy. Its
+    // With the scaled conic the ellipse is u² + z² <= reach, u = l1·(dx − shear·dy), z = l3·dy. Its
     // rightmost point is at dy = peak, its leftmost at dy = −peak.
     let peak = g.cov.y / g.cov.x * half_width;
     var bits = 0u;

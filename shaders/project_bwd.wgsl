@@ -1,4 +1,4 @@
-// Stage 6: splat gradients to parameter gradients, one row per invocation;
+// Stage 6: from splat gradients to parameter gradients, one row per invocation;
 // src/render/cpu/project_bwd.rs derives the formulas.
 
 // Sums of the records, one record per row.
@@ -29,14 +29,14 @@ fn project_bwd(@builtin(global_invocation_id) id: vec3<u32>) {
     let l1 = factor.x;
     let shear = factor.y;
     let l3 = factor.z;
-    // Undo the folded units of the rasteriser.
-    let unfold = 1.0 / FOLD;
+    // Undo the scaling of the conic in the rasteriser's sums.
+    let unscale = 1.0 / EXPONENT_SCALE;
     let q = row_sums[at];
-    let qu = row_sums[at + 1u] * unfold;
-    let qz = row_sums[at + 2u] * unfold;
-    let muu = row_sums[at + 3u] * (unfold * unfold);
-    let muz = row_sums[at + 4u] * (unfold * unfold);
-    let mzz = row_sums[at + 5u] * (unfold * unfold);
+    let qu = row_sums[at + 1u] * unscale;
+    let qz = row_sums[at + 2u] * unscale;
+    let muu = row_sums[at + 3u] * (unscale * unscale);
+    let muz = row_sums[at + 4u] * (unscale * unscale);
+    let mzz = row_sums[at + 5u] * (unscale * unscale);
 
     // Projected mean: L·Σ q·(u, z).
     let dm = vec2(l1 * qu, l3 * qz - l1 * shear * qu);
@@ -66,7 +66,7 @@ fn project_bwd(@builtin(global_invocation_id) id: vec3<u32>) {
     let j02 = dot(db0, r2);
     let j11 = dot(db1, r1);
     let j12 = dot(db1, r2);
-    // J = f/z·[1, 0, −x/z; 0, 1, −y/z]; where x/z or y/z is clamped, it is constant.
+    // J = f/z·[1, 0, −x/z; 0, 1, −y/z]; where x/z or y/z is clamped, that ratio is constant.
     let by_inv_z = frame.lens.x * (j00 - g.clamped.x * j02) + frame.lens.y * (j11 - g.clamped.y * j12);
     let free = g.clamped == g.ratio;
     let by_ratio = frame.lens.xy * (dm - select(vec2(0.0), g.inv_z * vec2(j02, j12), free));

@@ -1,21 +1,21 @@
-// Stage 3: tile lists to pixels; src/render/cpu/rasterize.rs. quads.wgsl assigns pixels to invocations.
+// Stage 3: from tile lists to pixels, as in src/render/cpu/rasterize.rs. quads.wgsl assigns pixels to invocations.
 
 // Red, green, blue (background included), depth.
 @group(0) @binding(6) var<storage, read_write> canvas: array<vec4<f32>>;
 // Bits of the final transmittance; index in the tile's list at which the pixel stopped, or NONE.
 @group(0) @binding(7) var<storage, read_write> finish: array<vec2<u32>>;
 
-// Number of pixels that each row dominates: no other row has a larger blend weight there. Unused if
-// they are not counted.
+// Number of pixels that each row dominates: no other row has a larger blend weight there. Used only if
+// COUNTS_DOMINANT is set.
 @group(0) @binding(8) var<storage, read_write> dominant: array<atomic<u32>>;
 
 override COUNTS_DOMINANT: bool = false;
 
-// Splats loaded at a time, where all invocations share them (batch.wgsl).
+// Number of splats loaded at a time if all invocations share them (batch.wgsl).
 const BATCH: u32 = 64u;
 
-// The state of an invocation's pixels.
-struct Shown {
+// What has been accumulated in an invocation's pixels.
+struct Accumulated {
     red: vec4<f32>,
     green: vec4<f32>,
     blue: vec4<f32>,
@@ -27,33 +27,33 @@ struct Shown {
 }
 
 // Blends splat k of the `count` loaded ones, which start at index n of the list.
-fn draw(
+fn blend_splat(
     k: u32,
     count: u32,
     n: u32,
     quad: Quad,
     pixels: ptr<function, Open>,
-    shown: ptr<function, Shown>,
+    accumulated: ptr<function, Accumulated>,
 ) {
     if k >= count {
         return;
     }
-    let went_on = (*pixels).goes_on;
+    let was_unfinished = (*pixels).unfinished;
     let splat = loaded_splat(k);
     let w = blend(falloff(splat, quad).exponent, pixels);
-    (*shown).red += w * splat.colour.x;
-    (*shown).green += w * splat.colour.y;
-    (*shown).blue += w * splat.colour.z;
-    (*shown).depth += w * splat.b.z;
+    (*accumulated).red += w * splat.colour.x;
+    (*accumulated).green += w * splat.colour.y;
+    (*accumulated).blue += w * splat.colour.z;
+    (*accumulated).depth += w * splat.b.z;
     if COUNTS_DOMINANT {
-        (*shown).most_at = select((*shown).most_at, vec4(n + k), w > (*shown).most);
-        (*shown).most = max((*shown).most, w);
+        (*accumulated).most_at = select((*accumulated).most_at, vec4(n + k), w > (*accumulated).most);
+        (*accumulated).most = max((*accumulated).most, w);
     }
-    let stops = went_on & !(*pixels).goes_on;
-    (*shown).stop = select((*shown).stop, vec4(n + k), stops);
+    let stops = was_unfinished & !(*pixels).unfinished;
+    (*accumulated).stop = select((*accumulated).stop, vec4(n + k), stops);
 }
 
-// now.a: the band.
+// launch.a: the band of tiles that this launch handles.
 @compute @workgroup_size(64)
 fn rasterize(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -68,12 +68,12 @@ fn rasterize(
     let begin = tile_starts[tile];
     let end = tile_starts[tile + 1u];
     var pixels = Open(vec4(1.0), quad.inside);
-    let dark = vec4(0.0);
-    var shown = Shown(dark, dark, dark, dark, vec4(NONE), dark, vec4(0u));
-    var has_ended = true;
+    let zero = vec4(0.0);
+    var accumulated = Accumulated(zero, zero, zero, zero, vec4(NONE), zero, vec4(0u));
+    var completed = true;
     var first = begin;
     for (; first < end; first += m.members) {
-        if largest_of_all(m, u32(any(pixels.goes_on))) == 0u {
+        if largest_of_all(m, u32(any(pixels.unfinished))) == 0u {
             break;
         }
         let count = min(m.members, end - first);
@@ -84,25 +84,25 @@ fn rasterize(
         // Four per round, unrolled by hand: compilers do not unroll a body of this size, and the number
         // of rounds is limited (see expect_end).
         var k = 0u;
-        for (; k < count && is_needed(any(pixels.goes_on)); k += 4u) {
-            draw(k, count, first - begin, quad, &pixels, &shown);
-            draw(k + 1u, count, first - begin, quad, &pixels, &shown);
-            draw(k + 2u, count, first - begin, quad, &pixels, &shown);
-            draw(k + 3u, count, first - begin, quad, &pixels, &shown);
+        for (; k < count && is_needed(any(pixels.unfinished)); k += 4u) {
+            blend_splat(k, count, first - begin, quad, &pixels, &accumulated);
+            blend_splat(k + 1u, count, first - begin, quad, &pixels, &accumulated);
+            blend_splat(k + 2u, count, first - begin, quad, &pixels, &accumulated);
+            blend_splat(k + 3u, count, first - begin, quad, &pixels, &accumulated);
         }
-        has_ended &= k >= count || !any(pixels.goes_on);
+        completed &= k >= count || !any(pixels.unfinished);
     }
-    expect_end(has_ended && (first >= end || !any(pixels.goes_on)));
-    let red = shown.red + pixels.light * frame.background.x;
-    let green = shown.green + pixels.light * frame.background.y;
-    let blue = shown.blue + pixels.light * frame.background.z;
+    expect_end(completed && (first >= end || !any(pixels.unfinished)));
+    let red = accumulated.red + pixels.light * frame.background.x;
+    let green = accumulated.green + pixels.light * frame.background.y;
+    let blue = accumulated.blue + pixels.light * frame.background.z;
     for (var p = 0u; p < 4u; p++) {
         if quad.inside[p] {
             let to = quad.place[p];
-            canvas[to] = vec4(red[p], green[p], blue[p], shown.depth[p]);
-            finish[to] = vec2(bitcast<u32>(pixels.light[p]), shown.stop[p]);
-            if COUNTS_DOMINANT && shown.most[p] > 0.0 {
-                atomicAdd(&dominant[row_of_slot[list[begin + shown.most_at[p]]]], 1u);
+            canvas[to] = vec4(red[p], green[p], blue[p], accumulated.depth[p]);
+            finish[to] = vec2(bitcast<u32>(pixels.light[p]), accumulated.stop[p]);
+            if COUNTS_DOMINANT && accumulated.most[p] > 0.0 {
+                atomicAdd(&dominant[row_of_slot[list[begin + accumulated.most_at[p]]]], 1u);
             }
         }
     }

@@ -1,4 +1,4 @@
-// Stage 5 without atomics: pixel gradients to splat gradients, one record per entry, then one sum per
+// Stage 5 without atomics: from pixel gradients to splat gradients, one record per entry, then one sum per
 // row. rasterize_bwd_atomic.wgsl does the same with atomics; both use backward.wgsl.
 
 // One record per slot.
@@ -24,7 +24,7 @@ fn store_splat(
     }
 }
 
-// now.a: the band.
+// launch.a: the band of tiles that this launch handles.
 @compute @workgroup_size(64)
 fn rasterize_bwd(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -42,7 +42,7 @@ fn rasterize_bwd(
 
     let m = member(lane);
     let reached = largest_of_all(m, last_of(pixels));
-    // No pixel takes splats behind those.
+    // No pixel blends a splat behind the first `reached` ones.
     var i = reached + lane;
     for (; i < length; i += MEMBERS) {
         let slot = list[begin + i];
@@ -50,7 +50,7 @@ fn rasterize_bwd(
             records[slot * RECORD + f] = 0.0;
         }
     }
-    var has_ended = i >= length;
+    var completed = i >= length;
 
     let batches = (reached + BATCH - 1u) / BATCH;
     var n = 0u;
@@ -75,19 +75,19 @@ fn rasterize_bwd(
             }
             wait_for_all();
         }
-        has_ended &= top <= 0;
+        completed &= top <= 0;
     }
-    expect_end(has_ended && n >= batches);
+    expect_end(completed && n >= batches);
 }
 
-// --- Records to one sum per row -------------------------------------------------------------------
+// --- From records to one sum per row -------------------------------------------------------------------
 
 @group(0) @binding(9) var<storage, read> depths: array<u32>;
 @group(0) @binding(10) var<storage, read> slots_of_row: array<vec2<u32>>;
 @group(0) @binding(11) var<storage, read> all_records: array<f32>;
 @group(0) @binding(12) var<storage, read_write> row_sums: array<f32>;
 
-// Sums a row's records, which are contiguous, in order; now.a: the band.
+// Sums a row's records, which are contiguous, in order; launch.a: the band.
 @compute @workgroup_size(256)
 fn gather(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = index_of(id);
@@ -96,7 +96,7 @@ fn gather(@builtin(global_invocation_id) id: vec3<u32>) {
     }
     let slots = slots_of_row[row];
     var totals: array<f32, FIELDS>;
-    if now.a > 0u {
+    if launch.a > 0u {
         for (var f = 0u; f < RECORD; f++) {
             totals[f] = row_sums[row * RECORD + f];
         }

@@ -1,5 +1,5 @@
-// Stage 5 with atomics: pixel gradients are added directly to the sums of rows, without records. The
-// sums are those of rasterize_bwd.wgsl, in no fixed order.
+// Stage 5 with atomics: pixel gradients are added straight to each row's sums, without records. The
+// sums are those of rasterize_bwd.wgsl, but their terms are added in no fixed order.
 
 // The subgroup's contribution to the gradients of loaded splat i; the first is at index n of the list.
 fn add_splat(
@@ -12,13 +12,13 @@ fn add_splat(
 ) {
     // Initialised explicitly: naga does not reset a variable in each round of a loop.
     var sums = array<f32, FIELDS>();
-    let is_taken = backpropagate(loaded_splat(i), n + i, quad, own, pixels, &sums);
-    if subgroupAny(is_taken) {
+    let is_blended = backpropagate(loaded_splat(i), n + i, quad, own, pixels, &sums);
+    if subgroupAny(is_blended) {
         add_to_row(m, i, sums, RECORD, maximum());
     }
 }
 
-// now.a: the band.
+// launch.a: the band of tiles that this launch handles.
 @compute @workgroup_size(64)
 fn rasterize_bwd_atomic(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -36,7 +36,7 @@ fn rasterize_bwd_atomic(
     var pixels = behind_all(quad, own, tile_starts[tile + 1u] - begin);
     let reached = largest_of_all(m, last_of(pixels));
     let batches = (reached + m.members - 1u) / m.members;
-    var has_ended = true;
+    var completed = true;
     var n = 0u;
     for (; n < batches; n++) {
         let first = (batches - 1u - n) * m.members;
@@ -54,20 +54,20 @@ fn rasterize_bwd_atomic(
                 left ^= 1u << bit;
                 add_splat(32u * (word - 1u) + bit, first, m, quad, own, &pixels);
             }
-            has_ended &= left == 0u;
+            completed &= left == 0u;
         }
-        has_ended &= word == 0u;
+        completed &= word == 0u;
     }
-    expect_end(has_ended && n >= batches);
+    expect_end(completed && n >= batches);
 }
 
-// Sets the sums of all rows to 0, before the first band; now.a: numbers per row.
+// Sets the sums of all rows to 0, before the first band; launch.a: numbers per row.
 @compute @workgroup_size(256)
 fn clear_sums(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = index_of(id);
     if row < frame.model.x {
-        for (var f = 0u; f < now.a; f++) {
-            clear(row * now.a + f);
+        for (var f = 0u; f < launch.a; f++) {
+            clear(row * launch.a + f);
         }
     }
 }

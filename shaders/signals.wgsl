@@ -1,4 +1,4 @@
-// Stage 8: accumulates the requested signals over views; src/render/cpu/signals.rs. One row per
+// Stage 8: accumulates the requested signals over views, as in src/render/cpu/signals.rs. One row per
 // invocation. Each requested signal has planes of accumulators, with a number per row that is not frozen.
 
 @group(0) @binding(1) var<storage, read> state: State;
@@ -15,8 +15,8 @@
 // Change of each mask's logit since its start, if there are masks.
 @group(0) @binding(10) var<storage, read> mask_offsets: array<f32>;
 
-const FOLD: f32 = 0.8493218;
-// Least largest weight of a view that counts as support.
+const EXPONENT_SCALE: f32 = 0.8493218;
+// A view counts as support if the row's largest weight in it is at least this.
 override SUPPORT_WEIGHT: f32;
 
 // Numbers of the signals, which index frame.planes; policies/src/signals.rs has the table.
@@ -89,11 +89,11 @@ fn accumulate(@builtin(global_invocation_id) id: vec3<u32>) {
     add(MEAN_GRADIENT_Z, row, by_mean.z);
     add(MEAN_GRADIENT_NORM, row, norm3(by_mean));
     if ABS_X_AT > 0u {
-        // The sums are in folded units, and the first lacks its factor l1.
-        let unfold = 1.0 / FOLD;
-        let l1 = splats[3u * row].z * unfold;
-        let by_x = l1 * unfold * row_sums[at + ABS_X_AT];
-        let by_y = unfold * unfold * row_sums[at + ABS_Y_AT];
+        // The sums are of scaled values (see project_bwd.wgsl), and the first lacks its factor l1.
+        let unscale = 1.0 / EXPONENT_SCALE;
+        let l1 = splats[3u * row].z * unscale;
+        let by_x = l1 * unscale * row_sums[at + ABS_X_AT];
+        let by_y = unscale * unscale * row_sums[at + ABS_Y_AT];
         add(SCREEN_GRADIENT_ABS, row, weight * norm2(vec2(by_x, by_y) * half));
     }
     if WEIGHT_SUM_AT > 0u {
@@ -138,7 +138,7 @@ fn score(error: f32, weight: f32) -> f32 {
     return score;
 }
 
-// A norm by scaling: squares of small gradients would underflow, on some devices even sooner.
+// The norm, computed from scaled components: the squares of small gradients would underflow.
 fn norm2(v: vec2<f32>) -> f32 {
     let most = max(abs(v.x), abs(v.y));
     if !(most > 0.0) {
@@ -157,28 +157,28 @@ fn norm3(v: vec3<f32>) -> f32 {
     return most * sqrt(dot(scaled, scaled));
 }
 
-// Writes a signal that is computed from the rows to the first plane of `signals`, here a scratch
-// buffer; now.a: the signal, now.b: rows (`frame` may not be set yet), now.c: bits of the initial logit
-// of masks, now.d: frozen rows, which are skipped.
+// Computes a signal from the current rows and writes it to the first plane of `signals`, here a scratch
+// buffer. launch.a: the signal, launch.b: number of rows (`frame` may not be set yet), launch.c: bits of the
+// initial logit of masks, launch.d: number of frozen rows, which are skipped.
 @compute @workgroup_size(256)
 fn present(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = index_of(id);
-    if row < now.d || row >= now.b {
+    if row < launch.d || row >= launch.b {
         return;
     }
-    let own = row - now.d;
+    let own = row - launch.d;
     let s = vec3(rows[12u * row + 3u], rows[12u * row + 4u], rows[12u * row + 5u]);
     let logit = rows[12u * row + 10u];
     var value = 0.0;
-    if now.a == OPACITY {
+    if launch.a == OPACITY {
         value = sigmoid(logit);
-    } else if now.a == MASK {
-        value = sigmoid(bitcast<f32>(now.c) + mask_offsets[own]);
-    } else if now.a == SCALE_MAX {
+    } else if launch.a == MASK {
+        value = sigmoid(bitcast<f32>(launch.c) + mask_offsets[own]);
+    } else if launch.a == SCALE_MAX {
         value = exp_exact(max(max(s.x, s.y), s.z));
-    } else if now.a == SCALE_PRODUCT {
+    } else if launch.a == SCALE_PRODUCT {
         value = exp_exact(s.x + s.y + s.z);
-    } else if now.a == AGE {
+    } else if launch.a == AGE {
         value = f32(ages[own] & 0xffffu);
     }
     signals[own] = value;

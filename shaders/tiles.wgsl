@@ -1,9 +1,9 @@
-// Stage 2: splats to tile lists; src/render/cpu/tiles.rs. The rows on screen are sorted by depth,
+// Stage 2: from splats to tile lists, as in src/render/cpu/tiles.rs. The rows on screen are sorted by depth,
 // their entries emitted in that order, and the entries sorted by tile with a stable sort: each tile's
 // list is then sorted by depth, and by row where depths are equal. project.wgsl has stored each row's
 // footprint in integers, so counting entries and emitting them cannot disagree.
 //
-// Sums and sorts are exact and have a fixed order: no result depends on timing. An entry's index
+// Prefix sums and sorts are exact and have a fixed order: no result depends on timing. An entry's index
 // before the sort is its slot: the slots of a row are contiguous, in the order of its tiles.
 //
 // One file, because counting, emitting and sorting share the state and the counters.
@@ -29,10 +29,10 @@
 @group(0) @binding(14) var<storage, read_write> tile_starts: array<u32>;
 @group(0) @binding(15) var<storage, read_write> tile_counts: array<atomic<u32>>;
 
-// Items per group in sums and sorts.
+// Items per workgroup and per invocation in prefix sums and sorts.
 const BLOCK: u32 = 2048u;
 const EACH: u32 = 8u;
-// Sums saturate here, beyond any cap.
+// Prefix sums saturate at this number, which is beyond any cap.
 const MOST: u32 = 0x40000000u;
 
 // Indices in `groups`.
@@ -42,7 +42,7 @@ const ARGS_ROW_DIGITS: u32 = 6u;
 const ARGS_ENTRY_BLOCKS: u32 = 9u;
 const ARGS_ENTRY_DIGITS: u32 = 12u;
 
-// The numbers to sum (now.a of scan_blocks and scan_sums).
+// The numbers to sum (launch.a of scan_blocks and scan_sums).
 const FLAGS: u32 = 0u;
 const COUNTS_ALL: u32 = 1u;
 const COUNTS_BAND: u32 = 2u;
@@ -60,7 +60,7 @@ fn set_groups(at: u32, count: u32) {
     groups[at + 2u] = 1u;
 }
 
-// --- Sums ---------------------------------------------------------------------------------------
+// --- Prefix sums --------------------------------------------------------------------------------
 
 var<workgroup> partial: array<u32, 256>;
 
@@ -88,7 +88,7 @@ fn sum_before(lane: u32, value: u32) -> u32 {
     return before;
 }
 
-// The number of values to sum.
+// The number of values of which `what` forms prefix sums.
 fn count_of(what: u32) -> u32 {
     switch what {
         case FLAGS: { return frame.model.x; }
@@ -104,7 +104,7 @@ fn scan_blocks(
     @builtin(local_invocation_index) lane: u32,
 ) {
     let block = group_of(id);
-    let count = count_of(now.a);
+    let count = count_of(launch.a);
     let first = block * BLOCK + lane * EACH;
     var values: array<u32, 8>;
     var sum = 0u;
@@ -112,7 +112,7 @@ fn scan_blocks(
         let i = first + k;
         var value = 0u;
         if i < count {
-            if now.a == FLAGS {
+            if launch.a == FLAGS {
                 value = select(0u, 1u, depths[i] != NONE);
             } else {
                 value = sums[i];
@@ -137,7 +137,7 @@ fn scan_blocks(
 // Prefix sums over blocks, and the results that depend on the total; a single group.
 @compute @workgroup_size(256)
 fn scan_sums(@builtin(local_invocation_index) lane: u32) {
-    let blocks = ceil_div(count_of(now.a), BLOCK);
+    let blocks = ceil_div(count_of(launch.a), BLOCK);
     var carry = 0u;
     for (var start = 0u; start < blocks; start += BLOCK) {
         let first = start + lane * EACH;
@@ -166,9 +166,9 @@ fn scan_sums(@builtin(local_invocation_index) lane: u32) {
     }
 }
 
-// now.b: number of encoded bands.
+// launch.b: number of encoded bands.
 fn conclude(total: u32) {
-    switch now.a {
+    switch launch.a {
         case FLAGS: {
             state.visible = total;
             set_groups(ARGS_ROWS, ceil_div(total, GROUP));
@@ -182,29 +182,29 @@ fn conclude(total: u32) {
         }
         case COUNTS_ALL: {
             state.total = total;
-            if now.b == 1u {
+            if launch.b == 1u {
                 // Only one band was encoded. If the image needs more, the lists stay empty and no
                 // kernel changes the model.
                 let fits = total <= frame.model.z;
                 state.short = select(1u, 0u, fits);
                 state.cuts[0] = 0u;
                 state.cuts[1] = frame.image.w;
-                hold(select(0u, total, fits), true);
+                set_held(select(0u, total, fits), true);
             }
         }
-        case COUNTS_BAND: { hold(total, true); }
-        case COUNTS_AGAIN: { hold(total, false); }
+        case COUNTS_BAND: { set_held(total, true); }
+        case COUNTS_AGAIN: { set_held(total, false); }
         default: {}
     }
 }
 
-// Sets the number of entries of the current band.
-fn hold(held: u32, is_news: bool) {
+// Sets the number of entries of the current band, and adds it to the total if `is_new`.
+fn set_held(held: u32, is_new: bool) {
     state.held = held;
     let blocks = ceil_div(held, BLOCK);
     set_groups(ARGS_ENTRY_BLOCKS, blocks);
     set_groups(ARGS_ENTRY_DIGITS, ceil_div(16u * blocks, BLOCK));
-    if is_news {
+    if is_new {
         let low = state.entries_low + held;
         state.entries_high += select(0u, 1u, low < held);
         state.entries_low = low;
@@ -234,8 +234,8 @@ struct Run {
     last: u32,
 }
 
-// The part of block `bit` in a line of blocks that is in the footprint and in the band's tiles
-// low..high; empty if first > last. `before` is the line's first tile.
+// The tiles of block `bit` in a line of tiles that are in the footprint and among the band's tiles
+// low..high; none if first > last. `before` is the line's first tile.
 fn run_of(x0: u32, x1: u32, wide: u32, bit: u32, before: u32, low: u32, high: u32) -> Run {
     var first = x0 + (bit << wide);
     var last = min(first + (1u << wide) - 1u, x1);
@@ -251,12 +251,12 @@ fn run_of(x0: u32, x1: u32, wide: u32, bit: u32, before: u32, low: u32, high: u3
     return Run(first, last);
 }
 
-// The range of the band's tiles; now.a: the band, or NONE for the whole image.
+// The range of the band's tiles; launch.a: the band, or NONE for the whole image.
 fn band() -> vec2<u32> {
-    if now.a == NONE {
+    if launch.a == NONE {
         return vec2(0u, frame.image.w);
     }
-    return vec2(state.cuts[now.a], state.cuts[now.a + 1u]);
+    return vec2(state.cuts[launch.a], state.cuts[launch.a + 1u]);
 }
 
 // Counts the entries of each row, front to back.
@@ -284,7 +284,7 @@ fn count_entries(@builtin(global_invocation_id) id: vec3<u32>) {
     sums[i] = min(count, MOST);
 }
 
-// Writes the entries: tile and row per slot, slots per row.
+// Writes the entries: the tile and row of each slot, and the slots of each row.
 @compute @workgroup_size(256)
 fn emit_entries(@builtin(global_invocation_id) id: vec3<u32>) {
     let i = index_of(id);
@@ -343,7 +343,7 @@ fn count_tiles(@builtin(global_invocation_id) id: vec3<u32>) {
     }
 }
 
-// Divides the tiles into bands whose lists fit the cap; now.b: number of encoded bands. The list of a
+// Divides the tiles into bands whose lists fit the cap; launch.b: number of encoded bands. The list of a
 // single tile always fits, since the cap is at least the budget.
 @compute @workgroup_size(1)
 fn cut_bands() {
@@ -356,16 +356,16 @@ fn cut_bands() {
         if held + here > cap {
             band++;
             held = 0u;
-            if band < now.b {
+            if band < launch.b {
                 state.cuts[band] = tile;
             }
         }
         held += here;
     }
     state.bands = band + 1u;
-    let fits = band < now.b;
+    let fits = band < launch.b;
     state.short = select(1u, 0u, fits);
-    for (var k = 0u; k <= now.b; k++) {
+    for (var k = 0u; k <= launch.b; k++) {
         if !fits {
             state.cuts[k] = 0u;
         } else if k > band {
@@ -374,17 +374,17 @@ fn cut_bands() {
     }
 }
 
-// --- Stable sort, four bits at a time; now.a: shift, now.b: 1 to sort entries, 0 to sort rows,
-// now.c: 1 if the values are the indices -----------------------------------------------------------
+// --- Stable sort, four bits at a time; launch.a: shift, launch.b: 1 to sort entries, 0 to sort rows,
+// launch.c: 1 if the values are the indices -----------------------------------------------------------
 
 var<workgroup> histogram: array<atomic<u32>, 16>;
 
 fn items() -> u32 {
-    return select(state.visible, state.held, now.b == 1u);
+    return select(state.visible, state.held, launch.b == 1u);
 }
 
 fn digit_of(key: u32) -> u32 {
-    return (key >> now.a) & 15u;
+    return (key >> launch.a) & 15u;
 }
 
 @compute @workgroup_size(256)
@@ -474,7 +474,7 @@ fn scatter(
             counters[word] += 1u << half;
             let to = summed(digit * blocks + block) + place - digit_starts[digit];
             keys_out[to] = keys[k];
-            if now.c == 1u {
+            if launch.c == 1u {
                 values_out[to] = i;
             } else {
                 values_out[to] = values_in[i];

@@ -1,4 +1,4 @@
-//! The measured training steps and their scenes.
+//! The training steps that the benchmarks measure, and their scenes.
 
 use std::time::Duration;
 
@@ -59,7 +59,7 @@ const RATES: LearningRates = LearningRates {
     sh_rest: 1e-6,
 };
 
-/// A step of training on the whole model.
+/// The input of one training step.
 pub(crate) fn input<'a>(step: u32, camera: &'a Camera, target: &'a Image8) -> StepInput<'a> {
     StepInput {
         step,

@@ -13,7 +13,7 @@ use crate::plan::{
 use crate::policy::{PolicyResult, SceneInfo, Signal, Snapshot};
 use crate::sample::top_k;
 
-/// Signals read by growth by screen gradient and by pruning by opacity and size.
+/// Signals for growth by screen gradient and for pruning by opacity and size.
 pub(crate) const GROWTH_SIGNALS: [Signal; 4] =
     [Signal::VisibleCount, Signal::ScreenGradient, Signal::Opacity, Signal::ScaleMax];
 
@@ -59,7 +59,7 @@ impl OpacityResets {
     /// `white_at` if the scene's background is white (all in steps; 0: never).
     ///
     /// # Errors
-    /// When `reset_opacity`, rounded to the f32 that plans take, is not in (0, 1).
+    /// When `reset_opacity`, rounded to f32, is not in (0, 1).
     pub fn new(
         every: u32,
         until: u32,
@@ -239,8 +239,8 @@ mod tests {
     }
 
     #[test]
-    fn the_curve_is_that_of_taming() {
-        // M = 29, 28 events at 1000..14500; the last ends 1/29² below the end.
+    fn the_concave_curve_matches_values_worked_out_by_hand() {
+        // M = 29: after the last event, the 28th at step 14,500, 1/29² of the growth is still missing.
         let window = Window { from: 500, until: 15_000, every: 500 };
         let at = |step| concave_curve(window, step, 1000, 85_100);
         // x = 1: 84,100·(2/29 − 1/841) = 84,100·57/841 = 5,700.
@@ -277,7 +277,7 @@ mod tests {
     }
 
     #[test]
-    fn the_faint_the_huge_and_the_undefined_are_pruned() {
+    fn faint_huge_and_non_finite_rows_are_pruned() {
         let limits = PruneLimits { min_opacity: 0.005, max_scale: 2.0 };
         assert!(!limits.exceeded(0.005, 2.0));
         assert!(limits.exceeded(0.0049, 1.0) && limits.exceeded(0.5, 2.1));
@@ -287,9 +287,9 @@ mod tests {
     }
 
     #[test]
-    fn resets_take_an_opacity_between_0_and_1() {
+    fn reset_opacities_outside_0_to_1_are_refused() {
         let scene = crate::event::Event::new(1, 1, 1).scene;
-        // The last is 1 as f32.
+        // The last value rounds to 1 as f32.
         for opacity in [0.0, 1.0, f64::NAN, 0.999_999_99] {
             assert!(OpacityResets::new(3000, 15_000, 500, opacity, &scene).is_err(), "{opacity}");
         }

@@ -121,7 +121,7 @@ pub struct Decay {
 /// Opacity at which [`Decay`] stops: far below the smallest alpha that is rendered, 1/255.
 pub const MIN_DECAYED_OPACITY: f32 = 2e-4;
 
-/// Largest magnitude of a base colour: larger values would not fit the narrowest storage.
+/// Largest magnitude of a base colour: larger values would not fit the narrowest storage format.
 pub const COLOUR_MAX: f32 = 1e4;
 
 /// A new row without a parent, whose colour does not depend on the view; see [`Seed::round`].

@@ -1,4 +1,4 @@
-//! Hand-made events for tests of policies: signals in, pruned and grown rows out.
+//! Hand-made events (steps at which a policy edits the model) for tests of policies.
 
 use crate::conformance::check_policy_with;
 use crate::plan::{EditPlan, Offspring, ParentFate, RowOps};
@@ -136,7 +136,7 @@ impl Event {
         signals
     }
 
-    /// Lets the policy plan, with exactly the signals and the number of views that it requests.
+    /// Lets the policy plan, with exactly the signals and at most as many views as it requests.
     pub(crate) fn run_policy(&self, policy: &mut dyn DensityPolicy) -> PolicyResult<Outcome> {
         let request = policy.needs(&self.scene).aux.unwrap_or_default();
         let wanted = policy.aux_views(self.step, self.rows, self.budget) as usize;

@@ -65,11 +65,11 @@ impl<'a> Neighbours<'a> {
         self.nearest_below(index, f64::INFINITY, buffer)
     }
 
-    /// Calls `visit` with the index of each point and its `most` nearest neighbours, nearest first. Consecutive
+    /// Calls `visit` with the index of each point and its `count` nearest neighbours, nearest first. Consecutive
     /// points are near each other.
-    pub fn for_each_nearest(&self, most: usize, mut visit: impl FnMut(usize, &[Neighbour])) {
-        let most = most.min(self.points.len().saturating_sub(1));
-        let mut buffer = vec![NOT_FOUND; most];
+    pub fn for_each_nearest(&self, count: usize, mut visit: impl FnMut(usize, &[Neighbour])) {
+        let count = count.min(self.points.len().saturating_sub(1));
+        let mut buffer = vec![NOT_FOUND; count];
         let mut before: Option<(usize, f64)> = None;
         for &index in &self.order {
             let index = index as usize;
@@ -81,7 +81,7 @@ impl<'a> Neighbours<'a> {
             });
             let found = self.nearest_below(index, bound, &mut buffer);
             visit(index, found);
-            before = found.last().filter(|_| found.len() == most).map(|last| (index, last.square));
+            before = found.last().filter(|_| found.len() == count).map(|last| (index, last.square));
         }
     }
 
@@ -101,7 +101,7 @@ impl<'a> Neighbours<'a> {
         &buffer[..count]
     }
 
-    /// Searches a range of points whose box is at distance `outside` along each axis.
+    /// Searches a range of points whose box is at distance `outside` from the point of `nearest` along each axis.
     fn visit(&self, from: usize, to: usize, outside: [f64; 3], nearest: &mut Nearest<'_>) {
         if to - from <= LEAF {
             for &other in &self.order[from..to] {
@@ -183,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn few_points_by_hand() {
+    fn distances_of_few_points_match_values_worked_out_by_hand() {
         assert!(mean_square_distances(&[]).is_empty());
         assert_eq!(mean_square_distances(&[[1.0; 3]]), [0.0]);
         let line = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [3.0, 0.0, 0.0]];

@@ -79,9 +79,9 @@ const MIN_INTERVAL: i64 = 100;
 /// length of the run; a value that is set does not.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StepParameter {
-    /// A step of the run, or a number of them: scales in proportion.
+    /// A step of the run, or a number of steps: scales in proportion.
     Step(&'static str),
-    /// The steps from one event to the next: scales, but does not shrink below 100.
+    /// The number of steps between events: scales, but does not shrink below 100.
     Interval(&'static str),
 }
 

@@ -2,7 +2,7 @@
 //!
 //! Methods that prune a grown model differ in their measure and share this code: the measure is accumulated
 //! over the auxiliary views of one event, and the rows with the lowest values are pruned. A control prunes the
-//! same number of rows at random, so that a study can tell the effect of the measure.
+//! same number of rows at random, so that a study can isolate the effect of the measure.
 
 use serde::{Deserialize, Serialize};
 
@@ -26,7 +26,7 @@ impl OverViews {
         self.combine(step, values, |sum, value| sum + value);
     }
 
-    /// Takes the maximum with the values of a view of `step`, and with 0. Shape: `[rows]`.
+    /// Raises the values so far to those of a view of `step` where these are larger. Shape: `[rows]`.
     pub fn maximum(&mut self, step: u32, values: &[f32]) {
         self.combine(step, values, f32::max);
     }

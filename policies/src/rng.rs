@@ -14,7 +14,7 @@ pub enum Purpose {
     Place = 2,
     /// Noise on parameters.
     Noise = 3,
-    /// Drawing with replacement; the index of the draw takes the place of the row.
+    /// Sampling rows with replacement; the index of the sample takes the place of the row.
     Draw = 4,
     /// Stochastic rounding of numbers stored in fewer bits.
     Round = 5,

@@ -72,7 +72,7 @@ pub fn with_replacement(weights: &[f32], k: usize, rng: &PolicyRng) -> Vec<(u32,
         .map(|draw| {
             let at = rng.uniform_f64(draw, Purpose::Draw) * total;
             let row = sums.partition_point(|&sum| sum <= at);
-            // The product may round up to the total, which means the last row with a positive weight.
+            // The product may round up to the total; then the last row with a positive weight is drawn.
             row.min(sums.partition_point(|&sum| sum < total)) as u32
         })
         .collect();
@@ -116,7 +116,7 @@ mod tests {
     const NAN: f32 = f32::NAN;
 
     #[test]
-    fn top_k_by_hand() {
+    fn top_k_matches_values_worked_out_by_hand() {
         let values = [1.0, NAN, 3.0, -NAN, 3.0, f32::INFINITY, -2.0, f32::NEG_INFINITY];
         assert_eq!(top_k(&values, 3), [5, 2, 4]);
         assert_eq!(top_k(&values, 100), [5, 2, 4, 0, 6, 7, 1, 3]);
@@ -149,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn quantiles_by_hand() {
+    fn quantiles_match_values_worked_out_by_hand() {
         let values = [5.0, NAN, 1.0, 2.0, f32::INFINITY, 4.0];
         // Of 1, 2, 4, 5: places 0, 0.75, 1.5 and 3.
         let found = [0.0, 0.25, 0.5, 1.0].map(|share| quantile(&values, share));

@@ -16,7 +16,7 @@ pub enum SignalKind {
     EpochMaximum,
     /// The largest value of a view since the last reset, or since the row was created.
     Maximum,
-    /// The smallest value over the views in which the row was visible since then; +∞ if there are none.
+    /// The smallest value of a view in which the row was visible, over the same time; +∞ if there was none.
     Minimum,
     /// Computed from the current parameters or age of the row; needs no memory.
     Present,
@@ -111,8 +111,8 @@ signals! {
     PixelCount: Count "pixels" [Count];
     /// Sum over all pixels of α·T·e, >= 0, e the pixel's part of the training loss:
     /// 0.8·|I − G| + 0.2·(1 − SSIM), the mean over channels. Divided by
-    /// [`WeightSum`](Self::WeightSum) it is the mean error where the row is visible. Map and pixel weights of
-    /// [`Needs::error_score`](crate::policy::Needs::error_score) apply to this sum, too.
+    /// [`WeightSum`](Self::WeightSum) it is the mean error where the row is visible. The error map and pixel
+    /// weights of [`Needs::error_score`](crate::policy::Needs::error_score) apply to this sum, too.
     WeightedError: Sum "pixels" [WeightedError];
     /// Sum over views of the row's error, >= 0, as defined by [`ErrorScore`](crate::policy::ErrorScore).
     ErrorScore: Sum "1" [Weight, WeightedError];
@@ -126,7 +126,7 @@ signals! {
     DepthMin: Minimum "scene units" [];
     /// Smallest width of a pixel at the depth of the mean, depth / focal length `[scene units]`, > 0.
     PixelSizeMin: Minimum "scene units" [];
-    /// Largest share of a view's pixels in which no row has a larger blend weight, in `[0, 1]`.
+    /// Largest share of a view's pixels that the row dominates: no other has a larger blend weight. In `[0, 1]`.
     DominantPixels: Maximum "image" [];
     /// Current opacity, in (0, 1).
     Opacity: Present "1" [];
@@ -320,7 +320,7 @@ pub enum AuxColumn {
     DistanceSum,
     /// Largest blend weight α·T, in `[0, 1]`.
     WeightMax,
-    /// Number of pixels in which no row has a larger blend weight, >= 0.
+    /// Number of pixels in which no other row has a larger blend weight, >= 0.
     DominantPixels,
     /// Camera z of the mean `[scene units]`.
     Depth,
@@ -355,7 +355,7 @@ mod tests {
     }
 
     #[test]
-    fn a_set_holds_what_was_put_in() {
+    fn a_set_contains_the_signals_added_to_it() {
         let set = SignalSet::from([Signal::Age, Signal::VisibleCount]).with(Signal::Opacity);
         let listed: Vec<Signal> = set.iter().collect();
         assert_eq!(listed, [Signal::VisibleCount, Signal::Opacity, Signal::Age]);

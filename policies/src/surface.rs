@@ -24,11 +24,11 @@ pub fn sizes(positions: &[[f64; 3]], extent: f32) -> Vec<f32> {
     (0..positions.len()).map(|index| size(index) as f32).collect()
 }
 
-/// Replaces all rows by at most `most` of the surface points, with this opacity. If no point is valid, the
+/// Replaces all rows by at most `max_rows` of the surface points, with this opacity. If no point is valid, the
 /// model is kept.
 pub fn replace_model(
     points: &[Candidate],
-    most: usize,
+    max_rows: usize,
     opacity: f32,
     extent: f32,
     plan: &mut EditPlan,
@@ -36,7 +36,7 @@ pub fn replace_model(
     // The size is a placeholder until the neighbours are known.
     let seed = |c: &Candidate| Seed::round(c.position, c.colour, 1.0, opacity);
     let valid = points.iter().map(seed).filter(|seed| seed.bad_field().is_none());
-    let mut seeds: Vec<Seed> = valid.take(most).collect();
+    let mut seeds: Vec<Seed> = valid.take(max_rows).collect();
     if seeds.is_empty() {
         return;
     }
@@ -54,9 +54,9 @@ pub fn replace_model(
     plan.reset(Reset::Candidates);
 }
 
-/// Number of surface points per view for a total of `most` over all `views`, at least one.
-pub fn points_per_view(most: usize, views: u32) -> u32 {
-    let per_view = (most / views.max(1) as usize).max(1);
+/// Number of surface points per view for a total of `total` over all `views`, at least one.
+pub fn points_per_view(total: usize, views: u32) -> u32 {
+    let per_view = (total / views.max(1) as usize).max(1);
     u32::try_from(per_view).unwrap_or(u32::MAX)
 }
 
@@ -70,7 +70,7 @@ mod tests {
         let line = [[0.0; 3], [1.0, 0.0, 0.0], [3.0, 0.0, 0.0], [6.0, 0.0, 0.0]];
         let found = sizes(&line, 1.0);
         assert!((found[0] - (46.0_f32 / 3.0).sqrt()).abs() < 1e-6, "{found:?}");
-        // At one place: 2e-4 of the extent; alone: 0.02 of it; none: none.
+        // Coinciding points get 2e-4 of the extent, a single point 0.02 of it.
         assert_eq!(sizes(&[[1.0; 3]; 3], 10.0), [2e-3; 3]);
         assert_eq!(sizes(&[[1.0; 3]], 10.0), [0.2]);
         assert!(sizes(&[], 10.0).is_empty());

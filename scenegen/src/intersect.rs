@@ -66,7 +66,7 @@ impl ShearedRay {
             let z = p[self.kz];
             (p[self.kx] - self.shear.x * z, p[self.ky] - self.shear.y * z, self.shear.z * z)
         };
-        // `map` is not inlined here.
+        // Written out, because `map` would not be inlined here.
         let (a, b, c) = (corner(triangle[0]), corner(triangle[1]), corner(triangle[2]));
         let mut u = c.0 * b.1 - c.1 * b.0;
         let mut v = a.0 * c.1 - a.1 * c.0;

@@ -158,7 +158,7 @@ pub enum LightKind {
         /// Cosine of the angle beyond which intensity is zero.
         cos_outer: f32,
     },
-    /// A rectangle that emits to the side of `u x v`; intensity is radiance. Sampled.
+    /// A rectangle that emits to the side of `u x v`, sampled at random points; intensity is radiance.
     Area {
         /// A corner.
         corner: DVec3,
@@ -176,7 +176,7 @@ pub struct Light {
     pub kind: LightKind,
     /// Linear colour times intensity, in the kind's unit.
     pub intensity: Vec3,
-    /// Distance beyond which it has no effect; may be infinite.
+    /// Distance beyond which the light has no effect; may be infinite.
     pub range: f64,
 }
 

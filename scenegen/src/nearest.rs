@@ -46,7 +46,7 @@ impl Surface {
             if !node.is_leaf() {
                 let [a, b] =
                     [node.first_index, node.first_index + 1].map(|child| (bound(child), child));
-                // The nearer child is opened first.
+                // The nearer child is visited first.
                 open.extend(if a.0 < b.0 { [b, a] } else { [a, b] });
                 continue;
             }

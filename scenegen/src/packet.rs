@@ -16,7 +16,7 @@ use crate::surface::{LocalHit, LocalRay, Surface, padded};
 /// Maximum number of rays of a packet: the default number of subsamples of a pixel.
 pub(crate) const LANES: usize = 16;
 /// Maximum depth of a tree that is traversed with packets.
-const DEEPEST: usize = 96;
+const MAX_DEPTH: usize = 96;
 
 /// Each lane's bit.
 const BITS: [u32; LANES] = {
@@ -147,7 +147,7 @@ impl<'a> RayPacket<'a> {
             }
             flat
         };
-        // `map` is not inlined here.
+        // Written out, because `map` would not be inlined here.
         let (a, b, c) = (corner(triangle[0]), corner(triangle[1]), corner(triangle[2]));
         let mut may = 0;
         for lane in 0..LANES {
@@ -169,7 +169,7 @@ impl<'a> RayPacket<'a> {
     fn traverse(&self, surface: &Surface, mut visit: impl FnMut(u32, u32) -> f32) {
         let nodes = &surface.bvh.nodes;
         let mut reach = self.rays.iter().map(|ray| ray.tmax).fold(0.0, f32::max);
-        let mut open = [(0_u32, 0.0_f32); DEEPEST];
+        let mut open = [(0_u32, 0.0_f32); MAX_DEPTH];
         let mut count = 1;
         open[0] = (0, self.bounds.entry(nodes[0].aabb()));
         while count > 0 {
@@ -240,7 +240,7 @@ impl Surface {
         accept: impl Fn(u32, &Intersection) -> bool,
     ) -> [Option<LocalHit>; LANES] {
         let mut best = [None::<LocalHit>; LANES];
-        let packet = if self.depth() <= DEEPEST { RayPacket::new(rays) } else { None };
+        let packet = if self.depth() <= MAX_DEPTH { RayPacket::new(rays) } else { None };
         let Some(packet) = packet else {
             let mut hint = None;
             for (best, ray) in best.iter_mut().zip(rays) {
@@ -306,7 +306,7 @@ impl Surface {
             *other = rays[lane];
         }
         let others = &others[..count];
-        let packet = if self.depth() <= DEEPEST { RayPacket::new(others) } else { None };
+        let packet = if self.depth() <= MAX_DEPTH { RayPacket::new(others) } else { None };
         let Some(packet) = packet else {
             for (ray, lane) in others.iter().zip(left) {
                 if let Some(slot) = self.occluder(ray, &accept) {

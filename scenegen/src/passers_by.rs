@@ -53,11 +53,11 @@ pub(crate) fn draw(
         photograph.as_chunks_mut::<4>().0.iter_mut().zip(&mut mask).enumerate()
     {
         let corner = DVec2::new((at % width) as f64, (at / width) as f64);
-        let behind = match frame.depth[at] {
+        let scene_depth = match frame.depth[at] {
             0.0 => f64::INFINITY,
             depth => f64::from(depth),
         };
-        let (colour, cover) = trace(&parts, camera, corner, behind);
+        let (colour, cover) = trace(&parts, camera, corner, scene_depth);
         if cover > 0.0 {
             *mask = 0;
             *pixel = over(colour * gains / cover, cover, *pixel);
@@ -102,8 +102,8 @@ fn figure(camera: &Camera, depth: f64, draws: &mut Draws) -> [Part; 4] {
     ]
 }
 
-/// Sum of the radiance, and share of the rays, of a pixel that hit a figure nearer than this depth.
-fn trace(parts: &[Part], camera: &Camera, corner: DVec2, behind: f64) -> (Vec3, f32) {
+/// Sum of the radiance, and share of the rays, of a pixel that hit a figure nearer than `scene_depth`.
+fn trace(parts: &[Part], camera: &Camera, corner: DVec2, scene_depth: f64) -> (Vec3, f32) {
     let axes = camera.world_from_camera.transpose();
     let (mut sum, mut hits) = (Vec3::ZERO, 0);
     for ray in 0..GRID * GRID {
@@ -114,7 +114,7 @@ fn trace(parts: &[Part], camera: &Camera, corner: DVec2, behind: f64) -> (Vec3, 
             let (a, b) = (scaled.length_squared(), scaled.dot(centre));
             let root = b * b - a * (centre.length_squared() - 1.0);
             let depth = (b - root.max(0.0).sqrt()) / a;
-            (root > 0.0 && depth > 0.0 && depth < behind).then_some((depth, part))
+            (root > 0.0 && depth > 0.0 && depth < scene_depth).then_some((depth, part))
         });
         if let Some((depth, part)) = first.min_by(|a, b| a.0.total_cmp(&b.0)) {
             let normal = ((depth * direction - part.centre) / (part.half * part.half)).normalize();

@@ -1,6 +1,6 @@
 //! Reads the files that a mesh file refers to, and decodes images. All files are untrusted.
 //!
-//! References must be relative paths within the mesh's folder, also after following symbolic links. No
+//! References must be relative paths within the mesh's folder, even after following symbolic links. No
 //! allocation is sized by a header's claim: readers take the bytes that exist, and decoders have limits.
 
 use std::fs::{File, OpenOptions};
@@ -44,7 +44,7 @@ pub(crate) fn open(path: &Path) -> Result<File, Error> {
     let known = file.metadata().map_err(Error::io(path))?;
     if !known.is_file() && !known.is_dir() {
         let problem = "it is a pipe, a socket or a device, not a file";
-        return Err(Error::malformed(path, "the file", problem, "replace it by a regular file"));
+        return Err(Error::malformed(path, "the file", problem, "replace it with a regular file"));
     }
     Ok(file)
 }

@@ -102,10 +102,10 @@ impl Default for Options {
     }
 }
 
-/// With [`Options::exposure_jitter`], largest relative change of red and blue.
+/// Largest relative change of red and blue with [`Options::exposure_jitter`].
 const WHITE_BALANCE: f32 = 0.1;
 /// Largest [`Options::exposure_jitter`] `[stops]`.
-const MOST_JITTER: f32 = 8.0;
+const MAX_JITTER: f32 = 8.0;
 /// Key of the random stream of exposures.
 const EXPOSURES: u64 = 0x0065_7870_6f73_6564;
 
@@ -160,7 +160,7 @@ pub struct Scene {
 pub struct Generated {
     /// The scene.
     pub scene: Scene,
-    /// Rendered views, as [`Scene::views`].
+    /// Rendered views, in the order of [`Scene::views`].
     pub frames: Vec<Frame>,
     /// Initial points.
     pub points: InitPoints,
@@ -281,9 +281,9 @@ impl Scene {
             return None;
         }
         let mut draws = Draws::new(self.options.seed, &[EXPOSURES, view as u64]);
-        let mut either = || 2.0 * draws.unit() - 1.0;
-        let gain = (stops * either()).exp2();
-        let [red, blue] = [either(), either()].map(|change| 1.0 + WHITE_BALANCE * change);
+        let mut signed_unit = || 2.0 * draws.unit() - 1.0;
+        let gain = (stops * signed_unit()).exp2();
+        let [red, blue] = [signed_unit(), signed_unit()].map(|change| 1.0 + WHITE_BALANCE * change);
         Some([gain * red, gain, gain * blue])
     }
 
@@ -322,9 +322,9 @@ fn check(options: &Options) -> Result<(), Error> {
     if options.points.count > 1 << 28 {
         return Err(Error::option("--points", "there can be at most 2^28 points"));
     }
-    if !(0.0..=MOST_JITTER).contains(&options.exposure_jitter) {
+    if !(0.0..=MAX_JITTER).contains(&options.exposure_jitter) {
         let stops = options.exposure_jitter;
-        let problem = format!("{stops} stops are not in 0 to {MOST_JITTER}");
+        let problem = format!("{stops} stops are not in 0 to {MAX_JITTER}");
         return Err(Error::option("--exposure-jitter", problem));
     }
     if options.exposure.is_some_and(|e| !(e > 0.0 && e.is_finite())) {

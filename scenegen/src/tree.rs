@@ -192,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn a_tree_in_parts_is_as_good() {
+    fn a_tree_built_in_parts_costs_little_more_to_traverse() {
         // The expected number of boxes hit by a ray that hits the root's box, by their areas.
         let cost = |tree: &Bvh2| {
             let areas: f32 = tree.nodes.iter().map(|node| node.aabb().half_area()).sum();

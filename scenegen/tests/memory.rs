@@ -27,7 +27,7 @@ fn write_views(train: u32) {
 }
 
 #[test]
-fn the_number_of_views_makes_no_difference() {
+fn peak_memory_does_not_depend_on_the_number_of_views() {
     write_views(3);
     let Some(few) = status("VmHWM:") else {
         eprintln!("skipped: this system does not report the peak memory of a process");

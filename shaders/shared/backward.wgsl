@@ -1,9 +1,9 @@
-// The backward pass of a splat in a tile's pixels, for rasterize_bwd.wgsl and rasterize_bwd_atomic.wgsl.
+// The backward pass of one splat over a tile's pixels, for rasterize_bwd.wgsl and rasterize_bwd_atomic.wgsl.
 // src/render/cpu/rasterize_bwd.rs derives the sums.
 
 @group(0) @binding(6) var<storage, read> finish: array<vec2<u32>>;
-// Planes of dL/dpixel: red, green, blue, and, if MORE is set, alpha and depth. If it is not, a plane of
-// the pixels' errors follows if records have a sum of errors.
+// Planes of dL/dpixel: red, green, blue, and, if MORE is set, alpha and depth. If it is not set, a plane of
+// the pixels' errors follows, provided that records have a sum of errors.
 @group(0) @binding(7) var<storage, read> pixel_gradient: array<f32>;
 
 // True if alpha and depth have gradients.
@@ -19,8 +19,8 @@ struct Upstream {
     map: vec4<f32>,
 }
 
-// The state of the pixels behind the current splat: the transmittance there, dL/d(transmitted colour),
-// and the index in the list at which the pixels stopped.
+// The state of the pixels behind the current splat: the transmittance there, the product of dL/dpixel with the colour
+// seen there, and the index in the list at which the pixels stopped.
 struct Behind {
     light: vec4<f32>,
     seen: vec4<f32>,
@@ -64,7 +64,7 @@ fn behind_all(quad: Quad, own: Upstream, length: u32) -> Behind {
     return pixels;
 }
 
-// The field of a record that is the largest of its values instead of their sum, or NONE.
+// The field of a record that is a maximum instead of a sum; NONE if there is no such field.
 fn maximum() -> u32 {
     return select(NONE, WEIGHT_MAX_AT, WEIGHT_MAX_AT > 0u);
 }
@@ -75,8 +75,8 @@ fn last_of(pixels: Behind) -> u32 {
 }
 
 // Sums of splat n of the list over the pixels, from which its gradients follow, with q = α·dL/dα and
-// w = α·T; updates the state for the next splat in front. Returns false if none of the pixels takes
-// the splat.
+// w = α·T; updates the state for the next splat in front. Returns false if the splat is blended into
+// none of the pixels.
 fn backpropagate(
     splat: Splat,
     n: u32,

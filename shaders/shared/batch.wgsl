@@ -3,7 +3,7 @@
 
 struct Member {
     place: u32,
-    // At most as many as splats are loaded at a time.
+    // Number of splats loaded at a time.
     members: u32,
 }
 
@@ -20,7 +20,7 @@ fn wait_for_all() {
     workgroupBarrier();
 }
 
-// True if an invocation must continue with the loaded splats; `wants`: if it has use for them itself.
+// True if an invocation must continue with the loaded splats; `wants`: true if its own pixels need them.
 fn is_needed(wants: bool) -> bool {
     return wants;
 }
@@ -39,7 +39,7 @@ fn largest_of_all(m: Member, x: u32) -> u32 {
     return workgroupUniformLoad(&largest_known);
 }
 
-// Loads a row's splat to index `place`; `corner`: of the tile.
+// Loads a row's splat to index `place`; `corner`: that of the tile [px].
 fn load_splat(place: u32, row: u32, corner: vec2<u32>) {
     let splat = splat_of(row, corner);
     batch[3u * place] = splat.a;

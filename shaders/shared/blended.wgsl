@@ -1,6 +1,7 @@
 // A splat's sums over the pixels of an auxiliary view, for observe.wgsl and observe_atomic.wgsl.
 
-// Sums of the map, of pixels, of weights, of distances; the largest weight.
+// Values per splat: sum of the pixel map, number of pixels, sum of blend weights, sum of distances from the mean [px],
+// largest weight.
 const COLUMNS: u32 = 5u;
 // The field that is a maximum; the others are sums.
 const MAXIMUM: u32 = 4u;

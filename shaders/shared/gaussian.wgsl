@@ -8,7 +8,8 @@
 @group(0) @binding(5) var<storage, read> sh3: array<f32>;
 
 const BLUR: f32 = 0.3;
-const FOLD: f32 = 0.8493218;
+// √(½·log₂ e): splats have conic factors scaled by it, so that exp becomes exp2.
+const EXPONENT_SCALE: f32 = 0.8493218;
 const COLOUR_MAX: f32 = 1e6;
 
 struct Row {
@@ -111,12 +112,12 @@ fn geometry(row: Row) -> Geometry {
     return g;
 }
 
-// Unfolded conic factor (l1, r, l3).
+// Conic factor (l1, r, l3), not scaled.
 fn conic(g: Geometry) -> vec3<f32> {
     return vec3(sqrt(g.cov.z / g.det), g.cov.y / g.cov.z, 1.0 / sqrt(g.cov.z));
 }
 
-// Unit vector from the camera to the mean; w: 1/distance. All 0 where they coincide.
+// Unit vector from the camera to the mean; w: 1/distance. All are 0 if camera and mean coincide.
 fn direction(mean: vec3<f32>) -> vec4<f32> {
     let v = mean - frame.centre.xyz;
     let norm2 = dot(v, v);

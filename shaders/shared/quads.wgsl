@@ -1,7 +1,7 @@
 // Shared by the kernels that work tile by tile (rasterize, rasterize_bwd, observe and the atomic ones):
 // their inputs, the pixels of an invocation, and a splat's blending there.
 //
-// One tile per group of 64 invocations. Each has a square of four pixels, the components of a vec4: a
+// One tile per group of 64 invocations. Each invocation has a square of four pixels, the components of a vec4: a
 // splat is read once for all four, and their contributions to its sums are added in registers.
 
 @group(0) @binding(1) var<storage, read_write> state: State;
@@ -37,20 +37,20 @@ struct Quad {
     inside: vec4<bool>,
 }
 
-// True for a tile of the image that is in the current band, `now.a`.
+// True for a tile of the image that is in the current band, `launch.a`.
 fn is_in_band(tile: u32) -> bool {
-    return tile < frame.image.w && tile >= state.cuts[now.a] && tile < state.cuts[now.a + 1u];
+    return tile < frame.image.w && tile >= state.cuts[launch.a] && tile < state.cuts[launch.a + 1u];
 }
 
-// Records in `state` if a loop ended early: llvmpipe silently ends the loops of an invocation after
+// Records in `state` that a loop ended early: llvmpipe silently ends the loops of an invocation after
 // 65,535 rounds in total. The results are then invalid, and the host reports it.
-fn expect_end(has_ended: bool) {
-    if !has_ended {
+fn expect_end(completed: bool) {
+    if !completed {
         state.broken_off = 1u;
     }
 }
 
-// Invocations with close indices have close pixels, so that those that run together rarely diverge.
+// Invocations with nearby indices have nearby pixels, so that invocations that run together rarely diverge.
 fn quad_of(tile: u32, lane: u32) -> Quad {
     let corner = corner_of(tile);
     let x = ((lane & 1u) << 1u) | (lane & 4u) | ((lane >> 1u) & 8u);
@@ -68,14 +68,14 @@ fn quad_of(tile: u32, lane: u32) -> Quad {
     );
 }
 
-// The splat of a row; `corner`: of the tile.
+// The splat of a row; `corner`: that of the tile [px].
 fn splat_of(row: u32, corner: vec2<u32>) -> Splat {
     let a = splats[3u * row];
     let within = vec4(a.xy - vec2<f32>(corner), a.zw);
     return Splat(within, splats[3u * row + 1u], splats[3u * row + 2u]);
 }
 
-// A splat at the pixels: distances from its mean along its own axes, and log2 of its opacity there.
+// A splat at the pixels: their whitened coordinates relative to its mean, and log2 of its alpha there.
 struct Falloff {
     u: vec4<f32>,
     z: vec4<f32>,
@@ -89,15 +89,15 @@ fn falloff(splat: Splat, quad: Quad) -> Falloff {
     return Falloff(u, z, splat.b.y - u * u - z * z);
 }
 
-// The state of pixels from front to back: the transmittance, and true while they have not stopped.
+// The state of pixels from front to back: the transmittance, and whether they have not stopped yet.
 struct Open {
     light: vec4<f32>,
-    goes_on: vec4<bool>,
+    unfinished: vec4<bool>,
 }
 
 // Blends a splat into the pixels and returns its weights; pixels that stop before it get 0.
 fn blend(exponent: vec4<f32>, pixels: ptr<function, Open>) -> vec4<f32> {
-    let reached = (*pixels).goes_on & (exponent >= vec4(-LOG2_REACH));
+    let reached = (*pixels).unfinished & (exponent >= vec4(-LOG2_REACH));
     if !any(reached) {
         return vec4(0.0);
     }
@@ -107,7 +107,7 @@ fn blend(exponent: vec4<f32>, pixels: ptr<function, Open>) -> vec4<f32> {
     let stops = reached & (next <= vec4(TRANSMITTANCE_MIN));
     let takes = reached & !stops;
     (*pixels).light = select(light, next, takes);
-    (*pixels).goes_on = (*pixels).goes_on & !stops;
+    (*pixels).unfinished = (*pixels).unfinished & !stops;
     return select(vec4(0.0), weight, takes);
 }
 

@@ -1,5 +1,5 @@
 // Random numbers as hashes of (seed, step, row, purpose), the counterpart of policies/src/rng.rs;
-// uniform numbers agree bit by bit. Normal numbers use the logarithm, sine and cosine defined here,
+// uniform numbers agree bit for bit. Normal numbers use the logarithm, sine and cosine defined here,
 // since a device's own may have errors of 2^-11.
 
 const PURPOSE_PLACE: u32 = 2u;

@@ -1,9 +1,9 @@
 // Sums over a tile's pixels, written to one record per entry, in its slot. Each invocation stores the
-// sums over its four pixels in shared memory; these are added in a fixed order, the same on every
+// sums over its four pixels in shared memory; these are added in the same order on every
 // device. Four splats share two barriers. atomics.wgsl replaces this file if gradients are added by
 // atomics.
 
-// Splats summed per round, and splats loaded at a time, at most.
+// Number of splats summed per round, and maximum number of splats loaded at a time.
 const SPLATS: u32 = 4u;
 const BATCH: u32 = 8u;
 
@@ -35,7 +35,7 @@ fn store_part(n: u32, lane: u32, x: f32) {
     parts[n * PITCH + lane] = x;
 }
 
-// ROUND parts, added in order to the given value, or the largest of all of them.
+// ROUND parts, added in order to `given`; or, for a maximum, the largest of these parts and `given`.
 fn reduced(given: f32, first: u32, is_maximum: bool) -> f32 {
     var sum = given;
     for (var i = 0u; i < ROUND; i++) {

@@ -1,4 +1,4 @@
-// Constants of the optimiser, for adam.wgsl and mask.wgsl; src/render/cpu/adam.rs.
+// Constants of the optimiser, for adam.wgsl and mask.wgsl, as in src/render/cpu/adam.rs.
 
 const BETA1: f32 = 0.9;
 const BETA2: f32 = 0.999;

@@ -1,4 +1,4 @@
-// The invocations of a subgroup share splats, without shared memory or barriers: each holds one splat
+// The invocations of a subgroup share splats, without shared memory or barriers: each loads one splat
 // and broadcasts it to the others. batch.wgsl replaces this file on devices without subgroups.
 
 // The index of an invocation in its subgroup, and the size of the subgroup. Invocations are counted,
@@ -32,7 +32,7 @@ fn may_reach(splat: Splat, block: Block) -> bool {
     return !(any(splat.a.xy + half < block.low) || any(splat.a.xy - half > block.high));
 }
 
-// The splat that this invocation holds, and its row.
+// The splat that this invocation has loaded, and its row.
 var<private> own_splat: Splat;
 var<private> own_row: u32;
 
@@ -45,7 +45,7 @@ fn member(lane: u32) -> Member {
 fn wait_for_all() {
 }
 
-// True if an invocation must continue with the loaded splats: others may need the one that it holds.
+// True if an invocation must continue with the loaded splats: others may need the one that it has loaded.
 fn is_needed(wants: bool) -> bool {
     return subgroupAny(wants);
 }
@@ -55,7 +55,7 @@ fn largest_of_all(m: Member, x: u32) -> u32 {
     return subgroupMax(x);
 }
 
-// Loads a row's splat to index `place`, which is this invocation's; `corner`: of the tile.
+// Loads a row's splat to index `place`, which is this invocation's; `corner`: that of the tile [px].
 fn load_splat(place: u32, row: u32, corner: vec2<u32>) {
     own_row = row;
     own_splat = splat_of(row, corner);

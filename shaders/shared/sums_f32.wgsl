@@ -12,7 +12,7 @@ fn add(at: u32, x: f32) {
 }
 
 // Replaces a sum by the larger of itself and x. WGSL has no atomic maximum of f32: values are exchanged,
-// and an invocation that gets back a larger value than it stored stores that value again.
+// and an invocation that receives a larger value than it stored puts that value back.
 fn raise(at: u32, x: f32) {
     var mine = x;
     loop {

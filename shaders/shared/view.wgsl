@@ -8,19 +8,19 @@ struct Frame {
     centre: vec4<f32>,
     // Focal lengths, principal point [px].
     lens: vec4<f32>,
-    // Least and greatest x/z, y/z in J: (x, y, x, y).
+    // Smallest and largest x/z, y/z in J: (x, y, x, y).
     ratio: vec4<f32>,
-    // w: depth from which signals of gradients count in full.
+    // w: depth from which gradient signals have full weight.
     background: vec4<f32>,
-    // Width, height [px], columns of tiles, tiles.
+    // Width, height [px], number of tile columns, number of tiles.
     image: vec4<u32>,
-    // Rows, degree evaluated now, cap on tile entries, most rows that are not frozen.
+    // Number of rows, current SH degree, cap on tile entries, maximum number of rows that are not frozen.
     model: vec4<u32>,
     // Step sizes: mean, log-scale, quaternion, opacity.
     rates: vec4<f32>,
     // Step sizes of band 0 and of bands 1-3; derivative of the opacity and of the scale term per row.
     more_rates: vec4<f32>,
-    // Strength times step size, sharpness, opacity.
+    // The noise term: strength times step size, sharpness, opacity.
     noise: vec4<f32>,
     // The combination of errors into a score: exponent of a pixel's error, weight of edges, exponents of
     // the sum of weights and of a view's score.
@@ -35,18 +35,18 @@ struct Frame {
 }
 
 struct State {
-    // Rows on screen.
+    // Number of rows on screen.
     visible: u32,
-    // Entries of the whole image, saturated at 2^30.
+    // Number of entries of the whole image, saturated at 2^30.
     total: u32,
     // Number of bands that the image needs.
     bands: u32,
     // 1: more bands are needed than were encoded; the step must change nothing.
     short: u32,
-    // Entries of all bands, as one number of 64 bits.
+    // Number of entries of all bands, in 64 bits.
     entries_low: u32,
     entries_high: u32,
-    // Entries of the current band.
+    // Number of entries of the current band.
     held: u32,
     // 1: a loop over a tile's splats has ended too early, in this step or an earlier one.
     broken_off: u32,
@@ -54,12 +54,12 @@ struct State {
     l1: f32,
     ssim: f32,
     spare_f: vec2<f32>,
-    // Band b has the tiles cuts[b]..cuts[b + 1].
+    // Band b consists of the tiles cuts[b]..cuts[b + 1].
     cuts: array<u32>,
 }
 
 // Parameters that differ between dispatches of one kernel.
-struct Now {
+struct Launch {
     a: u32,
     b: u32,
     c: u32,
@@ -67,7 +67,7 @@ struct Now {
 }
 
 @group(0) @binding(0) var<uniform> frame: Frame;
-var<immediate> now: Now;
+var<immediate> launch: Launch;
 
 const NONE: u32 = 0xffffffffu;
 const TILE: u32 = 16u;

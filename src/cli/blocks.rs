@@ -23,8 +23,8 @@ use densify_run::{ByteCount, Fraction, Rows, Threads, Whole};
 /// Trains a large scene in blocks, on one machine or on a cluster, and merges them.
 ///
 /// The ground is divided into cells of equal work. A coarse run sees the whole scene; each block then starts from its
-/// part of the coarse model, with everything else in its views frozen around it, and trains its share of the Gaussians.
-/// The merged model never has more than was asked for, and the memory of every task is known before it starts.
+/// part of the coarse model, with everything else in its views frozen, and trains its share of the Gaussians. The
+/// merged model never exceeds the requested size, and the memory of every task is known before it starts.
 #[derive(Debug, Args)]
 pub(super) struct BlocksArgs {
     #[command(subcommand)]
@@ -52,21 +52,21 @@ struct PlanArgs {
     /// Folder to write the plan to
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
-    /// Most Gaussians in the merged model, such as 2M or 500k
+    /// Maximum number of Gaussians in the merged model, such as 2M or 500k
     #[arg(long, value_name = "N", required_unless_present = "bytes", conflicts_with = "bytes")]
     rows: Option<Rows>,
-    /// Largest PLY of the merged model, such as 500MB
+    /// Maximum size of the merged model as a PLY file, such as 500MB
     #[arg(long, value_name = "SIZE")]
     bytes: Option<ByteCount>,
     /// Number of blocks: strips along the longer side of the ground (4), or strips and blocks per strip (3x2); auto:
-    /// as few as fit --memory
+    /// the fewest that fit --memory
     #[arg(long, value_name = "auto|K|KxL", default_value = "auto")]
     blocks: Grid,
-    /// Most memory that a task may take, such as 8GiB
+    /// Maximum memory of a task, such as 8GiB
     #[arg(long, value_name = "SIZE", required_if_eq("blocks", "auto"))]
     memory: Option<ByteCount>,
-    /// Budget of the coarse run `[default: two fifths of the merged model, at least 1,000, or half of what fits
-    /// --memory]`
+    /// Budget of the coarse run `[default: two fifths of the merged model, at most half of what fits --memory, at
+    /// least 1,000]`
     #[arg(long, value_name = "N")]
     coarse_rows: Option<Rows>,
     /// Width of the margin around its cell that a block also trains, as a share of the usual width of a cell
@@ -91,14 +91,14 @@ struct SubmitArgs {
     /// Folder of the plan
     #[arg(value_name = "DIR")]
     folder: PathBuf,
-    /// Engine that starts them
+    /// Engine that starts the tasks
     #[arg(long, value_name = "ENGINE", default_value = "local")]
     engine: Engine,
     #[command(flatten)]
     more: SubmissionArgs,
 }
 
-/// Runs one task of a plan, or the rest of it. Schedulers call this.
+/// Runs one task of a plan, or resumes it. Schedulers call this.
 #[derive(Debug, Args)]
 struct RunArgs {
     /// Folder of the plan
@@ -166,7 +166,7 @@ fn run_plan(args: &PlanArgs, console: &Console) -> Result<(), Failure> {
     threads::limit(options.given.clone().describe().ok().and_then(|spec| spec.device.threads));
     let blocks = plan(&options, console)?;
     console.result(format_table(&blocks));
-    console.result(format_args!("everything in {}", args.output.display()));
+    console.result(format_args!("the plan is in {}", args.output.display()));
     Ok(())
 }
 
@@ -254,7 +254,7 @@ fn run_merge(args: &MergeArgs, console: &Console) -> Result<(), Failure> {
     let blocks = BlockPlan::read(&args.folder)?;
     let merged = merge(&args.folder, &blocks, &args.output, format, args.partial, console)?;
     if !merged.missing.is_empty() {
-        console.say(format_args!("note: left out, not complete: {}", merged.missing.join(", ")));
+        console.say(format_args!("note: left out as not complete: {}", merged.missing.join(", ")));
     }
     console.result(format_args!(
         "{} ({}): {} Gaussians, {}",

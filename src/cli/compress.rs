@@ -1,4 +1,4 @@
-//! `densify compress`: a smaller model or file, at the least loss.
+//! `densify compress`: reduces a model or its file with the least loss of quality.
 
 use std::path::PathBuf;
 
@@ -18,24 +18,24 @@ use densify_run::{RunConfig, Whole};
 
 /// Reduces a trained model to a number of Gaussians, or to a file size.
 ///
-/// Prunes the Gaussians that contribute least to the training views, at most half of them at once, and trains the others
-/// on in between. For a file it tries the model's SH degree and lower ones, and coarser colour where the format has
-/// it, which leave room for more Gaussians, and keeps the attempt whose file reproduces the training views best. Held-out
-/// views are measured too, but decide nothing. The table that it prints is the curve of size against quality: the whole
-/// model, the file after each pruning on the way, and the attempts at the final size.
+/// Prunes the Gaussians that contribute least to the training views, at most half of them at once, and trains the rest
+/// in between. For a file it tries the model's SH degree and lower ones, and coarser colour where the format has it:
+/// these leave room for more Gaussians. It keeps the attempt whose file reproduces the training views best. Held-out
+/// views are measured, too, but do not affect the choice. The table that it prints shows quality against size: of the
+/// whole model, of the file after each intermediate pruning, and of the attempts at the final size.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct CompressArgs {
     /// Folder that `densify train` wrote, or a file (of SOG also a folder) of Gaussian splats
     #[arg(value_name = "RUN_OR_MODEL")]
     model: PathBuf,
-    /// Most bytes of the file, such as 5MiB or 800kB, or a number of Gaussians, such as 20k
+    /// Maximum size of the file, such as 5MiB or 800kB, or a number of Gaussians, such as 20k
     #[arg(long, value_name = "SIZE|ROWS", value_parser = parse_target)]
     to: Target,
-    /// File to write; its extension says in which format, as for `densify export`
+    /// File to write; its extension selects the format, as for `densify export`
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
-    /// Format of the file, or any: the one that holds most Gaussians, whose extension is added to FILE
+    /// Format of the file, or any: the one that holds the most Gaussians; its extension is then added to FILE
     /// `[default: the one with FILE's extension]`
     #[arg(long, value_name = "NAME")]
     format: Option<String>,
@@ -144,7 +144,7 @@ fn candidate_formats(args: &CompressArgs) -> Result<Vec<&'static Format>, Failur
     }
 }
 
-/// The curve of size against quality: the whole model, each pruning on the way, and the attempts at the final size.
+/// Quality against size: the whole model, each intermediate pruning, and the attempts at the final size.
 fn format_table(compressed: &Compressed) -> String {
     let Compressed { whole, stages, attempts, best, .. } = compressed;
     let mut text = format!(

@@ -13,9 +13,9 @@ use densify_run::failure::Failure;
 /// Lists the adapters that can train and render, with their limits.
 ///
 /// Choose one with `--gpu NAME`. The largest budget is what one buffer of the adapter can hold; drivers do
-/// not report how much memory there is in all. `WGPU_BACKEND` (vulkan, metal, dx12) and, for
-/// Vulkan, `VK_DRIVER_FILES` select the drivers. Accumulation is the way gradients are added up:
-/// slots repeat, atomics and cas are faster (`train --knob accumulation=NAME`, `train --deterministic`).
+/// not report the total memory. `WGPU_BACKEND` (vulkan, metal, dx12) and, for Vulkan, `VK_DRIVER_FILES`
+/// select the drivers. Accumulation is the way gradients are added up: slots is deterministic, atomics and
+/// cas are faster (`train --knob accumulation=NAME`, `train --deterministic`).
 #[derive(Debug, Args)]
 pub(super) struct DevicesArgs {}
 
@@ -41,7 +41,7 @@ pub(super) fn run(_: &DevicesArgs, console: &Console) -> Result<(), Failure> {
         let default = adapter.accumulation();
         let others = adapter.accumulations.iter().filter(|method| **method != default);
         let others: Vec<_> = others.map(ToString::to_string).collect();
-        let note = if others.is_empty() { "" } else { "; if asked for, " };
+        let note = if others.is_empty() { "" } else { "; on request, " };
         console.result(format_args!("  accumulation    {default}{note}{}", others.join(", ")));
         for missing in &adapter.missing {
             console.result(format_args!("  cannot be used: {missing}"));

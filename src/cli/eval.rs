@@ -24,8 +24,8 @@ use densify_train::output::{write_geometry, write_scores};
 /// Prints the scores of each view and their mean, and writes those of a run to results.json and
 /// per_view.json in its folder (results_train.json and per_view_train.json for the views trained on). For a
 /// file of Gaussian splats nothing is written, and every 8th photograph is measured unless the dataset or an
-/// option says which. Where the geometry is known (built-in scenes, and those that `densify scenegen`
-/// wrote), also measures how well the Gaussians match it: a second table, and geometry.json
+/// option selects others. Where the geometry is known (built-in scenes, and those that `densify scenegen`
+/// wrote), also measures how well the Gaussians match it: in a second table, and in geometry.json
 /// (geometry_train.json).
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
@@ -164,7 +164,7 @@ fn format_table(geometry: &Geometry) -> String {
         lines.push((name, percent(width.recall)));
     }
     lines.push(("rows blended per pixel".to_owned(), plain(redundancy.blended_per_pixel, "")));
-    lines.push(("rows that never weigh 1 %".to_owned(), percent(redundancy.below_one_percent)));
+    lines.push(("rows with weights below 1 %".to_owned(), percent(redundancy.below_one_percent)));
     let width = lines.iter().map(|(name, _)| name.chars().count()).max().unwrap_or(0);
     let mut text = String::from("\ngeometry");
     for (name, value) in lines {

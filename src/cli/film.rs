@@ -10,7 +10,7 @@ use densify_inspect::{CameraRoute, Channels, Film, FilmError, FilmOptions, FilmS
 use densify_run::failure::{DEVICE, Failure, OTHER};
 
 /// Largest number of frames.
-const MOST_FRAMES: u32 = 100_000;
+const MAX_FRAMES: u32 = 100_000;
 
 /// Options of a camera path.
 #[derive(Debug, Args)]
@@ -23,7 +23,7 @@ pub(super) struct FilmArgs {
     #[arg(long, value_name = "orbit|spiral|FILE")]
     pub(super) path: Option<CameraRoute>,
     /// Number of frames `[default: 120; for a file, its seconds times its fps, or one per camera]`
-    #[arg(long, value_name = "N", requires = "path", value_parser = clap::value_parser!(u32).range(1..=i64::from(MOST_FRAMES)))]
+    #[arg(long, value_name = "N", requires = "path", value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_FRAMES)))]
     frames: Option<u32>,
     /// Width and height of the frames, such as 640x480 `[default: those of the file, else of the first photograph]`
     #[arg(long, value_name = "WxH", requires = "path", value_parser = parse_size)]

@@ -8,8 +8,8 @@ use signal_hook::flag;
 
 use densify_run::Interrupt;
 
-/// The exit code of a process that a signal ended is the signal's number plus this.
-const BY_SIGNAL: i32 = 128;
+/// The exit code of a process ended by a signal is the signal's number plus this.
+const SIGNAL_EXIT_BASE: i32 = 128;
 
 /// The signals that this process has received; all its runs share them.
 #[derive(Debug, Clone, Copy)]
@@ -33,7 +33,8 @@ impl Interrupts {
             SIGTERM => "SIGTERM",
             _ => return None,
         };
-        Some(Interrupt { name, exit_code: u8::try_from(BY_SIGNAL + last).unwrap_or(u8::MAX) })
+        let exit_code = u8::try_from(SIGNAL_EXIT_BASE + last).unwrap_or(u8::MAX);
+        Some(Interrupt { name, exit_code })
     }
 }
 
@@ -42,7 +43,7 @@ fn register() -> Arc<AtomicUsize> {
     for signal in [SIGINT, SIGTERM] {
         // In this order, so that the first signal finds `any` unset. Where registration fails, a signal ends the
         // process as it does by default.
-        let _ = flag::register_conditional_shutdown(signal, BY_SIGNAL + signal, any.clone());
+        let _ = flag::register_conditional_shutdown(signal, SIGNAL_EXIT_BASE + signal, any.clone());
         let _ = flag::register_usize(signal, last.clone(), signal.unsigned_abs() as usize);
         let _ = flag::register(signal, any.clone());
     }

@@ -50,7 +50,7 @@ impl<'a> Progress<'a> {
         Self { console, bar, done, iterations, budget, started: now, drawn: now, loss: None }
     }
 
-    /// Reports a step that is done.
+    /// Reports a completed step.
     pub(super) fn step(&mut self, step: u32, loss: f32, rows: usize) {
         let smooth = self.loss.map_or(loss, |before| before + LOSS_SMOOTHING * (loss - before));
         self.loss = Some(smooth);

@@ -18,8 +18,8 @@ use densify_train::evaluate::Split;
 
 /// Renders a trained scene to PNG files.
 ///
-/// Renders the views held out, or those trained on, of a run or of any file of Gaussian splats
-/// (which needs --scene for the cameras); or with --path a camera path through the scene, and a film of it.
+/// Renders the held-out views or the training views of a run, or of any file of Gaussian splats (which needs
+/// --scene for the cameras); or, with --path, a camera path through the scene, and a film of it.
 ///
 /// Depth is Σ α·T·z along each ray, in the dataset's own units: opaque surfaces show their
 /// distance along the optical axis. It is written in 16 bits, where 65535 stands for the largest
@@ -30,8 +30,8 @@ pub(super) struct RenderArgs {
     /// Folder that `densify train` wrote, or a file (of SOG also a folder) of Gaussian splats
     #[arg(value_name = "RUN_OR_MODEL")]
     model: PathBuf,
-    /// Folder or ZIP archive of the dataset: needed for a file, unless --path names one of cameras, and for a run whose
-    /// dataset has moved
+    /// Folder or ZIP archive of the dataset: needed for a run whose dataset has moved, and for a file unless --path is
+    /// a file with cameras
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
     /// Folder for the pictures

@@ -105,13 +105,13 @@ pub(super) struct ScenegenArgs {
     /// Number of initial points, on surfaces with detail that at least three views see
     #[arg(long, value_name = "N", help_heading = "Points", default_value_t = 5000)]
     points: usize,
-    /// Standard deviation of their coordinates, as a share of the scene's diagonal
+    /// Standard deviation of the noise on their coordinates, as a share of the scene's diagonal
     #[arg(long, value_name = "SHARE", help_heading = "Points", default_value_t = 0.001)]
     point_noise: f64,
-    /// Share of them at random places
+    /// Share of the points that are at random places
     #[arg(long, value_name = "SHARE", help_heading = "Points", default_value_t = 0.02)]
     outliers: f64,
-    /// Share of space, in patches of 2 % of the diagonal, without points
+    /// Share of space without points, in patches of 2 % of the diagonal
     #[arg(long, value_name = "SHARE", help_heading = "Points", default_value_t = 0.0)]
     dropout: f64,
     /// Put no points on thin structures
@@ -167,7 +167,7 @@ impl From<RigArg> for RigKind {
 }
 
 fn parse_size(text: &str) -> Result<(u32, u32), String> {
-    let wrong = |_| format!("`{text}` is no image size; write it as 400 or 640x480");
+    let wrong = |_| format!("`{text}` is not an image size; write it as 400 or 640x480");
     let (width, height) = text.split_once('x').unwrap_or((text, text));
     Ok((width.parse().map_err(wrong)?, height.parse().map_err(wrong)?))
 }

@@ -20,10 +20,10 @@ pub(super) fn run(args: &StudyRun, _: &Console) -> Result<(), Failure> {
     args.train()
 }
 
-/// Prints the summary; there is none yet if the runs were handed to a scheduler.
+/// Prints the summary; there is none yet if the runs were submitted to a scheduler.
 fn print_summary(finished: Option<Finished>, console: &Console) -> Result<(), Failure> {
     let Some(Finished { summary, report }) = finished else { return Ok(()) };
     console.result(summary);
-    console.result(format_args!("everything in {}", report.display()));
+    console.result(format_args!("the report is in {}", report.display()));
     Ok(())
 }

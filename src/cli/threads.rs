@@ -8,7 +8,7 @@ use densify_run::{DeviceSpec, Observer, Threads};
 /// Only a command may do so: the pool belongs to the process, not to the library.
 pub(super) fn limit(threads: Option<Threads>) {
     if let Some(threads) = threads {
-        // Fails only if the pool is already in use, which keeps its size.
+        // Fails only if the pool is already in use; it then keeps its size.
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads.0 as usize);
         let _ = pool.build_global();
     }

@@ -40,8 +40,8 @@ pub(super) struct ViewArgs {
     /// Port of the page `[default: the first free one from 8080 on]`
     #[arg(long, value_name = "N", help_heading = "Page")]
     port: Option<u16>,
-    /// Address of this machine to serve the page on. With another than its own loopback, such as 0.0.0.0, others
-    /// on the network who know the page's whole address, with its random part, can look too, unencrypted
+    /// Address of this machine to serve the page on. With an address other than loopback, such as 0.0.0.0, anyone on
+    /// the network who knows the page's whole address, with its random part, can open it, too, unencrypted
     #[arg(long, value_name = "ADDRESS", default_value_t = Ipv4Addr::LOCALHOST.into(), help_heading = "Page")]
     host: IpAddr,
     #[command(flatten)]

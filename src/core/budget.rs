@@ -1,14 +1,14 @@
 //! The row budget of a model that may have frozen rows.
 
-/// The most rows that a model may have, frozen ones included.
+/// The maximum number of rows of a model, frozen ones included.
 ///
 /// Frozen rows are rendered but neither trained nor edited. They come first, they count towards the budget, and
-/// policies do not know of them: the arithmetic between the two views of a budget is done here only.
+/// policies do not know of them. Only this type converts between row counts with and without them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RowBudget {
-    /// Most rows in all.
+    /// Maximum number of rows in total.
     pub total: usize,
-    /// Rows that never change.
+    /// Number of rows that never change.
     pub frozen: usize,
 }
 
@@ -25,7 +25,7 @@ impl RowBudget {
         Self { total: trainable.saturating_add(frozen), frozen }
     }
 
-    /// Most rows that can be trained.
+    /// Maximum number of rows that can be trained.
     pub fn trainable(self) -> usize {
         self.total.saturating_sub(self.frozen)
     }
@@ -35,12 +35,12 @@ impl RowBudget {
         row < self.frozen
     }
 
-    /// The number of a row as policies count, without frozen rows; `None` for a frozen one.
+    /// The row's index as policies count, without the frozen rows; `None` for a frozen row.
     pub fn trained_row(self, row: u32) -> Option<u32> {
         row.checked_sub(u32::try_from(self.frozen).ok()?)
     }
 
-    /// The trained rows of a model that has `rows` in all.
+    /// Number of trained rows of a model that has `rows` rows in total.
     pub fn trained(self, rows: usize) -> usize {
         rows.saturating_sub(self.frozen)
     }

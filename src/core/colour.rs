@@ -108,16 +108,16 @@ mod tests {
     };
 
     #[test]
-    fn the_inverse_takes_colours_back() {
+    fn the_inverse_restores_colours() {
         let colour = [0.2, 0.9, 0.4];
         let back = SOME.inverse().apply(SOME.apply(colour));
         assert!(back.iter().zip(colour).all(|(a, b)| (a - b).abs() < 1e-6), "{back:?}");
         let flat = ColourTransform { matrix: [[1.0; 3]; 3], ..SOME };
-        assert_eq!(flat.inverse(), ColourTransform::IDENTITY, "nothing takes it back");
+        assert_eq!(flat.inverse(), ColourTransform::IDENTITY, "this transform has no inverse");
     }
 
     #[test]
-    fn what_is_behind_looks_the_same() {
+    fn the_background_looks_the_same_with_any_exposure() {
         let background = [0.0, 0.5, 1.0];
         let seen = SOME.apply(SOME.behind(background));
         assert!(seen.iter().zip(background).all(|(a, b)| (a - b).abs() < 1e-6), "{seen:?}");

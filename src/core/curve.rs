@@ -1,4 +1,4 @@
-//! Morton codes (Morton 1966): positions on a Z-order curve through space, by which the first rows are sorted.
+//! Morton codes (Morton 1966): positions on a Z-order curve through space, by which the initial rows are sorted.
 //!
 //! Neighbours in memory are then neighbours in the scene: the rows of a block are mostly visible together or not
 //! at all, and those of a tile share cache lines.

@@ -38,7 +38,7 @@ impl ModelArray {
         Self::ALL.into_iter().find(holds).unwrap_or(Self::Sh)
     }
 
-    /// The array's part of a row's parameters at a degree.
+    /// The indices of the array's values among a row's parameters at a degree.
     pub const fn parameters(self, sh_degree: u8) -> std::ops::Range<usize> {
         match self {
             Self::Means => 0..3,

@@ -8,7 +8,7 @@ use serde::de::Error as _;
 use serde::{Deserialize, Deserializer};
 use serde_json::Value;
 
-/// The most rows that 32-bit row numbers can address.
+/// The maximum number of rows that 32-bit row numbers can address.
 const MAX_ROWS: f64 = u32::MAX as f64;
 
 /// Parses a number of rows: `200000`, `28k`, `1.5M`.
@@ -139,7 +139,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rows_in_every_spelling() {
+    fn rows_are_parsed_in_every_spelling() {
         let good = [
             ("1", 1),
             ("200000", 200_000),
@@ -164,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn bytes_in_every_spelling() {
+    fn bytes_are_parsed_in_every_spelling() {
         let good = [
             ("0", 0),
             ("1000000", 1_000_000),
@@ -185,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn fractions() {
+    fn fractions_exclude_0_and_1() {
         assert_eq!(fraction("0.01"), Ok(0.01));
         for text in ["0", "1", "-0.1", "NaN", "x"] {
             assert!(fraction(text).is_err(), "{text}");
@@ -193,7 +193,7 @@ mod tests {
     }
 
     #[test]
-    fn shown_numbers() {
+    fn numbers_and_durations_are_formatted() {
         assert_eq!([0, 999, 1_000, 1_234_567].map(grouped), ["0", "999", "1,000", "1,234,567"]);
         let shown = |seconds| duration(Duration::from_secs_f64(seconds));
         assert_eq!(

@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-/// Rows written to a file at a time: a few megabytes.
+/// Number of rows written to a file at a time: a few megabytes.
 pub const ROWS_AT_A_TIME: usize = 1 << 14;
 
 /// Splits `rows` rows into pieces of at most [`ROWS_AT_A_TIME`]; no rows give one empty piece.

@@ -1,9 +1,9 @@
-//! The spelling of options in messages. Errors name options by their name, as data; whoever shows a message says how its
-//! reader writes them.
+//! The spelling of options in messages. Errors store only the names of options; the code that shows a message
+//! decides how they are written for its reader.
 
 use std::fmt::Display;
 
-/// The way in which a reader of messages writes options.
+/// How options are written in messages.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Spelling {
     /// Flags of a command: `--tile-cap 90000`.

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use densify_core::files::one_line;
 
-/// A dataset, one of its images, or a model that cannot be loaded. Options are data, so that whoever shows the error spells
-/// them; as displayed here, remedies by options are missing.
+/// A dataset, one of its images, or a model that cannot be loaded. Remedies by options are data, because the names of
+/// options depend on the interface that shows the error; the `Display` text leaves these remedies out.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum LoadError {
     /// A fault that no option remedies: the file, the field, and the remedy.
@@ -17,7 +17,7 @@ pub enum LoadError {
     Remedied {
         /// The file, the field and the fault.
         problem: String,
-        /// The option and the other ways out.
+        /// The remedy, by an option or otherwise.
         remedy: LoadRemedy,
     },
     /// A fault in the [list of views](crate::dataset::LoadOptions::views).
@@ -33,7 +33,7 @@ pub enum LoadError {
     NoMasks {
         /// The file that lists the photographs.
         listing: PathBuf,
-        /// True for inverted masks, false for the background that they carve away.
+        /// True if masks are to be inverted, false if they are to carve the background away.
         inverted: bool,
     },
 }
@@ -47,11 +47,11 @@ pub enum LoadRemedy {
     AddOrImagesFolder,
     /// Name a folder of images instead of paths that lead out of the dataset.
     OtherImagesFolder,
-    /// Name the folder that holds both images at their original paths, as suffixes do not tell them apart.
+    /// Name the folder that holds both images at their original paths, as the suffixes of their paths are the same.
     ImagesFolderOfBoth,
-    /// Invert masks that hide everything, or do not.
+    /// Change whether masks that hide everything are inverted.
     InvertMasks(bool),
-    /// Hold fewer views out.
+    /// Hold out fewer views.
     LargerTestEvery,
     /// Keep the usable field of view of a lens that folds over.
     KeepFieldOfView,

@@ -1,5 +1,5 @@
-//! Readers of everything that other programs write, datasets and models of Gaussian splats in all formats, and the
-//! writers of model formats. This layer knows no backend and no run.
+//! Readers of other programs' files (datasets and models of Gaussian splats in all formats), and writers of models.
+//! This layer depends on neither backends nor runs.
 //!
 //! Its modules in order, each using only those before it: `error`, `picture_file`, `ply`, [`points`], [`models`], [`dataset`],
 //! [`track_colours`] and [`views`].

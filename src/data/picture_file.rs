@@ -4,13 +4,13 @@ use std::io::{self, BufRead, Seek};
 
 use image::ImageReader;
 
-/// Anything that an image is read from. Decoders are generic and large; as everything is read through this one type,
-/// they are compiled once.
+/// Anything that an image is read from. Decoders are generic and large; as all images are read through this one trait
+/// object, they are compiled once.
 pub(crate) trait Input: BufRead + Seek {}
 
 impl<T: BufRead + Seek> Input for T {}
 
-/// A reader of the format that the first bytes say.
+/// A reader of the format that the first bytes indicate.
 ///
 /// # Errors
 /// The bytes cannot be read.

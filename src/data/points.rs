@@ -30,7 +30,7 @@ impl PointCloud {
         self.positions.is_empty()
     }
 
-    /// At most `most` points, equally spaced in their order.
+    /// At most `most` of the points, at equal intervals in their order.
     pub fn thinned(&self, most: usize) -> Self {
         let stride = self.len().div_ceil(most.max(1)).max(1);
         Self {
@@ -76,7 +76,7 @@ pub fn read_points(path: &Path) -> Result<PointCloud, LoadError> {
     ply.each_row(&vertices, &columns, |row| {
         points.positions.push(DVec3::new(row[0], row[1], row[2]));
         points.colours.push(match row[3..] {
-            // The cast takes NaN to 0 and saturates.
+            // The cast turns NaN into 0 and saturates.
             [r, g, b] => [r / full[0], g / full[1], b / full[2]].map(|v| (255.0 * v + 0.5) as u8),
             _ => [GREY; 3],
         });

@@ -53,8 +53,8 @@ impl AdapterSummary {
 /// The requested adapter.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct AdapterChoice {
-    /// Part of the name of the adapter or its driver, case-insensitive; `None` takes the best adapter.
+    /// Part of the name of the adapter or its driver, case-insensitive; `None` selects the best adapter.
     pub name: Option<String>,
-    /// The method of accumulating gradients; `None` takes the adapter's [default](AdapterSummary::accumulation).
+    /// The method of accumulating gradients; `None` selects the adapter's [default](AdapterSummary::accumulation).
     pub accumulation: Option<Accumulation>,
 }

@@ -15,7 +15,7 @@ use densify_core::image::Image8;
 pub(super) struct Candidates {
     pub(super) request: Option<CandidateRequest>,
     pub(super) list: Vec<Candidate>,
-    ranking: Vec<Ranked>,
+    ranking: Vec<RankedPixel>,
 }
 
 /// A photograph with the background and exposure of its view.
@@ -39,9 +39,9 @@ impl<'a> Photograph<'a> {
 }
 
 /// The error and the number of a pixel.
-pub(super) type Ranked = (f32, u32);
+pub(super) type RankedPixel = (f32, u32);
 
-/// Pixels ranked per candidate, so that enough remain after spacing.
+/// Number of pixels ranked per candidate, so that enough remain after spacing.
 const RANKED_PER_CANDIDATE: usize = 16;
 /// Values per candidate in a checkpoint.
 const VALUES: usize = 8;
@@ -52,9 +52,9 @@ impl Candidates {
         Self { request, list: Vec::with_capacity(capacity), ranking: Vec::new() }
     }
 
-    /// Bytes of the list and of the ranking of an image's pixels.
+    /// Bytes of the list, and of the ranking of an image's pixels.
     pub(super) fn bytes(request: Option<CandidateRequest>, pixels: usize) -> u64 {
-        let ranking = pixels * size_of::<Ranked>();
+        let ranking = pixels * size_of::<RankedPixel>();
         request.map_or(0, |r| (r.capacity * size_of::<Candidate>() + ranking) as u64)
     }
 
@@ -89,7 +89,7 @@ impl Candidates {
         Ok(())
     }
 
-    /// The request and the number of candidates to take in the view of `step`, if any.
+    /// The request and the number of candidates to collect in the view of `step`, if any.
     pub(super) fn to_take(&self, step: u32, rows: usize) -> Option<(CandidateRequest, usize)> {
         let r = self.request.filter(|r| r.from < step && step < r.until)?;
         let count = rows / r.rows_per_candidate.max(1) as usize;
@@ -111,7 +111,7 @@ impl Candidates {
         spaced: bool,
         error: impl Fn(usize, usize) -> Option<f32>,
     ) -> Vec<(usize, usize, f32)> {
-        let rank = |ranking: &mut Vec<Ranked>, _| {
+        let rank = |ranking: &mut Vec<RankedPixel>, _| {
             ranking.clear();
             for y in 0..height {
                 for x in 0..width {
@@ -125,7 +125,8 @@ impl Candidates {
         self.worst_by([width, height], count, spaced, rank, &error)
     }
 
-    /// The same for a list of pixels with their errors, which includes at least the worst [`ranked`] of them.
+    /// Like [`worst`](Self::worst), for a list of pixels with their errors, which includes at least the worst
+    /// [`ranked`] of them.
     #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "used by the GPU backend only"))]
     pub(super) fn worst_of(
         &mut self,
@@ -134,25 +135,25 @@ impl Candidates {
         spaced: bool,
         known: impl IntoIterator<Item = (f32, u32)>,
     ) -> Vec<(usize, usize, f32)> {
-        let known: Vec<Ranked> = known.into_iter().collect();
+        let known: Vec<RankedPixel> = known.into_iter().collect();
         let errors: HashMap<u32, f32> = known.iter().map(|&(e, pixel)| (pixel, e)).collect();
         // Pixels that are not listed have smaller errors.
         let error = |x: usize, y: usize| errors.get(&((y * size[0] + x) as u32)).copied();
-        let rank = |ranking: &mut Vec<Ranked>, _| {
+        let rank = |ranking: &mut Vec<RankedPixel>, _| {
             *ranking = known;
             ranking.len()
         };
         self.worst_by(size, count, spaced, rank, error)
     }
 
-    /// The same for a function `rank(list, n)` that writes pixels, the `n` worst among them, to the head of the list,
-    /// and returns their number.
+    /// Like [`worst`](Self::worst), for a function `rank(list, n)` that writes at least the `n` worst pixels to the
+    /// head of the list and returns how many it has written.
     pub(super) fn worst_by(
         &mut self,
         [width, height]: [usize; 2],
         count: usize,
         spaced: bool,
-        rank: impl FnOnce(&mut Vec<Ranked>, usize) -> usize,
+        rank: impl FnOnce(&mut Vec<RankedPixel>, usize) -> usize,
         error: impl Fn(usize, usize) -> Option<f32>,
     ) -> Vec<(usize, usize, f32)> {
         let ranked = ranked(count, spaced);
@@ -181,12 +182,12 @@ impl Candidates {
 }
 
 /// Orders by descending error, then by pixel number.
-fn worse(a: &Ranked, b: &Ranked) -> Ordering {
+fn worse(a: &RankedPixel, b: &RankedPixel) -> Ordering {
     b.0.total_cmp(&a.0).then(a.1.cmp(&b.1))
 }
 
 /// Moves the `most` worst pixels to the head, in any order, and returns their number.
-pub(super) fn keep_worst(ranking: &mut [Ranked], most: usize) -> usize {
+pub(super) fn keep_worst(ranking: &mut [RankedPixel], most: usize) -> usize {
     if ranking.len() > most {
         ranking.select_nth_unstable_by(most, worse);
     }

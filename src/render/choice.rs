@@ -1,4 +1,4 @@
-//! The choice of a backend: the one place that turns it into limits, a memory plan, and a backend.
+//! The choice of a backend. Only this module turns it into limits, a memory plan, and a backend.
 
 use clap::ValueEnum;
 use densify_policies::policy::Needs;
@@ -77,7 +77,7 @@ pub enum Device {
 }
 
 impl Device {
-    /// Opens the requested device. [`BackendChoice::Auto`] takes a GPU if there is one or if `name` is given,
+    /// Opens the requested device. [`BackendChoice::Auto`] selects a GPU if there is one or if `name` is given,
     /// else the processor. Without an `accumulation`, a GPU uses the fastest that it supports.
     ///
     /// # Errors
@@ -139,7 +139,7 @@ impl Device {
         }
     }
 
-    /// The most (row, tile) pairs that the device can hold at a time.
+    /// The maximum number of (row, tile) pairs that the device can hold at a time.
     pub fn most_pairs(&self, needs: &Needs) -> usize {
         match self {
             Self::Processor => u32::MAX as usize,
@@ -164,7 +164,7 @@ impl Device {
         }
     }
 
-    /// The f32 columns that the host needs in addition to the backend while signals are read; none if the backend
+    /// The number of f32 columns that the host must allocate while `columns` columns are read; 0 if the backend
     /// lends its own memory.
     pub fn columns_on_host(&self, columns: usize) -> usize {
         match self {
@@ -173,8 +173,8 @@ impl Device {
         }
     }
 
-    /// Compiles the GPU kernels for these needs and verifies their results on a small scene. Done before memory is planned:
-    /// the plan must include the memory that the driver takes.
+    /// Compiles the GPU kernels for these needs and verifies their results on a small scene. Done before memory is
+    /// planned: the plan must include the memory that the driver takes.
     ///
     /// # Errors
     /// When a kernel does not compile or its results are wrong.

@@ -8,11 +8,11 @@ use densify_core::image::Image8;
 /// The gradient of a loss with respect to an image.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ImageGradient {
-    /// By colour. Shape: `[height, width, 3]`.
+    /// With respect to colour. Shape: `[height, width, 3]`.
     pub rgb: Vec<f32>,
-    /// By alpha. Shape: `[height, width]`.
+    /// With respect to alpha. Shape: `[height, width]`.
     pub alpha: Vec<f32>,
-    /// By depth. Shape: `[height, width]`.
+    /// With respect to depth. Shape: `[height, width]`.
     pub depth: Vec<f32>,
 }
 

@@ -1,4 +1,5 @@
-//! Errors of backends, as data: no remedy and no option's name, which only the layer that renders messages knows.
+//! Errors of backends, as data. They contain no remedies and no option names: only the layer that shows messages knows
+//! these.
 
 use densify_core::memory::Bytes;
 use densify_shaders::Accumulation;
@@ -29,7 +30,7 @@ pub enum BackendError {
         /// The longest side supported `[px]`.
         max: u32,
     },
-    /// No adapter can be used: which were found, and what they lack.
+    /// No adapter can be used; the text lists the adapters found and what they lack.
     #[error("{0}")]
     NoAdapter(String),
     /// An adapter was named for the native backend.
@@ -93,7 +94,7 @@ pub enum BackendError {
     LoopCut {
         /// The adapter's name.
         device: String,
-        /// The accumulation in use; [`Accumulation::Slots`] gets through the most Gaussians.
+        /// The accumulation in use; [`Accumulation::Slots`] can process the most Gaussians.
         accumulation: Accumulation,
     },
 }
@@ -101,9 +102,9 @@ pub enum BackendError {
 /// The setting that decides the size of a buffer, with the largest value that fits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fit {
-    /// (row, tile) pairs held at a time.
+    /// Maximum number of (row, tile) pairs in memory at a time.
     TileCap(u64),
-    /// Rows of the budget.
+    /// The budget, in rows.
     Budget(u64),
     /// The size of the images.
     ImageSize,

@@ -99,9 +99,9 @@ pub struct StepInput<'a> {
 pub struct AuxInput<'a> {
     /// The iteration just finished, 1-based.
     pub step: u32,
-    /// The view's number, for random draws.
+    /// The view's number, for random sampling.
     pub view: usize,
-    /// Seed of the run, for random draws.
+    /// Seed of the run, for random sampling.
     pub seed: u64,
     /// The view's camera.
     pub camera: &'a Camera,
@@ -124,7 +124,7 @@ pub struct AuxOutput {
     pub loss: f32,
     /// The requested columns, in order. Shape of each: `[rows]`.
     pub columns: Vec<(AuxColumn, Vec<f32>)>,
-    /// Surface points, each with its pixel's alpha as its error.
+    /// Surface points; the error of each is its pixel's alpha.
     pub points: Vec<Candidate>,
 }
 
@@ -214,8 +214,8 @@ pub trait Backend: Send {
     /// See [`BackendError`].
     fn take_signals(&mut self, wanted: SignalSet) -> Result<Signals, BackendError>;
 
-    /// Returns the signals after they have been read. Their memory may belong to the backend, which otherwise has
-    /// to allocate it again.
+    /// Returns the signals after they have been read. Their memory may belong to the backend, which must otherwise
+    /// allocate it again.
     fn give_back(&mut self, signals: Signals) {
         drop(signals);
     }
@@ -306,8 +306,8 @@ pub trait Backend: Send {
         values: &[f32],
     ) -> Result<(), BackendError>;
 
-    /// The arrays that hold everything except the model that later steps depend on, such as moments, ages and
-    /// accumulated signals.
+    /// The arrays that hold everything on which later steps depend, except the model: moments, ages, accumulated
+    /// signals and so on.
     fn state(&self) -> Vec<StateArray>;
 
     /// Copies one array of [`state`](Self::state) to the host.
@@ -332,7 +332,7 @@ pub trait Backend: Send {
     fn save_rows(&self, name: &str, rows: Range<usize>) -> Result<Tensor, BackendError>;
 
     /// Restores an array that [`save`](Self::save) returned, in a backend set up with the same options for the
-    /// [model](Self::download) of that step. With all arrays restored, later steps are the same to the bit.
+    /// [model](Self::download) of that step. With all arrays restored, later steps are bit-identical.
     ///
     /// # Errors
     /// [`StateError`] when this backend has no such array, or one of another type or shape. The

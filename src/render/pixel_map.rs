@@ -35,30 +35,30 @@ pub(super) fn pixel_map(
     error.iter().zip(&edge).map(|(e, g)| map.error * e + map.edge * g).collect()
 }
 
-/// Pixels (x, y, alpha) drawn without replacement in proportion to their alpha.
-pub(super) fn draw_pixels(
+/// Pixels (x, y, alpha) sampled without replacement in proportion to their alpha.
+pub(super) fn sample_pixels(
     alpha: &[f32],
     width: usize,
     input: &AuxInput<'_>,
 ) -> Vec<(usize, usize, f32)> {
-    // Views of one step use different draws.
+    // Views of one step use different random numbers.
     let view_hash = (input.view as u64 + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
     let rng = PolicyRng::new(input.seed ^ view_hash, input.step);
-    let drawn = weighted(alpha, input.request.points as usize, &rng);
-    drawn
+    let sampled = weighted(alpha, input.request.points as usize, &rng);
+    sampled
         .into_iter()
         .map(|at| (at as usize % width, at as usize / width, alpha[at as usize]))
         .collect()
 }
 
 /// Three standard deviations along the longer axis of a projected covariance [a b; b c], rounded up
-/// `[px]`; of its factor 1/l1 = √(det/c), r = b/c, 1/l3 = √c.
+/// `[px]`. Computed from its factor 1/l1 = √(det/c), r = b/c, 1/l3 = √c.
 pub(super) fn radius_px(inv_l1: f32, shear: f32, inv_l3: f32) -> f32 {
     let c = inv_l3 * inv_l3;
     let b = shear * c;
     let a = inv_l1 * inv_l1 + shear * b;
     let mid = 0.5 * (a + c);
-    // The root of mid² − det without its cancellation.
+    // The root of mid² − det, without cancellation.
     let root = (0.5 * (a - c)).hypot(b);
     (3.0 * (mid + root).sqrt()).ceil()
 }

@@ -12,12 +12,11 @@ pub struct Setup {
     pub budget: RowBudget,
     /// Near plane `[scene units]`, > 0: rows closer to the camera are not rendered.
     pub near: f32,
-    /// The most (row, tile) pairs held at a time; an image with more is processed in bands. `None` means 16
-    /// per row, or as many as the device can hold. Raised to the budget if smaller, as one tile's list
-    /// must fit.
+    /// Maximum number of (row, tile) pairs in memory at a time; an image with more is processed in bands. `None` means
+    /// 16 per row, or as many as the device can hold. Raised to the budget if smaller, as one tile's list must fit.
     pub tile_cap: Option<usize>,
-    /// The most gradient records, one per pair, held at a time, >= 1; the backward pass processes more pairs in
-    /// parts (native backend).
+    /// Maximum number of gradient records, one per pair, in memory at a time, >= 1; the backward pass processes more
+    /// pairs in parts (native backend).
     pub record_cap: usize,
     /// Instruction set of the kernels (native backend).
     pub instructions: InstructionSet,

@@ -26,11 +26,11 @@ pub(super) enum Field {
     WeightSum,
     /// Number of pixels with w > 0.
     PixelCount,
-    /// Σw·(gradient by depth); only for [`Differentiable`](super::Differentiable), never in training.
+    /// Σw·(gradient with respect to depth); only for [`Differentiable`](super::Differentiable), never in training.
     Depth,
     /// Σw·(error of the pixel); only in training, never together with [`Depth`](Self::Depth).
     Error,
-    /// max w; the last, as it is the only value that is not a sum.
+    /// max w; comes last, as it is the only value that is not a sum.
     WeightMax,
 }
 
@@ -133,7 +133,7 @@ impl RecordLayout {
     }
 }
 
-/// Returns whether pixels are counted for the row with the largest blend weight.
+/// Returns whether the pixels in which each row has the largest blend weight are counted.
 pub(super) fn counts_dominant(needs: &Needs) -> bool {
     let in_views = |aux: &AuxRequest| aux.columns.contains(&AuxColumn::DominantPixels);
     needs.signals.contains(Signal::DominantPixels) || needs.aux.as_ref().is_some_and(in_views)
@@ -156,11 +156,11 @@ pub(super) struct SignalPlanes {
     pub(super) full_depth: f32,
     /// See [`Needs::error_score`].
     pub(super) score: ErrorScore,
-    /// True if the first of an epoch signal's two planes belongs to the current epoch, not the second.
+    /// True if the first of an epoch signal's two planes belongs to the current epoch, false if the second does.
     swapped: bool,
 }
 
-/// Planes per signal.
+/// Number of planes per signal.
 const fn planes(kind: SignalKind) -> usize {
     match kind {
         SignalKind::Sum | SignalKind::Count | SignalKind::Maximum | SignalKind::Minimum => 1,
@@ -280,7 +280,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn attributes_and_no_others_are_parameters_as_many_as_they_are_wide() {
+    fn exactly_the_attributes_are_parameters_and_their_widths_agree() {
         for signal in Signal::ALL {
             let found = ParameterSignal::new(signal).map(|found| found.parameters.len());
             let width = match signal.kind() {

@@ -6,7 +6,7 @@
 
 use std::io;
 
-/// Values converted to bytes at a time.
+/// Number of values converted to bytes at a time.
 const CHUNK: usize = 1 << 14;
 
 /// The name and kind of a state array.
@@ -48,7 +48,7 @@ impl Tensor {
         matches!(name, "ages" | "device.ages")
     }
 
-    /// Steps since each row was last created or rewritten; `None` for an array without ages. Shape: `[rows]`.
+    /// Number of steps since each row was last created or rewritten; `None` for an array without ages. Shape: `[rows]`.
     pub fn ages(&self) -> Option<Vec<u32>> {
         match &self.values {
             _ if !Self::has_ages(&self.name) => None,

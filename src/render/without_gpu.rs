@@ -49,7 +49,7 @@ impl GpuDevice {
     }
 }
 
-/// All adapters: none.
+/// All adapters; there are none.
 pub fn adapters() -> Vec<AdapterSummary> {
     Vec::new()
 }

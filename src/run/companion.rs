@@ -8,20 +8,20 @@ use densify_render::Device;
 pub struct Companion {
     /// Adds the bytes it needs to the ledger of a run of this size.
     pub reserve: fn(&CompanionSize<'_>, &mut Ledger),
-    /// Most points of the dataset that it is given.
+    /// Maximum number of the dataset's points that it receives.
     pub points: usize,
 }
 
 /// The sizes of a run that the memory of a [`Companion`] may depend on.
 #[derive(Debug, Clone, Copy)]
 pub struct CompanionSize<'a> {
-    /// Most Gaussians there may ever be.
+    /// Maximum number of Gaussians.
     pub budget: u64,
     /// The device that trains.
     pub device: &'a Device,
     /// Width and height of the largest image `[px]`.
     pub largest_image: (u32, u32),
-    /// Bytes of one decoded photograph, and of decoding it.
+    /// Bytes of one decoded photograph, and those for decoding it.
     pub photograph: u64,
     /// Number of views, training and test.
     pub views: usize,

@@ -1,5 +1,5 @@
-//! Detects a model in other coordinates than the photographs. Its renderings correlate with them no more than by chance,
-//! while those of a poor model of the scene still do.
+//! Detects models whose coordinates are not those of the photographs. Their renderings correlate with the photographs
+//! no more than by chance; even those of a poor model of the scene correlate better.
 
 use std::path::Path;
 
@@ -9,22 +9,22 @@ use densify_core::image::Image8;
 use densify_data::views::ViewSource;
 use densify_render::{Backend, Rendering};
 
-/// Most views that are compared, evenly from first to last.
-const COMPARED: usize = 8;
-/// Correlation below which a model is in other coordinates. Models moved, mirrored, turned or scaled have −0.1 to 0.3,
+/// Maximum number of views compared, spread evenly over all.
+const MAX_VIEWS: usize = 8;
+/// Correlation below which a model is refused. Models that were moved, mirrored, turned or scaled have −0.1 to 0.3,
 /// trained ones 0.88 to 0.99, and 0.97 after a thousand steps (room256, fox, office, chair, cup).
-const ELSEWHERE: f64 = 0.1;
-/// Correlation below which a model may be in other coordinates.
-const DOUBTFUL: f64 = 0.35;
-/// Standard deviation of the sum of three channels in `[0, 1]` below which an image has nothing to compare.
-const FLAT: f64 = 0.02;
-/// Least share of the pixels that a model covers: one that covers less is nowhere in the view.
-const COVERED: f64 = 1e-3;
+const REFUSED_BELOW: f64 = 0.1;
+/// Correlation below which the user is told that the model may be in other coordinates.
+const DOUBTED_BELOW: f64 = 0.35;
+/// Standard deviation of the sum of three channels in `[0, 1]` below which an image has too little contrast to compare.
+const CONTRAST: f64 = 0.02;
+/// Share of the pixels below which a model counts as not being in the view.
+const MIN_COVERAGE: f64 = 1e-3;
 
 /// The correlation of a model's renderings with the photographs.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CoordinateCheck {
-    /// Mean over views; `None` if the renderings or the photographs have one colour.
+    /// Mean over views; `None` if the renderings or the photographs have only one colour.
     correlation: Option<f64>,
 }
 
@@ -38,7 +38,7 @@ impl CoordinateCheck {
         views: &impl ViewSource,
         (background, sh_degree): ([f32; 3], u8),
     ) -> Result<Self, Failure> {
-        let count = views.count().min(COMPARED);
+        let count = views.count().min(MAX_VIEWS);
         let mut found = Vec::new();
         for place in 0..count {
             let view = place * views.count() / count;
@@ -50,11 +50,11 @@ impl CoordinateCheck {
         Ok(Self { correlation: (!found.is_empty()).then_some(mean) })
     }
 
-    /// Fails if the model of `file` is in other coordinates than the dataset, and notes it if it may be. `option` is the
-    /// one that names the file, if there is one.
+    /// Fails if the model of `file` is in other coordinates than the dataset, and tells the user if it may be. `option`
+    /// is the option that names the file, if there is one.
     ///
     /// # Errors
-    /// When the model shows nothing of the photographs.
+    /// When the correlation is too low.
     pub fn require(
         self,
         option: Option<&'static str>,
@@ -62,7 +62,7 @@ impl CoordinateCheck {
         observer: &dyn Observer,
     ) -> Result<(), Failure> {
         match self.correlation {
-            Some(correlation) if correlation < ELSEWHERE => {
+            Some(correlation) if correlation < REFUSED_BELOW => {
                 let file = file.to_owned();
                 Err(ModelProblem::OtherCoordinates { option, file, correlation }.into())
             }
@@ -73,20 +73,21 @@ impl CoordinateCheck {
         }
     }
 
-    /// Notes that the model may be in other coordinates than the dataset.
+    /// Tells the user if the model may be in other coordinates than the dataset.
     pub fn note(self, option: Option<&'static str>, file: &Path, observer: &dyn Observer) {
-        if let Some(correlation) = self.correlation.filter(|&value| value < DOUBTFUL) {
+        if let Some(correlation) = self.correlation.filter(|&value| value < DOUBTED_BELOW) {
             let note = notes::other_coordinates(observer.spelling(), option, file, correlation);
             observer.say(format_args!("{note}"));
         }
     }
 }
 
-/// The correlation of a rendering with its photograph: the larger of that over all pixels, which sees outlines, and that
-/// over the pixels that the model covers, which may be a part of the scene. `None` if either has one colour.
+/// The correlation of a rendering with its photograph. It is computed over all pixels, where outlines count, and over
+/// the pixels that the model covers, for models of a part of the scene; the larger one is returned. `None` if either
+/// image has only one colour.
 fn compare(rendering: &Rendering, image: &Image8, background: [f32; 3]) -> Option<f64> {
     let covered = rendering.alpha.iter().map(|&alpha| f64::from(alpha)).sum::<f64>();
-    if covered < COVERED * rendering.alpha.len() as f64 {
+    if covered < MIN_COVERAGE * rendering.alpha.len() as f64 {
         return Some(0.0);
     }
     let whole = correlation(rendering, image, background, |_| 1.0);
@@ -122,7 +123,7 @@ fn correlation(
     }
     let variance = |square: f64, mean: f64| square / sum - (mean / sum).powi(2);
     let (of_model, of_truth) = (variance(xx, x), variance(yy, y));
-    let varies = sum > 0.0 && of_model > FLAT * FLAT && of_truth > FLAT * FLAT;
+    let varies = sum > 0.0 && of_model > CONTRAST * CONTRAST && of_truth > CONTRAST * CONTRAST;
     varies.then(|| (xy / sum - x / sum * (y / sum)) / (of_model * of_truth).sqrt())
 }
 
@@ -169,14 +170,14 @@ mod tests {
     }
 
     #[test]
-    fn a_part_of_the_scene_is_enough_and_nothing_is_not() {
+    fn a_partial_model_matches_and_an_invisible_one_does_not() {
         let photograph = image(|pixel| (255.0 * noise(pixel)) as u8);
         let is_part = |pixel: usize| pixel < 2 * SIZE;
         let part =
             rendering(|p| if is_part(p) { noise(p) } else { 0.0 }, |p| f32::from(is_part(p)));
         assert!(compared(&part, &photograph).is_some_and(|value| value > 0.99));
         assert_eq!(compared(&rendering(|_| 0.0, |_| 0.0), &photograph), Some(0.0));
-        // One colour, in either, is no evidence.
+        // An image of a single colour is no evidence.
         assert_eq!(compared(&rendering(|_| 0.5, |_| 1.0), &photograph), None);
         assert_eq!(compared(&rendering(noise, |_| 1.0), &image(|_| 99)), None);
     }

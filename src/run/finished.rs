@@ -71,7 +71,7 @@ impl Machine {
         self.device.backend(model, &setup)
     }
 
-    /// A backend with a model in scene coordinates that measures signals by steps that change nothing.
+    /// A backend with a model in scene coordinates, for measuring signals with steps that do not change it.
     pub fn backend_to_measure(
         &self,
         model: &Gaussians,
@@ -96,11 +96,11 @@ pub struct Opened {
     pub data: DataSpec,
     /// Spherical-harmonic degree of the model.
     pub sh_degree: u8,
-    /// Holds the model.
+    /// The backend, which contains the model.
     pub backend: Box<dyn Backend>,
 }
 
-/// Adds a remedy to a failure if the dataset of a run is no longer at `path`, a path that the user did not name.
+/// Adds a remedy to a failure if the dataset is no longer at `path`, the path in the run's configuration.
 pub fn or_moved(failure: Failure, path: &Path) -> Failure {
     if path.exists() || builtin::name(path).is_some() {
         failure
@@ -130,7 +130,7 @@ pub fn open_run(
         .map_err(|failure| if was_moved { failure } else { or_moved(failure, &path) })
 }
 
-/// Opens a model by any program with a dataset. The near plane is a fraction of the extent.
+/// Opens a model, written by any program, with a dataset. The near plane is given as a fraction of the extent.
 ///
 /// # Errors
 /// When the model, the dataset or the device cannot be opened.
@@ -150,8 +150,8 @@ pub fn open(
     Ok(Opened { sh_degree, backend, dataset, data })
 }
 
-/// Opens a model without a dataset, for cameras in its own coordinates. Returns its normalisation and degree, too. The
-/// near plane is a fraction of its extent.
+/// Opens a model without a dataset, for cameras in its own coordinates. Also returns its normalisation and degree. The
+/// near plane is given as a fraction of its extent.
 ///
 /// # Errors
 /// When the model or the device cannot be opened.
@@ -168,7 +168,7 @@ pub fn open_alone(
     Ok((backend, normalisation, model.sh_degree))
 }
 
-/// Reads the dataset at `path` and passes its notes on.
+/// Reads the dataset at `path` and passes its notes to the observer.
 ///
 /// # Errors
 /// When it cannot be read.

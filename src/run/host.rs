@@ -1,4 +1,4 @@
-//! The caller's side of a run: who observes it, and how it may measure its process.
+//! Services that the caller of a run provides: an observer, and a way to measure the process's memory.
 
 use crate::companion::Companion;
 use crate::observer::{Observer, Silent};
@@ -7,7 +7,7 @@ use crate::process::ProcessMemory;
 /// The surroundings of a run, which its caller provides.
 #[derive(Clone, Copy)]
 pub struct Host<'a> {
-    /// Is told everything, and may stop the run.
+    /// Receives all messages and progress, and may stop the run.
     pub observer: &'a dyn Observer,
     /// Measures the memory of the process.
     pub process: ProcessMemory,

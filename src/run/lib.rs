@@ -1,11 +1,11 @@
-//! A run as data, in three stages: a description as it was asked for (`spec`), the same with everything decided
-//! (`resolved`), and the training of it (`session`).
+//! A run in three stages: its description as the user gave it (`spec`), the same with every choice made (`resolved`),
+//! and its training (`session`).
 //!
-//! The crate knows no subcommand, prints nothing, and changes nothing of its process. Its caller provides a [`Host`];
+//! The crate knows no subcommand, prints nothing, and does not modify its process. Its caller provides a [`Host`];
 //! progress goes to an [`Observer`]; errors stay data until they are shown.
 //!
-//! From below, each module using only those before it: failure, spec, companion, observer, process, host, models,
-//! coordinate_check, resolved, finished, session.
+//! Modules from bottom to top, each of which uses only those before it: failure, spec, companion, observer, process,
+//! host, models, coordinate_check, resolved, finished, session.
 
 mod companion;
 pub mod coordinate_check;

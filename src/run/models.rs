@@ -1,4 +1,4 @@
-//! Files of models: single files, and those that a run has saved.
+//! Files of models: single files, and those saved by a run.
 
 use std::path::{Path, PathBuf};
 
@@ -11,7 +11,7 @@ use densify_data::models;
 use densify_train::checkpoint::newest_step;
 use densify_train::output::{is_in_use, model_path, saved_iterations};
 
-/// True for a file that is not the archive of a dataset, and for a folder of SOG.
+/// True for a file that is not the archive of a dataset, and for a folder in SOG format.
 pub fn is_model(path: &Path) -> bool {
     (path.is_file() && !is_archive(path)) || path.join("meta.json").is_file()
 }
@@ -37,7 +37,7 @@ pub fn iteration(run: &Path, asked: Option<u32>) -> Result<u32, Failure> {
     }
 }
 
-/// As [`iteration`], for a run that may still be training; also returns true if it is, and notes it.
+/// As [`iteration`], for a run that may still be training; also returns true if it is, and tells the observer.
 ///
 /// # Errors
 /// As [`iteration`].
@@ -54,18 +54,18 @@ pub fn iteration_so_far(
     if trains {
         let run = run.display();
         observer.say(format_args!(
-            "note: {run} is being trained; what is shown is its model of iteration {iteration}"
+            "note: {run} is being trained; this is its model of iteration {iteration}"
         ));
     }
     Ok((iteration, trains))
 }
 
-/// The last part of a path, to be shown without the private names of the folders above it.
+/// The last part of a path, to be shown without revealing the names of the folders above it.
 pub fn name_of(path: &Path) -> String {
     names_of(&[path]).swap_remove(0)
 }
 
-/// Names for paths that are shown together: each is as short as it can be and still differ from the others.
+/// Names for paths that are shown together: each has as few parts as needed to differ from the others.
 pub fn names_of(paths: &[&Path]) -> Vec<String> {
     let whole = |path: &&Path| path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
     let whole: Vec<PathBuf> = paths.iter().map(whole).collect();
@@ -74,21 +74,22 @@ pub fn names_of(paths: &[&Path]) -> Vec<String> {
         all[all.len().saturating_sub(parts)..].iter().collect()
     };
     let name = |path: &PathBuf| {
-        let tells_apart = |parts: &usize| {
+        let is_unique = |parts: &usize| {
             let mut others = whole.iter().filter(|other| *other != path);
             others.all(|other| last(other, *parts) != last(path, *parts))
         };
         let most = path.components().count();
-        let parts = (1..most).find(tells_apart).unwrap_or(most);
+        let parts = (1..most).find(is_unique).unwrap_or(most);
         files::one_line(&last(path, parts).to_string_lossy())
     };
     whole.iter().map(name).collect()
 }
 
-/// The file of a model that is named by itself, or by its run and the iteration asked for, or else the last.
+/// The file of a model: `named` itself if it is a file, else the model that the run in this folder saved at the
+/// iteration asked for, by default the last.
 ///
 /// # Errors
-/// As [`iteration`], and when an iteration is asked for of a file.
+/// As [`iteration`], and when an iteration is given for a file.
 pub fn model_file(named: &Path, asked: Option<u32>) -> Result<PathBuf, Failure> {
     if !is_model(named) {
         return Ok(model_path(named, iteration(named, asked)?));
@@ -99,7 +100,8 @@ pub fn model_file(named: &Path, asked: Option<u32>) -> Result<PathBuf, Failure> 
     }
 }
 
-/// Reads a file of Gaussian splats by any program, in its own coordinates, and notes what was repaired.
+/// Reads a file of Gaussian splats, written by any program, in its own coordinates, and reports dropped and repaired
+/// rows.
 ///
 /// # Errors
 /// When it cannot be read.
@@ -121,7 +123,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_have_as_many_parts_as_tell_them_apart() {
+    fn names_have_as_few_parts_as_needed_to_differ() {
         let names = |paths: &[&str]| names_of(&paths.iter().map(Path::new).collect::<Vec<_>>());
         assert_eq!(names(&["/home/me/out/a", "/home/me/out/b"]), ["a", "b"]);
         assert_eq!(names(&["/x/one/run", "/x/two/run", "/x/b"]), ["one/run", "two/run", "b"]);

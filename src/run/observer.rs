@@ -1,4 +1,4 @@
-//! Observers of a run: they are told its progress, see each step, and may ask it to stop.
+//! Observers of a run: they receive its progress and may ask it to stop.
 
 use std::fmt;
 
@@ -23,13 +23,13 @@ pub struct Interrupt {
 /// An observer's answer after it has looked at the model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Between {
-    /// Go on with the next step.
+    /// Continue with the next step.
     Step,
     /// Write a checkpoint, then ask again.
     Checkpoint,
 }
 
-/// Passes the notes of a dataset on.
+/// Passes the notes of a dataset to an observer.
 pub fn say_notes(observer: &dyn Observer, notes: &[Note]) {
     for note in notes {
         observer.say(format_args!("{}", notes::dataset(observer.spelling(), note)));
@@ -49,7 +49,7 @@ pub trait Observer {
     /// Lines of detail, such as the table of memory: for users who ask for them.
     fn detail(&self, _lines: fmt::Arguments<'_>) {}
 
-    /// Training begins after `done` steps and goes to step `last`, with at most `budget` rows.
+    /// Training begins after `done` steps and continues to step `last`, with at most `budget` rows.
     fn begin(&self, _done: u32, _last: u32, _budget: usize) {}
 
     /// A step is done.
@@ -64,7 +64,7 @@ pub trait Observer {
     /// The test views were measured.
     fn tested(&self, _step: u32, _mean: &Mean) {}
 
-    /// A checkpoint was written, or failed because of `trouble`.
+    /// A checkpoint was written, or could not be written because of `trouble`.
     fn checkpoint_written(&self, _step: u32, _trouble: Option<&str>) {}
 
     /// Called before every step, so that the model can be rendered while training waits; rendering changes nothing. The

@@ -1,5 +1,5 @@
-//! The memory of this process, and the limits that the system sets to it. A run measures it only through the
-//! [`ProcessMemory`] that its caller provides.
+//! The memory of this process, and the system's limits on it. A run measures it only through the [`ProcessMemory`] that
+//! its caller provides.
 
 use std::fs::read_to_string;
 use std::path::Path;
@@ -11,12 +11,12 @@ const ALLOCATOR_SLACK: u64 = 16 << 20;
 /// Address space per thread: a stack, and a heap of its own (glibc) `[bytes]`.
 const ADDRESSES_PER_THREAD: u64 = (2 + 64) << 20;
 
-/// Measures the memory of the process. Each function returns `None` if the system does not tell.
+/// Measures the memory of the process. Each function returns `None` if the system does not report the value.
 #[derive(Debug, Clone, Copy)]
 pub struct ProcessMemory {
     /// Resident memory now `[bytes]`.
     pub resident: fn() -> Option<u64>,
-    /// The most resident memory so far `[bytes]`.
+    /// Peak resident memory so far `[bytes]`.
     pub peak: fn() -> Option<u64>,
     /// The tightest limit for a process with this many busy threads.
     pub grant: fn(usize) -> Option<MemoryLimit>,
@@ -25,14 +25,14 @@ pub struct ProcessMemory {
 impl ProcessMemory {
     /// As the operating system reports it (Linux).
     pub const SYSTEM: Self = Self { resident, peak: peak_resident, grant };
-    /// Nothing is known, so no run is refused for it.
+    /// Reports nothing, so that no run is refused for lack of memory.
     pub const UNKNOWN: Self = Self { resident: || None, peak: || None, grant: |_| None };
 }
 
-/// Memory left to the process, and its limit.
+/// Memory left to the process, and the limit that determines it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct MemoryLimit {
-    /// Memory that the process can still have `[bytes]`.
+    /// Memory that the process can still obtain `[bytes]`.
     pub left: u64,
     /// Name of the limit, for messages.
     pub by: &'static str,
@@ -54,8 +54,9 @@ pub fn grant(threads: usize) -> Option<MemoryLimit> {
 
 fn address_space(threads: usize) -> Option<u64> {
     let limit = parse_limit(&read_to_string("/proc/self/limits").ok()?)?;
-    let kept = ADDRESSES_PER_THREAD.saturating_mul(threads as u64).saturating_add(ALLOCATOR_SLACK);
-    Some(limit.saturating_sub(status_line("VmSize:")?).saturating_sub(kept))
+    let reserved =
+        ADDRESSES_PER_THREAD.saturating_mul(threads as u64).saturating_add(ALLOCATOR_SLACK);
+    Some(limit.saturating_sub(status_line("VmSize:")?).saturating_sub(reserved))
 }
 
 /// The soft limit in `/proc/self/limits`, "Max address space   SOFT   HARD   bytes"; `None` for

@@ -58,7 +58,8 @@ pub struct Mean {
     pub fitted: Option<FittedScore>,
 }
 
-/// Scores of a rendering, or means of several, after fitting a factor and an offset per channel to the photograph.
+/// Scores of a rendering, or means of several. In [`ViewScore`] and [`Mean`], they are those after fitting a factor and
+/// an offset per channel to the photograph.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct FittedScore {
     /// Peak signal-to-noise ratio `[dB]`.
@@ -112,7 +113,7 @@ impl Mean {
 /// Metrics by which renderings are compared with photographs.
 #[derive(Clone, Copy, Default)]
 pub struct Comparison<'a> {
-    /// Network for LPIPS, which is measured only with one.
+    /// Network for LPIPS; without one, LPIPS is not measured.
     pub lpips: Option<&'a Lpips>,
     /// Renderings are also compared with the exposure that fits the photograph best.
     pub fits_exposure: bool,

@@ -7,7 +7,7 @@ use densify_core::gaussians::{Gaussians, sigmoid};
 use densify_data::views::ViewSource;
 use densify_render::{AuxInput, Backend, BackendError};
 
-/// The needs with which the backend for [`importance`] must be made.
+/// The values that the backend for [`importance`] must record; pass them when creating it.
 pub fn needs() -> Needs {
     Needs { aux: Some(request()), ..Needs::default() }
 }
@@ -71,7 +71,7 @@ pub fn footprints(model: &Gaussians) -> Vec<f64> {
     (0..model.len()).map(footprint).collect()
 }
 
-/// The `count` most important rows in ascending order; of equal ones the first.
+/// The `count` most important rows in ascending order; among equally important rows, the first.
 pub fn largest(importance: &[f64], count: usize) -> Vec<usize> {
     let mut rows: Vec<usize> = (0..importance.len()).collect();
     rows.sort_by(|&a, &b| importance[b].total_cmp(&importance[a]));

@@ -61,7 +61,7 @@ def check(browser: Browser, url: str, run: Path, folder: Path | None) -> None:
     browser.wait_for("document.getElementById('training-numbers').textContent.includes('Checkpoint of step')", "no checkpoint is shown")
     assert (run / f"checkpoints/iteration_{paused + 1}.safetensors").is_file(), "no checkpoint is there"
     browser.wait_until_sharp()
-    # The heading counts as the run does, whatever it said before.
+    # The heading shows the run's number of Gaussians, whatever it showed before.
     browser.run("scene.models[0].rows = 1; showModels()")
     counts = "document.getElementById('models').textContent.split(': ')[1].replace('Gaussians', 'of at most')"
     browser.wait_for(f"document.getElementById('training-numbers').textContent.includes({counts})", "the heading's count is not updated")

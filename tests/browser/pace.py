@@ -3,8 +3,8 @@
     python pace.py DENSIFY RUN [ROUNDS]          needs chromium and chromium-driver
 
 The stage is 640x480. In each round the scene is turned for four seconds, a little with every frame of the screen, and
-then left at rest. Printed are the pictures shown per second, the rate that the page reports, the mean width of the
-pictures, and the time from the last movement to a picture of full resolution. For a model of 30,000 Gaussians:
+then left at rest. The output is the number of pictures shown per second, the rate that the page reports, the mean width
+of the pictures, and the time from the last movement to a picture of full resolution. For a model of 30,000 Gaussians:
 
     densify train scene:room -o RUN --budget 30k --init random --init-points 30k --iterations 600 --eval
 """

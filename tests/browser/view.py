@@ -124,7 +124,7 @@ const [milliseconds, took, alone] = arguments;
 pace([{ bitmap: { width: 1, height: 1 }, bytes: 1000, milliseconds, held: milliseconds, took }], performance.now() - took, true, 0.5);
 return coarse;
 """
-# Every reply comes later by so many milliseconds, as over a network; also counts the requests that are under way at once.
+# Delays every reply by a number of milliseconds, like a network; also counts the requests under way at the same time.
 DELAY = """
 const undelayed = window.fetch;
 window.fetch = async (...request) => {
@@ -208,7 +208,7 @@ class Browser:
         self.call("POST", f"{self.session}/actions", {"actions": sources})
 
     def check_keyboard_access(self) -> None:
-        """All visible controls are reached by Tab and have a name."""
+        """Checks that all visible controls are reached by Tab and have a name."""
         for _ in range(70):
             self.press("\ue004")  # Tab
             self.run("document.activeElement.dataset.reached = true")
@@ -237,7 +237,7 @@ class Browser:
 
 
 def check_moves(browser: Browser) -> None:
-    """All other ways to move go in the right direction only."""
+    """Checks that all other ways to move the camera move it in the right direction only."""
     browser.run("document.getElementById('marks').focus()")
     state = "return [camera.at, camera.right, camera.up, camera.back, camera.away, camera.fov]"
     dot = lambda a, b: sum(x * y for x, y in zip(a, b))
@@ -490,7 +490,7 @@ def check(browser: Browser, url: str, densify: str, run: str, rendered: Path, fo
 
 
 def check_slow_network(browser: Browser, url: str) -> None:
-    """Over a slow network, the page shows as many pictures per second, and not much smaller ones."""
+    """Checks that a slow network hardly lowers the number and size of the pictures that the page shows per second."""
 
     def turned() -> tuple[float, float]:
         found = browser.run_async(TURN, 3)

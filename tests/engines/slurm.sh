@@ -19,7 +19,7 @@ stop() {
 }
 trap stop EXIT
 
-# Only root may submit jobs, with a new key.
+# A fresh munge key that only root can read, so that only root can submit jobs.
 dd if=/dev/urandom of="$folder/key" bs=1024 count=1 status=none
 chmod 400 "$folder/key"
 munged --force --key-file="$folder/key" --socket="$folder/munge" --pid-file="$folder/munge.pid" \

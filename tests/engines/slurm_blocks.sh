@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Trains a scene in four blocks with Slurm, killing one of the tasks, and without Slurm; the merged models must be
-# identical. Then the same for a comparison of policies. Called by slurm.sh:
+# identical. Then does the same for a comparison of policies. Called by slurm.sh:
 #
 #   tests/engines/slurm.sh tests/engines/slurm_blocks.sh PROGRAM
 set -euo pipefail

@@ -1,8 +1,8 @@
 //! Reads arbitrary bytes as a file of each format that comes from other programs. Whatever the bytes are, a reader
-//! accepts or refuses them: no panic, no hang, and no allocation that the size of the file does not account for.
+//! accepts or refuses them: it never panics, hangs, or allocates more than the size of the file justifies.
 //!
 //! Formats of models and datasets come from their registries. `cargo fuzz` runs without end (see CONTRIBUTING.md),
-//! `tests/it/fuzz.rs` for a moment in every test run, both from the same corpora.
+//! `tests/it/fuzz.rs` briefly in every test run; both use the same corpora.
 
 use std::path::Path;
 
@@ -86,7 +86,7 @@ impl Target {
         for (name, contents) in photographs.chain(corpus_files(input, &self.file)) {
             let path = folder.path().join(name);
             if let Some(parent) = path.parent() {
-                // Damaged names may contradict each other; such files are left out.
+                // Damaged names may contradict each other (a file and a folder of one name); such files are left out.
                 let _ =
                     std::fs::create_dir_all(parent).and_then(|()| std::fs::write(&path, contents));
             }

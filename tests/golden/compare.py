@@ -16,11 +16,11 @@ from cases import INTENDED
 IGNORED = ("*events.out.tfevents.*", "*densify.lock", "*local.lock", "case.json")
 # Must exist, but is not compared: it is full of times and measured memory.
 PRESENT = ("report.html", "compare/*.html", "trade/*.html", "compare/growth-*.svg", "trade/pareto-*.svg")
-# Text for people: its figures must be the same, in any order; other words are only mentioned.
+# Text for people: its figures must be the same, in any order; changed words are only reported.
 WORDS = ("*.out", "*.err", "*.log", "*requirements.json", "*.md")
 # Keys of JSON with a time or measured memory.
 VARYING_KEYS = {"seconds", "cpu_seconds", "resident_bytes", "peak_bytes", "ledger_bytes"}
-# Parts of text that are left out: in which files, and what.
+# Parts of text that are left out: the pattern of the files, and the regular expression of the text.
 VARYING = (
     ("*plan.toml", r"^(merge_)?memory = \d+\n"),  # includes measured memory
     ("*.err", r"^(step \d+/\d+|rendered \d+ of \d+ views).*\n?"),  # progress
@@ -35,7 +35,7 @@ VARYING = (
 # Lines of printed text whose figures follow from measured memory, and so may differ a little.
 LOOSE_LINES = re.compile(r"program and dataset|^  (total|left|degree \d) |--memory \d+MiB holds|"
                          r"^(coarse|block-\S+|merge) ")
-# By how much at most, as a share of the larger one.
+# Largest accepted difference of these figures, as a share of the larger one.
 LOOSE = 0.4
 FIGURE = re.compile(r"(?<![\w.])[-+]?\d+(?:,\d{3})*(?:\.\d+)?(?:e[-+]?\d+)?")
 
@@ -129,7 +129,7 @@ def listed(counted: Counter) -> str:
 
 
 def without_varying_columns(text: str) -> str:
-    """Markdown without the cells of columns of times and measured memory."""
+    """Markdown without the columns of times and measured memory."""
     lines, varying = [], []
     for line in text.splitlines():
         cells = line.split("|") if line.startswith("|") else []

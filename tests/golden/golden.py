@@ -11,10 +11,10 @@ Run it by hand before and after refactoring. It needs Python 3.11, the test data
 the cases whose names begin with gpu or resume/gpu, lavapipe (apt-get install mesa-vulkan-drivers).
 
 Both programs run the cases of cases.py on the same machine, because results differ between processors and drivers. The
-reference's output is kept in target/golden, so the reference runs only once. Files, printed text and exit codes are
-compared; of checkpoints the arrays. Times, speeds and measured memory are ignored (compare.py). Of printed text, the
-figures must be the same; changed words are only mentioned, unless --words is given. The cases named resume continue
-from checkpoints that the reference wrote.
+reference's output is kept in target/golden, so the reference runs only once. Files (for checkpoints, their arrays),
+printed text and exit codes are compared. Times, speeds and measured memory are ignored (compare.py). The figures in
+printed text must be the same; changed words are only reported, unless --words is given. The cases named resume
+continue from checkpoints that the reference wrote.
 
 Prints one line per case. The exit code is 1 if any case differs. Intended differences are listed in cases.py, with
 their reasons.
@@ -99,7 +99,7 @@ def main() -> None:
 
 
 class Program:
-    """A program, and the folder of its output. Each program has its own folder, and on each kind of machine."""
+    """A program, and the folder of its output. Each program has its own folder for each kind of machine."""
 
     def __init__(self, path: Path, store: Path, data: Path):
         self.path = path.resolve(strict=True)
@@ -226,7 +226,7 @@ def compare_all(reference: Program, program: Program, chosen: list[Case], args: 
 
 
 def folders_of(*programs: Program) -> list[tuple[str, str]]:
-    """The paths that may appear in text, each with a word to replace it by."""
+    """The paths that may appear in text, each with a word that replaces it."""
     found = []
     for it in programs:
         found += [(str(it.outputs), "OUTPUTS"), (str(it.path), "densify"), (it.path.name, "densify"),
@@ -272,8 +272,8 @@ def is_text(content: bytes) -> bool:
 
 
 def corrupted(content: bytes):
-    """Yields changed copies. Of text, one digit is changed: from the middle on, until one is not in a line that varies;
-    of other data, one bit."""
+    """Yields changed copies. In text, one digit is changed; each copy changes another digit, from the middle outwards,
+    because a digit may be in a line that varies. In other data, one bit is changed."""
     middle = len(content) // 2
     digits = [place for place, byte in enumerate(content) if chr(byte).isdigit()] if is_text(content) else []
     for place in sorted(digits, key=lambda place: abs(place - middle))[:300]:

@@ -13,7 +13,7 @@ import pycolmap
 
 
 def colmap(root: Path) -> None:
-    """COLMAP reads the model without complaint, and computes the stored errors."""
+    """Checks that COLMAP reads the model without complaint and computes the stored errors."""
     model = pycolmap.Reconstruction(root / "sparse/0")
     print(model.summary())
     names = {image.name for image in model.images.values()}

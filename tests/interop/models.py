@@ -1,4 +1,4 @@
-"""Reads every format that densify writes with other programs, and their files with densify.
+"""Reads every format that densify writes with other programs, and reads their files with densify.
 
     python models.py DENSIFY NODE_MODULES MODEL.ply...
 
@@ -20,9 +20,9 @@ from PIL import Image, ImageChops, ImageStat
 
 SIZE = (320, 240)
 FOV = 50.0
-# Least PSNR [dB] of each export's picture to that of the PLY.
+# Lowest accepted PSNR [dB] between each export's picture and that of the PLY.
 EXPORTS = {"m.ply": 99, "m.compressed.ply": 45, "m.spz": 45, "m.v4.spz": 45, "m.sog": 42}
-# Least PSNR [dB] between the two rasterisers, which differ in tile sizes, thresholds, and rounding to bytes.
+# Lowest accepted PSNR [dB] between the two rasterisers, which differ in tile sizes, thresholds, and rounding to bytes.
 LEAST_BETWEEN_RASTERISERS = 38
 
 Row = dict[str, float]

@@ -21,7 +21,7 @@ const WORDS_FROM: [&str; 6] = [".rs", ".wgsl", ".py", ".sh", ".js", ".toml"];
 const THIS: &str = "tests/it/documents.rs";
 /// Parts that mark a name as a placeholder.
 const PLACEHOLDERS: [&str; 4] = ["NAME", "FORMAT", "*", "…"];
-/// Names that are allowed although no source file contains them.
+/// Names that are allowed even though no source file contains them.
 const EXEMPT: [&str; 7] = [
     // Notation for transforms.
     "a_from_b",

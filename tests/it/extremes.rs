@@ -8,7 +8,7 @@
 //! | extreme | tested in |
 //! |---|---|
 //! | 1 no row | selftest; `src/train/init/tests.rs: impossible_requests_are_errors`; `src/data/models/tests/round_trips.rs: formats_in_f32_keep_every_bit`; `policies/src/conformance/tests.rs: every_registered_policy_conforms` |
-//! | 2 one row | selftest; `src/train/init/tests.rs: few_points` |
+//! | 2 one row | selftest; `src/train/init/tests.rs: one_to_three_points_have_the_expected_scales` |
 //! | 3 duplicates | selftest; `src/train/init/tests.rs: duplicates_are_merged_and_counted_and_break_nothing` |
 //! | 4 a budget below the points | `src/train/init/tests.rs: the_budget_is_kept_by_a_seeded_subsample`; `tests/it/cli/training.rs: points_beyond_the_budget_are_subsampled_and_reported`; `tests/it/cli/training.rs: a_budget_of_one_row_trains`; `tests/it/cli/faults.rs: flags_out_of_range_are_refused` |
 //! | 5 log-scales | selftest; `src/data/models/ply/tests.rs: damaged_rows_are_dropped_up_to_one_percent` |

@@ -113,7 +113,8 @@ fn frozen_rows_never_change() {
     });
 }
 
-/// Other rows, their moments, ages, masks and signals change as if no row were frozen. Those of frozen rows stay 0.
+/// Other rows, their moments, ages, masks and signals change as if no row were frozen. The moments, ages, masks and
+/// signals of frozen rows stay 0.
 #[test]
 fn other_rows_train_as_usual() {
     // Loss terms are averaged over the rows that train.

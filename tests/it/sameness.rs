@@ -141,7 +141,7 @@ fn running_twice_changes_nothing() {
     }
 }
 
-/// With room for few records, those of removed rows must not be taken for those of remaining ones.
+/// With room for few records, the records of removed rows must not be mistaken for those of remaining rows.
 #[test]
 fn removed_rows_leave_no_records() {
     let camera = scenes::camera(64, 48, 11);

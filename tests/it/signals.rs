@@ -372,8 +372,8 @@ fn attribute_signals_equal_the_parameters() {
     }
 }
 
-/// Signals are returned in the buffer of gradient sums. Neither giving it back nor the number of columns may affect
-/// later steps or images.
+/// Signals are returned in the buffer of gradient sums. Neither the return of the buffer nor the number of columns may
+/// affect later steps or images.
 #[test]
 fn lending_buffers_for_signals_changes_nothing() {
     let views = views();

@@ -11,7 +11,7 @@
 //! **Growth** is that of `vanilla`, with its parameters: clones and splits by screen gradient, pruning by
 //! opacity and size, opacity resets, and a hard stop at the budget (or `governor`).
 //!
-//! **Mask.** Each Gaussian has a parameter m, initially `mask_start`. It is rendered with its opacity and
+//! **Mask.** Each Gaussian has a parameter m, initially `mask_start`. The Gaussian is rendered with opacity and
 //! scales multiplied by 1\[σ(m) > `min_mask`\], whose derivative is taken to be that of σ(m)
 //! (straight-through). `mask_weight` · mean σ(m) is added to the loss, so a mask falls unless the images
 //! need its Gaussian. m has the learning rate `mask_rate`. Clones and children of splits inherit the
@@ -27,7 +27,7 @@
 //!
 //! The budget bounds growth and is never exceeded. Until `grow_until`, new Gaussians take the place of those
 //! pruned by their masks. Nothing grows after that, so a run ends below the budget: at 96 to 100 % of a
-//! budget of 8,000 after 7,000 steps at half size (six scenes).
+//! budget of 8,000 after 7,000 steps on half-resolution images (six scenes).
 //!
 //! ## Differences from the published code
 //!

@@ -23,7 +23,7 @@ fn rows_whose_mask_has_fallen_are_pruned() {
         assert!(done.ops.cause.ends_with("prune"), "{}", done.ops.cause);
     }
     assert_eq!(run(&event(17_000, &masks), "min_mask = 0.4").pruned, [0, 1, 3]);
-    // The last row is kept, the one with the largest mask.
+    // One row is always kept: that with the largest mask.
     assert_eq!(run(&event(17_000, &[0.001, 0.003, 0.002]), "").pruned, [0, 2]);
 }
 
@@ -45,7 +45,7 @@ fn masks_prune_at_every_growth_and_every_thousand_steps_to_the_end() {
 }
 
 #[test]
-fn the_mask_is_declared_as_published_and_its_control_has_none() {
+fn the_mask_has_the_published_constants_and_the_control_has_no_mask() {
     let scene = Event::new(1, 1, 1).scene;
     let needs = build("compact-3dgs", "", &scene).needs(&scene);
     let mask = MaskTerm { start: 1.0, rate: 0.01, weight: 5e-4, threshold: 0.01 };

@@ -15,7 +15,7 @@
 //! views, are plausible, zero, all equal, negative, infinite, NaN or a mixture. [`Check`] lists the
 //! properties that are checked:
 //!
-//! - the budget holds, and one row is left;
+//! - the budget holds, and at least one row is left;
 //! - the policy edits at least one of the models (some have thousands of rows, so that a small fraction is
 //!   still several rows);
 //! - the same input gives the same plan, and a policy saved and restored in mid-run continues identically;

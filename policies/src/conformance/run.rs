@@ -42,7 +42,7 @@ pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Resu
     let due: Vec<u32> = (1..=scene.iterations).filter(|&step| policy.is_due(step)).collect();
     let mut model = Model { rows: scene.initial_rows, candidates: Vec::new() };
     let mut edits = false;
-    let events = due.len().min(scenario.most_events());
+    let events = due.len().min(scenario.max_events());
     for (event, &step) in due.iter().take(events).enumerate() {
         let rows = model.rows;
         let at = |(check, why): Failure| (check, format!("step {step}, {rows} rows: {why}"));

@@ -16,16 +16,16 @@ pub(super) struct Scenario {
 }
 
 /// Maximum number of events of a run, which bounds the time of policies that are due at every step.
-const MOST_EVENTS: usize = 400;
-/// Maximum number of events of a run with models of [`MANY`] rows.
-const MAX_EVENTS_OF_LARGE_MODEL: usize = 40;
-/// Rows of a large model, in which a small fraction is still several rows.
-const MANY: usize = 5_000;
+const MAX_EVENTS: usize = 400;
+/// Maximum number of events of a run with a large model.
+const MAX_EVENTS_IF_LARGE: usize = 40;
+/// Number of rows of a large model, in which a small fraction is still several rows.
+const LARGE_MODEL_ROWS: usize = 5_000;
 
 impl Scenario {
     /// Maximum number of events that are run.
-    pub(super) fn most_events(&self) -> usize {
-        if self.scene.initial_rows >= MANY { MAX_EVENTS_OF_LARGE_MODEL } else { MOST_EVENTS }
+    pub(super) fn max_events(&self) -> usize {
+        if self.scene.initial_rows >= LARGE_MODEL_ROWS { MAX_EVENTS_IF_LARGE } else { MAX_EVENTS }
     }
 
     /// The budget of the plan for a model of `rows` rows.
@@ -77,7 +77,7 @@ pub(super) fn scenarios() -> Vec<Scenario> {
     });
     let many = [Pattern::Plausible, Pattern::Mixture].map(|pattern| Scenario {
         name: "thousands of rows",
-        scene: scene(MANY, MANY + MANY / 2),
+        scene: scene(LARGE_MODEL_ROWS, LARGE_MODEL_ROWS + LARGE_MODEL_ROWS / 2),
         refuses_growth: false,
         pattern,
     });

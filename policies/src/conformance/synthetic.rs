@@ -1,4 +1,4 @@
-//! Synthetic statistics, plausible or broken, for a model of which only the number of rows is tracked.
+//! Synthetic statistics, plausible or broken. Of the model only the number of rows is tracked.
 
 use crate::plan::RowOps;
 use crate::policy::{
@@ -6,7 +6,7 @@ use crate::policy::{
 };
 use crate::rng::{PolicyRng, Purpose};
 
-/// The kind of values that the statistics of a run hold.
+/// The kind of values in the statistics of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Pattern {
     Plausible,

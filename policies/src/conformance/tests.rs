@@ -1,6 +1,6 @@
 //! Tests that the registered policies conform, and that a policy with any one fault is caught.
 //!
-//! One file, as one policy has all the faults.
+//! One file, because one policy can have each of the faults.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{SystemTime, UNIX_EPOCH};

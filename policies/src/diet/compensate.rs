@@ -14,7 +14,7 @@ impl Diet {
         if every == 0 || from >= until {
             return None;
         }
-        // The most that one interval can collect at the budget, but at most the budget.
+        // The number of pixels that one interval collects if the model is at the budget, but at most the budget.
         let steps = every.min(until - from) as usize;
         let per_step = (scene.budget / self.params.rows_per_candidate as usize).max(1);
         let capacity = steps.saturating_mul(per_step).min(scene.budget).max(1);

@@ -12,7 +12,7 @@
 //! **Growth**, every `grow_every` steps between `grow_from` and `grow_until`. Candidates are
 //! Gaussians with g >= `tau`, where g = g_p + `colour_weight` · g_c. g_p and g_c are the norms of the
 //! loss gradient with respect to the projected mean (NDC) and to the colour, averaged over the views
-//! that saw the Gaussian; views nearer than `full_depth` are weighted by the square of the ratio (as in
+//! that saw the Gaussian; a view at a depth below `full_depth` is weighted by (depth / `full_depth`)² (as in
 //! *Pixel-GS*, Zhang et al. 2024). Gaussians below `min_opacity` are pruned and are never candidates. If
 //! there are more candidates than room, the least important Gaussians are evicted: at most `rho` · budget
 //! over the whole run, an equal part at each growth step. Then the candidates with the largest g are
@@ -103,7 +103,7 @@
 //! | colour_weight | 30.0 | >= 0 | | weight of the colour gradient |
 //! | full_depth | 0.8 | >= 0 | scene extent | nearer views count less in g; 0: all count equally |
 //! | growth | "turnover" | turnover, all | | how many candidates grow |
-//! | rho | 0.25 | >= 0 | budget | most Gaussians that growth replaces in the whole run |
+//! | rho | 0.25 | >= 0 | budget | maximum number of Gaussians that growth replaces in the whole run |
 //! | small | 0.01 | >= 0 | scene extent | largest size that is cloned; larger ones are split |
 //! | split | "long-axis" | random, long-axis | | how a large Gaussian is split |
 //! | split_factor | 1.6 | 1 to 100 | | a `random` split divides the scales by this |
@@ -122,7 +122,7 @@
 //! | compensate_from | 10000 | >= 0 | step | start of compensation (exclusive) |
 //! | compensate_until | 15000 | >= 0 | step | end of compensation (exclusive) |
 //! | insert_every | 500 | >= 0 | steps | interval of insertions; 0: no compensation |
-//! | rho_c | 0.1 | >= 0 | budget | most Gaussians that insertions add in the whole run; 0: no compensation |
+//! | rho_c | 0.1 | >= 0 | budget | maximum number of Gaussians inserted in the whole run; 0: no compensation |
 //! | rows_per_candidate | 3000 | >= 1 | Gaussians | each step collects one pixel per this many |
 //! | error | "l1-dssim" | l1-dssim, l1, grad | | error that ranks pixels |
 //! | depth | "max-weight" | max-weight, median | | surface point on a pixel's ray |
@@ -132,7 +132,7 @@
 //! | size_pixels | 2.0 | > 0 | pixels | size of inserted Gaussians for `pixel` |
 //! | newborn_opacity | 0.1 | 0 to 1, both excluded | | opacity of inserted Gaussians |
 //! | reinit_at | 0 | >= 0 | step | step at which the whole model is replaced; 0: never |
-//! | reinit_share | 0.8 | 0 to 1, 0 excluded | budget | most Gaussians after the replacement |
+//! | reinit_share | 0.8 | 0 to 1, 0 excluded | budget | maximum number of Gaussians after the replacement |
 //!
 //! ## Ablations
 //!
@@ -145,7 +145,7 @@
 //! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
 //! (`…_every`) do not shrink below 100 steps. `protect` does not scale.
 
-// Over 400 lines, of which a third is the manual page; growth, compensation and pruning meet in `plan`.
+// Long, because more than a third is the manual page, and because growth, compensation and pruning meet in `plan`.
 
 use crate::adc::{
     GROWTH_SIGNALS, PruneLimits, Window, add_colour_gradient, mean_over_views, spare_one,

@@ -69,7 +69,7 @@ fn at_the_budget_the_least_important_are_replaced() {
 }
 
 #[test]
-fn all_events_together_replace_the_share() {
+fn event_quotas_add_up_to_the_share() {
     let window = Window { from: 500, until: 10_000, every: 100 };
     let parts = |share: f64, window: Window, budget: usize| -> Vec<usize> {
         let steps = (1..=30_000).filter(|&step| window.is_due(step));
@@ -88,7 +88,7 @@ fn all_events_together_replace_the_share() {
 }
 
 #[test]
-fn the_dead_and_the_room_come_first() {
+fn pruned_slots_and_room_are_used_before_rows_are_evicted() {
     // 19 rows, one dead, budget 20: room for 2, and 2 more by eviction.
     let mut opacity = [0.5; 19];
     opacity[7] = 0.0049;
@@ -113,7 +113,7 @@ fn huge_rows_are_kept_unless_a_size_limit_is_set() {
     let late = Event { step: 3100, ..event.clone() };
     let kept = run(&late, "");
     assert_eq!((kept.pruned, kept.split), (vec![], vec![2, 3]));
-    // With one they are pruned after step 3000, at growth only.
+    // With a limit they are pruned after step 3000, at growth steps only.
     let named = "max_scale = 0.1";
     let early = run(&event, named);
     assert_eq!((early.pruned, early.split), (vec![], vec![2, 3]));
@@ -124,7 +124,7 @@ fn huge_rows_are_kept_unless_a_size_limit_is_set() {
 
 #[test]
 fn importance_may_be_measured_in_fresh_views() {
-    // By epochs rows 0 and 1 are least important; in the fresh views row 4, a candidate, then 6 and 2.
+    // With `epochs`, rows 0 and 1 are least important; in the fresh views row 4, a candidate, then 6 and 2.
     let fresh = [0.3, 0.4, 0.02, 0.5, 0.0, 0.6, 0.01, 0.7];
     let mut event = event(600, 8, 8).with(Signal::ScreenGradient, &gradient_sums(8, &[4, 7]));
     // Each row is in one of two views.
@@ -249,7 +249,7 @@ fn a_conserving_clone_shares_its_opacity() {
     // o′ = 0.5, so 0.75 / (1 − 0.25/√2).
     let ScaleRule::Uniform(scale) = offspring.scale else { panic!("{offspring:?}") };
     assert!((scale - 0.911_053).abs() < 1e-5, "{scale}");
-    // The limits given by Kheradmand et al.: hardly smaller when faint, much when opaque.
+    // The extremes given by Kheradmand et al.: faint Gaussians hardly shrink, opaque ones do.
     assert!((conserving_scale(0.05) - 0.996).abs() < 1e-3);
     assert!((conserving_scale(0.99) - 0.81).abs() < 5e-3);
     assert!((conserving_scale(0.0) - 1.0).abs() < 1e-6);
@@ -266,7 +266,7 @@ fn at_the_budget_with_nothing_to_do_the_plan_is_empty() {
 }
 
 #[test]
-fn a_model_too_large_is_cut_to_the_budget() {
+fn a_model_above_the_budget_is_pruned_to_it() {
     let weights = [0.5, 0.1, 0.4, 0.2, 0.3, f32::NAN];
     let event = event(550, 6, 4).with(Signal::WeightMax, &weights);
     let done = run(&event, "");
@@ -314,7 +314,7 @@ fn no_row_is_evicted_for_a_pixel_without_a_point() {
 }
 
 #[test]
-fn the_size_of_the_code_is_the_squared_geometric_mean() {
+fn code_size_is_the_squared_geometric_mean() {
     let mut event = event(10_500, 3, 40).with(Signal::ScaleMax, &[0.1, 0.4, f32::NAN]);
     event.candidates = vec![candidate(0.1, 7.0)];
     let scale = |set| run(&event, &format!("rho_c = 1\n{set}")).ops.seeds[0].1.scales[0];
@@ -337,7 +337,7 @@ fn growth_pruning_and_insertion_can_fall_on_one_step() {
 }
 
 #[test]
-fn windows_are_those_of_the_paper() {
+fn schedules_match_the_paper() {
     let due = |set: &str, iterations: u32| {
         due_steps("diet", set, &SceneInfo { iterations, ..Event::new(1, 1, 1).scene })
     };

@@ -21,9 +21,9 @@
 //! `governor`).
 //!
 //! **Pruning.** A Gaussian's influence is the sum of its blend weights α·T over all pixels of the views
-//! trained on since the last prune, or since it was created. Every `prune_every` steps before `prune_until`, those
-//! Gaussians are pruned whose influence is at most the `prune_share` quantile, interpolated linearly as numpy
-//! and PyTorch do. Gaussians that grow in the same step are kept.
+//! trained on since the last prune, or since it was created. Every `prune_every` steps before `prune_until`,
+//! Gaussians whose influence is at most the `prune_share` quantile are pruned. (The quantile is interpolated
+//! linearly, as in numpy and PyTorch.) Gaussians that grow in the same step are kept.
 //!
 //! `victims = "random"` is a control that measures the effect of the criterion: it prunes the same number
 //! at random.

@@ -27,7 +27,7 @@ fn the_least_influential_are_pruned_and_sums_are_reset() {
     assert!(run(&event(5100, &influence), "prune_share = 0").pruned == [20]);
     // One row is left.
     assert_eq!(run(&event(5100, &influence), "prune_share = 1.0").pruned.len(), 20);
-    // Rows that no view has shown are equal and are pruned together.
+    // Rows that no view has shown have equal influence and are pruned together.
     let unseen = [0.0, 5.0, 0.0, f32::NAN, 0.0, 7.0, 8.0, 9.0];
     assert_eq!(run(&event(5100, &unseen), "").pruned, [0, 2, 3, 4]);
 }

@@ -24,9 +24,9 @@
 //! times, so that both ends stay in place. Their opacity is the parent's times `child_opacity`.
 //!
 //! **Pruning** follows the splits of the same step; the next growth step uses the room it makes, and
-//! Gaussians below the opacity limit may be drawn before they are pruned. Each growth step but the last
-//! prunes Gaussians below `min_opacity`; at the last nothing would take their place, so it prunes only with
-//! `prune_last`. `recover` steps after each of the first `recoveries` opacity resets, a recovery prune also
+//! Gaussians below the opacity limit may be drawn before they are pruned. Each growth step prunes Gaussians
+//! below `min_opacity`, but the last does so only with `prune_last`, because nothing would take their
+//! place. `recover` steps after each of the first `recoveries` opacity resets, a recovery prune also
 //! removes the share `recovery_share` of the remaining Gaussians, those with the lowest opacity: a Gaussian
 //! that has not recovered is not needed. Before growth starts, at step `first_prune_at`, Gaussians below
 //! `first_prune_opacity` are pruned.
@@ -50,8 +50,8 @@
 //!   the interval of resets, so that the prune comes before the next reset.
 //! - The published code averages gradients from step 500 on; here the first growth averages over all
 //!   steps before it.
-//! - The published code divides edge scores by their mean over all Gaussians; here the mean is over those
-//!   that the view shows.
+//! - The published code divides edge scores by their mean over all Gaussians; here the mean is over the
+//!   Gaussians with a positive score in the view.
 //! - The last Gaussian is never pruned.
 //!
 //! ## Parameters
@@ -78,10 +78,10 @@
 //! | recover | 300 | >= 1 | steps | steps from a reset to its recovery prune |
 //! | recoveries | 2 | >= 0 | | number of recovery prunes, after the first resets |
 //! | recovery_share | 0.2 | 0 to 1 | Gaussians | share that a recovery prune removes; 0: none |
-//! | sum_from | 15000 | >= 0 | step | start of summed gradients (exclusive) |
-//! | sum | 5 | 1 to 1000 | steps | iterations per optimiser step from then on |
-//! | sum_more_from | 22500 | >= 0 | step | start of longer sums (exclusive) |
-//! | sum_more | 20 | 1 to 1000 | steps | iterations per optimiser step from then on |
+//! | sum_from | 15000 | >= 0 | step | start of summing gradients over `sum` iterations (exclusive) |
+//! | sum | 5 | 1 to 1000 | steps | iterations per optimiser step after `sum_from` |
+//! | sum_more_from | 22500 | >= 0 | step | start of summing them over `sum_more` iterations (exclusive) |
+//! | sum_more | 20 | 1 to 1000 | steps | iterations per optimiser step after `sum_more_from` |
 //! | sums | "scaled" | scaled, fixed | | whether `sum` and `sum_more` scale with the run |
 //! | mean_start | 0.00004 | > 0 | extent / step | learning rate of the means at the start |
 //! | mean_end | 0.000002 | > 0 | extent / step | learning rate of the means at the end |
@@ -221,7 +221,7 @@ impl DensityPolicy for Igs {
         let IgsParams { split_share, child_opacity, .. } = self.params;
         let split = split_long_axis(split_share as f32, child_opacity as f32);
         for &row in &drawn {
-            // A row that is pruned because its children would be is not split.
+            // A row whose children would be pruned has been pruned itself and is not split.
             if plan.is_free(row) {
                 let _ = plan.grow(row, split);
             }

@@ -31,7 +31,8 @@ fn growth_follows_the_square_root() {
     assert_eq!(done.ops.cause, "grow");
     assert!(!done.ops.reset_signals.is_empty());
     let after = |step| run(&Event { step, ..event.clone() }, "").ops.rows_after;
-    // Never below the current number; at 14,500 the budget, and never beyond it. (Then each row has a child.)
+    // A curve below the current number prunes nothing. From 14,500 on it is at the budget of 140, but each of the 60
+    // rows is split only once.
     assert_eq!([after(600), after(2000), after(14_500), after(14_900)], [60, 60, 120, 120]);
     let low = Event { budget: 100, ..event.clone() };
     assert_eq!(run(&Event { step: 14_500, ..low }, "").ops.rows_after, 100);
@@ -45,7 +46,7 @@ fn only_candidates_with_edges_are_split() {
     let mut split = run(&event, "").split;
     split.sort_unstable();
     assert_eq!(split, [0, 2]);
-    // After 14,500 2e-4 is enough, and the gradient is the score.
+    // After step 14,500 a gradient of 2e-4 is enough, and the gradient is the score.
     let sorted = |step| {
         let mut split = run(&Event { step, ..event.clone() }, "").split;
         split.sort_unstable();
@@ -78,9 +79,10 @@ fn each_view_has_the_same_weight() {
 }
 
 #[test]
-fn draws_follow_the_edges() {
+fn candidates_are_drawn_in_proportion_to_edge_scores() {
     let edges: Vec<f32> = (0..4000).map(|row| if row % 2 == 0 { 1.0 } else { 9.0 }).collect();
-    // Room for 100 splits, 10 of them of rows with weak edges, within five standard deviations (3 each).
+    // Room for about 100 splits; 10 are expected of rows with weak edges, with a standard deviation of 3, five of which
+    // are allowed.
     let split = run(&event(14_400, &edges, 4114), "").split;
     let weak = split.iter().filter(|row| *row % 2 == 0).count();
     assert!((90..=110).contains(&split.len()) && weak <= 25, "{weak} of {}", split.len());
@@ -98,8 +100,8 @@ fn the_faint_are_pruned_at_each_growth_and_first_at_step_300() {
     assert_eq!((growing.split.len(), growing.ops.counts.denied), (2, 0));
     let all = event.clone().with(Signal::Opacity, &[0.001, 0.002, 0.001, 0.0]);
     assert_eq!(run(&all, "").pruned, [0, 2, 3]);
-    // If both fall on one step, the first prune comes before the draw. The curve allows two of 24 rows, and
-    // the one that is left is split, not those with edges.
+    // If both fall on one step, the first prune comes before the draw. The curve allows two rows at a budget of 24,
+    // and the one remaining row is split, not the pruned ones, which have stronger edges.
     let budget = 24;
     let edges = vec![view(&[1e9, 1.0, 1e9, 1e9])];
     let both = Event { step: 600, budget, views: edges, ..event };
@@ -172,7 +174,7 @@ fn a_fifth_is_pruned_after_each_of_two_resets() {
     assert_eq!(done.pruned, [1, 4]);
     assert_eq!(done.ops.cause, "recovery-prune+grow");
     assert!(!done.ops.reset_signals.is_empty());
-    // The dead go first; of nine, those below place 0.2 · 8 = 1.6: two more.
+    // Row 1 is below `min_opacity` and is not counted. Of the other nine, two are below place 0.2 · 8 = 1.6.
     let one_dead = opacity.map(|o| if o < 0.015 { 0.001 } else { o });
     let one_dead = event.clone().with(Signal::Opacity, &one_dead);
     assert_eq!(run(&one_dead, "").pruned, [1, 4, 7]);
@@ -188,7 +190,7 @@ fn a_fifth_is_pruned_after_each_of_two_resets() {
 }
 
 #[test]
-fn the_fifth_is_that_of_the_model_after_the_splits() {
+fn recovery_prunes_take_their_share_of_the_rows_after_the_splits() {
     // Step 3300: √(2800/14000) = 0.447; ⌊20 · 0.447⌋ = 8: the two of six rows with edges are drawn.
     let opacity = [0.9, 0.1, 0.05, 0.3, 0.4, 0.2];
     let event = event(3300, &[0.0, 1.0, 0.0, 0.0, 1.0, 0.0], 20).with(Signal::Opacity, &opacity);
@@ -204,7 +206,7 @@ fn the_fifth_is_that_of_the_model_after_the_splits() {
 }
 
 #[test]
-fn the_share_is_cut_at_the_quantile() {
+fn the_limit_is_the_first_value_at_or_above_the_quantile() {
     let eleven: Vec<f32> = (0..11_u8).map(f32::from).collect();
     // At place 2.5 the quantile is between 2 and 3, so the limit is 3.
     let limits: Vec<f32> =

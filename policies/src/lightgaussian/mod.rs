@@ -27,7 +27,7 @@
 //! - `hit` is the contribution of a pixel: `opacity`, the opacity o, as in the published code; or
 //!   `blend-weight`, the Gaussian's weight α·T there, so that a Gaussian hidden behind others counts less.
 //!   The paper uses the opacity times the transmittance T; the blend weight also falls off towards the
-//!   Gaussian's edge. The default is that of the published figures.
+//!   Gaussian's edge. The published figures are for `opacity`, the default.
 //! - `volume` is V: `plain`, as in the published code; or `clipped`, as in the paper, min(V / V90, 1),
 //!   where V90 is the 90th percentile.
 //! - `victims = "random"` is a control that measures the effect of the criterion: it prunes the same number
@@ -37,7 +37,7 @@
 //!
 //! The budget bounds growth and is never exceeded. Nothing grows after the prunes, so a run ends far below
 //! it: with the defaults at 0.5 · 0.6 = 30 % of the grown model, with `once` at 34 %. Other policies end
-//! with three times as many Gaussians at the same budget, so compare by final number, too.
+//! with three times as many Gaussians at the same budget, so also compare at equal final numbers.
 //!
 //! ## Differences from the published code
 //!
@@ -45,7 +45,7 @@
 //!   all Gaussians and does not change their order, so it is left out.
 //! - ⌊share · N⌋ of N Gaussians are pruned; the published code also prunes those of equal significance.
 //!   The last Gaussian is never pruned.
-//! - Training views that nearly repeat another are not rendered (`--full` renders all).
+//! - Training views that nearly duplicate another are not rendered (`--full` renders all).
 //! - The published pipeline continues with distilled spherical harmonics and quantised vectors. They reduce
 //!   the file size of a finished model and are not part of density control.
 //!

@@ -13,7 +13,7 @@ fn run(event: &Event, set: &str) -> Outcome {
     event.run("lightgaussian", set)
 }
 
-/// Rows of opacity 0.5 and volume 1 and no view; the growth rules neither densify nor prune them.
+/// Rows of opacity 0.5 and volume 1, and no auxiliary view; the growth rules neither densify nor prune them.
 fn event(step: u32, rows: usize) -> Event {
     Event::small_rows(step, rows, rows).with_all(Signal::ScaleProduct, 1.0)
 }
@@ -53,7 +53,7 @@ fn the_blend_weight_is_not_multiplied_by_the_opacity() {
 
 #[test]
 fn volume_counts_by_its_tenth_root() {
-    // Volumes 1 and 1024: factors 1 and 1024^0.1 = 2. Pixels · ½ · factor: 5, 4.5·2 = 9, 4, 2.5·2 = 5.
+    // Volumes 1 and 1024: factors 1 and 1024^0.1 = 2. Pixels · ½ · factor: 5, 4.5·2 = 9, 4, 2.45·2 = 4.9.
     let mut event = event(16_000, 4).with(Signal::ScaleProduct, &[1.0, 1024.0, 1.0, 1024.0]);
     event.views = vec![view(&[10.0, 9.0, 8.0, 4.9], &[0.0; 4])];
     // In ascending order: 4, 4.9, 5, 9.
@@ -105,7 +105,7 @@ fn nan_has_no_significance() {
 }
 
 #[test]
-fn the_published_shares_leave_three_tenths() {
+fn the_published_shares_leave_30_percent() {
     // 1,000 → 500 → 300, the second share being 0.5·0.8; once: 1,000 → 340.
     let at = |step, rows: usize, set: &str| {
         let mut event = event(step, rows);

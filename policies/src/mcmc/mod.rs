@@ -26,8 +26,8 @@
 //! `scale_term` · mean standard deviation, so that Gaussians which are not needed fade and shrink.
 //! After the optimiser step every mean moves by Σ·ξ · σ(−`noise_sharpness`·(o − `noise_opacity`)) ·
 //! `noise` · λ, with Σ the Gaussian's covariance, ξ ~ N(0, I) and λ the learning rate of the means at
-//! that step. In short runs the trainer increases learning rates; λ is the rate before this increase, which
-//! serves to follow gradients further and does not apply to noise.
+//! that step. In short runs the trainer increases learning rates so that parameters follow their gradients
+//! further per step. This does not apply to noise: λ is the rate before the increase.
 //!
 //! **Learning rates** are the published ones, independent of the trainer's: means 1.6e-4 falling to
 //! 1.6e-6, log-scales 5e-3, quaternions 1e-3, opacities 0.05, SH band 0 2.5e-3, and bands 1–3 a twentieth
@@ -47,8 +47,8 @@
 //!   radius (scene extent / 1.1), as in gsplat's normalised scenes.
 //! - The published code grows by 5 % every 100 steps: 244 events, ×150,000. A run of 2,000 has 16 events;
 //!   at 5 % each they would only double the model, whatever the budget. `growth` is therefore per 100 steps
-//!   of a run of 30,000, and an event stands for n = `grow_every` · 300 / iterations of them: 15 in a run of
-//!   2,000, where each event doubles the model.
+//!   of a run of 30,000, and each event applies it n = `grow_every` · 300 / iterations times: 15 times in a
+//!   run of 2,000, where each event doubles the model.
 //! - If no Gaussian is alive, nothing happens.
 //!
 //! ## Parameters
@@ -101,7 +101,7 @@ crate::register_policy!(
 /// Scene extent / camera radius.
 const EXTENT_MARGIN: f64 = 1.1;
 
-/// Steps from one published event to the next.
+/// Steps between two events of the published code.
 const PUBLISHED_INTERVAL: u32 = 100;
 
 /// The published learning rates.

@@ -39,11 +39,11 @@ fn shares_conserve_opacity() {
 }
 
 #[test]
-fn two_shares_by_hand() {
+fn two_shares_match_values_worked_out_by_hand() {
     // o = 0.75: o′ = 0.5, 0.75/(1 − 0.25/√2) = 0.911053.
     let (half, scale) = share(0.75, 2, 0.005);
     assert!((half - 0.5).abs() < 1e-12 && (scale - 0.911_053).abs() < 1e-6, "{half} {scale}");
-    // Values stated with the formula: 0.996 at 0.05, 0.81 at 0.99.
+    // Scale factors given beside the formula in the paper: 0.996 at opacity 0.05, 0.81 at 0.99.
     assert!((share(0.05, 2, 0.005).1 - 0.996).abs() < 1e-3);
     assert!((share(0.99, 2, 0.005).1 - 0.81).abs() < 5e-3);
     // Clamped from below: 1 − 0.994^½ = 0.003 becomes 0.005.
@@ -91,7 +91,7 @@ fn growth_is_five_percent_up_to_the_budget() {
 }
 
 #[test]
-fn an_event_of_a_short_run_stands_for_several_published_ones() {
+fn growth_per_event_compounds_in_short_runs() {
     let opacity = [0.5; 100];
     let after = |iterations: u32, set: &str| {
         let mut event = event(&opacity, 100_000);
@@ -101,8 +101,8 @@ fn an_event_of_a_short_run_stands_for_several_published_ones() {
             .ops
             .rows_after
     };
-    // An event stands for one published event in a run of 30,000, two (1.05² = 1.1025) in 15,000, and fifteen (1.05¹⁵ =
-    // 2.0789) in 2,000.
+    // An event grows the model by 5 % once in a run of 30,000 steps, twice in 15,000 (1.05² = 1.1025), and 15 times in
+    // 2,000 (1.05¹⁵ = 2.0789).
     assert_eq!([after(30_000, ""), after(15_000, ""), after(2000, "")], [105, 110, 207]);
     // In longer runs the interval increases (100 becomes 200), and the growth per event stays the same.
     assert_eq!(after(60_000, ""), 105);
@@ -171,7 +171,7 @@ fn opaque_rows_are_drawn_more_often() {
 }
 
 #[test]
-fn the_formulas_use_at_most_most_shares_copies() {
+fn opacity_and_scale_formulas_cap_the_number_of_copies() {
     let mut opacity = [0.001; 80];
     opacity[7] = 0.5;
     let family = run(&event(&opacity, 80), "").offspring()[0];

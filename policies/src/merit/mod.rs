@@ -27,11 +27,11 @@
 //! **Parents** are the Gaussians with the largest g = g_p + `colour_weight` · g_c. g_c is the norm of the loss
 //! gradient with respect to the colour, g_p that with respect to the projected mean (NDC), with absolute
 //! values summed over pixels if `gradient` is `abs`. Both are averaged over the views since the last event;
-//! views nearer than `full_depth` are weighted by the square of the ratio. Gaussians seen in fewer than
+//! a view at a depth below `full_depth` is weighted by (depth / `full_depth`)². Gaussians seen in fewer than
 //! `least_views` of these views get no children.
 //!
 //! **Pruning.** Gaussians below `min_opacity` are pruned. If there is no room for new Gaussians, the least
-//! important ones are pruned, but no parents. Newborns (younger than an epoch, at most `protect` steps)
+//! important ones that are not parents are pruned. Newborns (younger than an epoch, at most `protect` steps)
 //! are pruned only if there are no others, the oldest first.
 //!
 //! **Children.** A Gaussian larger than `small` is split along its longest axis: with d = `split_share`, two
@@ -49,13 +49,13 @@
 //! | grow_until | 15000 | >= 0 | step | end of events (exclusive) |
 //! | grow_every | 100 | >= 0 | steps | interval of events; 0: never |
 //! | curve_until | 30000 | >= 0 | step | step at which the curve reaches the budget |
-//! | rho | 0.25 | >= 0 | budget | fewest Gaussians replaced in the whole run |
+//! | rho | 0.25 | >= 0 | budget | minimum number of Gaussians replaced in the whole run |
 //! | replaceable | 0.15 | >= 0 | median importance | less important Gaussians are replaced; 0: only `rho` |
-//! | most_rho | 2.0 | >= 0 | budget | most Gaussians replaced in the whole run |
+//! | most_rho | 2.0 | >= 0 | budget | maximum number of Gaussians replaced in the whole run |
 //! | gradient | "abs" | abs, screen | | screen gradient, with absolute values or without |
 //! | colour_weight | 30.0 | >= 0 | | weight of the colour gradient; 0: none |
 //! | full_depth | 0.8 | >= 0 | scene extent | nearer views count less in g; 0: all count equally |
-//! | least_views | 3 | >= 0 | views | fewest views that a parent is seen in |
+//! | least_views | 3 | >= 0 | views | minimum number of views in which a parent is seen |
 //! | protect | 100 | 0 to 65535 | steps | longest protection of newborns; 0: none |
 //! | small | 0.01 | >= 0 | scene extent | largest size that is cloned; 0: all are split |
 //! | split_share | 0.45 | 0 to 1, both excluded | | d of the split |

@@ -30,7 +30,7 @@ fn the_curve_fills_the_budget_without_a_threshold() {
     assert_eq!((done.ops.rows_after, done.pruned.len()), (100, 0));
     assert_eq!(done.cloned[..3], [59, 58, 57]);
     assert_eq!((done.ops.cause.as_str(), done.ops.reset_signals.is_empty()), ("grow", false));
-    // Each row has at most one child in an event, and after the curve's end the budget is full.
+    // Each row has at most one child in an event, and after its end the curve allows the whole budget.
     let late = Event { step: 8600, ..event.clone() };
     assert_eq!(run(&late, "curve_until = 8500").ops.rows_after, 120);
     let low = Event { budget: 99, ..late };
@@ -67,7 +67,7 @@ fn all_unimportant_rows_are_replaced() {
     let done = run(&event, set);
     assert_eq!((done.pruned, done.cloned), (vec![0, 1, 2], vec![19, 18, 17]));
     assert_eq!((done.ops.rows_after, done.ops.counts.denied), (20, 0));
-    // Each of the 144 events (600 to 14,900) has at most 14.4 · 20 / 144 = 2.
+    // Each of the 144 events (600 to 14,900) replaces at most 14.4 · 20 / 144 = 2 rows.
     let most = run(&event, "replaceable = 0.3\nmost_rho = 14.4");
     assert_eq!(most.pruned, [0, 1]);
     // At least `rho`, even if fewer are below the limit: 36 · 20 / 144 = 5.
@@ -89,7 +89,7 @@ fn all_unimportant_rows_are_replaced() {
 }
 
 #[test]
-fn the_least_important_rows_are_pruned_but_no_parents() {
+fn the_least_important_rows_that_are_not_parents_are_pruned() {
     // The two with the largest gradients are the least important too.
     let mut gradient = vec![0.1; 6];
     gradient[..2].copy_from_slice(&[5.0, 6.0]);
@@ -106,7 +106,7 @@ fn the_least_important_rows_are_pruned_but_no_parents() {
 }
 
 #[test]
-fn the_gradient_is_a_mean_with_its_colour_over_enough_views() {
+fn parents_are_ranked_by_mean_screen_and_colour_gradients() {
     // g: 4/4 + 30·0; 1/2 + 30·0.04/2; 8/2; 0.
     let event = event(8600, 4, 5)
         .with(Signal::VisibleCount, &[4.0, 3.0, 2.0, 9.0])
@@ -125,8 +125,8 @@ fn the_gradient_is_a_mean_with_its_colour_over_enough_views() {
 }
 
 #[test]
-fn the_small_are_cloned_and_the_large_are_split() {
-    // 0.01 of an extent of 10.
+fn small_rows_are_cloned_and_large_ones_split() {
+    // The limit is 0.01 times the extent of 10.
     let event = event(8600, 2, 4).with(Signal::ScaleMax, &[0.1, 0.11]);
     let done = run(&event, "curve_until = 8500");
     assert_eq!((&done.cloned[..], &done.split[..]), (&[0][..], &[1][..]));

@@ -40,8 +40,8 @@
 //! The budget bounds growth and is never exceeded. The published code grows to several million Gaussians and
 //! then prunes; here the budget is the peak. Sampling keeps `sample_share` of the Gaussians that dominate a
 //! pixel (many dominate none), and the cut keeps `cut_mass` of the importance. With a budget of 8,000, runs of
-//! 7,000 steps at half size ended at 9 to 22 % of it, on average 15 % over six scenes. When comparing policies, also
-//! compare at equal final numbers of Gaussians.
+//! 7,000 steps on half-resolution images ended at 9 to 22 % of it, 15 % on average over six scenes. Compare policies
+//! at equal final numbers of Gaussians, too.
 //!
 //! ## Differences from the published code
 //!
@@ -49,7 +49,7 @@
 //!   view-dependent colour only after sampling. Here both follow the trainer's schedule.
 //! - A Gaussian has one edit per event: a cloned Gaussian is not split as well.
 //! - A restarted Gaussian keeps its orientation, which has no effect as it is round.
-//! - Training views that nearly repeat another are not rendered (`--full` renders all).
+//! - Training views that nearly duplicate another are not rendered (`--full` renders all).
 //! - The last Gaussian is never pruned.
 //!
 //! ## Parameters
@@ -74,7 +74,7 @@
 //! | dominant_share | 0.0002 | 0 to 1 | pixels of a view | Gaussians that dominate more than this are split |
 //! | first_reinit_at | 5000 | >= 0 | step | first re-initialisation; 0: none |
 //! | second_reinit_at | 10000 | >= 0 | step | second re-initialisation; 0: none |
-//! | reinit_share | 0.8 | 0 to 1, 0 excluded | budget | most Gaussians after a re-initialisation |
+//! | reinit_share | 0.8 | 0 to 1, 0 excluded | budget | maximum number of Gaussians after a re-initialisation |
 //! | sample_at | 15000 | >= 0 | step | sampling; 0: none |
 //! | sample_share | 0.5 | 0 to 1 | Gaussians | share of the Gaussians with an importance above 0 that is kept |
 //! | importance | "sum" | sum, density | | sum of blend weights, or the sum per pixel of each view |

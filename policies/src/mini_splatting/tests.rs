@@ -126,7 +126,7 @@ fn importance_may_be_counted_per_pixel() {
 
 #[test]
 fn the_cut_leaves_ninety_nine_percent_of_the_importance() {
-    // 0.4 + 0.5 + 0.2 = 1.1 is more than 1 of 100; 0.4 + 0.2 is not.
+    // The pruned rows may have 1 % of the importance, 1 of 100: 0.2 + 0.4 is less, 0.2 + 0.4 + 0.5 is more.
     let mut event = event(20_000, 5);
     event.views = vec![view(&[0.4, 90.0, 8.9, 0.5, 0.2], &[1.0; 5], &[1.0; 5])];
     let done = run(&event, "");

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use super::at_least;
 use crate::signals::AuxColumn;
 
-/// The sum of pixel errors that is [`Signal::ErrorScore`](crate::policy::Signal::ErrorScore). A view adds
+/// How pixel errors are summed into [`Signal::ErrorScore`](crate::policy::Signal::ErrorScore). A view adds
 ///
 /// (Σ w·M(p) / (Σ w)^`footprint`)^`view_power`, with M(p) = e(p)^`power` · (1 + `edge` · g(p) / ḡ),
 ///
@@ -60,7 +60,7 @@ impl Default for ErrorScore {
 }
 
 impl ErrorScore {
-    /// True if M is the error itself, apart from edges.
+    /// True if `power` is 1, so that M is the error itself apart from the factor for edges.
     pub fn is_plain_map(&self) -> bool {
         self.power.total_cmp(&1.0).is_eq()
     }
@@ -101,7 +101,7 @@ pub struct CandidateRequest {
     pub until: u32,
     /// Each step collects one candidate per this many rows, >= 1.
     pub rows_per_candidate: u32,
-    /// Maximum number of candidates held at a time; later ones are dropped.
+    /// Maximum number of candidates in the list; later ones are dropped.
     pub capacity: usize,
     /// The error that ranks pixels.
     pub error: ErrorMode,
@@ -113,7 +113,7 @@ pub struct CandidateRequest {
     pub spaced: bool,
 }
 
-/// The error of a pixel.
+/// The error that ranks pixels as [candidates](CandidateRequest). (Scores of rows use an [`ErrorMap`].)
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ErrorMode {

@@ -32,8 +32,8 @@ impl LossTerms {
 /// Noise on the means after each optimiser step (*3D Gaussian Splatting as Markov Chain Monte Carlo*,
 /// Kheradmand et al. 2024, section 3.2): Δμ = Σ·ξ · σ(−`sharpness`·(o − `opacity`)) · `strength` · λ,
 /// with Σ the row's covariance, ξ ~ N(0, I), o its opacity, σ the logistic function and λ the learning rate
-/// of the means at that step `[scene units]`, without the trainer's increase in short runs (that increase serves only
-/// to follow gradients further).
+/// of the means at that step `[scene units]`, without the trainer's increase in short runs (which serves only to move
+/// parameters further along their gradients).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct NoiseTerm {
     /// Strength of the noise `[1 / scene units²]`, >= 0.
@@ -62,7 +62,7 @@ impl NoiseTerm {
 }
 
 /// A learned mask per row (*Compact 3D Gaussian Representation*, Lee et al. 2024, section 3.1). A row is
-/// rendered with its opacity and scales multiplied by 1\[σ(m) > `threshold`\], whose derivative by m is taken
+/// rendered with its opacity and scales multiplied by 1\[σ(m) > `threshold`\], whose derivative in m is taken
 /// to be that of σ(m), and `weight` · mean σ(m) is added to the loss. A row whose mask falls to the threshold
 /// stays transparent, also in saved models, until the policy prunes it.
 ///
@@ -75,7 +75,7 @@ pub struct MaskTerm {
     pub rate: f32,
     /// Coefficient of the mean of σ(m) over rows, >= 0.
     pub weight: f32,
-    /// σ(m) up to which a row is transparent, in (0, 1).
+    /// Largest σ(m) at which a row is transparent, in (0, 1).
     pub threshold: f32,
 }
 

@@ -45,7 +45,7 @@ fn numbers_out_of_range_are_refused() {
 }
 
 #[test]
-fn a_view_scores_by_error_size_and_power() {
+fn the_score_of_a_view_depends_on_error_footprint_and_power() {
     let score = ErrorScore { footprint: 0.5, view_power: 0.5, ..ErrorScore::default() };
     // 8 / √4 = 4, whose root is 2.
     assert!((score.of_view(8.0, 4.0) - 2.0).abs() < 1e-6);
@@ -72,7 +72,7 @@ fn the_optimiser_steps_at_multiples_of_the_cadence() {
     assert_eq!(due(Cadence::default(), 0).len(), 12);
     let sh = Cadence { all: 1, sh_rest: 4 };
     assert_eq!((due(sh, 0).len(), due(sh, 1)), (12, vec![4, 8, 12]));
-    // Bands 1–3 are never ahead of the others.
+    // Bands 1–3 never step more often than the other parameters.
     let all = Cadence { all: 5, sh_rest: 1 };
     assert_eq!((due(all, 0), due(all, 1)), (vec![5, 10], vec![5, 10]));
     assert!(sh.is_within(sh) && !sh.is_within(Cadence::default()));

@@ -30,7 +30,7 @@ fn shrinking() -> RowOps {
 }
 
 #[test]
-fn a_plan_passes() {
+fn a_valid_plan_passes() {
     let ops = shrinking();
     assert_eq!(ops.rows_after, 7);
     assert_eq!(ops.child_slots, [1]);
@@ -151,7 +151,7 @@ fn a_broken_plan_stops_the_run() {
 }
 
 #[test]
-fn empty_means_nothing_to_do() {
+fn a_plan_is_empty_only_if_it_changes_nothing() {
     let empty = || EditPlan::new(3, 3);
     let mut refused = empty();
     refused.append(SEED).unwrap_err();

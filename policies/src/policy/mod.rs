@@ -105,8 +105,8 @@ pub type PolicyState = serde_json::Value;
 /// The scene and the run, as known before the first step.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SceneInfo {
-    /// Size of the scene `[scene units]`, > 0: 1.1 times the largest distance of a training camera from their
-    /// mean, or of its substitute described at [`Signal::Position`]. Size thresholds are fractions of it.
+    /// Size of the scene `[scene units]`, > 0: 1.1 times the largest distance of a training camera from the mean
+    /// of all, or the substitute described at [`Signal::Position`]. Size thresholds are fractions of it.
     pub extent: f32,
     /// Number of training views, >= 1; also the length of an epoch in steps.
     pub train_views: u32,

@@ -20,7 +20,7 @@ fn only_declared_signals_can_be_read() {
 }
 
 #[test]
-fn attributes_come_row_by_row() {
+fn attributes_are_read_per_row() {
     use Signal::{Colour, LogScale, Orientation, Position};
     let mut event = Event::new(1, 2, 2);
     for (signal, first) in [(Position, 0.0), (LogScale, 10.0), (Orientation, 20.0), (Colour, 30.0)]

@@ -27,15 +27,15 @@
 //!
 //! The budget bounds growth and is never exceeded. Nothing grows after the prunes, so a run ends below
 //! the budget, by an amount that depends on the scene; when comparing policies, also compare at equal final numbers.
-//! With a budget of 8,000 and 2,000 steps at half size, the defaults kept 97 % of the grown model on room256 and 87 % on
-//! cup, the light variant 34 % and 11 %.
+//! With a budget of 8,000 and 2,000 steps on half-resolution images, the defaults kept 97 % of the grown model on
+//! room256 and 87 % on cup; the light variant kept 34 % and 11 %.
 //!
 //! ## Differences from the paper
 //!
 //! - The paper starts from a radiance field and trains on its renderings. Here initial model and
 //!   photographs are the same as for every other policy.
 //! - The last Gaussian is never pruned.
-//! - Training views that nearly repeat another are not rendered (`--full` renders all).
+//! - Training views that nearly duplicate another are not rendered (`--full` renders all).
 //! - The paper then groups cameras and stores which Gaussians each group sees. That speeds up viewing and
 //!   is not part of density control.
 //!

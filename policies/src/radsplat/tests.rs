@@ -35,7 +35,7 @@ fn rows_below_the_weight_in_every_view_are_pruned() {
     // The light variant leaves row 2.
     assert_eq!(run(&event(16_000, &views), "min_weight = 0.25").pruned, [0, 1, 3, 4]);
     assert!(run(&event(16_000, &views), "min_weight = 0.0").pruned.is_empty());
-    // The last row is kept, the one with the largest weight.
+    // One row is always kept: that with the largest weight.
     assert_eq!(run(&event(16_000, &views), "min_weight = 1.0").pruned, [0, 1, 3, 4]);
 }
 
@@ -46,7 +46,7 @@ fn prunes_come_after_growth_and_scale_with_the_run() {
         due_steps("radsplat", &format!("grow_every = 0\nreset_every = 0\n{set}"), &scene)
     };
     assert_eq!(due("", 30_000), [16_000, 24_000]);
-    // 7,000/30,000 of them: 3733.3 and 5600.
+    // Steps scale by 7,000/30,000: to 3733.3 and 5600.
     assert_eq!(due("", 7000), [3733, 5600]);
     assert_eq!(due("first_at = 0", 30_000), [24_000]);
     assert_eq!(due("second_at = 0", 30_000), [16_000]);

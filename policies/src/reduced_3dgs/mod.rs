@@ -30,16 +30,16 @@
 //!
 //! `victims = "random"` is a control that measures the effect of the criterion: it prunes the same number at
 //! random. As it leaves redundant Gaussians, it then finds more to prune than the real run. To end at the same
-//! number, set `random_keep` to that of the real run: from `grow_until` on, each prune then removes the same
-//! share, and the last one ends at this number.
+//! number, set `random_keep` to the number of Gaussians at which the real run ended: from `grow_until` on, each
+//! prune then removes the same share, and the last one leaves this number.
 //!
 //! ## Under a budget
 //!
 //! The budget bounds growth and is never exceeded. Until `grow_until`, new Gaussians take the place of pruned
 //! ones. Nothing grows after that, so a run ends below the budget: with the defaults each prune removes at
 //! least the faintest 3 %, as long as these are below `faint_opacity`. With a budget of 8,000, runs of 7,000
-//! steps at half size ended at 24 to 34 % of it (six scenes). When comparing policies, also compare at equal final
-//! numbers.
+//! steps on half-resolution images ended at 24 to 34 % of the budget (six scenes). When comparing policies, also
+//! compare at equal final numbers.
 //!
 //! ## Differences from the published code
 //!
@@ -180,7 +180,7 @@ impl Reduced {
         let mut count = 0;
         for row in self.victims(now)? {
             if plan.is_free(row) && order[row as usize].is_infinite() {
-                // If all rows are to be pruned, the most opaque one is kept.
+                // The order of pruning: if all rows are victims, the most opaque one is kept.
                 order[row as usize] = opacity[row as usize];
                 count += 1;
             }
@@ -228,8 +228,8 @@ impl Reduced {
         rows
     }
 
-    /// Number of rows that the control prunes at `step` to end at `random_keep`: the same share at each prune
-    /// after growth. `None` during growth or without `random_keep`.
+    /// Number of rows that the random control prunes now so that it ends at `random_keep`: the same share at each
+    /// prune after growth. `None` during growth or without `random_keep`.
     fn random_count(&self, now: &Snapshot<'_>, plan: &EditPlan) -> Option<usize> {
         let ReducedParams { victims, random_keep, prune_until, prune_every, .. } = self.params;
         let (step, until) = (now.step, prune_until.min(now.scene.iterations));

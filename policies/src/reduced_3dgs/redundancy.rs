@@ -7,12 +7,12 @@ use crate::neighbours::Neighbours;
 const HALF_DIAGONAL: f64 = 0.866_025_403_784_438_6;
 /// Maximum number of steps of Newton's method. In a million random cases with axes that differ by up to 10¹²,
 /// none took more than 16.
-const MOST_STEPS: u32 = 50;
+const MAX_STEPS: u32 = 50;
 /// Relative change at which Newton's method stops: some multiples of the rounding error of an f64.
 const TOLERANCE: f64 = 1e-14;
 /// Shortest half-axis: its square is well within the range of f64, and no scene is so small.
 const SHORTEST: f64 = 1e-38;
-/// Longest half-axis and distance, likewise.
+/// Longest half-axis and largest distance, for the same reason.
 const LONGEST: f64 = 1e38;
 
 /// Ellipsoids and pixel sizes of all rows.
@@ -32,9 +32,9 @@ pub(super) struct Ellipsoids<'a> {
 
 impl Ellipsoids<'_> {
     /// The redundancy of each row: the smallest count of the spheres that it intersects, its own included. The
-    /// count of a row's sphere is 1 plus the number of its `most` nearest neighbours whose ellipsoids
-    /// intersect it. 1 for a row that intersects none or is not finite. Shape: `[rows]`.
-    pub(super) fn redundancy(&self, most: usize) -> Vec<f32> {
+    /// count of a row's sphere is 1 plus the number of those of the row's `neighbours` nearest neighbours whose
+    /// ellipsoids intersect the sphere. 1 for a row that intersects none or is not finite. Shape: `[rows]`.
+    pub(super) fn redundancy(&self, neighbours: usize) -> Vec<f32> {
         let half_axes: Vec<[f64; 3]> = self.log_scales.iter().map(|s| self.half_axes(*s)).collect();
         let is_valid = |&row: &u32| {
             let row = row as usize;
@@ -50,7 +50,7 @@ impl Ellipsoids<'_> {
         let tree = Neighbours::new(&points);
         let mut redundancy = vec![f32::INFINITY; self.means.len()];
         let mut met = Vec::new();
-        tree.for_each_nearest(most, |index, nearest| {
+        tree.for_each_nearest(neighbours, |index, nearest| {
             let (row, mean) = (rows[index], points[index]);
             let radius = HALF_DIAGONAL * f64::from(self.pixel_sizes[row as usize]);
             let has_sphere = radius > 0.0 && radius <= LONGEST;
@@ -129,11 +129,11 @@ fn sphere_meets(centre: [f64; 3], radius: f64, half_axes: [f64; 3]) -> bool {
     // shortest axis.
     let mut t = axes.iter().map(|(e, p)| e * (p - e)).fold(0.0, f64::max);
     let shortest = half_axes[0].min(half_axes[1]).min(half_axes[2]);
-    let most = axes.iter().map(|(e, p)| (e * p).powi(2)).sum::<f64>().sqrt() - shortest * shortest;
-    if is_within(most.max(t)) {
+    let upper = axes.iter().map(|(e, p)| (e * p).powi(2)).sum::<f64>().sqrt() - shortest * shortest;
+    if is_within(upper.max(t)) {
         return true;
     }
-    for _ in 0..MOST_STEPS {
+    for _ in 0..MAX_STEPS {
         if !is_within(t) {
             return false;
         }
@@ -167,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn distances_to_an_ellipsoid_by_hand() {
+    fn distances_to_an_ellipsoid_match_values_worked_out_by_hand() {
         // A ball; the end of each axis; inside.
         assert_distance([0.0, -2.0, 0.0], [1.0; 3], 1.0);
         assert_distance([2.0, 2.0, 1.0], [1.0; 3], 2.0);
@@ -215,7 +215,7 @@ mod tests {
         assert!(same.iter().zip(1..).all(|(x, k)| (x - f64::from(k)).abs() < 1e-12));
     }
 
-    fn redundancy(xs: &[f32], half_axes: &[[f32; 3]], pixels: &[f32], most: usize) -> Vec<f32> {
+    fn redundancy(xs: &[f32], half_axes: &[[f32; 3]], pixels: &[f32], count: usize) -> Vec<f32> {
         let means: Vec<_> = xs.iter().map(|&x| [x, 0.0, 0.0]).collect();
         let log_scales: Vec<_> =
             half_axes.iter().map(|axes| axes.map(|a| (a / 3.0).ln())).collect();
@@ -226,11 +226,11 @@ mod tests {
             pixel_sizes: pixels,
             sigmas: 3.0,
         };
-        ellipsoids.redundancy(most)
+        ellipsoids.redundancy(count)
     }
 
     #[test]
-    fn the_smallest_count_of_all_intersected_spheres() {
+    fn redundancy_is_the_smallest_count_of_the_intersected_spheres() {
         // Balls of radius 1 at 0, 2, 4 and 20, with spheres of radius 1.1: the surface of the next ball is 1 away
         // from each mean. Counts: 2, 3, 2, 1. The second row is in the sphere of the first.
         let pixel = 1.1 / 0.866_025_4;
@@ -249,7 +249,7 @@ mod tests {
     #[test]
     fn only_the_nearest_neighbours_are_tested() {
         // Five rows at one place: with two neighbours each sphere counts three, with thirty it counts five.
-        let at = |most| redundancy(&[1.0; 5], &[[1.0; 3]; 5], &[1.0; 5], most);
+        let at = |count| redundancy(&[1.0; 5], &[[1.0; 3]; 5], &[1.0; 5], count);
         assert_eq!((at(2), at(30)), (vec![3.0; 5], vec![5.0; 5]));
         assert!(redundancy(&[], &[], &[], 30).is_empty());
     }

@@ -51,7 +51,7 @@ fn the_fainter_half_of_the_redundant_is_pruned() {
     let done = run(&event, "");
     assert_eq!(done.ops.cause, "densify+prune");
     assert!(done.ops.reset_signals.contains(Signal::PixelSizeMin));
-    // By the default of `min_redundancy`, an R of 3 is not enough and 4 is.
+    // With the default `min_redundancy`, an R of 3 is not enough and 4 is.
     let at = |xs: &[f32]| {
         let fades: Vec<f32> = (0..xs.len()).map(|row| 0.1 + 0.1 * row as f32).collect();
         let event = self::event(1000, xs).with(Signal::Opacity, &fades);
@@ -202,7 +202,7 @@ fn the_control_may_end_at_a_given_number() {
 }
 
 #[test]
-fn deviations_by_hand() {
+fn mean_and_deviation_match_values_worked_out_by_hand() {
     assert_eq!(mean_and_deviation(&[1.0, 3.0, 5.0]), (3.0, 2.0));
     assert_eq!((mean_and_deviation(&[4.0]), mean_and_deviation(&[])), ((4.0, 0.0), (0.0, 0.0)));
 }

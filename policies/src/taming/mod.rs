@@ -34,8 +34,8 @@
 //!
 //! ## Differences from the published code
 //!
-//! - The published code draws from all Gaussians and prunes those drawn that are dead (too faint or too
-//!   large). It also uses scores from before splits removed parents, so that they belong to other Gaussians.
+//! - The published code draws from all Gaussians and prunes the dead ones (too faint or too large) among those
+//!   drawn. It also uses scores from before splits removed parents, so that they belong to other Gaussians.
 //!   `prune = "published"` does both; the default, `candidates`, draws from the dead by their own scores.
 //! - Dead Gaussians do not grow.
 //! - Colour, map and sums come from one render per view; the published code renders twice.

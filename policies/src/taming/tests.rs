@@ -45,7 +45,7 @@ fn score(event: &Event, set: &str) -> Vec<f32> {
 }
 
 #[test]
-fn the_score_by_hand() {
+fn the_score_is_the_weighted_sum_of_its_terms() {
     // All terms at their medians: 50·0.02·(25 + 100 + 5 + 10 + 25 + 50 + 10 + 0.1 + 50) = 275.1.
     let mut event = event(1000, 3, 9);
     for found in score(&event, "") {
@@ -127,7 +127,7 @@ fn small_and_large_rows_share_the_growth() {
 }
 
 #[test]
-fn draws_follow_the_score() {
+fn only_rows_with_a_score_are_drawn() {
     // Rows that no view shows have no score and are never drawn.
     let mut event = event(1000, 100, 942);
     let shown: Vec<f32> = (0..100).map(|row| if row % 2 == 0 { 2.0 } else { 0.0 }).collect();
@@ -175,7 +175,7 @@ fn the_dead_do_not_grow() {
 
 #[test]
 fn the_published_draw_prunes_fewer_and_other_rows() {
-    // 4 of 400 rows are dead: the ⌊4/2⌋ = 2 rows drawn among all are unlikely to be.
+    // 4 of 400 rows are dead: the ⌊4/2⌋ = 2 rows drawn from all rows are unlikely to be among them.
     let mut opacity = [0.5; 400];
     opacity[..4].fill(0.004);
     let mut event = event(1000, 400, 400).with(Signal::Opacity, &opacity);

@@ -89,7 +89,7 @@ fn the_largest_gradients_grow_first() {
 }
 
 #[test]
-fn the_schedule_is_that_of_the_original() {
+fn the_schedule_matches_the_original() {
     let due = |set: &str, white_background, iterations| {
         let scene = SceneInfo { white_background, iterations, ..Event::new(1, 1, 1).scene };
         due_steps("vanilla", set, &scene)

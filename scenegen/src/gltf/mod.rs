@@ -127,8 +127,8 @@ fn parse(path: &Path, text: &[u8]) -> Result<json::Root, Error> {
             scene.entry("nodes").or_insert_with(|| Value::Array(Vec::new()));
         }
     }
-    // The text again, as a second deserialiser of the whole format takes long to compile. The original error has the
-    // line and column.
+    // The value is written as text again, because a second deserialiser of the whole format would take long to compile.
+    // The original error has the line and column.
     let rewritten = serde_json::to_vec(&value).unwrap_or_default();
     json::deserialize::from_slice(&rewritten).map_err(|_| error)
 }

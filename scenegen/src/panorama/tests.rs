@@ -61,7 +61,7 @@ fn an_image_of_a_gradient_lights_like_the_gradient() {
 }
 
 #[test]
-fn a_bright_pixel_shines_from_where_it_is() {
+fn a_bright_pixel_shines_from_its_direction() {
     // (column, row) of 16 x 8 pixels, and the direction of the pixel's centre.
     let turned = |degrees: f32, height: f32| {
         let (sin, cos) = degrees.to_radians().sin_cos();

@@ -1,7 +1,7 @@
 //! Initial points like those of structure-from-motion, with errors of known size.
 //!
-//! Candidates are pixels of training views, drawn in proportion to the local gradient of luminance, as feature
-//! matching finds nothing in flat regions. A candidate is used if at least three training views see it.
+//! Candidates are pixels of training views, sampled in proportion to the local gradient of luminance, because
+//! feature matching finds nothing in flat regions. A candidate is used if at least three training views see it.
 
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
@@ -11,7 +11,7 @@ use crate::camera::Camera;
 use crate::random::Draws;
 use crate::trace::{Frame, Tracer};
 
-/// Views that must see a point.
+/// Smallest number of views that must see a point.
 const MIN_VIEWS: usize = 3;
 /// Candidates per requested point, as some are seen by fewer than three views.
 const CANDIDATES: f64 = 2.0;
@@ -27,7 +27,7 @@ const SAME_DEPTH: f64 = 1e-3;
 pub struct PointOptions {
     /// Number of points; fewer if the views do not see enough.
     pub count: usize,
-    /// Standard deviation of each coordinate, as a share of the diagonal.
+    /// Standard deviation of the noise on each coordinate, as a share of the diagonal.
     pub noise: f64,
     /// Share of points that are placed anywhere in the bounding box enlarged by a fifth.
     pub outliers: f64,
@@ -82,7 +82,7 @@ impl<'a> PointCollector<'a> {
         Self { tracer, cameras, options, bounds, candidates: Vec::new() }
     }
 
-    /// Draws candidates from training view `view`.
+    /// Samples candidates from training view `view`.
     pub fn observe(&mut self, view: usize, frame: &Frame) {
         if self.options.count == 0 {
             return;

@@ -127,7 +127,7 @@ fn units_are_uniform_and_streams_differ() {
 }
 
 #[test]
-fn strata_are_filled_evenly_and_jitter_within() {
+fn strata_are_filled_evenly_and_jitter_stays_within_them() {
     let mut draws = Draws::new(2, &[]);
     let mut counts = vec![0_u64; 64];
     for _ in 0..2000 {
@@ -143,7 +143,7 @@ fn strata_are_filled_evenly_and_jitter_within() {
 }
 
 #[test]
-fn normals_are_normal() {
+fn normal_draws_follow_the_normal_distribution() {
     let mut draws = Draws::new(9, &[]);
     let mut counts = vec![0_u64; 40];
     for _ in 0..DRAWS {
@@ -162,7 +162,7 @@ fn normals_are_normal() {
 }
 
 #[test]
-fn wrong_distributions_are_found() {
+fn wrong_distributions_are_rejected() {
     let uneven: Vec<u64> = (0..100).map(|i| 1000 + 5 * i).collect();
     assert!(check_distribution(&uneven, &[0.01; 100]).is_err());
     let even = vec![1000; 100];

@@ -228,7 +228,7 @@ impl Rig {
         let count = f64::from(if test { self.test } else { self.train });
         let (i, low, high) =
             (f64::from(number), self.elevation[0].to_radians(), self.elevation[1].to_radians());
-        // Test views are between training views in every coordinate.
+        // Test views lie between training views in every coordinate.
         let shift = if test { 0.5 } else { 0.0 };
         let along = |share: f64| self.arc.to_radians() * (share - 0.5);
         match self.kind {

@@ -20,7 +20,7 @@ const STREET: u32 = 3;
 const SHOWN: f64 = 0.65;
 /// Columns and rows of the rays that are tested for this.
 const RAYS: [u32; 2] = [12, 9];
-/// The golden ratio's fraction, whose multiples are spread evenly over `[0, 1)`.
+/// Fractional part of the golden ratio. The fractional parts of its multiples are spread evenly over `[0, 1)`.
 const SPREAD: f64 = 0.618_033_988_749_895;
 
 /// The area and streets that the cameras of a survey cover.
@@ -161,9 +161,9 @@ fn place_in_rows(i: u32, count: u32, sides: DVec2) -> (DVec2, DVec2) {
     let (i, count) = (u64::from(i), u64::from(count));
     let first = |row: u64| (count * row).div_ceil(rows);
     let row = i * rows / count.max(1);
-    let (number, of) = (i - first(row), first(row + 1) - first(row));
-    let number = if row % 2 == 0 { number } else { of - 1 - number };
-    let cell = sides / DVec2::new(of as f64, rows as f64);
+    let (number, row_length) = (i - first(row), first(row + 1) - first(row));
+    let number = if row % 2 == 0 { number } else { row_length - 1 - number };
+    let cell = sides / DVec2::new(row_length as f64, rows as f64);
     (cell * (DVec2::new(number as f64, row as f64) + 0.5), cell)
 }
 
@@ -220,7 +220,7 @@ mod tests {
             // There is nothing around the scene, so the share required after 40 attempts is used.
             assert!(shows_enough(&surface, camera, 40), "{camera:?}");
         }
-        // Every corner of the ground that is looked at is shown.
+        // The corners and the middle of the surveyed ground are visible.
         for (x, z) in [(-30.0, 24.0), (50.0, 24.0), (-30.0, -24.0), (50.0, -24.0), (10.0, 0.0)] {
             let sees = |camera: &&Camera| {
                 let (pixel, depth) = camera.project(DVec3::new(x, 2.0, z));

@@ -1,7 +1,7 @@
 //! Writes COLMAP's text model under `sparse/0`; image names are relative to `images`.
 //!
 //! Features are at the exact projections of true surface points, and only the points have noise. Reprojection
-//! errors are therefore those of the noise.
+//! errors therefore come from the noise alone.
 
 use std::fmt::Write as _;
 use std::path::Path;

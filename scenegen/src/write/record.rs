@@ -1,4 +1,4 @@
-//! Writes `scene.json`, which has everything needed to render the scene again.
+//! Writes `scene.json`, which contains everything needed to render the scene again.
 
 use std::path::Path;
 

@@ -26,8 +26,8 @@ const ALL: &str = "all";
 /// Writes a trained model in another format, or in all.
 ///
 /// The model keeps the coordinates of the dataset. A file appears only when it is complete. With
-/// --format all, or --scene, prints what each format takes; with --scene also how near the pictures of
-/// each, read back, are to those of the model itself, over the held-out views.
+/// --format all, or --scene, prints the size of each file; with --scene also how closely its renderings of
+/// the held-out views, after reading it back, match those of the original model.
 #[derive(Debug, Args)]
 #[command(after_help = after_help())]
 pub(super) struct ExportArgs {
@@ -148,7 +148,7 @@ fn output_files(args: &ExportArgs) -> Result<Vec<(&'static Format, PathBuf)>, Fa
             if args.output.exists() && !args.output.is_dir() {
                 let output = args.output.display();
                 return Err(Failure::input(format!(
-                    "-o: {output} is no folder; with --format {ALL} name a folder"
+                    "-o: {output} is not a folder; with --format {ALL} name a folder"
                 )));
             }
             let stem = output_stem(&args.model);

@@ -1,4 +1,4 @@
-//! Faults of the disk and the device: the tests of what `docs/errors.md` promises.
+//! Tests of what `docs/errors.md` promises for faults of the disk and the device.
 
 use std::io::ErrorKind;
 use std::path::PathBuf;
@@ -178,7 +178,7 @@ fn a_run_stopped_by_the_disk_can_be_resumed() {
             let context = format!("{operation:?} {file}: {message}");
             assert_eq!(code, OTHER, "{context}");
             let system = std::io::Error::from(kind).to_string();
-            for words in [file, "cannot write", &system, "was written until then is in"] {
+            for words in [file, "cannot write", &system, "files written so far are in"] {
                 assert!(message.contains(words), "{words:?} is not in: {context}");
             }
             assert_eq!(case.checkpoints(), left, "{context}");
@@ -238,7 +238,7 @@ fn a_run_stopped_by_a_lost_device_can_be_resumed() {
                 None => before += 1,
                 Some(step) => {
                     after += 1;
-                    let words = format!("iteration_{step}.safetensors; go on with: ");
+                    let words = format!("iteration_{step}.safetensors; continue with: ");
                     assert!(message.contains(&words), "{context}");
                     case.train("--resume").unwrap_or_else(|e| panic!("{context}: {e}"));
                     assert!(case.model() == expected, "{context}");

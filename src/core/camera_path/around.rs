@@ -7,14 +7,14 @@ use glam::{DMat3, DVec3};
 use super::{CameraPath, Keyframe};
 use crate::camera::Camera;
 
-/// Keyframes of a path.
+/// Number of keyframes of a path.
 const KEYFRAMES: u32 = 48;
-/// Turns of a spiral.
+/// Number of turns of a spiral.
 const TURNS: f64 = 2.0;
 /// Directions count as coplanar if at most this fraction of their squared length is normal to the plane: a mean
 /// roll of 13°.
 const MAX_NORMAL_FRACTION: f64 = 0.05;
-/// Coplanar directions count as collinear if their second axis has at most this fraction.
+/// Coplanar directions count as collinear if at most this fraction is along their second axis.
 const MAX_LINE_FRACTION: f64 = 0.1;
 /// The quantile of the cameras' offsets that a spiral reaches.
 const REACH_QUANTILE: f64 = 0.9;
@@ -33,7 +33,7 @@ struct Rig {
 }
 
 impl Rig {
-    /// Measures at least one camera.
+    /// Computes the properties of cameras, of which there must be at least one.
     fn new(cameras: &[Camera]) -> Self {
         let mean = |vector: &dyn Fn(&Camera) -> DVec3| {
             cameras.iter().map(vector).sum::<DVec3>() / cameras.len() as f64
@@ -139,8 +139,8 @@ pub fn orbit(cameras: &[Camera]) -> CameraPath {
     CameraPath { keyframes: (0..KEYFRAMES).map(keyframe).collect(), is_loop: true }
 }
 
-/// A spiral of two turns around the centre of the cameras that looks at their focus and reaches as far as nine
-/// tenths of them (*Local Light Field Fusion*, Mildenhall et al. 2019).
+/// A spiral of two turns around the centre of the cameras that looks at their focus and reaches the 90 %
+/// quantile of their offsets (*Local Light Field Fusion*, Mildenhall et al. 2019).
 ///
 /// # Panics
 /// Without cameras.
@@ -156,7 +156,7 @@ pub fn spiral(cameras: &[Camera]) -> CameraPath {
     };
     let reaches = [right, down, rig.forward].map(reach);
     let distance = (rig.focus - rig.centre).dot(rig.forward);
-    // Without a common point ahead, the path looks at one well beyond the cameras.
+    // If the focus is not ahead of the cameras, the path looks at a point well beyond them.
     let distance = if distance > reaches[2] {
         distance
     } else {

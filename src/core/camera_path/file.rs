@@ -8,11 +8,11 @@ use serde::Deserialize;
 use super::{CameraPath, Keyframe};
 use crate::files;
 
-/// The largest file `[bytes]`.
+/// Maximum size of a file `[bytes]`.
 const MAX_BYTES: u64 = 64 << 20;
-/// The most keyframes, and the most frames, of a path.
+/// Maximum number of keyframes, and of frames, of a path.
 const MAX_KEYFRAMES: usize = 100_000;
-/// The longest side of a frame `[px]`.
+/// Maximum width and height of a frame `[px]`.
 pub const MAX_SIDE: u32 = 16_384;
 
 /// Errors of reading a camera path.
@@ -51,7 +51,7 @@ pub struct SavedCameraPath {
 
 /// The fields of the file that are used.
 #[derive(Deserialize)]
-struct Saved {
+struct SavedFile {
     camera_path: Vec<SavedKeyframe>,
     camera_type: Option<String>,
     #[serde(default)]
@@ -82,7 +82,7 @@ pub fn read(path: &Path) -> Result<SavedCameraPath, CameraPathError> {
 }
 
 pub(super) fn parse(text: &str) -> Result<SavedCameraPath, String> {
-    let saved: Saved = serde_json::from_str(text)
+    let saved: SavedFile = serde_json::from_str(text)
         .map_err(|e| format!("it is no camera path of nerfstudio ({e}); save one in its viewer"))?;
     if let Some(kind) = saved.camera_type.filter(|kind| !kind.eq_ignore_ascii_case("perspective")) {
         return Err(format!("camera_type is {kind:?}; only perspective cameras can be rendered"));
@@ -99,7 +99,7 @@ pub(super) fn parse(text: &str) -> Result<SavedCameraPath, String> {
     let path = CameraPath { keyframes, is_loop: saved.is_cycle };
     let bounded = |name: &str, value: Option<f64>, most: f64| match value {
         Some(value) if !(value > 0.0 && value <= most) => {
-            Err(format!("{name} is {value}; it must be above 0, and {most} at most"))
+            Err(format!("{name} is {value}; it must be above 0 and at most {most}"))
         }
         value => Ok(value),
     };

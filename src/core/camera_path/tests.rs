@@ -26,7 +26,7 @@ fn a_keyframe_looks_at_its_target_with_the_world_upright() {
     let camera = key.camera((80, 60));
     let (pixel, depth) = camera.project(DVec3::new(1.0, 5.0, 3.0));
     assert!((depth - 3.0).abs() < 1e-12 && (pixel.x - 40.0).abs() < 1e-9, "{pixel} {depth}");
-    // Higher in the world is higher in the image, and at 45° its upper edge.
+    // A point 45° above the axis is at the image's upper edge.
     let (pixel, _) = camera.project(DVec3::new(1.0, 5.0, 6.0));
     assert!((pixel.y - 0.0).abs() < 1e-9 && (pixel.x - 40.0).abs() < 1e-9, "{pixel}");
     let (pixel, _) = camera.project(DVec3::new(2.0, 5.0, 3.0));
@@ -46,7 +46,7 @@ fn an_orbit_circles_the_focus_of_the_cameras() {
         let (pixel, depth) = key.camera((64, 48)).project(around);
         assert!(depth > 2.0 && pixel.distance(glam::DVec2::new(32.0, 24.0)) < 0.1, "{pixel}");
     }
-    // From inside a room one looks around.
+    // Around cameras that look outward, the path looks outward.
     let path = orbit(&circle(12, around, false));
     for frame in 0..30 {
         let key = path.frame(frame, 30);
@@ -56,7 +56,7 @@ fn an_orbit_circles_the_focus_of_the_cameras() {
 }
 
 #[test]
-fn cameras_in_a_circle_say_what_is_up_even_if_they_lie_on_their_side() {
+fn a_circle_of_cameras_on_their_side_still_gives_the_up_direction() {
     let around = DVec3::new(5.0, -3.0, 0.5);
     let mut cameras = circle(12, around, true);
     for camera in &mut cameras {
@@ -114,7 +114,7 @@ fn a_path_passes_its_keyframes_smoothly() {
         world_from_camera: DQuat::from_rotation_z(angle),
         fov_y: 1.0 + 0.1 * x,
     };
-    // The third turn is written as the other of its two quaternions.
+    // The third rotation is given by the other of its two quaternions, −q.
     let mut keys = vec![key(0.0, 0.0), key(1.0, 0.5), key(2.0, 1.5), key(3.0, 3.0)];
     keys[2].world_from_camera = -keys[2].world_from_camera;
     let path = CameraPath { keyframes: keys.clone(), is_loop: false };
@@ -127,7 +127,7 @@ fn a_path_passes_its_keyframes_smoothly() {
         );
         assert!((found.fov_y - key.fov_y).abs() < 1e-9, "{at}: {found:?}");
     }
-    // Steps between frames change little: no stop and no jump at a key.
+    // Consecutive steps between frames differ little: no stop and no jump at a keyframe.
     let frames: Vec<Keyframe> = (0..301).map(|frame| path.frame(frame, 301)).collect();
     let steps: Vec<DVec3> = frames.windows(2).map(|pair| pair[1].centre - pair[0].centre).collect();
     for pair in steps.windows(2) {

@@ -90,7 +90,7 @@ fn replace<E>(
 /// The depth of a run's folders: `point_cloud/iteration_N`.
 pub const RUN_FOLDER_DEPTH: u32 = 2;
 
-/// Removes temporary files, down to a depth of `deeper` folders.
+/// Removes temporary files from a folder and from its subfolders down to a depth of `deeper`.
 pub fn remove_incomplete(folder: &Path, deeper: u32) {
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
     for entry in entries {
@@ -132,7 +132,7 @@ mod tests {
 
     #[cfg(unix)]
     #[test]
-    fn others_may_read_as_with_any_new_file() {
+    fn files_have_the_permissions_of_any_new_file() {
         use std::os::unix::fs::PermissionsExt;
         let root = tempfile::tempdir().unwrap();
         let (ours, plain) = (root.path().join("ours"), root.path().join("plain"));

@@ -1,5 +1,5 @@
 //! Fault injection for tests: everything that a run writes passes through here and can be made to fail. Without a
-//! fault this costs one look at a thread-local variable.
+//! fault this costs one read of a thread-local variable.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -56,7 +56,7 @@ mod faults {
         pub operation: Operation,
         /// The end of the file's path.
         pub file: &'static str,
-        /// The number of times that the operation succeeds first.
+        /// The number of times that the operation succeeds before it fails.
         pub spared: u32,
         /// The error returned.
         pub kind: io::ErrorKind,
@@ -66,7 +66,7 @@ mod faults {
     struct Plan {
         fault: Option<Fault>,
         met: u32,
-        /// True if every write accepts one byte at most.
+        /// True if every write accepts at most one byte.
         short: bool,
     }
 

@@ -1,13 +1,13 @@
-//! Reading of untrusted files. Only regular files are read, up to a limit of size, and control characters are
+//! Reading of untrusted files. Only regular files are read, up to a maximum size, and control characters are
 //! escaped before their text is shown.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Read};
 use std::path::Path;
 
-/// The message about text in another encoding, often because of a name in it.
+/// The message about text in another encoding, often caused by a file name in it.
 pub(super) const NOT_UTF8: &str = "it is not text in UTF-8; save it as UTF-8, and rename files whose names are in another encoding";
-/// The largest size of a file of options `[bytes]`.
+/// The maximum size of a file of options `[bytes]`.
 pub const MAX_OPTIONS: u64 = 4 << 20;
 
 /// Opens a file for reading. Pipes, sockets and devices are refused without waiting for their data.
@@ -53,12 +53,12 @@ pub fn read_text(path: &Path, limit: u64) -> io::Result<String> {
     })
 }
 
-/// The most bytes that a compressed file of `packed` bytes may be unpacked to.
+/// The maximum unpacked size of a compressed file of `packed` bytes `[bytes]`.
 pub fn most_unpacked(packed: u64) -> u64 {
     /// The limit for small files.
     const LEAST: u64 = 64 << 20;
-    /// Limit per byte of a larger file. Models unpack to 2 to 5 times their size, those with little colour to up
-    /// to 20 times, tables of text to up to 10 times.
+    /// Limit per byte of a larger file. Models unpack to 2 to 5 times their size, or up to 20 times if
+    /// they have little colour; tables of text unpack to up to 10 times their size.
     const RATIO: u64 = 100;
     LEAST.max(packed.saturating_mul(RATIO))
 }
@@ -110,7 +110,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn text_is_read_within_its_limit_and_what_else_it_is_is_said() {
+    fn text_is_read_up_to_its_limit_and_other_contents_are_named() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("text");
         let read = |bytes: &[u8]| {
@@ -133,7 +133,7 @@ mod tests {
 
     #[cfg(unix)]
     #[test]
-    fn what_would_be_waited_for_is_refused_at_once() {
+    fn pipes_and_devices_are_refused_without_waiting() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("pipe");
         let made = std::process::Command::new("mkfifo").arg(&path).status().unwrap();

@@ -2,8 +2,8 @@
 
 use super::Image8;
 
-/// A weighted mean of pixels. Colours are also weighted by alpha, as the colour of a transparent
-/// pixel must not bleed into its neighbours.
+/// A weighted mean of pixels. Colours are also weighted by alpha, because the colour of a
+/// transparent pixel must not bleed into its neighbours.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct PixelMean {
     rgb: [f32; 3],

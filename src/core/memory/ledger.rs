@@ -51,11 +51,11 @@ pub enum Section {
     Policy,
     /// Decoded images.
     Images,
-    /// Held briefly during training, one at a time: evaluation, export.
+    /// Allocated briefly during training, one at a time: evaluation, export.
     Passing,
-    /// Held only while loading, and freed before training.
+    /// Allocated only while loading, and freed before training.
     Before,
-    /// Held only after training, when its buffers are freed.
+    /// Allocated only after training, when the buffers of training are freed.
     After,
     /// The program itself.
     Process,
@@ -111,7 +111,7 @@ impl Ledger {
         peak(&lines.collect::<Vec<_>>())
     }
 
-    /// The sum of all buffers in GPU memory, which are held throughout `[bytes]`.
+    /// The sum of all buffers in GPU memory, which stay allocated throughout `[bytes]`.
     pub fn on_device(&self) -> u64 {
         sum(self.lines.iter().filter(|line| line.on_device).map(|line| line.bytes))
     }
@@ -126,10 +126,10 @@ fn peak(lines: &[&LedgerLine]) -> u64 {
     sum(lines.iter().zip(held).filter(|(_, is_held)| *is_held).map(|(line, _)| line.bytes))
 }
 
-/// Finds the lines that are held at the peak: those of the process, and of the largest phase.
+/// Finds the lines whose buffers exist at the peak: those of the process, and of the largest phase.
 ///
 /// Only the largest line counts in each of [`Section::Passing`], [`Section::Before`] and [`Section::After`], as these
-/// are never held together. GPU memory is held together with [`Section::After`], not with [`Section::Before`].
+/// never exist at the same time. GPU memory exists at the same time as [`Section::After`], but not [`Section::Before`].
 fn held_at_peak(lines: &[&LedgerLine]) -> Vec<bool> {
     let largest = |section| {
         let indices = (0..lines.len()).filter(|&i| lines[i].section == section);
@@ -145,7 +145,7 @@ fn held_at_peak(lines: &[&LedgerLine]) -> Vec<bool> {
     let bytes = |is_held: &&dyn Fn(usize) -> bool| {
         sum((0..lines.len()).filter(|&i| is_held(i)).map(|i| lines[i].bytes))
     };
-    // Of equal phases the last one: training.
+    // If phases are equal, this is the last one: training.
     let largest = phases.iter().copied().max_by_key(bytes);
     let is_held = |i: usize| {
         lines[i].section == Section::Process || largest.is_some_and(|is_held| is_held(i))
@@ -153,8 +153,8 @@ fn held_at_peak(lines: &[&LedgerLine]) -> Vec<bool> {
     (0..lines.len()).map(is_held).collect()
 }
 
-/// A table of section, buffer and size, with the total below. Sizes not held at the peak are in parentheses;
-/// the others add up to the total, to the last digit.
+/// A table of section, buffer and size, with the total below. Sizes of buffers that do not exist at the peak are in
+/// parentheses; the others add up to the total, to the last digit.
 impl fmt::Display for Ledger {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut lines: Vec<_> = self.lines.iter().collect();
@@ -222,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn buffers_freed_before_training_count_only_if_they_are_the_most() {
+    fn buffers_freed_before_training_count_only_if_they_are_the_peak() {
         let mut ledger = sample();
         let total = ledger.total();
         ledger.add_to(Section::Before, "loading", 30 << 20);
@@ -230,7 +230,7 @@ mod tests {
         assert_eq!(ledger.total(), total);
         ledger.add_to(Section::Before, "measuring more", 38 << 20);
         assert_eq!(ledger.total(), 41 << 20);
-        // GPU memory is held together with the buffers after training.
+        // GPU memory exists at the same time as the buffers after training.
         ledger.add_to(Section::After, "measuring the model", 39 << 20);
         assert_eq!(ledger.total(), 42 << 20);
         ledger.add_on_device(Section::Renderer, "on the device", 2 << 20);

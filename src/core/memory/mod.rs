@@ -34,7 +34,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn bytes_read_well() {
+    fn bytes_are_shown_in_binary_units() {
         let shown = |n| Bytes(n).to_string();
         assert_eq!(
             [0, 1023, 1024, 1536, (1 << 20) - 1, 1 << 20, 1 << 30].map(shown),

@@ -27,7 +27,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn status_lines() {
+    fn status_lines_are_parsed() {
         let status = "Name:\tx\nVmHWM:\t   2048 kB\nVmRSS:\t     10 kB\n";
         assert_eq!(parse_status(status, "VmHWM:"), Some(2 << 20));
         assert_eq!(parse_status(status, "VmRSS:"), Some(10 << 10));

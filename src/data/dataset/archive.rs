@@ -20,7 +20,7 @@ use densify_core::memory::Bytes;
 
 /// Largest number of files in an archive.
 const MAX_FILES: usize = 4_000_000;
-/// Most nested folders that contain nothing but the next one, above the dataset's folder.
+/// Maximum number of nested folders above the dataset's folder that contain only the next one.
 const MAX_OUTER: usize = 8;
 /// Names of files and folders that operating systems add to archives.
 const SYSTEM_FILES: [&str; 4] = ["__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini"];
@@ -37,12 +37,12 @@ pub(super) struct Unpacked {
     bytes: u64,
 }
 
-/// Whether a file is a complete ZIP archive other than a SOG model, by its contents.
+/// Returns true if a file's contents are a complete ZIP archive other than a SOG model.
 pub fn is_archive(path: &Path) -> bool {
     is_zip(path) && open(path).is_ok_and(|archive| archive.index_for_name("meta.json").is_none())
 }
 
-/// Whether a file begins like a ZIP archive, which may be damaged.
+/// Returns true if a file begins like a ZIP archive; the archive may still be damaged.
 pub(super) fn is_zip(path: &Path) -> bool {
     let mut start = [0; 2];
     path.is_file()
@@ -82,7 +82,7 @@ pub(super) fn load(path: &Path, options: &LoadOptions) -> Result<Dataset, LoadEr
 impl Unpacked {
     fn new(path: &Path) -> Result<Self, LoadError> {
         let mut archive = open(path)?;
-        let most = most_bytes(path)?;
+        let most = max_unpacked_bytes(path)?;
         let bytes = check(path, &mut archive, most)?;
         let all = tempfile::Builder::new()
             .prefix("densify-zip-")
@@ -122,7 +122,7 @@ impl Unpacked {
         &self.folder
     }
 
-    /// Replaces the temporary folder by the archive's name in a message.
+    /// Replaces the temporary folder with the archive's name in a message.
     pub(super) fn named(&self, text: &str) -> String {
         let archive = self.archive.to_string_lossy();
         [&*self.folder, self.all.path()].iter().fold(text.to_owned(), |text, folder| {
@@ -130,7 +130,7 @@ impl Unpacked {
         })
     }
 
-    /// Replaces the temporary folder by the archive's name in an error.
+    /// Replaces the temporary folder with the archive's name in an error.
     fn named_error(&self, error: LoadError) -> LoadError {
         match error {
             LoadError::Data(problem) => LoadError::Data(self.named(&problem)),
@@ -145,7 +145,7 @@ impl Unpacked {
         }
     }
 
-    /// Replaces the temporary folder by the archive's name in a path.
+    /// Replaces the temporary folder with the archive's name in a path.
     pub(super) fn shown(&self, path: &Path) -> PathBuf {
         let rest = path.strip_prefix(&self.folder).or_else(|_| path.strip_prefix(self.all.path()));
         rest.map_or_else(|_| path.to_owned(), |rest| self.archive.join(rest))
@@ -158,7 +158,7 @@ fn open(path: &Path) -> Result<ZipArchive<BufReader<File>>, LoadError> {
 }
 
 /// Largest unpacked size that is accepted `[bytes]`.
-fn most_bytes(path: &Path) -> Result<u64, LoadError> {
+fn max_unpacked_bytes(path: &Path) -> Result<u64, LoadError> {
     let packed = fs::metadata(path).map_err(LoadError::io(path))?.len();
     Ok(files::most_unpacked(packed))
 }
@@ -230,7 +230,7 @@ enum Copying {
     Writing(io::Error),
 }
 
-/// Copies a file; the error tells a damaged archive from a full disk.
+/// Copies a file; the error distinguishes a damaged archive from a full disk.
 fn copy(input: &mut impl Read, output: &mut File) -> Result<u64, Copying> {
     let mut buffer = vec![0; 1 << 16];
     let mut copied = 0;

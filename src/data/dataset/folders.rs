@@ -19,7 +19,7 @@ pub(super) struct Folders {
     pub(super) chosen: Option<Root>,
     /// The folder `images_K` and K, if requested by `-r K` and present.
     reduced: Option<(Root, u32)>,
-    /// Whether names are relative to `images/`, as in COLMAP models, rather than to the dataset's folder.
+    /// True if names are relative to `images/`, as in COLMAP models, rather than to the dataset's folder.
     within_images: bool,
 }
 
@@ -31,7 +31,7 @@ pub(super) struct ImageFile {
     pub(super) path: PathBuf,
     /// K, if the file is in the folder `images_K`.
     pub(super) reduced: Option<u32>,
-    /// Whether the file is missing in `images_K`, so that the full-size image is shrunk instead.
+    /// True if the file is missing in `images_K`, so that the full-size image is shrunk instead.
     pub(super) fell_back: bool,
 }
 
@@ -72,7 +72,7 @@ impl Folders {
         }
     }
 
-    /// The folder given by `--images`, if this is an absolute path, which is mostly that of another machine.
+    /// The folder given by `--images`, if `value` is an absolute path, which mostly comes from another machine.
     pub(super) fn folder_for_absolute(&self, value: &str) -> Option<&Root> {
         self.chosen.as_ref().filter(|_| is_absolute(value))
     }
@@ -125,7 +125,7 @@ impl Folders {
         Ok(None)
     }
 
-    /// Extensions to try; COLMAP files always name them.
+    /// Extensions to try; names in COLMAP models always have one.
     fn endings(&self) -> &'static [&'static str] {
         if self.within_images { &ENDINGS[..1] } else { &ENDINGS }
     }

@@ -1,9 +1,9 @@
 //! A cache of decoded images with a size limit, filled ahead of use by background threads.
 //!
-//! Training visits every view once per epoch, in a new order each time. The next use of a view just
-//! seen is therefore the furthest away on average, so that the most recently used image is evicted
-//! first, but never one that was announced. (Least-recently-used eviction would always miss as soon
-//! as the images do not all fit.)
+//! Training visits every view once per epoch, in a new order each time. The next use of the view used
+//! last is therefore the furthest away on average, so the most recently used image that is not
+//! announced is evicted first. (Least-recently-used eviction would almost always miss once the images
+//! do not all fit.)
 
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -25,7 +25,7 @@ struct Shared {
     sources: Vec<ImageSource>,
     capacity: u64,
     state: Mutex<State>,
-    /// Signalled when an image was queued, memory became available, or the threads shall end.
+    /// Signalled when an image was queued, memory became available, or the threads are to end.
     work: Condvar,
     /// Signalled when an image was loaded.
     loaded: Condvar,
@@ -45,7 +45,7 @@ struct State {
 #[derive(Debug, Default)]
 struct Slot {
     content: Content,
-    /// Whether the image was announced and not fetched since.
+    /// True if the image was announced and not fetched since.
     is_announced: bool,
     /// Value of the clock at the last use.
     used: u64,
@@ -312,7 +312,7 @@ mod tests {
     }
 
     #[test]
-    fn cyclic_access_keeps_hitting_when_not_all_fits() {
+    fn cyclic_access_hits_the_cache_even_if_not_all_images_fit() {
         let folder = tempfile::tempdir().unwrap();
         let cache = ImageCache::new(sources(folder.path(), 6), 4 * 768, 0);
         let mut hits = 0;
@@ -328,7 +328,7 @@ mod tests {
     }
 
     #[test]
-    fn announced_images_are_decoded_ahead_and_stay() {
+    fn announced_images_are_decoded_ahead_and_stay_cached() {
         let folder = tempfile::tempdir().unwrap();
         let cache = ImageCache::new(sources(folder.path(), 6), 3 * 768, 2);
         cache.prefetch(&[4, 2, 5, 1]);
@@ -340,7 +340,7 @@ mod tests {
         }
         drop(state);
         assert_eq!(held(&cache), [2, 4, 5]);
-        // No room beside announced images: handed out, not held.
+        // There is no room beside the announced images: the image is returned but not cached.
         assert_eq!(cache.get(0).unwrap().rgb[0], 0);
         assert_eq!(held(&cache), [2, 4, 5]);
         assert_eq!(cache.get(4).unwrap().rgb[0], 4);
@@ -362,7 +362,7 @@ mod tests {
         }
         assert_eq!(cache.get(0).unwrap().rgb[0], 0);
         let state = cache.shared.lock();
-        assert_eq!(state.bytes, 2 * 768, "the failed image's room is free again");
+        assert_eq!(state.bytes, 2 * 768, "the failed image's memory is free again");
     }
 
     #[test]
@@ -376,12 +376,12 @@ mod tests {
     }
 
     #[test]
-    fn the_accounting_covers_what_is_held() {
+    fn the_demand_covers_cached_images_and_one_in_use() {
         let folder = tempfile::tempdir().unwrap();
         let demand = |count| ImageDemand::total(sources(folder.path(), count).iter());
         assert_eq!(demand(4).held(1 << 30), 4 * 768, "all images, not the cache's size");
         assert_eq!(demand(9).held(3 * 768), 4 * 768);
-        assert_eq!(demand(9).held(0), 3 * 768, "two, and one handed out");
+        assert_eq!(demand(9).held(0), 3 * 768, "two in the cache, one in use");
         assert!(demand(9).decoding(1) >= 2 * 768);
         assert_eq!(demand(0), ImageDemand { all: 0, largest: 0, working: 0 });
     }

@@ -26,11 +26,11 @@ pub use densify_core::image::{Image8, SharedImage};
 
 /// Longest side accepted `[px]`.
 const MAX_SIDE: u32 = 16_384;
-/// Most pixels accepted.
+/// Largest number of pixels accepted.
 const MAX_PIXELS: u64 = 1 << 28;
-/// Most bytes of one decoded image.
+/// Largest size of one decoded image `[bytes]`.
 const MAX_DECODED_BYTES: u64 = 1 << 30;
-/// Most bytes read from an image file: no JPEG of [`MAX_PIXELS`] is larger.
+/// Largest image file that is read `[bytes]`: no JPEG of [`MAX_PIXELS`] is larger.
 const MAX_FILE_BYTES: u64 = MAX_DECODED_BYTES;
 /// Supported formats.
 const FORMATS: [ImageFormat; 3] = [ImageFormat::Jpeg, ImageFormat::Png, ImageFormat::WebP];
@@ -65,9 +65,9 @@ pub struct ImageHeader {
     pub width: u32,
     /// Height `[px]`.
     pub height: u32,
-    /// Whether there is an alpha channel.
+    /// True if there is an alpha channel.
     pub has_alpha: bool,
-    /// Rotation applied before anything else; width and height are those after it.
+    /// Rotation applied before anything else; `width` and `height` are those of the rotated image.
     pub turn: Option<Orientation>,
     /// Size after decoding `[bytes]`.
     pub decoded_bytes: u64,
@@ -136,7 +136,7 @@ impl ImageSource {
             || self.undistortion.as_ref().is_some_and(|undistortion| undistortion.masked)
     }
 
-    /// Whether the mask becomes transparency.
+    /// Returns true if the mask becomes transparency.
     fn is_carved(&self) -> bool {
         self.mask.as_ref().is_some_and(|mask| mask.mode == MaskMode::Background)
     }

@@ -36,8 +36,8 @@ pub(super) fn decode(bytes: &[u8]) -> Result<DynamicImage, String> {
     image.ok_or_else(|| "the decoder returned another number of pixels".to_owned())
 }
 
-/// Whether an end marker follows the first scan. Earlier segments are skipped by their lengths, since an embedded preview
-/// has an end marker of its own. Compressed pixels cannot contain the marker.
+/// Returns true if an end marker follows the first scan. Earlier segments are skipped by their lengths, since an
+/// embedded preview has an end marker of its own. Compressed pixels cannot contain the marker.
 fn has_end(bytes: &[u8]) -> bool {
     const SCAN: u8 = 0xda;
     const END: [u8; 2] = [0xff, 0xd9];
@@ -68,7 +68,7 @@ mod tests {
     }
 
     #[test]
-    fn whole_files_decode_as_the_crate_image_does_it() {
+    fn whole_files_decode_like_in_the_crate_image() {
         let bytes = sample();
         let expected = image::load_from_memory(&bytes).unwrap();
         assert_eq!(decode(&bytes).unwrap(), expected);

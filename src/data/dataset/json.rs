@@ -26,7 +26,7 @@ pub(super) fn read(path: &Path) -> Result<Value, LoadError> {
     })
 }
 
-/// Whether parsing failed at NaN or Infinity.
+/// Returns true if parsing failed at NaN or Infinity.
 fn is_at_nonfinite_number(text: &str, error: &serde_json::Error) -> bool {
     let line = text.lines().nth(error.line().saturating_sub(1)).unwrap_or_default();
     // The reported column may be off by one.

@@ -108,7 +108,7 @@ mod tests {
     use crate::dataset::images::ImageSource;
 
     #[test]
-    fn a_mask_of_another_size_is_fitted_and_shrunk_along() {
+    fn a_mask_of_another_size_is_scaled_to_its_photograph_and_shrunk_with_it() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.png");
         RgbImage::from_pixel(4, 4, [10, 20, 30].into()).save(&path).unwrap();

@@ -22,7 +22,7 @@ const FOLDERS: [&str; 4] = ["masks", "mask", "segmentation", "dynamic_masks"];
 #[derive(Debug, Clone)]
 pub(super) struct MaskFile {
     pub(super) path: PathBuf,
-    /// Whether all values but 0 hide a pixel; otherwise 0 hides it, and other values in part.
+    /// True if all values but 0 hide a pixel; otherwise 0 hides it, and other values in part.
     pub(super) hides_all_but_black: bool,
 }
 
@@ -33,7 +33,7 @@ impl MaskFile {
     }
 }
 
-/// Whether a file beside photographs is a mask of one.
+/// Returns true if a file beside photographs is a mask of one.
 pub(super) fn is_mask(name: &OsStr) -> bool {
     name.to_str().is_some_and(|name| name.ends_with(LAYER) || name.starts_with(DYNAMIC))
 }

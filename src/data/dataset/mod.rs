@@ -1,6 +1,6 @@
 //! Loads datasets: photographs with known cameras, in any of the supported formats.
 //!
-//! `FORMATS` lists the formats; the first that recognises its files in a folder reads it. A ZIP archive is read as the
+//! `formats` lists the formats; the first that recognises its files in a folder reads it. A ZIP archive is read as the
 //! folder inside it. All files are untrusted: see [`LoadError`].
 
 mod archive;
@@ -87,7 +87,8 @@ pub struct Dataset {
     pub notes: Vec<Note>,
 }
 
-/// A note for the user about a dataset. Options are data, so that whoever shows the note spells them.
+/// A note for the user about a dataset. Options are given by variants, since their names depend on the interface that
+/// shows the note.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Note {
     /// A note that names no option.
@@ -96,7 +97,7 @@ pub enum Note {
     FarCamerasLeftOut {
         /// Number of cameras.
         count: usize,
-        /// The first of their views.
+        /// Names of the first of their views.
         names: String,
     },
     /// Undistortion crops photographs, unless the [field of view is kept](LoadOptions::keep_fov).
@@ -125,13 +126,13 @@ struct Scene {
     /// The file that lists the frames.
     listing: PathBuf,
     frames: Vec<Frame>,
-    /// The first place where a missing image was looked for.
+    /// The first path at which the first missing image was looked for.
     first_missing: Option<PathBuf>,
     points: PointCloud,
     points_file: Option<PathBuf>,
     /// Tracks, which name photographs by [`Frame::id`].
     tracks: Tracks,
-    /// Whether the dataset defines its own test split.
+    /// True if the dataset defines its own test split.
     own_split: bool,
     /// As [`Dataset::surface_bytes`], if the reader knows it.
     surface_bytes: Option<u64>,
@@ -176,8 +177,8 @@ impl Dataset {
         }
         if path.is_file() {
             return Err(LoadError::Data(format!(
-                "{}: this file is no dataset and no ZIP archive; name the dataset's folder, or a complete ZIP \
-                 archive of it (a damaged or incompletely downloaded archive is not recognised)",
+                "{}: this file is neither a dataset nor a ZIP archive; name the dataset's folder, or a \
+                 complete ZIP archive of it (a damaged or incompletely downloaded archive is not recognised)",
                 path.display()
             )));
         }

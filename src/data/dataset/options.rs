@@ -20,16 +20,16 @@ pub struct LoadOptions {
     pub views: Option<PathBuf>,
     /// Treatment of views whose camera is far from all others.
     pub far_cameras: FarCameras,
-    /// Whether undistorted images show the whole field of view of the lens, with the rest masked, instead of the
+    /// True if undistorted images show the whole field of view of the lens, with the rest masked, instead of the
     /// largest rectangle inside it.
     pub keep_fov: bool,
-    /// Whether white pixels of masks hide those of the photographs, instead of black ones.
+    /// True if white pixels of masks hide those of the photographs, instead of black ones.
     pub invert_masks: bool,
     /// Meaning of masked pixels.
     pub mask_mode: MaskMode,
     /// Cache folder of rendered built-in scenes; `None`: they are rendered each time.
     pub cache: Option<PathBuf>,
-    /// Whether to read the [`Tracks`](super::Tracks) of the reconstruction's points.
+    /// True to read the [`Tracks`](super::Tracks) of the reconstruction's points.
     pub tracks: bool,
 }
 

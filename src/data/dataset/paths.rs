@@ -111,7 +111,7 @@ impl Root {
 fn names(folder: &Path) -> Names {
     let mut entries: Vec<PathBuf> =
         fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path()).collect();
-    // Of several spellings of one name the last in sorted order counts, whatever order the system lists them in.
+    // Of several spellings of one name, the last in sorted order counts, whatever order the system lists them in.
     entries.sort();
     let name = |path: PathBuf| {
         let name = path.file_name()?.to_str().filter(|name| !name.is_ascii())?;
@@ -145,7 +145,7 @@ pub(super) fn relative(value: &str) -> String {
     value.split('/').filter(|part| !part.is_empty() && *part != ".").collect::<Vec<_>>().join("/")
 }
 
-/// Whether a path of any system begins with a root, a drive or a scheme.
+/// Returns true if a path of any system begins with a root, a drive or a scheme.
 pub(super) fn is_absolute(value: &str) -> bool {
     value.starts_with(['/', '\\'])
         || value.as_bytes().get(1) == Some(&b':')
@@ -224,7 +224,7 @@ mod tests {
 
     #[cfg(unix)]
     #[test]
-    fn no_spelling_leads_out() {
+    fn no_spelling_leads_out_of_the_folder() {
         let (folder, outside) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
         fs::write(outside.path().join("e\u{301}.png"), "secret").unwrap();
         std::os::unix::fs::symlink(outside.path(), folder.path().join("out")).unwrap();

@@ -24,9 +24,9 @@ const SILENTLY_CROPPED: f64 = 0.005;
 pub(super) struct Photograph {
     /// One view, or several if the field of view of the lens is too wide for one pinhole camera.
     pub(super) views: Vec<View>,
-    /// Whether the mask hides all of each view; empty without a mask. Shape: `[views]`.
+    /// True for views that the mask hides completely; empty without a mask. Shape: `[views]`.
     pub(super) hidden: Vec<bool>,
-    /// Whether the dataset holds the photograph out.
+    /// True if the dataset's own split holds the photograph out.
     pub(super) held_out: bool,
     /// Id of the photograph in tracks.
     pub(super) id: Option<u32>,
@@ -92,7 +92,7 @@ struct Checked {
     lens: Lens,
     /// EXIF fields, if they were needed.
     exif: Option<Exif>,
-    /// Whether EXIF asks for a quarter turn, and the pose file does not say whether its poses include it.
+    /// True if EXIF asks for a quarter turn, and the pose file does not say whether its poses include it.
     is_turn_ambiguous: bool,
 }
 
@@ -175,7 +175,7 @@ fn lens_error(frame: &Frame, lens: &Lens, error: PinholeError) -> LoadError {
     LoadError::malformed(image, origin, problem, remedy)
 }
 
-/// Notes about split and cropped photographs, from numbers of photographs and their pinholes.
+/// Notes about split and cropped photographs. `all` has the pinholes of each lens and its number of photographs.
 fn pinhole_notes<'a>(
     all: impl Iterator<Item = (usize, &'a Option<Pinholes>)> + Clone,
     keep_fov: bool,
@@ -278,7 +278,7 @@ fn photograph(
     };
     let hidden = match &mask {
         None => Vec::new(),
-        // One mask at a time is decoded, which the memory of a run allows for.
+        // Masks are decoded one at a time; a run's planned memory includes one.
         Some(mask) => {
             let weights = mask.read_weights(|found| check_mask(mask, found, header))?;
             views.iter().map(|view| is_hidden(view, views.len() > 1, &weights, &lens)).collect()
@@ -287,7 +287,7 @@ fn photograph(
     Ok(Photograph { views, hidden, held_out: frame.held_out, id: frame.id })
 }
 
-/// Checks that a mask is a rescale of its photograph.
+/// Checks that a mask has the proportions of its photograph.
 fn check_mask(mask: &Mask, found: ImageHeader, image: ImageHeader) -> Result<(), LoadError> {
     let (found, size) = ((found.width, found.height), (image.width, image.height));
     if is_proportional(found, size) {
@@ -296,9 +296,9 @@ fn check_mask(mask: &Mask, found: ImageHeader, image: ImageHeader) -> Result<(),
     Err(LoadError::size(&mask.file.path, found, size))
 }
 
-/// Whether a mask hides all of a view, which may be one of `several` of its photograph.
+/// Returns true if a mask hides all of a view; `several` is true if its photograph has more than one view.
 fn is_hidden(view: &View, several: bool, mask: &GrayImage, lens: &Lens) -> bool {
-    /// Most pixels along a side of a mask that are tested against each of several views.
+    /// Maximum number of pixels along a side of a mask that are tested against each of several views.
     const SAMPLED_SIDE: u32 = 512;
     let (width, height) = mask.dimensions();
     let stride = if several { (width.max(height) / SAMPLED_SIDE).max(1) } else { 1 } as usize;
@@ -348,7 +348,7 @@ fn divided(side: u32, k: u32) -> u32 {
     ((f64::from(side) / f64::from(k.max(1))).round() as u32).max(1)
 }
 
-/// Whether one factor scales `reference` to `size` within 1 px along both axes.
+/// Returns true if one factor scales `reference` to `size` within 1 px along both axes.
 fn is_proportional(size: (u32, u32), reference: (u32, u32)) -> bool {
     let range = |side: u32, reference: u32| {
         let (side, reference) = (f64::from(side), f64::from(reference));
@@ -363,7 +363,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rescales_are_told_from_other_sizes() {
+    fn rescaled_sizes_are_distinguished_from_others() {
         for (size, fits) in [
             ((1237, 822), true),
             ((619, 411), true),

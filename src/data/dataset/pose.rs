@@ -5,15 +5,15 @@ use std::path::Path;
 use glam::{DMat3, DVec3};
 
 use super::LoadError;
-use super::lens::{Lens, Plane};
+use super::lens::{Lens, Projection};
 
 /// Accepted fields of view of pinhole cameras `[degrees]`.
 const FIELD_OF_VIEW: std::ops::RangeInclusive<f64> = 0.5..=160.0;
 
-/// Largest accepted field of view of fisheyes without their distortion `[degrees]`. It is large because the corners of
-/// the image may lie outside the image circle.
-const WIDEST_FISHEYE: f64 = 720.0;
-/// Largest accepted ω of the FOV model `[rad]`, for which tan(ω/2) is 20.
+/// Largest accepted field of view of a fisheye, computed without its distortion `[degrees]`. It is large because the
+/// corners of the image may lie outside the image circle.
+const MAX_FISHEYE_FOV: f64 = 720.0;
+/// Largest accepted |ω| of the FOV model `[rad]`; tan(ω/2) is then 20.
 const MAX_OMEGA: f64 = 3.04;
 
 /// Largest accepted entry of |RᵀR − I|; smaller deviations are corrected.
@@ -82,19 +82,19 @@ pub(super) fn check_lens(file: &Path, camera: &str, lens: &Lens) -> Result<(), L
     if !lens.is_finite() {
         return fault("the principal point or the distortion is not finite".into());
     }
-    if let Plane::Fov(omega) = lens.distortion.plane
+    if let Projection::Fov(omega) = lens.distortion.plane
         && omega.abs() > MAX_OMEGA
     {
         return fault(format!("omega = {omega} is not within {MAX_OMEGA} of 0"));
     }
     for (name, focal, side) in [("fx", lens.focal.x, size.x), ("fy", lens.focal.y, size.y)] {
         let (half, most) = match lens.distortion.plane {
-            Plane::Perspective => ((0.5 * side / focal).atan(), *FIELD_OF_VIEW.end()),
-            Plane::Equidistant | Plane::Fov(_) => (0.5 * side / focal, WIDEST_FISHEYE),
+            Projection::Perspective => ((0.5 * side / focal).atan(), *FIELD_OF_VIEW.end()),
+            Projection::Equidistant | Projection::Fov(_) => (0.5 * side / focal, MAX_FISHEYE_FOV),
         };
         let degrees = 2.0 * half.to_degrees();
         if !(*FIELD_OF_VIEW.start()..=most).contains(&degrees) {
-            let wide = if degrees > most && lens.distortion.plane == Plane::Perspective {
+            let wide = if degrees > most && lens.distortion.plane == Projection::Perspective {
                 "; a lens this wide is a fisheye: use a fisheye model, or undistort its images to a pinhole"
             } else {
                 ""
@@ -141,7 +141,7 @@ mod tests {
             let focal = 50.0 / (0.5 * degrees.to_radians()).tan();
             // A principal point outside the image is allowed.
             let principal = DVec2::new(-70.0, 130.0);
-            let none = Distortion::none(Plane::Perspective);
+            let none = Distortion::none(Projection::Perspective);
             let lens = Lens::new((100, 100), DVec2::splat(focal), principal, none);
             check_lens(Path::new("f"), "camera 7", &lens)
         };

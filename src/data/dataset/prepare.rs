@@ -123,7 +123,7 @@ pub(super) fn assemble(
     for position in &mut points.positions {
         *position = normalisation.scene_from_world(*position);
     }
-    drop_bad(points_path, &mut points, &mut notes, "within reach of f32", |p| {
+    drop_bad(points_path, &mut points, &mut notes, "within the range of f32", |p| {
         p.as_vec3().is_finite()
     })?;
     // Of several views of a photograph, a track is assigned to the one that shows its point.

@@ -20,7 +20,7 @@ use super::folders::Folders;
 use super::formats::DatasetFormat;
 use super::images::{self, ImageHeader};
 use super::lens::models::Term;
-use super::lens::{Distortion, Lens, Plane};
+use super::lens::{Distortion, Lens, Projection};
 use super::paths::{DataPath, Root, relative};
 use super::pose::{check_lens, checked_pose};
 use super::transforms::usual_points;
@@ -37,7 +37,7 @@ pub(super) const FORMAT: DatasetFormat = DatasetFormat {
 
 /// Largest file read `[bytes]`; a photograph takes about 200.
 const MAX_BYTES: u64 = 256 << 20;
-/// Most CSV files that are examined in the dataset's folder.
+/// Maximum number of CSV files that are examined in the dataset's folder.
 const MAX_CANDIDATES: usize = 64;
 const MAX_FRAMES: usize = 1_000_000;
 const REMEDY: &str = "export \"Internal/External camera parameters\" again";
@@ -241,7 +241,7 @@ impl Row<'_> {
         let k = reduced.unwrap_or(1);
         let (width, height) = (header.width * k, header.height * k);
         let longer = f64::from(width.max(height));
-        let mut distortion = Distortion::none(Plane::Perspective);
+        let mut distortion = Distortion::none(Projection::Perspective);
         for (column, term) in DISTORTION {
             distortion.set(term, self.number(column)?);
         }

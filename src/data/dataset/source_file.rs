@@ -63,7 +63,7 @@ impl SourceFile {
     /// Opens the file.
     ///
     /// # Errors
-    /// When it cannot be opened, or has been replaced by a link to another file.
+    /// When it cannot be opened, or has been replaced with a link to another file.
     pub(super) fn open(&self) -> Result<File, LoadError> {
         if self.archive.is_some() {
             return files::open(&self.real).map_err(LoadError::io(&self.path));

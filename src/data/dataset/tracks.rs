@@ -7,8 +7,8 @@ use glam::DVec3;
 
 use super::normalise::Normalisation;
 
-/// Smallest number of tracks to which more of them are thinned; up to twice as many are kept.
-const MAX_TRACKS: usize = 1 << 15;
+/// Number of tracks that remain after thinning. At twice this number the tracks are thinned to half.
+const THINNED_TRACKS: usize = 1 << 15;
 /// Largest number of views kept per track.
 pub(super) const MAX_VIEWS: u64 = 64;
 /// Smallest number of views of a track; with fewer, changes of colour with the view cannot be measured.
@@ -77,7 +77,7 @@ impl TrackSampler {
         Self { tracks: Tracks::default(), stride: 1, seen: 0 }
     }
 
-    /// Counts the next track; returns whether it shall be [added](Self::add).
+    /// Counts the next track; returns true if it must be [added](Self::add).
     pub(super) fn wants(&mut self, views: u64) -> bool {
         if views < MIN_VIEWS as u64 {
             return false;
@@ -96,7 +96,7 @@ impl TrackSampler {
         self.tracks.positions.push(position);
         self.tracks.colours.push(colour);
         self.tracks.views.push(views.into_iter().take(MAX_VIEWS as usize).collect());
-        if self.tracks.count() >= 2 * MAX_TRACKS {
+        if self.tracks.count() >= 2 * THINNED_TRACKS {
             self.stride *= 2;
             keep_every_second(&mut self.tracks.positions);
             keep_every_second(&mut self.tracks.colours);
@@ -124,14 +124,15 @@ mod tests {
     #[test]
     fn many_tracks_are_thinned_evenly_and_short_ones_left_out() {
         let mut sampler = TrackSampler::new();
-        for i in 0..5 * MAX_TRACKS {
+        for i in 0..5 * THINNED_TRACKS {
             let views = if i % 2 == 0 { 5 } else { 3 };
             if sampler.wants(views) {
                 sampler.add(DVec3::splat(i as f64), [0; 3], 0..views as u32);
             }
         }
         let tracks = sampler.finish();
-        assert!((MAX_TRACKS..2 * MAX_TRACKS).contains(&tracks.count()), "{}", tracks.count());
+        let count = tracks.count();
+        assert!((THINNED_TRACKS..2 * THINNED_TRACKS).contains(&count), "{count}");
         let gaps: Vec<f64> = tracks.positions.windows(2).map(|p| p[1].x - p[0].x).collect();
         assert!(gaps.iter().all(|gap| (gap - 4.0).abs() < 1e-9), "{:?}", &gaps[..4]);
         assert!(tracks.views.iter().all(|views| views.len() == 5));

@@ -17,7 +17,7 @@ use super::formats::DatasetFormat;
 use super::images::{self, ImageHeader};
 use super::json;
 use super::lens::models::{FISHEYE_FIELDS, OPENCV_FIELDS};
-use super::lens::{Distortion, Lens, Plane};
+use super::lens::{Distortion, Lens, Projection};
 use super::mask_files::MaskFile;
 use super::paths::{DataPath, Root, is_absolute, relative};
 use super::pose::{check_lens, checked_pose};
@@ -400,9 +400,9 @@ impl<'a> Fields<'a> {
             return Err(LoadError::lens(self.path, &self.full("camera_model"), problem));
         }
         let (plane, fields) = if is_fisheye {
-            (Plane::Equidistant, &FISHEYE_FIELDS[..])
+            (Projection::Equidistant, &FISHEYE_FIELDS[..])
         } else {
-            (Plane::Perspective, &OPENCV_FIELDS[..])
+            (Projection::Perspective, &OPENCV_FIELDS[..])
         };
         let mut distortion = Distortion::none(plane);
         for (field, _) in OPENCV_FIELDS {

@@ -29,12 +29,12 @@ pub struct Undistortion {
     pub(super) to: Pinhole,
     /// Rotation from the pinhole's axes to the lens's.
     pub(super) lens_from_pinhole: DMat3,
-    /// Whether the lens saw only a part of the pinhole's image, so that the rest is masked.
+    /// True if the lens saw only a part of the pinhole's image, so that the rest is masked.
     pub(super) masked: bool,
 }
 
 impl Undistortion {
-    /// Whether the pinhole's image contains a ray of the lens.
+    /// Returns true if the pinhole's image contains a ray of the lens.
     pub(super) fn shows(&self, ray: DVec3) -> bool {
         let ray = self.lens_from_pinhole.transpose() * ray;
         let at = ray.truncate() / ray.z * self.to.focal + self.to.principal;
@@ -71,7 +71,7 @@ impl Undistortion {
             for x in 0..width {
                 let source = self.source_of(DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5));
                 let mut mean = PixelMean::default();
-                // Beyond the centres of the outermost pixels these are repeated.
+                // Beyond the centres of the outermost pixels, those pixels are repeated.
                 if let Some(at) = source {
                     let at = (at - 0.5).clamp(DVec2::ZERO, last);
                     let [columns, rows] =
@@ -127,7 +127,7 @@ impl Stencil {
 
 #[cfg(test)]
 mod tests {
-    use super::super::lens::{Distortion, Pinholes, Plane};
+    use super::super::lens::{Distortion, Pinholes, Projection};
     use super::*;
 
     const SIZE: (u32, u32) = (90, 60);
@@ -146,7 +146,7 @@ mod tests {
 
     fn undistortion() -> Undistortion {
         let (focal, middle) = (DVec2::splat(70.0), DVec2::new(45.0, 30.0));
-        let lens = Lens::new(SIZE, focal, middle, Distortion::none(Plane::Equidistant));
+        let lens = Lens::new(SIZE, focal, middle, Distortion::none(Projection::Equidistant));
         Pinholes::covering(&lens, false).unwrap().faces[0].1
     }
 
@@ -204,7 +204,7 @@ mod tests {
     }
 
     #[test]
-    fn hidden_pixels_reach_no_pixel_that_counts() {
+    fn hidden_pixels_do_not_affect_visible_ones() {
         let is_hidden = |at: DVec2| (at - DVec2::new(40.0, 30.0)).length() < 9.0;
         let with = |hidden: u8| {
             let colour = |at: DVec2| if is_hidden(at) { hidden } else { 90 };

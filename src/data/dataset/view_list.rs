@@ -35,7 +35,7 @@ struct Entry {
     line: usize,
     /// The part of the view that is used, if not all.
     part: Option<Part>,
-    /// Whether the dataset has a view of this name.
+    /// True if the dataset has a view of this name.
     exists: bool,
 }
 
@@ -54,15 +54,15 @@ impl ViewList {
         });
         let entries = entries.collect::<Result<_, usize>>().map_err(|line| {
             let problem = format!(
-                "line {line}: after the tab come left, top, right and bottom of the part that is used, as \
-                 fractions of the image from 0 to 1, such as `0.25 0 1 0.5`"
+                "line {line}: the tab must be followed by left, top, right and bottom of the part that is \
+                 used, as fractions of the image from 0 to 1, such as `0.25 0 1 0.5`"
             );
             fault(file, problem)
         })?;
         Ok(Self { file: file.to_owned(), entries })
     }
 
-    /// The part of a view that is used, if that is not all; `None` if the view is not listed.
+    /// The part of a view that is used, `Some(None)` for the whole view; `None` if the view is not listed.
     fn part(&mut self, name: &str) -> Option<Option<Part>> {
         let entry = self.entries.get_mut(name)?;
         entry.exists = true;

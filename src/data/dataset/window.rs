@@ -43,7 +43,7 @@ impl FromStr for Part {
 }
 
 impl Part {
-    /// Whether the sides are in order and inside the image.
+    /// Returns true if the sides are in order and inside the image.
     fn is_valid(&self) -> bool {
         let is_span = |from: f64, to: f64| 0.0 <= from && from < to && to <= 1.0;
         is_span(self.left, self.right) && is_span(self.top, self.bottom)
@@ -98,7 +98,7 @@ mod tests {
     use densify_fixtures::Made;
 
     #[test]
-    fn windows_hold_their_part_and_stay_in_the_image() {
+    fn windows_contain_their_part_and_stay_in_the_image() {
         let part = |left, right| Part { left, right, top: 0.25, bottom: 0.75 };
         let window = |left, right| part(left, right).window(200, 100);
         assert_eq!(window(0.5, 0.9), Some(Window { x: 100, y: 25, width: 80, height: 50 }));
@@ -116,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn a_windowed_view_shows_what_it_showed_there() {
+    fn a_windowed_view_shows_the_same_as_the_whole_view_there() {
         let made = Made::colmap_txt();
         let dataset = Dataset::load(made.path(), &LoadOptions::default()).expect("a dataset");
         let (width, height) = (60, 40);
@@ -145,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn a_window_has_the_pixels_of_its_place() {
+    fn a_windowed_image_has_the_pixels_of_its_window() {
         let image = Image8 {
             width: 5,
             height: 4,

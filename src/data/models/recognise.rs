@@ -12,15 +12,15 @@ use super::{Format, SplatFile, formats, names};
 use crate::error::LoadError;
 use densify_core::files;
 
-/// Number of bytes by which formats are recognised.
+/// Number of bytes at the start of a file that are used to recognise its format.
 const START: u64 = 64;
 /// Largest file that is JSON, such as glTF with its buffers inside `[bytes]`.
 const MAX_JSON: u64 = 1 << 30;
 
-/// How a format's files are recognised and read.
+/// The functions that recognise and read a format's files.
 #[derive(Debug, Clone, Copy)]
 pub struct Reader {
-    /// Decides by the content if a file has this format.
+    /// Decides from a file's content whether it has this format.
     pub recognise: fn(&ModelFile<'_>) -> Result<Match, LoadError>,
     /// Reads a file that was recognised.
     pub read: fn(ModelFile<'_>) -> Result<SplatFile, LoadError>,
@@ -28,7 +28,7 @@ pub struct Reader {
     pub main_file: Option<&'static str>,
 }
 
-/// How well a file's content fits a format.
+/// The certainty that a file has a format, judged by its content.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Match {
     /// The file has another format.
@@ -117,7 +117,7 @@ pub fn read_model(path: &Path) -> Result<SplatFile, LoadError> {
     weak.map_or_else(|| Err(unrecognised(path)), |reader| (reader.read)(file))
 }
 
-/// The file by which a folder is a model, if it is one.
+/// The main file of a folder that is a model; `None` if the folder is not one.
 pub fn main_file(folder: &Path) -> Option<PathBuf> {
     let names = readers().into_iter().filter_map(|(_, reader)| reader.main_file);
     names.map(|name| folder.join(name)).find(|path| path.is_file())

@@ -18,7 +18,7 @@ pub struct SplatFile {
     pub gaussians: Gaussians,
     /// Gaussians dropped because a value was not finite.
     pub dropped: usize,
-    /// Gaussians whose zero quaternion was replaced by the identity.
+    /// Gaussians whose zero quaternion was replaced with the identity.
     pub repaired: usize,
 }
 

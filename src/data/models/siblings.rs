@@ -1,4 +1,4 @@
-//! Files that a model file names: only those in its own folder, also after following links.
+//! Opens files that a model file names: only those in its own folder, even after following links.
 
 use std::fs::File;
 use std::path::Path;
@@ -6,7 +6,7 @@ use std::path::Path;
 use crate::error::LoadError;
 use densify_core::files::{self, folder_of};
 
-/// Opens the file called `name` in the folder of `path`; `field` is where `path` names it.
+/// Opens the file called `name` in the folder of `path`; `field` is the place in `path` that names it.
 ///
 /// # Errors
 /// When the name is a path or leads out of the folder, or as [`files::open`].

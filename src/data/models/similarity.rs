@@ -1,4 +1,5 @@
-//! Similarity transforms of a model: a rotation, a uniform scale and a translation; its colours turn with it.
+//! Similarity transforms of a model: a rotation, a uniform scale and a translation. The rotation also turns the
+//! spherical harmonics.
 
 use glam::{DMat3, DMat4, DQuat, DVec3};
 
@@ -6,7 +7,7 @@ use densify_core::gaussians::{Gaussians, sh_coefficients};
 use densify_core::sh;
 
 /// Deviations below this are rounding errors: of a matrix from a uniform scale, and of an entry of a colour rotation
-/// from 0 or ±1. Ten steps of f32, in which both are mostly computed.
+/// from 0 or ±1. About ten times the relative precision of f32, in which transforms are mostly computed.
 const ROUNDING: f64 = 1e-6;
 /// Directions to which a colour rotation is fitted; a band has at most seven coefficients.
 const DIRECTIONS: usize = 32;
@@ -160,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn a_half_turn_changes_signs_and_the_identity_nothing() {
+    fn a_half_turn_changes_only_signs_and_the_identity_changes_nothing() {
         let before = model(2, 3);
         let mut after = before.clone();
         Similarity::from_matrix(&DMat4::IDENTITY).unwrap().apply(&mut after);

@@ -33,7 +33,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn neighbours_come_together_whatever_the_unit() {
+    fn neighbours_follow_each_other_whatever_the_unit() {
         for unit in [1e-6, 1.0, 1e6] {
             let mut model = Gaussians::zeros(64, 0);
             // Two clusters, their rows in turn.

@@ -8,7 +8,7 @@ use crate::error::LoadError;
 
 /// Longest header accepted `[bytes]`.
 const MAX_HEADER: u64 = 1 << 20;
-/// Most rows accepted of one element.
+/// Number of rows from which on an element is refused.
 const MAX_ROWS: u64 = 1 << 32;
 
 /// Encoding of the data.

@@ -43,7 +43,7 @@ pub struct TrackColours {
 /// Gains of the views and colours of the tracks in one channel.
 #[derive(Debug, Clone)]
 struct Fit {
-    /// Whether a view has enough trusted values. Shape: `[views]`.
+    /// True for views with enough trusted values. Shape: `[views]`.
     is_known: Vec<bool>,
     /// Gains. Shape: `[views]`.
     gains: Vec<f32>,
@@ -95,7 +95,7 @@ impl TrackColours {
         self.fits.each_ref().map(|fit| fit.gains[view])
     }
 
-    /// Whether a view has enough trusted values in every channel.
+    /// Returns true if a view has enough trusted values in every channel.
     pub fn knows(&self, view: usize) -> bool {
         self.fits.iter().all(|fit| fit.is_known[view])
     }

@@ -28,9 +28,9 @@ pub struct ExposureSpread {
     pub views: usize,
     /// Root mean square difference of the gains from their mean, over these views and the channels `[stops]`.
     pub stops: f64,
-    /// Median difference between an observed colour and that of its track, with equal exposures `[1/255]`.
+    /// Median difference between an observed colour and its track's colour, assuming equal exposures `[1/255]`.
     pub alike: f64,
-    /// Median difference with the fitted gains `[1/255]`.
+    /// The same median difference with the fitted gains `[1/255]`.
     pub with_gains: f64,
 }
 
@@ -90,7 +90,7 @@ impl ExposureSpread {
         (spread, gains)
     }
 
-    /// Whether exposures shall be learned; `None` if too few tracks or views are known for a decision.
+    /// True if exposures are to be learned; `None` if too few tracks or views are known for a decision.
     pub fn decides(&self, views: usize) -> Option<bool> {
         let is_enough = self.tracks >= MIN_TRACKS && 2 * self.views > views;
         let differ = self.stops >= MIN_STOPS && self.with_gains <= MAX_UNEXPLAINED * self.alike;

@@ -54,7 +54,7 @@ fn posed(image: Image8) -> View {
 }
 
 #[test]
-fn colours_that_stay_ask_for_degree_0_whatever_the_exposure() {
+fn constant_colours_need_degree_0_whatever_the_exposure() {
     for exposures in [[1.0; VIEWS], [1.0, 0.8, 1.1, 0.7, 1.0, 1.2, 0.9, 1.05]] {
         let (tracks, views) = scene(|view, _, value| value * exposures[view]);
         let found = measured(&tracks, &views).unwrap();
@@ -71,7 +71,7 @@ fn exposures_are_found_where_gains_explain_the_colours() {
         let (tracks, views) = scene(shade);
         let (found, gains) = ExposureSpread::measure(&TrackColours::read(&tracks, &views).unwrap());
         assert_eq!((found.tracks, found.views), (tracks.count(), VIEWS));
-        // As many tracks as decide.
+        // As if there were enough tracks for a decision.
         (ExposureSpread { tracks: MIN_TRACKS, ..found }, gains)
     };
     let (differ, gains) = found(&|view, _, value| value * exposures[view]);
@@ -81,7 +81,7 @@ fn exposures_are_found_where_gains_explain_the_colours() {
     for (gains, exposure) in gains.iter().zip(exposures) {
         assert!(gains.iter().all(|gain| (gain - exposure / mean.exp()).abs() < 0.01), "{gains:?}");
     }
-    // Half of the colours are clipped in the brightest view, and say nothing of its gain.
+    // Half of the colours are clipped in the brightest view and cannot be used to fit its gain.
     let (_, gains) = found(&|view, _, value| 2.2 * value * exposures[view]);
     let brightest = exposures[5] / mean.exp();
     assert!(gains[5].iter().all(|gain| (gain - brightest).abs() < 0.01), "{gains:?}");
@@ -93,11 +93,11 @@ fn exposures_are_found_where_gains_explain_the_colours() {
         value * (0.6 + 0.1 * ((view * 31 + square * 17 + view * square * 7) % 9) as f32)
     });
     assert_eq!(noise.decides(VIEWS), Some(false), "{noise:?}");
-    assert_eq!(differ.decides(2 * VIEWS), None, "of half of the views nothing is known");
+    assert_eq!(differ.decides(2 * VIEWS), None, "half of the views are unknown");
 }
 
 #[test]
-fn colours_that_change_with_the_view_ask_for_more() {
+fn colours_that_change_with_the_view_need_a_higher_degree() {
     for (strength, degree) in [(0.0, 0), (2.0, 1), (5.0, 2), (30.0, 3)] {
         // A tenth of the squares shine in half of the views.
         let shade = |view: usize, square: usize, value: f32| match square % 10 {
@@ -121,7 +121,7 @@ fn occlusion_in_a_quarter_of_the_views_is_ignored() {
 }
 
 #[test]
-fn points_that_are_not_on_a_surface_decide_nothing() {
+fn no_degree_is_chosen_if_most_points_are_not_on_a_surface() {
     let (mut tracks, views) = scene(|_, _, value| value);
     let on = measured(&tracks, &views).unwrap();
     assert!(on.on_surface > 0.99, "{on:?}");
@@ -138,7 +138,7 @@ fn points_that_are_not_on_a_surface_decide_nothing() {
 
 #[test]
 #[ignore = "takes minutes: run by .ci/run"]
-fn built_in_scenes_ask_for_what_their_materials_need() {
+fn built_in_scenes_get_the_degree_that_their_materials_need() {
     for (name, degrees) in [("spheres", 0..=0), ("room", 0..=0), ("glossy", 2..=3)] {
         let options = LoadOptions { tracks: true, ..LoadOptions::default() };
         let path = format!("{PREFIX}{name}");

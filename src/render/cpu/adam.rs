@@ -1,4 +1,5 @@
-//! Stage 7: Adam (Kingma and Ba 2015, algorithm 1), with the bias correction of each row's own age.
+//! Stage 7: Adam (Kingma and Ba 2015, algorithm 1), with the bias correction of each row's own age, its number of
+//! steps.
 //!
 //! A new row starts with zero moments and age 0, so that its first step has the length of one learning rate. With
 //! the shared step counter of other implementations it would have 3.2 times that length
@@ -114,7 +115,7 @@ pub(super) fn confine<S: Simd>(s: S, params: &mut [f32], slack: f32) {
         let at = |p: usize| p * WIDTH + lane;
         let q = each!(i in 4 => V::load(s, &params[at(plane::QUAT + i)..]));
         let norm2 = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
-        // A quaternion this short has no direction left; it is reset to the identity. Here and
+        // A quaternion this short has no direction left, and is reset to the identity. Here and
         // below, NaN stays NaN, so that an audit finds it.
         let lost = norm2.le(c(1e-12));
         let inv = (norm2 - c(1.0)).abs().le(c(slack)).select(c(1.0), c(1.0) / norm2.sqrt());

@@ -14,7 +14,7 @@ use super::mask::Masks;
 use super::moments::Moments;
 use super::parameters::Parameters;
 use super::signals::Accumulators;
-use super::summed::Summed;
+use super::summed::GradientSums;
 use super::threads::Threads;
 use densify_core::gaussians::{logit, rgb_to_dc, sigmoid};
 
@@ -25,7 +25,7 @@ pub(super) struct Model<'a> {
     pub(super) ages: &'a mut Blocks<u16>,
     pub(super) masks: &'a mut Masks,
     pub(super) signals: &'a mut Accumulators,
-    pub(super) summed: &'a mut Summed,
+    pub(super) summed: &'a mut GradientSums,
     pub(super) threads: &'a Threads,
 }
 
@@ -167,7 +167,7 @@ impl Model<'_> {
                 continue;
             }
             let was = self.params.get(row, plane::OPACITY);
-            // Non-finite numbers are left to the audit, and a decay of 0 must not change a bit.
+            // Non-finite numbers are left to the audit, and a decay of 0 must leave every bit unchanged.
             if decay.opacity > 0.0 && was.is_finite() {
                 let opacity = sigmoid(was);
                 let left = (opacity - decay.opacity).max(MIN_DECAYED_OPACITY);
@@ -209,7 +209,7 @@ fn longest(log_scale: [f32; 3]) -> usize {
 
 fn scales_of(log_scale: [f32; 3], rule: ScaleRule) -> [f32; 3] {
     match rule {
-        // A factor of 1 must not change a bit.
+        // A factor of 1 must leave every bit unchanged.
         ScaleRule::Uniform(factor) => log_scale.map(|x| x + factor.ln()),
         ScaleRule::LongAxis { long, other } => {
             let longest = longest(log_scale);
@@ -228,7 +228,7 @@ fn quaternion([w, x, y, z]: [f32; 4]) -> glam::Quat {
 
 /// Rotates an orientation about its own axes; the length of the quaternion is preserved.
 fn rotated(quat: [f32; 4], turn: [f32; 4]) -> [f32; 4] {
-    // The identity must not change a bit.
+    // The identity must leave every bit unchanged.
     if turn.map(f32::to_bits) == NO_ROTATION.map(f32::to_bits) {
         return quat;
     }

@@ -8,7 +8,7 @@ use densify_core::gaussians::ModelArray;
 
 impl CpuBackend {
     /// The rows with a non-finite number, in order.
-    pub(super) fn unsound(&self) -> Vec<NonFinite> {
+    pub(super) fn find_non_finite(&self) -> Vec<NonFinite> {
         let rows = self.rows;
         let first_block = self.moments.first() / WIDTH;
         let (params, moments) = (self.params.view(rows), self.moments.view(rows));

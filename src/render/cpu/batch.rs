@@ -1,8 +1,8 @@
 //! Batches of splats from a tile's list, copied side by side with the values that are constant over a patch or over
 //! all patches.
 //!
-//! A batch is filled before any of its patches is drawn. The patches that a splat reaches are then known long
-//! before the loop over them ends, so that a mispredicted end waits for no arithmetic.
+//! A batch is filled before any of its patches is rendered. The patches that a splat reaches are then known long
+//! before the loop over them ends, so that a mispredicted loop exit does not have to wait for arithmetic.
 
 use std::sync::atomic::AtomicU64;
 
@@ -13,7 +13,7 @@ use super::rasterize::{PATCH, PATCHES, TilePlace};
 use super::simd::{V, WIDTH};
 use super::tiles::Entry;
 
-/// Splats of a batch. They are copied before use, so that their cache misses overlap.
+/// Number of splats in a batch. They are copied before use, so that their cache misses overlap.
 pub(super) const BATCH: usize = 32;
 
 /// Pixel centres within a patch, and corners of a tile's patches.
@@ -34,7 +34,7 @@ const fn grid(x: bool, step: f32, first: f32) -> [f32; WIDTH] {
     values
 }
 
-/// A batch of splats. The arrays per splat are valid up to the number of splats given.
+/// A batch of splats. The arrays per splat are valid up to the number of splats in the batch.
 #[repr(C, align(64))]
 pub(super) struct Batch {
     pub(super) splats: [Splat; BATCH],
@@ -46,7 +46,7 @@ pub(super) struct Batch {
     corner_z: [[f32; PATCHES]; BATCH],
     /// For each patch a bit per splat: whether the splat may be blended into one of its pixels.
     pub(super) splats_of: [u32; PATCHES],
-    /// The same as a bit per patch, for each splat.
+    /// The same information as a bit per patch, for each splat.
     pub(super) patches_of: [u32; BATCH],
 }
 
@@ -107,7 +107,7 @@ impl Batch {
         }
     }
 
-    /// Removes the splats from `end` on from patch `p`.
+    /// Removes splat `end` and all later ones from patch `p`.
     #[inline(always)]
     pub(super) fn cut(&mut self, p: usize, end: usize) {
         if end < BATCH {

@@ -26,11 +26,11 @@ pub(super) mod plane {
     pub(in super::super) const SH: usize = 11;
     /// First plane of bands 1–3.
     pub(in super::super) const SH_REST: usize = SH + 3;
-    /// Planes at degree 3.
+    /// Number of planes at degree 3.
     pub(in super::super) const MOST: usize = 59;
 }
 
-/// Planes per row at a spherical-harmonic degree.
+/// Number of planes at a spherical-harmonic degree.
 pub(super) const fn planes(sh_degree: u8) -> usize {
     plane::SH + 3 * sh_coefficients(sh_degree)
 }
@@ -44,7 +44,7 @@ impl Scratch {
     pub(super) const ZERO: Self = Self([0.0; plane::MOST * WIDTH]);
 }
 
-/// An edit of whole rows, which every array of rows executes alike.
+/// An edit of whole rows, which is applied to every array of rows in the same way.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum RowEdit<'a> {
     /// Sets a row to 0.
@@ -55,7 +55,7 @@ pub(super) enum RowEdit<'a> {
     Reorder(&'a [u32]),
 }
 
-/// Rows of `planes` numbers each, from a first row on; earlier rows have no numbers.
+/// Rows of `planes` numbers each, from a first row on; earlier rows are not stored.
 #[derive(Debug, Clone)]
 pub(super) struct Blocks<T = f32> {
     /// Numbers per row.
@@ -79,7 +79,7 @@ impl<T: Copy + Default> Blocks<T> {
 
     /// Allocated bytes.
     #[cfg(test)]
-    pub(super) fn held(&self) -> u64 {
+    pub(super) fn allocated_bytes(&self) -> u64 {
         (self.data.capacity() * size_of::<T>()) as u64
     }
 
@@ -148,7 +148,7 @@ impl<T: Copy + Default> Blocks<T> {
     fn reorder(&mut self, order: &[u32]) {
         let order = order.get(self.first..).unwrap_or_default();
         let mut values = vec![T::default(); order.len()];
-        // Plane by plane: rows mostly move by little, so that reads are mostly sequential.
+        // Plane by plane: most rows move only a little, so that most reads are sequential.
         for plane in 0..self.planes {
             for (value, &row) in values.iter_mut().zip(order) {
                 *value = self.get(row as usize, plane);
@@ -240,7 +240,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn parts_are_chunks_and_nothing_where_there_is_nothing() {
+    fn parts_are_chunks_and_an_empty_buffer_gives_empty_parts() {
         for length in [1, 6, 7, 63, 64] {
             let mut numbers: Vec<usize> = (0..length).collect();
             let chunks: Vec<Vec<usize>> = numbers.chunks(7).map(<[_]>::to_vec).collect();

@@ -12,10 +12,10 @@ use super::observe;
 use super::parameters::Parameters;
 use super::project::Splat;
 use super::rasterize::TileCanvas;
-use super::rasterize_bwd::{Blended, TileGradient};
+use super::rasterize_bwd::{BlendedBatch, TileGradient};
 use super::signals::Accumulators;
 use super::simd::WIDTH;
-use super::summed::Summed;
+use super::summed::GradientSums;
 use super::tiles::{Grid, TileLists};
 use crate::candidates::Candidates;
 use crate::signals::{Field, counts_dominant};
@@ -23,19 +23,20 @@ use crate::{BackendError, Setup};
 use densify_core::budget::RowBudget;
 use densify_core::memory::{Ledger, Section};
 
-/// The most (row, tile) pairs held at a time; at least the budget, as one tile's list holds each row at most once.
+/// Maximum number of (row, tile) pairs in memory at a time; at least the budget, as a tile's list has each row at most
+/// once.
 pub(super) fn tile_cap(options: &Setup) -> usize {
     let rows = options.budget.total;
     let cap = options.tile_cap.unwrap_or(rows.saturating_mul(16));
     cap.max(rows).max(1).min(u32::MAX as usize)
 }
 
-/// The most gradient records held at a time; no more than pairs.
+/// Maximum number of gradient records in memory at a time; at most the number of pairs.
 pub(super) fn record_cap(options: &Setup) -> usize {
     if options.only_renders { 1 } else { options.record_cap.clamp(1, tile_cap(options)) }
 }
 
-/// The trainable rows, starting at a whole task. Earlier rows are frozen and have memory only for rendering.
+/// The rows of the tasks that have trainable rows. Earlier rows are frozen and have memory only for rendering.
 pub(super) fn trained(options: &Setup) -> Range<usize> {
     if options.only_renders {
         return 0..0;
@@ -44,7 +45,7 @@ pub(super) fn trained(options: &Setup) -> Range<usize> {
     frozen.min(total) / ROWS_PER_TASK * ROWS_PER_TASK..total
 }
 
-/// Rows in the buffer of summed records, frozen ones included.
+/// Number of rows in the buffer of summed records, frozen ones included.
 pub(super) fn summed_rows(options: &Setup) -> usize {
     if options.only_renders { 0 } else { options.row_budget().total.next_multiple_of(WIDTH) }
 }
@@ -72,8 +73,8 @@ pub(super) fn ledger(sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
         "optimiser ages and bias tables",
         Blocks::<u16>::bytes(trained.clone(), 1) + BiasCorrection::bytes(),
     );
-    if Summed::is_needed(needs.cadence) {
-        let bytes = Summed::bytes(trained.clone(), per_row, needs.cadence);
+    if GradientSums::is_needed(needs.cadence) {
+        let bytes = GradientSums::bytes(trained.clone(), per_row, needs.cadence);
         ledger.add_to(Section::Gradients, "gradients summed between steps", bytes);
     }
     if let Some(request) = &needs.aux {
@@ -106,13 +107,13 @@ pub(super) fn ledger(sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
     let loss = LossBuffers::bytes(grid.width, grid.height, threads, by_pixel);
     let per_tile = size_of::<TileCanvas>() + size_of::<TileGradient>();
     ledger.add_to(Section::Renderer, "image and image gradient", (grid.tiles() * per_tile) as u64);
-    let loss_and_backward = loss + (threads * size_of::<Blended>()) as u64;
+    let loss_and_backward = loss + (threads * size_of::<BlendedBatch>()) as u64;
     let what = format!("loss and backward pass, for up to {threads} threads");
     ledger.add_to(Section::Renderer, what, loss_and_backward);
     ledger
 }
 
-/// Allocates the whole ledger at once and frees it, so that a lack of memory is an error before
+/// Allocates the ledger's total at once and frees it, so that a lack of memory is an error before
 /// training instead of an abort during it.
 pub(super) fn reserve(ledger: &Ledger) -> Result<(), BackendError> {
     let bytes = ledger.total();
@@ -158,8 +159,8 @@ mod tests {
             assert_eq!(line("optimiser moments"), Some(112 * of_moments), "{moments:?}");
             assert_eq!(line("gradients per entry"), Some(70 * 9 * 4));
             let CpuBackend { params, moments, records, sums, splats, visible, .. } = &backend;
-            assert_eq!(line("parameters"), Some(params.held()));
-            assert_eq!(line("optimiser moments"), Some(moments.held()));
+            assert_eq!(line("parameters"), Some(params.allocated_bytes()));
+            assert_eq!(line("optimiser moments"), Some(moments.allocated_bytes()));
             let bytes = |size: usize| Some(size as u64);
             assert_eq!(line("gradients per entry"), bytes(size_of_val(&records[..])));
             assert_eq!(line("splat gradients, signals at events"), bytes(size_of_val(&sums[..])));
@@ -169,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn what_only_renders_has_no_room_for_training_and_draws_the_same() {
+    fn without_memory_for_training_renderings_are_the_same() {
         let model = Gaussians {
             sh_degree: 0,
             means: vec![[0.0, 0.1, 2.0], [0.3, 0.0, 3.0]],
@@ -182,8 +183,8 @@ mod tests {
         let made = [false, true].map(|only_renders| {
             let options = Setup { only_renders, threads: Some(1), ..Setup::new(2) };
             let mut backend = CpuBackend::new(&model, &options).unwrap();
-            let bytes = backend.moments.held() as usize
-                + backend.ages.held() as usize
+            let bytes = backend.moments.allocated_bytes() as usize
+                + backend.ages.allocated_bytes() as usize
                 + size_of_val(&backend.sums[..])
                 + size_of_val(&backend.records[..]);
             (bytes, backend.ledger.total(), backend.render(&camera, [0.1; 3], 0).unwrap())
@@ -193,7 +194,7 @@ mod tests {
         assert!(found == expected);
     }
 
-    /// Budgets around 2³¹ and 2³² rows, and more than a slot number can address.
+    /// Budgets around 2³¹ and 2³² rows, and one beyond what a slot number can address.
     #[test]
     fn huge_budgets_are_refused_and_do_not_wrap() {
         let model = Gaussians { sh_degree: 3, ..Gaussians::default() };

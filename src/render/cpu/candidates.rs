@@ -1,8 +1,8 @@
 //! Candidates for new rows: the surface points of the pixels with the largest error (*Gaussians on a
 //! Diet*, arXiv 2604.20046, "compensation").
 //!
-//! Each chosen pixel walks its tile's list once more, in scalar code, to find the Gaussian that represents its
-//! surface. That takes a few thousand operations per step, while recording surfaces during rendering would
+//! For each chosen pixel, its tile's list is traversed once more, in scalar code, to find the Gaussian that represents
+//! its surface. That takes a few thousand operations per step, while recording surfaces during rendering would
 //! slow down every pixel.
 
 use std::sync::atomic::AtomicU64;
@@ -18,18 +18,18 @@ use super::rasterize::ALPHA_MAX;
 use super::threads::Threads;
 use super::tiles::Entry;
 use crate::Shortcuts;
-use crate::candidates::{Ranked, keep_worst};
+use crate::candidates::{RankedPixel, keep_worst};
 
-/// Image rows ranked per task.
+/// Number of image rows ranked per task.
 const LINES: usize = 2;
-/// Lists merged per task.
+/// Number of lists merged per task.
 const LISTS: usize = 8;
 
 /// Writes the `most` worst pixels of an image to the head of `ranking`, in any order, and returns their number. Each
 /// task keeps its own worst pixels; their lists are merged until one is left.
 pub(super) fn rank(
     threads: &Threads,
-    ranking: &mut Vec<Ranked>,
+    ranking: &mut Vec<RankedPixel>,
     [width, height]: [usize; 2],
     most: usize,
     error: impl Fn(usize, usize) -> Option<f32> + Send + Sync,
@@ -136,7 +136,7 @@ mod tests {
 
     /// Images of one line, of a few tasks, and of several rounds of merging, with equal errors among them.
     #[test]
-    fn the_worst_are_those_of_a_list_of_all() {
+    fn merged_rankings_have_the_worst_pixels_of_one_complete_list() {
         let threads = Threads::new(Some(2)).expect("threads");
         let request = CandidateRequest {
             from: 0,

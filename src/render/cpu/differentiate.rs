@@ -2,7 +2,7 @@
 
 use super::loss::ImageTerms;
 use super::optimise::Differentiate;
-use super::rasterize::{Beside, DARK};
+use super::rasterize::{DARK, DepthPlane};
 use super::tiles::Grid;
 use super::{CpuBackend, ModelGradient, for_each_pixel, scalars};
 use crate::signals::RecordLayout;
@@ -23,7 +23,7 @@ impl Differentiable for CpuBackend {
         if self.records.len() < records {
             self.records = bytemuck::zeroed_vec(records);
         }
-        let frame = self.forward(camera, background, sh_degree, Beside::Depth, None)?;
+        let frame = self.forward(camera, background, sh_degree, DepthPlane::Depth, None)?;
         let rendering = self.rendering(&frame);
         for (tile, gradient) in self.gradient[..frame.grid.tiles()].iter_mut().enumerate() {
             gradient.planes = [DARK; 5];

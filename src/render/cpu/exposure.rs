@@ -1,5 +1,5 @@
 //! The exposure of the current photograph. Between stages 3 and 4 it transforms the rendered colours; after stage 4
-//! it takes the gradient back to the colours before the transform, and sums up the gradient of the transform itself.
+//! it backpropagates the gradient to the colours before the transform, and sums up the transform's own gradient.
 //! Steps without an exposure skip both.
 //!
 //! A task is a row of tiles. Each returns its own sums, which are added in order.
@@ -14,7 +14,7 @@ use super::simd::WIDTH;
 use super::tiles::Grid;
 use densify_core::colour::{ColourGradient, ColourTransform, ExposureSums};
 
-/// Sums of a task; see [`ExposureSums`].
+/// Number of sums per task; see [`ExposureSums`].
 const SUMS: usize = 15;
 
 impl CpuBackend {
@@ -28,8 +28,8 @@ impl CpuBackend {
         clock.lap("exposure");
     }
 
-    /// Takes the gradient of the loss back to the colours before the transform, and returns the gradient of the
-    /// transform, for an image over `background`.
+    /// Backpropagates the gradient of the loss to the colours before the transform, and returns the gradient with
+    /// respect to the transform, for an image over `background`.
     pub(super) fn exposure_bwd(
         &mut self,
         grid: &Grid,

@@ -13,8 +13,8 @@ use super::project::Splat;
 use super::simd::{Mask, V};
 use super::tiles::{Grid, TILE};
 
-/// Slack for the bounds of an ellipse `[px]`. Rounding errors, those of f32 at 16,384 px, are far smaller, and a
-/// pixel missed at the bound has the smallest alpha that is blended.
+/// Slack for the bounds of an ellipse `[px]`. The rounding errors of f32 are far smaller, even at 16,384 px, and a
+/// pixel missed at the bound would have the smallest alpha that is blended.
 const SLACK: f32 = 0.02;
 
 /// The tiles of a band that a splat covers: the number of the first tile, and a bit for each of the
@@ -98,8 +98,8 @@ fn far_tiles(splat: &Splat, grid: &Grid, band: &Range<usize>, mut f: impl FnMut(
     }
 }
 
-/// The ellipses of several splats. In folded units an ellipse is u² + z² <= reach, u = l1·(dx − shear·dy), z = l3·dy.
-/// Its rightmost point is at dy = peak, its leftmost at dy = −peak. See [`Splat`].
+/// The ellipses of several splats. With the scaled conic an ellipse is u² + z² <= reach, u = l1·(dx − shear·dy),
+/// z = l3·dy. Its rightmost point is at dy = peak, its leftmost at dy = −peak. See [`Splat`].
 pub(super) struct Ellipse<S: Simd> {
     pub(super) s: S,
     pub(super) mean: [V<S>; 2],
@@ -302,7 +302,7 @@ mod tests {
     }
 
     #[test]
-    fn bits_are_the_tiles_that_are_found_one_by_one() {
+    fn footprint_bits_are_the_tiles_found_one_by_one() {
         let mut rng = ChaCha8Rng::seed_from_u64(3);
         let (mut far, mut cut) = (0, 0);
         for (width, height, size) in

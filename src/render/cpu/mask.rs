@@ -1,5 +1,6 @@
 //! Learned masks: a number per row that decides whether the row is needed (*Compact 3D Gaussian Representation*,
-//! Lee et al. 2024, section 3.1). They step between stages 6 and 7, if a policy declares them.
+//! Lee et al. 2024, section 3.1). If a policy declares them, they are optimised between stages 6
+//! and 7.
 
 use std::ops::Range;
 
@@ -98,8 +99,8 @@ impl Masks {
 }
 
 impl MaskTask<'_> {
-    /// Steps the masks of a block by Adam, from the gradient of the image loss; `ages` are the ages
-    /// before the step. A row whose mask falls to the threshold becomes transparent.
+    /// Takes an Adam step of the masks of a block, from the gradient of the image loss; `ages` are
+    /// those before the step. A row whose mask falls to the threshold becomes transparent.
     pub(super) fn step(
         &mut self,
         block: usize,

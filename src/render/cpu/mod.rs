@@ -1,7 +1,7 @@
 //! The native backend: rayon over tiles and rows, SIMD with run-time dispatch, one file per stage.
 //!
-//! It is the default on machines without a GPU and the reference for the shaders. The same inputs
-//! and the same seed give the same bytes at any thread count: work is split at fixed places, every
+//! It is the default on machines without a GPU and the reference for the shaders. With the same inputs
+//! and the same seed, results are byte-identical at any thread count: work is split at fixed places, every
 //! sum has a fixed order, and no sum is accumulated by two threads.
 //!
 //! All buffers are allocated once, at the size of the budget; the ledger lists them.
@@ -67,12 +67,12 @@ use moments::Moments;
 use parameters::Parameters;
 use passes::{for_each_pixel, scalars};
 use project::Splat;
-use rasterize::{Beside, TileCanvas};
+use rasterize::{DepthPlane, TileCanvas};
 use rasterize_bwd::TileGradient;
 use signals::Accumulators;
 use simd::WIDTH;
 use stage_clock::StageClock;
-use summed::Summed;
+use summed::GradientSums;
 use threads::Threads;
 use tiles::TileLists;
 
@@ -80,9 +80,9 @@ pub use instructions::InstructionSet;
 pub use optimise::ModelGradient;
 pub use threads::StepTasks;
 #[cfg(feature = "gpu")]
-pub(crate) use {loss::SSIM_WEIGHT, project::FOLD, project::ViewParams};
+pub(crate) use {loss::SSIM_WEIGHT, project::EXPONENT_SCALE, project::ViewParams};
 
-/// The largest side of an image `[px]`, at which every index of the stages still fits its type.
+/// The largest side of an image `[px]` at which every index of the stages still fits its type.
 pub(crate) const MAX_SIDE: u32 = 16_384;
 /// Blocks per task: 128 rows, which have 100 kB of parameters and moments at degree 3. 50,000 rows give each of 64
 /// threads six tasks.
@@ -102,10 +102,10 @@ pub struct CpuBackend {
     shortcuts: Shortcuts,
     params: Parameters,
     moments: Moments,
-    /// Optimiser steps per row, without whole tasks of frozen rows: one plane.
+    /// Number of optimiser steps per row, in one plane; tasks with only frozen rows are not stored.
     ages: Blocks<u16>,
     bias: BiasCorrection,
-    summed: Summed,
+    summed: GradientSums,
     masks: Masks,
     signals: Accumulators,
     candidates: Candidates,
@@ -138,7 +138,7 @@ impl CpuBackend {
         budget::ledger(sh_degree, options, threads)
     }
 
-    /// Takes over `model` and allocates all buffers for `options.budget` rows.
+    /// Copies `model` and allocates all buffers for `options.budget` rows.
     ///
     /// # Errors
     /// [`BackendError::OutOfMemory`] when the memory is not available; [`BackendError::Threads`].
@@ -174,7 +174,7 @@ impl CpuBackend {
             moments: Moments::zeros(trained.clone(), per_row, storage.moments),
             ages: Blocks::zeros(trained.clone(), 1),
             bias: BiasCorrection::new(),
-            summed: Summed::new(trained.clone(), per_row, options.needs.cadence),
+            summed: GradientSums::new(trained.clone(), per_row, options.needs.cadence),
             masks: Masks::new(trained, options.needs.mask),
             signals,
             candidates: Candidates::new(options.needs.candidates),
@@ -209,8 +209,8 @@ impl CpuBackend {
     /// Runs a training step on a thread of the pool.
     fn step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
         let StepInput { camera, target, background, exposure, .. } = *input;
-        let behind = exposure.map_or(background, |exposure| exposure.behind(background));
-        let frame = self.forward(camera, behind, input.sh_degree, Beside::Nothing, None)?;
+        let unexposed = exposure.map_or(background, |exposure| exposure.behind(background));
+        let frame = self.forward(camera, unexposed, input.sh_degree, DepthPlane::Unused, None)?;
         if let Some(exposure) = exposure {
             self.expose(&frame.grid, exposure);
         }
@@ -308,7 +308,7 @@ impl Backend for CpuBackend {
     }
 
     fn audit(&mut self) -> Result<Vec<NonFinite>, BackendError> {
-        Ok(self.unsound())
+        Ok(self.find_non_finite())
     }
 
     fn render(
@@ -317,7 +317,7 @@ impl Backend for CpuBackend {
         background: [f32; 3],
         sh_degree: u8,
     ) -> Result<Rendering, BackendError> {
-        let frame = self.forward(camera, background, sh_degree, Beside::Depth, None)?;
+        let frame = self.forward(camera, background, sh_degree, DepthPlane::Depth, None)?;
         Ok(self.rendering(&frame))
     }
 
@@ -372,7 +372,7 @@ impl Inspect for CpuBackend {
         colours: &[[f32; 3]],
     ) -> Result<Rendering, BackendError> {
         assert_eq!(colours.len(), self.rows, "one colour per row");
-        let frame = self.forward(camera, background, 0, Beside::Depth, Some(colours))?;
+        let frame = self.forward(camera, background, 0, DepthPlane::Depth, Some(colours))?;
         Ok(self.rendering(&frame))
     }
 
@@ -381,7 +381,7 @@ impl Inspect for CpuBackend {
     }
 
     fn render_counts(&mut self, camera: &Camera) -> Result<Rendering, BackendError> {
-        let frame = self.forward(camera, [0.0; 3], 0, Beside::Count, None)?;
+        let frame = self.forward(camera, [0.0; 3], 0, DepthPlane::RowCount, None)?;
         Ok(self.rendering(&frame))
     }
 }

@@ -51,9 +51,9 @@ impl Moments {
 
     /// Allocated bytes.
     #[cfg(test)]
-    pub(super) fn held(&self) -> u64 {
-        let wide: u64 = self.wide.iter().map(Blocks::held).sum();
-        wide + self.ratios.held() + self.seconds.held()
+    pub(super) fn allocated_bytes(&self) -> u64 {
+        let wide: u64 = self.wide.iter().map(Blocks::allocated_bytes).sum();
+        wide + self.ratios.allocated_bytes() + self.seconds.allocated_bytes()
     }
 
     /// The first row with moments.

@@ -1,4 +1,4 @@
-//! Auxiliary views: training views that are rendered for a policy's event and measured row by row.
+//! Auxiliary views: training views that are rendered for a policy's event, with statistics per Gaussian.
 //!
 //! Blending is replayed front to back with the arithmetic of the forward pass. Each row's sums over the pixels that
 //! it is blended into, and its largest weight, go to one record per (row, tile); these are added in order of tile
@@ -15,7 +15,7 @@ use super::loss::ImageTerms;
 use super::passes::{Frame, for_each_pixel, scalars};
 use super::project::Splat;
 use super::rasterize::{
-    ALPHA_MAX, Beside, Blending, DARK, PATCHES, Plane, TRANSMITTANCE, TilePlace,
+    ALPHA_MAX, Blending, DARK, DepthPlane, PATCHES, Plane, TRANSMITTANCE, TilePlace,
 };
 use super::rasterize_bwd::gather_all;
 use super::records::{Sums, TileRecords, parts};
@@ -24,21 +24,21 @@ use super::tiles::{Entry, Grid, Visible};
 use super::{AuxInput, AuxOutput, BackendError, CpuBackend};
 use crate::assert_same_size;
 use crate::candidates::Photograph;
-use crate::pixel_map::{draw_pixels, pixel_map, radius_px};
+use crate::pixel_map::{pixel_map, radius_px, sample_pixels};
 use densify_core::image::Image8;
 
-/// Values per record: sums of the map, of pixels, of weights and of distances, and the largest weight.
+/// Values per record: sum of the pixel map, number of pixels, sum of blend weights, sum of distances, largest weight.
 const STRIDE: usize = 5;
 /// The index of the largest weight, the only value that is not a sum.
 const MAXIMUM: usize = STRIDE - 1;
 /// The plane of a tile's gradient that temporarily holds the pixel map.
 const MAP: usize = 3;
 
-/// Bytes for an image of `pixels` pixels: colours, error, edge and luma, and the drawing of points.
+/// Bytes for an image of `pixels` pixels: colours, error, edge and luma, and the sampling of points.
 pub(super) fn bytes(request: &AuxRequest, pixels: usize) -> u64 {
-    let drawing =
+    let sampling =
         if request.points > 0 { 2 * size_of::<f32>() + size_of::<(f64, u32)>() } else { 0 };
-    (pixels * (5 * size_of::<f32>() + 1 + drawing)) as u64
+    (pixels * (5 * size_of::<f32>() + 1 + sampling)) as u64
         + u64::from(request.points) * size_of::<Candidate>() as u64
 }
 
@@ -46,11 +46,11 @@ impl CpuBackend {
     /// Renders and measures a view.
     pub(super) fn observe_view(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {
         let AuxInput { camera, target, background, exposure, request, .. } = *input;
-        let behind = exposure.map_or(background, |exposure| exposure.behind(background));
+        let unexposed = exposure.map_or(background, |exposure| exposure.behind(background));
         assert_same_size(camera, target);
         // Stage times remain those of training.
         let clock = std::mem::take(&mut self.clock);
-        let frame = self.forward(camera, behind, input.sh_degree, Beside::Nothing, None);
+        let frame = self.forward(camera, unexposed, input.sh_degree, DepthPlane::Unused, None);
         let measured = frame.map(|frame| {
             if let Some(exposure) = exposure {
                 self.expose(&frame.grid, exposure);
@@ -58,7 +58,7 @@ impl CpuBackend {
             let loss =
                 scalars(self.image_loss(&frame.grid, target, background, ImageTerms::default()))
                     .loss;
-            let points = self.draw_points(&frame, input);
+            let points = self.sample_points(&frame, input);
             let columns = if request.columns.is_empty() {
                 Vec::new()
             } else {
@@ -75,8 +75,8 @@ impl CpuBackend {
         measured
     }
 
-    /// The surface points of pixels drawn in proportion to their alpha.
-    fn draw_points(&mut self, frame: &Frame, input: &AuxInput<'_>) -> Vec<Candidate> {
+    /// The surface points of pixels sampled in proportion to their alpha.
+    fn sample_points(&mut self, frame: &Frame, input: &AuxInput<'_>) -> Vec<Candidate> {
         if input.request.points == 0 {
             return Vec::new();
         }
@@ -87,7 +87,7 @@ impl CpuBackend {
                 alpha[at] = 1.0 - canvas.planes[TRANSMITTANCE][patch][lane];
             });
         }
-        let pixels = draw_pixels(&alpha, grid.width, input);
+        let pixels = sample_pixels(&alpha, grid.width, input);
         let AuxInput { target, background, exposure, .. } = *input;
         let photograph = Photograph { target, background, exposure };
         self.surface_points(frame, photograph, &pixels, DepthMode::MaxWeight)
@@ -167,8 +167,9 @@ impl CpuBackend {
 
 /// The [radius](radius_px) of a splat `[px]`.
 fn radius(splat: &Splat) -> f32 {
-    let unfold = super::project::FOLD;
-    radius_px(unfold / splat.l1, splat.shear, unfold / splat.l3)
+    // The splat's conic factor is scaled.
+    let scale = super::project::EXPONENT_SCALE;
+    radius_px(scale / splat.l1, splat.shear, scale / splat.l3)
 }
 
 /// Replays the blending of one tile.
@@ -180,7 +181,7 @@ struct Replay<'a> {
     /// The settings of the forward pass.
     blending: Blending,
     map: &'a Plane,
-    /// The records of the tile's own entries, as far as they are held.
+    /// The records of this tile's entries; entries outside the current part have none.
     records: TileRecords<'a>,
 }
 

@@ -18,13 +18,13 @@ use super::project_bwd::BlockGradient;
 use super::rasterize_bwd::field;
 use super::regularise::{Noise, Terms};
 use super::simd::WIDTH;
-use super::summed::{Due, TaskSums};
+use super::summed::{Stepping, TaskSums};
 use crate::LearningRates;
 use crate::signals::{Field, RecordLayout, SignalPlanes};
 use densify_core::gaussians::sh_coefficients;
 
-/// Tolerance of a quaternion's squared length where it is stored in fewer bits. Normalised and rounded at each step,
-/// a row at rest would rotate randomly.
+/// Tolerance of a quaternion's squared length where it is stored in fewer bits. If it were normalised and rounded at
+/// each step, even a row without a gradient would rotate randomly.
 const NARROW_SLACK: f32 = 1.0 / 16.0;
 
 /// An optimiser step for consecutive blocks.
@@ -34,7 +34,7 @@ pub(super) struct Optimise<'a> {
     /// Random numbers for stochastic rounding.
     pub(super) storing: &'a PolicyRng,
     pub(super) ages: &'a mut [u16],
-    /// Signal accumulators of these blocks; empty without any.
+    /// Signal accumulators of these blocks; empty if there are none.
     pub(super) signals: &'a mut [f32],
     pub(super) planes: SignalPlanes,
     /// Pixels in which each row has the largest weight; empty if they are not counted. Shape: `[rows]`.
@@ -51,13 +51,13 @@ pub(super) struct Optimise<'a> {
     pub(super) masks: Option<MaskTask<'a>>,
     /// Gradients kept for a later step.
     pub(super) summed: TaskSums<'a>,
-    /// The parameters that step now.
-    pub(super) due: Due,
+    /// The parameter groups that step now.
+    pub(super) due: Stepping,
     /// Loss terms of every row, if there are any.
     pub(super) terms: Option<Terms>,
     /// Noise on the means, if there is any.
     pub(super) noise: Option<Noise>,
-    /// The first row of the first block, and from there on the numbers of frozen rows and of all rows.
+    /// The first row of the first block; the numbers of frozen rows and of all rows, counted from it.
     pub(super) first_row: usize,
     pub(super) frozen: usize,
     pub(super) rows: usize,
@@ -143,7 +143,7 @@ impl WithSimd for Optimise<'_> {
                     noise.add(params, first, self.rows.saturating_sub(b * WIDTH).min(WIDTH));
                 }
             }
-            // Terms, masks, noise and limits also changed frozen rows.
+            // Loss terms, masks, noise and clamping have also changed the frozen rows of this block.
             if frozen > 0 {
                 for plane in (0..trained * WIDTH).step_by(WIDTH) {
                     params[plane..plane + frozen].copy_from_slice(&kept.0[plane..plane + frozen]);

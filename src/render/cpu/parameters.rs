@@ -71,8 +71,8 @@ impl Parameters {
 
     /// Allocated bytes.
     #[cfg(test)]
-    pub(super) fn held(&self) -> u64 {
-        self.wide.held() + self.fixed.held() + self.half.held()
+    pub(super) fn allocated_bytes(&self) -> u64 {
+        self.wide.allocated_bytes() + self.fixed.allocated_bytes() + self.half.allocated_bytes()
     }
 
     /// Numbers per row.
@@ -127,7 +127,7 @@ impl Parameters {
         self.half.edit(edit);
     }
 
-    /// Stores a host model; `self` must have room for its rows, and its number of planes.
+    /// Stores a host model; `self` must have room for its rows, and the same number of planes.
     pub(super) fn pack(&mut self, model: &Gaussians) {
         for row in 0..model.len() {
             self.set_n(row, plane::MEAN, model.means[row]);

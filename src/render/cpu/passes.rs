@@ -14,8 +14,8 @@ use super::loss::{ImageTerms, LossValue};
 use super::optimise::Optimise;
 use super::project::{Project, ViewParams};
 use super::rasterize::{
-    Beside, Blending, CANVAS_PLANES, DARK, DEPTH, Rasterize, TRANSMITTANCE, TileCanvas, TilePlace,
-    in_plane,
+    Blending, CANVAS_PLANES, DARK, DEPTH, DepthPlane, Rasterize, TRANSMITTANCE, TileCanvas,
+    TilePlace, in_plane,
 };
 use super::rasterize_bwd::{RasterizeBwd, TileGradient, gather};
 use super::records::{Sums, parts as parts_of_records};
@@ -42,7 +42,7 @@ pub(super) struct Frame {
 impl CpuBackend {
     pub(super) fn resize_images(&mut self, grid: &Grid) {
         let tiles = grid.tiles();
-        // Never shrinks, so that views of alternating sizes do not initialise the rest again and again.
+        // Never shrinks, so that views of alternating sizes do not initialise the difference again and again.
         if self.canvas.len() < tiles {
             self.canvas.resize(tiles, TileCanvas::EMPTY);
             self.gradient.resize(tiles, TileGradient { planes: [DARK; 5] });
@@ -65,14 +65,14 @@ impl CpuBackend {
         value
     }
 
-    /// Stages 1–3, with `colours` instead of the rows' own, if given. Afterwards the canvas holds the image and, if there
+    /// Stages 1–3; `colours`, if given, replace the rows' own. Afterwards the canvas holds the image and, if there
     /// is only one band, the lists hold its entries.
     pub(super) fn forward(
         &mut self,
         camera: &Camera,
         background: [f32; 3],
         sh_degree: u8,
-        beside: Beside,
+        depth_plane: DepthPlane,
         colours: Option<&[[f32; 3]]>,
     ) -> Result<Frame, BackendError> {
         if camera.width > MAX_SIDE || camera.height > MAX_SIDE {
@@ -140,7 +140,7 @@ impl CpuBackend {
                         list: lists.of_tile(i),
                         place: TilePlace::new(&grid, band.start + i),
                         background,
-                        beside,
+                        depth_plane,
                         dominant,
                         blending,
                         canvas,
@@ -255,7 +255,7 @@ impl CpuBackend {
         self.candidates.list.extend(points);
     }
 
-    /// The surface points of pixels (x, y, error) of the view, in order, without pixels that show no surface.
+    /// The surface points of pixels (x, y, error) of the view, in order; pixels without a surface are skipped.
     pub(super) fn surface_points(
         &mut self,
         frame: &Frame,

@@ -1,10 +1,10 @@
-//! Stage 1: rows to splats. Each row's Gaussian is projected onto the image (EWA splatting; Zwicker
+//! Stage 1: from rows to splats. Each row's Gaussian is projected onto the image (EWA splatting; Zwicker
 //! et al. 2001, Kerbl et al. 2023, section 4) and its colour evaluated for the view.
 //!
 //! Numerics. With V = J·W·R·S (2×3, rows v₀ and v₁) the projected covariance is Σ = V·Vᵀ + 0.3·I.
 //! - Its determinant comes from the Lagrange identity |v₀ × v₁|² + 0.3(|v₀|² + |v₁|²) + 0.09: all
 //!   terms are positive, whereas a·c − b² loses all precision for needles with an aspect ratio above 1,000:1.
-//! - Its inverse is kept as the Cholesky factor L, Σ⁻¹ = L·Lᵀ: with (u, z) = Lᵀ·d the exponent is
+//! - Its inverse is stored as the Cholesky factor L, Σ⁻¹ = L·Lᵀ: with (u, z) = Lᵀ·d the exponent is
 //!   −½(u² + z²), never positive. L = [[l₁, 0], `[−l₁·r, l₃]`], l₁ = √(c/det), r = b/c, l₃ = 1/√c.
 //!   Inside a splat's footprint the error of u does not depend on which axis is eliminated; the
 //!   choice here makes z constant along an image row.
@@ -28,11 +28,11 @@ pub(super) const BLUR: f32 = 0.3;
 /// Margin around the image, as a fraction of its size, beyond which the direction used in J is clamped:
 /// 0.15 = 0.3/2 (the original clamps at 1.3 tan(fov/2)).
 const FOV_MARGIN: f64 = 0.15;
-/// Rows with a larger colour are broken and are not drawn: added to a pixel, such a colour would leave no bits of
+/// Rows with a larger colour are broken and are not rendered: added to a pixel, such a colour would leave no bits of
 /// precision for the other rows.
 const COLOUR_MAX: f32 = 1e6;
-/// √(½·log₂ e): folded into the conic so that exp(−p) becomes 2^(−u² − z²).
-pub(crate) const FOLD: f32 = 0.849_321_8;
+/// √(½·log₂ e): the conic factors are scaled by it, so that exp(−p) becomes 2^(−u² − z²).
+pub(crate) const EXPONENT_SCALE: f32 = 0.849_321_8;
 
 /// A camera in the form that the kernels use.
 #[derive(Debug, Clone, Copy)]
@@ -80,11 +80,11 @@ impl ViewParams {
 pub(super) struct Splat {
     /// Projected mean `[px]`.
     pub(super) mean: [f32; 2],
-    /// Folded conic factor: l₁·FOLD `[1/px]`, >= 0.
+    /// Scaled conic factor: l₁·EXPONENT_SCALE `[1/px]`, >= 0.
     pub(super) l1: f32,
     /// Shear r = Σ₀₁/Σ₁₁.
     pub(super) shear: f32,
-    /// Folded conic factor: l₃·FOLD `[1/px]`, > 0.
+    /// Scaled conic factor: l₃·EXPONENT_SCALE `[1/px]`, > 0.
     pub(super) l3: f32,
     /// log₂ of the opacity, <= 0.
     pub(super) log2_opacity: f32,
@@ -107,7 +107,7 @@ pub(super) struct Splat {
     pub(super) tiles: u32,
 }
 
-/// Numbers of a [`Splat`].
+/// Number of values in a [`Splat`].
 const SPLAT_FIELDS: usize = 16;
 
 /// Intermediate results of the forward projection that the backward pass uses too.
@@ -211,7 +211,7 @@ fn difference_of_products<S: Simd>(a: V<S>, b: V<S>, c: V<S>, d: V<S>) -> V<S> {
     a.mul_add(b, -cd) + error
 }
 
-/// Unfolded conic factor (l₁, r, l₃).
+/// Conic factor (l₁, r, l₃), not scaled.
 #[inline(always)]
 pub(super) fn conic<S: Simd>(g: &Geometry<S>) -> [V<S>; 3] {
     let [_, b, d] = g.cov;
@@ -276,7 +276,7 @@ fn below<S: Simd>(x: V<S>, most: f32) -> Mask<S> {
 }
 
 /// True if a splat reaches any pixel centre (½ to size − ½). False for NaN, so that rows with NaN are not
-/// drawn.
+/// rendered.
 #[inline(always)]
 fn reaches<S: Simd>(s: S, centre: V<S>, half: V<S>, size: u32) -> Mask<S> {
     let last = V::splat(s, size as f32 - 0.5);
@@ -329,7 +329,7 @@ impl WithSimd for Project<'_> {
                     continue;
                 }
                 let [l1, shear, l3] = conic(&g);
-                let radius = reach.max(V::zero(s)).sqrt() * (1.0 / FOLD);
+                let radius = reach.max(V::zero(s)).sqrt() * (1.0 / EXPONENT_SCALE);
                 let half_width = radius * g.cov[0].sqrt();
                 let half_height = radius * g.cov[2].sqrt();
                 let u =
@@ -356,15 +356,15 @@ impl WithSimd for Project<'_> {
                     mean: [u, v],
                     half_sides: [half_width, half_height],
                     shear,
-                    l3: l3 * FOLD,
-                    inv_l1: V::splat(s, 1.0 / FOLD) / l1,
+                    l3: l3 * EXPONENT_SCALE,
+                    inv_l1: V::splat(s, 1.0 / EXPONENT_SCALE) / l1,
                     peak: g.cov[1] / g.cov[0] * half_width,
                     reach,
                 };
                 let fields = [
                     u,
                     v,
-                    l1 * FOLD,
+                    l1 * EXPONENT_SCALE,
                     shear,
                     ellipse.l3,
                     log2_opacity,

@@ -1,12 +1,12 @@
-//! Stage 6: splat gradients to parameter gradients.
+//! Stage 6: from splat gradients to parameter gradients.
 //!
 //! The forward projection is evaluated again instead of stored. With the sums of stage 5 in
 //! whitened coordinates, M = Σ q·[u z]ᵀ[u z], the covariance's gradient is G = ½·L·M·Lᵀ. It is not
 //! formed: for a needle 1,000 px long its entries cancel along the needle's axis. With
 //! W = Lᵀ·V, whose entries are at most 1, and wₖ its columns (one per axis of the Gaussian),
 //! - dL/d(log sₖ) = wₖᵀ·M·wₖ,
-//! - the gradient by a rotation about local axis x is nᵧᵀ·M·n_z·(sᵧ² − s_z²), wₖ = sₖ·nₖ, and cyclically for
-//!   the others; it vanishes exactly for a sphere, and maps to the quaternion as 2/|q|·q̂⊗(0, g), which
+//! - the gradient with respect to a rotation about local axis x is nᵧᵀ·M·n_z·(sᵧ² − s_z²), wₖ = sₖ·nₖ, and cyclically
+//!   for the others; it vanishes exactly for a sphere, and maps to the quaternion as 2/|q|·q̂⊗(0, g), which
 //!   is orthogonal to q,
 //! - dL/dV = L·M·W leads on to J and the mean.
 //!
@@ -16,8 +16,8 @@ use pulp::Simd;
 
 use super::blocks::plane;
 use super::project::{
-    FOLD, Geometry, ViewParams, conic, direction, dot, geometry, lanes, raw_colour, rotation,
-    sh_basis,
+    EXPONENT_SCALE, Geometry, ViewParams, conic, direction, dot, geometry, lanes, raw_colour,
+    rotation, sh_basis,
 };
 use super::rasterize_bwd::field;
 use super::simd::{V, WIDTH, each};
@@ -115,12 +115,12 @@ impl BlockGradient {
 
         let g = geometry(s, block, at, view);
         let [l1, shear, l3] = conic(&g);
-        // Out of the folded units of the rasteriser.
-        let unfold = 1.0 / FOLD;
-        let (q, qu, qz) = (sum!(field::Q), sum!(field::U) * unfold, sum!(field::Z) * unfold);
-        let unfold2 = unfold * unfold;
+        // Undo the scaling of the conic in the rasteriser's sums.
+        let unscale = 1.0 / EXPONENT_SCALE;
+        let (q, qu, qz) = (sum!(field::Q), sum!(field::U) * unscale, sum!(field::Z) * unscale);
+        let unscale2 = unscale * unscale;
         let (muu, muz, mzz) =
-            (sum!(field::UU) * unfold2, sum!(field::UZ) * unfold2, sum!(field::ZZ) * unfold2);
+            (sum!(field::UU) * unscale2, sum!(field::UZ) * unscale2, sum!(field::ZZ) * unscale2);
 
         seen.keep(g.inv_z).store(&mut self.inv_z[at..]);
         // Projected mean: L·Σ q·(u, z).
@@ -129,9 +129,9 @@ impl BlockGradient {
             seen.keep(x).store(&mut slot[at..]);
         }
         if layout.has(Field::AbsX) {
-            // The sums hold Σ|q·u'| and Σ|q·(l3'·z' − l1'·shear·u')| with folded u', z', l'.
+            // The sums hold Σ|q·u'| and Σ|q·(l3'·z' − l1'·shear·u')| with scaled u', z', l'.
             let abs =
-                [l1 * sum!(Field::AbsX.number()) * unfold, sum!(Field::AbsY.number()) * unfold2];
+                [l1 * sum!(Field::AbsX.number()) * unscale, sum!(Field::AbsY.number()) * unscale2];
             for (slot, x) in self.mean2d_abs.iter_mut().zip(abs) {
                 seen.keep(x).store(&mut slot[at..]);
             }

@@ -1,8 +1,8 @@
-//! Stage 3: tile lists to pixels. Front to back alpha blending (Kerbl et al. 2023, section 3 and
+//! Stage 3: from tile lists to pixels. Front to back alpha blending (Kerbl et al. 2023, section 3 and
 //! appendix C): alpha = min(0.99, o·exp(−p)), skipped below 1/255. A pixel is finished before the first
-//! splat that would reduce its transmittance to 1e-4 or below. Both limits are knobs ([`Blending`]).
+//! splat that would reduce its transmittance to 1e-4 or below. Both limits can be set ([`Blending`]).
 //!
-//! A task draws one tile. It processes one batch of splats after another, and for each batch one patch of 4×4 pixels
+//! A task renders one tile. It processes one batch of splats after another, and for each batch one patch of 4×4 pixels
 //! after another. A patch is a vector that stays in registers while the batch is blended into it. Most splats are a
 //! few pixels wide, and patches cover them with a third fewer vectors than rows of sixteen pixels do. In
 //! the coordinates (u, z) = Lᵀ·d the exponent is e = log₂o − u² − z²; from patch to patch u and z only
@@ -39,13 +39,13 @@ impl From<Shortcuts> for Blending {
 
 /// The quantity accumulated in the depth plane.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Beside {
+pub(super) enum DepthPlane {
     /// Nothing.
-    Nothing,
+    Unused,
     /// Depth, weighted as in blending.
     Depth,
     /// The number of rows.
-    Count,
+    RowCount,
 }
 
 /// Planes of a rendered tile: red, green, blue, final transmittance, depth.
@@ -153,7 +153,7 @@ pub(super) struct Rasterize<'a> {
     pub(super) list: &'a [AtomicU64],
     pub(super) place: TilePlace,
     pub(super) background: [f32; 3],
-    pub(super) beside: Beside,
+    pub(super) depth_plane: DepthPlane,
     /// The number of pixels in which each row has the largest blend weight, to which the tile adds its pixels; empty
     /// if they are not counted. Integers, so that the order of tiles does not matter.
     pub(super) dominant: &'a [AtomicU32],
@@ -168,7 +168,7 @@ impl WithSimd for Rasterize<'_> {
     fn with_simd<S: Simd>(self, s: S) {
         // Halves or quarters of a patch are processed in pairs, so that common values are loaded once. The rarely
         // used features share one kernel.
-        let with_more = self.beside != Beside::Nothing || !self.dominant.is_empty();
+        let with_more = self.depth_plane != DepthPlane::Unused || !self.dominant.is_empty();
         match (with_more, matches!(S::F32_LANES, 4 | 8)) {
             (true, true) => self.blend::<S, true, 2>(s),
             (true, false) => self.blend::<S, true, 1>(s),
@@ -183,8 +183,8 @@ impl Rasterize<'_> {
     #[inline(always)]
     #[expect(clippy::too_many_lines, reason = "a numeric kernel")]
     fn blend<S: Simd, const WITH_MORE: bool, const N: usize>(self, s: S) {
-        let Self { splats, list, place, background, dominant, canvas, blending, beside } = self;
-        let counts = beside == Beside::Count;
+        let counts = self.depth_plane == DepthPlane::RowCount;
+        let Self { splats, list, place, background, dominant, canvas, blending, .. } = self;
         let c = |x: f32| V::splat(s, x);
         let (faintest, least_light) = (c(-blending.log2_reach), c(blending.transmittance_min));
         let (zero, never) = (V::zero(s), c(-1.0));

@@ -1,4 +1,4 @@
-//! Stage 5: pixel gradients to splat gradients, one record per (row, tile) entry.
+//! Stage 5: from pixel gradients to splat gradients, one record per (row, tile) entry.
 //!
 //! Each tile's list is walked back to front. For pixel x and splat i with blend weight w = α·T,
 //! the derivative of Σ g·C is dL/dα = T·(c·g − b), where b is the gradient-weighted colour of
@@ -51,7 +51,7 @@ mod extra {
     pub(super) const WEIGHTS: u8 = 2;
     /// The largest weight.
     pub(super) const LARGEST: u8 = 4;
-    /// The sum of the weighted error, in addition to the two above.
+    /// The sum of the weighted error, together with the two above.
     pub(super) const ERROR: u8 = 8 | WEIGHTS | LARGEST;
     pub(super) const ERROR_ABS: u8 = ERROR | ABS;
     /// Everything except the error, with the gradients of alpha and depth.
@@ -78,10 +78,10 @@ pub(super) struct RasterizeBwd<'a> {
     pub(super) canvas: &'a TileCanvas,
     pub(super) upstream: &'a TileGradient,
     pub(super) layout: RecordLayout,
-    /// The records of the tile's own entries, as far as they are held.
+    /// The records of this tile's entries; entries outside the current part have none.
     pub(super) records: TileRecords<'a>,
     /// Scratch.
-    pub(super) blended: &'a mut Blended,
+    pub(super) blended: &'a mut BlendedBatch,
 }
 
 impl WithSimd for RasterizeBwd<'_> {
@@ -132,13 +132,13 @@ impl WithSimd for RasterizeBwd<'_> {
     }
 }
 
-/// The most (splat, patch) pairs of a batch.
+/// Maximum number of (splat, patch) pairs in a batch.
 const PAIRS: usize = BATCH * PATCHES;
 
-/// Results of the first walk over a batch, pair after pair and patch by patch.
+/// Results of the first walk over a batch, one for each (splat, patch) pair, patch by patch.
 #[derive(Zeroable)]
 #[repr(C, align(64))]
-pub(super) struct Blended {
+pub(super) struct BlendedBatch {
     alpha: [[f32; WIDTH]; PAIRS],
     /// α·Π(1 − α), the product over the splats of the batch in front.
     weight: [[f32; WIDTH]; PAIRS],
@@ -168,7 +168,7 @@ impl RasterizeBwd<'_> {
     ) -> [usize; PATCHES] {
         let c = |x: f32| V::splat(s, x);
         let faintest = c(-self.blending.log2_reach);
-        let Blended { alpha: alphas, weight: weights } = &mut *self.blended;
+        let BlendedBatch { alpha: alphas, weight: weights } = &mut *self.blended;
         let mut ends = [0; PATCHES];
         let mut start = 0;
         for p in 0..PATCHES {
@@ -195,7 +195,7 @@ impl RasterizeBwd<'_> {
                     product = alpha.neg_mul_add(product, product);
                     pair += 1;
                 }
-                // Where the product underflows, so has the transmittance behind.
+                // Where the product underflows, the transmittance behind has underflowed too.
                 let light = &mut light[p][at..];
                 (V::load(s, light) / product.max(c(f32::MIN_POSITIVE))).store(light);
             }

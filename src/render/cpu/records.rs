@@ -2,10 +2,10 @@
 //!
 //! If every entry of the lists has a record, it is stored in the entry's slot, so that the records of a row are
 //! adjacent. However, records take three quarters of the memory of an entry and are only needed until they are
-//! summed. With fewer records, a band is processed in parts: runs of tiles whose records are in the order of the
-//! lists, and which each row sums up before the next part. A tile with more entries than records is processed once
-//! for each piece of its list. A row's records are always added in order of tile number, so that parts, like bands,
-//! cost time but change no bit.
+//! summed. With fewer records, a band is processed in parts, each a run of tiles: its records are written in the order
+//! of the lists and added to the sums of their rows before the next part. A tile with more entries than records is
+//! processed once for each piece of its list. A row's records are always added in order of tile number, so that parts,
+//! like bands, cost time but do not change the result.
 
 use std::ops::Range;
 use std::sync::atomic::AtomicU32;
@@ -17,7 +17,7 @@ use super::threads::Threads;
 use super::tiles::{Entry, TileLists};
 use super::{BLOCKS_PER_TASK, ROWS_PER_TASK};
 
-/// Entries of a band whose records are held at the same time.
+/// Entries of a band whose records are in memory at the same time.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Part {
     /// The tiles of these entries.
@@ -83,7 +83,7 @@ fn divide(firsts: &[u32], cap: usize) -> Vec<Part> {
         let fit = firsts[start + 1..].partition_point(|&first| first as usize - from <= cap);
         let end = start + fit.max(1);
         let mut entries = from..firsts[end] as usize;
-        // More than one part only for a single tile with more than `cap` entries.
+        // Gives several parts only if this is a single tile with more than `cap` entries.
         while !entries.is_empty() {
             let some = entries.start..entries.end.min(entries.start + cap);
             entries.start = some.end;

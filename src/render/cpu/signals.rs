@@ -60,7 +60,7 @@ impl SignalPlanes {
                 };
             }
             let mean = each!(i in 3 => lanes(s, &g.params, plane::MEAN + i, at));
-            // Infinite, and so clamped to 1, if all depths count in full.
+            // Infinite, and therefore clamped to 1, if all depths have full weight.
             let one = V::splat(s, 1.0);
             let depth = (one / (line!(g.inv_z) * self.full_depth)).min(one);
             let weight = depth * depth;
@@ -95,7 +95,7 @@ impl SignalPlanes {
                     Signal::DepthMin => seen.keep(line!(g.inv_z)),
                     Signal::PixelSizeMin => seen.keep(line!(g.inv_z) * focal),
                     Signal::DominantPixels => line!(g.dominant) * per_pixel,
-                    // Read from the row when the policy is due.
+                    // Computed from the row when the policy reads its signals.
                     Signal::Opacity
                     | Signal::ScaleMax
                     | Signal::ScaleProduct
@@ -218,7 +218,7 @@ impl Accumulators {
     }
 }
 
-/// The value of a signal that follows from the row's present state.
+/// The value of a signal that depends only on the row's current state.
 fn present(
     signal: Signal,
     row: usize,

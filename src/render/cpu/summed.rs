@@ -2,8 +2,8 @@
 //! iteration ([`Cadence`]). Other policies need no buffer and pay nothing.
 //!
 //! A step uses the sum of the gradients of all views since the last one. SH bands 1–3 may
-//! step less often than all other parameters; they then have ages of their own, as Adam's bias
-//! correction counts steps.
+//! step less often than all other parameters; they then need their own step counts per row
+//! (ages), because Adam's bias correction depends on the number of steps.
 
 use std::ops::Range;
 
@@ -17,26 +17,34 @@ use crate::{StateError, StepInput, Tensor};
 
 /// The sums of the trainable rows.
 #[derive(Debug)]
-pub(super) struct Summed {
+pub(super) struct GradientSums {
     longest: Cadence,
     /// First parameter plane that is summed.
     first: usize,
     sums: Blocks,
-    /// Optimiser steps of bands 1–3 in one plane, if they may differ from those of other parameters.
+    /// Number of optimiser steps of bands 1–3, per row; has no plane if it is always that of the other parameters.
     rest_ages: Blocks<u16>,
-    /// The parameter groups whose sums wait for a step.
-    pending: Due,
+    waiting: Waiting,
 }
 
-/// The parameter groups that step, or that wait.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(super) struct Due {
+/// The parameter groups that step now.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Stepping {
     /// All but bands 1–3.
     pub(super) main: bool,
     /// Bands 1–3.
     pub(super) rest: bool,
-    /// True if sums were waiting before this step: main parameters, bands 1–3.
-    waited: [bool; 2],
+    /// The groups whose sums were waiting before this step.
+    had_sums: Waiting,
+}
+
+/// The parameter groups whose sums wait for a step.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+struct Waiting {
+    /// All but bands 1–3.
+    main: bool,
+    /// Bands 1–3.
+    rest: bool,
 }
 
 /// The sums of one task's rows.
@@ -60,7 +68,7 @@ fn first_plane(planes: usize, longest: Cadence) -> usize {
     }
 }
 
-impl Summed {
+impl GradientSums {
     pub(super) fn new(rows: Range<usize>, planes: usize, longest: Cadence) -> Self {
         let first = first_plane(planes, longest);
         Self {
@@ -68,7 +76,7 @@ impl Summed {
             first,
             sums: Blocks::zeros(rows.clone(), planes - first),
             rest_ages: Blocks::zeros(rows, usize::from(longest.sh_rest > 1)),
-            pending: Due::default(),
+            waiting: Waiting::default(),
         }
     }
 
@@ -85,12 +93,12 @@ impl Summed {
     ///
     /// # Panics
     /// When the cadence was not declared: a bug in the caller that would lose gradients.
-    pub(super) fn advance(&mut self, input: &StepInput<'_>) -> Due {
+    pub(super) fn advance(&mut self, input: &StepInput<'_>) -> Stepping {
         let (step, cadence) = (input.step, input.cadence);
         assert!(cadence.is_within(self.longest), "step {step}: {cadence:?} was not declared");
         let [main, rest] = cadence.steps_at(step);
-        let due = Due { main, rest, waited: [self.pending.main, self.pending.rest] };
-        self.pending = Due { main: !main, rest: !rest, waited: [false; 2] };
+        let due = Stepping { main, rest, had_sums: self.waiting };
+        self.waiting = Waiting { main: !main, rest: !rest };
         due
     }
 
@@ -129,7 +137,7 @@ impl Summed {
                 Tensor::f32(name, &shape, self.sums.to_rows(rows, 0..planes))
             }
             WAITING => {
-                let Due { main, rest, .. } = self.pending;
+                let Waiting { main, rest } = self.waiting;
                 Tensor::u8(name, &[2], vec![u8::from(main), u8::from(rest)])
             }
             _ => Tensor::u16(name, &[rows.len()], self.rest_ages.to_rows(rows, 0..1)),
@@ -153,7 +161,7 @@ impl Summed {
             Some(&WAITING) => {
                 let waiting = tensor.into_u8(&[2])?;
                 let [main, rest] = [0, 1].map(|i| waiting[i] != 0);
-                self.pending = Due { main, rest, waited: [false; 2] };
+                self.waiting = Waiting { main, rest };
             }
             Some(_) => {
                 let ages = tensor.into_u16(&[rows.len()])?;
@@ -176,10 +184,10 @@ impl Summed {
     }
 }
 
-impl Due {
-    /// Returns whether gradients are added to the sums or taken from them.
+impl Stepping {
+    /// True if a step adds to the sums or takes from them, that is, unless every group steps and no sums were waiting.
     pub(super) fn uses_sums(self) -> bool {
-        !self.main || !self.rest || self.waited != [false; 2]
+        !self.main || !self.rest || self.had_sums != Waiting::default()
     }
 }
 
@@ -196,16 +204,16 @@ impl TaskSums<'_> {
         block: usize,
         gradient: &mut [f32],
         trained: usize,
-        due: Due,
+        due: Stepping,
     ) -> bool {
         let sums = self.sums.block(block);
         let classes = [
-            (0..trained.min(plane::SH_REST), due.main, due.waited[0]),
-            (plane::SH_REST..trained, due.rest, due.waited[1]),
+            (0..trained.min(plane::SH_REST), due.main, due.had_sums.main),
+            (plane::SH_REST..trained, due.rest, due.had_sums.rest),
         ];
         let mut changed = false;
-        for (planes, steps, waited) in classes {
-            if planes.start < self.first || planes.is_empty() || (steps && !waited) {
+        for (planes, steps, had_sums) in classes {
+            if planes.start < self.first || planes.is_empty() || (steps && !had_sums) {
                 continue;
             }
             let values = &mut gradient[planes.start * WIDTH..planes.end * WIDTH];

@@ -65,7 +65,7 @@ impl Threads {
         self.recorder.get().map(Recorder::tasks).unwrap_or_default()
     }
 
-    /// Runs a whole step on a thread of the pool, so that its regions need not be handed over one by one.
+    /// Runs a whole step on a thread of the pool, so that its regions need not be submitted to the pool one by one.
     pub(super) fn step<R: Send>(&self, run: impl FnOnce() -> R + Send) -> R {
         self.install(|| {
             let Some(recorder) = self.recorder.get() else { return run() };
@@ -223,7 +223,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn tasks_are_recorded_by_region_and_change_nothing() {
+    fn recording_lists_tasks_by_region_and_changes_no_results() {
         let threads = Threads::new(Some(1)).expect("a thread");
         let run = || {
             threads.step(|| {

@@ -1,4 +1,4 @@
-//! Stage 2: splats to tile lists. Every visible row is entered into the list of each 16×16 tile that
+//! Stage 2: from splats to tile lists. Every visible row is entered into the list of each 16×16 tile that
 //! its ellipse covers; each list is then sorted by depth, ties by row.
 //!
 //! Tiles are numbered row by row. Entries are counted per (chunk of rows, tile), and a prefix sum
@@ -12,7 +12,7 @@
 //!
 //! When all lists together would exceed the cap, the image is processed in bands: runs of
 //! consecutive tiles whose lists fit. Tiles are independent, and each row's gradients are summed in
-//! order of tile number, so that bands change no bit of the result.
+//! order of tile number, so that bands do not change the result.
 //!
 //! The file is one piece because counting, placing and emitting share the counters and their division.
 //!
@@ -32,15 +32,15 @@ use super::threads::Threads;
 
 /// Side of a tile `[px]`.
 pub(super) const TILE: usize = WIDTH;
-/// The most counters, one per (chunk of rows, tile): 16 MiB.
+/// Maximum number of counters, one per (chunk of rows, tile): 16 MiB.
 const MAX_COUNTERS: usize = 1 << 22;
-/// The most chunks of rows: four for each of 64 threads.
+/// Maximum number of chunks of rows: four for each of 64 threads.
 const MAX_CHUNKS: usize = 256;
-/// The smallest chunk.
+/// Minimum number of rows per chunk.
 const MIN_ROWS_PER_CHUNK: usize = 128;
-/// The most tasks that add up counters.
+/// Maximum number of tasks that add up counters.
 const MAX_RUNS: usize = 64;
-/// The fewest tiles of such a task.
+/// Minimum number of tiles of such a task.
 const MIN_TILES_PER_RUN: usize = 64;
 
 /// An image as a grid of tiles.
@@ -113,10 +113,10 @@ pub(super) struct TileLists {
     slots: Vec<[u32; 2]>,
     /// First entry of each tile of the band. Shape: `[tiles of the band + 1]`.
     starts: Vec<u32>,
-    /// Entries per (chunk of rows, tile). While entries are emitted, their positions in the tile's list instead.
-    /// Shape: `[chunks, tiles of the band]`, or more.
+    /// Number of entries per (chunk of rows, tile). While entries are emitted, their positions in the tile's list
+    /// instead. Shape: `[chunks, tiles of the band]`, or more.
     counters: Vec<u32>,
-    /// Entries per chunk of rows.
+    /// Number of entries per chunk of rows.
     lengths: Vec<u64>,
 }
 
@@ -142,7 +142,7 @@ impl TileLists {
         (budget * per_row + cap * per_entry + starts_and_counters) as u64
     }
 
-    /// The most entries held at a time.
+    /// Maximum number of entries in memory at a time.
     pub(super) fn cap(&self) -> usize {
         self.entries.len()
     }
@@ -223,8 +223,8 @@ impl TileLists {
     }
 
     /// Computes from the counters of `tiles` tiles where each list starts, and replaces the counters by the positions
-    /// in the list at which the entries of each chunk start. Counters are read in memory order; down the chunks of
-    /// one tile, each would be a cache miss.
+    /// in the list at which the entries of each chunk start. Counters are read in memory order: chunk by chunk for
+    /// one tile, each read would be a cache miss.
     fn find_places(&mut self, threads: &Threads, tiles: usize) {
         let run = tiles_per_run(tiles);
         let mut runs: Vec<Vec<&mut [u32]>> = Vec::new();
@@ -370,7 +370,7 @@ fn chunk_rows(rows: usize, tiles: usize) -> usize {
     rows.div_ceil(chunks).max(MIN_ROWS_PER_CHUNK).next_multiple_of(WIDTH)
 }
 
-/// Tiles whose counters one task adds up.
+/// Number of tiles whose counters one task adds up.
 fn tiles_per_run(tiles: usize) -> usize {
     tiles.div_ceil(MAX_RUNS).max(MIN_TILES_PER_RUN)
 }
@@ -393,7 +393,7 @@ mod tests {
                 let tiles: usize = bands.iter().map(Range::len).sum();
                 let whole = bands.windows(2).all(|pair| pair[0].end == pair[1].start);
                 assert!(whole && bands[0].start == 0 && tiles as u64 == TILES);
-                // No more than are needed.
+                // No more bands than are needed.
                 let per_band = cap / rows;
                 assert_eq!(bands.len() as u64, TILES.div_ceil(per_band));
             }
@@ -414,9 +414,9 @@ mod tests {
         }
     }
 
-    /// Fewer tiles than a run has, whole runs, and more.
+    /// Fewer tiles than one run, whole runs, and a partial last run.
     #[test]
-    fn places_are_sums_of_all_that_comes_before() {
+    fn places_are_prefix_sums_over_tiles_and_chunks() {
         const RUN: usize = MIN_TILES_PER_RUN;
         let threads = Threads::new(Some(2)).expect("threads");
         for tiles in [1, RUN - 1, RUN, 2 * RUN, 2 * RUN + 7, MAX_RUNS * RUN + 1] {

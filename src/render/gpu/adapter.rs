@@ -62,8 +62,8 @@ impl AdapterSummary {
     }
 }
 
-/// False if there is certainly no GPU: on Linux, if the kernel shows no device. Drivers, also software drivers,
-/// take time to load and memory that is never freed.
+/// False if there is certainly no GPU: on Linux, if the kernel shows no device. Loading drivers, even
+/// software drivers, takes time, and memory that is never freed.
 pub fn may_be_present() -> bool {
     const NODES: [&str; 6] =
         ["/dev/dri", "/dev/nvidiactl", "/dev/dxg", "/dev/kgsl-3d0", "/dev/mali0", "/dev/kfd"];
@@ -129,8 +129,7 @@ impl AdapterChoice {
     /// The accumulation to use on an adapter: the requested one, or the adapter's fastest.
     ///
     /// # Errors
-    /// [`BackendError::NoAdapter`] if the adapter does not support the requested one: what it lacks, and what it
-    /// supports.
+    /// [`BackendError::NoAdapter`], with what the adapter lacks and supports, if it does not support the requested one.
     pub(super) fn accumulation(
         &self,
         adapter: &AdapterSummary,
@@ -213,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn gradients_are_added_up_as_the_adapter_can() {
+    fn the_accumulation_is_the_requested_or_the_fastest_supported_one() {
         use Accumulation::{Slots, SubgroupAtomics, SubgroupCas};
         let subgroups = Features::SUBGROUP;
         let both = subgroups | Features::SHADER_FLOAT32_ATOMIC;

@@ -8,7 +8,7 @@ use densify_core::gaussians::ModelArray;
 
 impl GpuBackend {
     /// The rows with a number that is not finite, in order.
-    pub(super) fn find_unsound(&self) -> Result<Vec<NonFinite>, BackendError> {
+    pub(super) fn find_non_finite(&self) -> Result<Vec<NonFinite>, BackendError> {
         let rows = self.rows as u32;
         let bytes = 4 * u64::from(rows);
         let mut encoder = self.device.device.create_command_encoder(&Default::default());

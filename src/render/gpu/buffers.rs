@@ -5,14 +5,14 @@ use std::collections::HashMap;
 use wgpu::{Buffer, BufferDescriptor};
 
 use super::device::Device;
-use super::sizes::{Planned, Sizes};
+use super::sizes::{PlannedBuffer, Sizes};
 use crate::{BackendError, Fit};
 
 /// The buffers, by name.
 #[derive(Debug)]
 pub(super) struct Buffers {
     named: HashMap<&'static str, Buffer>,
-    nothing: Buffer,
+    placeholder: Buffer,
 }
 
 impl Buffers {
@@ -27,8 +27,8 @@ impl Buffers {
                 .map(|p| (p.name, create(device, p)))
                 .collect::<HashMap<&'static str, Buffer>>()
         })?;
-        let nothing = named["nothing"].clone();
-        Ok(Self { named, nothing })
+        let placeholder = named["placeholder"].clone();
+        Ok(Self { named, placeholder })
     }
 
     /// Reallocates the buffers whose size has changed.
@@ -55,16 +55,16 @@ impl Buffers {
     /// The buffer of this name. A buffer that does not exist, such as that of a band beyond the model's degree, is
     /// replaced by a few bytes that are never read.
     pub(super) fn get(&self, name: &str) -> &Buffer {
-        self.named.get(name).unwrap_or(&self.nothing)
+        self.named.get(name).unwrap_or(&self.placeholder)
     }
 
-    /// Current size of all buffers `[bytes]`.
+    /// Current total size of all buffers `[bytes]`.
     pub(super) fn bytes(&self) -> u64 {
         self.named.values().map(Buffer::size).sum()
     }
 }
 
-fn create(device: &wgpu::Device, planned: &Planned) -> Buffer {
+fn create(device: &wgpu::Device, planned: &PlannedBuffer) -> Buffer {
     device.create_buffer(&BufferDescriptor {
         label: Some(planned.name),
         size: planned.bytes,
@@ -74,7 +74,11 @@ fn create(device: &wgpu::Device, planned: &Planned) -> Buffer {
 }
 
 /// Fails if a buffer is larger than the device can bind: a driver may accept it and fail later.
-fn check_sizes(device: &Device, planned: &[Planned], sizes: &Sizes) -> Result<(), BackendError> {
+fn check_sizes(
+    device: &Device,
+    planned: &[PlannedBuffer],
+    sizes: &Sizes,
+) -> Result<(), BackendError> {
     let most = device.largest_binding();
     // The buffer of photographs is only copied from and to, and is no larger than the device supports.
     let bound_buffers = planned.iter().filter(|p| p.name != "photographs");

@@ -16,8 +16,8 @@ use densify_core::image::Image8;
 const ROWS: u32 = 60;
 const SIZE: u32 = 40;
 const BACKGROUND: [f32; 3] = [0.1, 0.2, 0.4];
-/// Largest difference of a colour: rounding stays below 1e-5, but a splat at the threshold of 1/255 may appear in a pixel
-/// or not.
+/// Largest difference of a colour: rounding stays below 1e-5, but a splat at the threshold of 1/255 may or may not
+/// appear in a pixel.
 const TOLERANCE: f32 = 6e-3;
 /// Largest difference of a loss.
 const LOSS_TOLERANCE: f32 = 1e-3;
@@ -139,7 +139,7 @@ fn check(device: &GpuDevice, needs: &Needs) -> Result<(), BackendError> {
         why: format!("its driver computes wrongly: {difference}"),
     };
     for (step, (found, expected)) in found.iter().zip(&expected).enumerate() {
-        // `<=`, so that NaN is wrong.
+        // `<=`, so that NaN counts as a difference.
         let is_close = (found.loss - expected.loss).abs() <= LOSS_TOLERANCE;
         if !is_close || found.visible != expected.visible {
             return Err(wrong(format!(

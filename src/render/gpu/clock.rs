@@ -1,4 +1,4 @@
-//! Times the stages of a step on the device, for benchmarks: a timestamp is written at the beginning of each.
+//! Times the stages of a step on the device, for benchmarks: a timestamp is written at the beginning of each stage.
 
 use std::time::Duration;
 

@@ -19,7 +19,7 @@ use densify_core::memory::Ledger;
 
 /// Errors that a device reports asynchronously.
 #[derive(Debug, Default)]
-struct Reported {
+struct ReportedErrors {
     lost: Option<String>,
     error: Option<String>,
 }
@@ -61,7 +61,7 @@ impl GpuDevice {
         self.0.summary.largest_budget(sh_degree)
     }
 
-    /// Largest number of (row, tile) pairs held at a time, for a policy's needs.
+    /// Largest number of (row, tile) pairs in memory at a time, for a policy's needs.
     pub fn max_pairs(&self, needs: &Needs) -> u64 {
         memory_plan::max_pairs(&self.0, needs)
     }
@@ -93,7 +93,7 @@ pub(super) struct Device {
     pub(super) clock: Option<Clock>,
     pub(super) summary: AdapterSummary,
     pub(super) accumulation: Accumulation,
-    reported: Arc<Mutex<Reported>>,
+    reported: Arc<Mutex<ReportedErrors>>,
     /// The compiled variants.
     pipelines: Mutex<Vec<(Variant, Arc<Pipelines>)>>,
     /// The record layouts for which the device has passed the canary.
@@ -119,7 +119,7 @@ impl Device {
         let (device, queue) = wait(adapter.request_device(&descriptor)).map_err(|e| {
             BackendError::NoAdapter(format!("{} cannot be opened: {e}", summary.name))
         })?;
-        let reported = Arc::new(Mutex::new(Reported::default()));
+        let reported = Arc::new(Mutex::new(ReportedErrors::default()));
         let (errors, losses) = (reported.clone(), reported.clone());
         device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| {
             lock(&errors).error.get_or_insert(error.to_string());
@@ -217,11 +217,11 @@ impl Device {
     }
 }
 
-fn lock(reported: &Mutex<Reported>) -> std::sync::MutexGuard<'_, Reported> {
+fn lock(reported: &Mutex<ReportedErrors>) -> std::sync::MutexGuard<'_, ReportedErrors> {
     reported.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Waits for a future of wgpu; natively they are ready at once.
+/// Waits for a future of wgpu; outside of browsers such futures are ready at once.
 pub(super) fn wait<T>(future: impl Future<Output = T>) -> T {
     let mut future = pin!(future);
     let mut context = Context::from_waker(Waker::noop());

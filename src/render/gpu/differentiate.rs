@@ -2,7 +2,7 @@
 
 use super::GpuBackend;
 use super::frame::{Frame, State, grid};
-use crate::cpu::{FOLD, ModelGradient};
+use crate::cpu::{EXPONENT_SCALE, ModelGradient};
 use crate::signals::{Field, RecordLayout};
 use crate::{BackendError, Differentiable, ImageGradient, Rendering, StepOutput};
 use densify_core::camera::Camera;
@@ -27,7 +27,7 @@ impl GpuBackend {
             let seen = depth.to_bits() != u32::MAX;
             let sums = if seen { *sums } else { [0.0; RecordLayout::MOST] };
             let l1 = if seen { splat[2] } else { 0.0 };
-            let unfold = 1.0 / FOLD;
+            let unscale = 1.0 / EXPONENT_SCALE;
             out.means.push([g[0], g[1], g[2]]);
             out.log_scales.push([g[3], g[4], g[5]]);
             out.quats.push([g[6], g[7], g[8], g[9]]);
@@ -35,8 +35,8 @@ impl GpuBackend {
             out.mean2d.push([g[11], g[15]]);
             let sum = |field: Field| sums[field.number()];
             out.mean2d_abs.push([
-                l1 * unfold * unfold * sum(Field::AbsX),
-                unfold * unfold * sum(Field::AbsY),
+                l1 * unscale * unscale * sum(Field::AbsX),
+                unscale * unscale * sum(Field::AbsY),
             ]);
             out.colour.push([sums[6], sums[7], sums[8]]);
             out.max_weight.push(sum(Field::WeightMax));
@@ -105,7 +105,7 @@ impl Differentiable for GpuBackend {
             draw: [0, 0, 0, self.upload_target(target)],
             ..bytemuck::Zeroable::zeroed()
         };
-        // Without a forward pass no entries are counted, and the bands of the last view must not seem too few.
+        // Without a forward pass nothing resets the state, and that of the last view could report too few bands.
         self.write("state", bytemuck::bytes_of(&<State as bytemuck::Zeroable>::zeroed()));
         let (state, _) = self.run(&frame, |passes, to| passes.loss(to, [[0.0; 2]; 2]))?;
         let planes = self.read("pixel gradient", 0, 12 * pixels.len() as u64)?;

@@ -1,6 +1,6 @@
 //! Executes a compiled edit plan on the device, in place: encodes its operations as words, in chunks of fixed size,
-//! and dispatches them. `shaders/apply.wgsl` documents the encoding. One file, because
-//! encoding and dispatch must agree on chunks and order.
+//! and dispatches them. `shaders/apply.wgsl` documents the encoding. Both are in one file because they must agree on
+//! chunks and order.
 
 use densify_policies::plan::{
     Decay, OpacityRule, ParentFate, Placement, RowOps, ScaleRule, Update,
@@ -19,7 +19,7 @@ use densify_core::gaussians::{ModelArray, logit, rgb_to_dc};
 const CHUNK: usize = (OPS_BYTES / 4) as usize;
 /// Words per operation.
 const WORDS: usize = 20;
-/// Source that clears the row.
+/// In place of a source row: the destination is cleared.
 const NOTHING: u32 = u32::MAX;
 
 fn scale_words(rule: ScaleRule) -> [u32; 4] {
@@ -187,7 +187,8 @@ impl GpuBackend {
         pairs: &[[u32; 2]],
         arrays: impl Iterator<Item = &'a RowLaunch<Launch>> + Clone,
     ) {
-        // Rows are counted from the first row of each array. Plans contain no frozen rows, which some arrays do not store.
+        // Rows are counted from the first row of each array. Plans contain no frozen rows, which some arrays do not
+        // store.
         let mut firsts: Vec<u32> = arrays.clone().map(|array| array.first_row).collect();
         firsts.sort_unstable();
         firsts.dedup();
@@ -238,17 +239,17 @@ impl GpuBackend {
                 to.run(launches.get("breed"), immediates, (count as u32).div_ceil(256));
             });
         }
-        let mut births: Vec<[u32; 2]> = Vec::new();
-        let mut reborn: Vec<[u32; 2]> = Vec::new();
+        let mut inherited: Vec<[u32; 2]> = Vec::new();
+        let mut cleared: Vec<[u32; 2]> = Vec::new();
         for family in &ops.families {
             let children = ops.children(family);
-            births.extend(children.iter().map(|&slot| [family.parent, slot]));
-            reborn.extend(children.iter().map(|&slot| clear(slot)));
+            inherited.extend(children.iter().map(|&slot| [family.parent, slot]));
+            cleared.extend(children.iter().map(|&slot| clear(slot)));
             if family.fate() == ParentFate::BecomesChild {
-                reborn.push(clear(family.parent));
+                cleared.push(clear(family.parent));
             }
         }
-        self.copy_rows(&births, &[Edited::Inherited]);
+        self.copy_rows(&inherited, &[Edited::Inherited]);
         let updates: Vec<_> = ops
             .updates
             .iter()
@@ -265,7 +266,7 @@ impl GpuBackend {
             .collect();
         self.run_ops(launches.get("rewrite"), &updates);
         self.drop_bands(&ops.updates);
-        reborn.extend(ops.updates.iter().filter(|(_, u)| !u.keep_moments).map(|u| clear(u.0)));
+        cleared.extend(ops.updates.iter().filter(|(_, u)| !u.keep_moments).map(|u| clear(u.0)));
         let seeded: Vec<_> = ops.seeds.iter().map(|&(row, _)| clear(row)).collect();
         self.copy_rows(&seeded, &[Edited::Inherited]);
         let seeds: Vec<_> = ops
@@ -283,8 +284,8 @@ impl GpuBackend {
             })
             .collect();
         self.run_ops(launches.get("sow"), &seeds);
-        reborn.extend(seeded);
-        self.copy_rows(&reborn, &[Edited::Cleared]);
+        cleared.extend(seeded);
+        self.copy_rows(&cleared, &[Edited::Cleared]);
         let moves: Vec<_> = ops.moves.iter().map(|&(from, to)| [from, to]).collect();
         self.copy_rows(&moves, &[Edited::Computed, Edited::Inherited, Edited::Cleared]);
         self.reorder(&ops.order());
@@ -341,7 +342,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn two_rounds_of_swaps_are_any_permutation() {
+    fn two_rounds_of_swaps_make_any_permutation() {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         for rows in [0, 1, 2, 3, 4, 5, 17, 300] {
             let mut order: Vec<u32> = (0..rows).collect();
@@ -385,7 +386,7 @@ mod tests {
                     let slots = &words[first as usize..][..children as usize];
                     match found.last_mut().filter(|(row, ..)| *row == parent) {
                         Some((_, all, rewritten)) => {
-                            // A part goes on where the last one ended, before the parent changed.
+                            // A part continues where the last one ended, and the parent has not changed yet.
                             assert_eq!((number as usize, *rewritten), (all.len() + 1, 0));
                             all.extend_from_slice(slots);
                             *rewritten = becomes;

@@ -1,5 +1,5 @@
-//! The uniform buffer that all stages read and the scalars that they return: the Rust side of `shaders/shared/view.wgsl`. A
-//! test compares the layouts.
+//! The uniform buffer that all stages read and the scalars that they return: the Rust side of
+//! `shaders/shared/view.wgsl`. A test compares the layouts.
 
 use bytemuck::{Pod, Zeroable};
 use densify_policies::policy::{ErrorScore, Signal};
@@ -81,8 +81,8 @@ pub(super) mod due {
     pub(in super::super) const NOISE: u32 = 64;
 }
 
-/// Bits of `Frame::draw[3]`: planes of the target, outputs of the error per pixel for candidates and for signals, and
-/// exposure.
+/// Bits of `Frame::draw[3]`: planes that the target has, whether the error per pixel is written for candidates and for
+/// signals, and whether there is an exposure.
 pub(super) mod target {
     pub(in super::super) const HAS_ALPHA: u32 = 1;
     pub(in super::super) const HAS_MASK: u32 = 2;

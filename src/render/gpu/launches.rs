@@ -8,7 +8,7 @@ use std::collections::HashMap;
 use wgpu::{BindGroup, BindGroupDescriptor, BindGroupEntry, ComputePipeline, Device};
 
 use super::buffers::Buffers;
-use super::pipelines::{Compiled, Pipelines};
+use super::pipelines::{CompiledKernel, Pipelines};
 use super::rows::{Edited, FIRST, PARAMETERS, RowArray, SECOND, WAITING};
 use super::sizes::Sizes;
 use crate::{Accumulation, NumberKind};
@@ -37,7 +37,7 @@ pub(super) struct Launches<L = Launch> {
     pub(super) record: u32,
     /// True if gradients are accumulated in slots: they are gathered, and no sums are cleared.
     pub(super) in_slots: bool,
-    /// Count the pixels that each row dominates.
+    /// True if the pixels that each row dominates are counted.
     pub(super) counts_dominant: bool,
     /// `copy_rows`, which copies or clears rows, for every array that edits change.
     pub(super) copy_rows: Vec<RowLaunch<L>>,
@@ -74,7 +74,7 @@ pub(super) struct Audit<L> {
     pub(super) mark: u32,
 }
 
-/// Offset from a parameter's mark to that of its moments; more than the parameters of a row.
+/// Offset from a parameter's mark to that of its moments; larger than the number of parameters of a row.
 pub(super) const MOMENTS: u32 = 64;
 
 impl Launches {
@@ -94,7 +94,7 @@ impl Launches {
 
 fn launch(
     device: &Device,
-    kernel: &Compiled,
+    kernel: &CompiledKernel,
     buffers: &Buffers,
     rebindings: &[Rebinding],
 ) -> Launch {
@@ -122,7 +122,7 @@ fn launch(
 type Bind<'a, L> = &'a dyn Fn(&str, &[Rebinding]) -> L;
 
 impl<L> Launches<L> {
-    /// Binds each kernel by the names of its variables, and those of [`rebound`] once per list of exceptions.
+    /// Binds each kernel by the names of its variables, and each kernel in [`rebound`] once per list of exceptions.
     pub(super) fn new<'k>(
         kernels: impl Iterator<Item = &'k str>,
         bind: Bind<'_, L>,
@@ -190,7 +190,7 @@ pub(super) fn rebound() -> HashMap<&'static str, Vec<Vec<Rebinding>>> {
         ("compact", vec![vec![("keys out", KEYS[0]), ("values out", VALUES[0])]]),
         ("count_digits", keys_in.clone()),
         ("find_tiles", keys_in),
-        // The third writes the order of rows.
+        // The third launch writes the order of rows.
         ("scatter", vec![scatter(0, VALUES[1]), scatter(1, VALUES[0]), scatter(1, "order")]),
         ("emit_entries", vec![vec![("keys out", KEYS[0])]]),
         ("rasterize", two(&|i| vec![list(i)])),

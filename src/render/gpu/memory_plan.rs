@@ -36,7 +36,7 @@ pub(super) fn sizes(device: &Device, sh_degree: u8, options: &Setup) -> Sizes {
     let mut sizes = Sizes::new(budget, cap, sh_degree, image, &options.needs, device.accumulation);
     sizes.photographs = options.photographs;
     sizes.exposures = options.exposures;
-    // They lie in one buffer, which is only copied from and to.
+    // The photographs are in one buffer, which no kernel binds.
     let bytes = sizes.photograph_bytes().iter().sum::<u64>();
     let max = usize::try_from(device.summary.largest_buffer / bytes).unwrap_or(usize::MAX);
     sizes.photographs.count = sizes.photographs.count.min(max);
@@ -62,7 +62,7 @@ pub(super) fn ledger(sizes: &Sizes, needs: &Needs) -> Ledger {
 
 /// Memory on the host while it measures an auxiliary view of this number of pixels `[bytes]`.
 fn aux_bytes(request: &AuxRequest, pixels: u64) -> u64 {
-    let drawing = if request.points > 0 { 20 } else { 0 };
+    let sampling = if request.points > 0 { 20 } else { 0 };
     // The copied image, its map, error, edges and luma.
-    pixels * (20 + 24 + 13 + drawing) + u64::from(request.points) * size_of::<Candidate>() as u64
+    pixels * (20 + 24 + 13 + sampling) + u64::from(request.points) * size_of::<Candidate>() as u64
 }

@@ -99,8 +99,8 @@ pub struct GpuBackend {
     waiting: Waiting,
     candidates: Candidates,
     /// Photographs that stay on the device, by view: the first ones used. The others are uploaded at every step.
-    /// None is ever replaced: views come in a new random order in each epoch, so that the most recent ones would
-    /// be evicted before they are used again.
+    /// They are never replaced: views come in a new random order in each epoch, so that a photograph would often be
+    /// evicted before it is used again.
     photographs: HashMap<usize, ResidentPhotograph>,
     /// Derivative sums of the last step's exposure, if it had one; see `shaders/exposure.wgsl`.
     exposure_sums: [[f32; 4]; 4],
@@ -182,7 +182,7 @@ impl GpuBackend {
         let (max_width, max_height) = self.sizes.image;
         if width > max_width || height > max_height {
             self.sizes.image = (max_width.max(width), max_height.max(height));
-            // Their places have moved.
+            // The slots of the photographs have moved.
             self.photographs.clear();
             self.rebuild()?;
         }
@@ -290,7 +290,7 @@ impl Backend for GpuBackend {
     }
 
     fn audit(&mut self) -> Result<Vec<NonFinite>, BackendError> {
-        self.find_unsound()
+        self.find_non_finite()
     }
 
     fn render(
@@ -356,7 +356,7 @@ impl Inspect for GpuBackend {
         background: [f32; 3],
         colours: &[[f32; 3]],
     ) -> Result<Rendering, BackendError> {
-        assert_eq!(colours.len(), self.rows, "colours of other rows");
+        assert_eq!(colours.len(), self.rows, "one colour per row");
         // The colours temporarily replace band 0, which needs no device memory.
         let (band, rows) = (ModelArray::Sh.parameters(0), 0..self.rows);
         let own = self.parameters_of(&band, rows.clone())?;

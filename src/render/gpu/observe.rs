@@ -1,6 +1,7 @@
 //! Measures single views for a policy: candidates for new rows while training, and auxiliary views at its events. In
-//! training the device lists the pixels with the largest errors, of which the host selects; in auxiliary views the host
-//! draws pixels from a copy of the image. The device then finds their surface points, and sums over each row's pixels.
+//! training the device lists the pixels with the largest errors, from which the host selects; in auxiliary views the
+//! host samples pixels from a copy of the image. The device then finds their surface points, and sums over each row's
+//! pixels.
 
 use densify_policies::policy::{
     AuxColumn, AuxRequest, Candidate, CandidateRequest, DepthMode, ErrorMode,
@@ -12,8 +13,8 @@ use super::passes::{Search, Shape};
 use super::rows::GRADIENT;
 use super::sizes::OPS_BYTES;
 use crate::candidates::{Photograph, ranked};
-use crate::cpu::FOLD;
-use crate::pixel_map::{draw_pixels, pixel_map, radius_px};
+use crate::cpu::EXPONENT_SCALE;
+use crate::pixel_map::{pixel_map, radius_px, sample_pixels};
 use crate::{AuxInput, AuxOutput, BackendError, assert_same_size};
 
 /// A rendered view, with its lists and its image on the device.
@@ -31,7 +32,7 @@ impl GpuBackend {
         count: usize,
         [width, height, ..]: [u32; 4],
     ) -> Option<Search> {
-        // The result, after its length, borrows the gradients of the rows.
+        // The result, which begins with its length, borrows the buffer of the rows' gradients.
         let room = (GRADIENT / 2 * self.sizes.trained() as usize - 1).min(u32::MAX as usize);
         let wanted = ranked(count, request.spaced);
         (wanted <= room).then_some(Search {
@@ -43,7 +44,8 @@ impl GpuBackend {
         })
     }
 
-    /// Adds the pixels with the largest errors to the candidates. `search` is the search that the device has done, if any.
+    /// Adds the pixels with the largest errors to the candidates. `search` is the search that the device has done, if
+    /// any.
     pub(super) fn collect_candidates(
         &mut self,
         rendered: &RenderedView<'_>,
@@ -67,10 +69,10 @@ impl GpuBackend {
         Ok(())
     }
 
-    /// The pixels that a search has found, with their errors; `None` if there are more than fit, as in an image with the
-    /// same error everywhere.
+    /// The pixels that a search has found, with their errors; `None` if there are more than fit, as in an image with
+    /// the same error everywhere.
     fn search_result(&self, search: &Search) -> Result<Option<Vec<(f32, u32)>>, BackendError> {
-        // The wanted ones, and a few that are as bad as the last.
+        // The pixels wanted, and a few whose errors equal that of the last one.
         let likely = (search.wanted + 63).min(search.room);
         let mut read = self.read("gradient", 0, 8 * (1 + u64::from(likely)))?;
         let count = read[0].to_bits();
@@ -172,7 +174,7 @@ impl GpuBackend {
         let points = if request.points == 0 {
             Vec::new()
         } else {
-            let pixels = draw_pixels(&image.alpha, camera.width as usize, input);
+            let pixels = sample_pixels(&image.alpha, camera.width as usize, input);
             self.surface_points(&rendered, &pixels, DepthMode::MaxWeight)?
         };
         let columns = if request.columns.is_empty() {
@@ -210,7 +212,7 @@ impl GpuBackend {
                 AuxColumn::Depth => depths[row],
                 AuxColumn::Radius => {
                     let [_, _, l1, shear, l3] = [0, 1, 2, 3, 4].map(|i| splats[12 * row + i]);
-                    radius_px(FOLD / l1, shear, FOLD / l3)
+                    radius_px(EXPONENT_SCALE / l1, shear, EXPONENT_SCALE / l3)
                 }
             }
         };

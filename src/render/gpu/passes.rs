@@ -20,7 +20,7 @@ mod args {
     pub(super) const ENTRY_BLOCKS: u64 = 36;
     pub(super) const ENTRY_DIGITS: u64 = 48;
 }
-/// Quantities to sum; see `shaders/tiles.wgsl`.
+/// Quantities of which prefix sums are computed; see `shaders/tiles.wgsl`.
 const FLAGS: u32 = 0;
 const COUNTS_ALL: u32 = 1;
 const COUNTS_BAND: u32 = 2;
@@ -60,9 +60,9 @@ pub(super) struct Search {
     pub(super) wanted: u32,
     /// Largest number of pixels that the result can hold.
     pub(super) room: u32,
-    /// Smallest alpha of a pixel.
+    /// Smallest alpha of a pixel that may be selected.
     pub(super) min_alpha: f32,
-    /// Use the length of the loss's gradient as error.
+    /// True if the error is the length of the loss's gradient.
     pub(super) of_gradient: bool,
 }
 
@@ -277,8 +277,8 @@ impl Passes<'_> {
         to.run(l.get("adam_geometry"), [0; 4], groups);
     }
 
-    /// Writes the pixels with the largest errors to the gradients of the rows: their number, then the error bits and the
-    /// index of each, as many as fit. Pixels as bad as the last wanted one are included.
+    /// Writes the pixels with the largest errors to the gradients of the rows: their number, then the error bits and
+    /// the index of each, as many as fit. Pixels whose error equals that of the last one wanted are included.
     pub(super) fn worst(&self, to: &mut Recorder<'_>, search: &Search) {
         let l = self.launches;
         let &Search { pixels, wanted, room, min_alpha, of_gradient } = search;

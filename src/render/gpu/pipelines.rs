@@ -15,11 +15,11 @@ use densify_shaders::STAGES;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Variant {
     pub(super) records: RecordLayout,
-    /// Gradients of alpha and depth too.
+    /// True if gradients of alpha and depth are computed too.
     pub(super) alpha_and_depth: bool,
     pub(super) shortcuts: Shortcuts,
     pub(super) accumulation: Accumulation,
-    /// Count the pixels that each row dominates.
+    /// True if the pixels that each row dominates are counted.
     pub(super) counts_dominant: bool,
 }
 
@@ -58,7 +58,7 @@ fn constant(signal: Signal) -> String {
 
 /// A compiled kernel and its bindings.
 #[derive(Debug)]
-pub(super) struct Compiled {
+pub(super) struct CompiledKernel {
     pub(super) pipeline: ComputePipeline,
     pub(super) bindings: Vec<Binding>,
 }
@@ -66,7 +66,7 @@ pub(super) struct Compiled {
 /// The kernels of a device, by name.
 #[derive(Debug)]
 pub(super) struct Pipelines {
-    kernels: HashMap<String, Compiled>,
+    kernels: HashMap<String, CompiledKernel>,
 }
 
 impl Pipelines {
@@ -87,7 +87,8 @@ impl Pipelines {
             let constants: Vec<_> = declared.map(|(name, value)| (&**name, *value)).collect();
             for kernel in kernels(stage, &text, &parsed) {
                 let pipeline = compile(device, &module, &kernel.entry, &constants);
-                compiled.insert(kernel.entry, Compiled { pipeline, bindings: kernel.bindings });
+                let compiled_kernel = CompiledKernel { pipeline, bindings: kernel.bindings };
+                compiled.insert(kernel.entry, compiled_kernel);
             }
         }
         Self { kernels: compiled }
@@ -99,7 +100,7 @@ impl Pipelines {
 
     /// # Panics
     /// When the device does not have the kernel: a bug in the caller.
-    pub(super) fn get(&self, kernel: &str) -> &Compiled {
+    pub(super) fn get(&self, kernel: &str) -> &CompiledKernel {
         let found = self.kernels.get(kernel);
         found.unwrap_or_else(|| panic!("this device has no kernel `{kernel}`"))
     }

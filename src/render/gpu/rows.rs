@@ -1,5 +1,5 @@
-//! The table of the device's arrays with an entry per row: name, width, line of the ledger, and how edits, checkpoints and
-//! the audit treat it.
+//! The table of the device's arrays with an entry per row: name, width, line of the ledger, and how edits, checkpoints
+//! and the audit treat it.
 
 use std::ops::Range;
 
@@ -68,11 +68,11 @@ pub(super) struct Traits {
     /// Line of the ledger.
     pub(super) line: &'static str,
     pub(super) edited: Edited,
-    /// Saved in checkpoints as this array; parameters are saved as the model, signals one by one.
+    /// True if checkpoints save it as this array; parameters are saved as the model, signals one by one.
     pub(super) is_saved: bool,
-    /// Searched for numbers that are not finite.
+    /// The kind of its numbers, if the audit searches it for numbers that are not finite.
     pub(super) audited: Option<NumberKind>,
-    /// Used by training only, so that frozen rows are not stored.
+    /// True if only training uses it, so that frozen rows are not stored.
     pub(super) is_for_training: bool,
 }
 
@@ -134,8 +134,8 @@ impl RowArray {
     }
 }
 
-/// All arrays for models of this SH degree. `may_wait`: gradients of the geometry and band 0, and those of bands 1–3, may
-/// wait for a step. The last argument has the numbers per row of signals, records, dominated pixels and masks.
+/// All arrays for models of this SH degree. `may_wait`: gradients of the geometry and band 0, and those of bands 1–3,
+/// may wait for a step. The last argument has the numbers per row of signals, records, dominated pixels and masks.
 pub(super) fn row_arrays(
     sh_degree: u8,
     may_wait: [bool; 2],

@@ -13,20 +13,20 @@ use crate::signals::{Field, RecordLayout, SignalPlanes, counts_dominant};
 use densify_core::budget::RowBudget;
 use densify_core::memory::{Ledger, Section};
 
-/// Bytes of an edit's operations that are uploaded at a time.
+/// Number of bytes of an edit's operations that are uploaded at a time.
 pub(super) const OPS_BYTES: u64 = 1 << 18;
 /// Largest number of bytes read back at a time.
 pub(super) const READ_BYTES: u64 = 1 << 20;
-/// Items per group of the sums and sorts; see `shaders/tiles.wgsl`.
+/// Items per workgroup of the prefix sums and sorts; see `shaders/tiles.wgsl`.
 pub(super) const BLOCK: u64 = 2048;
-/// Largest number of entries held at a time; sums saturate beyond it.
+/// Largest number of (row, tile) pairs in the tile lists at a time; prefix sums saturate beyond it.
 pub(super) const MAX_ENTRIES: u64 = 1 << 28;
 
 /// The quantities that determine all sizes.
 #[derive(Debug, Clone)]
 pub(super) struct Sizes {
     pub(super) budget: RowBudget,
-    /// Largest number of (row, tile) pairs held at a time.
+    /// Largest number of (row, tile) pairs in memory at a time.
     pub(super) cap: u64,
     pub(super) sh_degree: u8,
     /// Largest image, width and height `[px]`.
@@ -41,21 +41,21 @@ pub(super) struct Sizes {
     /// True if gradients of alpha and depth are computed too.
     pub(super) alpha_and_depth: bool,
     pub(super) cadence: Cadence,
-    /// Count the pixels that each row dominates.
+    /// True if the pixels that each row dominates are counted.
     pub(super) counts_dominant: bool,
-    /// Rows have masks.
+    /// True if rows have masks.
     pub(super) with_masks: bool,
-    /// The loss writes the error per pixel.
+    /// True if the loss writes the error per pixel.
     with_error: bool,
     /// True if pixels at edges have more weight.
     pub(super) with_edges: bool,
-    /// Photographs have exposures.
+    /// True if photographs have exposures.
     pub(super) exposures: bool,
 }
 
 /// A buffer to allocate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Planned {
+pub(super) struct PlannedBuffer {
     pub(super) name: &'static str,
     pub(super) section: Section,
     /// Line of the ledger.
@@ -129,12 +129,12 @@ impl Sizes {
     }
 
     /// Every buffer.
-    pub(super) fn planned(&self) -> Vec<Planned> {
+    pub(super) fn planned(&self) -> Vec<PlannedBuffer> {
         let storage = BufferUsages::STORAGE | BufferUsages::COPY_SRC | BufferUsages::COPY_DST;
         let mut all = Vec::new();
         let mut add = |section, line, name, bytes: u64| {
             let bytes = bytes.max(16).next_multiple_of(16);
-            all.push(Planned { name, section, line, bytes, usage: storage });
+            all.push(PlannedBuffer { name, section, line, bytes, usage: storage });
         };
         let cap = self.cap;
         for array in self.row_arrays() {
@@ -170,8 +170,8 @@ impl Sizes {
         if self.with_error {
             add(Section::Renderer, "loss", "error", 4 * pixels);
         }
-        // Allocated without exposures too: the loss binds it, and a kernel cannot bind the placeholder several times
-        // if it writes to it.
+        // Allocated even without exposures: the loss always binds it, and the placeholder cannot stand in for several
+        // bindings of a kernel that writes to it.
         add(Section::Renderer, "small buffers", "exposure", exposure::TRANSFORM);
         if self.exposures {
             let sums = exposure::SUMS * exposure::groups(pixels);
@@ -185,10 +185,10 @@ impl Sizes {
             add(Section::Images, "photographs kept on the device", "photographs", kept);
         }
         add(Section::Policy, "operations of an edit", "ops", OPS_BYTES);
-        add(Section::Renderer, "small buffers", "nothing", 16);
+        add(Section::Renderer, "small buffers", "placeholder", 16);
         add(Section::Renderer, "small buffers", "selection", 4 * (4 + 256));
         let mut add_as = |line, name, bytes, usage| {
-            all.push(Planned { name, section: Section::Renderer, line, bytes, usage });
+            all.push(PlannedBuffer { name, section: Section::Renderer, line, bytes, usage });
         };
         let frame = size_of::<Frame>() as u64;
         add_as("small buffers", "frame", frame, BufferUsages::UNIFORM | BufferUsages::COPY_DST);
@@ -206,7 +206,7 @@ impl Sizes {
     /// The ledger: bytes per purpose.
     pub(super) fn ledger(&self) -> Ledger {
         let mut ledger = Ledger::default();
-        for Planned { section, line, bytes, .. } in self.planned() {
+        for PlannedBuffer { section, line, bytes, .. } in self.planned() {
             ledger.add_on_device(section, line, bytes);
         }
         ledger

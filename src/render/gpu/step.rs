@@ -14,7 +14,8 @@ use crate::signals::Field;
 use crate::{BackendError, StepInput, StepOutput, assert_same_size};
 
 impl GpuBackend {
-    /// Parameter groups that step and groups that have waited, as bits of the frame; and the groups that wait afterwards.
+    /// The parameter groups that step and those that have waited, as bits of the frame; then the groups that wait after
+    /// the step.
     fn cadence_bits(&self, input: &StepInput<'_>) -> (u32, Waiting) {
         let (step, cadence) = (input.step, input.cadence);
         assert!(cadence.is_within(self.cadence), "step {step}: {cadence:?} was not declared");

@@ -19,7 +19,7 @@ impl GpuBackend {
         self.write_at(name, 0, bytes);
     }
 
-    /// Writes numbers from byte `at` on.
+    /// Writes numbers, starting at byte `at`.
     pub(super) fn write_at(&self, name: &str, at: u64, values: &[impl bytemuck::NoUninit]) {
         if !values.is_empty() {
             let bytes = bytemuck::cast_slice(values);
@@ -74,8 +74,8 @@ impl GpuBackend {
             | (if image.mask.is_some() { target::HAS_MASK } else { 0 })
     }
 
-    /// Copies a view's photograph to the buffer that the loss reads, and keeps it on the device if there is room. Returns
-    /// its bits of [`target`]. A view always has the same photograph.
+    /// Copies a view's photograph to the buffer that the loss reads, and keeps it on the device if there is room.
+    /// Returns its bits of [`target`]. A view always has the same photograph.
     pub(super) fn load_photograph(&mut self, view: usize, image: &Image8) -> u32 {
         let size = [image.width, image.height];
         let resident = self.photographs.get(&view).copied();
@@ -85,7 +85,7 @@ impl GpuBackend {
         }
         let flags = self.upload_target(image);
         let room = self.sizes.photographs;
-        // A view whose image has another size now keeps its slot.
+        // A view whose image size has changed keeps its slot.
         let slot = resident.map_or(self.photographs.len() as u64, |photograph| photograph.slot);
         if slot < room.count as u64 && (flags & target::HAS_MASK == 0 || room.with_masks) {
             let photograph = ResidentPhotograph { slot, size, flags };
@@ -218,7 +218,8 @@ impl GpuBackend {
         Ok(values)
     }
 
-    /// Computes and reads a signal of the present, with zeros for frozen rows; see `present` in `shaders/signals.wgsl`.
+    /// Computes and reads a signal that depends only on the current rows, with zeros for frozen rows; see `present` in
+    /// `shaders/signals.wgsl`.
     pub(super) fn present(&self, signal: Signal) -> Result<Vec<f32>, BackendError> {
         let (rows, launch) = (self.rows as u32, self.launches.get("present"));
         let start = self.mask.map_or(0.0, |mask| mask.start);
@@ -237,8 +238,8 @@ fn overlap(a: &Range<usize>, b: &Range<usize>) -> Option<(Range<usize>, Range<us
     (start < end).then(|| (start - a.start..end - a.start, start - b.start..end - b.start))
 }
 
-/// For an array whose first stored row is `first`: the index in the array of the first of `rows` that is stored, and the
-/// number of `rows` that are not.
+/// For an array whose first stored row is `first`: the index in the array of the first of `rows` that is stored, and
+/// the number of `rows` that are not.
 pub(super) fn stored_rows(first: u64, rows: &Range<usize>) -> (u64, usize) {
     let stored = (first as usize).clamp(rows.start, rows.end);
     ((stored as u64).saturating_sub(first), stored - rows.start)

@@ -1,5 +1,5 @@
-//! Errors of runs: an exit code with what went wrong. [Problems](Problem) are data; their words are in one place, and
-//! whoever shows them says how options are spelled.
+//! Errors of runs: an exit code and a message. [Problems](Problem) are data; all their messages are in one place, and
+//! the code that shows them chooses how options are spelled.
 
 pub(crate) mod notes;
 mod problem;
@@ -26,16 +26,16 @@ use densify_train::init::InitError;
 use densify_train::output::FolderError;
 use densify_train::trainer::TrainError;
 
-/// Exit code of anything that has no code of its own.
+/// Exit code of all other errors.
 pub const OTHER: u8 = 1;
 /// Exit code of bad input and usage.
 pub const INPUT: u8 = 2;
 /// Exit code if a measured value is beyond the limit that was given for it.
 pub const LIMIT: u8 = 4;
-/// Exit code if device or memory do not suffice.
+/// Exit code if the device or the memory does not suffice.
 pub const DEVICE: u8 = 3;
 
-/// The failure of a run or a command. Displayed with options as on a terminal.
+/// The failure of a run or a command. Displayed with options spelled as on a terminal.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("{}", self.words(Spelling::Terminal))]
 pub struct Failure {
@@ -44,10 +44,10 @@ pub struct Failure {
     parts: Vec<Part>,
 }
 
-/// A part of what a failure says.
+/// A part of a failure's message.
 #[derive(Debug, Clone, PartialEq)]
 enum Part {
-    /// Words, such as those of another library.
+    /// Text, such as the message of another library.
     Text(String),
     Problem(Box<Problem>),
     /// The option that the next part is about, with its value if there is one.
@@ -55,7 +55,7 @@ enum Part {
 }
 
 impl Failure {
-    /// A failure whose words name no option, or come from a command.
+    /// A failure whose message names no option, or comes from a command.
     #[expect(clippy::needless_pass_by_value, reason = "errors are passed as they come")]
     pub fn new(code: u8, message: impl ToString) -> Self {
         Self { code, parts: vec![Part::Text(message.to_string())] }
@@ -74,16 +74,16 @@ impl Failure {
     /// The same failure, prefixed with its origin.
     #[must_use]
     pub fn within(self, origin: &str) -> Self {
-        self.after([Part::Text(format!("{origin}: "))])
+        self.with_prefix([Part::Text(format!("{origin}: "))])
     }
 
     /// The same failure, prefixed with an option, and with its value if there is one.
     #[must_use]
     pub fn within_option(self, option: &'static str, value: Option<String>) -> Self {
-        self.after([Part::Option(option, value), Part::Text(": ".to_owned())])
+        self.with_prefix([Part::Option(option, value), Part::Text(": ".to_owned())])
     }
 
-    fn after<const COUNT: usize>(mut self, parts: [Part; COUNT]) -> Self {
+    fn with_prefix<const COUNT: usize>(mut self, parts: [Part; COUNT]) -> Self {
         self.parts.splice(0..0, parts);
         self
     }
@@ -103,7 +103,7 @@ impl Failure {
         self
     }
 
-    /// The whole message, with options as its reader spells them.
+    /// The whole message, with options in this spelling.
     pub fn words(&self, spelling: Spelling) -> String {
         let words = |part: &Part| match part {
             Part::Text(text) => text.clone(),
@@ -162,13 +162,13 @@ impl<E: BadInput> From<E> for Failure {
 
 impl From<BackendError> for Failure {
     fn from(error: BackendError) -> Self {
-        Self::of_backend(&error, &error)
+        Self::from_backend(&error, &error)
     }
 }
 
 impl Failure {
     /// A failure of a backend: the message, which ends with the error, and its remedy.
-    fn of_backend(error: &BackendError, message: impl ToString) -> Self {
+    fn from_backend(error: &BackendError, message: impl ToString) -> Self {
         let (code, remedy) = BackendRemedy::of(error);
         Self::with_remedy(code, message, remedy)
     }
@@ -253,7 +253,7 @@ impl From<TrainError> for Failure {
             TrainError::NoView => {
                 return Self::with_remedy(INPUT, error, TrainRemedy::MoreViews);
             }
-            TrainError::Backend { source, .. } => return Self::of_backend(source, &error),
+            TrainError::Backend { source, .. } => return Self::from_backend(source, &error),
             _ => OTHER,
         };
         Self::new(code, error)
@@ -277,7 +277,7 @@ impl From<EvaluateError> for Failure {
         let code = match &error {
             EvaluateError::Stopped => OTHER,
             EvaluateError::Backend { source, .. } | EvaluateError::Model(source) => {
-                return Self::of_backend(source, &error);
+                return Self::from_backend(source, &error);
             }
             _ => INPUT,
         };
@@ -299,7 +299,7 @@ impl From<SceneError> for Failure {
 mod tests {
     use super::*;
 
-    /// The error's own words first, then the remedy; also when the error is the source of another.
+    /// The error's message comes first, then the remedy, even if the error is the source of another.
     #[test]
     fn errors_of_backends_end_with_their_remedy() {
         let device = || "Card".to_owned();
@@ -333,7 +333,7 @@ mod tests {
             (
                 cut(Accumulation::SubgroupCas),
                 DEVICE,
-                "a tile); --knob accumulation=slots goes through",
+                "a tile); --knob accumulation=slots may avoid this",
             ),
         ] {
             let wrapped = TrainError::Backend { step: 3, source: error };

@@ -1,4 +1,4 @@
-//! The words of notes that name options, for the user of a run that goes well.
+//! Notes to the user that name options, for runs without errors.
 
 use std::path::Path;
 
@@ -59,7 +59,7 @@ pub(crate) fn accumulation(s: Spelling, taken: Accumulation) -> String {
     format!("sums     accumulation={taken}: {note}")
 }
 
-/// Colours of a model that are truncated.
+/// The note that a model's colours are truncated to a lower degree.
 pub(crate) fn degree_cut(s: Spelling, own: u8, degree: u8) -> String {
     format!(
         "note: colours of degree {own} are cut to {degree}; {} keeps them",
@@ -67,7 +67,7 @@ pub(crate) fn degree_cut(s: Spelling, own: u8, degree: u8) -> String {
     )
 }
 
-/// A model that may be in other coordinates.
+/// The note that a model may be in other coordinates.
 pub(crate) fn other_coordinates(
     s: Spelling,
     option: Option<&str>,
@@ -81,13 +81,13 @@ pub(crate) fn other_coordinates(
     )
 }
 
-/// The way to learn exposures that tracks do not decide.
+/// The hint on how to learn exposures if the tracks leave it undecided.
 pub(crate) fn learn_exposures(s: Spelling) -> String {
-    format!("{} learns exposures all the same", s.text("exposure", "on"))
+    format!("{} learns exposures anyway", s.text("exposure", "on"))
 }
 
-/// The budget and the reason for it. `most`: the most rows that the user allows, if given; `solved`: the memory given,
-/// and true if it limits the rows.
+/// The budget and the reason for it. `most`: the maximum number of rows that the user gave, if any; `solved`: the
+/// memory limit, and true if it determines the number of rows.
 pub(crate) fn budget(
     s: Spelling,
     rows: usize,
@@ -108,12 +108,12 @@ pub(crate) fn budget(
         }
         (Some((_, false)), _, Some(_)) => format!(": {memory} would hold as many or more"),
         (Some((_, true)), _, None) => format!(", as many as {memory} holds"),
-        (Some((_, false)), _, None) => ", as many as the device takes".to_owned(),
+        (Some((_, false)), _, None) => ", as many as fit the device".to_owned(),
     };
     format!("budget   {rows} rows{reason}")
 }
 
-/// A degree that memory has lowered.
+/// The note that the degree was lowered because of the memory limit.
 pub(crate) fn degree_lowered(
     s: Spelling,
     [degree, wanted]: [u8; 2],
@@ -121,19 +121,20 @@ pub(crate) fn degree_lowered(
     start: usize,
 ) -> String {
     format!(
-        "note: degree {degree} instead of {wanted}, at which only {} rows fit and the scene starts with {}; {} insists",
+        "note: degree {degree} instead of {wanted}, at which only {} rows fit and the scene starts with {}; \
+         {} enforces it",
         grouped(at_wanted),
         grouped(start),
         s.set("sh_degree", wanted)
     )
 }
 
-/// The rest of the memory given.
+/// The part of the memory limit that is left.
 pub(crate) fn memory_left(s: Spelling, bytes: u64) -> String {
     format!("\n  {:<11} {} of {}", "left", Bytes(bytes), s.option("memory"))
 }
 
-/// A run that has nothing left to do.
+/// The note that a run has no iterations left.
 pub(crate) fn all_done(s: Spelling, last: u32) -> String {
     format!(
         "note: all {last} iterations are done; {} with a larger number extends the run",

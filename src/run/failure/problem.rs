@@ -1,5 +1,5 @@
-//! Everything that can be wrong with a run, as data: the option or file, its content, and what would fit. Options are
-//! named as [`OPTIONS`](crate::OPTIONS) names them.
+//! Everything that can be wrong with a run, as data: the option or file, its content, and a valid alternative. Options
+//! are named as [`OPTIONS`](crate::OPTIONS) names them.
 
 use std::path::PathBuf;
 
@@ -12,21 +12,21 @@ use densify_render::{Accumulation, BackendKind};
 pub enum OptionProblem {
     /// A file has a key that is no option.
     UnknownOption { name: String, nearest: Option<String> },
-    /// An option has a value that is not one of its values.
+    /// An option has an invalid value.
     Value { option: &'static str, problem: String },
     /// Parts of an option contradict each other.
     Conflict { option: &'static str, problem: String },
-    /// A value of `policy_set` is not of its form.
+    /// A value of `policy_set` is not of the form `policy.parameter=value`.
     PolicySetting { setting: String },
     /// A path cannot be written to `config.toml`.
     NotUtf8 { option: &'static str, path: PathBuf },
     /// No dataset is named.
     NoScene,
-    /// Something is to be done after an iteration that the run does not have.
+    /// The model is to be saved or tested after an iteration that the run does not have.
     IterationOutOfRange { option: &'static str, step: u32, last: u32 },
-    /// A file is not what it should be.
+    /// A value cannot be parsed; `origin` is its source.
     Malformed { origin: String, problem: String },
-    /// `deterministic` contradicts the knob.
+    /// `deterministic` contradicts the knob `accumulation`.
     AccumulationConflict { given: Accumulation },
     /// A knob is set that this backend does not have.
     KnobOfOtherBackend {
@@ -40,13 +40,13 @@ pub enum OptionProblem {
     AutomaticWithFull { option: &'static str },
     /// An automatic budget cannot remove frozen Gaussians.
     AutoBudgetWithFreeze,
-    /// A number of random points for a start that is not random.
+    /// A number of random points is given, but the run does not start from random points.
     UnusedInitPoints { points: usize },
-    /// Test views are to be measured, and there is none.
+    /// Test views are to be measured, but there are none.
     NothingToTest,
 }
 
-/// A run that does not fit.
+/// A size that is contradictory or does not fit.
 #[derive(Debug, Clone, PartialEq)]
 #[expect(missing_docs, reason = "the fields are the data of the message of each variant")]
 pub enum SizeProblem {
@@ -56,9 +56,9 @@ pub enum SizeProblem {
     FreezeFillsBudget { frozen: usize, budget: usize },
     /// `tile_cap` and the knob both set the length of tile lists.
     TileCapConflict { cap: usize, pairs: usize },
-    /// A run that goes on takes more than its memory.
+    /// A resumed run needs more than its memory limit.
     OverMemory { memory: u64, needed: u64, remedies: Vec<Vec<Remedy>> },
-    /// The system does not grant the process the memory of the run.
+    /// The system does not grant the process the memory that the run needs.
     OverGrant {
         needed: u64,
         resident: u64,
@@ -66,7 +66,7 @@ pub enum SizeProblem {
         left: u64,
         remedies: Vec<Vec<Remedy>>,
     },
-    /// No size fits the memory, and the least memory is unknown.
+    /// No size fits the memory, and the smallest sufficient memory is unknown.
     NoSize { memory: u64 },
     /// Not even the smallest model fits the memory.
     NoModelFits { memory: u64, rows: usize, sh_degree: u8, needed: u64, remedies: Vec<Vec<Remedy>> },
@@ -78,7 +78,7 @@ pub enum SizeProblem {
 pub enum ModelProblem {
     /// The model of an option has no Gaussian.
     EmptyModel { option: &'static str, file: PathBuf },
-    /// The file is the folder of a run, which has this model.
+    /// The path is the folder of a run; this file is its model.
     ModelOfRun { file: PathBuf },
     /// Too few Gaussians of the model of `init` lie in a training view.
     InitOutOfView { file: PathBuf, seen: usize, rows: usize },
@@ -86,7 +86,7 @@ pub enum ModelProblem {
     FreezeOutOfView { file: PathBuf, rows: usize },
     /// The model of `freeze` has changed.
     FreezeChanged { file: PathBuf, rows: usize, expected: usize },
-    /// A model shows nothing of the photographs.
+    /// A model is in other coordinates than the photographs.
     OtherCoordinates { option: Option<&'static str>, file: PathBuf, correlation: f64 },
     /// A split has no views.
     NoTestViews,
@@ -98,11 +98,11 @@ pub enum ModelProblem {
     NoSuchIteration { iteration: u32, run: PathBuf, saved: Vec<u32> },
     /// A run is being trained, and has saved no model.
     StillTraining { run: PathBuf },
-    /// An iteration is named for a file, which has one model.
+    /// An iteration is given for a file, which has only one model.
     IterationOfFile,
 }
 
-/// A run that cannot go on.
+/// A run that cannot be resumed.
 #[derive(Debug, Clone, PartialEq)]
 #[expect(missing_docs, reason = "the fields are the data of the message of each variant")]
 pub enum ResumeProblem {
@@ -110,33 +110,33 @@ pub enum ResumeProblem {
     InterruptedReplacement { output: PathBuf, staged: PathBuf },
     /// A run cannot be made shorter.
     Shortened { asked: u32, origin: String, length: u32, done: u32 },
-    /// An automatic value for a run that had another one.
+    /// `auto` is given, but the run was started with a fixed value.
     AutoOnResume { option: &'static str, origin: String, saved: String },
-    /// No checkpoint is sound.
+    /// No checkpoint is usable.
     NoSoundCheckpoint { output: PathBuf, errors: Vec<String> },
-    /// A complete run without a checkpoint.
+    /// A run has saved models, but no checkpoint.
     NoCheckpoint { output: PathBuf },
-    /// Options of a run that goes on would change its result.
+    /// Options would change the result of a resumed run.
     ResultWouldDiffer { origin: PathBuf, differences: Vec<Difference> },
-    /// A run goes on with another dataset.
+    /// A run is resumed with another dataset.
     OtherDataset { origin: PathBuf, difference: String },
 }
 
-/// The end of a run that is not complete.
+/// A problem that ended a run, or the files that the run left.
 #[derive(Debug, Clone, PartialEq)]
 #[expect(missing_docs, reason = "the fields are the data of the message of each variant")]
 pub enum TrainingProblem {
-    /// The model draws nothing in most of the last views.
+    /// The model is invisible in most of the last views.
     DrawsNothing { empty: usize, views: usize },
-    /// A signal stopped the run; without a step nothing was written.
+    /// A signal stopped the run; `step` is `None` if nothing was written.
     Stopped { by: &'static str, step: Option<u32> },
     /// The checkpoint at the end could not be written.
     CheckpointFailed { error: String },
-    /// After an error of the policy, the model before it.
+    /// The file of the model as it was before an error of the policy, or the error of saving it.
     ModelSaved { saved: Result<PathBuf, String> },
     /// Measuring failed; the run itself is complete.
     OnlyMeasuringFailed { run: PathBuf },
-    /// The files of a run that failed, and the checkpoint to go on from.
+    /// The files of a run that failed, and the checkpoint to resume from.
     LeftBehind { run: PathBuf, checkpoint: Option<PathBuf>, scene: PathBuf },
 }
 
@@ -149,13 +149,13 @@ pub enum Problem {
     Size(SizeProblem),
     /// With a model.
     Model(ModelProblem),
-    /// With going on.
+    /// With resuming it.
     Resume(ResumeProblem),
-    /// While it trains.
+    /// During training.
     Training(TrainingProblem),
-    /// The remedy for an error of a backend, which stands before it.
+    /// The remedy for an error of a backend, whose message precedes it.
     Backend(BackendRemedy),
-    /// The remedy for an error of training, which stands before it.
+    /// The remedy for an error of training, whose message precedes it.
     Train(TrainRemedy),
     /// A dataset or model that cannot be loaded.
     Load(LoadError),
@@ -166,7 +166,7 @@ pub enum Problem {
 pub enum TrainRemedy {
     /// Another folder, or replacing the run in this one.
     OtherFolderOrOverwrite,
-    /// The end of the process that trains in the folder, or another folder.
+    /// Waiting for or stopping the process that trains in the folder, or another folder.
     WaitOrOtherFolder,
     /// Another folder.
     OtherFolder,
@@ -189,7 +189,7 @@ pub enum BackendRemedy {
     FewerThreads,
     /// Smaller images.
     SmallerImages,
-    /// A look at the adapters that exist, or the native backend.
+    /// Listing the available adapters, or the native backend.
     ListAdapters,
     /// Either no adapter, or the GPU backend.
     NoAdapterOrGpu,
@@ -201,7 +201,7 @@ pub enum BackendRemedy {
     TileCap(u64),
     /// The native backend.
     NativeBackend,
-    /// Another start from what was saved, or the native backend.
+    /// Restarting from the saved files, or the native backend.
     StartAgain,
     /// Accumulation in slots, another driver, or the native backend.
     SlotsOrOtherDriver,
@@ -209,12 +209,12 @@ pub enum BackendRemedy {
     OtherDriver,
 }
 
-/// A change of the options after which a run fits.
+/// A change of the options that makes a run fit.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Remedy {
     /// Keep no decoded photographs.
     NoImages,
-    /// Let the tile lists be chosen.
+    /// Choose the length of tile lists automatically.
     NoTileCap,
     /// Tile lists of this many pairs.
     TileCap(usize),
@@ -222,7 +222,7 @@ pub enum Remedy {
     Preset(&'static str),
     /// Degree 0.
     LeastDegree,
-    /// Photographs this many times smaller.
+    /// Photographs smaller by this factor.
     Shrink(u32),
     /// This much memory `[MiB]`.
     Memory(u64),
@@ -230,15 +230,15 @@ pub enum Remedy {
     Budget(usize),
 }
 
-/// A setting that differs from the run that goes on.
+/// A setting that differs from that of the run being resumed.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Difference {
     /// The option.
     pub option: String,
-    /// The member of an option that has several; else empty.
+    /// The part of the option, such as a knob; empty for options without parts.
     pub member: String,
     /// The value now, as text; `None`: not set.
     pub now: Option<String>,
-    /// The value in that run.
+    /// The value in the run being resumed.
     pub then: Option<String>,
 }

@@ -1,4 +1,5 @@
-//! The words of every [`Problem`], with options as their reader spells them. One piece, so that all can be compared.
+//! The message of every [`Problem`], with options in the user's spelling. They share one file so that they can be
+//! compared.
 
 use std::path::Path;
 
@@ -113,7 +114,7 @@ impl BackendRemedy {
             Self::NativeBackend => format!("use {native}"),
             Self::StartAgain => format!("start again from what was saved, or use {native}"),
             Self::SlotsOrOtherDriver => format!(
-                "{} goes through more; otherwise try another driver, or {native}",
+                "{} may avoid this; otherwise try another driver, or {native}",
                 s.member("knob", "accumulation", Accumulation::Slots)
             ),
             Self::OtherDriver => format!("try another driver, or {native}"),
@@ -192,7 +193,7 @@ impl OptionProblem {
                 )
             }
             Self::AutoBudgetWithFreeze => format!(
-                "{} asks of all Gaussians what each is worth, and {freeze} keeps some whatever it is; give {budget} a \
+                "{} removes Gaussians with little effect, but {freeze} keeps some regardless; give {budget} a \
                  number of Gaussians",
                 s.text("budget", "auto")
             ),
@@ -304,7 +305,7 @@ impl ModelProblem {
                 s.text("split", "train")
             ),
             Self::DatasetMoved => {
-                // That of the run itself is a positional argument.
+                // Training takes the scene as a positional argument, other commands with this flag.
                 let scene = short(s, "scene", "--scene");
                 format!("if the dataset has moved, say where it is with {scene}")
             }
@@ -312,8 +313,8 @@ impl ModelProblem {
                 let (run, earlier) = (run.display(), iterations("N"));
                 format!(
                     "{run} holds a run that was stopped before it saved a model, with a checkpoint of iteration \
-                     {step}; `densify train --resume -o {run}` goes on from there, and saves its model at the end, or \
-                     earlier with {earlier}"
+                     {step}; `densify train --resume -o {run}` continues from there, and saves its model at the end, \
+                     or earlier with {earlier}"
                 )
             }
             Self::NoSuchIteration { iteration, run, saved } => {
@@ -343,7 +344,7 @@ impl ResumeProblem {
         let folder = output_option(s);
         match self {
             Self::InterruptedReplacement { output, staged } => format!(
-                "{resume}: {} holds a run that was to replace the one there and was interrupted: {}; go on with it by \
+                "{resume}: {} holds a run that was to replace the one there and was interrupted: {}; resume it by \
                  naming that folder with {folder}, or remove it",
                 output.display(),
                 staged.display()
@@ -361,13 +362,13 @@ impl ResumeProblem {
             Self::NoSoundCheckpoint { output, errors } => {
                 let errors: String = errors.iter().map(|error| format!("\n  {error}")).collect();
                 format!(
-                    "{resume}: no checkpoint in {} can be used:{errors}\nto begin anew, leave {resume} out and give \
+                    "{resume}: no checkpoint in {} can be used:{errors}\nto start over, leave {resume} out and give \
                      {overwrite}",
                     output.display()
                 )
             }
             Self::NoCheckpoint { output } => format!(
-                "{resume}: {} holds a run, but no checkpoint to go on from; to begin anew, leave {resume} out and \
+                "{resume}: {} holds a run, but no checkpoint to resume from; to start over, leave {resume} out and \
                  give {overwrite}, or choose another folder with {folder}",
                 output.display()
             ),
@@ -413,13 +414,13 @@ impl TrainingProblem {
                 format!("the model could not be saved: {error}")
             }
             Self::OnlyMeasuringFailed { run } => {
-                format!("the run is complete in {} all the same", run.display())
+                format!("the run itself is complete in {}", run.display())
             }
             Self::LeftBehind { run, checkpoint: None, .. } => {
-                format!("what was written until then is in {}", run.display())
+                format!("the files written so far are in {}", run.display())
             }
             Self::LeftBehind { run, checkpoint: Some(checkpoint), scene } => format!(
-                "what was written until then is in {run}, with the checkpoint {}; go on with: densify train {} -o \
+                "the files written so far are in {run}, with the checkpoint {}; continue with: densify train {} -o \
                  {run} --resume",
                 checkpoint.display(),
                 scene.display(),
@@ -429,7 +430,7 @@ impl TrainingProblem {
     }
 }
 
-/// `A`, `A, or B`, `A, or B, or C`; each may be several changes.
+/// Lists alternatives as `A`, `A, or B`, `A, or B, or C`; each may consist of several changes.
 fn any_of(remedies: &[Vec<Remedy>], s: Spelling) -> String {
     let all = remedies.iter().map(|changes| {
         let changes: Vec<String> = changes.iter().map(|change| change.words(s)).collect();
@@ -456,7 +457,7 @@ impl Remedy {
     }
 }
 
-/// A model, by the option that names it if there is one.
+/// A model, shown with the option that names it if there is one.
 pub(super) fn model_name(s: Spelling, option: Option<&str>, file: &Path) -> String {
     let file = file.display();
     option.map_or_else(|| file.to_string(), |option| s.text(option, &file))
@@ -467,7 +468,7 @@ fn output_option(s: Spelling) -> String {
     short(s, "output", "-o")
 }
 
-/// An option that has another name on a terminal.
+/// An option that has a special flag on a terminal.
 fn short(s: Spelling, name: &str, flag: &str) -> String {
     match s {
         Spelling::Terminal => flag.to_owned(),
@@ -497,7 +498,7 @@ mod tests {
     }
 
     #[test]
-    fn options_are_spelled_as_their_reader_writes_them() {
+    fn options_are_spelled_as_users_write_them() {
         let remedies = vec![vec![Remedy::NoImages, Remedy::Shrink(4)], vec![Remedy::Memory(96)]];
         let (memory, rows, sh_degree, needed) = (64 << 20, 1_000, 0, 96);
         let fits = SizeProblem::NoModelFits { memory, rows, sh_degree, needed, remedies };

@@ -1,4 +1,4 @@
-//! A description with the inputs it names and all choices that do not depend on its size.
+//! A run's description, with its inputs and all choices that do not depend on its size.
 
 use std::borrow::Cow;
 
@@ -11,7 +11,7 @@ use super::degree::Degree;
 use super::exposure::Exposure;
 use super::fit::RunSize;
 use super::inputs::{Evidence, Inputs, Reading, open_device};
-use super::size::LEAST_ROWS;
+use super::size::MIN_ROWS;
 use crate::failure::{Failure, OptionProblem, SizeProblem};
 use crate::host::Host;
 use crate::spec::knobs::Knobs;
@@ -23,7 +23,7 @@ use densify_train::exposure::ExposureChoice;
 use densify_train::schedule::Background;
 use densify_train::trainer::{AutoChoices, growth_signals};
 
-/// Most points of a random initialisation without `--init-points` (Kerbl et al. 2023 use 100,000).
+/// Maximum number of random initial points without `--init-points` (Kerbl et al. 2023 use 100,000).
 const RANDOM_POINTS: usize = 100_000;
 /// Resident memory by which a process that resumes a run may exceed the one that began it `[bytes]`. The ledger keeps more
 /// room than this for the allocator.
@@ -35,7 +35,7 @@ pub(crate) const TEST_DECODERS: usize = 1;
 
 /// A run before its size is known. Trials of other sizes and options share the inputs.
 pub(crate) struct Case<'a> {
-    /// As it was asked for.
+    /// The description, as the user gave it.
     pub(crate) spec: &'a RunSpec,
     pub(crate) inputs: Cow<'a, Inputs>,
     pub(crate) choices: Choices,
@@ -68,7 +68,7 @@ pub(crate) enum Init {
 }
 
 impl Choices {
-    /// Choices that the colours of the scene decided, for the user.
+    /// Messages about the choices that depend on the scene's colours.
     pub(super) fn lines(&self, spelling: Spelling) -> impl Iterator<Item = String> {
         self.degree.line().into_iter().chain(self.exposure.line(spelling))
     }
@@ -76,7 +76,7 @@ impl Choices {
 
 impl<'a> Case<'a> {
     /// A new run.
-    pub(super) fn anew(spec: &'a RunSpec, host: Host<'_>) -> Result<Self, Failure> {
+    pub(super) fn for_new_run(spec: &'a RunSpec, host: Host<'_>) -> Result<Self, Failure> {
         let is_exposed = spec.schedule.exposure != ExposureChoice::Off;
         let reading = Reading {
             tracks: spec.size.sh_degree == Some(ShDegree::Auto(None)) || is_exposed,
@@ -90,7 +90,7 @@ impl<'a> Case<'a> {
         })
     }
 
-    /// A run that goes on.
+    /// A resumed run.
     pub(super) fn from_saved(
         spec: &'a RunSpec,
         saved: &RunConfig,
@@ -100,7 +100,7 @@ impl<'a> Case<'a> {
         let finds_exposures = spec.schedule.exposure != ExposureChoice::Off && !has_checkpoint;
         let found = &saved.resolved;
         let reading = Reading {
-            // The checkpoint has their rows; the files may be gone.
+            // The checkpoint contains their rows; the files may no longer exist.
             models: Some([found.init_model, found.frozen]),
             tracks: finds_exposures,
             colours: true,
@@ -118,7 +118,7 @@ impl<'a> Case<'a> {
         })
     }
 
-    /// A run whose models do not exist yet, only to know what it takes.
+    /// A run whose models do not exist yet, for estimating its memory.
     pub(super) fn for_estimate(
         spec: &'a RunSpec,
         models: [Option<ModelSize>; 2],
@@ -162,19 +162,19 @@ impl<'a> Case<'a> {
         Ok(case)
     }
 
-    /// Bytes of the process that the device's driver takes for its kernels.
+    /// Bytes of process memory that the device's driver uses for its kernels.
     fn driver_bytes(&self, host: Host<'_>) -> Result<u64, Failure> {
         if self.inputs.device.adapter().is_none() {
             return Ok(0);
         }
         let resident = || (host.process.resident)().unwrap_or(0);
         let before = resident();
-        // Kernels depend on which signals there are, not on how many rows.
-        self.inputs.device.prove(&self.needs(LEAST_ROWS)?)?;
+        // Kernels depend on the signals, not on the number of rows.
+        self.inputs.device.prove(&self.needs(MIN_ROWS)?)?;
         Ok(resident().saturating_sub(before))
     }
 
-    /// The same inputs for a run with other options of size, policy, knobs or resolution.
+    /// The same inputs with another description, which may differ in size, policy, knobs and resolution.
     pub(super) fn with<'b>(&'b self, spec: &'b RunSpec) -> Result<Case<'b>, Failure> {
         let inputs = if spec.data.resolution == self.spec.data.resolution {
             Cow::Borrowed(&*self.inputs)
@@ -201,7 +201,8 @@ impl<'a> Case<'a> {
         match self.init() {
             InitChoice::Points => Init::Points,
             InitChoice::Random => Init::Random(
-                self.start().unwrap_or_else(|| random_points(self.budget(rows).trainable())),
+                self.wanted_initial_rows()
+                    .unwrap_or_else(|| random_points(self.budget(rows).trainable())),
             ),
             InitChoice::Model(file) => Init::Model(file),
         }
@@ -218,8 +219,8 @@ impl<'a> Case<'a> {
         }
     }
 
-    /// Rows that the scene starts with if nothing limits them; `None` if the limit decides.
-    pub(super) fn start(&self) -> Option<usize> {
+    /// Number of rows that the scene starts with if nothing limits it; `None` if it depends on the budget.
+    pub(super) fn wanted_initial_rows(&self) -> Option<usize> {
         match self.init() {
             InitChoice::Model(_) => self.inputs.init_model.map(|model| model.rows),
             InitChoice::Points => Some(self.inputs.usable_points),
@@ -227,10 +228,10 @@ impl<'a> Case<'a> {
         }
     }
 
-    /// Rows to start with besides the frozen ones.
+    /// Number of rows to start with, without frozen ones.
     pub(super) fn initial_rows(&self, rows: usize) -> usize {
         let trainable = self.budget(rows).trainable();
-        self.start().unwrap_or_else(|| random_points(trainable)).min(trainable)
+        self.wanted_initial_rows().unwrap_or_else(|| random_points(trainable)).min(trainable)
     }
 
     /// A budget of this many rows, frozen ones included.
@@ -238,7 +239,7 @@ impl<'a> Case<'a> {
         RowBudget { total, frozen: self.frozen_rows() }
     }
 
-    /// All rows of a budget in which this many can be trained.
+    /// The total of a budget in which this many rows can be trained.
     pub(super) fn rows_for(&self, trainable: usize) -> usize {
         RowBudget::for_trainable(trainable, self.frozen_rows()).total
     }
@@ -247,7 +248,7 @@ impl<'a> Case<'a> {
         self.inputs.frozen_model.map_or(0, |model| model.rows)
     }
 
-    /// The scene as policies see it, which do not know of frozen rows.
+    /// The scene as policies see it, without frozen rows.
     pub(super) fn scene(&self, rows: usize, initial_rows: usize) -> Result<SceneInfo, Failure> {
         let dataset = &self.inputs.dataset;
         Ok(SceneInfo {
@@ -273,7 +274,7 @@ impl<'a> Case<'a> {
         Ok(self.backend_needs(policy.needs(&scene)))
     }
 
-    /// The needs of a policy with those of the trainer.
+    /// The needs of a policy, plus those of the trainer.
     pub(crate) fn backend_needs(&self, needs: Needs) -> Needs {
         let signals = if self.choices.automatic.rows {
             growth_signals().iter().fold(needs.signals, SignalSet::with)
@@ -284,7 +285,7 @@ impl<'a> Case<'a> {
     }
 }
 
-/// Random points to start from if no number is given.
+/// Default number of random points to start from.
 fn random_points(trainable: usize) -> usize {
     (trainable / 2).clamp(1, RANDOM_POINTS)
 }

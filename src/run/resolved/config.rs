@@ -1,5 +1,5 @@
-//! `config.toml`: a run with every option decided, and the findings that decided them. This is the one place that turns
-//! a description and what was resolved for it into a file, and back.
+//! `config.toml`: a run with a value for every option, and the findings behind them. Only this module converts a
+//! resolved run to the file and back.
 
 use std::path::{Path, PathBuf};
 
@@ -18,16 +18,16 @@ use densify_data::track_colours::Spread;
 use densify_data::track_colours::exposures::ExposureSpread;
 use densify_train::output::{CONFIG_FILE, FolderError};
 
-/// A resolved run as its `config.toml` has it.
+/// A resolved run as stored in its `config.toml`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RunConfig {
     /// Version of densify that made the run.
     pub densify: String,
-    /// A description that makes the same run: it asks for everything that was decided.
+    /// A description that reproduces the run: it names every choice.
     pub spec: RunSpec,
-    /// The findings that decided them.
+    /// The findings behind the choices.
     pub resolved: Findings,
-    /// The most rows there may ever be.
+    /// Maximum number of rows.
     pub budget: usize,
     /// The highest spherical-harmonic degree.
     pub sh_degree: u8,
@@ -44,13 +44,13 @@ pub struct Findings {
     /// The order in which a GPU added up gradients; `None`: the processor.
     pub accumulation: Option<String>,
     /// The iteration to which a resumed run was extended beyond its length. Schedules do not depend on it: learning
-    /// rates stay at their end.
+    /// rates keep their final values.
     pub extended_to: Option<u32>,
     /// The reason for the degree.
     pub sh_degree_from: DegreeSource,
-    /// `--memory` made the degree lower than was wanted.
+    /// `--memory` made the degree lower than requested.
     pub sh_degree_lowered: bool,
-    /// The reason for learning exposures, or for not learning them.
+    /// The reason for learning exposures or not.
     pub exposure_from: ExposureSource,
     /// Exposures are learned.
     pub has_exposures: bool,
@@ -70,7 +70,7 @@ pub struct ModelSize {
     pub sh_degree: u8,
 }
 
-/// The reason why each photograph has an exposure of its own, or has none.
+/// The reason for learning an exposure for each photograph, or not.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ExposureSource {
@@ -106,7 +106,7 @@ impl RunConfig {
         let ResolvedRun { case, size, init, degree_lowered, .. } = run;
         let (inputs, choices, asked) = (&case.inputs, &case.choices, case.spec);
         let mut spec = asked.clone();
-        // The file's own folder is the output.
+        // The output is the folder of the file.
         spec.output.output = None;
         let budget = asked.size.budget.unwrap_or(Budget::Rows(size.rows));
         spec.size.budget = Some(budget.limited_to(size.rows));
@@ -114,7 +114,7 @@ impl RunConfig {
             Some(ShDegree::Auto(_)) => ShDegree::Auto(Some(size.sh_degree)),
             _ => ShDegree::Fixed(size.sh_degree),
         });
-        // The knob gives the tile lists their length.
+        // If the knob is set, it determines the length of the tile lists.
         spec.size.tile_cap = choices.knobs.pairs_per_row.is_none().then_some(Rows(size.tile_cap));
         spec.size.image_cache = Some(ImageCache::Bytes(size.image_cache));
         spec.device.backend = inputs.device.kind().choice();
@@ -171,7 +171,7 @@ impl RunConfig {
         Ok(table)
     }
 
-    /// Reads what [`table`](Self::table) wrote.
+    /// Reads a table that [`table`](Self::table) returned.
     ///
     /// # Errors
     /// Names the key, and what was expected.
@@ -232,7 +232,7 @@ impl RunConfig {
     }
 }
 
-/// `f32` values in their shortest decimals: 0.005 rather than 0.004999999888241291.
+/// Gives `f32` values their shortest decimals: 0.005 rather than 0.004999999888241291.
 fn in_shortest_decimals(mut table: Table) -> Table {
     for value in table.iter_mut().map(|(_, value)| value) {
         if let Value::Float(number) = value
@@ -277,13 +277,13 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn what_is_written_is_read_back() {
+    fn configs_are_read_back_unchanged() {
         let root = tempfile::tempdir().unwrap();
         sample().write(root.path()).unwrap();
         assert_eq!(RunConfig::read(root.path()).unwrap(), sample());
         let text = std::fs::read_to_string(root.path().join(CONFIG_FILE)).unwrap();
         assert!(text.contains("background = \"#ff0010\""), "{text}");
-        // A run's file describes the run: it is a file for --config, too.
+        // The file can also be passed to --config.
         let again = Partial::read(&root.path().join(CONFIG_FILE)).unwrap();
         assert_eq!(again.describe().unwrap(), sample().spec);
     }

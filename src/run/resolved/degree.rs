@@ -12,7 +12,7 @@ use densify_data::track_colours::{self, MIN_TRACKS};
 /// The degree of a run, before its memory is known.
 #[derive(Debug, Clone)]
 pub(crate) struct Degree {
-    /// The highest wanted, and how far memory may lower it.
+    /// From the lowest degree that memory may enforce, to the highest wanted.
     pub(crate) range: RangeInclusive<u8>,
     pub(crate) source: DegreeSource,
 }
@@ -22,8 +22,8 @@ impl Degree {
         *self.range.end()
     }
 
-    /// Decides the degree as the options say, or else from the colours of the dataset's tracks, if it has enough. In
-    /// a resumed run the degree is a number, which `source` had decided.
+    /// Decides the degree by the options, or with `auto` by the colours of the dataset's tracks, if there are enough.
+    /// In a resumed run the degree is a number, and `source` the original reason for it.
     pub(super) fn decide(
         spec: &RunSpec,
         source: Option<DegreeSource>,
@@ -61,8 +61,8 @@ impl Degree {
                 found.twentieth,
             )),
             DegreeSource::Undecided => Some(format!(
-                "colour   degree {} (auto): points of a reconstruction decide nothing, as fewer than \
-                 {MIN_TRACKS} are known in enough views, or fewer than half of them lie on surfaces",
+                "colour   degree {} (auto): undecided, because fewer than {MIN_TRACKS} \
+                 reconstructed points are known in enough views, or fewer than half of them lie on surfaces",
                 self.highest()
             )),
         }

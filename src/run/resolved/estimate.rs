@@ -1,4 +1,4 @@
-//! The memory of runs that are not prepared here, such as those of a batch.
+//! The memory of runs that are prepared elsewhere, such as those of a batch.
 
 use super::{ModelSize, ResolvedRun};
 use crate::failure::Failure;
@@ -6,7 +6,7 @@ use crate::host::Host;
 use crate::spec::RunSpec;
 use densify_core::memory::Ledger;
 
-/// The rows and the ledger of a run whose models of `--init` and `--freeze` do not exist yet. Exposures count where
+/// The rows and the ledger of a run whose models of `--init` and `--freeze` do not exist yet. Exposures are counted if
 /// they may be learned.
 ///
 /// # Errors
@@ -20,11 +20,11 @@ pub fn estimate(
     Ok((run.size.rows, run.case.ledger_of(&run.size)?))
 }
 
-/// Host memory of a run, at most `[bytes]`.
+/// Upper bound of the host memory of a run `[bytes]`.
 ///
 /// # Errors
 /// As preparing the run.
 pub fn host_bytes(spec: &RunSpec, host: Host<'_>) -> Result<u64, Failure> {
-    let run = ResolvedRun::anew(spec, host)?;
+    let run = ResolvedRun::for_new_run(spec, host)?;
     Ok(run.case.ledger_of(&run.size)?.on_host())
 }

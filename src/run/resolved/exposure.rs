@@ -1,4 +1,4 @@
-//! `--exposure`: an exposure of its own for each photograph.
+//! `--exposure`: a separate exposure for each photograph.
 
 use super::config::ExposureSource;
 use super::inputs::Evidence;
@@ -18,12 +18,12 @@ pub(crate) struct Exposure {
     /// Exposures are learned.
     pub(crate) is_on: bool,
     pub(crate) source: ExposureSource,
-    /// Gains of the training views to begin with; empty: all begin alike.
+    /// Initial gains of the training views; empty if all views start alike.
     gains: Vec<[f32; 3]>,
-    /// The colours of tracks gave the gains.
+    /// The gains come from the colours of tracks.
     by_tracks: bool,
     /// Use of the exposures in EXIF.
-    believed: ExifUse,
+    exif_use: ExifUse,
     /// Standard deviation of the exposures in EXIF `[stops]`.
     reported: f64,
     /// Problems with EXIF, for the user.
@@ -31,21 +31,21 @@ pub(crate) struct Exposure {
 }
 
 impl Exposure {
-    /// A decision that was made before; a checkpoint has the exposures to begin with.
+    /// An earlier decision; the exposures to start with are in the checkpoint.
     pub(super) fn known(is_on: bool, source: ExposureSource) -> Self {
         Self {
             is_on,
             source,
             gains: Vec::new(),
             by_tracks: false,
-            believed: ExifUse::Unused,
+            exif_use: ExifUse::Unused,
             reported: 0.0,
             notes: Vec::new(),
         }
     }
 
-    /// Decides as the option says, or else from the colours of tracks. Gains to begin with come from these, and from
-    /// EXIF where they say nothing.
+    /// Decides by the option, or with `auto` by the colours of tracks. Initial gains come from these colours, and from
+    /// EXIF for views without them.
     pub(super) fn decide(spec: &RunSpec, evidence: &Evidence) -> Self {
         let Evidence { colours, reported, .. } = evidence;
         let colours = colours.as_ref();
@@ -76,11 +76,11 @@ impl Exposure {
             _ => vec![false; views],
         };
         found.gains.resize(views, [1.0; 3]);
-        found.believed = complete_gains(&mut found.gains, &known, &reported.stops);
-        if !found.by_tracks && found.believed == ExifUse::Unused {
+        found.exif_use = complete_gains(&mut found.gains, &known, &reported.stops);
+        if !found.by_tracks && found.exif_use == ExifUse::Unused {
             found.gains.clear();
         }
-        if let ExifUse::Contradicted { by } = found.believed {
+        if let ExifUse::Contradicted { by } = found.exif_use {
             found.notes.push(format!(
                 "the exposures in EXIF are {by:.1} stops (rms) from what the colours of points show, and are not used"
             ));
@@ -94,7 +94,7 @@ impl Exposure {
         found
     }
 
-    /// The exposures that the run begins with, if they are learned.
+    /// The exposures that the run starts with, if they are learned.
     pub(crate) fn first(&self, spec: &RunSpec, dataset: &Dataset) -> Option<Exposures> {
         let alike = vec![[1.0; 3]; dataset.train.len()];
         let gains = if self.gains.is_empty() { &alike } else { &self.gains };
@@ -105,7 +105,7 @@ impl Exposure {
     pub(super) fn line(&self, spelling: Spelling) -> Option<String> {
         let word = if self.is_on { "on" } else { "off" };
         match self.source {
-            ExposureSource::Given if self.is_on => Some(match (self.by_tracks, self.believed) {
+            ExposureSource::Given if self.is_on => Some(match (self.by_tracks, self.exif_use) {
                 (true, _) => {
                     format!(
                         "exposure on, from the gains of points in several views{}",
@@ -115,7 +115,7 @@ impl Exposure {
                 (false, ExifUse::Views(views)) => {
                     format!("exposure on, from the EXIF of {} views", grouped(views))
                 }
-                (false, _) => "exposure on, from one for all views".to_owned(),
+                (false, _) => "exposure on, initially the same for all views".to_owned(),
             }),
             ExposureSource::Given => None,
             ExposureSource::Tracks(found) => Some(format!(
@@ -141,10 +141,10 @@ impl Exposure {
         }
     }
 
-    /// The number of views that begin from EXIF where the others begin from tracks.
+    /// The number of views that start from EXIF while the others start from tracks.
     fn exif_views(&self) -> String {
-        match self.believed {
-            ExifUse::Views(views) => format!("; {} views begin from their EXIF", grouped(views)),
+        match self.exif_use {
+            ExifUse::Views(views) => format!("; {} views start from their EXIF", grouped(views)),
             ExifUse::Unused | ExifUse::Contradicted { .. } => String::new(),
         }
     }
@@ -191,12 +191,12 @@ mod tests {
             note.contains("1 photographs have nonsense") && note.contains("c.jpg says"),
             "{note}"
         );
-        // Where nothing is told, all begin alike.
+        // Without any EXIF, all views start alike.
         let nothing = ReportedExposures { stops: vec![None; 3], ..ReportedExposures::default() };
         let found = decided(ExposureChoice::On, &nothing);
         assert_eq!(
             found.line(Spelling::Terminal).as_deref(),
-            Some("exposure on, from one for all views")
+            Some("exposure on, initially the same for all views")
         );
         assert!(found.gains.is_empty() && found.notes.is_empty());
     }

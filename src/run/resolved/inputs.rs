@@ -25,17 +25,17 @@ pub(crate) struct Inputs {
     pub(crate) dataset: Dataset,
     /// The memory that training and test images take.
     pub(crate) images: [ImageDemand; 2],
-    /// The model that `--init` names, if it names one.
+    /// Size of the model that `--init` names, if it names one.
     pub(crate) init_model: Option<ModelSize>,
-    /// The model that `--freeze` names, if it names one.
+    /// Size of the model that `--freeze` names, if it names one.
     pub(crate) frozen_model: Option<ModelSize>,
-    /// Gaussians that a start on all points of the dataset has.
+    /// Number of Gaussians of a run that starts from all points of the dataset.
     pub(super) usable_points: usize,
-    /// Bytes that reading the colours of tracks takes, besides an image; 0 where they decide nothing.
+    /// Bytes for reading the colours of tracks, in addition to an image; 0 if no choice depends on them.
     pub(super) track_bytes: u64,
     /// Resident memory with the dataset and the device's driver, if it is known `[bytes]`.
     pub(super) resident: Option<u64>,
-    /// The most resident memory before the driver had its kernels, if it is known `[bytes]`.
+    /// Peak resident memory before the driver compiled its kernels, if it is known `[bytes]`.
     pub(super) peak: Option<u64>,
     pub(super) companion: Option<Companion>,
 }
@@ -44,25 +44,25 @@ pub(crate) struct Inputs {
 #[derive(Default)]
 pub(super) struct Evidence {
     pub(super) tracks: Tracks,
-    /// The colours of the tracks; `None` if they are too few, or were not read.
+    /// The colours of the tracks; `None` if there are too few tracks, or colours were not read.
     pub(super) colours: Option<TrackColours>,
     /// Exposures in EXIF.
     pub(super) reported: ReportedExposures,
 }
 
-/// The evidence that is read besides the dataset, and the source of the sizes of models.
+/// The evidence to read in addition to the dataset, and the sizes of models if they are known.
 #[derive(Default)]
 pub(super) struct Reading {
     /// Sizes of the models of `--init` and `--freeze`; `None`: their files are read.
     pub(super) models: Option<[Option<ModelSize>; 2]>,
-    /// The tracks of the reconstruction.
+    /// Read the tracks of the reconstruction.
     pub(super) tracks: bool,
-    /// The colours of the tracks.
+    /// Read the colours of the tracks.
     pub(super) colours: bool,
-    /// The exposures in EXIF.
+    /// Read the exposures in EXIF.
     pub(super) exif: bool,
-    /// Bytes of resident memory not counted, so that a resumed run is not refused for a process that takes a little
-    /// more than the one that began it.
+    /// Bytes of resident memory not counted, so that a resumed run is not refused because its process takes a little
+    /// more than the one that started the run.
     pub(super) tolerance: u64,
 }
 
@@ -91,7 +91,7 @@ impl Inputs {
                 size("freeze", freeze.as_ref().map(|file| &*file.0))?,
             ],
         };
-        // Tracks have a line of their own in the ledger, and are freed before training.
+        // Tracks have a separate line in the ledger, and are freed before training.
         let apart = dataset.tracks.bytes() + reading.tolerance;
         let resident = (host.process.resident)().map(|now| now.saturating_sub(apart));
         let peak = (host.process.peak)();
@@ -131,7 +131,8 @@ fn image_demand(dataset: &Dataset) -> [ImageDemand; 2] {
     [demand(&dataset.train), demand(&dataset.test)]
 }
 
-/// Opens the device, checks that it has the knobs that are set, and sets the knob of how it adds up gradients.
+/// Opens the device, checks that it supports the knobs that are set, and sets the knob `accumulation` to the method in
+/// use.
 pub(super) fn open_device(
     spec: &RunSpec,
     knobs: &mut Knobs,

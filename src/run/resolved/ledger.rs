@@ -1,6 +1,5 @@
-//! The memory of a run, buffer by buffer, for any size of it, before anything is allocated. A run, the solver for
-//! `--memory` and `densify plan` read this ledger, so they cannot disagree. It is a pure function of what was opened,
-//! what was decided, and the size.
+//! The memory of a run of any size, buffer by buffer, before anything is allocated. Runs, the solver for `--memory` and
+//! `densify plan` use the same ledger, so they cannot disagree. It is a pure function of inputs, choices and size.
 
 use densify_policies::plan::bytes_per_row;
 use densify_policies::policy::Needs;
@@ -22,30 +21,30 @@ use densify_train::exposure::Exposures;
 use densify_train::metrics::{geometry, scratch_bytes};
 use densify_train::trainer::AutoChoices;
 
-/// The program itself: the pages of code that run, and the stacks of its threads. Measured at 10 to 13 MiB, and at about
-/// 14 MiB in builds for tests (profile `dev`).
+/// The program itself: the code pages in use, and the stacks of its threads. Measured at 10 to 13 MiB, and at about 14
+/// MiB in builds for tests (profile `dev`).
 const PROGRAM: u64 = 16 << 20;
-/// A program that takes more, such as one with a driver in it, counts as what it has, rounded up to these steps so that
-/// the promise does not change from call to call.
+/// If the process takes more, for example because of a driver, its actual memory counts, rounded up to a multiple of
+/// this so that the ledger does not change from call to call.
 const PROGRAM_STEP: u64 = 8 << 20;
 /// Memory that the system's allocator keeps between two uses. Measured at up to 5 MiB.
-const KEPT: u64 = 6 << 20;
-/// Bytes per row that a policy derives from its signals before it plans: means, orders, sums of weights and draws.
-/// Columns of auxiliary views are counted twice for policies that derive more from them. Sorting rows takes at most as
-/// much, when this is free again.
-const PLANNING: u64 = 20;
-/// Bytes per thread of either pool: the part of its stack that it touches, and buffers that it keeps. Measured at 44 to
-/// 52 KiB for both together, from 64 to 256 threads.
-const THREAD: u64 = 64 << 10;
-/// The promise holds for any number of threads up to this, so that it does not depend on them.
-const THREADS: usize = 64;
-/// Bytes of a copy and of the text of exposures, at most, per byte.
+const ALLOCATOR_RESERVE: u64 = 6 << 20;
+/// Bytes per row that a policy derives from its signals before it plans: means, orders, sums of weights and random
+/// numbers. Columns of auxiliary views are counted twice for policies that derive more from them. Sorting rows
+/// afterwards takes no more than this, when it is free again.
+const PLANNING_BYTES: u64 = 20;
+/// Bytes per thread of both thread pools together: the used part of its stack, and the buffers that it keeps. Measured
+/// at 44 to 52 KiB with 64 to 256 threads.
+const THREAD_BYTES: u64 = 64 << 10;
+/// The ledger assumes at least this many threads, so that it is the same for all smaller numbers.
+const MIN_THREADS: usize = 64;
+/// Maximum bytes of a copy of the exposures and of their text, per byte of the exposures.
 const EXPOSURE_TEXT: u64 = 1 + 4;
-/// A point with its colour.
-const POINT: u64 = (size_of::<DVec3>() + 3) as u64;
+/// Bytes of a point with its colour.
+const POINT_BYTES: u64 = (size_of::<DVec3>() + 3) as u64;
 
 impl Case<'_> {
-    /// The backend of a size.
+    /// The setup of the backend for a size.
     pub(crate) fn backend_setup(&self, size: &RunSize, needs: Needs) -> Setup {
         Setup {
             budget: self.budget(size.rows),
@@ -63,7 +62,8 @@ impl Case<'_> {
         }
     }
 
-    /// Gradient records for two pairs in five, where pairs are counted; else for all.
+    /// The maximum number of gradient records: two for every five pairs if the knob `pairs_per_row` is set, else
+    /// unlimited.
     fn record_cap(&self, size: &RunSize) -> usize {
         match self.choices.knobs.pairs_per_row {
             Some(_) => (size.tile_cap / 5 * 2).max(1),
@@ -81,9 +81,9 @@ impl Case<'_> {
         KeptPhotographs { count: count.min(train.len()), with_masks }
     }
 
-    /// All memory of a run with these needs. The solver finds the largest size by this function.
+    /// All memory of a run with these needs. The solver finds the largest size with this function.
     pub(crate) fn ledger(&self, size: &RunSize, needs: &Needs) -> Ledger {
-        let threads = self.choices.threads.max(THREADS);
+        let threads = self.choices.threads.max(MIN_THREADS);
         let degree = size.sh_degree;
         let options = self.backend_setup(size, needs.clone());
         let mut ledger = self.inputs.device.memory_plan(degree, &options, threads);
@@ -118,15 +118,15 @@ impl Case<'_> {
             ledger.add_to(Section::Before, "the frozen model", reading_bytes(model));
         }
         let mut pass = |what: &str, bytes| ledger.add_to(Section::Passing, what, bytes);
-        // Points, their order, neighbours in f64, and the rows before the backend has them.
+        // Points, their order, neighbours in f64, and the first rows before they are copied to the backend.
         let first = self.rows_for(self.initial_rows(size.rows)) as u64;
         let points =
             self.spec.start.init_points.map_or(self.inputs.dataset.points.len(), |points| points.0)
                 as u64;
-        pass("first rows", points.max(first) * (POINT + 16) + first * (row + 96));
+        pass("first rows", points.max(first) * (POINT_BYTES + 16) + first * (row + 96));
         pass("a policy's event", self.event_bytes(size, needs));
-        // A piece of rows, as much again because allocators keep some freed arrays for a while, and what the
-        // writer holds.
+        // A piece of rows, the same again because allocators keep some freed arrays for a while, and the buffers of the
+        // writer.
         let piece = budget.min(ROWS_AT_A_TIME as u64);
         let held = PLY.held_bytes(Shape { rows: size.rows, sh_degree: degree });
         pass("export of the model, checkpoint", 2 * piece * row + held + EXPOSURE_TEXT * exposures);
@@ -149,14 +149,14 @@ impl Case<'_> {
             || self.inputs.init_model.is_some()
         {
             let (width, height) = self.inputs.dataset.largest_image();
-            // Exposures need another copy of the colours, with the exposure that fits best.
+            // Exposures need another copy of the colours, transformed by the exposure that fits best.
             let planes = if self.choices.exposure.is_on { 8 } else { 5 };
             let rendering = u64::from(width) * u64::from(height) * planes * float;
             let one = |images: &ImageDemand| images.held(0) + images.decoding(1);
             let tested = if measures_test { one(&test) } else { 0 };
             let image = tested.max(if self.inputs.init_model.is_some() { one(&train) } else { 0 });
-            // While the rows that matter least are found: the order of all rows, and their opacities twice or, after
-            // that, a plan.
+            // Finding the least important rows takes the order of all rows, and their opacities twice or, after that, a
+            // plan.
             let row = float + (2 * float).max(bytes_per_row(&Needs::default()) as u64);
             let asked = if self.choices.automatic.rows { budget * row } else { 0 };
             pass("measuring a view", rendering + image + scratch_bytes(width, threads) + asked);
@@ -166,11 +166,11 @@ impl Case<'_> {
             ledger.add_to(Section::Before, "loading the scene", beyond);
         }
         ledger.add_to(Section::Process, "program and dataset", process);
-        let stacks = threads as u64 * THREAD;
+        let stacks = threads as u64 * THREAD_BYTES;
         ledger.add_to(Section::Process, format!("up to {threads} threads"), stacks);
         let Some(measuring) = self.measuring(size, threads) else { return ledger };
-        let counted = measuring.counted(&ledger, size.rows, degree);
-        // Measuring does not lower the number of rows: if the memory given is too little for it, it is left out.
+        let counted = measuring.added_to(&ledger, size.rows, degree);
+        // Measuring must not lower the number of rows: if the memory limit is too small for it, it is skipped.
         match self.memory() {
             Some(memory) if self.inputs.device.limited_bytes(&counted) > memory => ledger,
             _ => counted,
@@ -192,12 +192,12 @@ impl Case<'_> {
         Some(Measuring { device, options, threads, surface, views })
     }
 
-    /// Bytes of signals on the host, of the plan, and of what the policy derives from the signals.
+    /// Bytes of signals on the host, of the plan, and of values that the policy derives from the signals.
     fn event_bytes(&self, size: &RunSize, needs: &Needs) -> u64 {
         let float = size_of::<f32>() as u64;
         let candidate = size_of::<densify_policies::policy::Candidate>() as u64;
         let seed = size_of::<densify_policies::plan::Seed>() as u64;
-        // The native backend lends its own memory for signals.
+        // The native backend lets the policy read its own arrays of signals.
         let signals = self.inputs.device.columns_on_host(needs.signals.width()) as u64;
         // One auxiliary view's columns, and as many that a policy derives from them; all views' points.
         let aux = needs.aux.as_ref();
@@ -205,7 +205,7 @@ impl Case<'_> {
         let points = aux.map_or(0, |request| u64::from(request.points));
         // The policy keeps a point, makes a seed of it, and compiles the seed.
         let plan = bytes_per_row(needs) as u64;
-        size.rows as u64 * ((signals + columns) * float + plan + PLANNING)
+        size.rows as u64 * ((signals + columns) * float + plan + PLANNING_BYTES)
             + points * self.inputs.dataset.train.len() as u64 * (candidate + 3 * seed)
     }
 
@@ -217,15 +217,15 @@ impl Case<'_> {
         let rendered = |view: &View| view.source.rendered.as_ref().map_or(0, |image| image.bytes());
         // A view's name and path, in the dataset and again for its images.
         let view = |view: &View| (3 * size_of::<View>() + 464) as u64 + rendered(view);
-        let expected = PROGRAM + views.map(view).sum::<u64>() + points.len() as u64 * POINT;
+        let expected = PROGRAM + views.map(view).sum::<u64>() + points.len() as u64 * POINT_BYTES;
         let program = match self.inputs.resident {
             Some(resident) if resident > expected => resident.next_multiple_of(PROGRAM_STEP),
             _ => expected,
         };
-        program + KEPT
+        program + ALLOCATOR_RESERVE
     }
 
-    /// Bytes of all training images decoded.
+    /// Bytes of all training images when decoded.
     pub(super) fn all_images(&self) -> u64 {
         self.inputs.images[0].all
     }

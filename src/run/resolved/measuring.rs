@@ -1,4 +1,4 @@
-//! Measuring the finished model against a known surface: the backend that does it, and the memory that it takes.
+//! Measurement of the finished model against a known surface: its backend and its memory.
 
 use densify_core::budget::RowBudget;
 use densify_core::memory::{Ledger, Section};
@@ -20,17 +20,17 @@ pub(crate) struct Measuring {
 }
 
 impl Measuring {
-    /// The ledger of training with the memory of measuring a model of this many rows after it.
-    pub(super) fn counted(&self, training: &Ledger, rows: usize, sh_degree: u8) -> Ledger {
+    /// The ledger of training, with the memory for measuring a model of this many rows afterwards.
+    pub(super) fn added_to(&self, training: &Ledger, rows: usize, sh_degree: u8) -> Ledger {
         let mut counted = training.clone();
         let [host, device] = self.bytes(rows, sh_degree);
-        // The device's memory is that of training; what is beyond it would come on top.
+        // Measuring reuses the device memory of training; only an excess is added.
         let beyond = device.saturating_sub(training.on_device());
         counted.add_to(Section::After, "measuring geometry", host + beyond);
         counted
     }
 
-    /// Memory of measuring besides the process, on the host and on the device `[bytes]`.
+    /// Memory for measuring in addition to the process, on the host and on the device `[bytes]`.
     pub(crate) fn bytes(&self, rows: usize, sh_degree: u8) -> [u64; 2] {
         let options = self.for_rows(rows);
         let plan = self.device.memory_plan(sh_degree, &options, self.threads);
@@ -41,13 +41,13 @@ impl Measuring {
     /// The backend for a model of this many rows.
     pub(crate) fn for_rows(&self, rows: usize) -> Setup {
         let rows = rows.max(1);
-        // A view rarely has more pairs; it is rendered in bands then, with the same result.
+        // Few views have more pairs; these are rendered in bands, with the same result.
         let pairs = rows.saturating_mul(3).min(self.device.most_pairs(&self.options.needs));
         let cap = self.options.tile_cap.map_or(pairs, |cap| cap.min(pairs));
         Setup {
             budget: RowBudget { total: rows, ..self.options.budget },
             tile_cap: Some(cap.max(rows)),
-            // Nothing is differentiated.
+            // No gradient is computed.
             record_cap: rows,
             ..self.options.clone()
         }

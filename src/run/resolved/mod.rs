@@ -1,6 +1,6 @@
-//! A run with everything decided. [`Inputs`] are what it reads; a [`Case`] is a description with these and with the
-//! choices that do not depend on its size; a [`ResolvedRun`] has its size, too. The ledger is a function of inputs,
-//! choices and size. Nothing is written.
+//! A run with every choice made. [`Inputs`] are the device and the dataset; a [`Case`] adds the description and the
+//! choices that do not depend on its size; a [`ResolvedRun`] adds the size. The ledger is a function of inputs, choices
+//! and size. Nothing is written.
 
 mod case;
 mod config;
@@ -36,16 +36,16 @@ use crate::host::Host;
 use crate::spec::RunSpec;
 use size::Size;
 
-/// A run with everything decided, before the model that it starts from is made.
+/// A run with every choice made, before its first model exists.
 pub(crate) struct ResolvedRun<'a> {
     pub(crate) case: Case<'a>,
     /// Rows, degree, tile lists and image cache.
     pub(crate) size: RunSize,
     /// The first Gaussians.
     pub(crate) init: Init,
-    /// `--memory` made the degree lower than was wanted.
+    /// `--memory` made the degree lower than requested.
     pub(crate) degree_lowered: bool,
-    /// Lines for the user: the reasons for the size, and the choices that the colours of the scene decided.
+    /// Lines for the user: the reasons for the size, and the choices that depend on the scene's colours.
     pub(crate) reasons: Vec<String>,
 }
 
@@ -54,18 +54,18 @@ impl<'a> ResolvedRun<'a> {
     ///
     /// # Errors
     /// When options contradict each other, something cannot be opened, or no model fits.
-    pub(crate) fn anew(spec: &'a RunSpec, host: Host<'_>) -> Result<Self, Failure> {
-        let case = Case::anew(spec, host)?;
+    pub(crate) fn for_new_run(spec: &'a RunSpec, host: Host<'_>) -> Result<Self, Failure> {
+        let case = Case::for_new_run(spec, host)?;
         let size = Size::choose(&case)?;
         let degree_lowered = size.is_lowered(&case);
         Ok(Self::new(case, &size, degree_lowered, host))
     }
 
-    /// Resolves a run that goes on, as `saved` had decided. `spec` is the saved description with the options given
-    /// now. Only a checkpoint has the exposures that photographs begin with; without one they are found again.
+    /// Resolves a resumed run with the choices of `saved`. `spec` is the saved description overlaid with the options
+    /// given now. Only a checkpoint contains the exposures; without one, the initial ones are determined again.
     ///
     /// # Errors
-    /// As [`anew`](Self::anew).
+    /// As [`for_new_run`](Self::for_new_run).
     pub(crate) fn from_saved(
         spec: &'a RunSpec,
         saved: &RunConfig,
@@ -77,11 +77,11 @@ impl<'a> ResolvedRun<'a> {
         Ok(Self::new(case, &size, saved.resolved.sh_degree_lowered, host))
     }
 
-    /// Resolves a run whose models of `--init` and `--freeze` do not exist yet, to know what it takes. Exposures count
-    /// where they may be learned.
+    /// Resolves a run whose models of `--init` and `--freeze` do not exist yet, to estimate its memory. Exposures are
+    /// counted if they may be learned.
     ///
     /// # Errors
-    /// As [`anew`](Self::anew).
+    /// As [`for_new_run`](Self::for_new_run).
     pub(crate) fn for_estimate(
         spec: &'a RunSpec,
         models: [Option<ModelSize>; 2],

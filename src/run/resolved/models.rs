@@ -52,13 +52,13 @@ fn bytes_of(model: ModelSize) -> u64 {
     (model.rows * size_of::<f32>() * (11 + 3 * sh_coefficients(model.sh_degree))) as u64
 }
 
-/// Bytes that reading a model takes, into arrays that grow.
+/// Bytes for reading a model into growing arrays.
 pub(super) fn reading_bytes(model: ModelSize) -> u64 {
     3 * bytes_of(model)
 }
 
-/// Bytes that the model of `--init` takes before the run has its own rows: as it is read, or while its importance is
-/// measured because it exceeds the budget.
+/// Peak bytes for the model of `--init` before training: while it is read, or, if it exceeds the budget, while its
+/// importance is measured.
 pub(super) fn first_bytes(
     model: ModelSize,
     case: &Case<'_>,
@@ -73,7 +73,7 @@ pub(super) fn first_bytes(
     let backend = case.inputs.device.memory_plan(model.sh_degree, &setup, threads).on_host();
     let [train, _] = case.inputs.images;
     let image = train.held(0) + train.decoding(1);
-    // The model beside its copy in the backend, then beside the rows that are kept.
+    // The model together with its copy in the backend, and then with the rows that are kept.
     reading.max(bytes_of(model) + backend + image + densify_train::importance::bytes(model.rows))
 }
 
@@ -84,7 +84,7 @@ pub(crate) fn measuring_setup(rows: usize, case: &Case<'_>, size: &RunSize) -> S
     Setup {
         budget: rows.into(),
         tile_cap: Some(pairs.max(rows)),
-        // Nothing is differentiated, and no moment matters.
+        // No gradient is computed, and moments are unused.
         record_cap: rows,
         storage: Storage { moments: MomentStorage::Both8, ..Storage::default() },
         ..case.backend_setup(size, needs)

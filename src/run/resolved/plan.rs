@@ -24,10 +24,10 @@ pub struct Plan {
     pub alternatives: Alternatives,
 }
 
-/// Rows that a memory holds, by degree and by size of the images.
+/// Number of rows that fit a memory limit, by degree and image size.
 #[derive(Debug, Clone)]
 pub struct Alternatives {
-    /// The memory `[bytes]`.
+    /// The memory limit `[bytes]`.
     pub memory: u64,
     /// `--resolution`, and width and height of the largest image `[px]`.
     pub images: Vec<(u32, (u32, u32))>,
@@ -40,16 +40,17 @@ pub struct Alternatives {
 /// # Errors
 /// As preparing the run.
 pub fn plan(spec: &RunSpec, host: Host<'_>) -> Result<Plan, Failure> {
-    let ResolvedRun { case, size, mut reasons, .. } = ResolvedRun::anew(spec, host)?;
+    let ResolvedRun { case, size, mut reasons, .. } = ResolvedRun::for_new_run(spec, host)?;
     let ledger = case.ledger_of(&size)?;
-    reasons.push(case.promise(&ledger, host.observer.spelling()));
+    reasons.push(case.memory_table(&ledger, host.observer.spelling()));
     let limited = case.inputs.device.limited_bytes(&ledger);
     let memory = case.memory().unwrap_or(limited.next_multiple_of(MIB));
     let alternatives = alternatives(&case, memory, size.rows)?;
     Ok(Plan { ledger, lines: reasons, alternatives })
 }
 
-/// Sizes of this run that fit `memory` without `--budget`. As few as `planned` rows count as a useful model.
+/// Sizes of this run that fit `memory` if `--budget` is ignored. A model of `planned` rows counts as useful, however
+/// small.
 fn alternatives(case: &Case<'_>, memory: u64, planned: usize) -> Result<Alternatives, Failure> {
     let own = case.spec.data.resolution.unwrap_or(Resolution::Divisor(1));
     let mut resolutions = vec![own];
@@ -66,7 +67,7 @@ fn alternatives(case: &Case<'_>, memory: u64, planned: usize) -> Result<Alternat
         (resolution, spec)
     };
     let specs: Vec<_> = resolutions.into_iter().map(spec).collect();
-    // A size is left out if there are no images of it.
+    // A resolution is left out if its images cannot be loaded.
     let cases = specs.iter().map(|(resolution, spec)| Some((*resolution, case.with(spec).ok()?)));
     let all: Vec<(Resolution, Case<'_>)> = cases.flatten().collect();
     let rows_at = |degree| {

@@ -1,4 +1,4 @@
-//! Changes of the options that make a run fit, each tried, the cheapest first.
+//! Changes of the options that were checked to make a run fit, cheapest first.
 
 use super::case::Case;
 use super::size::MIB;
@@ -12,7 +12,7 @@ use densify_render::BackendKind;
 const SMALL: &str = "tiny-memory";
 
 impl Remedy {
-    /// Changes of a new run, the cheapest first: time, then view-dependent colours, then detail.
+    /// Changes for new runs, cheapest first: they cost time, then view-dependent colours, then detail.
     pub(super) const NEW: [Self; 7] = [
         Self::NoImages,
         Self::NoTileCap,
@@ -59,8 +59,8 @@ fn with_preset(preset: &str, spec: &RunSpec) -> Option<RunSpec> {
     Partial::option("preset", preset).over(given).describe().ok()
 }
 
-/// The changes after which the run `fits`, each alone; or else the fewest of them together. Among smaller photographs
-/// only the largest that fit are named.
+/// Each change that alone makes the run fit; if there is none, the shortest sequence of the first changes that does. Of
+/// several smaller image sizes, only the largest that fits is listed.
 pub(super) fn remedies(
     case: &Case<'_>,
     base: &RunSpec,

@@ -1,8 +1,10 @@
-//! The size of a run: as the options say, or solved for `--memory`.
+//! The size of a run: taken from the options, or solved for `--memory`.
 
 use super::ResolvedRun;
 use super::case::{Case, DECODERS, TEST_DECODERS};
-use super::fit::{Fit, IMAGES, PAIRS, RunSize, SizeRequest, fit, min_memory, most_within};
+use super::fit::{
+    Fit, IMAGE_SHARE_DIVISOR, PAIRS, RunSize, SizeRequest, fit, largest_where, min_memory,
+};
 use super::remedy::remedies;
 use crate::failure::{DEVICE, Failure, Remedy, SizeProblem, notes};
 use crate::process::{MemoryLimit, ProcessMemory};
@@ -14,15 +16,15 @@ use densify_core::spelling::Spelling;
 use densify_data::dataset::Resolution;
 use densify_render::BackendKind;
 
-/// Most rows without `--budget`: trains on a laptop in well under 2 GiB, and is enough for a room or an object; large
-/// outdoor scenes need more.
+/// Default of `--budget`: such a model trains on a laptop in well under 2 GiB, and is enough for a room or an object;
+/// large outdoor scenes need more.
 pub const DEFAULT_BUDGET: usize = 200_000;
 /// Memory for decoded photographs without `--image-cache` `[bytes]`.
 const DEFAULT_IMAGE_CACHE: u64 = 1 << 30;
 /// (Row, tile) pairs per row of the budget without `--memory`.
 const PAIRS_PER_ROW: usize = 16;
-/// Fewest trained rows of a useful model, unless fewer are asked for.
-pub(super) const LEAST_ROWS: usize = 1_000;
+/// Minimum number of trained rows of a useful model, unless the user asks for fewer.
+pub(super) const MIN_ROWS: usize = 1_000;
 /// Memory in messages is rounded up to this `[bytes]`.
 pub(super) const MIB: u64 = 1 << 20;
 /// Image sizes that `densify plan` shows as alternatives.
@@ -32,15 +34,15 @@ pub(super) const RESOLUTIONS: [Resolution; 3] =
 /// The size of a run.
 pub(super) struct Size {
     pub(super) setting: RunSize,
-    /// The memory given, and the solution for it.
+    /// The memory limit and the solution for it, if there is a limit.
     solved: Option<(u64, Fit)>,
 }
 
 impl Size {
-    /// As the options say.
+    /// Takes the size from the options.
     pub(super) fn as_given(case: &Case<'_>) -> Result<Self, Failure> {
         let rows = case.asked_budget().unwrap_or(DEFAULT_BUDGET);
-        let most = most_pairs(case, rows)?;
+        let most = max_pairs(case, rows)?;
         let per_row = case.choices.knobs.pairs_per_row.unwrap_or(PAIRS_PER_ROW);
         let pairs = rows.saturating_mul(per_row).min(most);
         let mut setting = RunSize {
@@ -53,24 +55,24 @@ impl Size {
         setting.image_cache = match case.spec.size.image_cache {
             None => DEFAULT_IMAGE_CACHE,
             Some(ImageCache::Bytes(bytes)) => bytes,
-            // An eighth of the total, which includes the images.
+            // An eighth of the total, that is, a seventh of the rest.
             Some(ImageCache::Auto) => {
                 let rest = case.ledger_of(&setting)?.on_host();
-                (rest / (IMAGES - 1)).min(DEFAULT_IMAGE_CACHE).min(case.all_images())
+                (rest / (IMAGE_SHARE_DIVISOR - 1)).min(DEFAULT_IMAGE_CACHE).min(case.all_images())
             }
         };
-        let share = case.memory().map_or(u64::MAX, |memory| memory / IMAGES);
+        let share = case.memory().map_or(u64::MAX, |memory| memory / IMAGE_SHARE_DIVISOR);
         setting.images_on_gpu = case.image_cache().unwrap_or(DEFAULT_IMAGE_CACHE).min(share);
         Ok(Self { setting, solved: None })
     }
 
-    /// As the options say, or as large as `--memory` allows.
+    /// Takes the size from the options, or the largest that `--memory` allows.
     ///
     /// # Errors
-    /// When nothing fits, with changes of the options after which it does.
+    /// When nothing fits; lists changes of the options after which it does.
     pub(super) fn choose(case: &Case<'_>) -> Result<Self, Failure> {
         let Some(size) = solve(case)? else {
-            return Err(too_little(case, &request(case, case.memory().unwrap_or(0))?)?);
+            return Err(no_size_error(case, &request(case, case.memory().unwrap_or(0))?)?);
         };
         let budget = case.budget(size.setting.rows);
         if budget.trainable() == 0 {
@@ -80,7 +82,7 @@ impl Size {
         Ok(size)
     }
 
-    /// True if memory made the degree lower than was wanted.
+    /// True if memory made the degree lower than requested.
     pub(super) fn is_lowered(&self, case: &Case<'_>) -> bool {
         self.setting.sh_degree < case.choices.degree.highest()
     }
@@ -100,9 +102,9 @@ impl Size {
             "memory   {memory} given: degree {sh_degree}, {} (Gaussian, tile) pairs, images {}",
             grouped(tile_cap),
             match case.all_images() {
-                all if image_cache >= all => format!("all held decoded ({})", Bytes(all)),
+                all if image_cache >= all => format!("all kept decoded ({})", Bytes(all)),
                 all => format!(
-                    "{} of {} held decoded, the rest streams",
+                    "{} of {} kept decoded, the rest decoded when needed",
                     Bytes(image_cache),
                     Bytes(all)
                 ),
@@ -110,7 +112,7 @@ impl Size {
         ));
         let wanted = case.choices.degree.highest();
         if self.is_lowered(case) {
-            let start = case.start().unwrap_or(LEAST_ROWS);
+            let start = case.wanted_initial_rows().unwrap_or(MIN_ROWS);
             let degrees = [sh_degree, wanted];
             lines.push(notes::degree_lowered(spelling, degrees, fit.at_wanted_degree, start));
         }
@@ -119,8 +121,8 @@ impl Size {
 }
 
 impl Case<'_> {
-    /// The ledger, and the rest of `--memory`, for the user.
-    pub(crate) fn promise(&self, ledger: &Ledger, spelling: Spelling) -> String {
+    /// The ledger and the unused part of `--memory`, for the user.
+    pub(crate) fn memory_table(&self, ledger: &Ledger, spelling: Spelling) -> String {
         let left = self
             .memory()
             .map(|memory| memory.saturating_sub(self.inputs.device.limited_bytes(ledger)));
@@ -128,9 +130,9 @@ impl Case<'_> {
         format!("memory promised\n{ledger}{left}")
     }
 
-    /// Fewest rows of a useful model, unless fewer are asked for.
-    fn least_rows(&self) -> usize {
-        self.rows_for(LEAST_ROWS)
+    /// Minimum number of rows of a useful model, including frozen ones, unless the user asks for fewer.
+    fn min_rows(&self) -> usize {
+        self.rows_for(MIN_ROWS)
     }
 
     /// The budget, if it is a number.
@@ -156,8 +158,8 @@ impl Case<'_> {
 }
 
 impl ResolvedRun<'_> {
-    /// Fails if the run would take more than `--memory`. A size that was solved for it cannot, but a run that goes on
-    /// may have new tile lists and a new image cache.
+    /// Fails if the run would take more than `--memory`. A size solved for `--memory` always fits, but a resumed run
+    /// may be given another `--tile-cap` or `--image-cache`.
     pub(crate) fn check_memory(&self, ledger: &Ledger) -> Result<(), Failure> {
         let Self { case, size, .. } = self;
         let needed = case.inputs.device.limited_bytes(ledger);
@@ -166,7 +168,7 @@ impl ResolvedRun<'_> {
             let size = RunSize { tile_cap: pairs, ..*size };
             Ok::<_, Failure>(bytes(case, &size)? <= memory)
         };
-        let pairs = most_within(size.rows, size.tile_cap, fits)?.unwrap_or(size.rows);
+        let pairs = largest_where(size.rows, size.tile_cap, fits)?.unwrap_or(size.rows);
         let changes = [Remedy::NoImages, Remedy::TileCap(pairs)];
         let remedies = remedies(case, case.spec, &changes, |case| {
             Ok(bytes(case, &Size::as_given(case)?.setting)? <= memory)
@@ -190,14 +192,14 @@ impl ResolvedRun<'_> {
         if more <= left {
             return Ok(());
         }
-        // Not all: the grant varies from call to call.
+        // Leave a 64th unused: the memory that the system grants varies from call to call.
         let most = (now + left) / 64 * 63;
         let on_host = |case: &Case<'_>| {
             let Some(Size { setting, .. }) = solve(case)? else { return Ok(false) };
             Ok::<_, Failure>(case.ledger_of(&setting)?.on_host() <= most)
         };
         let mut base = case.spec.clone();
-        // On a GPU it would limit the device's memory.
+        // `--memory` is no remedy on a GPU: there it limits the device's memory.
         let less = (!is_resumed && case.inputs.device.kind() == BackendKind::Cpu).then(|| {
             base.size.memory = Some(ByteCount(most / MIB * MIB));
             Remedy::Memory(most / MIB)
@@ -219,7 +221,7 @@ impl ResolvedRun<'_> {
     }
 }
 
-/// The size of a run as the options say, or as large as `--memory` allows; `None` if nothing fits.
+/// The size of a run according to its options, or the largest that `--memory` allows; `None` if nothing fits.
 ///
 /// # Errors
 /// When options contradict each other.
@@ -234,8 +236,8 @@ pub(super) fn solve(case: &Case<'_>) -> Result<Option<Size>, Failure> {
     Ok(fit.map(|fit| Size { setting: fit.setting, solved: Some((memory, fit)) }))
 }
 
-/// The rows that fit in `memory` at a degree if nothing else limits them; fewer than [`LEAST_ROWS`] only if as few were
-/// planned.
+/// The number of rows that fit in `memory` at this degree, ignoring the budget; at least the smaller of [`MIN_ROWS`]
+/// and `planned`, or `None`.
 pub(super) fn rows_at(
     case: &Case<'_>,
     memory: u64,
@@ -244,15 +246,15 @@ pub(super) fn rows_at(
 ) -> Result<Option<usize>, Failure> {
     let request = SizeRequest {
         sh_degree: sh_degree..=sh_degree,
-        least_rows: case.least_rows().min(planned),
-        most_rows: case.inputs.device.largest_budget(sh_degree),
+        min_rows: case.min_rows().min(planned),
+        max_rows: case.inputs.device.largest_budget(sh_degree),
         ..request(case, memory)?
     };
     let fit = fit(&request, |setting| bytes(case, setting))?;
     Ok(fit.map(|fit| fit.setting.rows))
 }
 
-/// Bytes of a run of this size that `--memory` limits.
+/// Bytes of a run of this size that count towards `--memory`.
 fn bytes(case: &Case<'_>, setting: &RunSize) -> Result<u64, Failure> {
     Ok(case.inputs.device.limited_bytes(&case.ledger_of(setting)?))
 }
@@ -262,38 +264,39 @@ fn request(case: &Case<'_>, memory: u64) -> Result<SizeRequest, Failure> {
     let possible = case.inputs.device.largest_budget(*degrees.end());
     Ok(SizeRequest {
         memory,
-        least_rows: case.least_rows(),
-        enough_rows: case.rows_for(case.start().unwrap_or(LEAST_ROWS)),
-        most_rows: case.asked_budget().map_or(possible, |budget| budget.min(possible)),
+        min_rows: case.min_rows(),
+        enough_rows: case.rows_for(case.wanted_initial_rows().unwrap_or(MIN_ROWS)),
+        max_rows: case.asked_budget().map_or(possible, |budget| budget.min(possible)),
         sh_degree: degrees,
         tile_cap: case.tile_cap(),
         pairs: case.choices.knobs.pairs_per_row.map_or(PAIRS, |pairs| [pairs; 3]),
-        most_pairs: most_pairs(case, case.least_rows())?,
-        // Host memory, while the limit is the device's.
+        max_pairs: max_pairs(case, case.min_rows())?,
+        // On a GPU the image cache is in host memory, which `--memory` does not limit.
         image_cache: match case.inputs.device.kind() {
             BackendKind::Gpu => Some(case.image_cache().unwrap_or(DEFAULT_IMAGE_CACHE)),
             BackendKind::Cpu => case.image_cache(),
         },
-        most_images: DEFAULT_IMAGE_CACHE,
+        max_images: DEFAULT_IMAGE_CACHE,
         all_images: case.all_images(),
     })
 }
 
-/// Most (row, tile) pairs that the backend can hold at a time.
-fn most_pairs(case: &Case<'_>, rows: usize) -> Result<usize, Failure> {
+/// Maximum number of (row, tile) pairs that the backend supports at a time.
+fn max_pairs(case: &Case<'_>, rows: usize) -> Result<usize, Failure> {
     Ok(case.inputs.device.most_pairs(&case.needs(rows)?))
 }
 
-/// The error if not even the smallest model fits: the memory that it takes, and changes that make it fit, each tried.
-fn too_little(case: &Case<'_>, request: &SizeRequest) -> Result<Failure, Failure> {
-    let rows = case.least_rows().min(request.most_rows);
+/// The error if not even the smallest model fits: the memory that it takes, and option changes that were checked to
+/// make it fit.
+fn no_size_error(case: &Case<'_>, request: &SizeRequest) -> Result<Failure, Failure> {
+    let rows = case.min_rows().min(request.max_rows);
     let degree = *request.sh_degree.start();
     let memory = request.memory;
     let Some(least) = min_memory(request, MIB, |setting| bytes(case, setting))? else {
         return Ok(SizeProblem::NoSize { memory }.into());
     };
     let mut remedies = remedies(case, case.spec, &Remedy::NEW, |case| Ok(solve(case)?.is_some()));
-    let fewer = SizeRequest { least_rows: case.rows_for(1), ..request.clone() };
+    let fewer = SizeRequest { min_rows: case.rows_for(1), ..request.clone() };
     if let Some(fewer) = fit(&fewer, |setting| bytes(case, setting))? {
         remedies.push(vec![Remedy::Budget(fewer.setting.rows)]);
     }

@@ -1,5 +1,5 @@
-//! Sizes and bytes are one function in both directions: what a number of rows takes holds as many, and what
-//! a memory holds takes no more.
+//! Sizes and bytes agree in both directions: the memory of a number of rows fits at least as many, and the rows that
+//! fit a memory limit take no more than it.
 
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
@@ -16,12 +16,12 @@ use densify_fixtures::Made;
 use densify_policies::policy::Needs;
 use densify_render::gpu::adapters;
 
-/// A run of these options.
+/// The description of a run with these options.
 fn described(options: &[(&str, toml::Value)]) -> RunSpec {
-    let lay = |all: Partial, (name, value): &(&str, toml::Value)| {
+    let add = |all: Partial, (name, value): &(&str, toml::Value)| {
         Partial::option(name, value.clone()).over(all)
     };
-    options.iter().fold(Partial::default(), lay).describe().expect("a run")
+    options.iter().fold(Partial::default(), add).describe().expect("a run")
 }
 
 /// Rows of a run, and its bytes that `--memory` limits.
@@ -56,11 +56,11 @@ fn check(case: &Case<'_>, rows: usize) -> Result<(), TestCaseError> {
 }
 
 #[test]
-fn detailed_edits_are_counted_where_they_are_declared() {
+fn detailed_edits_are_counted_if_they_are_declared() {
     let made = Made::colmap_txt();
     let scene = made.path().to_str().expect("UTF-8");
     let spec = described(&[("scene", scene.into()), ("backend", "cpu".into())]);
-    let case = Case::anew(&spec, Host::default()).expect("a scene");
+    let case = Case::for_new_run(&spec, Host::default()).expect("a scene");
     let setting = size::solve(&case).expect("it is solved").expect("it fits").setting;
     let declared = [false, true].map(|detailed_edits| {
         let needs = case.needs(setting.rows).expect("needs");
@@ -75,7 +75,7 @@ fn detailed_edits_are_counted_where_they_are_declared() {
     assert_eq!(detailed - plain, detailed_plan - plain_plan);
 }
 
-/// The lines of a small run's ledger, without what depends on what else this process has done; and its total.
+/// The lines of a small run's ledger, independent of what else this process has done, and its total.
 fn plain_ledger(made: &Made, exposure: &str) -> (Vec<(Section, String, u64)>, u64) {
     let scene = made.path().to_str().expect("UTF-8");
     let spec = described(&[
@@ -90,7 +90,7 @@ fn plain_ledger(made: &Made, exposure: &str) -> (Vec<(Section, String, u64)>, u6
         ("exposure", exposure.into()),
     ]);
     let host = Host { process: ProcessMemory::UNKNOWN, ..Host::default() };
-    let case = Case::anew(&spec, host).expect("a scene");
+    let case = Case::for_new_run(&spec, host).expect("a scene");
     let setting = size::solve(&case).expect("it is solved").expect("it fits").setting;
     let ledger = case.ledger_of(&setting).expect("a ledger");
     let total = ledger.total();
@@ -100,10 +100,10 @@ fn plain_ledger(made: &Made, exposure: &str) -> (Vec<(Section, String, u64)>, u6
 /// The memory of a run without exposures, masks and lenses is a fixed number: they take no byte where they are not used.
 #[cfg(all(unix, target_pointer_width = "64"))]
 #[test]
-fn what_is_not_used_of_photographs_takes_no_byte() {
+fn unused_features_of_photographs_take_no_memory() {
     let made = Made::colmap_txt();
     let (plain, total) = plain_ledger(&made, "off");
-    // A change that makes a run take more or less on purpose updates this number.
+    // Update this number if a change is meant to make a run take more or less.
     assert_eq!(total, 34_785_170, "{plain:#?}");
     let differing = |other: &[(Section, String, u64)]| {
         let found = other.iter().filter(|line| !plain.contains(line));
@@ -136,7 +136,7 @@ proptest! {
     #![proptest_config(ProptestConfig { failure_persistence: None, cases: 4, ..Default::default() })]
 
     #[test]
-    fn what_rows_take_holds_them_and_what_is_held_takes_no_more(
+    fn sizes_and_bytes_agree_in_both_directions(
         rows in prop_oneof![1..1_000_usize, 1_000..50_000_usize, 50_000..20_000_000_usize],
         given in prop_oneof![Just(None), Just(Some("tile_cap")), Just(Some("image_cache"))],
         policy: prop::sample::Index,
@@ -161,8 +161,8 @@ proptest! {
             ];
             shared.extend(given.map(|name| (name, 90_000.into())));
             let spec = described(&shared);
-            let case = Case::anew(&spec, Host::default()).expect("a scene");
-            // Both say how long tile lists are.
+            let case = Case::for_new_run(&spec, Host::default()).expect("a scene");
+            // Both set the length of tile lists.
             let contradicts = |preset: &&Preset| {
                 let sets_pairs = preset.levels.iter().any(|(knob, _)| *knob == "pairs_per_row");
                 given == Some("tile_cap") && sets_pairs

@@ -20,7 +20,7 @@ pub(crate) struct ResolvedTraining {
 }
 
 impl ResolvedTraining {
-    /// Decides for a run that starts with `initial_rows` rows besides frozen ones.
+    /// Builds the policy and the learning rates of a run that starts with `initial_rows` rows besides frozen ones.
     ///
     /// # Errors
     /// When a parameter of the policy or a learning rate is invalid.
@@ -35,7 +35,7 @@ impl ResolvedTraining {
         Ok(Self { policy, scene, declared, parameters, rates })
     }
 
-    /// The parameters of the policy that are steps, for the user; empty if it has none.
+    /// The policy's parameters that are given in steps, formatted for the user; empty if it has none.
     pub(crate) fn steps(&self, run: &ResolvedRun<'_>) -> String {
         let names = run.case.choices.entry.step_parameters().iter().map(|step| step.name());
         let steps = names.filter_map(|name| Some(format!("{name} {}", self.parameters.get(name)?)));

@@ -20,15 +20,16 @@ use densify_train::evaluate::Split;
 use densify_train::importance::{importance, largest};
 use densify_train::init::{initialise, random_points};
 
-/// A model with a smaller share of its Gaussians in the training views is in other coordinates.
+/// Minimum share of Gaussians in the training views; a model with less counts as being in other coordinates.
 const LEAST_IN_VIEW: f64 = 0.1;
-/// Extents of the scene beyond which nothing counts as in view: some camera looks at everything that is far away.
+/// Depth, in extents of the scene, beyond which nothing counts as in view, because far away every point is in front of
+/// some camera.
 const FARTHEST: f64 = 100.0;
 
 /// The model that a new run starts from, without frozen rows.
 ///
 /// # Errors
-/// When a model cannot be read or shown, or no point is usable.
+/// When a model cannot be read or rendered, or no point is usable.
 pub(super) fn first_model(
     run: &ResolvedRun<'_>,
     observer: &dyn Observer,
@@ -55,7 +56,7 @@ pub(super) fn first_model(
     for (number, reason) in [
         (report.unusable, "non-finite points ignored"),
         (report.duplicates, "duplicate points ignored"),
-        (report.over_budget, "points beyond the budget left out, drawn by the seed"),
+        (report.over_budget, "points beyond the budget left out at random"),
     ] {
         if number > 0 {
             observer.say(format_args!("note: {} {reason}", grouped(number)));
@@ -69,10 +70,10 @@ pub(super) fn first_model(
     Ok(model)
 }
 
-/// The model of `--init`, with the degree of the run and at most the rows that it has room for.
+/// The model of `--init`, converted to the degree of the run and reduced to its budget.
 ///
 /// # Errors
-/// When the file cannot be read, the device fails, or no training view shows the model.
+/// When the file cannot be read, the device fails, or too little of the model lies in the training views.
 fn load(file: &Path, run: &ResolvedRun<'_>, observer: &dyn Observer) -> Result<Gaussians, Failure> {
     let ResolvedRun { case, size, .. } = run;
     let dataset = &case.inputs.dataset;
@@ -113,11 +114,11 @@ fn with_degree(model: Gaussians, degree: u8, observer: &dyn Observer) -> Gaussia
     model.with_degree(degree)
 }
 
-/// The model behind that of `--freeze`, if there is one.
+/// Appends a model to that of `--freeze`, if there is one.
 ///
 /// # Errors
-/// When the file cannot be read or has changed, or no training view shows its model.
-pub(super) fn behind_frozen(
+/// When the file cannot be read or has changed, or its model lies in no training view.
+pub(super) fn append_to_frozen(
     run: &ResolvedRun<'_>,
     others: Gaussians,
     observer: &dyn Observer,
@@ -154,11 +155,11 @@ fn in_view(model: &Gaussians, dataset: &Dataset) -> usize {
     model.means.par_iter().filter(|mean| shows(mean)).count()
 }
 
-/// Fails if the model of `--init` is in other coordinates than the photographs. Beside frozen Gaussians it may be a small
-/// part of what is seen, so that this is only noted.
+/// Fails if the model of `--init` is in other coordinates than the photographs. Beside frozen Gaussians it may be a
+/// small part of the scene, so the user is only told.
 ///
 /// # Errors
-/// Then, and when a view cannot be read or rendered.
+/// In this case, and when a view cannot be read or rendered.
 pub(super) fn check_coordinates(
     file: &Path,
     run: &ResolvedRun<'_>,

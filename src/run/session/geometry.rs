@@ -1,5 +1,5 @@
-//! Measures the model of a complete run against the known surface, as `densify eval` does, in a backend of its own once
-//! that of training is freed.
+//! Measures the model of a complete run against the known surface, as `densify eval` does, in a separate backend after
+//! that of training has been freed.
 
 use std::path::Path;
 
@@ -13,7 +13,7 @@ use densify_train::evaluate::Split;
 use densify_train::output::{geometry_of, model_path, write_geometry};
 
 /// Writes `geometry.json` for the test views, if the surface is known and the promised memory has room for measuring.
-/// `folder` has the run's model.
+/// `folder` contains the run's model.
 ///
 /// # Errors
 /// When the files of the surface are damaged, or as [`geometry::measure`].
@@ -29,7 +29,7 @@ pub(super) fn measure(session: Session<'_>, folder: &Path) -> Result<(), Failure
     let process = run.ledger.lines.iter().filter(|line| line.section == Section::Process);
     let host = host + process.map(|line| line.bytes).sum::<u64>();
     drop(run.trainer);
-    // A complete run is not refused for a grant that is too small by now: the measurement is left out.
+    // A complete run does not fail because too little memory is available now: the measurement is skipped.
     let granted = (run.process.grant)(measuring.threads).zip((run.process.resident)());
     let granted = granted.map_or(u64::MAX, |(limit, now)| now.saturating_add(limit.left));
     let promised = run.ledger.total();

@@ -51,32 +51,32 @@ struct Session<'a> {
     folder: PathBuf,
     logs: Logs,
     totals: Totals,
-    /// Detects that another run has taken the folder.
+    /// Detects that another run has taken over the folder.
     guard: Guard,
     /// Step of the last checkpoint that this process has written or resumed from.
     checkpoint: Option<u32>,
 }
 
-/// The treatment of a run that is in the output folder already.
+/// Treatment of a run that already exists in the output folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Occupied {
     /// Keep it, and refuse the new run.
     Refuse,
     /// Replace it with the new run once the new run is complete.
     Replace,
-    /// Go on with it.
+    /// Resume it.
     Resume,
 }
 
 /// Trains to the end and writes all files of the run; returns the folder.
-fn train(run: Run, occupied: Occupied, observer: &dyn Observer) -> Result<PathBuf, Failure> {
+fn train(run: Run, if_exists: Occupied, observer: &dyn Observer) -> Result<PathBuf, Failure> {
     // Nothing is removed from a run that is being resumed, even if it consists only of its configuration file.
     let has_begun = run.session.is_some() || run.output.join(CONFIG_FILE).exists();
-    let resumes = occupied == Occupied::Resume && has_begun;
-    let folder = match occupied {
+    let resumes = if_exists == Occupied::Resume && has_begun;
+    let folder = match if_exists {
         Occupied::Resume => RunFolder::resume(&run.output, run.session.is_none())?,
         Occupied::Refuse | Occupied::Replace => {
-            RunFolder::create(&run.output, occupied == Occupied::Replace)?
+            RunFolder::create(&run.output, if_exists == Occupied::Replace)?
         }
     };
     let mut session = match Session::start(run, &folder, observer) {
@@ -102,10 +102,10 @@ fn train(run: Run, occupied: Occupied, observer: &dyn Observer) -> Result<PathBu
             })?;
             Ok(path)
         }
-        // Another run may have taken the folder.
+        // Another run may have taken over the folder.
         Err(failure) if guard.check().is_err() => Err(failure),
         // For example, a photograph cannot be decoded and the run has not yet saved anything worth keeping.
-        Err(failure) if failure.code == INPUT && !resumes && has_nothing(&folder.path()) => {
+        Err(failure) if failure.code == INPUT && !resumes && has_no_results(&folder.path()) => {
             // Dropping the last guard releases the lock; only then can the folder be removed.
             drop((session, guard));
             folder.discard();
@@ -125,7 +125,7 @@ fn train(run: Run, occupied: Occupied, observer: &dyn Observer) -> Result<PathBu
 }
 
 /// True if a run has left neither a model nor a checkpoint.
-fn has_nothing(folder: &Path) -> bool {
+fn has_no_results(folder: &Path) -> bool {
     saved_iterations(folder).is_err() && !folder.join(CHECKPOINTS).exists()
 }
 
@@ -199,12 +199,15 @@ impl<'a> Session<'a> {
         }
     }
 
-    /// Writes a checkpoint. If it cannot be written, training goes on: the run is worth more, and the previous checkpoint
-    /// is still there.
+    /// Writes a checkpoint. If it cannot be written, training continues: the run is worth more, and the previous
+    /// checkpoint still exists.
     fn try_checkpoint(&mut self) {
         let step = self.run.trainer.steps_done();
         let trouble = self.write_checkpoint().err().map(|error| {
-            tracing::error!(step, "the checkpoint could not be written, training goes on: {error}");
+            tracing::error!(
+                step,
+                "the checkpoint could not be written, training continues: {error}"
+            );
             format!("the checkpoint of step {step} could not be written: {error}")
         });
         self.observer.checkpoint_written(step, trouble.as_deref());
@@ -259,7 +262,7 @@ impl<'a> Session<'a> {
             config: self.config.clone(),
             dataset: self.run.fingerprint.clone(),
             trainer: trainer.map_err(|source| CheckpointError::Policy { source })?,
-            session: self.logs.keep(&self.totals, self.run.process)?,
+            session: self.logs.save(&self.totals, self.run.process)?,
         };
         write(&checkpoint_path(&self.folder, step), &header, self.run.trainer.backend())?;
         remove_older(&self.folder, step);

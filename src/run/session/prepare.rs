@@ -1,9 +1,9 @@
-//! Prepares a run: resolves it, makes the model that it starts from, and builds the trainer. Every error that the user can
-//! mend is found here, before anything is written.
+//! Prepares a run: resolves it, makes the model that it starts from, and builds the trainer. Every error that the user
+//! can fix is found here, before anything is written.
 
 use std::path::Path;
 
-use super::first_model::{behind_frozen, check_coordinates, first_model};
+use super::first_model::{append_to_frozen, check_coordinates, first_model};
 use super::resume::{self, Resumed};
 use super::run::Run;
 use crate::failure::{Failure, OptionProblem};
@@ -20,10 +20,10 @@ use densify_train::init::restart;
 use densify_train::schedule::RateOptions;
 use densify_train::trainer::{TrainOptions, Trainer};
 
-/// Views announced ahead: enough that each decoder has one at work and one waiting.
+/// Number of views to prefetch: for each decoder, one being decoded and one waiting.
 const AHEAD: usize = 2 * DECODERS;
 
-/// Prepares a new run, or one that goes on.
+/// Prepares a new run, or a resumed one.
 pub(super) fn prepare(
     spec: &RunSpec,
     resumed: Option<Resumed>,
@@ -35,7 +35,7 @@ pub(super) fn prepare(
     let output = spec.output_folder()?;
     let checkpoint = resumed.as_ref().and_then(|resumed| resumed.checkpoint.as_ref());
     let run = match &resumed {
-        None => ResolvedRun::anew(spec, host)?,
+        None => ResolvedRun::for_new_run(spec, host)?,
         Some(resumed) => {
             ResolvedRun::from_saved(spec, &resumed.config, checkpoint.is_some(), host)?
         }
@@ -56,11 +56,11 @@ pub(super) fn prepare(
         Init::Points | Init::Random(_) => None,
     };
     if checkpoint.is_none() {
-        // A model keeps its opacities and sizes, whatever the policy's paper starts with.
+        // A given model keeps its opacities and scales, even if the policy prescribes initial ones.
         if file.is_none() {
             restart(&mut model, &training.declared.start);
         }
-        model = behind_frozen(&run, model, observer)?;
+        model = append_to_frozen(&run, model, observer)?;
     }
     let config = RunConfig::new(&run, &training, last)?;
     let fingerprint = Fingerprint::new(&run.case.inputs.dataset);
@@ -74,7 +74,7 @@ pub(super) fn prepare(
     run.check_memory(&ledger)?;
     let total = Bytes(ledger.total());
     observer.say(format_args!("memory   {total} promised in all"));
-    observer.detail(format_args!("{}", case.promise(&ledger, observer.spelling())));
+    observer.detail(format_args!("{}", case.memory_table(&ledger, observer.spelling())));
     let measuring = case.measuring(size, case.choices.threads);
     let mut backend = case.inputs.device.backend(&model, &case.backend_setup(size, needs))?;
     drop(model);
@@ -125,7 +125,7 @@ fn train_options(run: &ResolvedRun<'_>, rates: RateOptions) -> TrainOptions {
         seed: schedule.seed,
         sh_degree: size.sh_degree,
         frozen: case.budget(size.rows).frozen,
-        // A trained model shows all of its bands from the start.
+        // A trained model uses all of its colour bands from the start.
         has_all_bands: case.inputs.init_model.is_some() || case.inputs.frozen_model.is_some(),
         background: data.background,
         rates,

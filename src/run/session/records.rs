@@ -1,4 +1,5 @@
-//! The logs of a run and its totals so far. Checkpoints have both, so that the records of an interrupted run have no gap.
+//! The logs of a run and its totals so far. Checkpoints contain both, so that the records of an interrupted run have no
+//! gap.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
@@ -23,12 +24,12 @@ pub(super) struct Totals {
     pub(super) cpu: Option<Duration>,
     /// Wall time by stage.
     pub(super) stages: BTreeMap<String, Duration>,
-    /// For each of the last steps, as many as there are training views: true if anything was drawn.
+    /// For each of the last N steps, with N training views: true if anything was rendered.
     #[serde(default)]
     pub(super) drawn: VecDeque<bool>,
     /// Scores of the test views, by step.
     pub(super) tested: BTreeMap<u32, Mean>,
-    /// Largest resident memory of the processes before this one.
+    /// Peak resident memory of earlier processes of this run.
     peak_before: Option<u64>,
 }
 
@@ -89,7 +90,7 @@ impl Totals {
         }
     }
 
-    /// Largest resident memory of all processes of this run.
+    /// Peak resident memory of all processes of this run.
     pub(super) fn peak_bytes(&self, process: ProcessMemory) -> Option<u64> {
         (process.peak)().max(self.peak_before)
     }
@@ -131,8 +132,8 @@ impl Logs {
         })
     }
 
-    /// The state of the session as JSON, after all records are on disk.
-    pub(super) fn keep(
+    /// Syncs all records to disk, and returns the state of the session as JSON.
+    pub(super) fn save(
         &self,
         totals: &Totals,
         process: ProcessMemory,
@@ -148,12 +149,12 @@ impl Logs {
         Ok(serde_json::json!({ "totals": totals, "logs": lengths }))
     }
 
-    /// Reopens the logs at their lengths, and returns the names of those that have lost records meanwhile.
+    /// Reopens the logs at their saved lengths, and returns the names of logs that have lost records since.
     pub(super) fn resume(
         folder: &Path,
-        kept: SavedSession,
+        saved: SavedSession,
     ) -> Result<(Self, Totals, Vec<&'static str>), FileError> {
-        let SavedSession { totals, logs } = kept;
+        let SavedSession { totals, logs } = saved;
         let (steps, steps_whole) = RecordLog::resume(&folder.join(STEPS), logs.steps)?;
         let (events, events_whole) = RecordLog::resume(&folder.join(EVENTS), logs.events)?;
         let board = TensorBoard::resume(folder, &logs.board.0, logs.board.1)?;

@@ -23,9 +23,9 @@ pub struct Requirements {
     pub sh_degree: u8,
     /// The reason for the degree.
     pub sh_degree_from: DegreeSource,
-    /// Each photograph has an exposure of its own.
+    /// An exposure is learned for each photograph.
     pub exposures: bool,
-    /// The reason for that, or against it.
+    /// The reason for learning exposures or not.
     pub exposures_from: ExposureSource,
     /// Measurements of `--budget auto`.
     pub rows: Option<AutoBudget>,
@@ -45,7 +45,7 @@ pub struct Reductions {
 }
 
 impl Reductions {
-    /// Reads those of a run; `None` if the file does not exist.
+    /// Reads the reductions of a run; `None` if the file does not exist.
     ///
     /// # Errors
     /// When the file cannot be read.
@@ -115,15 +115,15 @@ fn degree_left_out(config: &RunConfig) -> Option<LeftOut> {
     if config.resolved.sh_degree_lowered {
         return Some(LeftOut {
             what,
-            // The file is the same whoever started the run.
+            // The file has the spelling of the terminal, whoever started the run.
             evidence: format!(
-                "{} holds fewer rows at it than the scene starts with",
+                "{} holds fewer rows at this degree than the scene starts with",
                 Spelling::Terminal.option("memory")
             ),
             loss: "its loss was not measured".to_owned(),
         });
     }
-    // Any other degree below the highest is what the options say.
+    // Any other degree below the highest was set by an option.
     let DegreeSource::Spread(found) = config.resolved.sh_degree_from else { return None };
     Some(LeftOut {
         what,
@@ -132,8 +132,8 @@ fn degree_left_out(config: &RunConfig) -> Option<LeftOut> {
             found.tracks, found.twentieth
         ),
         loss: format!(
-            "the colours of all differ by {:.2}/255 (rms); at equal rows degree 3 was worth 0.5 to \
-             1.4 dB on matt scenes all the same (docs/tradeoffs.md)",
+            "the colours of all differ by {:.2}/255 (rms); with equal rows degree 3 still gained 0.5 to \
+             1.4 dB on matt scenes (docs/tradeoffs.md)",
             found.rms
         ),
     })
@@ -201,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_options_say_is_not_left_out() {
+    fn choices_by_options_are_not_reported() {
         let mut config = sample();
         let lines = |config: &RunConfig, unscored| {
             Requirements::new(config, 500, None, unscored).lines(Spelling::Terminal).join("\n")
@@ -218,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn each_decision_has_its_evidence_and_its_loss() {
+    fn each_reduction_has_its_evidence_and_its_loss() {
         let mut config = sample();
         let line = |config: &RunConfig, auto_budget: Option<&AutoBudget>| {
             Requirements::new(config, 900, auto_budget, 0).lines(Spelling::Terminal).join("\n")

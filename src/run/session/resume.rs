@@ -1,4 +1,4 @@
-//! `--resume`: the checkpoint that a run goes on from, and its options.
+//! `--resume`: the checkpoint that a run is resumed from, and its options.
 //!
 //! The saved description is overlaid with the options of this call. Options that would change the result are refused by
 //! name.
@@ -18,13 +18,13 @@ use densify_train::checkpoint::{Checkpoint, CheckpointError, Fingerprint, newest
 use densify_train::output::{CONFIG_FILE, RunFolder, saved_iterations};
 use densify_train::trainer::Trainer;
 
-/// A run that goes on.
+/// A run to resume.
 pub struct Resumed {
-    /// `None`: the run was stopped before its first checkpoint, and begins again.
+    /// `None`: the run was stopped before its first checkpoint, and starts over.
     pub(super) checkpoint: Option<Checkpoint>,
-    /// The run as it was.
+    /// The configuration that was saved.
     pub(super) config: RunConfig,
-    /// The step at which it ends, later than its length if it is extended.
+    /// The step at which it ends, beyond its original length if it is extended.
     pub(super) last: u32,
 }
 
@@ -41,14 +41,14 @@ impl Resumed {
     }
 }
 
-/// Knobs that do not change the result, or whose outcome is compared instead.
+/// Knobs that do not change the result, or whose resolved value is compared instead.
 const FREE_KNOBS: [&str; 2] = ["knob.pairs_per_row", "knob.accumulation"];
 
-/// Finds the newest sound checkpoint in the output folder that `given` describes, or else the description of a run that
-/// has none yet, and overlays the saved options with `given`. Without either, the run starts anew.
+/// Finds the newest usable checkpoint in the output folder of `given`, or else the configuration of a run without
+/// checkpoints, and overlays the saved options with `given`. Without either, the run is new.
 ///
 /// # Errors
-/// When a process is training there, or the run in the folder cannot go on.
+/// When a process is training there, or the run in the folder cannot be resumed.
 pub fn start(
     given: Partial,
     observer: &dyn Observer,
@@ -95,7 +95,7 @@ pub fn start(
     Ok((spec, Some(resumed)))
 }
 
-/// The saved options under those that are given.
+/// Overlays the saved options with those that are given.
 fn overlay(mut given: Partial, saved: &RunConfig, origin: &str) -> Result<RunSpec, Failure> {
     let mut lower = Partial::all(&saved.spec)?;
     // `auto` stands for the decision that was saved.
@@ -110,7 +110,8 @@ fn overlay(mut given: Partial, saved: &RunConfig, origin: &str) -> Result<RunSpe
             _ => {}
         }
     }
-    // A device or an order of sums that this call gives is compared with that of the run once the device is open.
+    // A device or an accumulation that this call chooses is compared with that of the saved run once the device is
+    // open.
     if given.get("backend").is_some() || given.get("gpu").is_some() {
         lower.remove("gpu");
         lower.remove("backend");
@@ -137,7 +138,7 @@ fn overlay(mut given: Partial, saved: &RunConfig, origin: &str) -> Result<RunSpe
     given.over(lower).spec()
 }
 
-/// Fails if the folder, which has no sound checkpoint, holds a run that cannot begin again.
+/// Fails if the folder, which has no usable checkpoint, holds a run that must not start over.
 fn check_restart(
     output: &Path,
     rejected: &[CheckpointError],
@@ -156,7 +157,7 @@ fn check_restart(
     Ok(())
 }
 
-/// Fails if this run would give another result than the saved one, or has another dataset.
+/// Fails if the result of this run would differ from that of the saved run, or its dataset does.
 pub(super) fn check(
     now: &RunConfig,
     resumed: &Resumed,
@@ -183,7 +184,7 @@ pub(super) fn check(
     }
 }
 
-/// A difference in a key of [`fixed`], by the option that sets it.
+/// A difference in a key of [`fixed`], named by the option that sets the key.
 fn difference(key: &str, now: Option<&String>, then: Option<&String>) -> Difference {
     let (option, member) = key.split_once('.').unwrap_or((key, ""));
     let (option, member) = match member {
@@ -195,7 +196,7 @@ fn difference(key: &str, now: Option<&String>, then: Option<&String>) -> Differe
     Difference { option, member, now: now.cloned(), then: then.cloned() }
 }
 
-/// Every setting that a resumed run must keep, by its path, as text.
+/// Every setting that a resumed run must keep: its path, and its value as text.
 fn fixed(config: &RunConfig) -> Result<BTreeMap<String, String>, Failure> {
     let mut table = config.spec.table()?;
     table.retain(|name, _| {
@@ -229,8 +230,8 @@ pub(super) fn restore(
     };
     if last > length {
         observer.say(format_args!(
-            "note: extended from {length} to {last} iterations; all schedules stay those of {length}, \
-             and learning rates no longer fall beyond it"
+            "note: extended from {length} to {last} iterations; schedules remain those of {length} \
+             iterations, after which learning rates stay constant"
         ));
     }
     if step >= last {

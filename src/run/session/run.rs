@@ -1,4 +1,4 @@
-//! A run that is prepared.
+//! A prepared run.
 
 use std::path::PathBuf;
 
@@ -20,18 +20,18 @@ use densify_train::trainer::Trainer;
 
 /// A run, ready to train.
 pub struct Run {
-    /// The description, as it was asked for.
+    /// The description, as the user gave it.
     pub(super) spec: RunSpec,
-    /// The run with everything decided, as `config.toml` has it.
+    /// The run with every choice made, as in `config.toml`.
     pub config: RunConfig,
     pub(super) output: PathBuf,
     /// The trainer.
     pub trainer: Trainer<DatasetViews>,
     /// The test views.
     pub(super) test: DatasetViews,
-    /// The dataset; of its points only those that a companion asks for.
+    /// The dataset, thinned to as many points as the companion (such as the page of `--view`) asks for.
     pub dataset: Dataset,
-    /// Bytes per buffer, as promised.
+    /// Planned bytes per buffer; the run takes no more.
     pub ledger: Ledger,
     /// The measurement at the end, if the surface is known.
     pub(super) measuring: Option<Measuring>,
@@ -39,7 +39,7 @@ pub struct Run {
     pub(super) fingerprint: Fingerprint,
     /// The step at which the run ends.
     pub(super) last: u32,
-    /// State of the logs, for a run that goes on.
+    /// State of the logs, for a resumed run.
     pub(super) session: Option<SavedSession>,
     pub(super) process: ProcessMemory,
 }
@@ -48,15 +48,15 @@ impl Run {
     /// Prepares a new run: opens scene and device, decides its size, and makes the trainer. Nothing is written.
     ///
     /// # Errors
-    /// When the description, one of its files or the device is unfit.
+    /// When the description, one of its files or the device is unsuitable.
     pub fn prepare(spec: &RunSpec) -> Result<Self, Failure> {
         Self::prepare_on(spec, None, Host::default())
     }
 
-    /// Prepares a run on `host`. With `resumed` it goes on with the run that [`start`](crate::start) has found.
+    /// Prepares a run on `host`. If `resumed` is given, it continues the run that [`start`](crate::start) found.
     ///
     /// # Errors
-    /// As [`prepare`](Self::prepare), and when the result would differ from that of the run that goes on.
+    /// As [`prepare`](Self::prepare), and when the options would change the result of the run being resumed.
     pub fn prepare_on(
         spec: &RunSpec,
         resumed: Option<Resumed>,
@@ -80,12 +80,13 @@ impl Run {
         Ok(self.dataset.normalisation.world_from_model(self.trainer.model()?))
     }
 
-    /// Trains to the end and writes everything that a run leaves; returns its folder.
+    /// Trains to the end, writes all files of the run, and returns its folder; `if_exists` decides about an existing
+    /// run.
     ///
     /// # Errors
     /// When a view cannot be read, or the device, the disk or the policy fails. The error names the files that were written
     /// until then; they stay.
-    pub fn train(self, occupied: Occupied, observer: &dyn Observer) -> Result<PathBuf, Failure> {
-        train(self, occupied, observer)
+    pub fn train(self, if_exists: Occupied, observer: &dyn Observer) -> Result<PathBuf, Failure> {
+        train(self, if_exists, observer)
     }
 }

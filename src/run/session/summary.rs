@@ -1,4 +1,4 @@
-//! The summary of a run: `stats/summary.json`, its automatic reductions, and a few lines for the user.
+//! The summary of a run: `stats/summary.json`, the automatic reductions, and a few lines for the user.
 
 use std::path::Path;
 

@@ -40,7 +40,7 @@ impl RunSpec {
     /// The options as the table of a file, without those that are `None`.
     ///
     /// # Errors
-    /// When a path is not UTF-8, which a file cannot hold.
+    /// When a path is not UTF-8 and therefore cannot be in a TOML file.
     pub fn table(&self) -> Result<Table, Failure> {
         let Self { start, data, output, .. } = self;
         for (option, path) in
@@ -136,7 +136,7 @@ impl RunSpec {
         Ok((entry, own.and_then(|own| own.as_table().cloned()).unwrap_or_default()))
     }
 
-    /// Fails if the run does not have an iteration after which to save or to test.
+    /// Fails if the model is to be saved or tested after an iteration that the run does not have.
     pub(crate) fn check_iterations(&self, last: u32) -> Result<(), Failure> {
         for (option, chosen) in [
             ("save_iterations", &self.output.save_iterations),
@@ -163,7 +163,7 @@ mod tests {
     }
 
     #[test]
-    fn learning_rates_by_name() {
+    fn learning_rates_are_set_by_name() {
         let rates = |lr: &str, of_policy: &RateOverrides| {
             let mut spec = spec("lr", lr).unwrap();
             spec.schedule.iterations.0 = 30_000;

@@ -1,5 +1,5 @@
 //! The description of a run: every option is declared here once, with its type, default, range, help text and whether a
-//! resumed run may change it. A description stays as it was asked for: nothing is written back into it.
+//! resumed run may change it. A description stays as the user gave it: choices are not written back into it.
 //!
 //! An option has one name everywhere: `--tile-cap` on the command line is `tile_cap` in a file and in
 //! [`RunSpec`]. The flags of `densify train` and their help, `config.toml`, `--config`, `--resume`, what
@@ -32,7 +32,7 @@ use densify_train::schedule::{Background, InitRates, REFERENCE_ITERATIONS};
 use densify_train::trainer::OnNan;
 use values::as_table;
 
-/// The rule for an option of a resumed run.
+/// Rule for changing an option of a resumed run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum OnResume {
     /// Another value is refused.
@@ -48,7 +48,7 @@ pub enum OnResume {
 pub struct RunOption {
     /// Name in files, such as `tile_cap`.
     pub name: &'static str,
-    /// The rule for a resumed run.
+    /// Rule for changing it in a resumed run.
     pub on_resume: OnResume,
 }
 
@@ -58,14 +58,14 @@ impl RunOption {
         OPTIONS.iter().find(|option| option.name == name)
     }
 
-    /// The flag, such as `--tile-cap`; `SCENE`, which has none.
+    /// The flag, such as `--tile-cap`, or `SCENE`, which is positional.
     pub fn flag(&self) -> String {
         Spelling::Terminal.option(self.name)
     }
 }
 
-/// Declares a struct per group, its defaults, [`RunSpec`] and the table of options from one list. A flag takes the value
-/// that is named; a switch stands alone, or has `=true` or `=false`.
+/// Declares a struct per group, its defaults, [`RunSpec`] and the table of options from one list. An option with
+/// `value` takes a value; one with `switch` stands alone, or has `=true` or `=false`.
 macro_rules! run_spec {
     ($($(#[$doc:meta])* $group:ident: $struct:ident, $heading:literal {
         $($(#[$meta:meta])* $name:ident: $type:ty = $default:expr, $on_resume:ident
@@ -98,7 +98,7 @@ macro_rules! run_spec {
         /// A run, completely described: plain data with a default for everything. Fields that are `None` are
         /// decided when the run is prepared.
         ///
-        /// In a file all options stand side by side; the groups are those of the help.
+        /// In a file all options are at the top level; the groups are those of the help.
         #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, Args)]
         pub struct RunSpec {
             $($(#[$doc])* #[command(flatten)] #[serde(flatten)] pub $group: $struct,)*
@@ -168,7 +168,7 @@ run_spec! {
         /// Source of the first Gaussians: one on each of the dataset's points, random places, or a model in the
         /// dataset's coordinates, by any program (default: points if the dataset has any, else random)
         ///
-        /// Of a model with more Gaussians than the budget, those that contribute most to the training views are kept.
+        /// If the model has more Gaussians than the budget, those that contribute most to the training views are kept.
         /// Its colours are cut or extended to --sh-degree
         init: Option<InitChoice> = None, Fixed, value "points|random|MODEL";
 
@@ -183,17 +183,15 @@ run_spec! {
         /// Number of random points to start from (default: half the budget, at most 100k)
         init_points: Option<Rows> = None, Fixed, value "N";
 
-        /// Nearest distance to a camera at which anything is drawn, as a fraction of the scene's
-        /// extent
-        // The original's 0.2 for an extent of 5. Nearer Gaussians become fog before one camera: with
-        // 0.01, test views lost up to 10 dB to it.
+        /// Smallest distance from a camera at which anything is rendered, as a fraction of the scene's extent
+        // The original's 0.2 for an extent of 5. Nearer Gaussians become fog in front of a single camera: with 0.01,
+        // test views lost up to 10 dB to it.
         near: Fraction = Fraction(0.04), Fixed, value "FRACTION";
     }
 
     /// Limits of memory and quality.
     size: SizeSpec, "Size" {
-        /// Most Gaussians that the model may have at any time: 200000, 28k, 1.5M (default: 200k, or as many as --memory
-        /// holds)
+        /// Maximum number of Gaussians in the model: 200000, 28k, 1.5M (default: 200k, or as many as --memory holds)
         ///
         /// auto: growth stops where twice as many Gaussians gain less than 0.10 dB on training
         /// views, and those with the least effect are then pruned. The default stays the limit;
@@ -204,20 +202,20 @@ run_spec! {
         /// Limit of all memory of the run: 512MiB, 1.5GiB, 800MB. On a GPU it limits the device's memory, else that of
         /// the process
         ///
-        /// Options that are given are kept: --budget (the smaller of the two limits holds), --sh-degree,
-        /// --tile-cap, --image-cache. The others are chosen: as many Gaussians as fit; degree 3
-        /// unless fewer fit than the scene starts with, then it is lowered until they do; decoded
-        /// photographs take at most an eighth, and those beyond it are decoded again; tile lists hold 4
-        /// pairs per Gaussian, up to 16 where --budget leaves room. `densify plan` shows the result
+        /// Options that are given are kept: --budget (the smaller of the two limits applies), --sh-degree, --tile-cap,
+        /// --image-cache. The others are chosen: as many Gaussians as fit; degree 3 unless fewer fit than the scene
+        /// starts with, then it is lowered until they do; decoded photographs take at most an eighth, and those beyond
+        /// it are decoded again; tile lists hold 4 pairs per Gaussian, up to 16 where --budget leaves room. `densify
+        /// plan` shows the result
         memory: Option<ByteCount> = None, Fixed, value "BYTES";
 
-        /// Most (Gaussian, tile) pairs held at a time; views with more are processed in bands, which
-        /// is exact but slower (default: 16 per Gaussian of the budget, or chosen for --memory)
+        /// Maximum number of (Gaussian, tile) pairs in memory; views with more are processed in bands, which is exact
+        /// but slower (default: 16 per Gaussian of the budget, or chosen for --memory)
         tile_cap: Option<Rows> = None, Free, value "PAIRS";
 
-        /// Memory for decoded photographs, and as much of a GPU's own; others are decoded and uploaded again when they
-        /// are needed. auto: an eighth of the memory of the run, and the rest of --memory; 1GiB if --memory limits a
-        /// GPU (default: 1GiB, or as auto with --memory)
+        /// Memory for decoded photographs, and the same amount on a GPU; others are decoded and uploaded again when
+        /// they are needed. auto: an eighth of the memory of the run, and the rest of --memory; 1GiB if --memory limits
+        /// a GPU (default: 1GiB, or as auto with --memory)
         image_cache: Option<ImageCache> = None, Free, value "BYTES";
 
         /// Dependence of colours on the viewing direction: 0 none, 3 most; auto: as much as the scene requires
@@ -246,32 +244,32 @@ run_spec! {
     /// Training.
     schedule: ScheduleSpec, "Schedule" {
         /// Length of the run; every schedule scales with it
-        // The default of a run that names no preset is that preset's.
+        // Without `--preset`, the preset `balanced` sets another value.
         #[arg(short)]
         iterations: Whole<1, { u32::MAX }> = Whole(REFERENCE_ITERATIONS), Longer, value "N";
 
-        /// Seed of everything random
+        /// Seed of all random numbers
         #[arg(value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
         seed: u64 = 0, Fixed, value "N";
 
-        /// Set a learning rate: mean_start, mean_end, log_scale, quat, opacity, sh_dc, sh_rest;
-        /// of all but the means also NAME_end; fade: factor of opacity, sh_dc and sh_rest at the
-        /// end, from the share fade_from of the run on; boost: factor of all at the start (1 for
-        /// runs of 30,000); may be repeated
+        /// Set a learning rate: mean_start, mean_end, log_scale, quat, opacity, sh_dc, sh_rest; for all but the means
+        /// also NAME_end; fade: final factor of opacity, sh_dc and sh_rest, which starts to act after the share
+        /// fade_from of the run; boost: initial factor of all (1 for runs of 30,000); may be repeated
         #[serde(with = "as_table")]
         lr: Vec<Assignment> = Vec::new(), Fixed, value "NAME=RATE";
 
-        /// Settings that go together: exact, balanced, fast or tiny-memory. Options that are given
-        /// win over it (default: balanced)
+        /// Settings that go together: exact, balanced, fast or tiny-memory. Options that are given override it
+        /// (default: balanced)
         preset: Option<String> = None, Free, value "NAME";
 
-        /// Set a knob of the trade between speed, memory and accuracy, such as alpha_min=1/128;
-        /// `densify knobs` lists them. May be repeated
+        /// Set a knob of the trade-off between speed, memory and accuracy, such as alpha_min=1/128; `densify knobs`
+        /// lists them. May be repeated
         #[serde(with = "as_table")]
         knob: Vec<Assignment> = Vec::new(), Fixed, value "NAME=VALUE";
 
         /// Learn an exposure for each training photograph: a factor and an offset per colour channel. Test views are
-        /// then measured as they are, and again after the best such fit. auto needs the tracks of a reconstruction
+        /// then measured both as rendered and with the exposure that fits best. auto needs the tracks of a
+        /// reconstruction
         exposure: ExposureChoice = ExposureChoice::Off, Fixed, value "WHEN";
 
         /// Form of an exposure

@@ -54,8 +54,7 @@ impl Partial {
         Ok(Self(table))
     }
 
-    /// Reads a TOML file with any of the options, such as the `config.toml` of a run, of which the findings are
-    /// ignored.
+    /// Reads a TOML file with any of the options, such as the `config.toml` of a run, whose findings are ignored.
     ///
     /// # Errors
     /// As [`new`](Self::new), and when the file cannot be read.
@@ -172,7 +171,7 @@ fn join(upper: Table, lower: &mut Table) {
     }
 }
 
-/// Checks the members of options that have several: knobs, learning rates, policies.
+/// Checks the names in options that have several members: knobs, learning rates, policies.
 fn check_names(spec: &RunSpec) -> Result<(), Failure> {
     spec.knobs()?;
     spec.learning_rates(&RateOverrides::default())?;

@@ -38,7 +38,7 @@ pub struct Whole<const LEAST: u32, const MOST: u32>(pub u32);
 /// A number of processor threads. More threads than the cores of a large machine would only waste their stacks.
 pub type Threads = Whole<1, 256>;
 
-/// `--budget`: the most Gaussians that the model may ever have, or `auto`.
+/// `--budget`: the maximum number of Gaussians, or `auto`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Budget {
     /// At most this many.

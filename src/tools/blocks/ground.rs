@@ -113,7 +113,7 @@ mod tests {
         assert!(up.dot(turn * DVec3::Z).abs() > 0.999, "{up}");
         assert!(ground.u.dot(turn * DVec3::X).abs() > 0.999, "the longer side comes first");
         let [a, b] = [DVec3::ZERO, turn * DVec3::new(3.0, 4.0, 9.0)].map(|p| ground.project(p));
-        // Heights lean with x by less than half a degree.
+        // The alternating heights tilt the plane by less than half a degree.
         assert!(((a[0] - b[0]).hypot(a[1] - b[1]) - 5.0).abs() < 0.1, "{a:?} {b:?}");
     }
 

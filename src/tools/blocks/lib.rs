@@ -39,7 +39,7 @@ pub use task::run;
 const MAX_PLAN: u64 = 256 << 20;
 /// File name of the plan.
 pub const PLAN_FILE: &str = "plan.toml";
-/// Run descriptions of the coarse run and of a block: the user's options and those that the plan decides.
+/// Run descriptions of the coarse run and of a block: the user's options and those that the plan sets.
 const COARSE_FILE: &str = "coarse.toml";
 const BLOCK_FILE: &str = "block.toml";
 /// Default file name of the merged model.
@@ -131,7 +131,7 @@ impl BlockPlan {
             |problem: String| Failure::from(FileError::malformed(&path, problem.trim()));
         let plan: Self = toml::from_str(&text).map_err(|error| malformed(error.to_string()))?;
         match plan.block.iter().find(|block| !is_plain(&block.name)) {
-            Some(block) => Err(malformed(format!("`{}` is no name of a block", block.name))),
+            Some(block) => Err(malformed(format!("`{}` is not a valid block name", block.name))),
             None if plan.block.is_empty() => Err(malformed("it has no block".to_owned())),
             None => Ok(plan),
         }
@@ -213,7 +213,7 @@ fn run_folder(folder: &Path, plan: &BlockPlan, task: Task) -> PathBuf {
     match task {
         Task::Coarse => folder.join("coarse"),
         Task::Block(index) => block_folder(folder, &plan.block[index].name).join("run"),
-        Task::Merge => unreachable!("a merge is no run"),
+        Task::Merge => unreachable!("a merge is not a run"),
     }
 }
 

@@ -29,8 +29,8 @@ pub struct Merged {
     pub missing: Vec<String>,
 }
 
-/// Upper bound of the memory of a merge `[bytes]`, for the largest number of rows of a block with its frozen ones: the
-/// model while it is read into growing arrays, and its part in the cell.
+/// Upper bound of the memory of a merge `[bytes]`, with `largest` the largest number of rows of a block, frozen ones
+/// included: the model while it is read into growing arrays, and its part in the cell.
 pub(super) fn memory(largest: usize, sh_degree: u8) -> u64 {
     let row = size_of::<f32>() * (11 + 3 * sh_coefficients(sh_degree));
     PROGRAM_MEMORY + 4 * (largest * row) as u64
@@ -69,7 +69,7 @@ pub fn merge(
         rows += read_part(folder, plan, index, observer)?.len();
     }
     if rows > plan.rows {
-        let message = format!("{rows} rows of the promised {}; this is a bug", plan.rows);
+        let message = format!("{rows} rows, but the plan allows only {}; this is a bug", plan.rows);
         return Err(Failure::new(OTHER, message));
     }
     let shape = Shape { rows, sh_degree: plan.sh_degree };

@@ -5,7 +5,7 @@ use std::str::FromStr;
 
 use densify_run::Partial;
 
-/// Most strips, and most cells of a strip.
+/// Maximum number of strips, and of blocks per strip.
 pub(super) const MAX_GRID: usize = 1000;
 
 /// The number of blocks.
@@ -13,7 +13,7 @@ pub(super) const MAX_GRID: usize = 1000;
 pub enum Grid {
     /// As few as fit in the memory of a task.
     Auto,
-    /// Strips along the longer side of the ground, and blocks in each.
+    /// Number of strips along the longer side of the scene's ground, and number of blocks per strip.
     Fixed([usize; 2]),
 }
 
@@ -28,7 +28,9 @@ impl FromStr for Grid {
             None => number(text).map(|strips| (strips, 1)),
         };
         let (strips, across) = parts.ok_or_else(|| {
-            format!("`{text}` is no division into blocks; give 4, 3x2 or auto, at most {MAX_GRID} along a side")
+            format!(
+                "`{text}` is not a grid of blocks; give 4, 3x2 or auto, at most {MAX_GRID} a side"
+            )
         })?;
         Ok(Self::Fixed([strips, across]))
     }
@@ -56,7 +58,8 @@ pub struct PlanOptions {
     pub memory: Option<u64>,
     /// Number of blocks.
     pub grid: Grid,
-    /// Budget of the coarse run. By default two fifths of the merged model's, or, if less, half of what fits in `memory`.
+    /// Budget of the coarse run. Default: two fifths of the merged model's, at most half of what fits in `memory`, and
+    /// at least 1,000.
     pub coarse_rows: Option<usize>,
     /// Margin around a cell, as a fraction of the average cell width.
     pub margin: f64,

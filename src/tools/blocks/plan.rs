@@ -27,16 +27,16 @@ use densify_run::{
 };
 use densify_train::exposure::ExposureChoice;
 
-/// Fewest Gaussians of a block.
+/// Minimum number of Gaussians of a block.
 const MIN_ROWS: usize = 100;
-/// Default budget of the coarse run, as a fraction of the merged model's. BlockPlan compensate errors of their frozen
+/// Default budget of the coarse run, as a fraction of the merged model's. Blocks compensate errors of their frozen
 /// neighbours, so a better coarse model gives a better merged one (docs/blocks.md).
 const COARSE_SHARE: [usize; 2] = [2, 5];
 /// Smallest default budget of the coarse run.
 const MIN_COARSE_ROWS: usize = 1_000;
 /// The length of a single run over the whole scene is divided by this for the coarse run.
 const COARSE_SHORTENING: u32 = 2;
-/// Most width of the images of the coarse run `[px]`.
+/// Maximum width of the images of the coarse run `[px]`.
 const COARSE_WIDTH: u32 = 400;
 /// Options of a run that the plan sets itself.
 const OWN_OPTIONS: [&str; 10] = [
@@ -149,7 +149,8 @@ impl<'a> Planner<'a> {
         };
         if rows < MIN_ROWS {
             return Err(Failure::input(format!(
-                "a merged model of {rows} Gaussians is none; give --rows or --bytes for at least {MIN_ROWS}"
+                "{rows} Gaussians are too few for a merged model; give --rows or --bytes for at \
+                 least {MIN_ROWS}"
             )));
         }
         let mut planner = Self {
@@ -184,7 +185,8 @@ impl<'a> Planner<'a> {
     fn plan_fewest(&self, staging: &Path) -> Result<BlockPlan, Failure> {
         let Some(memory) = self.options.memory else {
             return Err(Failure::input(
-                "--blocks auto: as few as fit --memory, which is missing; give it, or the number of blocks",
+                "--blocks auto needs --memory, to find the fewest blocks that fit it; give \
+                 --memory, or the number of blocks",
             ));
         };
         let mut last = None;
@@ -232,8 +234,8 @@ impl<'a> Planner<'a> {
             let train = views.iter().filter(|(_, part)| part.is_some()).count();
             if train == 0 || rows < MIN_ROWS {
                 return Err(Failure::input(format!(
-                    "{name} of {}x{} would have {train} training views and {rows} Gaussians, which is no model; \
-                     give fewer --blocks, or more --rows",
+                    "{name} of {}x{} would have {train} training views and {rows} Gaussians, which \
+                     is not enough; give fewer --blocks, or more --rows",
                     grid[0], grid[1]
                 )));
             }
@@ -302,7 +304,7 @@ impl<'a> Planner<'a> {
         Ok(spec)
     }
 
-    /// Upper bound of the memory of a block's run, which at most holds the whole coarse model.
+    /// Upper bound of the memory of a block's run, which holds at most the whole coarse model besides its own rows.
     fn memory_of_block(
         &self,
         name: &str,

@@ -9,7 +9,7 @@ use densify_data::dataset::Dataset;
 const SIDE: f64 = 900.0;
 /// Border around the drawing `[px]`.
 const BORDER: f64 = 20.0;
-/// Most points drawn.
+/// Maximum number of points drawn.
 const MAX_POINTS: usize = 4_000;
 
 pub(super) fn draw(plan: &BlockPlan, points: &[[f64; 2]], dataset: &Dataset) -> String {

@@ -1,4 +1,4 @@
-//! Runs a task. A task that was killed resumes from its last checkpoint and produces the same bytes.
+//! Runs a task. A task that was killed resumes from its last checkpoint, and its result is byte-identical.
 
 use std::fs;
 use std::path::Path;

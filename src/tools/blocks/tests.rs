@@ -94,7 +94,7 @@ pub(super) fn example() -> BlockPlan {
 }
 
 #[test]
-fn a_plan_is_read_as_it_was_written_and_leads_nowhere_else() {
+fn a_plan_is_read_as_written_and_block_names_cannot_leave_its_folder() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join(PLAN_FILE);
     let absent = BlockPlan::read(folder.path()).unwrap_err();

@@ -9,13 +9,13 @@ use densify_data::dataset::normalise::median;
 use densify_data::dataset::{Dataset, Part, View};
 use densify_run::failure::Failure;
 
-/// Fewer tracks are not representative.
+/// Minimum number of tracks; fewer are not representative.
 const MIN_TRACKS: usize = 500;
 /// A view belongs to a block if at least this fraction of the points that it sees lie in the block.
 const MIN_FRACTION: f64 = 0.05;
 /// Margin around a block's points in the part of a view that is trained, as a fraction of the image's size.
 const PART_MARGIN: f64 = 0.04;
-/// Most points that are projected into the training views, evenly sampled.
+/// Maximum number of points that are projected into the training views, evenly sampled.
 const MAX_POINTS: usize = 20_000;
 /// The same for the test views.
 const MAX_TEST_POINTS: usize = 2_000;
@@ -50,8 +50,8 @@ impl Visibility {
         let points = &dataset.points.positions;
         if points.is_empty() {
             return Err(Failure::input(format!(
-                "{}: the dataset has no points, by which a scene is divided; make a reconstruction with points \
-                 (COLMAP), or train it as a whole",
+                "{}: the dataset has no points, which are needed to divide it; make a \
+                 reconstruction with points (COLMAP), or train it as a whole",
                 dataset.root.display()
             )));
         }
@@ -180,7 +180,7 @@ mod tests {
     use densify_fixtures::Made;
 
     #[test]
-    fn a_view_has_the_part_that_shows_what_is_inside() {
+    fn the_part_of_a_view_covers_the_points_inside_the_cell() {
         let made = Made::colmap_txt();
         let mut dataset = Dataset::load(made.path(), &LoadOptions::default()).expect("a dataset");
         dataset.train.truncate(2);
@@ -188,7 +188,7 @@ mod tests {
             let size = (100, 50);
             view.camera = Camera::centred(size, (100.0, 100.0), DMat3::IDENTITY, DVec3::ZERO);
         }
-        // At x = 30, 50 and 90, in the middle of y; the last is outside, and view 1 does not see the first.
+        // Points at x = 30, 50 and 90 px, y = 25 px. The last is outside the cell; view 1 does not see the first.
         let visibility = Visibility {
             points: vec![DVec3::new(-0.2, 0.0, 1.0), DVec3::Z, DVec3::new(0.4, 0.0, 1.0)],
             on_ground: vec![[0.0; 2], [0.0; 2], [9.0; 2]],

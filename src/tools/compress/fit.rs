@@ -11,7 +11,7 @@ use densify_train::importance::{footprints, largest};
 
 /// Fraction of the size that an estimate aims at: training changes the compression ratio.
 const FILL: f64 = 0.98;
-/// Most estimates of the number of rows.
+/// Maximum number of estimates of the number of rows.
 const MAX_ESTIMATES: usize = 8;
 /// Fraction of the rows that is dropped in addition if the file is still too large.
 const EXTRA_TRIM: f64 = 0.01;
@@ -70,9 +70,9 @@ pub(super) struct Packing {
     pub(super) is_whole: bool,
 }
 
-/// Chooses the packings to try: the format that holds most rows, the first of equals. If it has several variants, these
-/// are all that hold at least four fifths of the most, or, if all rows fit with the default accuracy, the most accurate
-/// variant that still holds them. Empty if not even one row fits.
+/// Chooses the packings to try, in the format that holds the most rows, the first of equals. If it has several variants
+/// and all rows fit with the default accuracy, this is the most accurate variant that still holds all rows; otherwise
+/// it is every variant that holds at least four fifths of the maximum number of rows. Empty if not even one row fits.
 ///
 /// # Errors
 /// If no format can represent the model, or writing fails for another reason.

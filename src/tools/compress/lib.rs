@@ -112,7 +112,7 @@ pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compre
     let evaluator = Evaluator::open(options, observer)?;
     if options.exposure.is_some() {
         observer.say(format_args!(
-            "exposure learned again, as the run has learned it; PSNR is with the best exposure of each photograph"
+            "exposure learned again, as in the run; PSNR is with the best exposure of each photograph"
         ));
     }
     let model = read_model(options.model, observer)?;
@@ -161,7 +161,7 @@ struct Search<'a> {
 }
 
 impl Search<'_> {
-    /// The original model with at most this degree. Each attempt creates its own, so that it is not held during training.
+    /// The original model with at most this degree. Each attempt makes its own copy, so none takes memory in training.
     fn start(&self, degree: u8) -> Gaussians {
         colour::reduce(self.model.clone(), degree)
     }

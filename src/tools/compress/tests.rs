@@ -67,7 +67,7 @@ fn a_size_that_no_gaussian_fits_is_refused_before_training() {
 /// Less accurate variants are smaller, so that more rows fit. Variants that hold fewer than four fifths of the most rows
 /// are not tried. If all rows fit with the default accuracy, the most accurate variant that holds them is tried.
 #[test]
-fn variants_of_a_format_are_tried_that_hold_enough_rows() {
+fn only_variants_that_hold_enough_rows_are_tried() {
     let model = colourful(2_000);
     let sizes: Vec<u64> = sog()
         .variants()
@@ -98,7 +98,7 @@ fn variants_of_a_format_are_tried_that_hold_enough_rows() {
 /// The last iterations train the decoded model and keep its view-dependent colour, of which many rows share a palette
 /// entry.
 #[test]
-fn colours_end_as_in_the_file() {
+fn colours_stay_as_decoded_from_the_file() {
     let made = Made::colmap_txt();
     let formats = [sog()];
     let options = options(Target::Rows(256), made.path(), &formats);

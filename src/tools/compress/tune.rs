@@ -77,7 +77,7 @@ fn train(
     write_atomically(scratch, |out| PLY.write(&model, out))?;
     let mut spec = describe_run(&model, setting, options, scratch)?;
     if freezes_sh {
-        // Rates must be positive; steps of the smallest are lost to rounding.
+        // Rates must be positive; with one so small all steps are lost to rounding.
         spec.schedule.lr = vec![assignment("sh_rest=1e-30")?];
     }
     drop(model);

@@ -26,7 +26,7 @@ pub struct Reference {
 
 impl Reference {
     /// Loads the dataset at `scene` and renders `model`, which was read from `file`. `near` is a fraction of the
-    /// scene's extent. Without a split of its own every 8th photograph is held out.
+    /// scene's extent. Unless the dataset or `data` selects test views, every 8th photograph is held out.
     ///
     /// # Errors
     /// When the dataset cannot be loaded or the model cannot be rendered.
@@ -44,7 +44,7 @@ impl Reference {
         let mut backend = machine.backend(&dataset, model.clone(), near)?;
         let (background, sh_degree) = (data.background.fixed(), model.sh_degree);
         let views = views_of(&dataset, Split::Test)?;
-        // A model outside the views would look alike in every format.
+        // A model that no view shows would look the same in every format.
         CoordinateCheck::measure(backend.as_mut(), &views, (background, sh_degree))?
             .note(None, file, observer);
         Ok(Self { dataset, machine, near, background, sh_degree, backend })

@@ -17,7 +17,7 @@ use densify_train::pictures::picture;
 use crate::animation::{self, Animation};
 use crate::pictures::{Channels, PictureFolder};
 
-/// Frames of an orbit or a spiral, and frames per second, where neither is given.
+/// Default number of frames of an orbit or a spiral, and default frames per second.
 const FRAMES: u32 = 120;
 const FPS: u32 = 30;
 /// Memory that rendering takes for each pixel of a frame `[bytes]`.
@@ -104,7 +104,7 @@ pub enum FilmError {
         /// Memory that it takes `[bytes]`.
         bytes: u64,
     },
-    /// The name of the video has another extension.
+    /// The name of the video has an unknown extension.
     #[error("{path}: name a file that ends in .mp4 or .webp")]
     UnknownFormat {
         /// The video.
@@ -124,7 +124,7 @@ pub enum FilmError {
         /// The video.
         path: PathBuf,
     },
-    /// The video could not be made of the pictures.
+    /// The video could not be made from the pictures.
     #[error("{path}: {problem}; the pictures are in {pictures}")]
     Encoding {
         /// The video.
@@ -196,7 +196,7 @@ impl Film {
     /// Renders the pictures into `folder`, and the video if one is named.
     ///
     /// # Errors
-    /// See [`FilmError`]. Everything that the options get wrong fails before the first frame.
+    /// See [`FilmError`]. Errors in the options are found before the first frame is rendered.
     pub fn make(
         route: &CameraRoute,
         options: FilmOptions<'_>,

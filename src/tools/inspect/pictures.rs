@@ -12,7 +12,7 @@ use densify_render::Rendering;
 use densify_train::output::write_json;
 use densify_train::pictures::{photograph, picture, side_by_side, to_u8, write_png};
 
-/// The pictures that are written of each rendering beside its colours.
+/// The pictures that are written for each rendering in addition to its colours.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Channels {
     /// Opacity, as `NAME.alpha.png`.
@@ -33,8 +33,8 @@ pub struct PictureFolder {
 }
 
 impl PictureFolder {
-    /// Writes to `folder`, which is created with the first picture. Depth is in the units of the dataset that
-    /// `normalisation` leads back to.
+    /// Writes to `folder`, which is created with the first picture. Depth is converted with `normalisation` to the
+    /// units of the dataset.
     pub fn new(folder: &Path, channels: Channels, normalisation: &Normalisation) -> Self {
         let units = 1.0 / normalisation.scale;
         Self { folder: folder.to_owned(), channels, units, largest_depth: BTreeMap::new() }
@@ -79,7 +79,7 @@ impl PictureFolder {
         write_png(&path, &pair(image, background, rendering))
     }
 
-    /// Writes `depth.json`, which says what the depth pictures stand for, if there are any.
+    /// Writes `depth.json`, which has the scales of the depth pictures, if there are any.
     ///
     /// # Errors
     /// When the file cannot be written.
@@ -154,7 +154,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn file_names_stay_in_the_folder_and_apart() {
+    fn file_names_are_distinct_and_stay_in_the_folder() {
         assert_eq!(file_names(&["a.jpg", "sub/b.JPG", "c"]), ["a", "sub/b", "c"]);
         assert_eq!(file_names(&["a.jpg", "a.png"]), ["a.jpg", "a.png"]);
         assert_eq!(file_names(&["../../etc/x.png", "/y.png", "C:\\z.png"]), ["etc/x", "y", "C_/z"]);

@@ -48,10 +48,10 @@ pub struct SubmissionArgs {
     /// Print the files for the engine, and start nothing
     #[arg(long)]
     dry_run: bool,
-    /// Hand in again what is not complete
+    /// Submit incomplete tasks again
     #[arg(long)]
     again: bool,
-    /// Ask HyperQueue for memory too: its workers must offer the resource `mem`, in bytes, else tasks wait for ever
+    /// Also request memory from HyperQueue: its workers must offer the resource `mem`, in bytes, or tasks wait for ever
     #[arg(long)]
     mem_resource: bool,
 }
@@ -184,8 +184,8 @@ pub fn submit(
     }
     if let Some(jobs) = submitted_jobs(&batch.folder).filter(|_| !submission.again) {
         return Err(Failure::input(format!(
-            "{} was handed in before, as job {jobs}; see {}, and give --again to hand in what is not complete once \
-             those jobs have ended",
+            "{} was already submitted, as job {jobs}; see {}, and when those jobs have ended \
+            submit incomplete tasks with --again",
             batch.folder.display(),
             batch.status
         )));

@@ -17,7 +17,7 @@ use densify_run::grant;
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
 const LOCK_FILE: &str = "local.lock";
 
-/// Number of tasks of a stage to run at once, and threads of each.
+/// Number of tasks of a stage to run at once, and number of threads of each.
 fn concurrency(jobs: &[Job]) -> (usize, u32) {
     let cores = u32::try_from(rayon::current_num_threads()).unwrap_or(u32::MAX);
     let memory = jobs.iter().map(|job| job.memory).max().unwrap_or(1);
@@ -79,7 +79,7 @@ fn run_stage(
                     let log = log_path(logs, name);
                     let code = status.code().and_then(|code| u8::try_from(code).ok());
                     let message = format!(
-                        "{name} has failed: {}; the same command goes on from here ({})",
+                        "{name} has failed: {}; run the same command again to resume ({})",
                         last_line(&log),
                         log.display()
                     );
@@ -92,7 +92,7 @@ fn run_stage(
         }
         if let Some(interrupt) = observer.interrupt() {
             // The tasks have received the same signal and stop by themselves.
-            let message = format!("stopped by {}; the same command goes on", interrupt.name);
+            let message = format!("stopped by {}; the same command resumes", interrupt.name);
             failed.get_or_insert(Failure::new(interrupt.exit_code, message));
         }
         while failed.is_none() && running.len() < count {
@@ -146,6 +146,6 @@ fn lock(batch: &Batch) -> Result<File, Failure> {
 /// The last line of a task's output.
 fn last_line(log: &Path) -> String {
     let text = fs::read_to_string(log).unwrap_or_default();
-    let line = text.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or("no word");
+    let line = text.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or("no output");
     line.trim().trim_start_matches("error: ").to_owned()
 }

@@ -5,10 +5,10 @@ use std::fmt::Write as _;
 use super::{Batch, EngineFile, Job, Stage, run_scheduler, shell_quote};
 use densify_run::failure::Failure;
 
-/// Most automatic restarts of a task that was killed.
+/// Maximum number of automatic restarts of a task that was killed.
 const RESTARTS: u32 = 5;
 const REMEDY: &str =
-    "Slurm's programs must be on this machine's PATH; else choose --engine local or hq";
+    "Slurm's programs must be on this machine's PATH; otherwise choose --engine local or hq";
 
 /// Creates the batch scripts, in the order of the stages.
 pub(super) fn files(batch: &Batch) -> Result<Vec<EngineFile>, Failure> {
@@ -41,7 +41,7 @@ fn script(batch: &Batch, Stage { name, is_array, jobs }: &Stage) -> Result<Engin
         text,
         "{} {task}\n\
          code=$?\n\
-         # Killed, such as for memory or by its machine: it goes on from where it was, up to {RESTARTS} times.\n\
+         # A task that was killed, such as for lack of memory, is resumed, up to {RESTARTS} times.\n\
          if [ $code -ge 128 ] && [ \"${{SLURM_RESTART_COUNT:-0}}\" -lt {RESTARTS} ]; then\n    \
          scontrol requeue \"$SLURM_JOB_ID\" && sleep 60\n\
          fi\n\
@@ -64,7 +64,7 @@ pub(super) fn submit(files: &[EngineFile]) -> Result<Vec<String>, Failure> {
             run_scheduler("sbatch", &arguments, REMEDY).map_err(|failure| match &jobs[..] {
                 [] => failure,
                 jobs => failure
-                    .and(&format!("handed in already: {}; cancel with scancel", jobs.join(", "))),
+                    .and(&format!("already submitted: {}; cancel with scancel", jobs.join(", "))),
             })?;
         // The output is `ID`, or `ID;CLUSTER`.
         jobs.push(output.split(';').next().unwrap_or(&output).to_owned());

@@ -12,7 +12,7 @@ use densify_train::output::StepRecord;
 
 /// Size of a panel `[px]`: small, so that its text is readable on a phone.
 const SIZE: (u32, u32) = (460, 270);
-/// Most points of a curve, about twice the number that can be distinguished.
+/// Maximum number of points of a curve, about twice the number that can be distinguished.
 const MAX_POINTS: usize = 300;
 const MIB: f64 = 1024.0 * 1024.0;
 
@@ -41,7 +41,7 @@ pub(super) fn draw(runs: &[RunRecord]) -> Result<Option<Markup>, Failure> {
         let points = vec![(0.0, promised), (last, promised)];
         Some(Curve { name: run.name.clone(), points, colour: at % COLOURS, is_dashed: true })
     }));
-    panels.push(("Memory; dashed: what was promised", memory));
+    panels.push(("Memory; dashed: the promised limit", memory));
     panels.retain(|(_, panel)| panel.has_points());
     if panels.is_empty() {
         return Ok(None);

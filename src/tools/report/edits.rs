@@ -9,9 +9,9 @@ use densify_core::numbers::grouped;
 use densify_html::{Column, Table};
 use densify_train::trainer::EditEvent;
 
-/// Most causes listed separately.
+/// Maximum number of causes listed separately.
 const MAX_CAUSES: usize = 12;
-/// Most lines of the log.
+/// Maximum number of lines of the log.
 const MAX_LINES: usize = 400;
 
 /// Totals over edits.

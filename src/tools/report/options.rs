@@ -11,7 +11,7 @@ use densify_html::{Column, Table as HtmlTable};
 use densify_run::failure::Failure;
 use densify_run::{Partial, RunSpec};
 
-/// Most rows of the table of differences; more would not be readable.
+/// Maximum number of rows of the table of differences; more would not be readable.
 const MAX_DIFFERENCES: usize = 60;
 /// Options that are paths on the machine that trained; only their last component is published.
 const PATHS: [&str; 5] = ["scene", "images", "views", "init", "freeze"];
@@ -117,7 +117,7 @@ mod tests {
         });
         let found: Vec<&str> = paths.map(|arg| arg.get_id().as_str()).collect();
         assert!(found.len() > PATHS.len(), "{found:?}");
-        // The former is an enumeration, and the output folder is not published at all.
+        // `exposure_model` is an enumeration, and the output folder is not published at all.
         let others = ["exposure_model", "output"];
         let unknown: Vec<_> =
             found.iter().filter(|name| !PATHS.contains(name) && !others.contains(name)).collect();

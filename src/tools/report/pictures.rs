@@ -27,7 +27,7 @@ const MAX_SIDE: u32 = 960;
 const QUALITY: u8 = 88;
 /// Number of views from each end of the ranking.
 const FROM_EACH_END: usize = 2;
-/// Most views that are evaluated if the run has no scores.
+/// Maximum number of views that are evaluated if the run has no scores.
 const MAX_EVALUATED: usize = 24;
 /// Number of frames of an orbit.
 const FRAMES: u32 = 24;

@@ -1,9 +1,9 @@
 //! Compares a backend's arrays with the reference's.
 //!
-//! A renderer has thresholds: alpha below 1/255, transmittance used up, depth order. Close to one, `f32` and
-//! `f64` may decide differently, and the images then differ by more than rounding. So the comparison is tight
+//! A renderer has thresholds: alpha below 1/255, transmittance used up, depth order. Close to a threshold `f32`
+//! and `f64` may decide differently, and the images then differ by more than rounding. So the comparison is tight
 //! where no threshold is close. Elsewhere a pixel may flip, but rarely, by a bounded amount, and not always in
-//! the same direction, as a bias would be a bug. (After gsplat's `assert_close_with_boundary_band`.)
+//! the same direction: a bias would be a bug. (After gsplat's `assert_close_with_boundary_band`.)
 
 use std::fmt::Write as _;
 
@@ -33,7 +33,7 @@ impl Limits {
     }
 }
 
-/// Flipped pixels from which on the bias is tested: at bias ½, chance is excluded (p < 0.01).
+/// Minimum number of flipped pixels to test their bias: a bias of ½ is then not due to chance (p < 0.01).
 const MIN_FLIPS_FOR_BIAS: usize = 30;
 
 /// Compares two images; returns the largest difference away from boundaries.
@@ -245,7 +245,7 @@ mod tests {
     }
 
     #[test]
-    fn errors_are_told_from_rounding_and_flips() {
+    fn errors_are_distinguished_from_rounding_and_flips() {
         let cpu = Limits::CPU;
         let lenient = Limits { flipped: 0.01, ..cpu };
         let alternating = |k: usize| if k.is_multiple_of(2) { 0.004 } else { -0.004 };
@@ -266,7 +266,7 @@ mod tests {
         refused(&corrupted((0..1000).step_by(10), mostly), lenient, "bias -0.60");
         assert!(outcome(&[0.0; 5], cpu).is_err(), "lengths that disagree");
         for measured in [[0.0, f32::NAN, 0.5], [f32::NAN, 0.0, 0.0]] {
-            // It is not hidden by the next channel.
+            // The NaN is not hidden by the next channel.
             assert!(compare_images(&measured, &[0.0; 3], &[true], cpu).is_err());
         }
     }

@@ -24,7 +24,7 @@ impl Subject {
     /// The native backend with its default options.
     pub const NATIVE: Self = Self::Native { instructions: InstructionSet::Best, threads: None };
 
-    /// A name for people.
+    /// A name to show to the user.
     pub fn name(&self) -> String {
         match self {
             Self::Native { instructions: InstructionSet::Best, .. } => "native".into(),

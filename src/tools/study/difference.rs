@@ -8,13 +8,13 @@ use statrs::distribution::{ContinuousCDF, StudentsT};
 
 /// Resamples of a bootstrap, enough for a standard error accurate to one percent.
 const RESAMPLES: usize = 10_000;
-/// Fewest runs, or scenes, for which an interval is computed.
+/// Minimum number of runs, or of scenes, for which an interval is computed.
 const MIN_VALUES: usize = 3;
 
 /// Explanation of the intervals of [`Difference`], for reports.
-pub(super) const INTERVALS: &str = "Brackets are 95 % intervals of the mean: Student's t over seeds; over several scenes \
-    scenes and then their seeds are resampled, and the standard error is multiplied by Student's t, as scenes are few. \
-    Below three seeds, or three scenes, there is none";
+pub(super) const INTERVALS: &str = "Brackets are 95 % intervals of the mean: over seeds by Student's t; over several scenes by \
+     resampling scenes and then their seeds, with the standard error multiplied by Student's t, as \
+     scenes are few. There are none below three seeds, or three scenes";
 
 /// Mean of some numbers; `None` if there are none.
 pub(super) fn mean(values: impl IntoIterator<Item = f64>) -> Option<f64> {
@@ -190,7 +190,7 @@ mod tests {
     /// The variance of a resample is (variance of the scenes' means + mean over scenes of the seeds' variance divided by
     /// their number) / number of scenes.
     #[test]
-    fn resampled_errors_are_those_of_the_closed_form() {
+    fn resampled_errors_match_the_closed_form() {
         let scenes: [&[f64]; 4] = [&[0.0, 1.0, 2.0], &[2.0, 4.0], &[-1.0, 0.0, 4.0], &[5.0]];
         let variance = |values: &[f64]| {
             let mean = mean(values.iter().copied()).unwrap();
@@ -205,10 +205,10 @@ mod tests {
         assert!((half / expected - 1.0).abs() < 0.03, "{half}, not {expected}");
     }
 
-    /// In simulated studies of three scenes and three seeds, 19 of 20 intervals must contain the true mean, whether scenes
-    /// differ or not. Percentile intervals would in 15 to 17.
+    /// In simulated studies of three scenes and three seeds, 19 of 20 intervals must contain the true mean, whether
+    /// scenes differ or not. Of percentile intervals only 15 to 17 would contain it.
     #[test]
-    fn intervals_over_scenes_hold_the_truth_as_often_as_they_say() {
+    fn intervals_over_scenes_contain_the_true_mean_as_often_as_claimed() {
         let normal = Normal::new(0.0, 1.0).unwrap();
         let mut rng = ChaCha8Rng::seed_from_u64(3);
         for of_scenes in [0.0, 1.0, 5.0] {
@@ -222,9 +222,9 @@ mod tests {
                     difference(&scenes.each_ref().map(|s| &s[..])).unwrap().interval.unwrap();
                 low <= 0.0 && 0.0 <= high
             };
-            let held = (0..200).filter(holds).count();
+            let count = (0..200).filter(holds).count();
             // At least 190 are expected; the first percentile is 182.
-            assert!(held >= 182, "{held} of 200 where scenes differ by {of_scenes}");
+            assert!(count >= 182, "{count} of 200 where scenes differ by {of_scenes}");
         }
     }
 }

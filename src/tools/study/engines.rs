@@ -13,9 +13,9 @@ use densify_run::{Host, Observer, Partial, RunSpec, host_bytes};
 #[derive(Debug, Clone, Default, Args)]
 #[command(next_help_heading = "Engine")]
 pub struct EngineArgs {
-    /// What makes the runs, instead of one after another: this machine, several at once, or a scheduler, to which
-    /// they are handed in; the same command, called again, collects what is done. Then times compare only if the
-    /// machines are alike and nothing else runs on them
+    /// Train several runs at once on this machine (local), or submit them to a scheduler; by default they are
+    /// trained one after another. Run the same command again to collect the results of a scheduler. Times are then
+    /// comparable only if the machines are alike and run nothing else
     #[arg(long, value_name = "ENGINE")]
     engine: Option<Engine>,
     #[command(flatten)]
@@ -31,7 +31,7 @@ impl EngineArgs {
     }
 }
 
-/// Makes one run of a study: engines call this.
+/// Trains one run of a study; engines call this.
 #[derive(Debug, Args)]
 pub struct StudyRun {
     /// Folder of the study
@@ -52,7 +52,7 @@ impl StudyRun {
     }
 }
 
-/// Starts or submits the runs that are not done. If they were submitted before, reports the jobs instead.
+/// Starts or submits the runs that are not done. If they were already submitted, reports the jobs instead.
 pub(super) fn submit(
     output: &Path,
     runs: &[PlannedRun],
@@ -69,7 +69,8 @@ pub(super) fn submit(
         && let Some(jobs) = launch::submitted_jobs(&folder)
     {
         observer.say(format_args!(
-            "handed in before, as job {jobs}: call again when that has ended, with --again if it has failed (logs in {})",
+            "already submitted as job {jobs}: run this command again when that has ended, with \
+            --again if it has failed (logs in {})",
             folder.join("logs").display()
         ));
         return Ok(());
@@ -99,12 +100,12 @@ pub(super) fn submit(
     let batch = Batch {
         command: ["study-run", utf8(&folder)?].map(str::to_owned).into(),
         stages: vec![Stage { name: "runs", is_array: true, jobs }],
-        status: "what the same command says".to_owned(),
+        status: "the output of that process".to_owned(),
         folder,
     };
     launch::submit(&batch, submission, observer)?;
     if is_scheduled {
-        observer.say(format_args!("call the same command again to collect what is done"));
+        observer.say(format_args!("run the same command again to collect the results"));
     }
     Ok(())
 }

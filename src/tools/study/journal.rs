@@ -26,7 +26,7 @@ impl Journal {
         let outcomes = (1..).zip(whole.lines()).map(|(number, line)| {
             serde_json::from_str(line).map_err(|e| {
                 let place = format!("{}, line {number}", path.display());
-                Failure::input(format!("{place}: {e}; delete the line, and its run runs again"))
+                Failure::input(format!("{place}: {e}; delete the line to repeat its run"))
             })
         });
         Ok(Self { path: path.to_owned(), outcomes: outcomes.collect::<Result<_, _>>()? })

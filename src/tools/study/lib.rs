@@ -180,7 +180,7 @@ fn labels(scenes: &[PathBuf]) -> Result<Vec<String>, Failure> {
         };
         if labels.contains(&label) {
             return Err(Failure::input(format!(
-                "two scenes are called {label}; take them in two calls, or rename one folder"
+                "two scenes are called {label}; study them separately, or rename one folder"
             )));
         }
         labels.push(label);

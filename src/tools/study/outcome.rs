@@ -34,7 +34,7 @@ pub(super) struct Outcome {
     pub(super) flip: f64,
     /// Gaussians at the end.
     pub(super) rows: usize,
-    /// Most Gaussians at any instant.
+    /// Largest number of Gaussians at any instant.
     pub(super) peak_rows: usize,
     /// Peak resident memory of the process, if known.
     pub(super) peak_bytes: Option<u64>,

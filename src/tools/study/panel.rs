@@ -25,7 +25,7 @@ pub const PALETTE: [RGBColor; 7] = [
 
 /// Length of a dash and of a gap `[px]`.
 const DASH: [i32; 2] = [6, 4];
-/// Most points of a curve whose points are marked.
+/// Maximum number of points of a curve whose points are marked.
 const MAX_MARKED_POINTS: usize = 16;
 
 /// A line through some points.
@@ -203,7 +203,7 @@ mod tests {
     const SIZE: (u32, u32) = (720, 300);
 
     #[test]
-    fn a_plot_shows_every_curve_and_none_is_no_error() {
+    fn a_plot_shows_every_curve_and_may_have_none() {
         let curve =
             |name: &str, points| Curve { name: name.into(), points, colour: 0, is_dashed: false };
         let panel = |log_x| Panel {

@@ -81,7 +81,7 @@ impl PlannedRun {
     pub(super) fn train(&self, output: &Path) -> Result<Outcome, Failure> {
         let folder = output.join("runs").join(self.name());
         self.train_and_evaluate(&folder).map_err(|failure| {
-            failure.and(&format!("this was the run {self}; the same command goes on from here"))
+            failure.and(&format!("this was the run {self}; the same command resumes here"))
         })?;
         self.outcome(&folder)
     }

@@ -36,7 +36,7 @@ fn lens(camera: &Camera) -> Vec<f64> {
     vec![camera.fx / width, camera.fy / height, camera.cx / width, camera.cy / height]
 }
 
-/// Most bytes of a point in the description.
+/// Maximum number of bytes that a point takes in the description.
 pub(super) const MAX_POINT_BYTES: usize = 128;
 
 /// The description. Points are not part of the [`Value`], where they would take several times their memory.

@@ -27,13 +27,13 @@ use densify_train::pictures::{photograph, picture, to_u8};
 
 /// Stack of the encoder thread `[bytes]`. Image decoders use most of it, less than a quarter.
 pub(super) const STACK: usize = 512 << 10;
-/// JPEG quality at rest: at least 38 dB from the rendering, usually 45 dB.
+/// JPEG quality at rest: its PSNR against the rendering is at least 38 dB, usually 45 dB.
 const STILL_QUALITY: u8 = 95;
 /// JPEG quality while the camera moves.
 const MOVING_QUALITY: u8 = 80;
 /// The difference at the light end of the colour map. FLIP reaches 1, but values above this are rare.
 const MAX_FLIP: f64 = 0.5;
-/// Least opacity of a pixel for its depth to be shown.
+/// Minimum opacity of a pixel for its depth to be shown.
 const MIN_ALPHA: f32 = 0.02;
 
 /// A picture ready to be sent.
@@ -47,7 +47,7 @@ pub(super) struct EncodedPicture {
     pub(super) mean: Option<f64>,
     /// Distance to the model at the centre of the picture, in the dataset's own units.
     pub(super) distance: Option<f64>,
-    /// Number of training views in which the Gaussians were measured, and of all.
+    /// Number of training views in which the Gaussians were measured, and number of all training views.
     pub(super) measured_views: Option<[usize; 2]>,
     /// Time for rendering and encoding `[ms]`.
     pub(super) milliseconds: f64,

@@ -34,7 +34,7 @@ use scene::LoadedScene;
 
 use densify_run::failure::{Failure, OTHER};
 
-/// Pictures in progress at a time: one is rendered while another is encoded.
+/// Maximum number of pictures in progress: one is rendered while another is encoded.
 const MAX_ACTIVE: usize = 2;
 
 impl Server {

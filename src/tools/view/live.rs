@@ -1,5 +1,5 @@
 //! `train --view`: the page of a run in training. The training thread renders its own model between two steps, so no
-//! second copy is needed, and training waits for nothing else. Without requests, a step costs one look at an empty
+//! second copy is needed, and training waits for nothing else. Without requests, a step costs one check of an empty
 //! queue.
 
 use std::cell::Cell;
@@ -27,9 +27,9 @@ use densify_train::metrics::scratch_bytes;
 use densify_train::output::StepRecord;
 use densify_train::trainer::{EditEvent, RowHistory};
 
-/// Most waiting requests.
+/// Maximum number of waiting requests.
 const MAX_WAITING: usize = 8;
-/// Pictures in progress at a time; their memory is part of the plan.
+/// Maximum number of pictures in progress; their memory is part of the plan.
 const MAX_ACTIVE: usize = 1;
 /// Memory of a connection: the used part of its thread's stack, its buffers and its request `[bytes]`.
 const CONNECTION_BYTES: u64 = 80 << 10;
@@ -81,7 +81,7 @@ fn passing_bytes(rows: u64, device: &Device) -> u64 {
     rows * numbers * size_of::<f32>() as u64
 }
 
-/// Most of the dataset's points that the page draws; more would hide the scene.
+/// Maximum number of the dataset's points that the page draws; more would hide the scene.
 pub(crate) const MAX_POINTS: usize = 4000;
 
 /// The page's memory, for the ledger of a run that trains beside it.

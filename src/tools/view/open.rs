@@ -19,7 +19,7 @@ use densify_train::checkpoint::checkpoint_path;
 use densify_train::init::{initialise, random_points};
 use densify_train::output::{CONFIG_FILE, model_path};
 
-/// Most points of a dataset that are shown as Gaussians.
+/// Maximum number of points of a dataset that are shown as Gaussians.
 const MAX_POINTS: usize = 500_000;
 /// Number of random points for a dataset without points.
 const RANDOM_POINTS: usize = 20_000;

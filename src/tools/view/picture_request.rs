@@ -10,14 +10,14 @@ use densify_train::evaluate::Split;
 
 /// Longest side of a picture `[px]`.
 pub(super) const MAX_SIDE: u32 = 4096;
-/// Most pixels of a picture: its rendering takes 80 MiB, and its tiles as much again.
+/// Maximum number of pixels of a picture: its rendering takes 80 MiB, and its tiles as much again.
 pub(super) const MAX_PIXELS: u64 = 1 << 22;
-/// Most characters of a page's identifier.
+/// Maximum number of characters of a page's identifier.
 const MAX_NAME: usize = 32;
 /// Allowed fields of view `[°]`; beyond these nothing is recognisable.
 const FIELDS: std::ops::RangeInclusive<f64> = 1.0..=170.0;
-/// Largest distance of a camera from the scene's centre, in scene radii; far beyond, single precision cannot tell
-/// Gaussians apart.
+/// Largest distance of a camera from the scene's centre, in scene radii; far beyond, single precision cannot
+/// distinguish Gaussians.
 const FARTHEST: f64 = 1e4;
 
 #[derive(Deserialize)]

@@ -26,7 +26,7 @@ pub(super) struct RenderedPicture {
     pub(super) rendering: Rendering,
     /// The values at both ends of the colour map, if it represents numbers.
     pub(super) range: Option<Range<f64>>,
-    /// Number of training views in which the Gaussians were measured, and of all.
+    /// Number of training views in which the Gaussians were measured, and number of all training views.
     pub(super) measured_views: Option<[usize; 2]>,
     /// Rendering time `[ms]`.
     pub(super) milliseconds: f64,

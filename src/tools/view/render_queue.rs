@@ -53,9 +53,9 @@ struct Jobs {
 pub(super) struct RenderQueue {
     jobs: Mutex<Jobs>,
     changed: Condvar,
-    /// Most waiting requests; unlimited if `None`, as every connection has at most one.
+    /// Maximum number of waiting requests; unlimited if `None`, as every connection has at most one.
     capacity: Option<usize>,
-    /// Most jobs taken but not answered yet.
+    /// Maximum number of jobs taken but not answered yet.
     max_active: usize,
 }
 

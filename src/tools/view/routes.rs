@@ -54,7 +54,9 @@ impl Routes<'_> {
                         run_status.command(order);
                         json("{}".to_owned())
                     }
-                    Err(error) => Response::error(400, format_args!("this is no command: {error}")),
+                    Err(error) => {
+                        Response::error(400, format_args!("this is not a command: {error}"))
+                    }
                 }
             }
             (Method::Get | Method::Head, "progress") if let Some(run_status) = self.run_status => {
@@ -104,14 +106,14 @@ impl Routes<'_> {
     }
 }
 
-/// The response with a picture, its data in the headers. `held` is the time from request to response here, waiting
-/// included, so that the page can tell it from the latency of the network.
-fn picture_response(picture: EncodedPicture, held: Duration) -> Response {
+/// The response with a picture, its data in the headers. `server_time` is the time from request to response here,
+/// waiting included, so that the page can subtract it from the total to find the latency of the network.
+fn picture_response(picture: EncodedPicture, server_time: Duration) -> Response {
     let (width, height) = picture.size;
     let mut response = Response::ok("image/jpeg", picture.jpeg)
         .with_header("X-Size", format!("{width}x{height}"))
         .with_header("X-Milliseconds", format!("{:.1}", picture.milliseconds))
-        .with_header("X-Held", format!("{:.1}", 1e3 * held.as_secs_f64()));
+        .with_header("X-Held", format!("{:.1}", 1e3 * server_time.as_secs_f64()));
     if let Some(range) = picture.range {
         response = response.with_header("X-Range", format!("{} {}", range.start, range.end));
     }

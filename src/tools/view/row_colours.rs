@@ -52,7 +52,7 @@ enum Scale {
     Unit,
     /// 0 and the largest value.
     FromZero,
-    /// The least and the largest value.
+    /// The smallest and the largest value.
     Fitted,
 }
 
@@ -186,7 +186,7 @@ fn distinct_colour(row: u32) -> [f32; 3] {
     [24, 13, 2].map(|shift| 0.15 + 0.8 * (mixed >> shift & 255) as f32 / 255.0)
 }
 
-/// The least and the largest of the finite values, without outliers.
+/// The smallest and the largest of the finite values, without outliers.
 pub(super) fn ends(values: &[f32]) -> Range<f32> {
     let mut values: Vec<f32> = values.iter().copied().filter(|value| value.is_finite()).collect();
     if values.is_empty() {
@@ -262,7 +262,7 @@ mod tests {
             assert!((ends.start - range.start).abs() < 1e-5, "{kind:?}: {ends:?}");
             assert!((ends.end - range.end).abs() < 1e-5, "{kind:?}: {ends:?}");
             let bright: Vec<f32> = colours.rows.iter().map(brightness).collect();
-            // Row 0 has no gradient and row 1 the least.
+            // Row 0 has no gradient and row 1 the smallest.
             let rises = bright[0] < bright[1] || kind == PictureKind::RowGradient;
             assert!(rises && bright[1] < bright[2], "{kind:?}: {bright:?}");
         }

@@ -59,7 +59,7 @@ impl RowMeasurements {
         })
     }
 
-    /// Number of measured views, and of all.
+    /// Number of measured views, and number of all views.
     pub(super) fn progress(&self) -> [usize; 2] {
         [self.seen, self.order.len()]
     }

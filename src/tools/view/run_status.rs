@@ -9,7 +9,7 @@ use densify_train::evaluate::Mean;
 use densify_train::output::StepRecord;
 use densify_train::trainer::EditEvent;
 
-/// Most points of a curve; when exceeded, every second one is dropped.
+/// Maximum number of points of a curve; when exceeded, every second one is dropped.
 const MAX_POINTS: usize = 512;
 /// Number of newest edits that are kept.
 const MAX_EDITS: usize = 100;
@@ -61,7 +61,7 @@ struct Progress {
     /// Time of all steps `[s]`.
     seconds: f64,
     points: Vec<Point>,
-    /// Every how many records a point is kept.
+    /// One of this many records is kept as a point.
     #[serde(skip)]
     stride: usize,
     #[serde(skip)]

@@ -15,7 +15,7 @@ use densify_run::Run;
 use densify_run::finished::{Machine, name_of};
 use densify_train::evaluate::Split;
 
-/// Cache of decoded photographs `[bytes]`; none beside a run, which has promised its memory.
+/// Cache of decoded photographs `[bytes]`; there is none beside a run in training, whose memory is limited.
 const PHOTOGRAPH_CACHE: u64 = 64 << 20;
 
 const NO_COUNTS: &str = "GPU backends do not count them; densify view --backend cpu does";

@@ -11,8 +11,8 @@ pub const VERSION: u32 = 2;
 pub(super) const VERSION_KEY: &str = "densify.version";
 pub(super) const HEADER_KEY: &str = "densify.header";
 pub(super) const CHECKSUM_KEY: &str = "densify.crc32c";
-/// Size of the field before the header that states its length `[bytes]`.
-pub(super) const LENGTH: u64 = 8;
+/// Size of the field that states the header's length `[bytes]`.
+pub(super) const LENGTH_FIELD_BYTES: u64 = 8;
 
 /// Description of an array.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -34,12 +34,14 @@ pub(super) struct Contents<H> {
 }
 
 impl Record {
-    pub(super) fn values(&self) -> Option<usize> {
+    /// The number of values; `None` if it overflows.
+    pub(super) fn value_count(&self) -> Option<usize> {
         self.shape.iter().try_fold(1_usize, |product, &side| product.checked_mul(side))
     }
 
+    /// The number of bytes; `None` if it overflows.
     pub(super) fn bytes(&self) -> Option<usize> {
-        self.values()?.checked_mul(self.kind.bitsize() / 8)
+        self.value_count()?.checked_mul(self.kind.bitsize() / 8)
     }
 }
 

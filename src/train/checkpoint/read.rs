@@ -7,7 +7,8 @@ use std::path::{Path, PathBuf};
 use safetensors::tensor::{Dtype, Metadata};
 
 use super::format::{
-    CHECKSUM_KEY, Contents, HEADER_KEY, LENGTH, Record, VERSION, VERSION_KEY, name_of, shape_of,
+    CHECKSUM_KEY, Contents, HEADER_KEY, LENGTH_FIELD_BYTES, Record, VERSION, VERSION_KEY, name_of,
+    shape_of,
 };
 use super::{CheckpointError, Header};
 use densify_core::files::FileError;
@@ -40,9 +41,9 @@ impl Checkpoint {
         let failed = |source| FileError::io("read", path)(source);
         let mut file = densify_core::files::open(path).map_err(failed)?;
         let size = file.metadata().map_err(failed)?.len();
-        let mut length = [0; LENGTH as usize];
+        let mut length = [0; LENGTH_FIELD_BYTES as usize];
         let short = || invalid(format!("it is cut short: {size} bytes"));
-        if size < LENGTH {
+        if size < LENGTH_FIELD_BYTES {
             return Err(short());
         }
         file.read_exact(&mut length).map_err(failed)?;
@@ -52,12 +53,12 @@ impl Checkpoint {
                 "it is not a safetensors file: its header would be larger than 64 MiB".into(),
             ));
         }
-        if length > size - LENGTH {
+        if length > size - LENGTH_FIELD_BYTES {
             return Err(short());
         }
         let mut bytes = vec![0; length as usize];
         file.read_exact(&mut bytes).map_err(failed)?;
-        let (header, places) = parse(&bytes, LENGTH + length, size).map_err(invalid)?;
+        let (header, places) = parse(&bytes, LENGTH_FIELD_BYTES + length, size).map_err(invalid)?;
         let mut checkpoint = Self { path: path.to_owned(), file, header, places };
         for i in 0..checkpoint.places.len() {
             ArrayReader::new(&mut checkpoint, i)?.finish()?;

@@ -270,7 +270,7 @@ fn a_state_of_another_run_is_refused_by_name() {
 }
 
 #[test]
-fn the_newest_sound_one_is_found_and_two_are_kept() {
+fn the_newest_usable_checkpoint_is_found_and_two_are_kept() {
     let (root, path) = written();
     let run = root.path();
     for step in [5, 9, 100, 30] {
@@ -294,7 +294,7 @@ fn the_newest_sound_one_is_found_and_two_are_kept() {
 }
 
 #[test]
-fn datasets_are_told_apart() {
+fn differences_of_datasets_are_named() {
     let one = header(ROWS).dataset;
     assert_eq!(one.difference(&one), None);
     let with = |change: fn(&mut Fingerprint)| {

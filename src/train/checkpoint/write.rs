@@ -9,7 +9,8 @@ use safetensors::tensor::{Dtype, Metadata, TensorInfo};
 use serde::Serialize;
 
 use super::format::{
-    CHECKSUM_KEY, Contents, HEADER_KEY, LENGTH, Record, VERSION, VERSION_KEY, name_of, shape_of,
+    CHECKSUM_KEY, Contents, HEADER_KEY, LENGTH_FIELD_BYTES, Record, VERSION, VERSION_KEY, name_of,
+    shape_of,
 };
 use super::{CheckpointError, Header};
 use densify_core::files::{WriteError, write_atomically_from};
@@ -129,6 +130,6 @@ fn header_bytes(header: &Header, records: &[Record]) -> io::Result<Vec<u8>> {
     });
     let tensors = Metadata::new(None, infos.collect()).map_err(io::Error::other)?;
     let mut bytes = serde_json::to_vec(&Table { metadata, tensors })?;
-    bytes.resize(bytes.len().next_multiple_of(LENGTH as usize), b' ');
+    bytes.resize(bytes.len().next_multiple_of(LENGTH_FIELD_BYTES as usize), b' ');
     Ok(bytes)
 }

@@ -199,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn exposures_are_learned_and_their_mean_stays() {
+    fn exposures_are_learned_and_their_mean_stays_constant() {
         let mut exposures = Exposures::new(ExposureModel::Channels, &[[1.2, 1.0, 0.9]; 2]);
         assert!((exposures.transform(0).matrix[0][0] - 1.2).abs() < 1e-6, "{exposures:?}");
         let mut to = [ColourTransform::IDENTITY; 2];

@@ -92,7 +92,7 @@ pub fn initialise(
     }
     if chosen.len() > budget {
         report.over_budget = chosen.len() - budget;
-        schedule::draw(&mut chosen, budget, &mut ChaCha8Rng::seed_from_u64(seed));
+        schedule::sample(&mut chosen, budget, &mut ChaCha8Rng::seed_from_u64(seed));
     }
     chosen.sort_unstable_by_key(|&i| {
         (densify_core::curve::morton_code(points.positions[i].to_array()), i)

@@ -25,7 +25,7 @@ const COLOURS: (u8, u8) = (64, 128);
 /// give equal points.
 pub fn random_points(count: usize, cameras: &[Camera], background: bool, seed: u64) -> PointCloud {
     let focus = focus(cameras);
-    let mut draw = Draw(ChaCha8Rng::seed_from_u64(seed));
+    let mut draw = UniformRng(ChaCha8Rng::seed_from_u64(seed));
     let mut points = PointCloud::default();
     for index in 0..count {
         let position = match focus {
@@ -89,7 +89,7 @@ fn focus(cameras: &[Camera]) -> Option<(DVec3, f64)> {
 }
 
 /// A random point in view of a random camera.
-fn point_in_view(draw: &mut Draw, cameras: &[Camera], (near, far): (f64, f64)) -> DVec3 {
+fn point_in_view(draw: &mut UniformRng, cameras: &[Camera], (near, far): (f64, f64)) -> DVec3 {
     let camera = &cameras[((draw.unit() * cameras.len() as f64) as usize).min(cameras.len() - 1)];
     let pixel =
         DVec2::new(draw.unit() * f64::from(camera.width), draw.unit() * f64::from(camera.height));
@@ -98,10 +98,10 @@ fn point_in_view(draw: &mut Draw, cameras: &[Camera], (near, far): (f64, f64)) -
     camera.rotation.transpose() * (depth * ray - camera.translation)
 }
 
-/// A random number generator for coordinates.
-struct Draw(ChaCha8Rng);
+/// A generator of uniform random numbers.
+struct UniformRng(ChaCha8Rng);
 
-impl Draw {
+impl UniformRng {
     /// A uniform number in [0, 1) with 53 bits.
     fn unit(&mut self) -> f64 {
         (self.0.next_u64() >> 11) as f64 * (1.0 / 9_007_199_254_740_992.0)

@@ -76,7 +76,7 @@ fn rows_start_as_in_the_original_code() {
 }
 
 #[test]
-fn few_points() {
+fn one_to_three_points_have_the_expected_scales() {
     let ln = |v: f64| v.ln() as f32;
     let (one, _) = initialise(&cloud(&[[5.0, 0.0, 0.0]]), 9, 0, 0).unwrap();
     assert_eq!(one.log_scales, [[ln(0.01 * SCENE_DIAMETER); 3]]);

@@ -53,7 +53,7 @@ mod tests {
     }
 
     #[test]
-    fn known_values() {
+    fn uniform_errors_have_known_ratios() {
         let black = target(7, 5, 0);
         for (value, expected) in [(0.1, 20.0), (0.01, 40.0), (1.0, 0.0), (0.5, 6.020_599_913)] {
             let measured = psnr(&[value; 105], &black, [0.0; 3]).unwrap();

@@ -221,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn equal_images_have_exactly_one() {
+    fn equal_images_have_a_similarity_of_exactly_one() {
         assert_eq!(ssim(&[0.0; 19 * 23 * 3], &flat(19, 23, 0), [0.0; 3]), Ok(1.0));
         assert_eq!(ssim(&[1.0; 19 * 23 * 3], &flat(19, 23, 255), [0.0; 3]), Ok(1.0));
     }
@@ -287,7 +287,7 @@ mod tests {
     }
 
     #[test]
-    fn the_same_bits_at_any_thread_count() {
+    fn results_are_bit_identical_at_any_thread_count() {
         let (rendered, target) = noisy(50, 170, 0.4, 7);
         let bits = [1, 2, 5].map(|threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();

@@ -8,7 +8,7 @@ use densify_core::files::FileError;
 const MODEL_OR_RUN: &str =
     "name a file of Gaussian splats, or the folder that `densify train` wrote";
 
-/// Reason why the folder of a run cannot be read or written. The remedy is up to those who know the options.
+/// Reason why the folder of a run cannot be read or written. Callers that know the options add the remedy.
 #[derive(Debug, thiserror::Error)]
 pub enum FolderError {
     /// The folder holds another run.
@@ -77,7 +77,7 @@ pub enum FolderError {
             ),
             Some(aside) => format!(
                 "moving back failed too: files of the run that was to be replaced are in {}, and of the \
-                 new one in {}; leave them there, the next run in the folder ends or undoes the replacement",
+                 new one in {}; leave them there, the next run in the folder completes or undoes the replacement",
                 aside.display(),
                 staging.display()
             ),

@@ -39,7 +39,7 @@ impl FolderLock {
             match file.try_lock() {
                 Ok(()) => {}
                 Err(TryLockError::WouldBlock) => return Err(in_use(folder, file)),
-                // The file system has no locks, as some network file systems.
+                // The file system has no locks, like some network file systems.
                 Err(TryLockError::Error(_)) => break,
             }
             // The previous holder may have removed the file in the meantime.
@@ -115,7 +115,7 @@ mod tests {
 
     #[cfg(unix)]
     #[test]
-    fn there_is_one_holder_at_a_time() {
+    fn the_lock_has_one_holder_at_a_time() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path();
         FolderLock::check(path).unwrap();

@@ -15,7 +15,7 @@ use densify_core::files;
 use densify_core::files::FileError;
 
 /// Largest file that is read `[bytes]`.
-const MOST_BYTES: u64 = 256 << 20;
+const MAX_BYTES: u64 = 256 << 20;
 
 /// The mean scores of an iteration on the test views, if it was evaluated.
 ///
@@ -110,7 +110,7 @@ pub(super) fn read_entries(path: &Path) -> Result<Map<String, Value>, FileError>
 
 /// Reads the text of a file; `None` if it does not exist.
 fn text_of(path: &Path) -> Result<Option<String>, FileError> {
-    match files::read_text(path, MOST_BYTES) {
+    match files::read_text(path, MAX_BYTES) {
         Ok(text) => Ok(Some(text)),
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(None),
         Err(e) => Err(FileError::io("read", path)(e)),

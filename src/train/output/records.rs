@@ -82,7 +82,7 @@ impl RecordLog {
     /// [`FileError::Io`].
     pub fn append(&mut self, record: &impl Serialize) -> Result<(), FileError> {
         let line = serde_json::to_string(record).map_err(std::io::Error::other);
-        // One write per line, so that readers see, and killed processes leave, complete lines.
+        // One write per line, so that lines are complete even for concurrent readers and if the process is killed.
         let Self { file, path } = self;
         line.and_then(|line| WatchedFile { file, path }.write_all((line + "\n").as_bytes()))
             .map_err(FileError::io("write", path))
@@ -125,7 +125,7 @@ pub struct Summary {
     pub peak_rows: usize,
     /// Largest number of rows allowed.
     pub budget: usize,
-    /// Number of training views rendered for the policy's decisions, in addition to one per step.
+    /// Number of training views rendered for the policy or the automatic budget, in addition to one per step.
     pub extra_forwards: u64,
     /// Largest resident memory of the process `[bytes]`, if known.
     pub peak_bytes: Option<u64>,
@@ -276,17 +276,17 @@ mod tests {
         log.append(&1).unwrap();
         let sound = log.synced().unwrap();
         log.append(&22).unwrap();
-        let go_on = |bytes| {
+        let resume = |bytes| {
             let (mut log, whole) = RecordLog::resume(&path, bytes).unwrap();
             log.append(&3).unwrap();
             (std::fs::read_to_string(&path).unwrap(), whole)
         };
-        assert_eq!(go_on(sound), ("1\n3\n".to_owned(), true));
+        assert_eq!(resume(sound), ("1\n3\n".to_owned(), true));
         // The last line of a truncated log is incomplete.
         std::fs::write(&path, "1\n2").unwrap();
-        assert_eq!(go_on(9), ("1\n3\n".to_owned(), false));
+        assert_eq!(resume(9), ("1\n3\n".to_owned(), false));
         std::fs::remove_file(&path).unwrap();
-        assert_eq!(go_on(9), ("3\n".to_owned(), false));
+        assert_eq!(resume(9), ("3\n".to_owned(), false));
     }
 
     #[test]

@@ -78,7 +78,7 @@ impl TensorBoard {
     }
 
     fn append(&mut self, event: &[u8]) -> Result<(), FileError> {
-        // One write per record, so that readers see, and killed processes leave, complete records.
+        // One write per record, so that records are complete even for concurrent readers and if the process is killed.
         let Self { file, path } = self;
         WatchedFile { file, path }.write_all(&record(event)).map_err(FileError::io("write", path))
     }
@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn a_scalar_event_byte_by_byte() {
+    fn scalar_events_have_the_expected_bytes() {
         let event = scalar_event(0.5, 300, &[("loss", 1.0), ("n", -2.0)]);
         let expected = [
             &[0x09][..],

@@ -19,8 +19,8 @@ use densify_render::LearningRates;
 /// Length of the run for which the published constants were chosen `[steps]`.
 pub use densify_policies::parameters::REFERENCE_ITERATIONS;
 
-/// Step sizes (learning rates) of a run. That of the means is a fraction of the scene's extent and falls log-linearly over
-/// the run; all others are constant unless their value at the end is given.
+/// Step sizes (learning rates) of a run. The step size of the means is a fraction of the scene's extent and falls
+/// log-linearly over the run; all others are constant unless their value at the end is given.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RateOptions {
@@ -38,7 +38,7 @@ pub struct RateOptions {
     pub sh_dc: f32,
     /// Spherical-harmonic coefficients of bands 1–3, > 0.
     pub sh_rest: f32,
-    /// Log-scales at the end of the run, > 0. For this and the next four, `None` means as at the start.
+    /// Log-scales at the end of the run, > 0. For this and the next four, `None` means the same as at the start.
     pub log_scale_end: Option<f32>,
     /// Quaternions at the end of the run.
     pub quat_end: Option<f32>,
@@ -200,10 +200,10 @@ impl RateOptions {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 pub enum InitRates {
-    /// Those of the end of a run: the model keeps what it has learned
+    /// The final step sizes of a run: the model keeps what it has learned
     #[default]
     Fine,
-    /// Those of a run from its start: the model may change much
+    /// The step sizes of a run from its start: the model may change much
     Full,
 }
 
@@ -313,18 +313,18 @@ pub fn view_order(views: usize, seed: u64, epoch: u32) -> Vec<usize> {
     order
 }
 
-/// A random sample of `count` training views without replacement, or of all views if there are fewer, that depends on seed
-/// and step. Used for views that are rendered for decisions.
+/// A random sample of `count` training views without replacement, or of all views if there are fewer, that depends on
+/// seed and step. Used for views that are rendered for the policy's decisions and the automatic budget.
 pub fn fresh_views(views: usize, count: usize, seed: u64, step: u32) -> Vec<usize> {
     let mut chosen: Vec<usize> = (0..views).collect();
     let mut draws = random_stream(seed, Purpose::FreshViews, u64::from(step));
-    draw(&mut chosen, count.min(views), &mut draws);
+    sample(&mut chosen, count.min(views), &mut draws);
     chosen
 }
 
 /// Keeps a uniform random sample of `count` values: the first elements of a Fisher–Yates shuffle, implemented here because
 /// the sampling functions of a library may change with its version.
-pub(crate) fn draw(values: &mut Vec<usize>, count: usize, rng: &mut ChaCha8Rng) {
+pub(crate) fn sample(values: &mut Vec<usize>, count: usize, rng: &mut ChaCha8Rng) {
     for place in 0..count {
         let other = place + below(rng, (values.len() - place) as u64) as usize;
         values.swap(place, other);

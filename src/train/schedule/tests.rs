@@ -5,7 +5,7 @@ use densify_policies::policy::{Fade, Rate};
 use super::*;
 
 #[test]
-fn short_runs_start_with_longer_steps_and_end_with_the_published() {
+fn short_runs_start_with_larger_step_sizes_and_end_with_the_published_ones() {
     let published = RateOptions::default();
     assert_eq!(RateOptions::for_run(30_000), published);
     assert_eq!(RateOptions::for_run(100_000), published);
@@ -57,7 +57,7 @@ fn degree_rises_every_thousand_steps_of_thirty_thousand() {
 }
 
 #[test]
-fn each_epoch_is_another_permutation() {
+fn each_epoch_has_its_own_permutation() {
     for views in [0, 1, 2, 7, 100] {
         let mut order = view_order(views, 5, 3);
         order.sort_unstable();
@@ -75,12 +75,12 @@ fn every_view_is_first_equally_often() {
     for epoch in 0..5_000 {
         first[view_order(5, 1, epoch)[0]] += 1;
     }
-    // Binomial(5,000, 1/5): mean 1,000, deviation 28; five of them.
+    // Binomial(5,000, 1/5): mean 1,000, deviation 28; the bound is five deviations.
     assert!(first.iter().all(|n| n.abs_diff(1_000) < 142), "{first:?}");
 }
 
 #[test]
-fn fresh_views_are_a_fair_choice() {
+fn fresh_views_are_sampled_uniformly() {
     let mut times = [0_u32; 7];
     for step in 0..7_000 {
         let mut chosen = fresh_views(7, 3, 5, step);
@@ -92,7 +92,7 @@ fn fresh_views_are_a_fair_choice() {
             times[view] += 1;
         }
     }
-    // Binomial(7,000, 3/7): mean 3,000, deviation 41; five of them.
+    // Binomial(7,000, 3/7): mean 3,000, deviation 41; the bound is five deviations.
     assert!(times.iter().all(|n| n.abs_diff(3_000) < 207), "{times:?}");
     assert_ne!(fresh_views(50, 10, 5, 3), fresh_views(50, 10, 6, 3));
     assert_ne!(fresh_views(50, 50, 5, 0), view_order(50, 5, 0));
@@ -103,7 +103,7 @@ fn fresh_views_are_a_fair_choice() {
 }
 
 #[test]
-fn backgrounds_as_text() {
+fn backgrounds_are_read_from_text() {
     for text in ["black", "white", "random", "#0a0b0c", "#ffffff"] {
         assert_eq!(text.parse::<Background>().unwrap().to_string(), text);
     }
@@ -115,7 +115,7 @@ fn backgrounds_as_text() {
 }
 
 #[test]
-fn backgrounds() {
+fn backgrounds_have_the_expected_colours() {
     let same = |a: [f32; 3], b: [f32; 3]| a.map(f32::to_bits) == b.map(f32::to_bits);
     assert!(same(Background::White.at(1, 2), [1.0; 3]));
     assert!(same(Background::Black.at(1, 2), [0.0; 3]));

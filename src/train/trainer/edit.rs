@@ -36,18 +36,18 @@ impl<V: ViewSource> Trainer<V> {
         EditPlan::new(rows, budget)
     }
 
-    /// The current limit of rows, with the frozen ones among them.
+    /// The current limit of rows, including frozen ones.
     pub(super) fn row_budget(&self) -> RowBudget {
         RowBudget { total: self.row_limit(), frozen: self.options.frozen }
     }
 
-    /// Number and limit of rows as policies count, without frozen rows.
+    /// Number and limit of rows as policies see them, without frozen rows.
     pub(super) fn trained_rows_and_budget(&self) -> (usize, usize) {
         let budget = self.row_budget();
         (budget.trained(self.backend.rows()), budget.trainable())
     }
 
-    /// Executes a plan. The result is an event only if rows changed or edits were refused.
+    /// Executes a plan. Returns an event only if rows changed or edits were refused.
     pub(super) fn execute(
         &mut self,
         step: u32,
@@ -56,7 +56,7 @@ impl<V: ViewSource> Trainer<V> {
         let mut ops = plan.compile();
         self.check_plan(step, &ops)?;
         ops = ops.after_frozen(self.row_budget().frozen);
-        // The backend checks the budget, which the trainer's own limit may be below.
+        // The backend checks its own budget, which may be larger than the trainer's limit.
         ops.budget = self.backend.budget();
         self.backend.apply(&ops, self.options.seed, step).at(step)?;
         if let Some(history) = &mut self.history {

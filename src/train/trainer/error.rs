@@ -6,7 +6,7 @@ use densify_data::views::ViewError;
 use densify_render::BackendError;
 
 /// Reason why training cannot continue. The model stays as it was before the step's edit and can still be
-/// [read](super::Trainer::model); only after [`Diverged`](Self::Diverged) it is unusable.
+/// [read](super::Trainer::model); after [`Diverged`](Self::Diverged), however, it is unusable.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainError {
     /// There is no view to train on.

@@ -56,7 +56,7 @@ pub struct Trainer<V> {
     /// Order of the views in the next epoch.
     next_order: Vec<usize>,
     images_time: Duration,
-    /// Training views that the policy's scores are measured in.
+    /// Training views in which the policy's scores are measured.
     scored: Vec<usize>,
     /// Training views in which the automatic budget measures the PSNR; empty without it.
     probe_views: Vec<usize>,
@@ -186,7 +186,7 @@ impl<V: ViewSource> Trainer<V> {
     }
 
     /// A random sample of `count` scored views, or all of them if there are fewer, that depends on seed and step.
-    fn draw_scored(&self, count: usize, step: u32) -> Vec<usize> {
+    fn sample_scored_views(&self, count: usize, step: u32) -> Vec<usize> {
         let drawn = schedule::fresh_views(self.scored.len(), count, self.options.seed, step);
         drawn.into_iter().map(|place| self.scored[place]).collect()
     }

@@ -1,4 +1,4 @@
-//! Finds near-duplicates among the training views, which are not rendered for a policy's scores.
+//! Finds training views that nearly duplicate another; these are not rendered for a policy's scores.
 //!
 //! A view that nearly repeats another, such as the next frame of a video, costs as much as any other and adds nothing to a
 //! score. All views are trained on nevertheless, and all test views are evaluated.

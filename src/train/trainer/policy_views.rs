@@ -19,7 +19,7 @@ impl<V: ViewSource> Trainer<V> {
         };
         let (options, degree, frozen) =
             (self.options, self.sh_degree(step), self.row_budget().frozen);
-        for view in self.draw_scored(count, step) {
+        for view in self.sample_scored_views(count, step) {
             let image = self.image(step, view)?;
             let exposure = self.state.exposures.as_ref().map(|exposures| exposures.transform(view));
             let measured = self.backend.observe(&AuxInput {
@@ -47,9 +47,9 @@ impl<V: ViewSource> Trainer<V> {
     }
 }
 
-/// Calls the policy, which may be third-party code: if it panics, the run ends with an error that names it, and the model
-/// can still be read. Unwinding is safe because the policy is not called again, and because its calls change nothing else
-/// but the plan, which is dropped.
+/// Calls the policy, which may be third-party code: if it panics, the run ends with an error that names it, and the
+/// model can still be read. Unwinding is safe because the policy is not called again, and because its calls change
+/// nothing but the plan, which is dropped.
 ///
 /// # Errors
 /// [`PolicyError::Other`] with the message of the panic.

@@ -54,11 +54,11 @@ impl<V: ViewSource> Trainer<V> {
         self.needs.signals
     }
 
-    /// Starts recording the history of rows. For a resumed run, earlier edits are derived from the ages of the optimiser;
-    /// frozen rows have none.
+    /// Starts recording the history of rows. For a resumed run, earlier edits are derived from the optimiser's step
+    /// counts per row; frozen rows have no edits.
     ///
     /// # Errors
-    /// When the ages cannot be read.
+    /// When the step counts cannot be read.
     pub fn record_history(&mut self) -> Result<(), BackendError> {
         let ages = self.backend.take_signals(SignalSet::from([Signal::Age]))?;
         let (step, budget) = (self.state.step, self.row_budget());

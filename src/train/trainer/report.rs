@@ -38,7 +38,7 @@ pub struct EditEvent {
     pub denied: usize,
     /// Rows after.
     pub after: usize,
-    /// The reason, if the policy named one.
+    /// The reason, if the policy or the trainer named one.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub cause: String,
 }

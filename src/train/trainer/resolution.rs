@@ -49,7 +49,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn sides_are_shrunk_alike_and_not_below_the_least() {
+    fn sides_are_shrunk_in_proportion_and_not_below_the_minimum() {
         assert_eq!(shrunk((256, 192), 0.3), (76, 57));
         assert_eq!(shrunk((100, 50), 0.7), (70, 35));
         assert_eq!(shrunk((256, 192), 1.0), (256, 192));

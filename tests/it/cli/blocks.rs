@@ -77,7 +77,7 @@ fn blocks_are_trained_and_merged_into_one_model() {
     let stdout = blocks("submit", &folder).ok().stdout;
     assert!(stdout.contains("every task is complete"), "{stdout}");
 
-    // A block that is killed before its end resumes to the same bytes.
+    // A block that is killed before its end and resumed is byte-identical.
     let run = folder.join("blocks/block-1-0/run");
     let iterations = number(&listed[1], "iterations");
     std::fs::remove_dir_all(run.join(format!("point_cloud/iteration_{iterations}"))).unwrap();

@@ -29,7 +29,7 @@ fn compressed_files_stay_within_the_requested_size() {
     let written: Vec<_> = outcome.stdout.lines().filter(|l| l.starts_with("written ")).collect();
     assert_eq!(written.len(), 1, "{outcome:?}");
     assert!(outcome.stdout.contains("tried "), "no other degree was tried: {outcome:?}");
-    // The same call gives the same bytes.
+    // The same call gives a byte-identical file.
     let (outcome, again) = compress(&format!("{}B", whole / 2), "again.ply", "--threads 1");
     outcome.ok();
     assert!(read(&again) == read(&ply));

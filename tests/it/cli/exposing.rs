@@ -15,7 +15,7 @@ fn exposures_survive_resuming_and_do_not_depend_on_threads() {
     let flags = "--exposure on --eval --checkpoint-every 70 --policy mcmc --backend cpu";
     let (root, whole) = scratch();
     let outcome = train(scene.path(), &whole, ITERATIONS, &format!("{flags} --threads 1")).ok();
-    for words in ["exposure on, from one for all views", "fitted   PSNR"] {
+    for words in ["exposure on, initially the same for all views", "fitted   PSNR"] {
         assert!(outcome.stdout.contains(words), "{words}: {}", outcome.stdout);
     }
     let learned = format!("point_cloud/iteration_{ITERATIONS}/exposure.json");

@@ -74,7 +74,7 @@ fn a_truncated_photograph_ends_the_run() {
     let (_root, run) = scratch();
     let flags = "--budget 400 --quiet --save-iterations 1 --seed 4";
     let outcome = train(scene.path(), &run, 20, flags);
-    outcome.refused("cut short", &["cannot decode", "was written until then"]);
+    outcome.refused("cut short", &["cannot decode", "files written so far are in"]);
     assert!(!model(&run, 1).is_empty());
     assert_eq!(json(&run.join("stats/summary.json"))["finished"], false);
 }

@@ -1,5 +1,5 @@
-//! Killed and interrupted processes: only the steps since the last checkpoint are lost, and the resumed run ends in
-//! the same bytes.
+//! Killed and interrupted processes: only the steps since the last checkpoint are lost, and the resumed run writes
+//! the same files, byte for byte.
 //!
 //! `DENSIFY_KILLS=200 cargo test --test it killing` kills 200 times instead of 20.
 
@@ -16,7 +16,7 @@ use crate::photographs::Photographs;
 /// Number of kills without `DENSIFY_KILLS`.
 const KILLS: usize = 20;
 const ITERATIONS: u32 = 120;
-/// A checkpoint at every third step makes many kills hit the writing of one.
+/// A checkpoint at every third step, so that many kills happen while one is written.
 const FLAGS: &str = "--budget 360 --checkpoint-every 3 --eval --save-iterations 31,77 \
                      --test-iterations 50 --policy-set diet.grow_every=7";
 

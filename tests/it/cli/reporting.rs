@@ -1,4 +1,4 @@
-//! `densify report`: contents of the HTML file, self-containedness, and refused calls.
+//! `densify report`: contents of the HTML file, which loads nothing else, and refused calls.
 
 use std::path::{Path, PathBuf};
 
@@ -113,7 +113,7 @@ fn a_report_shows_the_results_and_is_self_contained() {
         "min_opacity".into(),
     ];
     // The four curves: loss, Gaussians, test PSNR with dots, memory with the promise as a dashed line.
-    expected.extend(["Loss", "PSNR of the test views", "what was promised"].map(String::from));
+    expected.extend(["Loss", "PSNR of the test views", "the promised limit"].map(String::from));
     for words in &expected {
         assert!(page.contains(words.as_str()), "{words} is not in the report");
     }

@@ -38,7 +38,7 @@ fn automatic_choices_survive_resuming_and_do_not_depend_on_threads() {
     assert!(outcome.stdout.contains("left out"), "{}", outcome.stdout);
     let found = report(&whole);
     // Too few tracks to decide the degree.
-    let line = "colour   degree 3 (auto): points of a reconstruction decide nothing";
+    let line = "colour   degree 3 (auto): undecided, because fewer than";
     assert!(outcome.stdout.contains(line), "{}", outcome.stdout);
     assert_eq!((&found["sh_degree_from"], &found["sh_degree"]), (&"undecided".into(), &3.into()));
     let intervals = list(&found, "/rows/intervals");

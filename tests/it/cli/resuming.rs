@@ -1,4 +1,5 @@
-//! `--resume`: for every policy, an interrupted run ends in the same bytes; unusable checkpoints are refused.
+//! `--resume`: for every policy, an interrupted run writes the same files, byte for byte; unusable checkpoints are
+//! refused.
 
 use std::path::{Path, PathBuf};
 
@@ -197,7 +198,7 @@ fn a_run_without_checkpoints_cannot_be_resumed() {
     train(scene.path(), &run, 20, "--budget 330 --checkpoint-every 0").ok();
     assert!(!run.join("checkpoints").exists());
     let refused = resume(scene.path(), &run, "");
-    refused.refused("none", &["no checkpoint to go on from", "--overwrite"]);
+    refused.refused("none", &["no checkpoint to resume from", "--overwrite"]);
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! `--init MODEL` and `--freeze MODEL`: runs that start from a model or train beside a fixed one, and refused models.
+//! `--init MODEL` and `--freeze MODEL`: runs that start from a model or train around a frozen one, and refused models.
 
 use std::path::Path;
 
@@ -53,7 +53,7 @@ fn a_run_can_start_from_any_model() {
         assert!(first_loss(&other) < 1.1 * from_model + 0.01, "{}", first_loss(&other));
     }
 
-    // Resumed from a checkpoint after the file is gone, the run ends in the same bytes.
+    // Resumed from a checkpoint after the file is gone, the run writes the same model, byte for byte.
     let whole = read(&model_path(&again, 20));
     let gone = root.path().join("gone.ply");
     std::fs::copy(&ply, &gone).unwrap();
@@ -75,7 +75,7 @@ fn a_run_can_start_from_any_model() {
 
 /// The learning rates of a new run would degrade a finished model at first.
 #[test]
-fn a_finished_model_keeps_its_quality_within_2_percent_of_the_iterations() {
+fn fine_rates_keep_the_quality_of_a_finished_model_in_the_first_steps() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
     train(scene.path(), &run, 300, &format!("--budget 300 --eval --quiet {NO_EDITS}")).ok();
@@ -127,7 +127,7 @@ fn frozen_gaussians_never_change_even_when_resumed() {
     assert!(count(&summary, "peak_rows") <= 260, "{summary}");
     assert!(count(&summary, "peak_bytes") <= count(&summary, "ledger_bytes"), "{summary}");
 
-    // Without the file, the run resumes to the same bytes.
+    // Resumed without the file, the run writes the same model, byte for byte.
     let whole = read(&model_path(&beside, 300));
     std::fs::remove_dir_all(beside.join("point_cloud/iteration_300")).unwrap();
     std::fs::remove_file(beside.join("checkpoints/iteration_300.safetensors")).unwrap();

@@ -208,7 +208,7 @@ fn frames_match_the_images_of_render() {
     let all = described["kinds"].as_array().expect("kinds").iter();
     let kinds: Vec<&str> = all.filter_map(|kind| kind["kind"].as_str()).collect();
     // No file records the age of Gaussians, so that kind is listed as missing. Edits come from the checkpoint.
-    let lacking = described["lacking"].as_array().expect("what lacks");
+    let lacking = described["lacking"].as_array().expect("a list of missing kinds");
     assert_eq!((kinds.len(), lacking.len()), (13, 1), "{described}");
     assert_eq!(page.frame(&frame_request("row_age", "test", 0, SIZE)).status, 400);
     let mut seen: Vec<Vec<u8>> = Vec::new();

@@ -43,12 +43,12 @@ fn longest(log_scale: [f32; 3]) -> usize {
     (1..3).fold(0, |best, axis| if log_scale[axis] > log_scale[best] { axis } else { best })
 }
 
-fn wide(quat: [f32; 4]) -> DQuat {
+fn to_dquat(quat: [f32; 4]) -> DQuat {
     let [w, x, y, z] = quat.map(f64::from);
     DQuat::from_xyzw(x, y, z, w)
 }
 
-fn unfold(quat: DQuat) -> [f32; 4] {
+fn from_dquat(quat: DQuat) -> [f32; 4] {
     [quat.w, quat.x, quat.y, quat.z].map(|v| v as f32)
 }
 
@@ -124,13 +124,13 @@ impl Row {
         };
         child.mean = [0, 1, 2].map(|i| (f64::from(self.mean[i]) + offset[i]) as f32);
         child.rescale(how.scale);
-        child.quat = unfold(wide(self.quat) * wide(how.turn).normalize());
+        child.quat = from_dquat(to_dquat(self.quat) * to_dquat(how.turn).normalize());
         child.cover(how.opacity, how.siblings());
         child
     }
 
     fn turned(&self, local: [f64; 3]) -> DVec3 {
-        wide(self.quat).normalize() * DVec3::from(local)
+        to_dquat(self.quat).normalize() * DVec3::from(local)
     }
 
     fn paint(&mut self, colour: [f32; 3]) {
@@ -141,7 +141,7 @@ impl Row {
         let mut sown = Self {
             mean: seed.position,
             log_scale: seed.scales.map(f32::ln),
-            quat: unfold(wide(seed.orientation).normalize()),
+            quat: from_dquat(to_dquat(seed.orientation).normalize()),
             logit: logit(f64::from(seed.opacity)),
             sh: vec![0.0; 12],
             signals: SIGNALS.map(empty),

@@ -1,4 +1,4 @@
-//! What only the GPU backend has, on every adapter that there is.
+//! Features that only the GPU backend has, tested on every adapter of the machine.
 
 mod ledger;
 mod long_lists;

@@ -1,4 +1,4 @@
-//! densify with a policy of our own.
+//! densify with a policy from this crate.
 use outside_policy as _;
 fn main() -> std::process::ExitCode {
     densify::cli::run()

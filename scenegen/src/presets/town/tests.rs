@@ -26,7 +26,7 @@ fn seen(surface: &Surface, camera: &Camera) -> Vec<Option<SurfaceHit>> {
 }
 
 #[test]
-fn no_view_is_from_inside_a_solid_and_most_of_each_is_surface() {
+fn views_are_outside_solids_and_mostly_show_surfaces() {
     for (size, seed) in [(1, 0), (2, 0), (2, 1), (3, 7)] {
         let (_, surface, views) = town(size, seed);
         for (i, camera) in views.iter().flatten().enumerate() {

@@ -163,7 +163,7 @@ fn model(
     Ok(([cameras, images, points], Model { cameras: lenses, images: posed, points: cloud, tracks }))
 }
 
-/// Adds the tracks of the COLMAP model in a folder to a scene of another format, if both have the same images with the
+/// Adds the tracks of the COLMAP model in a folder to a scene of another format, if the images that both list have the
 /// same poses, as `densify scenegen` writes them. Otherwise the model is ignored, as it may belong to another scene.
 pub(super) fn adopt_tracks(root: &Root, scene: &mut Scene) {
     let Some(folder) = find(root.path()) else { return };

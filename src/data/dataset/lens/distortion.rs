@@ -2,16 +2,16 @@
 
 use glam::{DMat2, DVec2};
 
-use super::Plane;
+use super::Projection;
 
-/// The plane of a lens and its distortion by radial, tangential and thin-prism terms (OpenCV, *Camera Calibration and
-/// 3D Reconstruction*; COLMAP, `sensor/models`). Coefficients of 0 have no effect.
+/// The projection of a lens to a plane, and radial, tangential and thin-prism distortion of that plane (OpenCV, *Camera
+/// Calibration and 3D Reconstruction*; COLMAP, `sensor/models`). Coefficients of 0 have no effect.
 ///
 /// p becomes p·(1 + a₁r² + a₂r⁴ + a₃r⁶ + a₄r⁸) / (1 + b₁r² + b₂r⁴ + b₃r⁶), plus the tangential and thin-prism parts.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Distortion {
-    /// The plane that is distorted.
-    pub(crate) plane: Plane,
+    /// The projection to the plane that is distorted.
+    pub(crate) plane: Projection,
     /// a₁ to a₄.
     pub(crate) radial: [f64; 4],
     /// b₁ to b₃.
@@ -22,12 +22,12 @@ pub(crate) struct Distortion {
     pub(crate) prism: [f64; 2],
 }
 
-/// Most steps of Newton's method. It converges quadratically, but halved steps need more.
+/// Maximum number of steps of Newton's method. It converges quadratically, but more slowly while steps are halved.
 const STEPS: u32 = 60;
 
 impl Distortion {
-    /// No distortion of a plane.
-    pub(crate) fn none(plane: Plane) -> Self {
+    /// A projection without distortion.
+    pub(crate) fn none(plane: Projection) -> Self {
         let (radial, denominator) = ([0.0; 4], [0.0; 3]);
         Self { plane, radial, denominator, tangential: [0.0; 2], prism: [0.0; 2] }
     }
@@ -104,7 +104,7 @@ impl Distortion {
                 break;
             }
         }
-        // For a target beyond the rim the search ends at the rim and misses.
+        // For a target beyond the rim, the search ends at the rim, too far from the target.
         (miss.length() < 1e-9 * (1.0 + target.length())).then_some(p)
     }
 }

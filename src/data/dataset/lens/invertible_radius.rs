@@ -2,14 +2,14 @@
 //!
 //! A map is injective on a disc if the symmetric part of its Jacobian is positive definite there: on the segment from
 //! one point to another, the image moves strictly in the direction of the segment. On a circle of radius r the radial
-//! part has the eigenvalues q and (r·q)′, where q is its factor; the tangential and thin-prism terms reduce them by at
-//! most 6|p|·r and 2|s|·r. So the distortion is invertible up to the first radius at which the smaller eigenvalue no
-//! longer exceeds that reduction t.
+//! part has the eigenvalues q and (r·q)′, where q is its factor; the tangential terms p reduce them by at most 6|p|·r
+//! and the thin-prism terms b by at most 2|b|·r. The distortion is therefore invertible up to the first radius at which
+//! the smaller eigenvalue no longer exceeds the total reduction t.
 //!
 //! With q = N/M, polynomials in s = r², the condition is that M, N − t·M and (N + 2sN′)·M − 2s·N·M′ − t·M² are
-//! positive. Each is bounded from below on whole intervals, so that no point between samples is missed: after a shift
-//! to the start of the interval, a polynomial is at least its constant coefficient plus all negative terms at the
-//! end of the interval.
+//! positive. Each is bounded from below on whole intervals, so that no point between samples is missed: with the
+//! variable counted from the start of the interval, a polynomial is at least its constant coefficient plus its negative
+//! terms at the end of the interval.
 
 use super::Distortion;
 
@@ -37,14 +37,14 @@ impl Distortion {
         from.sqrt()
     }
 
-    /// Whether the distortion is monotone where r² is between `from` and `to`.
+    /// Returns true if the distortion is provably monotone where r² is between `from` and `to`.
     fn is_monotone(&self, from: f64, to: f64) -> bool {
         let length = |[a, b]: [f64; 2]| a.hypot(b);
         let reduction =
             (6.0 * length(self.tangential) + 2.0 * length(self.prism)) * to.sqrt() + MIN_EIGENVALUE;
         let with_one = |terms: &[f64]| std::iter::once(1.0).chain(terms.iter().copied()).collect();
         let (n, m): (Vec<f64>, Vec<f64>) = (with_one(&self.radial), with_one(&self.denominator));
-        let less = |mut a: Vec<f64>, b: &[f64]| -> Vec<f64> {
+        let minus_reduced = |mut a: Vec<f64>, b: &[f64]| -> Vec<f64> {
             a.resize(a.len().max(b.len()), 0.0);
             for (sum, value) in a.iter_mut().zip(b) {
                 *sum -= reduction * value;
@@ -60,8 +60,8 @@ impl Distortion {
         for (sum, value) in slope.iter_mut().zip(product(&n, &twice(&m))) {
             *sum -= value;
         }
-        let factor = less(n, &m);
-        let slope = less(slope, &product(&m, &m));
+        let factor = minus_reduced(n, &m);
+        let slope = minus_reduced(slope, &product(&m, &m));
         [m, factor, slope].iter().all(|p| lowest(p, from, to) > 0.0)
     }
 }
@@ -78,7 +78,7 @@ fn product(a: &[f64], b: &[f64]) -> Vec<f64> {
 
 /// A lower bound of a polynomial, lowest coefficient first, on an interval; NaN where it is not finite.
 fn lowest(polynomial: &[f64], from: f64, to: f64) -> f64 {
-    // Horner's scheme, repeated, shifts it: the coefficients of P(from + x).
+    // Repeated Horner's scheme gives the coefficients of P(from + x).
     let mut shifted = polynomial.to_vec();
     for done in 0..shifted.len() {
         for power in (done..shifted.len() - 1).rev() {
@@ -88,7 +88,7 @@ fn lowest(polynomial: &[f64], from: f64, to: f64) -> f64 {
     let length = to - from;
     let (mut bound, mut power) = (0.0, 1.0);
     for (place, &coefficient) in shifted.iter().enumerate() {
-        // The constant counts whatever its sign; `min` would hide NaN.
+        // The constant counts whatever its sign is; `coefficient.min(0.0)` would hide NaN.
         let least = if place > 0 && coefficient > 0.0 { 0.0 } else { coefficient };
         bound += least * power;
         power *= length;
@@ -99,7 +99,7 @@ fn lowest(polynomial: &[f64], from: f64, to: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::dataset::lens::Plane;
+    use crate::dataset::lens::Projection;
 
     #[test]
     fn bounds_are_below_all_values_and_tight_on_short_intervals() {
@@ -119,7 +119,7 @@ mod tests {
     #[test]
     fn the_radius_ends_where_the_radial_part_folds_over() {
         let radius = |radial: [f64; 4], denominator: [f64; 3]| {
-            let plain = Distortion::none(Plane::Perspective);
+            let plain = Distortion::none(Projection::Perspective);
             Distortion { radial, denominator, ..plain }.invertible_radius(10.0)
         };
         assert!((radius([0.0; 4], [0.0; 3]) - 10.0).abs() < 1e-12);
@@ -139,7 +139,7 @@ mod tests {
 
     #[test]
     fn within_the_radius_the_symmetric_part_of_the_jacobian_is_positive_definite() {
-        let plain = Distortion::none(Plane::Perspective);
+        let plain = Distortion::none(Projection::Perspective);
         let tangential = Distortion { tangential: [0.03, -0.02], prism: [0.01, 0.04], ..plain };
         for distortion in [
             tangential,

@@ -1,14 +1,14 @@
 //! Lenses: projection of rays into the image, and back.
 //!
-//! A lens model is a [`Plane`], which maps the angle from the optical axis to a distance from the centre, and a
-//! [`Distortion`] of that plane. `models.rs` lists all models. Only the part of the plane on which the distortion is
-//! provably invertible is used (`invertible_radius.rs`).
+//! A lens model is a [`Projection`] to a plane, which maps the angle from the optical axis to a distance from the
+//! centre, and a [`Distortion`] of that plane. `models.rs` lists all models. Only the part of the plane on which the
+//! distortion is provably invertible is used (`invertible_radius.rs`).
 
 mod distortion;
 mod invertible_radius;
 pub(super) mod models;
 mod pinholes;
-mod plane;
+mod projection;
 #[cfg(test)]
 mod tests;
 
@@ -18,7 +18,7 @@ use glam::{DVec2, DVec3};
 
 pub(crate) use distortion::Distortion;
 pub(super) use pinholes::{PinholeError, Pinholes};
-pub(crate) use plane::Plane;
+pub(crate) use projection::Projection;
 
 /// A lens and the size of its image. The upper left corner of the image is (0, 0); pixel centres are at +0.5. The axes
 /// are x right, y down, z forward.
@@ -34,11 +34,12 @@ pub(crate) struct Lens {
     pub(crate) focal: DVec2,
     /// Principal point `[px]`.
     pub(crate) principal: DVec2,
-    /// The plane and its distortion.
+    /// The projection and its distortion.
     pub(crate) distortion: Distortion,
-    /// Distance from the centre of the plane up to which the distortion is invertible.
+    /// Distance from the centre of the plane up to which rays are mapped: there the distortion ceases to be invertible,
+    /// or the projection ends.
     reach: f64,
-    /// Whether the distortion folds over beyond that distance; otherwise the plane ends there.
+    /// True if the distortion folds over beyond `reach`; false if the projection ends there.
     folds: bool,
 }
 
@@ -61,21 +62,21 @@ impl Lens {
     ) -> Self {
         let limit = distortion.plane.radius(distortion.plane.widest());
         let reach = distortion.invertible_radius(limit);
-        // The factor allows for the rounding of a square root; false if the limit is NaN.
+        // The factor allows for the rounding of a square root. A limit of NaN gives false.
         let is_whole = reach >= limit * (1.0 - 1e-12);
         Self { width, height, focal, principal, distortion, reach, folds: !is_whole }
     }
 
-    /// Whether the lens differs from a pinhole.
+    /// Returns true if the lens differs from a pinhole.
     pub(crate) fn is_distorted(&self) -> bool {
-        self.distortion != Distortion::none(Plane::Perspective)
+        self.distortion != Distortion::none(Projection::Perspective)
     }
 
-    /// Whether all parameters are finite numbers.
+    /// Returns true if all parameters are finite numbers.
     pub(crate) fn is_finite(&self) -> bool {
         let omega = match self.distortion.plane {
-            Plane::Fov(omega) => omega,
-            Plane::Perspective | Plane::Equidistant => 0.0,
+            Projection::Fov(omega) => omega,
+            Projection::Perspective | Projection::Equidistant => 0.0,
         };
         let rest = self.distortion.coefficients().chain([omega]);
         self.focal.is_finite() && self.principal.is_finite() && { rest }.all(f64::is_finite)
@@ -86,7 +87,7 @@ impl Lens {
         2.0 * self.distortion.plane.angle(self.reach).to_degrees()
     }
 
-    /// The same lens with an image of another size.
+    /// The same lens with another image size.
     pub(crate) fn resized(&self, width: u32, height: u32) -> Self {
         let scale = DVec2::new(
             f64::from(width) / f64::from(self.width),
@@ -101,10 +102,10 @@ impl Lens {
         DVec2::new(f64::from(self.width), f64::from(self.height))
     }
 
-    /// Point of a ray on the undistorted plane; `None` if the plane does not contain the ray.
+    /// The point on the undistorted plane to which a ray projects; `None` if the ray is too far from the axis.
     fn on_plane(&self, direction: DVec3) -> Option<DVec2> {
         let (flat, plane) = (direction.truncate(), self.distortion.plane);
-        if plane == Plane::Perspective {
+        if plane == Projection::Perspective {
             return (direction.z > 0.0).then(|| flat / direction.z);
         }
         let sine = flat.length();
@@ -131,7 +132,7 @@ impl Lens {
         self.distortion.apply(on_plane) * self.focal + self.principal
     }
 
-    /// A ray of any length that is imaged at a point `[px]`.
+    /// The ray, not normalised, that is imaged at a point `[px]`.
     ///
     /// # Errors
     /// When no such ray is known.
@@ -139,7 +140,7 @@ impl Lens {
         let target = (pixel - self.principal) / self.focal;
         let unseen = if self.folds { Unseen::Folds } else { Unseen::TooWide };
         let p = self.distortion.inverse(target, self.reach).ok_or(unseen)?;
-        if self.distortion.plane == Plane::Perspective {
+        if self.distortion.plane == Projection::Perspective {
             return Ok(p.extend(1.0));
         }
         let radius = p.length();
@@ -149,7 +150,7 @@ impl Lens {
 }
 
 impl fmt::Display for Distortion {
-    /// The plane and the coefficients, for messages.
+    /// The projection and the coefficients, for messages.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { plane, radial, denominator, tangential, prism } = self;
         write!(f, "{plane:?}, radial {radial:?}")?;

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use super::{Distortion, Plane};
+use super::{Distortion, Projection};
 use crate::dataset::LoadError;
 
 /// A parameter that follows the focal lengths and the principal point.
@@ -26,18 +26,18 @@ pub(crate) struct LensModel {
     pub(crate) name: &'static str,
     /// Number of focal lengths, 1 or 2.
     pub(crate) focals: usize,
-    pub(crate) plane: Plane,
+    pub(crate) plane: Projection,
     /// Terms in the order of COLMAP's files.
     pub(crate) terms: &'static [Term],
 }
 
-use Plane::{Equidistant, Perspective};
+use Projection::{Equidistant, Perspective};
 use Term::{Denominator as B, Omega, Prism as S, Radial as A, Tangential as P};
 
 const fn model(
     name: &'static str,
     focals: usize,
-    plane: Plane,
+    plane: Projection,
     terms: &'static [Term],
 ) -> LensModel {
     LensModel { name, focals, plane, terms }
@@ -107,7 +107,7 @@ impl Distortion {
             S(place) => self.prism[place] = value,
             // For ω = 0 the model is a pinhole.
             Omega if value == 0.0 => {}
-            Omega => self.plane = Plane::Fov(value),
+            Omega => self.plane = Projection::Fov(value),
         }
     }
 }

@@ -1,11 +1,12 @@
-//! Replaces a lens by pinhole cameras: one, or the faces of a cube around the camera if the field of view is too wide.
+//! Replaces a lens with pinhole cameras: one, or the faces of a cube around the camera if the field of view is too
+//! wide.
 //!
 //! By default each image is the largest axis-aligned rectangle that the lens saw completely. With `keep_fov` it contains
 //! everything that the lens saw, and the rest is masked.
 
 use glam::{DMat3, DVec2, DVec3};
 
-use super::{Lens, Plane, Unseen};
+use super::{Lens, Projection, Unseen};
 use crate::dataset::undistort::{Pinhole, Undistortion};
 
 /// The pinhole cameras that replace a lens.
@@ -70,9 +71,9 @@ impl Pinholes {
         }
         let rays = || seen.iter().filter_map(|(_, ray)| ray.ok());
         let is_whole = rays().count() == seen.len();
-        let perspective = lens.distortion.plane == Plane::Perspective;
+        let perspective = lens.distortion.plane == Projection::Perspective;
         let most = if perspective { STEEPEST_PERSPECTIVE } else { STEEPEST };
-        // Cosine of the largest supported angle of planes that are infinite at 90 degrees.
+        // A little less than the cosine of the largest angle that projections through tan θ support.
         let is_forward = rays().all(|ray| ray.z > 0.08 * ray.length());
         let flat = |ray: DVec3| ray.truncate() / ray.z;
         let all = rays().fold(None, |all: Option<Rectangle>, ray| {
@@ -184,7 +185,7 @@ fn visible_part(
     is_useful.then(|| face(lens, turn, rectangle, None, masked))
 }
 
-/// The pinhole that shows a rectangle, at a given size or with as many pixels per radian on the axis as the lens.
+/// The pinhole that shows a rectangle, at a given size or with the lens's number of pixels per radian on the axis.
 fn face(
     lens: &Lens,
     turn: DMat3,

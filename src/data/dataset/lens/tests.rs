@@ -3,7 +3,7 @@
 use glam::{DVec2, DVec3};
 
 use super::models::{LensModel, MODELS};
-use super::{Distortion, Lens, PinholeError, Pinholes, Plane, Unseen};
+use super::{Distortion, Lens, PinholeError, Pinholes, Projection, Unseen};
 use densify_core::image::Image8;
 
 const SIZE: (u32, u32) = (300, 184);
@@ -127,7 +127,7 @@ fn lenses() -> Vec<(&'static str, Lens)> {
 }
 
 #[test]
-fn a_grid_comes_back_through_every_model() {
+fn every_lens_model_round_trips_a_grid() {
     for (name, lens) in lenses() {
         let (mut tried, mut worst) = (0, 0.0_f64);
         for (x, y) in (0..=60).flat_map(|x| (0..=40).map(move |y| (x, y))) {
@@ -218,7 +218,7 @@ fn a_wide_field_becomes_faces_of_a_cube() {
 }
 
 #[test]
-fn a_distortion_that_folds_over_is_refused_or_kept_where_it_does_not() {
+fn a_distortion_that_folds_over_is_refused_or_used_up_to_the_fold() {
     for k in [[-1.5, 0.0, 0.0, 0.0], [0.0, -4.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]] {
         let lens = lens("OPENCV", &[&[210.0, 214.0, 150.0, 92.0], &k[..]].concat());
         let Err(PinholeError::Folds(degrees)) = Pinholes::covering(&lens, false) else {
@@ -291,8 +291,9 @@ fn dots_land_where_pinholes_project_them() {
 }
 
 #[test]
-fn a_plane_and_its_inverse_agree() {
-    for plane in [Plane::Perspective, Plane::Equidistant, Plane::Fov(0.9), Plane::Fov(-1.4)] {
+fn a_projection_and_its_inverse_agree() {
+    use Projection::{Equidistant, Fov, Perspective};
+    for plane in [Perspective, Equidistant, Fov(0.9), Fov(-1.4)] {
         for i in 1..100 {
             let angle = plane.widest() * f64::from(i) / 100.0;
             assert!((plane.angle(plane.radius(angle)) - angle).abs() < 1e-12, "{plane:?} {angle}");

@@ -66,7 +66,7 @@ fn packed(made: &Made) -> Vec<u8> {
     pack(&files(made.path()), "", CompressionMethod::Deflated)
 }
 
-/// Replaces all occurrences of a name by another of the same length.
+/// Replaces all occurrences of a name with another of the same length.
 fn renamed(bytes: &[u8], old: &str, new: &str) -> Vec<u8> {
     assert_eq!(old.len(), new.len());
     let (mut bytes, mut count) = (bytes.to_vec(), 0);
@@ -104,7 +104,7 @@ fn unpacked_in(data: &Dataset) -> PathBuf {
 }
 
 #[test]
-fn an_archive_is_its_folder() {
+fn an_archive_loads_like_its_folder() {
     let renames: fn(&mut serde_json::Value) =
         |json| json["frames"][1]["file_path"] = "Фото 1/Küche (2).png".into();
     let names = Made::transforms(renames);
@@ -218,7 +218,7 @@ fn unsafe_archives_are_refused() {
         ("another file's name", "././imag/b.pn", ""),
     ] {
         match words {
-            // An odd spelling of a name that is free.
+            // An odd spelling of a path is accepted if no other file has that path.
             "" => assert!(Packed::of(&renamed(&whole, name, new)).load().is_ok(), "{case}"),
             _ => refused(case, &renamed(&whole, name, new), words),
         }

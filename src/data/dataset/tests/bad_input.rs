@@ -53,7 +53,7 @@ const IMAGES: &[Replacement] = &[
 const POINTS: &[Replacement] = &[(" 3 20 30", " 300 20 30", "points3D.txt, line 5, 300")];
 
 #[test]
-fn masks_to_invert_must_be_there() {
+fn options_for_masks_need_masks() {
     let inverts = LoadOptions { invert_masks: true, ..LoadOptions::default() };
     let carves = LoadOptions { mask_mode: MaskMode::Background, ..LoadOptions::default() };
     for (options, words) in [(inverts, "inverted: true"), (carves, "inverted: false")] {
@@ -162,7 +162,7 @@ fn colmap_binary() {
 
 /// With any single byte damaged, loading returns a dataset or an error.
 #[test]
-fn no_damaged_byte_makes_it_panic() {
+fn no_damaged_byte_causes_a_panic() {
     let made = Made::colmap_bin();
     let load = || Dataset::load(made.path(), &LoadOptions::default());
     for name in ["sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin"] {
@@ -281,7 +281,7 @@ fn transforms() {
     let file = made.file("scan.zip");
     std::fs::write(&file, "<html>404</html>").unwrap();
     let message = Dataset::load(&file, &options).unwrap_err().to_string();
-    assert!(message.contains("scan.zip") && message.contains("no ZIP archive"), "{message}");
+    assert!(message.contains("scan.zip") && message.contains("nor a ZIP archive"), "{message}");
 }
 
 #[test]

@@ -64,7 +64,7 @@ fn reported(made: &Made) -> ReportedExposures {
 
 #[test]
 fn exposures_are_reported_in_stops() {
-    // Twice the time; a quarter of it, at half the f-number and twice the sensitivity.
+    // The second has twice the time; the third has a quarter of it, half the f-number and twice the sensitivity.
     let found = reported(&with([
         Some(((1, 100), (4, 1), 100)),
         Some(((1, 50), (4, 1), 100)),
@@ -182,11 +182,11 @@ fn a_photograph_that_lies_on_its_side_for_its_camera_is_turned() {
         assert_eq!(image.rgb[..3], left, "{orientation}");
         assert_ne!(image.rgb[57..60], left, "{orientation}");
         assert_noted(&data, "1 photographs lie on, b.png");
-        // Turning takes the picture twice.
+        // Turning needs memory for two copies of the image.
         let bytes = view.source.working_bytes();
         assert!(bytes >= 2 * 3 * u64::from(SIZE.0 * SIZE.1), "{bytes}");
         assert!(data.train[0].source.header.turn.is_none());
-        // Its mask is that of the turned picture.
+        // A mask has the orientation of the turned image.
         write_mask(&made.file("masks/b.png"), |_| 9);
         let data = load(&made);
         assert_eq!(data.train[1].source.load().unwrap().mask.unwrap()[0], 9);

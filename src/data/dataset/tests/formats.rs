@@ -106,7 +106,7 @@ fn resolutions() {
                 assert!((view.camera.fx / f64::from(size.0) - 15.0 / 20.0).abs() < 1e-12);
             }
         }
-        // The ready-made folder, where there is one; one image is not in it.
+        // The folder of reduced images is used if there is one. One image is missing in it.
         for name in &NAMES[1..] {
             image(&made.file("images_2").join(name), (10, 6), 7);
         }
@@ -115,7 +115,7 @@ fn resolutions() {
         assert_eq!(data.train.iter().map(first).collect::<Vec<_>>(), [0, 7, 7]);
         assert!(data.train.iter().all(|view| view.camera.width == 10));
         assert_noted(&data, "images_2");
-        // Not for another divisor.
+        // It is not used for another divisor.
         assert_eq!(first(&load_with(&made, &options(Resolution::Divisor(4))).train[1]), 40);
     }
 }
@@ -220,7 +220,7 @@ fn masks_are_found_in_the_folder_that_is_named() {
     for made in [Made::colmap_txt(), Made::transforms(|_| ()), Made::realitycapture()] {
         std::fs::rename(made.file("images"), made.file("moved")).unwrap();
         masks.iter().for_each(|mask| image(&made.file(mask), SIZE, 200));
-        // All but black is hidden by this one.
+        // In this mask, every value but black hides a pixel.
         write_mask(&made.file(masks[9]), |_| 0);
         let options = LoadOptions { images: Some("moved".into()), ..LoadOptions::default() };
         for mask in masks {

@@ -104,7 +104,7 @@ fn views_of_one_photograph_share_its_file_and_split() {
 #[test]
 fn a_track_is_in_the_view_that_shows_its_point() {
     let made = colmap("OPENCV_FISHEYE 20 12 6 6 10 6 0 0 0 0");
-    // Four photographs see each point; the fourth is a copy of the first from another place.
+    // Four photographs see each point; the fourth has the orientation of the first and another position.
     densify_fixtures::image(&made.file("images/d.png"), SIZE, 9);
     let images = std::fs::read_to_string(made.file("sparse/0/images.txt")).unwrap();
     made.write("sparse/0/images.txt", images + "4 1 0 0 0 0.1 0 4 1 d.png\n1 1 -1\n");
@@ -155,7 +155,7 @@ fn views_that_a_mask_hides_are_named_and_left_out() {
         split: Split::Every(std::num::NonZeroU32::new(2).unwrap()),
         ..LoadOptions::default()
     };
-    // One photograph is hidden; the others are split as if it counted.
+    // One photograph is hidden; the others are split as if it were used.
     let made = Made::colmap_txt();
     write_mask(&made.file("masks/a.png"), |_| 0);
     let data = load_with(&made, &options);

@@ -15,7 +15,7 @@ use super::{Dataset, LoadOptions, Note, View};
 use densify_fixtures::{Made, SIZE};
 
 impl Note {
-    /// Whether the note names no option and contains these words.
+    /// Returns true if the note names no option and contains these words.
     fn contains(&self, words: &str) -> bool {
         matches!(self, Self::Text(text) if text.contains(words))
     }

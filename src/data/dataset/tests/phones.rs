@@ -122,7 +122,7 @@ fn a_frame_without_intrinsics_is_named() {
         });
         let loaded = Dataset::load(made.path(), &LoadOptions::default());
         match loaded {
-            // One focal length is both.
+            // One focal length is used for both axes.
             Ok(data) => assert_eq!((words, data.train[1].camera.fy), ("", 15.0)),
             Err(error) => {
                 let message = error.to_string();

@@ -69,7 +69,7 @@ fn lengths_are_relative_to_the_longer_side() {
 
 /// RealityScan 2 has other names for the same columns.
 #[test]
-fn tables_of_realityscan_are_the_same() {
+fn tables_of_realityscan_load_the_same() {
     let (older, newer) = (Made::realitycapture(), Made::realitycapture());
     newer.replace(TABLE, "heading", "yaw");
     newer.replace(TABLE, ",f,px,py,", ",f_35mm,px_norm,py_norm,");

@@ -46,7 +46,7 @@ fn real_datasets_load() {
             assert!(data.notes.iter().any(|note| note.contains("17 of 67")), "{:?}", data.notes);
         }
         if points > 0 {
-            // Points are what the cameras saw: all but a few are in view of one of them.
+            // Points were reconstructed from the photographs: all but a few are in view of one of the cameras.
             let seen_by = |camera: &Camera, p: DVec3| {
                 let (pixel, depth) = camera.project(p);
                 let (w, h) = (f64::from(camera.width), f64::from(camera.height));

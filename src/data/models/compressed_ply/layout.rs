@@ -1,6 +1,6 @@
 //! Elements and properties of the format.
 //!
-//! 256 Gaussians at a time share a `chunk`, which holds the bounds of their positions, log-scales and colours. A
+//! Every 256 Gaussians share a `chunk`, which holds the bounds of their positions, log-scales and colours. A
 //! `vertex` is four words: 11-10-11 bits of position and of scale, the index of the quaternion's largest component
 //! (2 bits) with the three others (10 bits each), and eight bits each of red, green, blue and opacity. Element `sh`
 //! holds the bands above 0, channel by channel.

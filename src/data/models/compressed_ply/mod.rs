@@ -1,5 +1,5 @@
 //! The compressed splat PLY of PlayCanvas, which SuperSplat, splat-transform, Spark and others open: 16 bytes per
-//! Gaussian beside one byte per coefficient of colour.
+//! Gaussian, and one byte per spherical-harmonic coefficient above band 0.
 
 mod layout;
 mod read;

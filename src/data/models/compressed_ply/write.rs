@@ -1,7 +1,7 @@
 //! Writes compressed splat PLY.
 //!
-//! A coefficient has a byte between −4 and 4 whose values leave out 0. Coefficients of 0, as in bands that were not
-//! trained, get the two nearest values in turn, so that the colour is right on average.
+//! A coefficient is a byte that stands for a value between −4 and 4, but never for 0. Coefficients of 0, as in bands
+//! that were not trained, alternate between the two nearest values, so that the colour is right on average.
 
 use std::io::{self, Write};
 
@@ -10,7 +10,7 @@ use crate::models::quantise::{MAX_LOG_SCALE, smallest_three};
 use crate::models::{ModelWriter, Shape};
 use densify_core::gaussians::{Gaussians, dc_to_rgb, sh_coefficients, sigmoid};
 
-/// Numbers of a Gaussian that are packed with those of its chunk: position, log-scale, colour, opacity and quaternion.
+/// Number of values per Gaussian that are packed chunk by chunk: position, log-scale, colour, opacity and quaternion.
 const PACKED: usize = 14;
 
 /// Holds the packed values of all Gaussians, because all chunks precede them in the file.

@@ -1,5 +1,5 @@
 //! glTF 2.0 with `KHR_gaussian_splatting` (Khronos, ratified). Binary files (`.glb`) are read and written, text
-//! (`.gltf`, with its buffers inside or beside it) is only read.
+//! (`.gltf`, with its buffers embedded or in files beside it) is only read.
 //!
 //! glTF has y up; the other formats use the coordinates of the dataset, mostly with y down. As in splat-transform, a
 //! half turn about z converts one into the other.

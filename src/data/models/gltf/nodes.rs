@@ -50,7 +50,7 @@ pub(super) fn placed_meshes(
     while let Some((index, parent)) = open.pop() {
         let node = nodes.get(index).ok_or_else(|| wrong("there is no such node"))?;
         if std::mem::replace(&mut seen[index], true) {
-            return Err(wrong("two of them contain the same node, or they contain each other"));
+            return Err(wrong("two nodes contain the same node, or nodes contain each other"));
         }
         let matrix = parent * node.matrix();
         if let Some(mesh) = node.mesh {

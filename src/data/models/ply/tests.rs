@@ -1,4 +1,4 @@
-//! Layouts of other programs, damaged files.
+//! Tests of PLY files in the layouts of other programs, and of damaged files.
 
 use std::path::Path;
 
@@ -7,8 +7,8 @@ use crate::models::PLY;
 use crate::models::tests::{model, saved, written};
 use crate::points::read_points;
 
-/// The same splat in ascii and big endian, properties shuffled, of other types, with others
-/// and a list between, behind another element.
+/// One splat in ASCII and in big endian. Its properties are shuffled, have other types, are mixed with unknown ones and
+/// a list, and follow another element.
 #[test]
 fn other_layouts_read_the_same() {
     let properties = "property double rot_3\nproperty double rot_0\nproperty list uchar short extra\nproperty double rot_1\n\
@@ -117,7 +117,7 @@ fn other_ply_files_are_refused_with_the_reason() {
     assert!(message.contains("cannot read /none/x.ply"), "{message}");
 }
 
-/// Cut or damaged anywhere: an error or a model, never a panic or a huge allocation.
+/// A file cut or damaged anywhere gives an error or a model, never a panic or a huge allocation.
 #[test]
 fn damaged_files_never_panic() {
     let whole = written(PLY, &model(3, 1)).unwrap();
@@ -144,7 +144,7 @@ fn shared_splats_of_other_programs_load() {
         assert!(file.gaussians.len() >= 3 && file.dropped == 0, "{}", path.display());
         if path.ends_with("train-1000.ply") {
             assert_eq!((file.gaussians.len(), file.gaussians.sh_degree), (1000, 3));
-            // The original's layout: ours, byte for byte.
+            // We write the layout of the original implementation, byte for byte.
             assert!(written(PLY, &file.gaussians).unwrap() == std::fs::read(&path).unwrap());
         }
     }

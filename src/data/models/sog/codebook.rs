@@ -4,7 +4,7 @@ use super::layout::CODEBOOK as ENTRIES;
 
 /// Intervals of the histogram.
 const BINS: usize = 1 << 14;
-/// Most iterations; the starting point usually needs few.
+/// Maximum number of iterations; from this starting point, few are usually needed.
 const ITERATIONS: usize = 50;
 
 /// A codebook, in ascending order.
@@ -29,7 +29,7 @@ impl Codebook {
             let bin = &mut bins[bin.min(BINS - 1)];
             *bin = [bin[0] + weight, bin[1] + weight * f64::from(value)];
         }
-        // The best density of entries is the cube root of that of values (Panter and Dite 1951).
+        // The best density of codebook entries is the cube root of the density of values (Panter and Dite 1951).
         let density: Vec<f64> = bins.iter().map(|bin| bin[0].cbrt()).collect();
         let total: f64 = density.iter().sum();
         let (mut book, mut sum) = (Vec::with_capacity(ENTRIES), 0.0);
@@ -91,14 +91,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn few_values_are_kept_and_many_are_near_their_number() {
+    fn few_values_are_kept_and_many_are_close_to_an_entry() {
         let few: Vec<f32> = (0..200).map(|i| (i as f32).sqrt() - 3.0).collect();
         let book = Codebook::fit(&few, |_| 1.0);
         for &value in &few {
             let found = book.values()[usize::from(book.nearest(value))];
             assert!((found - value).abs() < 2e-3, "{found} for {value}");
         }
-        // Most values lie near 0, so the numbers must too.
+        // Most values lie near 0, so the codebook's entries must too.
         let many: Vec<f32> = (0..100_000).map(|i| ((i as f32 / 50_000.0) - 1.0).powi(3)).collect();
         let book = Codebook::fit(&many, |_| 1.0);
         let error = |&v: &f32| (book.values()[usize::from(book.nearest(v))] - v).powi(2);
@@ -108,7 +108,7 @@ mod tests {
     }
 
     #[test]
-    fn values_that_weigh_more_are_nearer() {
+    fn values_with_more_weight_get_more_entries() {
         let values: Vec<f32> = (0..20_000).map(|i| i as f32 / 20_000.0).collect();
         let book = Codebook::fit(&values, |i| if i < 10_000 { 1000.0 } else { 1.0 });
         let low = book.values().iter().filter(|&&v| v < 0.5).count();
@@ -116,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn one_value_is_a_codebook() {
+    fn equal_values_give_a_constant_codebook() {
         assert_eq!(Codebook::fit(&[2.5; 7], |_| 1.0).values(), [2.5; 256]);
         assert_eq!(Codebook::fit(&[2.5], |_| 1.0).nearest(2.5), 0);
     }

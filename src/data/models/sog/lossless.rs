@@ -1,8 +1,8 @@
 //! Lossless WebP (VP8L, RFC 9649) for images whose pixels are numbers. Neighbouring pixels are Gaussians near each
 //! other, so that the pixel to the left predicts the next; channels are independent.
 //!
-//! `image-webp` always subtracts the green channel from the others and predicts from above; this encoder chooses both
-//! by the size. It has no references to earlier pixels, because pixels hardly ever repeat.
+//! `image-webp` always subtracts the green channel from the others and predicts from above; this encoder chooses the
+//! transforms that give the smallest file. It has no references to earlier pixels, because pixels hardly ever repeat.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -94,7 +94,8 @@ pub(super) fn encode(rgba: &[u8], (width, height): (usize, usize)) -> Vec<u8> {
     }
     if let Some(predictor) = transforms.predictor {
         to.put(1, 3);
-        // One predictor for all blocks of 512 pixels: an image of blocks whose green channel is its number, no cache.
+        // One predictor for all blocks of 512 pixels: an image with a pixel per block, whose green channel is the
+        // predictor's number, without a colour cache.
         to.put(0b111, 3);
         to.put(0, 1);
         put_single(&mut to, predictor as u8);
@@ -187,14 +188,14 @@ fn entropy(counts: &[u32]) -> f64 {
     used.map(|count| count * (total / count).log2()).sum()
 }
 
-/// Writes a code with one symbol, whose words have no bits.
+/// Writes a code with one symbol, whose code word has no bits.
 fn put_single(to: &mut Bits, symbol: u8) {
     // A simple code with one symbol of eight bits.
     to.put(0b101, 3);
     to.put(symbol.into(), 8);
 }
 
-/// Writes a code for values with these counts; returns the bits of each word and their number.
+/// Writes a code for values with these counts; returns the bits and the length of each code word.
 fn put_code(to: &mut Bits, counts: &[u32], symbols: usize) -> Vec<(u16, u8)> {
     let used: Vec<usize> = (0..counts.len()).filter(|&symbol| counts[symbol] > 0).collect();
     if let [] | [_] = used[..] {
@@ -208,7 +209,7 @@ fn put_code(to: &mut Bits, counts: &[u32], symbols: usize) -> Vec<(u16, u8)> {
     codes(&lengths)
 }
 
-/// Writes the lengths of a code, themselves coded, with runs of zeros.
+/// Writes the lengths of a code's words, which are themselves coded, with runs of zeros.
 fn put_lengths(to: &mut Bits, lengths: &[u8]) {
     // A symbol, then a number and its size in bits.
     let mut tokens: Vec<(usize, u64, u8)> = Vec::new();
@@ -244,8 +245,8 @@ fn put_lengths(to: &mut Bits, lengths: &[u8]) {
     }
 }
 
-/// The lengths of a Huffman code (1952) with words of at most `most` bits; 0 for values that do not occur. Counts are
-/// made more alike until no word is too long.
+/// The lengths of a Huffman code (1952) with words of at most `most` bits; 0 for values that do not occur. The counts
+/// are levelled until no word is too long.
 fn code_lengths(counts: &[u32], most: u8) -> Vec<u8> {
     let mut counts = counts.to_vec();
     loop {
@@ -311,7 +312,7 @@ mod tests {
     }
 
     #[test]
-    fn every_picture_comes_back() {
+    fn every_image_round_trips() {
         for (width, height) in [(1, 1), (4, 1), (1, 5), (3, 2), (520, 517), (64, 1040)] {
             for alpha in [255, 7] {
                 // One colour, two, a few, gradients along and across, waves, noise in all channels or one.

@@ -1,7 +1,7 @@
 //! Palettes of vectors: clusters are halved, the one with the largest error first, until there are enough (bisecting
 //! k-means: Steinbach, Karypis and Kumar 2000).
 //!
-//! A halving is linear in the rows of its cluster, so the fit takes O(n log n) for n rows. Nothing is random.
+//! Halving takes time linear in the rows of the cluster, so the fit takes O(n log n) for n rows. Nothing is random.
 
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
@@ -139,7 +139,7 @@ impl Rows<'_> {
                 break;
             }
         }
-        // The order within each half stays.
+        // The order within each half does not change.
         let mut high = Vec::new();
         let mut count = 0;
         for index in 0..rows.len() {
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn clusters_get_an_entry_each() {
+    fn every_cluster_gets_an_entry() {
         let values = corners();
         let Palette { entries, labels } = Palette::fit(&values, 2, &[1.0; 400], 4);
         assert_eq!(entries.len(), 8);
@@ -214,8 +214,8 @@ mod tests {
     }
 
     #[test]
-    fn rows_that_weigh_more_are_nearer() {
-        // Two entries for three places: the heavy ones keep theirs.
+    fn rows_with_more_weight_get_closer_entries() {
+        // Two entries for three values: the two with more weight get one each.
         let values = [0.0f32, 1.0, 1.4];
         let found = |weights: [f32; 3]| {
             let palette = Palette::fit(&values, 1, &weights, 2);

@@ -71,7 +71,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pictures_come_back() {
+    fn pictures_round_trip() {
         for rows in [1, 5, 300] {
             let (width, height) = side(rows);
             assert!(width * height >= rows && width % 4 == 0 && height % 4 == 0);

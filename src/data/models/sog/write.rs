@@ -17,7 +17,7 @@ use densify_core::gaussians::{Gaussians, sh_coefficients, sigmoid};
 
 /// Longest side of a WebP `[px]`; it limits the number of Gaussians.
 const MAX_SIDE: usize = 16_383;
-/// Most entries of the palette, whose index has 16 bits.
+/// Maximum number of palette entries: an index has 16 bits.
 const MAX_PALETTE: usize = 1 << 16;
 
 /// Holds all Gaussians, because codebooks and palette are fitted to all of them.

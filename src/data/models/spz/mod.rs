@@ -1,8 +1,8 @@
 //! SPZ (Niantic), a quantised and compressed format. Versions 2 to 4 are read; version 3, which every reader accepts,
 //! is written by default, and version 4 by choice.
 //!
-//! Coordinates are taken as they are, as splat-transform does: files do not say how the program that wrote them turned
-//! the scene.
+//! Coordinates are used unchanged, as in splat-transform: files do not say in which orientation their program wrote the
+//! scene.
 
 mod containers;
 mod layout;
@@ -29,7 +29,7 @@ const FORMAT: Format = Format {
     compress_rank: Some(3),
 };
 
-/// Version 4. Its extension ends in that of version 3, the default.
+/// Version 4. Its extension `.v4.spz` ends in that of version 3, the default.
 const VERSION_4: Format = Format {
     name: "spz-v4",
     extension: "v4.spz",

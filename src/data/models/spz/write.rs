@@ -13,11 +13,11 @@ use densify_core::gaussians::{Gaussians, sh_coefficients, sigmoid};
 
 /// Fractional bits of positions in files of other writers; small scenes get more.
 const MIN_FRACTIONAL_BITS: u8 = 12;
-/// Most fractional bits of positions.
+/// Maximum number of fractional bits of positions.
 const MAX_FRACTIONAL_BITS: u8 = 20;
 /// Bits of a position without its sign.
 const POSITION_BITS: i32 = 23;
-/// Step of positions, as a fraction of the median Gaussian's second largest scale.
+/// Step of positions, as a fraction of the median of all Gaussians' second largest scales.
 const STEP_OF_SIZE: f32 = 0.05;
 /// Largest error of a colour from rounding coefficients, root mean square over Gaussians and directions. Below this,
 /// images have at least 45 dB against those of the PLY (measured on room256, cup, chair).
@@ -25,7 +25,8 @@ const MAX_COLOUR_ERROR: f64 = 0.0165;
 /// Largest step of coefficients, in units of 1/128.
 const MAX_STEP: u8 = 31;
 
-/// Holds the quantised values of all Gaussians, but positions as they are: their fixed point depends on all of them.
+/// Holds the quantised values of all Gaussians. Only their positions are not quantised yet, because the fixed point
+/// depends on all of them.
 #[derive(Default)]
 pub(super) struct SpzWriter {
     /// True for version 4.

@@ -14,8 +14,8 @@ use densify_core::files::FileError;
 use densify_core::gaussians::{Gaussians, sh_coefficients};
 use densify_core::pieces::ROWS_AT_A_TIME;
 
-/// A model whose values all differ, so that a swapped column shows, with odd bits, so that a
-/// conversion shows.
+/// A model whose values all differ, so that tests notice swapped columns, and have odd bits, so that tests notice
+/// conversions.
 pub(crate) fn model(rows: usize, sh_degree: u8) -> Gaussians {
     let mut next = 0u32;
     let mut value = || {
@@ -145,7 +145,7 @@ fn an_unknown_format_names_the_nearest_and_the_list() {
 }
 
 #[test]
-fn the_writer_of_ply_holds_what_it_promises() {
+fn the_writer_of_ply_holds_as_many_bytes_as_it_reports() {
     let whole = model(300, 2);
     let mut writer = PLY.open_writer().unwrap();
     writer.begin(Shape { rows: 300, sh_degree: 2 }, &mut io::sink()).unwrap();

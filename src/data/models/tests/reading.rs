@@ -56,7 +56,8 @@ fn differences(a: &Gaussians, b: &Gaussians) -> [f32; 6] {
     most
 }
 
-/// Half a step of each format; one and a half where splat-transform does not round to the nearest.
+/// The limits are half a quantisation step of each format, or one and a half steps where splat-transform does not round
+/// to the nearest.
 #[test]
 fn every_format_holds_the_same_model() {
     let truth = read(&corpus("ply/twelve.ply"));
@@ -73,7 +74,7 @@ fn every_format_holds_the_same_model() {
         (corpus("sog/deflated.sog"), [0.000_3, 0.04, 0.004, 0.03, 0.4, 0.03]),
         (folder.path().to_owned(), [0.000_3, 0.04, 0.004, 0.03, 0.4, 0.03]),
         (folder.path().join("meta.json"), [0.000_3, 0.04, 0.004, 0.03, 0.4, 0.03]),
-        // As they were.
+        // Values in f32.
         (corpus("glb/twelve.glb"), [1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-3]),
     ] {
         let found = differences(&truth, &read(&path));
@@ -96,7 +97,7 @@ fn file_names_do_not_matter() {
 fn nodes_place_their_splats() {
     let placed = read(&corpus("gltf/placed.gltf"));
     let plain = read(&corpus("glb/twelve.glb"));
-    // Into glTF's frame, (x, y, z) to (z, x, y), twice as large, shifted, and back.
+    // Into glTF's frame; there (x, y, z) becomes (z, x, y), is doubled and shifted; then back.
     let expected = |[x, y, z]: [f32; 3]| {
         let [x, y, z] = [-x, -y, z];
         let [x, y, z] = [2.0 * z + 1.0, 2.0 * x + 2.0, 2.0 * y + 3.0];
@@ -114,12 +115,12 @@ fn nodes_place_their_splats() {
         let larger = placed.log_scales[row][0] - plain.log_scales[row][0];
         assert!((larger - 2f32.ln()).abs() < 1e-5, "{larger}");
     }
-    // The data of a primitive as SPZ, below a node that turns it by a quarter about x.
+    // A primitive with data in SPZ, below a node that rotates it by 90 degrees about x.
     let one = read(&corpus("glb/spz.glb"));
     assert_eq!(one.means, [[-1.0, -3.0, -2.0]]);
 }
 
-/// Cut anywhere and damaged anywhere: an error or a model, never a panic or a huge allocation.
+/// A file cut or damaged anywhere gives an error or a model, never a panic or a huge allocation.
 #[test]
 fn no_damage_makes_a_reader_panic() {
     for (format, may_be_cut) in [
@@ -291,7 +292,7 @@ fn shared_models_of_other_programs_load() {
         let [x, y, z] = spz.means[row];
         assert!(near(ply.means[row], [x, -y, -z]), "{:?}", spz.means);
     }
-    // Four Gaussians: the figures that splat-transform 3.7.0 has of them.
+    // Four Gaussians, with the figures that splat-transform 3.7.0 reports.
     for (name, y, first) in [
         ("minimal-v2.spz", -1.0, -1.111_111_2),
         ("minimal-v3.spz", 1.0, -0.588_235_3),

@@ -17,7 +17,7 @@ fn plausible(rows: usize, sh_degree: u8) -> Gaussians {
     let mut value = |reach: f32| random.random_range(-reach..reach);
     let mut model = Gaussians { sh_degree, ..Gaussians::default() };
     for row in 0..rows {
-        // On a curve, so that a row is known by its place.
+        // On a curve, so that a row is identified by its position.
         let t = row as f32 / rows as f32;
         model.means.push([4.0 * t - 2.0, (9.0 * t).sin(), (7.0 * t).cos()]);
         model.log_scales.push([value(1.5) - 4.0, value(1.5) - 4.0, value(1.5) - 5.0]);
@@ -36,7 +36,7 @@ fn read(bytes: &[u8]) -> Gaussians {
     file.gaussians
 }
 
-/// By the first coordinate, in which [`plausible`] models ascend.
+/// The model sorted by its first coordinate, the original order of [`plausible`] models.
 fn in_order(model: &Gaussians) -> Gaussians {
     let mut rows: Vec<usize> = (0..model.len()).collect();
     rows.sort_by(|&a, &b| model.means[a][0].total_cmp(&model.means[b][0]));
@@ -85,14 +85,14 @@ fn formats_in_f32_keep_every_bit() {
             let again = read(&bytes);
             let case = format!("{name}, {rows} rows, degree {degree}");
             assert_eq!(again, model, "{case}");
-            // Bits too: −0 equals 0.
+            // Bits are compared too, because −0 equals 0.
             assert!(written(format, &again).unwrap() == bytes, "{case}");
         }
     }
 }
 
 #[test]
-fn lossy_formats_say_so() {
+fn formats_are_lossy_if_a_round_trip_changes_values() {
     let model = plausible(100, 3);
     for format in export_formats().into_iter().filter(|format| format.name != "call-log") {
         let changes = in_order(&read(&written(format, &model).unwrap())) != model;
@@ -139,7 +139,7 @@ fn coefficients_of_zero_are_zero_on_average() {
 }
 
 #[test]
-fn pieces_do_not_matter_and_equal_models_are_equal_files() {
+fn files_do_not_depend_on_the_pieces_and_equal_models_give_equal_files() {
     let model = plausible(300, 2);
     for format in export_formats().into_iter().filter(|format| format.name != "call-log") {
         let in_pieces = |pieces: &[Range<usize>]| {
@@ -157,7 +157,7 @@ fn pieces_do_not_matter_and_equal_models_are_equal_files() {
     }
 }
 
-/// The extension of the default ends the other's.
+/// The extension of version 4, `.v4.spz`, ends in that of the default.
 #[test]
 fn the_version_of_spz_is_chosen_by_the_name() {
     let version = |path: &str| {

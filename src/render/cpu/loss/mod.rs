@@ -1,15 +1,15 @@
 //! Stage 4: the image loss 0.8·L1 + 0.2·(1 − SSIM) and its gradient (Kerbl et al. 2023, section 5.1;
 //! SSIM of Wang et al. 2004 with an 11×11 Gaussian window of σ = 1.5 and zero padding).
 //!
-//! SSIM is written in terms of the difference e = x − y, by an exact identity:
+//! SSIM is written in terms of the difference e = x − y of rendering x and target y, by an exact identity:
 //! SSIM = (1 − μₑ²/A)·(1 − Var(e)/B), A = μₓ² + μᵧ² + C₁, B = Var(x) + Var(y) + C₂.
 //! Where the images agree it is exactly 1; the usual form is off by up to 4e-7 there, and
 //! its gradient is noise. The identity holds for any linear window, also where zero padding takes
 //! part of the window's weight. Var(x) + Var(y) is 2·Cov(x, y) + Var(e), so that four means under the
 //! window are enough: of e, y, e² and x·y.
 //!
-//! Subtracting a constant from y, padding included, leaves the variances unchanged. With y − ½ they lose two bits
-//! less to rounding.
+//! Subtracting a constant from y, padding included, leaves the variances unchanged. Computed from y − ½, they lose two
+//! bits less to rounding.
 //!
 //! The file is one piece because the passes share their planes and their strips. Each pass runs over
 //! strips of image rows that write nothing that other strips of the pass read. Image rows are
@@ -45,11 +45,11 @@ pub(crate) const SSIM_WEIGHT: f32 = 0.2;
 const MIDDLE: f32 = 0.5;
 /// Rows per strip where tiles are written: a row of tiles.
 const STRIP: usize = TILE;
-/// Rows per strip elsewhere.
+/// Rows per strip in the other passes.
 const SHORT_STRIP: usize = TOGETHER;
 /// Lines convolved vertically per image row: e, y, e² and x·y.
 const CONVOLVED: usize = 4;
-/// The most scratch lines of a pass: the convolved ones, and one each for e and y outside the image.
+/// Maximum number of scratch lines of a pass: the convolved ones, and one each for e and y outside the image.
 const MAX_LINES: usize = CONVOLVED * TOGETHER + 2;
 
 /// The buffers of the loss.
@@ -68,7 +68,7 @@ pub(super) struct LossBuffers {
 pub(super) struct ImageTerms {
     /// Weights of |e| and 1 − SSIM in the error of each pixel, if that is requested.
     pub(super) error: Option<[f32; 2]>,
-    /// The score of the pixel errors to write to the last plane of the gradient, if requested.
+    /// How pixel errors are weighted in the last plane of the gradient, if they are requested there.
     pub(super) by_pixel: Option<ErrorScore>,
 }
 
@@ -342,7 +342,8 @@ fn scratch_lines<const A: usize, const B: usize>(
     )
 }
 
-/// First pass over one strip of one channel: SSIM and its derivatives by μₑ, E[e²] and E[e·(y − ½)].
+/// First pass over one strip of one channel: SSIM and its derivatives with respect to μₑ, E[e²] and
+/// E[e·(y − ½)].
 struct Similarity<'a> {
     width: usize,
     segments: Segments,
@@ -356,7 +357,7 @@ struct Similarity<'a> {
     errors: [&'a mut Line; 2],
     /// Weights of |e| and 1 − SSIM in each error.
     error_weights: [[f32; 2]; 2],
-    /// True if errors are written instead of added.
+    /// True if errors are overwritten instead of added to.
     first_channel: bool,
 }
 
@@ -406,7 +407,7 @@ impl WithSimd for Similarity<'_> {
                     });
                     for n in 0..2 {
                         let means = [mu_e[n], mu_y[n], ee[n], xy[n]];
-                        let Similar { ssim, by_mu_e, by_ee, by_ey } = Similar::new(s, means);
+                        let Ssim { ssim, by_mu_e, by_ee, by_ey } = Ssim::new(s, means);
                         let i = 2 * pair + n;
                         let inside = (V::load(s, &firsts[lane..]) + i as f32).lt(width);
                         inside.keep(by_mu_e).store(&mut p1[n][lane..]);
@@ -438,15 +439,15 @@ impl WithSimd for Similarity<'_> {
     }
 }
 
-/// SSIM of some pixels, and its derivatives by μₑ, E[e²] and E[e·(y − ½)].
-struct Similar<S: Simd> {
+/// SSIM of some pixels, and its derivatives with respect to μₑ, E[e²] and E[e·(y − ½)].
+struct Ssim<S: Simd> {
     ssim: V<S>,
     by_mu_e: V<S>,
     by_ee: V<S>,
     by_ey: V<S>,
 }
 
-impl<S: Simd> Similar<S> {
+impl<S: Simd> Ssim<S> {
     /// Computes them from the means of e, y − ½, e² and (x − ½)·(y − ½).
     #[inline(always)]
     fn new(s: S, [mu_e, middle, mean_ee, mean_xy]: [V<S>; 4]) -> Self {
@@ -545,7 +546,7 @@ impl WithSimd for Gradient<'_> {
                 }
             }
             segments.restore(out, pixels);
-            // The loss uses e·mask, so that the chain rule has the mask once more.
+            // The loss is a function of e·mask, so the chain rule multiplies by the mask.
             if let Some(mask) = mask {
                 apply_mask(pixels, &mask[(first + row) * grid.width..][..grid.width]);
             }

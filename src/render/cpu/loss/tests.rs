@@ -44,9 +44,9 @@ fn run_in(
     (value, values(0..3), values(4..5))
 }
 
-/// Optional results change neither the loss nor its gradient, and the pixels' parts add up to the loss.
+/// Optional results change neither the loss nor its gradient.
 #[test]
-fn parts_of_pixels_make_up_the_loss() {
+fn pixel_errors_add_up_to_the_loss() {
     for mask in [false, true] {
         let (full, gradient, _) = run(ImageTerms::default(), mask);
         assert!(gradient.iter().any(|g| *g != 0.0));
@@ -60,9 +60,9 @@ fn parts_of_pixels_make_up_the_loss() {
     }
 }
 
-/// Earlier images of other sizes, and steps with other results, do not affect the next.
+/// Earlier images of other sizes, and earlier runs with other optional results, have no effect.
 #[test]
-fn buffers_are_those_of_one_image() {
+fn reused_buffers_give_the_same_results_as_new_ones() {
     let terms = ImageTerms { error: Some([0.3, 0.7]), by_pixel: Some(ErrorScore::default()) };
     let all = |buffers: &mut LossBuffers, size: [u32; 2]| {
         let [width, height] = size.map(|side| side as usize);

@@ -1,5 +1,6 @@
 //! The convolution with SSIM's window: vertically for a few image rows at a time, then horizontally for a
-//! few vectors at a time. The window is symmetric, so that pairs are added first.
+//! few vectors at a time. The window is symmetric, so pixels at equal distances are added before they are
+//! weighted.
 //!
 //! A line is stored as sixteen segments side by side, one in each lane, so that the left and right neighbours of a
 //! vector's pixels are vectors too, and no load is unaligned.
@@ -9,7 +10,7 @@ use pulp::Simd;
 
 use super::super::simd::{V, WIDTH, each};
 
-/// Half the window.
+/// Number of pixels of the window on each side of its centre.
 pub(super) const REACH: usize = 5;
 /// The Gaussian window, normalised: exp(−k²/(2·1.5²))/Σ for k = −5..=5.
 const WINDOW: [f32; 2 * REACH + 1] = [
@@ -41,14 +42,14 @@ pub(super) struct Segments {
 }
 
 impl Segments {
-    /// The segments of lines of `width` pixels. They are whole runs and longer than half the window, so that it never
-    /// reaches beyond the next lane.
+    /// The segments of lines of `width` pixels. They are whole runs and longer than half the window, so that the
+    /// window never reaches beyond the next lane.
     pub(super) const fn new(width: usize) -> Self {
         let length = width.div_ceil(WIDTH).next_multiple_of(RUN);
         Self { length: if length < 2 * RUN { 2 * RUN } else { length } }
     }
 
-    /// Numbers of a line.
+    /// Numbers per line.
     pub(super) const fn stride(self) -> usize {
         self.length * WIDTH
     }
@@ -166,7 +167,7 @@ impl<'a> Near<'a> {
     }
 }
 
-/// An array with an expression for each row or vector within reach.
+/// An array of the values of an expression, one for each row or vector within reach.
 macro_rules! near {
     ($d:ident => $e:expr) => {
         near!(@ $d 0 1 2 3 4 5 6 7 8 9 10 11 12 13 => $e)
@@ -276,7 +277,7 @@ pub(super) fn horizontal<S: Simd, const N: usize, const M: usize>(
     lane: usize,
 ) -> [V<S>; N] {
     const { assert!(N <= TOGETHER && M == N + 2 * REACH) };
-    // The indices from M on are not within reach.
+    // Index M and all later ones are not within reach.
     let x = near!(d => V::load(s, &around[if d < M { d } else { 0 }][lane..]));
     let mut sums = [V::zero(s); N];
     for (n, sum) in sums.iter_mut().enumerate() {
@@ -286,7 +287,7 @@ pub(super) fn horizontal<S: Simd, const N: usize, const M: usize>(
 }
 
 #[cfg(test)]
-#[expect(clippy::float_cmp, reason = "pixels are moved to the bit")]
+#[expect(clippy::float_cmp, reason = "pixels are only moved")]
 mod tests {
     use super::*;
 
@@ -307,7 +308,7 @@ mod tests {
             let mut again = vec![-1.0; stride];
             segments.restore(&inner, &mut again);
             assert_eq!(again, pixels);
-            // The vector `d` farther has every lane's pixel `d` to the right.
+            // In each lane, the vector `d` places farther on has the pixel `d` places to the right.
             segments.pad(&mut line, 0.5);
             for (d, vector) in line.iter().enumerate() {
                 for (lane, first) in segments.firsts().into_iter().enumerate() {

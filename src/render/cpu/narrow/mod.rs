@@ -1,7 +1,8 @@
 //! Formats of 8 and 16 bits, sixteen numbers at a time, and the random bits for rounding to them.
 //!
 //! Rounding is stochastic (Gupta et al. 2015, section 3.1): a number becomes one of its two representable neighbours,
-//! the nearer more often, so that its mean is preserved. A representable number is unchanged, whatever the draw.
+//! the nearer more often, so that the mean is preserved. A representable number is unchanged, whatever the random
+//! bits.
 //!
 //! The code loops over arrays of integers instead of using `pulp`, which has no vectors of 8 and 16 bits to convert
 //! from; inlined into a dispatched kernel, the loops are vectorised by the compiler.
@@ -14,7 +15,7 @@ use super::simd::WIDTH;
 const F16_NORMAL: f32 = 6.103_515_6e-5;
 /// Bits of the significand that f16 lacks.
 const F16_DROPPED: u32 = 13;
-/// Difference of the exponents' biases of f32 and f16, at the position of the exponent.
+/// Difference between the exponent biases of f32 and f16, at the position of f16's exponent.
 const F16_BIAS: u32 = 112 << 10;
 /// Largest finite number of f16: 65,504.
 const F16_MAX: u32 = 0x7bff;
@@ -74,7 +75,7 @@ pub(super) trait Narrow: Copy + Default {
     /// Rounds to one of the two neighbours of `x`, by the upper bits of `random`. Finite numbers stay finite, and
     /// non-finite ones non-finite.
     fn round(x: f32, random: u32) -> Self;
-    /// Rounds to the nearest number, as the middle draw does; ties go up.
+    /// Rounds to the nearest number, as the middle random value does; ties go up.
     #[inline(always)]
     fn nearest(x: f32) -> Self {
         Self::round(x, 1 << 31)
@@ -263,7 +264,7 @@ pub(super) fn ratios(first: &[f32], second: &[F8], to: &mut [i8], draws: &mut Dr
             let root = RATIO_STEP * second[lane].to_f32().sqrt();
             let draw = unit(random[lane], 11) + 0.5 / 2048.0;
             // 0 if the second moment is 0, also where the square underflowed in f32. NaN becomes 0 here, and
-            // NaN again with its second moment.
+            // becomes NaN again when it is multiplied by its second moment, which is NaN.
             let ratio = if root > 0.0 { first[lane] / root } else { 0.0 };
             to[lane] = round_to_integer(ratio.clamp(-127.0, 127.0), draw) as i8;
         }

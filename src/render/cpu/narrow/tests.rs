@@ -4,7 +4,7 @@
 
 use super::*;
 
-/// All draws that f16 distinguishes.
+/// All random inputs that lead to different stochastic roundings to f16.
 fn draws() -> impl Iterator<Item = u32> {
     (0..1 << F16_DROPPED).map(|k| k << (32 - F16_DROPPED))
 }
@@ -19,7 +19,7 @@ fn numbers() -> impl Iterator<Item = f32> {
 }
 
 /// Checks that all codes survive a round trip, whatever the draw.
-fn all_come_back<T, B>(of_bits: fn(B) -> T, codes: impl Iterator<Item = B>)
+fn assert_round_trips<T, B>(of_bits: fn(B) -> T, codes: impl Iterator<Item = B>)
 where
     T: Narrow + PartialEq + std::fmt::Debug,
     B: Copy + std::fmt::LowerHex,
@@ -41,9 +41,9 @@ where
 }
 
 #[test]
-fn whatever_is_stored_comes_back() {
-    all_come_back(F16, 0..=u16::MAX);
-    all_come_back(F8, 0..=u8::MAX);
+fn all_codes_survive_a_round_trip() {
+    assert_round_trips(F16, 0..=u16::MAX);
+    assert_round_trips(F8, 0..=u8::MAX);
 }
 
 /// The definition of binary16, IEEE 754-2008, section 3.4.
@@ -63,9 +63,9 @@ fn halves_are_what_the_standard_says() {
     }
 }
 
-/// Checks that over all draws a number becomes one of its two neighbours with the right frequency, and the end of the
-/// range beyond it.
-fn is_fair<T: Narrow>(all: &[f32]) {
+/// Checks that over all draws a number in range is rounded to each of its two neighbours with the right frequency, and
+/// that a number out of range becomes the nearest end.
+fn assert_fair<T: Narrow>(all: &[f32]) {
     let (least, most) = (all[0], all[all.len() - 1]);
     for x in numbers() {
         if x < least || x > most {
@@ -84,7 +84,7 @@ fn is_fair<T: Narrow>(all: &[f32]) {
             ups += u32::from(y == high);
         }
         let found = f64::from(ups) / f64::from(1_u32 << F16_DROPPED);
-        // One draw of each that are told apart, and the rounding of what is added to small ones.
+        // Tolerance: one of the 2¹³ distinct draws, and the rounding error of the number added to small values.
         assert!((found - share).abs() < 2.5e-4, "{x:e}: {found} instead of {share}");
     }
 }
@@ -94,7 +94,7 @@ fn rounding_is_fair_and_stays_between_the_neighbours() {
     let halves = (0..=F16_MAX as u16).map(|bits| F16(bits).to_f32());
     let mut all: Vec<f32> = halves.flat_map(|x| [x, -x]).collect();
     all.sort_by(f32::total_cmp);
-    is_fair::<F16>(&all);
+    assert_fair::<F16>(&all);
     for x in numbers().filter(|x| x.abs() <= 65_504.0) {
         let above = all.partition_point(|&y| y < x);
         let step = f64::from(all[above]) - f64::from(all[above.saturating_sub(1)]);
@@ -105,21 +105,21 @@ fn rounding_is_fair_and_stays_between_the_neighbours() {
 
 /// Bytes: 7 bits of exponent and one of significand, without a sign.
 #[test]
-fn bytes_are_fair_and_cover_what_adam_needs() {
+fn bytes_are_rounded_fairly_and_cover_the_range_that_adam_needs() {
     let all: Vec<f32> = (0..=F8_MAX as u8).map(|bits| F8(bits).to_f32()).collect();
     assert!(all.is_sorted() && all[0] == 0.0, "{all:?}");
     assert!(F8(F8_NAN as u8).to_f32().is_nan());
     let (least, most) = (all[1], all[all.len() - 1]);
     assert_eq!((least, most), (2_f32.powi(-96), 1.5 * 2_f32.powi(30)));
-    // The root of the least is no more than a few of Adam's epsilon, 1e-15.
+    // The square root of the smallest positive number is within a few times Adam's epsilon, 1e-15.
     assert!(least.sqrt() < 4e-15);
     assert!(all[1..].windows(2).all(|pair| pair[1] <= 1.5 * pair[0]), "{all:?}");
-    is_fair::<F8>(&all);
+    assert_fair::<F8>(&all);
 }
 
 /// Fixed point: representable numbers are preserved, and rounding is fair.
 #[test]
-fn fixed_point_is_fair_and_stays() {
+fn fixed_point_round_trips_and_rounds_fairly() {
     for (digits, most) in [(11, 16.0_f32), (14, 2.0)] {
         let step = most / 32768.0;
         for stored in -i16::MAX..=i16::MAX {
@@ -155,7 +155,7 @@ fn fixed_point_is_fair_and_stays() {
 }
 
 #[test]
-fn what_is_no_number_stays_none() {
+fn nan_and_infinity_are_never_stored_as_finite() {
     for random in [0, 1 << 31, u32::MAX] {
         for x in [f32::INFINITY, f32::NEG_INFINITY] {
             assert_eq!(F16::round(x, random).to_f32(), x);
@@ -171,7 +171,7 @@ fn what_is_no_number_stays_none() {
 
 /// Representable ratios are preserved for any second moment; others are rounded fairly.
 #[test]
-fn ratios_are_fair_and_stay() {
+fn ratios_round_trip_and_are_rounded_fairly() {
     let rng = PolicyRng::new(3, 1);
     for second in [2e-29_f32, 3e-20, 1.7e-9, 0.4, 1e9] {
         let second = F8::nearest(second);
@@ -203,7 +203,7 @@ fn ratios_are_fair_and_stay() {
 
 /// A second moment of 0 makes the first 0, and one of NaN makes it NaN, so that an audit finds it.
 #[test]
-fn ratios_of_nothing() {
+fn ratios_with_a_zero_or_nonfinite_second_moment() {
     let [mut draws, ..] = Draws::of_block(&PolicyRng::new(0, 0), 0);
     for (first, second) in [(1e-30, 0.0), (0.0, 0.0), (f32::NAN, f32::NAN), (3.0, f32::INFINITY)] {
         let mut stored = [1; WIDTH];
@@ -244,7 +244,7 @@ fn draws_are_independent() {
     let found = [
         ("rows", correlation(&first, &first[1..])),
         ("planes", correlation(&first, &first[WIDTH..])),
-        ("planes but one", correlation(&first, &first[2 * WIDTH..])),
+        ("next plane but one", correlation(&first, &first[2 * WIDTH..])),
         ("blocks", correlation(&first, &first[WIDTH * PLANES..])),
         ("steps", correlation(&first, &table(1, 501, 0))),
         ("seeds", correlation(&first, &table(2, 500, 0))),

@@ -103,7 +103,7 @@ impl<S: Simd> V<S> {
         Self { s: self.s, v: self.s.max_f32s(self.v, b.v) }
     }
 
-    /// The absolute value. Not by `abs_f32s`, which some builds compile to a call, at a third of a step's time.
+    /// The absolute value. Avoids `abs_f32s`, which some builds compile to a call that takes a third of a step's time.
     #[inline(always)]
     pub(super) fn abs(self) -> Self {
         let s = self.s;
@@ -302,7 +302,7 @@ impl<S: Simd> Mask<S> {
         Self { s: self.s, m: self.s.or_m32s(self.m, b.m) }
     }
 
-    /// `yes` where true, `no` elsewhere. Not by `select_f32s`, for the reason given at [`V::abs`].
+    /// `yes` where true, `no` elsewhere. Avoids `select_f32s`, for the reason given at [`V::abs`].
     #[inline(always)]
     pub(super) fn select(self, yes: V<S>, no: V<S>) -> V<S> {
         let s = self.s;
@@ -326,7 +326,7 @@ impl<S: Simd> Mask<S> {
     /// set or clear, and without vectors a lane is one byte.
     #[inline(always)]
     pub(super) fn bits(self) -> u32 {
-        // AVX2 has an instruction for this, which must be named; the generic code takes two dozen.
+        // AVX2 has an instruction for this, which must be called explicitly; the generic code takes two dozen.
         #[cfg(target_arch = "x86_64")]
         if let Some(v3) = (&self.s as &dyn std::any::Any).downcast_ref::<pulp::x86::V3>() {
             return v3.avx._mm256_movemask_ps(pulp::bytemuck::cast(self.m)) as u32;

@@ -21,7 +21,7 @@ use crate::Shortcuts;
 use crate::signals::RecordLayout;
 use densify_shaders::{Accumulation, STAGES};
 
-/// Capabilities beyond those of every WebGPU device that naga must allow.
+/// Capabilities that naga must allow in addition to those of every WebGPU device.
 fn capabilities(accumulation: Accumulation) -> Capabilities {
     let needed = features_for(accumulation);
     [

@@ -1,57 +1,57 @@
 //! Finds the largest run that fits a memory limit: rows, degree, tile lists and image cache.
 //!
-//! Pure functions of the bytes of a size. Guarantees: the result fits; one more row does not, unless another limit holds;
-//! and more memory never gives a lower degree, or fewer rows at the same degree.
+//! The functions are pure; a callback returns the bytes of a size. Guarantees: the result fits; one more row does not
+//! fit, unless another limit applies; and more memory never gives a lower degree, or fewer rows at the same degree.
 
 use std::ops::RangeInclusive;
 
 /// The size of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct RunSize {
-    /// Most rows there may ever be, >= 1.
+    /// Maximum number of rows, >= 1.
     pub(crate) rows: usize,
     /// Highest spherical-harmonic degree, 0 to 3.
     pub(crate) sh_degree: u8,
-    /// Most (row, tile) pairs held at a time, >= rows.
+    /// Maximum number of (row, tile) pairs in the tile lists at a time, >= rows.
     pub(crate) tile_cap: usize,
-    /// Bytes of decoded images held at a time.
+    /// Bytes of decoded images kept in memory.
     pub(crate) image_cache: u64,
-    /// Bytes of training images that stay on a GPU, at most.
+    /// Maximum bytes of training images kept on a GPU.
     pub(crate) images_on_gpu: u64,
 }
 
-/// The memory limit, the wanted size, and the choices that are open.
+/// The memory limit, the wanted size, and the choices left to the solver.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct SizeRequest {
     /// The limit `[bytes]`.
     pub(crate) memory: u64,
-    /// Fewest rows of a useful model, >= 1.
-    pub(crate) least_rows: usize,
-    /// Rows at the start: the degree is lowered if fewer fit.
+    /// Minimum number of rows of a useful model, >= 1.
+    pub(crate) min_rows: usize,
+    /// Number of rows at the start; the degree is lowered if fewer fit.
     pub(crate) enough_rows: usize,
-    /// Most rows wanted or possible, >= 1.
-    pub(crate) most_rows: usize,
+    /// Maximum number of rows, wanted or possible, >= 1.
+    pub(crate) max_rows: usize,
     /// Degrees to choose from; the highest is the one wanted.
     pub(crate) sh_degree: RangeInclusive<u8>,
-    /// Most (row, tile) pairs; `None`: to be chosen.
+    /// Maximum number of (row, tile) pairs; `None`: chosen by the solver.
     pub(crate) tile_cap: Option<usize>,
-    /// (Row, tile) pairs per row if they are chosen: the minimum, and larger numbers that are used if
-    /// memory is left, in rising order.
+    /// (Row, tile) pairs per row to choose from, in ascending order; those above the first are chosen only if memory is
+    /// left.
     pub(crate) pairs: [usize; 3],
-    /// Most (row, tile) pairs possible.
-    pub(crate) most_pairs: usize,
-    /// Bytes of decoded images; `None`: to be chosen.
+    /// Maximum number of (row, tile) pairs that the device supports.
+    pub(crate) max_pairs: usize,
+    /// Bytes of decoded images; `None`: chosen by the solver.
     pub(crate) image_cache: Option<u64>,
-    /// Most bytes of decoded images that are chosen at the expense of rows.
-    pub(crate) most_images: u64,
-    /// Bytes of all images decoded.
+    /// Maximum bytes of decoded images that may reduce the number of rows.
+    pub(crate) max_images: u64,
+    /// Bytes of all images when decoded.
     pub(crate) all_images: u64,
 }
 
 /// The result of [`fit`].
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Fit {
-    /// The setting.
+    /// The size found.
     pub(crate) setting: RunSize,
     /// Memory limits the number of rows.
     pub(crate) by_memory: bool,
@@ -62,24 +62,25 @@ pub(super) struct Fit {
 /// Default (row, tile) pairs per row: the minimum, and larger numbers if memory is left. A view rarely
 /// has three per row; views with more than the limit are rendered in bands, with the same result.
 pub(super) const PAIRS: [usize; 3] = [4, 8, 16];
-/// Decoded images may take one part in this many of the memory.
-pub(super) const IMAGES: u64 = 8;
+/// Decoded images may take the memory divided by this number.
+pub(super) const IMAGE_SHARE_DIVISOR: u64 = 8;
 
 impl SizeRequest {
-    /// A size with this many pairs per row, and at most one part in [`IMAGES`] of the memory for images.
+    /// A size with this many pairs per row, and at most 1 / [`IMAGE_SHARE_DIVISOR`] of the memory for images.
     fn setting(&self, rows: usize, sh_degree: u8, pairs: usize) -> RunSize {
-        let most = self.most_pairs.max(rows);
+        let most = self.max_pairs.max(rows);
         let tile_cap = self.tile_cap.unwrap_or_else(|| rows.saturating_mul(pairs).min(most));
-        let share = self.memory / IMAGES;
-        let images = || self.all_images.min(share).min(self.most_images);
+        let share = self.memory / IMAGE_SHARE_DIVISOR;
+        let images = || self.all_images.min(share).min(self.max_images);
         let image_cache = self.image_cache.unwrap_or_else(images);
         let images_on_gpu = image_cache.min(share);
         RunSize { rows, sh_degree, tile_cap: tile_cap.max(rows), image_cache, images_on_gpu }
     }
 }
 
-/// Finds the largest size; `None` if not even the fewest rows fit. `bytes` returns the memory of a size: once above the
-/// limit, it must stay above it as rows, pairs or images grow, and images must take at most their cache and a fixed part.
+/// Finds the largest size; `None` if not even the fewest rows fit. `bytes` returns the memory of a size. Once above the
+/// limit, it must stay above it as rows, pairs or images grow, and images must take at most the size of their cache
+/// plus a constant.
 ///
 /// The degree is the highest at which enough rows fit, or else the lowest. As many rows as possible are chosen; if all
 /// wanted rows fit, the remaining memory goes to the tile lists and then to the images.
@@ -87,14 +88,14 @@ pub(super) fn fit<E>(
     request: &SizeRequest,
     mut bytes: impl FnMut(&RunSize) -> Result<u64, E>,
 ) -> Result<Option<Fit>, E> {
-    let most = request.most_rows.max(1);
-    let least = request.least_rows.clamp(1, most);
+    let most = request.max_rows.max(1);
+    let least = request.min_rows.clamp(1, most);
     let enough = request.enough_rows.clamp(least, most);
     let mut at_wanted_degree = None;
     let mut found = None;
     for degree in request.sh_degree.clone().rev() {
         let setting = |rows| request.setting(rows, degree, request.pairs[0]);
-        let rows = most_within(least, most, |rows| Ok(bytes(&setting(rows))? <= request.memory))?;
+        let rows = largest_where(least, most, |rows| Ok(bytes(&setting(rows))? <= request.memory))?;
         at_wanted_degree.get_or_insert(rows.unwrap_or(0));
         found = rows.map(|rows| (rows, degree));
         if rows.is_some_and(|rows| rows >= enough) {
@@ -125,7 +126,7 @@ pub(super) fn fit<E>(
     Ok(Some(Fit { setting, by_memory: rows < most, at_wanted_degree }))
 }
 
-/// The smallest memory in which a model fits, in multiples of `step` bytes, if there is any.
+/// The smallest memory in which a model fits, in multiples of `step` bytes; `None` if there is none.
 pub(super) fn min_memory<E>(
     request: &SizeRequest,
     step: u64,
@@ -137,16 +138,16 @@ pub(super) fn min_memory<E>(
     };
     // The smallest model with all of its images.
     let all = SizeRequest { memory: u64::MAX, ..request.clone() };
-    let least = request.least_rows.clamp(1, request.most_rows.max(1));
+    let least = request.min_rows.clamp(1, request.max_rows.max(1));
     let most = bytes(&all.setting(least, *request.sh_degree.start(), request.pairs[0]))?;
     let Ok(most) = usize::try_from(most.div_ceil(step)) else { return Ok(None) };
-    let too_little = most_within(0, most, |steps| Ok(!fits(steps, &mut bytes)?))?;
-    Ok(Some(too_little.map_or(0, |steps| steps as u64 + 1) * step))
+    let insufficient = largest_where(0, most, |steps| Ok(!fits(steps, &mut bytes)?))?;
+    Ok(Some(insufficient.map_or(0, |steps| steps as u64 + 1) * step))
 }
 
 /// The largest number in `least..=most` for which `holds` is true; it must be true up to some number
 /// and false above.
-pub(super) fn most_within<E>(
+pub(super) fn largest_where<E>(
     least: usize,
     most: usize,
     mut holds: impl FnMut(usize) -> Result<bool, E>,

@@ -1,4 +1,4 @@
-//! The guarantees of the solver, for random runs whose bytes grow as those of a backend.
+//! The guarantees of the solver, for random runs whose bytes grow like those of a backend.
 
 use std::convert::Infallible;
 
@@ -6,7 +6,7 @@ use proptest::prelude::*;
 
 use super::*;
 
-/// Bytes of an imaginary run that grow as those of real runs.
+/// Bytes of an imaginary run, which grow like those of real runs.
 #[derive(Debug, Clone)]
 struct Model {
     fixed: u64,
@@ -47,15 +47,15 @@ fn models() -> impl Strategy<Value = Model> {
 fn request(model: &Model, memory: u64) -> SizeRequest {
     SizeRequest {
         memory,
-        least_rows: 1_000,
+        min_rows: 1_000,
         enough_rows: 20_000,
-        most_rows: u32::MAX as usize,
+        max_rows: u32::MAX as usize,
         sh_degree: 0..=3,
         tile_cap: None,
         pairs: PAIRS,
-        most_pairs: u32::MAX as usize,
+        max_pairs: u32::MAX as usize,
         image_cache: None,
-        most_images: 1 << 30,
+        max_images: 1 << 30,
         all_images: model.all_images,
     }
 }
@@ -71,17 +71,17 @@ fn requests() -> impl Strategy<Value = (Model, SizeRequest)> {
         prop_oneof![Just(PAIRS), Just([1; 3]), Just([4; 3])],
     );
     (models(), sizes).prop_map(|(model, sizes)| {
-        let (memory, most_rows, tile_cap, image_cache, lowest, pairs) = sizes;
+        let (memory, max_rows, tile_cap, image_cache, lowest, pairs) = sizes;
         let sh_degree = lowest..=3;
         let open = request(&model, memory);
-        let request = SizeRequest { most_rows, tile_cap, image_cache, sh_degree, pairs, ..open };
+        let request = SizeRequest { max_rows, tile_cap, image_cache, sh_degree, pairs, ..open };
         (model, request)
     })
 }
 
-/// The size fits, keeps what was given, and cannot be larger.
+/// Checks that the size fits, keeps the given values, and cannot be larger.
 fn check_fit(model: &Model, request: &SizeRequest) -> Result<(), TestCaseError> {
-    let SizeRequest { memory, most_rows: most, tile_cap, image_cache, pairs, .. } = *request;
+    let SizeRequest { memory, max_rows: most, tile_cap, image_cache, pairs, .. } = *request;
     let lowest = *request.sh_degree.start();
     let Some(Fit { setting, by_memory, at_wanted_degree }) = model.fit(request) else {
         let least = request.setting(1_000.min(most), lowest, pairs[0]);
@@ -108,7 +108,7 @@ fn check_fit(model: &Model, request: &SizeRequest) -> Result<(), TestCaseError> 
                 || model.bytes(&images) > memory
         );
     }
-    // A lower degree needs a reason.
+    // The degree is lowered only if too few rows fit at a higher one.
     let enough = 20_000.min(most);
     prop_assert!(setting.sh_degree == 3 || at_wanted_degree < enough);
     if setting.sh_degree < 3 {
@@ -122,12 +122,12 @@ proptest! {
     #![proptest_config(ProptestConfig { failure_persistence: None, ..Default::default() })]
 
     #[test]
-    fn what_is_found_fits_and_a_row_more_does_not((model, request) in requests()) {
+    fn the_result_fits_and_one_more_row_does_not((model, request) in requests()) {
         check_fit(&model, &request)?;
     }
 
     #[test]
-    fn more_memory_is_never_a_smaller_model(
+    fn more_memory_never_gives_a_smaller_model(
         model in models(),
         memory in 0..2_000_000_000_u64,
         more in 0..200_000_000_u64,
@@ -140,7 +140,7 @@ proptest! {
     }
 
     #[test]
-    fn the_least_memory_is_the_least(model in models(), step in 1..2_000_000_u64) {
+    fn min_memory_is_minimal(model in models(), step in 1..2_000_000_u64) {
         let request = request(&model, 0);
         let bytes = |setting: &RunSize| Ok::<_, Infallible>(model.bytes(setting));
         let least = min_memory(&request, step, bytes).unwrap_or_else(|never| match never {});

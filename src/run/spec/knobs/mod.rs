@@ -1,7 +1,8 @@
-//! The knobs: settings that trade speed or memory for accuracy. One table has their names, domains and worst-case cost.
+//! The knobs: settings that trade speed or memory for accuracy. One table lists their names, domains and worst-case
+//! cost.
 //!
-//! A knob is set with `--knob NAME=VALUE`, or in the table `[knob]` of a file. [`Knobs`] holds those of a
-//! run; [`Preset`]s are knobs and options that go together.
+//! A knob is set with `--knob NAME=VALUE`, or in the table `[knob]` of a file. [`Knobs`] holds the knobs of a run;
+//! [`Preset`]s are knobs and options that go together.
 
 mod presets;
 mod settings;
@@ -21,7 +22,7 @@ pub use table::KNOBS;
 pub struct Knob {
     /// Such as `alpha_min`.
     pub name: &'static str,
-    /// Value of a run that does not set it.
+    /// Value if it is not set.
     pub default: &'static str,
     /// The values that it may have.
     pub domain: Domain,
@@ -102,7 +103,7 @@ impl BadInput for KnobError {}
 /// The knob of this name.
 ///
 /// # Errors
-/// When there is none, with the name most like it.
+/// When there is none; names the most similar knob.
 pub fn find(name: &str) -> Result<&'static Knob, KnobError> {
     KNOBS.iter().find(|knob| knob.name == name).ok_or_else(|| {
         let alike = KNOBS.iter().map(|knob| (strsim::jaro_winkler(name, knob.name), knob.name));
@@ -112,10 +113,10 @@ pub fn find(name: &str) -> Result<&'static Knob, KnobError> {
 }
 
 impl Knob {
-    /// A value as the table spells it, so that equal values are equal texts.
+    /// A value in the table's spelling, so that equal values have equal texts.
     ///
     /// # Errors
-    /// When it is outside the domain, with the nearest that is not.
+    /// When it is outside the domain; names the nearest valid value.
     pub fn canonical(&self, text: &str) -> Result<String, KnobError> {
         let text = text.trim();
         let bad = |nearest: String| KnobError::OutOfDomain {
@@ -128,16 +129,16 @@ impl Knob {
             Domain::Choice(words) if words.contains(&text) => Ok(text.to_owned()),
             Domain::Choice(words) => Err(bad(nearest_word(text, words).to_owned())),
             Domain::Number { least, most } => match number(text) {
-                Some(value) if (least..=most).contains(&value) => Ok(self.spelled(value)),
-                Some(value) if value < least => Err(bad(self.spelled(least))),
-                Some(value) if value > most => Err(bad(self.spelled(most))),
+                Some(value) if (least..=most).contains(&value) => Ok(self.spell(value)),
+                Some(value) if value < least => Err(bad(self.spell(least))),
+                Some(value) if value > most => Err(bad(self.spell(most))),
                 _ => Err(bad(self.default.to_owned())),
             },
         }
     }
 
-    /// A number as the default, the levels or the ends of the domain spell it, else as a decimal.
-    fn spelled(&self, value: f64) -> String {
+    /// A number as the default or a level spells it, else as a decimal.
+    fn spell(&self, value: f64) -> String {
         let known = self.levels.iter().copied().chain([self.default]);
         let same =
             |text: &&str| number(text).is_some_and(|number| number.total_cmp(&value).is_eq());
@@ -156,13 +157,13 @@ fn number(text: &str) -> Option<f64> {
     value.is_finite().then_some(value)
 }
 
-/// The shorter of the two ways to write a number.
+/// The shorter of the decimal and the scientific notation of a number.
 fn plain(value: f64) -> String {
     let (decimal, power) = (format!("{value}"), format!("{value:e}"));
     if power.len() < decimal.len() { power } else { decimal }
 }
 
-/// The number among the words nearest to a number, else the word most like a word.
+/// The word with the nearest number if `text` is a number, else the word most like `text`.
 fn nearest_word(text: &str, words: &'static [&'static str]) -> &'static str {
     let distance = |word: &str| match (number(text), number(word)) {
         (Some(a), Some(b)) => (a - b).abs(),

@@ -1,5 +1,5 @@
-//! Presets: knobs and options that go together, named by what they promise. Levels follow from measurements by
-//! `densify trade`, which each preset quotes.
+//! Presets: knobs and options that go together, named by what they promise. Each preset quotes the measurements by
+//! `densify trade` that its levels follow from.
 
 use std::fmt;
 
@@ -54,7 +54,7 @@ const LONG_COMMAND: &str = "densify trade scene:spheres scene:room data/chair da
 /// The preset that others are measured against.
 pub const EXACT: &str = "exact";
 
-/// The preset of a run that names none.
+/// The default preset.
 pub const DEFAULT_PRESET: &str = "balanced";
 
 /// All presets.
@@ -70,11 +70,10 @@ pub static PRESETS: &[Preset] = &[
         ],
         measured: None,
     },
-    // In runs as long as these, every other level loses more for the time that it saves:
-    // docs/tradeoffs.md.
+    // In runs of this length, every other level loses more quality for the time that it saves: docs/tradeoffs.md.
     Preset {
         name: "balanced",
-        promise: "four fifths of the iterations; what the others bring cannot be seen",
+        promise: "four fifths of the iterations; the rest make no visible difference",
         levels: &[("iterations", "24000")],
         measured: Some(Measured {
             psnr: -0.01,
@@ -140,7 +139,7 @@ impl fmt::Display for Preset {
             self.levels.iter().map(|(knob, value)| format!("{knob}={value}")).collect();
         write!(f, "{}: {}; {}; ", self.name, self.promise, levels.join(" "))?;
         match self.measured {
-            None => f.write_str("what the others are measured against"),
+            None => f.write_str("the reference for the others"),
             Some(Measured { psnr, interval: [low, high], seconds, peak, on, .. }) => write!(
                 f,
                 "{psnr:+.2} dB [{low:+.2}, {high:+.2}], {seconds:.2} of the processor time and {peak:.2} \

@@ -1,4 +1,4 @@
-//! The knobs of a run, with what follows from them for backends and for the trainer.
+//! The knobs of a run, and the settings of backends and of the trainer that follow from them.
 
 use std::collections::BTreeMap;
 
@@ -15,7 +15,7 @@ pub struct Knobs {
     pub shortcuts: Shortcuts,
     /// Storage of parameters and moments.
     pub storage: Storage,
-    /// (Row, tile) pairs held per row of the budget; `None`: from `--tile-cap` and `--memory`.
+    /// Maximum number of (row, tile) pairs per row of the budget; `None`: from `--tile-cap` and `--memory`.
     pub pairs_per_row: Option<usize>,
     /// The order in which a GPU adds up gradients; `None`: the fastest that it has.
     pub accumulation: Option<Accumulation>,
@@ -80,7 +80,7 @@ impl Knobs {
         self.iter().filter(|(knob, value)| *value != knob.default)
     }
 
-    /// All knobs by name, as files have them.
+    /// All knobs by name, as in files.
     pub fn table(&self) -> Table {
         self.iter().map(|(knob, value)| (knob.name.to_owned(), value.into())).collect()
     }

@@ -85,7 +85,7 @@ pub static KNOBS: &[Knob] = &[
     },
 ];
 
-/// The number of a value in the table's spelling.
+/// Parses a number in the table's spelling.
 fn real(value: &str) -> f64 {
     number(value).unwrap_or_default()
 }

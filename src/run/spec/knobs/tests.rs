@@ -1,4 +1,4 @@
-//! Tests of the table and of what its values may be.
+//! Tests of the table and of the domains of its values.
 
 use std::collections::BTreeSet;
 
@@ -12,7 +12,7 @@ fn canonical(setting: &str) -> Result<String, KnobError> {
 }
 
 #[test]
-fn the_table_agrees_with_itself() {
+fn the_table_is_consistent() {
     let mut names = BTreeSet::new();
     for knob in KNOBS {
         let name = knob.name;

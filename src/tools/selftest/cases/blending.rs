@@ -1,6 +1,6 @@
 //! Opacities at the thresholds of the renderer, thousands of faint layers, and opaque rows in front of them.
 
-use super::{GREY, UPRIGHT, shade, straight};
+use super::{GREY, UPRIGHT, axis_camera, shade};
 use crate::compare::class;
 use crate::reference::{CLASSES, Model, Rules, View, render};
 use crate::scenes;
@@ -15,7 +15,7 @@ fn logit(opacity: f64) -> f32 {
 
 /// Alphas around the minimum, around the clamp, and at both extremes.
 pub(super) fn opacities(trial: &mut Trial<'_>) -> Result<(), BackendError> {
-    let camera = straight(33, 27);
+    let camera = axis_camera(33, 27);
     let minimum = 1.0 / 255.0;
     let alphas = [
         1e-30,
@@ -44,7 +44,7 @@ pub(super) fn opacities(trial: &mut Trial<'_>) -> Result<(), BackendError> {
 }
 
 pub(super) fn layers(trial: &mut Trial<'_>) -> Result<(), BackendError> {
-    let camera = straight(5, 4);
+    let camera = axis_camera(5, 4);
     // σ(−5.53) is a little above 1/255.
     let all = [(600_usize, -3.0_f32), (20_000, -5.0), (2_400, -5.53), (100_000, -5.53)];
     for (rows, logit) in all {
@@ -68,7 +68,7 @@ pub(super) fn layers(trial: &mut Trial<'_>) -> Result<(), BackendError> {
             rgb.iter().map(|v| (f64::from(*v) / exact - 1.0).abs()).fold(0.0, f64::max)
         });
         trial.record(&label, "transmittance, relative", errors.fold(0.0, f64::max), 2e-4);
-        // (254/255)^n falls to 1e-4 at n = 2,345, where every pixel ends.
+        // (254/255)^n falls to 1e-4 at n = 2,345, where blending stops in every pixel.
         let blended: u32 = gradient.pixel_count.iter().sum();
         let pixels = camera.width * camera.height;
         trial.record(&label, "Gaussians in a pixel", f64::from(blended / pixels), 2345.0);
@@ -76,9 +76,9 @@ pub(super) fn layers(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     side_by_side(trial)
 }
 
-/// Rows of one tile, of which each pixel is covered by at most a twentieth, so that the list is read to its end.
+/// Many rows in one tile, at most a twentieth of which cover the same pixel, so that the list is read to its end.
 fn side_by_side(trial: &mut Trial<'_>) -> Result<(), BackendError> {
-    let camera = straight(16, 16);
+    let camera = axis_camera(16, 16);
     let mut model = Gaussians::default();
     for row in 0..100_000 {
         let z = 1.0 + row as f32 / 100_000.0;
@@ -92,7 +92,7 @@ fn side_by_side(trial: &mut Trial<'_>) -> Result<(), BackendError> {
 }
 
 pub(super) fn behind_opaque(trial: &mut Trial<'_>) -> Result<(), BackendError> {
-    let camera = straight(21, 17);
+    let camera = axis_camera(21, 17);
     // The last two are clamped to 0.99 at their centre.
     for opacity in [0.98, 0.9895, 0.9995, 0.9999] {
         let mut model = Gaussians::default();
@@ -118,7 +118,7 @@ pub(super) fn logits(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         trial.check(&label, &model, &camera, GREY, 0)?;
 
         // A single row on a pixel's centre: alpha is the opacity, and the gradient its derivative.
-        let camera = straight(17, 17);
+        let camera = axis_camera(17, 17);
         let mut model = Gaussians::default();
         scenes::push(&mut model, [0.0, 0.0, 1.0], [0.05; 3], UPRIGHT, logit, |_| 0.0);
         let mut backend = trial.subject.backend(&model)?;

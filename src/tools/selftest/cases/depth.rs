@@ -1,6 +1,6 @@
 //! Rows at the camera, around the near plane, and at equal or nearly equal depths.
 
-use super::{GREY, UPRIGHT, flat_colour, straight};
+use super::{GREY, UPRIGHT, axis_camera, flat_colour};
 use crate::scenes;
 use crate::trial::{Trial, bits, count_different};
 use densify_core::gaussians::Gaussians;
@@ -24,7 +24,7 @@ pub(super) fn near_plane(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     trial.check("behind and near", &model, &camera, GREY, 1)?;
 
     // One bit to either side of the plane; without rotation, camera z equals the mean's z exactly.
-    let camera = straight(16, 16);
+    let camera = axis_camera(16, 16);
     for z in [NEAR.next_down(), NEAR, NEAR.next_up()] {
         let mut model = Gaussians::default();
         scenes::push(&mut model, [0.0, 0.0, z], [z / 20.0; 3], UPRIGHT, 2.0, flat_colour);
@@ -37,7 +37,7 @@ pub(super) fn near_plane(trial: &mut Trial<'_>) -> Result<(), BackendError> {
 }
 
 pub(super) fn camera_inside(trial: &mut Trial<'_>) -> Result<(), BackendError> {
-    let camera = straight(40, 30);
+    let camera = axis_camera(40, 30);
     for times in [1.0_f32, 10.0, 100.0] {
         let mut model = Gaussians::default();
         for (row, z) in [0.02_f32, 0.3, 1.0].into_iter().enumerate() {
@@ -54,7 +54,7 @@ pub(super) fn camera_inside(trial: &mut Trial<'_>) -> Result<(), BackendError> {
 
 pub(super) fn camera_at_mean(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     for (label, offset) in [("0", 0.0), ("1e-20", 1e-20_f32), ("0.001", 1e-3)] {
-        let camera = straight(33, 30);
+        let camera = axis_camera(33, 30);
         let mut model = scenes::cloud(10, 2, &camera, 34);
         for row in 0..3 {
             model.means[row] = [0.0; 3];
@@ -63,8 +63,8 @@ pub(super) fn camera_at_mean(trial: &mut Trial<'_>) -> Result<(), BackendError> 
         }
         let label = format!("{label} from the camera");
         let gradient = trial.check_finite(&label, &model, &camera, GREY, 2)?;
-        let pulled = gradient.sh[..3 * 27].iter().filter(|g| **g != 0.0).count();
-        trial.count(&label, "gradients of SH without a direction", pulled);
+        let nonzero = gradient.sh[..3 * 27].iter().filter(|g| **g != 0.0).count();
+        trial.count(&label, "gradients of SH without a direction", nonzero);
     }
     Ok(())
 }
@@ -87,7 +87,7 @@ pub(super) fn equal_depths(trial: &mut Trial<'_>) -> Result<(), BackendError> {
 }
 
 pub(super) fn depth_order(trial: &mut Trial<'_>) -> Result<(), BackendError> {
-    let camera = straight(16, 16);
+    let camera = axis_camera(16, 16);
     // Red in front of green, in both orders of the rows.
     let (red, green) = ([1.5, -2.0, -2.0], [-2.0, 1.5, -2.0]);
     let (mut wrong, mut pairs) = (0, 0);

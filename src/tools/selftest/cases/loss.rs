@@ -98,8 +98,8 @@ pub(super) fn uniform_photographs(trial: &mut Trial<'_>) -> Result<(), BackendEr
         let tolerance = if matches!(trial.subject, Subject::Gpu(_)) { 3e-7 } else { 0.0 };
         trial.record(&label, "loss of equal images", off, tolerance);
         if tolerance == 0.0 {
-            let pulled = gradient.iter().filter(|g| g.abs() > 1e-12).count();
-            trial.count(&label, "gradients of equal images", pulled);
+            let nonzero = gradient.iter().filter(|g| g.abs() > 1e-12).count();
+            trial.count(&label, "gradients of equal images", nonzero);
         }
     }
     // An empty view that equals its photograph moves no row.

@@ -57,7 +57,7 @@ pub fn cases() -> &'static [Case] {
 }
 
 /// A camera at the origin that looks along z, with a focal length of 64 px.
-fn straight(width: u32, height: u32) -> Camera {
+fn axis_camera(width: u32, height: u32) -> Camera {
     Camera {
         translation: DVec3::ZERO,
         ..Camera::centred((width, height), (64.0, 64.0), DMat3::IDENTITY, DVec3::ZERO)

@@ -2,7 +2,7 @@
 
 use densify_policies::plan::EditPlan;
 
-use super::{GREY, UPRIGHT, flat_colour, shade, straight};
+use super::{GREY, UPRIGHT, axis_camera, flat_colour, shade};
 use crate::compare::class;
 use crate::reference::CLASSES;
 use crate::scenes;
@@ -38,7 +38,7 @@ pub(super) fn no_row(trial: &mut Trial<'_>) -> Result<(), BackendError> {
 }
 
 pub(super) fn one_row(trial: &mut Trial<'_>) -> Result<(), BackendError> {
-    let camera = straight(64, 64);
+    let camera = axis_camera(64, 64);
     for scale in [0.01, 0.1, 1.0] {
         let mut model = Gaussians::default();
         scenes::push(&mut model, [0.0, 0.0, 2.0], [scale; 3], UPRIGHT, 0.0, flat_colour);
@@ -70,7 +70,7 @@ pub(super) fn invisible(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let (image, gradient) = backend.differentiate(&camera, BACKGROUND, 1, &upstream)?;
     trial.count("all Gaussians", "pixels other than the background", count_drawn(&image));
     let gradients = CLASSES.iter().flat_map(|name| class(&gradient, name));
-    let pulled = gradients.filter(|g| **g != 0.0).count();
-    trial.count("all Gaussians", "gradients of invisible Gaussians", pulled);
+    let nonzero = gradients.filter(|g| **g != 0.0).count();
+    trial.count("all Gaussians", "gradients of invisible Gaussians", nonzero);
     trial.train("all Gaussians", &mut *backend, &camera, BACKGROUND, 1)
 }

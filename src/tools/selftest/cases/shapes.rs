@@ -1,6 +1,6 @@
 //! Rows of every shape and size, in general position and far outside the frustum.
 
-use super::{GREY, flat_colour, straight};
+use super::{GREY, axis_camera, flat_colour};
 use crate::compare::relative_error;
 use crate::scenes;
 use crate::trial::{Trial, count_broken};
@@ -29,7 +29,7 @@ fn cloud_of_scale(camera: &Camera, value: f32) -> Gaussians {
 
 pub(super) fn scales(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = scenes::camera(40, 30, 17);
-    // exp(−43.7)² is the smallest normal number; from exp(2.3) on, training stops growth.
+    // exp(−43.7)² is the smallest normal number; training clamps standard deviations at exp(2.3).
     for value in [-80.0, -43.7, -30.0, -20.0, 0.0, 2.3] {
         let label = format!("log-scale {value}");
         trial.check(&label, &cloud_of_scale(&camera, value), &camera, GREY, 0)?;
@@ -52,7 +52,7 @@ pub(super) fn quaternions(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         }
         model
     };
-    // Beyond 1.8e19 the square of the length overflows; below 1e-18 those of the components are subnormal,
+    // Beyond 1.8e19 the square of the length overflows. Below 1e-18 the squares of its components are subnormal,
     // which devices may flush to zero (WGSL, "Differences from IEEE-754"), as SwiftShader does.
     for length in [1e-15_f32, 1e-8, 1e-5, 1.0, 1e6, 1e18] {
         let label = format!("length {length:e}");
@@ -72,7 +72,7 @@ pub(super) fn quaternions(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let radial = along.fold(0.0, f64::max) / largest;
         trial.record(&label, "gradient along the length", radial, 2e-6);
     }
-    // Without a direction the row is not rendered; a step resets it to no rotation.
+    // A row with a zero quaternion is not rendered; the next step resets the quaternion to the identity.
     for length in [0.0, 1e-30] {
         let label = format!("length {length:e}");
         let mut model = scaled(1.0);
@@ -81,18 +81,18 @@ pub(super) fn quaternions(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let image = backend.render(&camera, GREY, 0)?;
         trial.count(&label, "NaN or infinity", count_broken(&[&image.rgb, &image.depth]));
         trial.train(&label, &mut *backend, &camera, GREY, 0)?;
-        // The first row was pruned, so that the row is the third now.
+        // `train` pruned the first row, so row 3 is now row 2.
         let upright = backend.download()?.quats[2][0] > 0.99;
-        trial.count(&label, "Gaussians that stay without a rotation", usize::from(!upright));
+        trial.count(&label, "Gaussians whose zero quaternion was not reset", usize::from(!upright));
     }
     Ok(())
 }
 
 pub(super) fn needles(trial: &mut Trial<'_>) -> Result<(), BackendError> {
-    let camera = straight(48, 48);
-    // The gradient of the long axis is the remainder after the short axis's part of dL/dΣ, larger by the
-    // squared ratio of the widths, cancels. By the usual formula with the inverse of Σ, nothing is left of it
-    // at 300 px.
+    let camera = axis_camera(48, 48);
+    // In the gradient of the long axis a much larger part, from the short axis of dL/dΣ, must cancel: larger by
+    // the squared ratio of the widths. With the usual formula, which has the inverse of Σ, the gradient is lost
+    // entirely at 300 px.
     trial.limits.interior = 1e-3;
     for (sigma_px, tolerance) in [(10.0_f32, 1e-3), (100.0, 5e-3), (1000.0, 1e-1)] {
         trial.gradient_tolerance = tolerance;
@@ -120,15 +120,15 @@ pub(super) fn needles(trial: &mut Trial<'_>) -> Result<(), BackendError> {
 ///
 /// Log-scales change the diagonal D of Σ = R D Rᵀ by 2D. A rotation δ about an axis of the row changes q by half
 /// of q ⊗ (0, δ), and the elements ij and ji of the other two axes by (Dᵢ − Dⱼ) δ.
-fn by_covariance(model: &Gaussians, log_scales: [f64; 3], quats: [f64; 4]) -> [f64; 5] {
+fn by_covariance(model: &Gaussians, d_log_scales: [f64; 3], d_quat: [f64; 4]) -> [f64; 5] {
     let variance = model.log_scales[0].map(|log| (2.0 * f64::from(log)).exp());
     let [w, x, y, z] = model.quats[0].map(f64::from);
-    let [gw, gx, gy, gz] = quats;
+    let [gw, gx, gy, gz] = d_quat;
     // Half the imaginary part of conj(q) ⊗ g.
     let turn_y = 0.5 * (w * gy - y * gw - z * gx + x * gz);
     let turn_z = 0.5 * (w * gz - z * gw - x * gy + y * gx);
     let [a, b, c] = variance;
-    let diagonal = [0, 1, 2].map(|i| log_scales[i] / (2.0 * variance[i]));
+    let diagonal = [0, 1, 2].map(|i| d_log_scales[i] / (2.0 * variance[i]));
     let [xx, yy, zz] = diagonal;
     [xx, yy, zz, turn_z / (2.0 * (a - b)), turn_y / (2.0 * (c - a))]
 }

@@ -1,6 +1,6 @@
 //! Awkward image sizes, extreme lenses, and rows that fill the image.
 
-use super::{GREY, UPRIGHT, shade, straight};
+use super::{GREY, UPRIGHT, axis_camera, shade};
 use crate::reference::{Model, Rules, View, blend, project};
 use crate::scenes;
 use crate::trial::{Trial, count_broken, step};
@@ -85,7 +85,7 @@ pub(super) fn large_rows(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let (rows, front) = if trial.long { (530_000, 128) } else { (300, 128) };
     // The long case uses the default, which is 16 entries per row.
     let tile_cap = (!trial.long).then_some(rows * TILES as usize / 6);
-    let camera = straight(1920, 1080);
+    let camera = axis_camera(1920, 1080);
     let model = |rows: usize| {
         let mut model = Gaussians::default();
         for row in 0..rows {
@@ -110,8 +110,8 @@ pub(super) fn large_rows(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let mut backend = trial.subject.backend_with(&all, setup)?;
     let output = step(&mut *backend, 1, &camera, &target, GREY, 0)?;
     if let (Some(before), Some(after), true) = (before, resident(), trial.is_memory_measurable()) {
-        let held = after.saturating_sub(before) as f64 / backend.ledger().total() as f64;
-        trial.record(&label, "memory used, relative to the ledger", held, 1.1);
+        let used = after.saturating_sub(before) as f64 / backend.ledger().total() as f64;
+        trial.record(&label, "memory used, relative to the ledger", used, 1.1);
     }
     let miscounted = output.entries.abs_diff(rows as u64 * TILES) as usize;
     trial.count(&label, "entries miscounted", miscounted);

@@ -1,4 +1,4 @@
-//! Whole training runs on small images, with checks on the way: no number drifts, and the budget is kept.
+//! Whole training runs on small images, with intermediate checks: no number drifts, and the budget is kept.
 
 use std::sync::Arc;
 

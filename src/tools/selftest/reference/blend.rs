@@ -213,8 +213,8 @@ fn add_exponent(sum: &mut ScreenGradient, splat: &Splat, hit: &Contribution, d_e
     sum.conic[2] += d_exponent * 0.5 * dy * dy;
 }
 
-/// Upper bounds of what the pixels outside `counted` add to a row's statistics, whatever is decided at close
-/// thresholds: largest weight, sum of weights, number of pixels.
+/// Upper bounds of the contributions of the pixels outside `counted` to each row's statistics, however close
+/// thresholds are decided: largest weight, sum of weights, number of pixels.
 pub fn leeway(
     splats: &[Splat],
     order: &[usize],

@@ -16,7 +16,7 @@ fn final_count(runs: &[&Outcome]) -> String {
     or_dash(rows.map(|rows| grouped(rows.round() as usize)))
 }
 
-/// Most Gaussians at any instant of any run; a dash without runs.
+/// Largest number of Gaussians at any instant of any run; a dash without runs.
 fn peak_count(runs: &[&Outcome]) -> String {
     let peak = runs.iter().map(|run| run.peak_rows).max();
     let mark = if runs.iter().all(|run| run.kept_its_budget()) { "" } else { " (over)" };
@@ -34,8 +34,8 @@ fn budgets(outcomes: &[Outcome]) -> Vec<usize> {
 pub(super) fn add_tables(document: &mut Document, outcomes: &[Outcome], policies: &[String]) {
     document.section("Gaussians at the end and at the true peak");
     document.paragraph(
-        "At the end: means over seeds. True peak: the most at any instant of any seed. A policy that ends below its \
-         budget is compared at equal peak above, and by what it ends with here.",
+        "At the end: means over seeds. True peak: the maximum at any instant of any seed. The \
+        tables above compare policies at equal peak; these also show what each ends with.",
     );
     for budget in budgets(outcomes) {
         let scenes =
@@ -78,7 +78,7 @@ pub(super) fn format(outcomes: &[Outcome], policies: &[String]) -> String {
         table.row(cells);
     }
     format!(
-        "Gaussians at the end (mean of the runs) and at the true peak (most of any), by budget\n\n{table}"
+        "Gaussians at the end (mean over runs) and at the true peak (maximum), by budget\n\n{table}"
     )
 }
 

@@ -20,7 +20,7 @@ use densify_train::evaluate::Split;
 use densify_train::output::model_path;
 use densify_train::pictures::{photograph, picture, side_by_side, write_png};
 
-/// Least width of an enlarged crop `[px]`. The factor is an integer.
+/// Minimum width of an enlarged crop `[px]`. The factor is an integer.
 const MIN_WIDTH: u32 = 480;
 /// Space between crops `[px]`.
 const GAP: u32 = 6;

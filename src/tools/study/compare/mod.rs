@@ -44,18 +44,17 @@ Examples:
 
 /// Trains a scene with several policies, under the same conditions, and says which did best.
 ///
-/// Every policy runs with every budget and every seed, one run after another. A run that is
-/// finished is not run again: call the same command to go on after an interruption. The folder then
-/// holds compare.md (tables and pictures), compare.html (the same as one file), compare.jsonl (a record per run),
-/// plots as SVG, and the runs themselves. With --engine a cluster makes the runs.
+/// Every policy runs with every budget and every seed, one run after another. Finished runs are not
+/// repeated: after an interruption, the same command continues. The folder then holds compare.md
+/// (tables and pictures), compare.html (the same as one file), compare.jsonl (a record per run),
+/// plots as SVG, and the runs themselves. With --engine the runs can be trained on a cluster.
 ///
-/// Quality is measured on views held out. Differences are taken between runs of the same scene,
-/// budget and seed, against the first policy named, with 95 % intervals of their mean from three
-/// seeds on; policies are ranked by that mean. A run whose peak exceeded its budget is marked, and
-/// takes no part in the ranking. The budget bounds the peak, and some policies end far below it: how
-/// many Gaussians each has at the end stands beside the peak. Where the geometry is known (built-in
-/// scenes, and those that `densify scenegen` wrote), the tables also say how well the Gaussians sit
-/// on it.
+/// Quality is measured on held-out views. Differences are between runs of the same scene, budget and
+/// seed, against the first policy named, with 95 % intervals of their mean from three seeds on;
+/// policies are ranked by that mean. A run whose peak exceeded its budget is marked and not ranked.
+/// The budget bounds the peak, and some policies end far below it, so the number of Gaussians at the
+/// end is shown beside the peak. Where the geometry is known (built-in scenes, and those that
+/// `densify scenegen` wrote), the tables also show how well the Gaussians match it.
 #[derive(Debug, Clone, Args)]
 #[command(after_help = EXAMPLES)]
 pub struct Comparison {
@@ -63,15 +62,15 @@ pub struct Comparison {
     #[arg(required = true)]
     pub scenes: Vec<PathBuf>,
     /// Policies, separated by commas; the others are compared with the first. `all` stands for all that
-    /// are not named besides. A policy with parameters of its own is one more: diet:rho=0, or
+    /// are not named otherwise. A policy with parameters counts as another policy: diet:rho=0, or
     /// diet:rho=0:split=random
     #[arg(long, value_name = "NAMES", value_delimiter = ',', required = true)]
     pub policies: Vec<String>,
-    /// Budgets in Gaussians, separated by commas; SCENE=ROWS for one scene alone, by its folder's
-    /// name, which then takes part with these only
+    /// Budgets in Gaussians, separated by commas; SCENE=ROWS is for one scene, named by its folder,
+    /// which then has no other budgets
     #[arg(short, long, value_name = "ROWS", value_delimiter = ',', required = true, value_parser = SceneBudget::parse)]
     pub budget: Vec<SceneBudget>,
-    /// Runs of each kind, with seeds 0, 1, …
+    /// Number of runs of each kind, with seeds 0, 1, …
     #[arg(long, value_name = "K", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub seeds: u32,
     /// Length of each run
@@ -93,7 +92,7 @@ pub struct Comparison {
 pub struct SceneBudget {
     /// Label of the scene, if the budget is for one scene only.
     pub scene: Option<String>,
-    /// Most Gaussians.
+    /// Maximum number of Gaussians.
     pub rows: usize,
 }
 
@@ -143,7 +142,7 @@ impl Comparison {
         study.finish("compare", &document, report::summary(&outcomes, &policies)).map(Some)
     }
 
-    /// All runs in the order of training: seed after seed, so that an interrupted comparison is fair with fewer seeds.
+    /// All runs in the order of training: seed after seed, so that an interrupted comparison is still fair.
     fn plan_runs(&self, policies: &[String], train: Partial) -> Result<Vec<PlannedRun>, Failure> {
         let shared = shared_options(train, &OWN_OPTIONS)?;
         require_unique(&self.budget, "--budget")?;
@@ -181,7 +180,7 @@ impl Comparison {
     }
 }
 
-/// The named policies, each once. `all` stands for the registered policies that are not named besides, ordered by
+/// The named policies, each once. `all` stands for the registered policies that are not named otherwise, ordered by
 /// name.
 fn all_policies(named: &[String]) -> Result<Vec<String>, Failure> {
     require_unique(named, "--policies")?;
@@ -269,7 +268,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn all_stands_for_the_policies_that_are_not_named_besides() {
+    fn all_stands_for_the_policies_that_are_not_named_otherwise() {
         let expanded = |text: &str| {
             let named: Vec<String> = text.split(',').map(String::from).collect();
             all_policies(&named).map_err(|failure| failure.to_string())

@@ -189,7 +189,7 @@ rank  policy  PSNR [dB]  from a                  SSIM  rank    FLIP  rank  runs
     }
 
     #[test]
-    fn what_broke_every_budget_has_no_rank() {
+    fn a_policy_that_broke_every_budget_has_no_rank() {
         let broken = Outcome { peak_rows: 1001, ..run("b", "room", 0, 99.0) };
         let all = [broken, run("a", "room", 0, 30.0), run("c", "room", 0, 29.0)];
         let text = table(&all, &["a", "b", "c"].map(String::from)).to_string();

@@ -82,9 +82,8 @@ pub(super) fn add_options(document: &mut Document, outcomes: &[Outcome]) -> Resu
     let versions = Vec::from_iter(versions).join(", ");
     document.section("Options");
     document.paragraph(format!(
-        "Of every run, with densify {versions}, defaults included; the tables above name what \
-         differs. What is not here differs between runs or was chosen by each, and stands in its \
-         config.toml."
+        "The options that all runs share, with densify {versions}, defaults included. Options that \
+        differ between runs, or that each run chose itself, are in its config.toml."
     ));
     document.code("toml", shared);
     Ok(())

@@ -91,7 +91,7 @@ fn checked_factor(
             (*is_exact, levels.for_study(study))
         } else if RunOption::find(name).is_some() {
             if given.is_empty() {
-                return Err(Failure::input(format!("say at which levels, as {name}:VALUE:VALUE")));
+                return Err(Failure::input(format!("give the levels, as in {name}:VALUE:VALUE")));
             }
             (false, Vec::new())
         } else {

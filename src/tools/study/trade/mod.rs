@@ -33,32 +33,32 @@ Examples:
   densify trade data/garden --knobs alpha_min,sh_degree --seeds 5 -- -r 4
   densify trade scene:spheres --knobs alpha_min:1/96:1/48 -i 1000 -b 5k -- --policy taming";
 
-/// Measures what each shortcut costs and buys.
+/// Measures what each shortcut costs and gains.
 ///
-/// For every knob (`densify knobs`) and each of its levels: what training with it arrives at, on views
-/// held out, with time and memory at its peak. One knob at a time from the preset `exact`, with
-/// the same seeds.
+/// Trains with every knob (`densify knobs`) at each of its levels, one at a time, and otherwise with
+/// the preset `exact` and the same seeds. Reports the quality of held-out views, the time, and the
+/// peak memory.
 ///
-/// A run that is finished is not run again: call the same command to go on after an interruption. The
-/// folder then holds trade.md (tables and plots), trade.html (the same as one file), trade.jsonl (a record per
-/// line), plots as SVG, and the runs themselves. With --engine a cluster makes the runs.
+/// Finished runs are not repeated: after an interruption, the same command continues. The folder then
+/// holds trade.md (tables and plots), trade.html (the same as one file), trade.jsonl (a record per
+/// line), plots as SVG, and the runs themselves. With --engine the runs can be trained on a cluster.
 #[derive(Debug, Clone, Args)]
 #[command(after_help = EXAMPLES)]
 pub struct Trade {
     /// Folders of the scenes, or built-in scenes (scene:NAME)
     #[arg(required = true)]
     pub scenes: Vec<PathBuf>,
-    /// Knobs, separated by commas; a knob with levels of its own as alpha_min:1/64:1/32
-    /// `[default: all that the policy has]`
+    /// Knobs or options, separated by commas; with levels as in alpha_min:1/64:1/32 `[default: all knobs that
+    /// apply, and some options]`
     #[arg(long, value_name = "NAMES", value_delimiter = ',')]
     pub knobs: Vec<String>,
-    /// Runs of each kind, with seeds 0, 1, …
+    /// Number of runs of each kind, with seeds 0, 1, …
     #[arg(long, value_name = "K", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub seeds: u32,
     /// Length of each run
     #[arg(short, long, value_name = "N", default_value_t = 7_000, value_parser = clap::value_parser!(u32).range(1..))]
     pub iterations: u32,
-    /// Most Gaussians of each run
+    /// Maximum number of Gaussians of each run
     #[arg(short, long, value_name = "ROWS", default_value_t = DEFAULT_BUDGET, value_parser = numbers::rows)]
     pub budget: usize,
     /// Folder for the results
@@ -94,8 +94,8 @@ impl Trade {
         study.finish("trade", &document, report::summary(&results)).map(Some)
     }
 
-    /// All runs in the order of training, each with at most one knob changed: seed after seed, so that an interrupted study
-    /// is fair with fewer seeds.
+    /// All runs in the order of training, each with at most one knob changed: seed after seed, so that an interrupted
+    /// study is still fair.
     fn plan_runs(&self, factors: &[Factor], shared: &Partial) -> Result<Vec<PlannedRun>, Failure> {
         let labels = labels(&self.scenes)?;
         let mut runs = Vec::new();

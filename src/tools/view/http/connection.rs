@@ -12,7 +12,7 @@ use super::{Method, Request, Response};
 const TIMEOUT: Duration = Duration::from_secs(10);
 /// Time limit for the next request to begin.
 const IDLE: Duration = Duration::from_mins(2);
-/// Most bytes of a refused request that are read and discarded.
+/// Maximum number of bytes of a refused request that are read and discarded.
 const MAX_DRAINED: usize = 64 << 10;
 
 /// Answers the requests of a connection.

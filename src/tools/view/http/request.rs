@@ -2,11 +2,11 @@
 
 use super::Response;
 
-/// Most bytes of a request's head.
+/// Maximum size of a request's head `[bytes]`.
 pub(super) const MAX_HEAD: usize = 8 << 10;
-/// Most bytes of a body; a picture request has a few hundred.
+/// Maximum size of a body `[bytes]`; a picture request has a few hundred.
 pub(super) const MAX_BODY: usize = 4 << 10;
-/// Most headers of a request.
+/// Maximum number of headers of a request.
 const MAX_HEADERS: usize = 64;
 
 /// The supported methods.
@@ -68,7 +68,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Option<Head>, Response> {
         Ok(httparse::Status::Partial) | Err(httparse::Error::TooManyHeaders) => {
             return Err(Response::error(431, "the head of the request is too long"));
         }
-        Err(_) => return Err(Response::error(400, "this is no HTTP request")),
+        Err(_) => return Err(Response::error(400, "this is not an HTTP request")),
     };
     let method = match parsed.method {
         Some("GET") => Method::Get,

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use super::connection::serve_connection;
 use super::{Request, Response};
 
-/// Most connections at a time; a browser opens six per page.
+/// Maximum number of connections at a time; a browser opens six per page.
 pub(crate) const MAX_CONNECTIONS: usize = 64;
 /// Stack of a connection's thread `[bytes]`.
 const STACK: usize = 256 << 10;

@@ -126,7 +126,7 @@ fn invalid_requests_get_a_short_error_and_the_next_connection_is_served() {
 }
 
 #[test]
-fn a_thousand_idle_connections_keep_nobody_out() {
+fn a_thousand_idle_connections_do_not_block_others() {
     with_server(|connect| {
         let mut known = connect();
         get(&mut known);

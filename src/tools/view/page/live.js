@@ -3,7 +3,7 @@
 
 /** Interval between requests of the progress [ms]. */
 const ASK_EVERY = 1000;
-/** Least time between two pictures of the changing model [ms]. */
+/** Minimum time between two pictures of the changing model [ms]. */
 const LOOK_EVERY = 2000;
 
 /** Follows the run of the scene. `look` requests a new picture. */

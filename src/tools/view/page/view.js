@@ -132,7 +132,7 @@ let coarse = 0.5, complete = -1, border = 0.5, wakeUp = () => {}, paces = [];
 let latency = 0, perByte = 0;
 /** Number of pending requests, number of all requests, and the one that is shown. */
 let underway = 0, requests = 0, newest = 0;
-/** The last request, and the least time from it to the next one [ms]. */
+/** The last request, and the minimum time from it to the next one [ms]. */
 let last = { version: -1, isMoving: true, begun: 0 }, spacing = 0;
 /** When a picture was shown last. */
 let shownAt = 0;
@@ -206,7 +206,7 @@ function untilNext() {
   return Math.max(last.begun + spacing - now, isNew ? 0 : rest);
 }
 
-/** Most pending requests: over a slow network, several keep the renderer busy. */
+/** Maximum number of pending requests: over a slow network, several keep the renderer busy. */
 const inFlight = () => clamp(1 + Math.round(latency / PACE), 1, 4);
 
 /** Requests pictures while the page is open: coarse ones while something changes, then a sharp one. */
@@ -227,13 +227,13 @@ async function follow() {
   underway += 1;
   try {
     const frames = await Promise.all([ask(0, left, isMoving, part), right && ask(1, right, isMoving, part)]);
-    // A newer picture has replaced it, on the server or on the way.
+    // A newer picture has replaced it, on the server or during the transfer.
     const isLate = request < newest || !frames[0] || (right && !frames[1]);
     if (isLate) frames.forEach((frame) => frame?.bitmap.close());
     else show(frames, { begun, asked, request, isMoving, part });
   } catch (error) {
     const isGone = error instanceof TypeError;
-    const gone = scene.live ? "Training has ended, or densify was stopped." : "densify view does not answer; start it again, and this page goes on.";
+    const gone = scene.live ? "Training has ended, or densify was stopped." : "densify view does not answer; start it again, and this page continues.";
     trouble(isGone ? gone : error.message);
     stage.dataset.state = "trouble";
     if (isGone) last.version = -1;
@@ -520,15 +520,15 @@ marks.addEventListener("wheel", (event) => {
 
 /** Flying keys and their directions along right, up and back. */
 const FLIGHT = { w: [0, 0, -1], s: [0, 0, 1], a: [-1, 0, 0], d: [1, 0, 0], e: [0, 1, 0], q: [0, -1, 0] };
-const held = new Set();
-const isFlying = () => held.size > 0 || flight !== null;
+const pressedKeys = new Set();
+const isFlying = () => pressedKeys.size > 0 || flight !== null;
 let ticked = 0;
 
 function fly(now) {
-  if (!held.size) return;
+  if (!pressedKeys.size) return;
   const seconds = Math.min(0.1, (now - ticked) / 1000);
   ticked = now;
-  const sum = [...held].reduce((sum, key) => add(sum, FLIGHT[key]), [0, 0, 0]);
+  const sum = [...pressedKeys].reduce((sum, key) => add(sum, FLIGHT[key]), [0, 0, 0]);
   const step = 0.6 * scene.radius * 2 ** Number(byId("speed").value) * seconds;
   leaveView();
   ["right", "up", "back"].forEach((name, i) => { camera.at = add(camera.at, camera[name], step * sum[i]); });
@@ -546,8 +546,8 @@ document.addEventListener("keydown", (event) => {
   if (target.matches(needed)) return;
   const low = key.toLowerCase();
   if (FLIGHT[low]) {
-    if (!held.size) { ticked = performance.now(); requestAnimationFrame(fly); }
-    held.add(low);
+    if (!pressedKeys.size) { ticked = performance.now(); requestAnimationFrame(fly); }
+    pressedKeys.add(low);
   } else if (STEPS[key]) {
     const [x, y] = STEPS[key], mode = modeOf(event);
     if (mode === "pan") pan(-0.05 * x, -0.05 * y);
@@ -563,8 +563,8 @@ document.addEventListener("keydown", (event) => {
   else return;
   event.preventDefault();
 });
-document.addEventListener("keyup", (event) => { held.delete(event.key.toLowerCase()); changedAt = performance.now(); wake(); });
-addEventListener("blur", () => { held.clear(); drop(); });
+document.addEventListener("keyup", (event) => { pressedKeys.delete(event.key.toLowerCase()); changedAt = performance.now(); wake(); });
+addEventListener("blur", () => { pressedKeys.clear(); drop(); });
 
 // ---- The border between two pictures.
 

@@ -21,9 +21,9 @@ const SENSITIVITY: [[(f64, f64); 2]; 3] =
 const WIDEST: f64 = 0.04;
 /// Exponent of colour distances, q_c.
 const COLOUR_EXPONENT: f64 = 0.7;
-/// Distances up to this fraction of the largest, p_c, …
+/// Distances up to this fraction of the largest count as small, p_c.
 const SMALL_SHARE: f64 = 0.4;
-/// … fill this fraction of the range of errors, p_t.
+/// Fraction of the range of errors that small distances fill, p_t.
 const SMALL_RANGE: f64 = 0.95;
 /// Width of a feature `[degrees]`, w.
 const FEATURE_WIDTH: f64 = 0.082;

@@ -58,7 +58,7 @@ fn results_do_not_depend_on_blocks_of_rows() {
 }
 
 #[test]
-fn masks_coverage_and_nan() {
+fn masks_and_coverage_are_applied_and_nan_is_kept() {
     let mut half = waves(0.0);
     let right = |p: usize| p % 37 >= 18;
     half.mask = Some((0..37 * 24).map(|p| if right(p) { 0 } else { 255 }).collect());

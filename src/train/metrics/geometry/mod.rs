@@ -126,7 +126,7 @@ pub struct KnownScene<'a> {
     pub is_stopped: &'a dyn Fn() -> bool,
 }
 
-/// The needs with which the backend for [`measure`] must be made.
+/// The values that the backend for [`measure`] must record; pass them when creating it.
 pub fn needs() -> Needs {
     let columns = vec![AuxColumn::WeightSum, AuxColumn::WeightMax, AuxColumn::PixelCount];
     Needs { aux: Some(AuxRequest { columns, ..AuxRequest::default() }), ..Needs::default() }

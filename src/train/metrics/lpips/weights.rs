@@ -12,7 +12,7 @@ use super::network::{Layer, Network, Stage};
 use densify_core::files;
 
 /// Largest file of weights `[bytes]`; VGG-16 takes 59 MB.
-const MOST_BYTES: u64 = 256 << 20;
+const MAX_BYTES: u64 = 256 << 20;
 /// Remedy for unsuitable files.
 const REMEDY: &str = "create it as described in docs/metrics.md";
 
@@ -47,14 +47,14 @@ impl Lpips {
         let read = |source| LpipsError::Read { path: path.to_owned(), source };
         let mut bytes = Vec::new();
         let file = files::open(path).map_err(read)?;
-        file.take(MOST_BYTES + 1).read_to_end(&mut bytes).map_err(read)?;
+        file.take(MAX_BYTES + 1).read_to_end(&mut bytes).map_err(read)?;
         Self::from_bytes(&bytes)
             .map_err(|problem| LpipsError::Malformed { path: path.to_owned(), problem })
     }
 
     pub(super) fn from_bytes(bytes: &[u8]) -> Result<Self, String> {
-        if bytes.len() as u64 > MOST_BYTES {
-            return Err(format!("it is longer than {MOST_BYTES} bytes"));
+        if bytes.len() as u64 > MAX_BYTES {
+            return Err(format!("it is longer than {MAX_BYTES} bytes"));
         }
         let file = SafeTensors::deserialize(bytes)
             .map_err(|e| format!("it is no safetensors file ({e})"))?;

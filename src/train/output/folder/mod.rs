@@ -13,7 +13,7 @@ use super::{CONFIG_FILE, FolderError};
 use densify_core::files::FileError;
 use densify_core::files::disk::{Operation, attempt};
 use densify_core::files::{RUN_FOLDER_DEPTH, is_temporary, remove_incomplete};
-use replacement::{NEW, OLD, REPLACED, Stuck, hidden, recover, replace, suffix};
+use replacement::{NEW, OLD, REPLACED, ReplaceError, hidden, recover, replace, suffix};
 
 /// Files and folders of a run. Everything else in its folder belongs to the user and is not modified.
 const OWNED: [&str; 11] = [
@@ -210,13 +210,13 @@ impl RunFolder {
         let Some(suffix) = &self.staged else {
             return Ok(self.target.clone());
         };
-        let confirmed = self.lock.confirm().map_err(|source| Stuck { source, aside: None });
+        let confirmed = self.lock.confirm().map_err(|source| ReplaceError { source, aside: None });
         match confirmed.and_then(|()| replace(&self.target, suffix)) {
             Ok(()) => {
                 remove_all(Self::staged(&self.target));
                 Ok(self.target.clone())
             }
-            Err(Stuck { source, aside }) => {
+            Err(ReplaceError { source, aside }) => {
                 let source = Box::new(source);
                 Err(FolderError::NotReplaced { staging: self.path(), aside, source })
             }

@@ -17,7 +17,7 @@ pub(super) const OLD: &str = ".densify-old-";
 pub(super) const REPLACED: &str = ".densify-replaced-";
 
 /// Reason why a run could not replace another.
-pub(super) struct Stuck {
+pub(super) struct ReplaceError {
     pub(super) source: FolderError,
     /// Folder of (a part of) the old run, if it could not be moved back either.
     pub(super) aside: Option<PathBuf>,
@@ -25,7 +25,7 @@ pub(super) struct Stuck {
 
 /// Replaces the run in `target` by the one in the hidden folder with this suffix, or leaves both unchanged as far as
 /// possible. [`recover`] completes or undoes an interrupted replacement.
-pub(super) fn replace(target: &Path, suffix: &str) -> Result<(), Stuck> {
+pub(super) fn replace(target: &Path, suffix: &str) -> Result<(), ReplaceError> {
     let [new, old, replaced] =
         [NEW, OLD, REPLACED].map(|prefix| target.join(format!("{prefix}{suffix}")));
     // Files that cannot be moved back stay where they are, for `recover`.
@@ -33,12 +33,12 @@ pub(super) fn replace(target: &Path, suffix: &str) -> Result<(), Stuck> {
         if moved_back.is_ok() {
             let _ = fs::remove_dir(aside);
         }
-        Stuck { source: source.into(), aside: moved_back.err().map(|_| aside.to_owned()) }
+        ReplaceError { source: source.into(), aside: moved_back.err().map(|_| aside.to_owned()) }
     };
     let created = attempt(Operation::Create, &old).and_then(|()| fs::create_dir(&old));
     created
         .map_err(FileError::io("create the folder", &old))
-        .map_err(|source| Stuck { source: source.into(), aside: None })?;
+        .map_err(|source| ReplaceError { source: source.into(), aside: None })?;
     let rename = || attempt(Operation::Rename, &old).and_then(|()| fs::rename(&old, &replaced));
     move_run(target, &old)
         .and_then(|()| rename().map_err(FileError::io("rename", &old)))

@@ -33,7 +33,7 @@ fn a_new_run_writes_in_place_beside_foreign_files() {
 }
 
 #[test]
-fn replacing_touches_only_what_a_run_owns_and_only_at_the_end() {
+fn replacing_affects_only_files_of_runs_and_only_at_the_end() {
     let root = tempfile::tempdir().unwrap();
     for name in ["config.toml", "stats/old.jsonl", "events.out.tfevents.1", "notes.txt"] {
         write(&root.path().join(name), "old");
@@ -55,7 +55,7 @@ fn replacing_touches_only_what_a_run_owns_and_only_at_the_end() {
 }
 
 #[test]
-fn a_run_that_cannot_take_its_place_leaves_the_old_one_there() {
+fn a_failed_replacement_leaves_the_old_run_unchanged() {
     let root = tempfile::tempdir().unwrap();
     // A file of the old run cannot be moved away; a file of the new run cannot be moved in.
     for file in ["config.toml", "results.json"] {
@@ -149,7 +149,7 @@ fn a_resumed_run_has_no_incomplete_files() {
 }
 
 #[test]
-fn an_interrupted_replacement_is_ended_by_the_next_run() {
+fn an_interrupted_replacement_is_completed_or_undone_by_the_next_run() {
     const OLD_RUN: [&str; 2] = ["cameras.json", "config.toml"];
     const NEW_RUN: [&str; 2] = ["config.toml", "results.json"];
     // Numbers of files of the old and of the new run that had been moved before the interruption.
@@ -218,7 +218,7 @@ fn a_moved_folder_is_detected() {
 }
 
 #[test]
-fn an_abandoned_run_is_kept_beside_the_old_one() {
+fn an_abandoned_run_and_the_old_one_are_both_kept() {
     let root = tempfile::tempdir().unwrap();
     write(&root.path().join("config.toml"), "old");
     let run = RunFolder::create(root.path(), true).unwrap();

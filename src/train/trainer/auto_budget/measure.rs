@@ -79,8 +79,8 @@ impl<V: ViewSource> Trainer<V> {
         Ok((rows, change))
     }
 
-    /// Hides one tenth of the rows after another, in the given order, until the PSNR falls too much. Returns the number of
-    /// rows that can be removed, and the change of the PSNR without them.
+    /// Hides the rows in the given order, a tenth at a time, until the PSNR falls too much. Returns the number of rows
+    /// that can be removed, and the change of the PSNR without them.
     fn hide_tenths(
         &mut self,
         step: u32,

@@ -17,8 +17,8 @@
 //! than [`MIN_GAIN`] per halving. The comparison uses the same model at the same step, so it has no noise; it
 //! overestimates the loss, because the other rows will adapt.
 //!
-//! Measuring does not change a bit of the model or of any other state: rows are hidden by their opacity logits only, and
-//! these are restored.
+//! Measuring does not change the model or any other state: rows are hidden only by their opacity logits, which are
+//! restored.
 
 mod measure;
 mod probe_views;
@@ -31,8 +31,8 @@ pub(super) use probe_views::probe_views;
 
 /// PSNR that a doubling of rows must gain `[dB]`.
 pub const MIN_GAIN: f64 = 0.10;
-/// Drop of the PSNR below the recent best from which on the model counts as recovering from an edit `[dB]`. The probe views
-/// are always the same; with random views the noise would be larger than this.
+/// Drop of the PSNR below the recent best beyond which the model counts as recovering from an edit `[dB]`. The probe
+/// views are always the same; with random views the noise would be larger than this.
 const MAX_DROP: f64 = 0.5;
 /// Number of intervals after which a loss counts as permanent. The insertions of `diet` take a sixth of a run, which is
 /// four intervals.
@@ -42,12 +42,12 @@ const INTERVAL: u32 = 1_500;
 /// Intervals are multiples of this number of steps, because policies are due every 100 steps at most.
 const INTERVAL_UNIT: u32 = 100;
 /// Growth of the limit per interval.
-const FACTOR: f64 = std::f64::consts::SQRT_2;
+const GROWTH_FACTOR: f64 = std::f64::consts::SQRT_2;
 /// Smallest initial limit.
 const MIN_LIMIT: usize = 1_000;
 /// Number of intervals to which the slope is fitted.
 const FITTED: usize = 3;
-/// Share of the run after which no rows are removed, so that the others can adapt.
+/// Share of the run after which no rows are removed, so that the remaining ones can adapt.
 const LAST_REMOVAL: f64 = 0.8;
 /// Largest number of tenths of the rows that are removed at once.
 const MAX_TENTHS: usize = 5;
@@ -128,14 +128,14 @@ impl AutoBudget {
         interval.gain = gain;
         let Interval { step, rows, .. } = *interval;
         // If the number of rows is far below the limit, a higher limit would have no effect.
-        let is_full = rows as f64 * FACTOR.sqrt() >= self.limit as f64;
+        let is_full = rows as f64 * GROWTH_FACTOR.sqrt() >= self.limit as f64;
         let is_idle = is_full && gain.is_some_and(|gain| gain < MIN_GAIN);
         self.idle = if is_idle { self.idle + 1 } else { 0 };
         if self.idle >= 2 {
             self.stopped = Some(step);
             self.limit = rows.max(1);
         } else {
-            self.limit = ((self.limit as f64 * FACTOR).round() as usize).min(budget);
+            self.limit = ((self.limit as f64 * GROWTH_FACTOR).round() as usize).min(budget);
         }
     }
 

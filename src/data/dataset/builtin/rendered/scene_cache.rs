@@ -17,7 +17,7 @@ use super::{About, Rendered};
 use densify_core::files::write_atomically;
 
 /// Largest size of all entries together `[bytes]`; the least recently used are removed first.
-const MOST_BYTES: u64 = 1 << 30;
+const MAX_BYTES: u64 = 1 << 30;
 const ENDING: &str = "safetensors";
 const CHECKSUM: &str = "crc32c";
 
@@ -46,7 +46,7 @@ impl Entry {
     /// Reads the scene, if the entry exists and is undamaged.
     pub(super) fn read(&self) -> Option<Rendered> {
         let mut bytes = Vec::new();
-        File::open(&self.path).ok()?.take(MOST_BYTES).read_to_end(&mut bytes).ok()?;
+        File::open(&self.path).ok()?.take(MAX_BYTES).read_to_end(&mut bytes).ok()?;
         // Mark the entry as used. This may fail in a shared, read-only cache.
         let file = File::options().write(true).open(&self.path);
         let _ = file.and_then(|file| file.set_modified(SystemTime::now()));
@@ -89,7 +89,7 @@ impl Entry {
         let metadata = HashMap::from([(CHECKSUM.to_owned(), checksum_of(tensors.clone()))]);
         let bytes = safetensors::serialize(tensors, Some(metadata))?;
         write_atomically(&self.path, |out| out.write_all(&bytes))?;
-        self.path.parent().map_or(Ok(()), |folder| bound(folder, MOST_BYTES))?;
+        self.path.parent().map_or(Ok(()), |folder| bound(folder, MAX_BYTES))?;
         Ok(())
     }
 }

@@ -1,4 +1,4 @@
-//! Tests of the measurements against values computed by hand: rows on, before and behind a square.
+//! Tests of the measurements against values computed by hand: rows on, in front of and behind a square.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -211,7 +211,7 @@ fn a_tilt_of_normals_is_measured() {
 }
 
 #[test]
-fn floaters_are_found_and_others_are_not() {
+fn only_floaters_are_counted() {
     let truth = truth(&square(), 2);
     let small = DVec3::splat(0.02);
     let with = |place: DVec3, scale: DVec3, opacity: f32| {
@@ -240,7 +240,7 @@ fn floaters_are_found_and_others_are_not() {
 }
 
 #[test]
-fn blended_rows_and_idle_ones_are_counted() {
+fn blended_and_negligible_rows_are_counted() {
     let truth = truth(&square(), 2);
     let mut model = Gaussians::default();
     push(&mut model, DVec3::ZERO, DVec3::new(50.0, 50.0, 0.01), 0.9);
@@ -253,7 +253,7 @@ fn blended_rows_and_idle_ones_are_counted() {
 }
 
 #[test]
-fn wires_are_found_or_not() {
+fn thin_structures_are_found_or_missed() {
     // A bar of 0.1 x 0.1, its front at z = −1: 3.2 px wide at distance 2.
     let bar = (DVec3::new(-0.05, -0.9, -1.0), DVec3::new(0.05, 0.9, -0.9));
     let mut triangles = square();

@@ -1,4 +1,4 @@
-//! Measures the weights of rows in the training views, and whether their positions are empty.
+//! Measures the weights of rows in the training views, and whether they lie in empty space.
 
 use densify_policies::policy::{AuxColumn, AuxRequest};
 use densify_scenegen::GBuffer;
@@ -37,7 +37,7 @@ pub(super) struct Visibility {
     empty: Vec<u32>,
     /// Numbers of blended (row, pixel) pairs and of pixels.
     blended: (f64, f64),
-    /// Samples of the mesh that enough views show.
+    /// Samples of the mesh that are visible in enough views.
     pub(super) samples: Vec<DVec3>,
 }
 

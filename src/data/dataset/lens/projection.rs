@@ -1,8 +1,8 @@
-//! Planes of lens models: the distance of a ray from the centre, as a function of its angle from the axis.
+//! Projections of lens models, before distortion.
 
-/// The map from the angle between a ray and the optical axis to a distance on the plane that is then distorted.
+/// The distance of a ray from the image centre, as a function of its angle θ from the optical axis, before distortion.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) enum Plane {
+pub(crate) enum Projection {
     /// tan θ: a pinhole.
     Perspective,
     /// θ: a fisheye (Kannala and Brandt 2006).
@@ -11,14 +11,14 @@ pub(crate) enum Plane {
     Fov(f64),
 }
 
-/// Largest supported angle from the axis, for planes that are infinite at 90 degrees `[rad]`. Beyond it a pixel covers
-/// less than a hundredth of the solid angle of a pixel at the centre.
+/// Largest supported angle from the axis for projections through tan θ, which is infinite at 90 degrees `[rad]`. A
+/// pinhole's pixel there covers about 1/1,500 of the solid angle of one at the centre.
 const WIDEST: f64 = 85.0_f64.to_radians();
-/// Largest supported angle from the axis for fisheyes `[rad]`; the sides of the cube around the camera extend a little
-/// farther.
+/// Largest supported angle from the axis for fisheyes `[rad]`. Wide lenses are resampled to the faces of a cube
+/// (`pinholes.rs`), whose side faces reach a little farther.
 const WIDEST_FISHEYE: f64 = 120.0_f64.to_radians();
 
-impl Plane {
+impl Projection {
     /// Distance from the centre, for an angle `[rad]` below [`Self::widest`].
     pub(crate) fn radius(self, angle: f64) -> f64 {
         match self {
@@ -37,8 +37,8 @@ impl Plane {
         }
     }
 
-    /// Derivative of [`Self::radius`] on the axis: the focal length, relative to that of the lens, with which a pinhole
-    /// has as many pixels per radian.
+    /// Derivative of [`Self::radius`] on the axis: the focal length, in units of the lens's, of a pinhole with the same
+    /// number of pixels per radian there.
     pub(crate) fn slope(self) -> f64 {
         match self {
             Self::Perspective | Self::Equidistant => 1.0,
