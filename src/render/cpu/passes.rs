@@ -8,6 +8,7 @@ use densify_policies::policy::{Candidate, CandidateRequest, DepthMode, ErrorMode
 use densify_policies::rng::PolicyRng;
 use rayon::prelude::*;
 
+use super::batch::Batch;
 use super::blocks::parts;
 use super::candidates;
 use super::loss::{ImageTerms, LossValue};
@@ -133,8 +134,9 @@ impl CpuBackend {
                 lists.fill(threads, visible, &grid, band.clone(), bands.len() == 1);
                 clock.lap("tiles");
                 let tiles = canvas[band.clone()].par_iter_mut().enumerate();
-                threads.each_with("rasterize", tiles, Vec::new, |scratch, (i, canvas)| {
-                    lists.sort(i, scratch);
+                let scratch = || (Vec::new(), Batch::new());
+                threads.each_with("rasterize", tiles, scratch, |(sorting, batch), (i, canvas)| {
+                    lists.sort(i, sorting);
                     arch.dispatch(Rasterize {
                         splats,
                         list: lists.of_tile(i),
@@ -144,6 +146,7 @@ impl CpuBackend {
                         dominant,
                         blending,
                         canvas,
+                        batch,
                     });
                 });
                 clock.lap("rasterize");
@@ -187,8 +190,8 @@ impl CpuBackend {
                     threads.each_with(
                         "rasterize_bwd",
                         tiles,
-                        bytemuck::zeroed_box,
-                        |blended, i| {
+                        || (Batch::new(), bytemuck::zeroed_box()),
+                        |(batch, blended), i| {
                             let tile = band.start + i;
                             arch.dispatch(RasterizeBwd {
                                 splats,
@@ -200,6 +203,7 @@ impl CpuBackend {
                                 upstream: &gradient[tile],
                                 layout,
                                 records: part.records(lists, i, records, stride),
+                                batch,
                                 blended,
                             });
                         },

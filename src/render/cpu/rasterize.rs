@@ -159,6 +159,8 @@ pub(super) struct Rasterize<'a> {
     pub(super) dominant: &'a [AtomicU32],
     pub(super) blending: Blending,
     pub(super) canvas: &'a mut TileCanvas,
+    /// Scratch.
+    pub(super) batch: &'a mut Batch,
 }
 
 impl WithSimd for Rasterize<'_> {
@@ -184,7 +186,7 @@ impl Rasterize<'_> {
     #[expect(clippy::too_many_lines, reason = "a numeric kernel")]
     fn blend<S: Simd, const WITH_MORE: bool, const N: usize>(self, s: S) {
         let counts = self.depth_plane == DepthPlane::RowCount;
-        let Self { splats, list, place, background, dominant, canvas, blending, .. } = self;
+        let Self { splats, list, place, background, dominant, canvas, blending, batch, .. } = self;
         let c = |x: f32| V::splat(s, x);
         let (faintest, least_light) = (c(-blending.log2_reach), c(blending.transmittance_min));
         let (zero, never) = (V::zero(s), c(-1.0));
@@ -204,7 +206,6 @@ impl Rasterize<'_> {
         // The largest weight of each pixel, and the index of its splat in the list.
         let mut largest = Aligned(DARK);
         let mut largest_at = [[0_u32; WIDTH]; PATCHES];
-        let mut batch = Batch::new();
         for (first, chunk) in (0..).step_by(BATCH).zip(list.chunks(BATCH)) {
             if alive == 0 {
                 break;

@@ -81,6 +81,7 @@ pub(super) struct RasterizeBwd<'a> {
     /// The records of this tile's entries; entries outside the current part have none.
     pub(super) records: TileRecords<'a>,
     /// Scratch.
+    pub(super) batch: &'a mut Batch,
     pub(super) blended: &'a mut BlendedBatch,
 }
 
@@ -155,20 +156,22 @@ struct Sums<S: Simd> {
     weight_max: V<S>,
 }
 
-impl RasterizeBwd<'_> {
+impl BlendedBatch {
     /// The first walk over a batch, whose first splat is entry `first` of the list. Changes `light` from the
     /// transmittance behind the batch to the one in front. Returns the end of each patch's pairs.
     #[inline(always)]
-    fn blend_again<S: Simd>(
+    fn fill<S: Simd>(
         &mut self,
         s: S,
         batch: &Batch,
         first: usize,
+        blending: Blending,
+        canvas: &TileCanvas,
         light: &mut Plane,
     ) -> [usize; PATCHES] {
         let c = |x: f32| V::splat(s, x);
-        let faintest = c(-self.blending.log2_reach);
-        let BlendedBatch { alpha: alphas, weight: weights } = &mut *self.blended;
+        let faintest = c(-blending.log2_reach);
+        let Self { alpha: alphas, weight: weights } = self;
         let mut ends = [0; PATCHES];
         let mut start = 0;
         for p in 0..PATCHES {
@@ -177,7 +180,7 @@ impl RasterizeBwd<'_> {
                 continue;
             }
             for at in (0..WIDTH).step_by(S::F32_LANES) {
-                let stop = S::as_simd_u32s(&self.canvas.stop[p][at..]).0[0];
+                let stop = S::as_simd_u32s(&canvas.stop[p][at..]).0[0];
                 let mut product = c(1.0);
                 let (mut pair, mut todo) = (start, reached);
                 while todo != 0 {
@@ -204,11 +207,14 @@ impl RasterizeBwd<'_> {
         }
         ends
     }
+}
 
+impl RasterizeBwd<'_> {
     #[inline(always)]
     #[expect(clippy::too_many_lines, reason = "a numeric kernel")]
-    fn backpropagate<S: Simd, const EXTRAS: u8>(mut self, s: S) {
-        let Self { splats, list, place, background, canvas, upstream, layout, records, .. } = self;
+    fn backpropagate<S: Simd, const EXTRAS: u8>(self, s: S) {
+        let Self { splats, list, place, background, blending, canvas, upstream, layout, .. } = self;
+        let Self { records, batch, blended, .. } = self;
         let c = |x: f32| V::splat(s, x);
         let [gr, gg, gb, ga, map] = &upstream.planes;
 
@@ -233,7 +239,6 @@ impl RasterizeBwd<'_> {
             write(record, &[0.0; RecordLayout::MOST], layout);
         }
 
-        let mut batch = Batch::new();
         let batches = list_end.div_ceil(BATCH);
         for n in (0..batches).rev() {
             let first = n * BATCH;
@@ -242,7 +247,7 @@ impl RasterizeBwd<'_> {
             for (p, &end) in patch_end.iter().enumerate() {
                 batch.cut(p, (end as usize).saturating_sub(first));
             }
-            let mut ends = self.blend_again(s, &batch, first, light);
+            let mut ends = blended.fill(s, batch, first, blending, canvas, light);
             for (i, splat) in batch.splats[..chunk.len()].iter().enumerate().rev() {
                 let mut todo = batch.patches_of[i];
                 let colour = each!(i in 3 => c(splat.colour[i]));
@@ -265,8 +270,8 @@ impl RasterizeBwd<'_> {
                     let pair = ends[p] % PAIRS;
                     for at in (0..WIDTH).step_by(S::F32_LANES) {
                         let [u, z] = batch.u_and_z(s, i, p, at);
-                        let alpha = V::load(s, &self.blended.alpha[pair][at..]);
-                        let part = V::load(s, &self.blended.weight[pair][at..]);
+                        let alpha = V::load(s, &blended.alpha[pair][at..]);
+                        let part = V::load(s, &blended.weight[pair][at..]);
                         let w = part * V::load(s, &light[p][at..]);
                         let (r, g, b) = (
                             V::load(s, &gr[p][at..]),

@@ -124,7 +124,7 @@ fn written_scenes_are_measured_against_their_files() {
     // The run is complete nevertheless.
     let other = root.path().join("other");
     train(&folder, &other, 6, "--budget 400 --eval --quiet")
-        .refused("a damaged mesh", &["mesh.ply", "the run is complete"]);
+        .refused("a damaged mesh", &["mesh.ply", "the run itself is complete"]);
     assert_eq!(json(&other.join("stats/summary.json"))["finished"], true);
     // Without a known surface no geometry is measured.
     std::fs::remove_file(folder.join("scene.json")).expect("an existing file");
