@@ -61,7 +61,7 @@ pub enum MaskMode {
     /// Unknown: they do not count, and anything may be there
     #[default]
     Ignore,
-    /// Empty: they are trained to show --background, which carves away what is not in the mask
+    /// Empty: they are trained to show the background, which carves away what is not in the mask
     Background,
 }
 

@@ -77,7 +77,12 @@ fn every_run_appears_once_in_the_log_and_the_table() {
     let lines = read_text(&log);
     let kept: Vec<&str> = lines.lines().take(7).collect();
     std::fs::write(&log, kept.join("\n") + "\n{\"densify\":").expect("written");
+    // A run with damaged records has no curves, which is said.
+    let run = all[0]["run"].as_str().expect("a name");
+    std::fs::write(output.join("runs").join(run).join("stats/train.jsonl"), "{\n")
+        .expect("written");
     let stdout = compare(scene.path(), &output, "-- --sh-degree 0").ok().stdout;
+    assert!(stdout.contains("train.jsonl: line 1: ") && stdout.contains("left out"), "{stdout}");
     assert_eq!(stdout.matches("done before").count(), 7, "{stdout}");
     assert_eq!(records(&log)[7]["psnr"], all[7]["psnr"]);
 }

@@ -276,7 +276,11 @@ fn foreign_and_malformed_requests_are_refused_without_effect() {
     for path in [&*config, "/../config.toml", "/%2e%2e/%2e%2e/etc/passwd", "/config.toml", "//"] {
         refused(&page.get(path), 404, "nothing here");
     }
-    refused(&page.send(b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n"), 400, "not an HTTP");
+    refused(
+        &page.send(b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n"),
+        400,
+        "not an HTTP",
+    );
     refused(&page.send(format!("GET /{} HTTP/1.1\r\n", "a".repeat(9000)).as_bytes()), 431, "long");
     // Idle and incomplete connections do not block others.
     let mut idle: Vec<TcpStream> = (0..1000).map(|_| page.connect()).collect();

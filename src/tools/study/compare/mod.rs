@@ -130,7 +130,7 @@ impl Comparison {
         let Some(outcomes) = study.run(&runs, &self.engine)? else { return Ok(None) };
         let mut document = report::document(&outcomes, &policies);
         document.section("Pictures");
-        for picture in plots::draw(&self.output, &outcomes, &policies)? {
+        for picture in plots::draw(&self.output, &outcomes, &policies, observer)? {
             document.picture(picture.file, picture.caption);
         }
         for picture in crops::draw(&self.output, &outcomes, observer)? {

@@ -1,5 +1,6 @@
 //! Plots quality against the budget, and Gaussians, PSNR and memory over the iterations.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use super::{Outcome, at, scenes_and_budgets};
@@ -9,17 +10,19 @@ use crate::distinct;
 use crate::panel::{COLOURS, Curve, Panel, svg};
 use crate::plot;
 use densify_core::numbers::grouped;
+use densify_run::Observer;
 use densify_run::failure::Failure;
 use densify_train::output::{StepRecord, steps_of};
 
 /// Size of a panel `[px]`.
 const PANEL: (u32, u32) = (720, 300);
 
-/// Draws all plots into the folder `output`.
+/// Draws all plots into the folder `output`. Runs whose records cannot be read are left out.
 pub(super) fn draw(
     output: &Path,
     outcomes: &[Outcome],
     policies: &[String],
+    observer: &dyn Observer,
 ) -> Result<Vec<Picture>, Failure> {
     let mut pictures = Vec::new();
     let all = scenes_and_budgets(outcomes);
@@ -36,7 +39,8 @@ pub(super) fn draw(
                 "{scene}, {} rows: rows, PSNR and memory over iterations, first seed",
                 grouped(budget)
             );
-            let plot = svg(&growth(output, &at(outcomes, scene, budget), policies), PANEL)?;
+            let growth = growth(output, &at(outcomes, scene, budget), policies, observer);
+            let plot = svg(&growth, PANEL)?;
             let file = format!("growth-{scene}-{budget}.svg");
             pictures.push(plot::write(output, file, caption, &plot)?);
         }
@@ -60,7 +64,7 @@ fn quality(
         curves: by_policy(policies, |policy| {
             let point = |&budget: &usize| {
                 let runs = at(outcomes, scene, budget).into_iter();
-                let runs = runs.filter(|r| r.factor == policy && r.kept_its_budget());
+                let runs = runs.filter(|r| r.factor == *policy && r.kept_its_budget());
                 Some(((budget as f64).ln(), mean(runs.map(score))?))
             };
             budgets.iter().filter_map(point).collect()
@@ -70,7 +74,23 @@ fn quality(
 }
 
 /// Gaussians, PSNR and memory over the iterations of the runs at the first seed.
-fn growth(output: &Path, runs: &[&Outcome], policies: &[String]) -> Vec<Panel> {
+fn growth(
+    output: &Path,
+    runs: &[&Outcome],
+    policies: &[String],
+    observer: &dyn Observer,
+) -> Vec<Panel> {
+    let first_run = |policy: &String| {
+        runs.iter().filter(|r| r.factor == *policy).min_by_key(|r| r.seed).copied()
+    };
+    let mut records = BTreeMap::new();
+    for run in policies.iter().filter_map(first_run) {
+        let steps = steps_of(&output.join("runs").join(&run.run)).unwrap_or_else(|error| {
+            observer.say(format_args!("note: {error}; its curves are left out"));
+            Vec::new()
+        });
+        records.insert(&run.run, steps);
+    }
     let (scene, budget) = runs.first().map_or(("", 0), |run| (&*run.scene, run.budget));
     let panel = |y: &'static str, curve: &dyn Fn(&Outcome) -> Vec<(u32, f64)>| Panel {
         title: format!("{scene}, {} rows: {y} over iterations", grouped(budget)),
@@ -79,14 +99,12 @@ fn growth(output: &Path, runs: &[&Outcome], policies: &[String]) -> Vec<Panel> {
         log_x: false,
         has_legend: true,
         curves: by_policy(policies, |policy| {
-            let first = runs.iter().filter(|r| r.factor == policy).min_by_key(|r| r.seed);
-            let points = first.map(|run| curve(run)).unwrap_or_default();
+            let points = first_run(policy).map(curve).unwrap_or_default();
             points.into_iter().map(|(x, y)| (f64::from(x), y)).collect()
         }),
     };
     let logged = |run: &Outcome, value: fn(&StepRecord) -> Option<f64>| {
-        let steps = steps_of(&output.join("runs").join(&run.run)).unwrap_or_default();
-        steps.iter().filter_map(|step| Some((step.step, value(step)?))).collect()
+        records[&run.run].iter().filter_map(|step| Some((step.step, value(step)?))).collect()
     };
     let memory = |step: &StepRecord| Some(step.resident_bytes? as f64 / f64::from(1 << 20));
     let mut panels = vec![
@@ -100,7 +118,7 @@ fn growth(output: &Path, runs: &[&Outcome], policies: &[String]) -> Vec<Panel> {
 }
 
 /// One curve per policy; those that repeat a colour are dashed.
-fn by_policy(policies: &[String], points: impl Fn(&str) -> Vec<(f64, f64)>) -> Vec<Curve> {
+fn by_policy(policies: &[String], points: impl Fn(&String) -> Vec<(f64, f64)>) -> Vec<Curve> {
     let curve = |(index, policy): (usize, &String)| Curve {
         name: policy.clone(),
         points: points(policy),
