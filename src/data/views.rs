@@ -111,8 +111,8 @@ mod tests {
 
     use super::*;
     use crate::dataset::images::ImageSource;
-    use densify_fixtures::Made;
     use crate::dataset::{Dataset, LoadOptions};
+    use densify_fixtures::Made;
 
     #[test]
     fn views_that_show_nothing_are_refused() {

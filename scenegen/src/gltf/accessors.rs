@@ -175,7 +175,7 @@ impl<'a> Buffers<'a> {
             Type::Vec4 => 4,
             Type::Mat4 => 16,
             Type::Mat2 | Type::Mat3 => {
-                return Err(fault(self.path, name, "nothing that is read has 2x2 or 3x3 matrices"));
+                return Err(fault(self.path, name, "matrices are not vertex attributes"));
             }
         };
         let count = usize::try_from(accessor.count.0).unwrap_or(usize::MAX);
