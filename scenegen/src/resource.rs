@@ -192,6 +192,17 @@ pub fn data_uri(uri: &str) -> Option<Vec<u8>> {
     head.ends_with(";base64").then(|| GeneralPurpose::new(&alphabet, PADDING).decode(body).ok())?
 }
 
+/// The text behind a byte-order mark, or the whole text if it has none.
+///
+/// # Errors
+/// When the mark is not that of UTF-8.
+pub(crate) fn without_mark(text: &[u8]) -> Result<&[u8], &'static str> {
+    match text {
+        [0xff, 0xfe, ..] | [0xfe, 0xff, ..] => Err("it is UTF-16, not UTF-8"),
+        _ => Ok(text.strip_prefix(b"\xef\xbb\xbf").unwrap_or(text)),
+    }
+}
+
 /// The folder that holds a file.
 pub(crate) fn folder_of(file: &Path) -> &Path {
     match file.parent() {

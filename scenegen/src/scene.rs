@@ -190,7 +190,8 @@ impl Scene {
     ///
     /// # Errors
     /// When the preset is unknown, the file is unreadable, malformed or needs an
-    /// unsupported feature, an option is out of range, or no camera can be placed.
+    /// unsupported feature, an option is out of range, no camera can be placed, or no view shows a
+    /// surface.
     pub fn prepare(source: &Source, options: &Options) -> Result<Self, Error> {
         check(options)?;
         let (name, staging, cameras) = stage(source, options.seed)?;
@@ -247,7 +248,7 @@ impl Scene {
         };
         let mut all = views(&train, Split::Train, "train");
         all.extend(views(&test, Split::Test, "test"));
-        Ok(Self {
+        let scene = Self {
             name,
             surface,
             views: all,
@@ -261,7 +262,29 @@ impl Scene {
             lighting,
             flags,
             model,
-        })
+        };
+        scene.check_visible()?;
+        Ok(scene)
+    }
+
+    /// An error if no view shows a surface.
+    fn check_visible(&self) -> Result<(), Error> {
+        let tracer = self.tracer();
+        let cameras = || self.views.iter().map(|view| &view.camera);
+        // One ray for each pixel finds most surfaces soon; what is slender or faint may need all of them.
+        let is_visible = cameras().any(|camera| tracer.meets_surface(camera))
+            || cameras().any(|camera| {
+                tracer.render(camera, 0, None).rgba.chunks_exact(4).any(|pixel| pixel[3] > 0)
+            });
+        if is_visible {
+            return Ok(());
+        }
+        Err(Error::Input(format!(
+            "{}: none of the {} views shows a surface: the cameras look past it or at the backs of one-sided faces, or its \
+             materials are transparent; choose another --rig or --radius, or correct the materials",
+            self.name,
+            self.views.len()
+        )))
     }
 
     /// Renders a view. The result does not depend on the number of threads.

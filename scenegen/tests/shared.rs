@@ -5,7 +5,7 @@
 //! scene of all its meshes (or, without any, of its accessors or buffer views as positions and
 //! indices) and a buffer of zeros. Some files that the validator rejects load nevertheless: their
 //! errors are in metadata that is not read, in alignments that this reader does not need, or in morph
-//! targets, which are not rendered. Files that it accepts load, or have no triangle to render.
+//! targets without weight. Files that it accepts load, or have no triangle to render.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -79,6 +79,33 @@ fn shared_meshes_that_need_other_software_are_refused_by_name() {
         let (_, words) = expected.iter().find(|(part, _)| name.contains(part)).expect("a row");
         for word in words {
             assert!(error.to_string().contains(word), "{name}: {error}");
+        }
+    }
+}
+
+/// The pictures of the files in a folder of the shared cases; those of one list show the same.
+#[test]
+#[ignore = "needs the shared cases: set DENSIFY_SHARED"]
+fn shared_cases_show_what_their_files_mean() {
+    let root = shared("..").join("../cases");
+    let views = |file: &str| {
+        let scene = prepare(&root.join(file)).unwrap_or_else(|e| panic!("{file}: {e}"));
+        (0..scene.views.len()).map(|i| scene.render(i).rgba).collect::<Vec<_>>()
+    };
+    let file = |name: &&str| {
+        if name.contains('.') { (*name).to_owned() } else { format!("obj/{name}/m.obj") }
+    };
+    for [first, others @ ..] in [
+        ["ok", "meshlab_tr", "maya_kd0"],
+        ["tex128", "vc128", "vc128"],
+        ["gltf/plain.gltf", "gltf/skin.gltf", "gltf/morph.gltf"],
+    ] {
+        let expected = views(&file(&first));
+        for other in &others {
+            let found = views(&file(other));
+            let pixels = expected.concat().into_iter().zip(found.concat());
+            let differ = pixels.filter(|(a, b)| a.abs_diff(*b) > 1).count();
+            assert_eq!(differ, 0, "{first} and {other}");
         }
     }
 }

@@ -1,11 +1,13 @@
 //! Access to views by index, for training and evaluation.
 
 use std::error::Error;
+use std::path::Path;
 
 use crate::dataset::View;
 use crate::dataset::images::ImageCache;
+use crate::error::LoadError;
 use densify_core::camera::Camera;
-use densify_core::image::SharedImage;
+use densify_core::image::{Image8, SharedImage};
 
 /// The error of a source of views.
 pub type ViewError = Box<dyn Error + Send + Sync>;
@@ -53,6 +55,32 @@ impl DatasetViews {
         let cache = ImageCache::new(sources, cache_bytes, threads);
         Self { views, cache }
     }
+
+    /// Checks that a view shows anything. Images without transparent pixels are not decoded for it, of others those up to
+    /// the first with a visible pixel.
+    ///
+    /// # Errors
+    /// When every pixel of every view of the dataset `root` is transparent.
+    pub fn check_visible(&self, root: &Path) -> Result<(), LoadError> {
+        let shows = |(number, view): (usize, &View)| {
+            let is_seen = |image: &Image8| match &image.alpha {
+                Some(alpha) => alpha.iter().any(|&alpha| alpha > 0),
+                None => true,
+            };
+            // Training reports images that cannot be loaded.
+            !view.source.may_be_transparent()
+                || self.cache.get(number).map_or(true, |image| is_seen(&image))
+        };
+        if self.views.iter().enumerate().any(shows) {
+            return Ok(());
+        }
+        Err(LoadError::Data(format!(
+            "{}: nothing is visible: every pixel of all {} views to train on is transparent; render them again with \
+             cameras that see a surface, or export them without an alpha channel",
+            root.display(),
+            self.views.len()
+        )))
+    }
 }
 
 impl ViewSource for DatasetViews {
@@ -74,5 +102,40 @@ impl ViewSource for DatasetViews {
 
     fn prefetch(&self, upcoming: &[usize]) {
         self.cache.prefetch(upcoming);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::PathBuf;
+
+    use super::*;
+    use crate::dataset::images::ImageSource;
+    use crate::dataset::{Dataset, LoadOptions};
+    use densify_fixtures::Made;
+
+    #[test]
+    fn views_that_show_nothing_are_refused() {
+        let made = Made::colmap_txt();
+        let dataset = Dataset::load(made.path(), &LoadOptions::default()).unwrap();
+        let (width, height) = (4, 3);
+        let view = |alpha: Option<u8>| {
+            let alpha = alpha.map(|last| [vec![0; 11], vec![last]].concat());
+            let image = Image8 { width, height, rgb: vec![9; 36], alpha, mask: None };
+            let source = ImageSource::rendered("made".into(), image, (width, height));
+            View { source, ..dataset.train[0].clone() }
+        };
+        let check = |views: Vec<View>| {
+            DatasetViews::new(views, 0, 0).check_visible(Path::new("scenes/empty"))
+        };
+        let message = check(vec![view(Some(0)), view(Some(0))]).unwrap_err().to_string();
+        assert!(message.contains("scenes/empty") && message.contains("all 2 views"), "{message}");
+        check(vec![view(Some(0)), view(Some(1))]).unwrap();
+        check(vec![view(Some(0)), view(None)]).unwrap();
+        // An image that cannot be loaded is none that shows nothing.
+        let mut lost = view(Some(0));
+        lost.source.rendered = None;
+        lost.source.file.path = PathBuf::from("missing.png");
+        check(vec![lost]).unwrap();
     }
 }

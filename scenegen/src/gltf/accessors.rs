@@ -7,7 +7,7 @@ use gltf::json;
 use json::accessor::{ComponentType, Type};
 use json::validation::Checked;
 
-use super::fault;
+use super::{fault, remedy};
 use crate::error::Error;
 use crate::resource::{Folder, data_uri};
 
@@ -39,6 +39,16 @@ impl Floats {
     pub(super) fn get<const N: usize>(&self, i: usize) -> [f32; N] {
         let element = &self.values[i * self.size..(i + 1) * self.size];
         std::array::from_fn(|c| element.get(c).copied().unwrap_or(1.0))
+    }
+
+    /// Adds `weight` times other elements, which may have fewer components.
+    pub(super) fn add(&mut self, deltas: &Self, weight: f32) {
+        let deltas = deltas.values.chunks_exact(deltas.size);
+        for (element, delta) in self.values.chunks_exact_mut(self.size).zip(deltas) {
+            for (value, delta) in element.iter_mut().zip(delta) {
+                *value += weight * delta;
+            }
+        }
     }
 }
 
@@ -91,6 +101,12 @@ impl<'a> Buffers<'a> {
         let Some(buffer) = self.root.buffers.get(index) else {
             return Err(fault(self.path, name(), "there is no such buffer"));
         };
+        let extensions = buffer.extensions.iter().filter(|_| buffer.uri.is_none());
+        let mut compressed = extensions.flat_map(|e| e.others.keys());
+        if let Some(extension) = compressed.find(|name| name.ends_with("_meshopt_compression")) {
+            let feature = format!("{}: data that only {extension} defines", name());
+            return Err(Error::unsupported(self.path, &feature, remedy(extension)));
+        }
         if self.read[index].is_none() {
             let bytes: Cow<'a, [u8]> = match (&buffer.uri, self.blob.filter(|_| index == 0)) {
                 (Some(uri), _) => self.uri(&name(), uri)?.into(),
@@ -157,7 +173,8 @@ impl<'a> Buffers<'a> {
             Type::Vec2 => 2,
             Type::Vec3 => 3,
             Type::Vec4 => 4,
-            Type::Mat2 | Type::Mat3 | Type::Mat4 => {
+            Type::Mat4 => 16,
+            Type::Mat2 | Type::Mat3 => {
                 return Err(fault(self.path, name, "matrices are not vertex attributes"));
             }
         };

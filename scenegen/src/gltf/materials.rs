@@ -27,7 +27,7 @@ impl Reader<'_> {
         if let Some(&number) = self.materials.get(&index) {
             return Ok(number);
         }
-        let root = self.root;
+        let (path, root) = (self.path, self.root);
         let default = json::Material::default();
         let source = match index {
             None => &default,
@@ -42,6 +42,12 @@ impl Reader<'_> {
         };
         let pbr = &source.pbr_metallic_roughness;
         let base_texture = texture(pbr.base_color_texture.as_ref().map(texture_use), true)?;
+        let has_holes = source.alpha_mode != Checked::Valid(JsonAlpha::Opaque);
+        if has_holes && base_texture.is_none() && pbr.base_color_texture.is_some() {
+            let feature = format!("{name}: the texture that says where it is transparent");
+            let remedy = "store it as PNG or JPEG, with one of the first two sets of coordinates";
+            return Err(Error::unsupported(path, &feature, remedy));
+        }
         let metal_rough_texture =
             texture(pbr.metallic_roughness_texture.as_ref().map(texture_use), false)?;
         let emissive_texture = texture(source.emissive_texture.as_ref().map(texture_use), true)?;

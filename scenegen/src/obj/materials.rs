@@ -1,6 +1,6 @@
 //! Reads MTL material libraries with their textures.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
 use glam::{Vec2, Vec3};
@@ -12,7 +12,11 @@ use crate::resource::{self, Folder};
 use crate::texture::{TextureRef, Wrap};
 
 /// Linear base colour of materials without a colour, and of faces without a material.
-pub(super) const GREY: [f32; 3] = [0.6; 3];
+pub(super) const GREY: f32 = 0.6;
+
+/// A material's statements by their keys in lower case, as some programs write them: line, key and text. Of several with
+/// one key, the last counts.
+type Entries = HashMap<String, (usize, String, String)>;
 
 /// The materials of all libraries of an OBJ file.
 pub(super) struct Materials {
@@ -21,6 +25,8 @@ pub(super) struct Materials {
     numbers: HashMap<String, Option<u32>>,
     /// The model's indices of textures, by file and colour space (true for sRGB).
     textures: HashMap<(PathBuf, bool), u32>,
+    /// The model's indices of materials with neither colour nor texture, which show vertex colours if there are any.
+    pub(super) uncoloured: HashSet<u32>,
     /// The model that materials, textures and notes are added to.
     pub(super) model: Model,
 }
@@ -28,7 +34,8 @@ pub(super) struct Materials {
 impl Materials {
     pub(super) fn new(obj: &Path) -> Result<Self, Error> {
         let (numbers, textures) = (HashMap::new(), HashMap::new());
-        Ok(Self { folder: Folder::around(obj)?, numbers, textures, model: Model::default() })
+        let (uncoloured, model) = (HashSet::new(), Model::default());
+        Ok(Self { folder: Folder::around(obj)?, numbers, textures, uncoloured, model })
     }
 
     /// The model's index of a material. An undefined material is noted once.
@@ -62,58 +69,108 @@ impl Materials {
         Ok(())
     }
 
-    /// Reads a library. Statements are checked before `tobj` parses them, as it panics if a colour does not have
-    /// three numbers (`Kd 1 1`), and its errors do not name the line.
+    /// Reads a library.
     fn read(&mut self, path: &Path) -> Result<(), Error> {
-        let mut text = String::new();
+        let mut material: Option<(String, Entries)> = None;
+        // MeshLab writes the opacity as `Tr`.
+        let mut tr_is_opacity = false;
         statements::for_each(path, |statement| {
-            text += &checked(statement)?;
+            let key = statement.key.to_ascii_lowercase();
+            if key == "newmtl" {
+                let name = statement.value().to_owned();
+                if name.is_empty() {
+                    return Err(statement.fault("newmtl has no name"));
+                }
+                if let Some((name, entries)) = material.replace((name, Entries::default())) {
+                    self.add(path, &name, &entries, tr_is_opacity)?;
+                }
+            } else if key.starts_with('#') {
+                tr_is_opacity |= statement.text.to_ascii_lowercase().contains("meshlab");
+            } else if let Some((_, entries)) = &mut material {
+                let Statement { line, key: written, text, .. } = statement;
+                entries.insert(key, (line, written.to_owned(), text.to_owned()));
+            }
             Ok(())
         })?;
-        let library = tobj::load_mtl_buf(&mut text.as_bytes()).map_err(|error| {
-            let remedy = "correct the file or export it again";
-            Error::malformed(path, "the library", error.to_string(), remedy)
-        })?;
-        library.0.iter().try_for_each(|material| self.add(path, material))
+        material.map_or(Ok(()), |(name, entries)| self.add(path, &name, &entries, tr_is_opacity))
     }
 
-    fn add(&mut self, path: &Path, source: &tobj::Material) -> Result<(), Error> {
-        let more = &source.unknown_param;
-        let number = |key| more.get(key).and_then(|value: &String| value.parse::<f32>().ok());
-        let mut material = Material::lambert(&source.name, GREY);
-        if let Some(colour) = source.diffuse {
-            material.base = linear(colour).extend(1.0);
-        }
-        material.emissive = source.emissive.map_or(Vec3::ZERO, linear);
-        material.base.w = source.dissolve.unwrap_or(1.0) as f32;
-        if ["Pr", "Pm", "map_Pr", "map_Pm"].iter().any(|&key| more.contains_key(key)) {
-            material.reflection = Reflection::MetalRough;
-        }
-        material.roughness = number("Pr").unwrap_or(material.roughness);
-        // Without a number, the map itself is the metalness.
-        let alone = if more.contains_key("map_Pm") { 1.0 } else { material.metallic };
-        material.metallic = number("Pm").unwrap_or(alone);
-        let mut texture = |map: Option<&String>, srgb| match map.and_then(|map| Map::read(map)) {
-            Some(map) => self.texture(path, &map, srgb).map(Some),
-            None => Ok(None),
+    fn add(
+        &mut self,
+        path: &Path,
+        name: &str,
+        entries: &Entries,
+        tr_is_opacity: bool,
+    ) -> Result<(), Error> {
+        let statement = |key: &str| {
+            let (line, key, text) = entries.get(key)?;
+            Some(Statement { path, line: *line, key, text })
         };
-        material.base_texture = texture(source.diffuse_texture.as_ref(), true)?;
-        material.emissive_texture = texture(more.get("map_Ke"), true)?;
-        material.alpha_texture = texture(source.dissolve_texture.as_ref(), false)?;
-        material.normal_texture = texture(more.get("norm"), false)?;
-        material.roughness_texture = texture(more.get("map_Pr"), false)?;
-        material.metallic_texture = texture(more.get("map_Pm"), false)?;
-        if material.base.w < 1.0 || material.alpha_texture.is_some() {
-            material.alpha = AlphaMode::Blend;
+        // Spectral and XYZ colours are ignored.
+        let colour = |key| {
+            let statement = statement(key).filter(|s| !s.text.starts_with(['s', 'x']));
+            statement.map(|s| numbers(s, 3)).transpose()
+        };
+        let share = |key| -> Result<Option<Vec3>, Error> {
+            let value = statement(key).map(|s| numbers(s, 1)).transpose()?;
+            Ok(value.map(|value| value.min(Vec3::ONE)))
+        };
+        let map = |key| statement(key).and_then(Map::read);
+        let mut texture =
+            |map: Option<&Map>, srgb| map.map(|map| self.texture(path, map, srgb)).transpose();
+        let (base_map, alpha_map) = (map("map_kd"), map("map_d"));
+        // The opacity of an image that is used twice is its alpha channel.
+        let file = |map: &Option<Map>| map.as_ref().map(|map| map.file.clone());
+        let shares_alpha = alpha_map.is_some() && file(&alpha_map) == file(&base_map);
+        let base_texture = texture(base_map.as_ref(), true)?;
+        let alpha_texture = texture(alpha_map.as_ref().filter(|_| !shares_alpha), false)?;
+        let emissive_texture = texture(map("map_ke").as_ref(), true)?;
+        let normal_texture = texture(map("norm").as_ref(), false)?;
+        let roughness_texture = texture(map("map_pr").as_ref(), false)?;
+        let metallic_texture = texture(map("map_pm").as_ref(), false)?;
+        let kd = colour("kd")?;
+        let mut opacity = share("d")?;
+        if let (None, Some(Vec3 { x: tr, .. })) = (opacity, share("tr")?) {
+            let shown = if tr_is_opacity { tr } else { 1.0 - tr };
+            if shown == 0.0 {
+                let name = shortened(name);
+                self.model.notes.push(format!(
+                    "material {name}: Tr {tr} would hide it, but is what some programs write for opaque materials; it is \
+                     shown (d 0 hides a material)"
+                ));
+            }
+            opacity = Some(Vec3::splat(if shown == 0.0 { 1.0 } else { shown }));
         }
-        if source.normal_texture.is_some() {
-            let name = shortened(&source.name);
+        let opacity = factor(opacity, alpha_map.is_some(), 1.0).x;
+        let is_shiny =
+            ["pr", "pm", "map_pr", "map_pm"].iter().any(|&key| entries.contains_key(key));
+        let is_transparent = opacity < 1.0 || alpha_map.is_some();
+        let number = self.model.material(Material {
+            name: name.to_owned(),
+            reflection: if is_shiny { Reflection::MetalRough } else { Reflection::Lambert },
+            base: factor(kd, base_texture.is_some(), GREY).extend(opacity),
+            metallic: factor(share("pm")?, metallic_texture.is_some(), 0.0).x,
+            roughness: factor(share("pr")?, roughness_texture.is_some(), 1.0).x,
+            emissive: factor(colour("ke")?, emissive_texture.is_some(), 0.0),
+            base_texture,
+            alpha_texture,
+            roughness_texture,
+            metallic_texture,
+            normal_texture,
+            emissive_texture,
+            alpha: if is_transparent { AlphaMode::Blend } else { AlphaMode::Opaque },
+            ..Material::default()
+        });
+        if base_texture.is_none() && kd.is_none_or(|kd| kd == Vec3::ZERO) {
+            self.uncoloured.insert(number);
+        }
+        if map("bump").or(map("map_bump")).is_some() {
+            let name = shortened(name);
             self.model.notes.push(format!(
                 "material {name}: bump maps are not supported; store a normal map (norm) instead"
             ));
         }
-        let number = self.model.material(material);
-        self.numbers.insert(source.name.clone(), Some(number));
+        self.numbers.insert(name.to_owned(), Some(number));
         Ok(())
     }
 
@@ -144,43 +201,30 @@ impl Materials {
     }
 }
 
-fn linear(colour: [f64; 3]) -> Vec3 {
-    Vec3::from(colour.map(|v| v as f32)).max(Vec3::ZERO)
+/// The factor of a map or, without a map, the value itself. For what a map defines, exporters write 0 or nothing.
+fn factor(given: Option<Vec3>, has_map: bool, default: f32) -> Vec3 {
+    match given {
+        Some(value) if !has_map || value != Vec3::ZERO => value,
+        None if !has_map => Vec3::splat(default),
+        _ => Vec3::ONE,
+    }
 }
 
-/// Checks a statement and returns the text to pass to `tobj`. Texture statements are prefixed with their line
-/// number, for messages.
-fn checked(statement: Statement<'_>) -> Result<String, Error> {
-    let (key, line) = (statement.key, statement.line);
-    let fault = |problem: &str| statement.fault(format!("{key} {problem}"));
+/// The first numbers of a statement, at most `most`; a single one counts three times.
+fn numbers(statement: Statement<'_>, most: usize) -> Result<Vec3, Error> {
+    let fault = |problem: &str| statement.fault(format!("{} {problem}", statement.key));
     let number = |word: &str| match word.parse::<f32>() {
-        Ok(value) if value.is_finite() => Ok(value),
+        Ok(value) if value.is_finite() => Ok(value.max(0.0)),
         _ => Err(fault("is not a finite number")),
     };
     // The halo of `d -halo 0.5` is ignored.
-    let words = statement.words().filter(|word| *word != "-halo").take(3);
-    let share = || -> Result<f32, Error> {
-        let word = words.clone().next().ok_or_else(|| fault("has no value"))?;
-        Ok(number(word)?.clamp(0.0, 1.0))
-    };
-    Ok(match key {
-        "newmtl" if statement.value().is_empty() => return Err(fault("has no name")),
-        "newmtl" => format!("newmtl {}\n", statement.value()),
-        // Spectral and XYZ colours are ignored.
-        "Kd" | "Ke" if !statement.text.starts_with(['s', 'x']) => {
-            let [r, g, b] = match words.clone().map(number).collect::<Result<Vec<_>, _>>()?[..] {
-                [r, g, b] => [r, g, b],
-                [grey] => [grey; 3],
-                _ => return Err(fault("needs three numbers")),
-            };
-            format!("{key} {r} {g} {b}\n")
-        }
-        "d" | "Pr" | "Pm" => format!("{key} {}\n", share()?),
-        "Tr" => format!("d {}\n", 1.0 - share()?),
-        "map_Kd" | "map_Ke" | "map_d" | "norm" | "map_Pr" | "map_Pm" | "bump" | "map_bump"
-        | "map_Bump" => format!("{key} {line} {}\n", statement.text),
-        _ => String::new(),
-    })
+    let words = statement.words().filter(|word| *word != "-halo").take(most);
+    match words.map(number).collect::<Result<Vec<_>, _>>()?[..] {
+        [r, g, b] => Ok(Vec3::new(r, g, b)),
+        [grey] => Ok(Vec3::splat(grey)),
+        [] => Err(fault("has no value")),
+        _ => Err(fault("needs three numbers")),
+    }
 }
 
 /// A texture statement.
@@ -193,10 +237,9 @@ pub(super) struct Map {
 }
 
 impl Map {
-    /// Parses a line number, options, and a file name that may contain spaces; `None` if there is no name.
-    pub(super) fn read(statement: &str) -> Option<Self> {
-        let (line, mut rest) = split_word(statement);
-        let line = line.parse().ok()?;
+    /// Parses options, and a file name that may contain spaces; `None` if there is no name.
+    pub(super) fn read(statement: Statement<'_>) -> Option<Self> {
+        let Statement { line, text: mut rest, .. } = statement;
         let mut map =
             Self { line, file: String::new(), scale: Vec2::ONE, offset: Vec2::ZERO, clamp: false };
         while rest.starts_with('-') {

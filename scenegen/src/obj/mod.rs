@@ -7,7 +7,12 @@
 //!
 //! Faces are visible from both sides. Materials are diffuse unless they have one of the PBR keys `Pr`,
 //! `Pm`, `map_Pr` or `map_Pm`. `norm` is a tangent-space normal map as in glTF; height maps (`bump`,
-//! `map_bump`) are ignored with a note.
+//! `map_bump`) are ignored with a note. Where programs disagree with the format, theirs is the meaning: a factor
+//! of 0 beside its map shows the map, `d` takes precedence over `Tr`, and a `Tr` that would hide a material does
+//! not.
+//!
+//! Vertex colours (`v x y z r g b`) are sRGB, from 0 to 1, or to 255 if one of them is at least 2. They replace
+//! the grey, or black, of materials without a texture.
 //!
 //! A corner without a normal is flat, or smooth within its smoothing group (`s 1`). A smooth normal is the mean
 //! of the normals of the group's faces, weighted by their angles (Thürmer and Wüthrich, "Computing Vertex
@@ -22,11 +27,12 @@ use std::collections::HashMap;
 use std::mem;
 use std::path::Path;
 
-use glam::{DVec2, DVec3, Vec2, Vec3, Vec4};
+use glam::{DVec2, DVec3, Vec2, Vec3};
 use tobj::Mesh;
 
 use crate::error::Error;
 use crate::mesh::{Material, Model, pad};
+use crate::texture::linear_from_srgb;
 use block::Block;
 use materials::{GREY, Materials};
 use statements::{Statement, shortened};
@@ -47,8 +53,8 @@ struct Corner {
 struct Reader {
     materials: Materials,
     positions: Vec<DVec3>,
-    /// Empty, or one per position up to the last one with a colour.
-    colours: Vec<Vec3>,
+    /// Colours as in the file; empty, or one per position up to the last one with a colour.
+    colours: Vec<Option<Vec3>>,
     uvs: Vec<Vec2>,
     normals: Vec<Vec3>,
     /// Number of triangles so far.
@@ -129,8 +135,12 @@ impl Reader {
         // x y z r g b, or x y z w r g b.
         if let &([r, g, b] | [_, r, g, b]) = &statement.numbers(8)?[3..] {
             let rgb = DVec3::new(r, g, b).as_vec3();
-            self.colours.resize(self.positions.len(), Vec3::ONE);
-            self.colours.push(if rgb.is_finite() { rgb.max(Vec3::ZERO) } else { Vec3::ONE });
+            if rgb.max_element() > 255.0 {
+                let problem = format!("the vertex colour {} is above 255", rgb.max_element());
+                return Err(statement.fault(problem));
+            }
+            self.colours.resize(self.positions.len(), None);
+            self.colours.push(rgb.is_finite().then_some(rgb));
         }
         self.positions.push(position);
         Ok(())
@@ -154,7 +164,9 @@ impl Reader {
         let material = match self.material {
             Some(material) => material,
             None => *self.grey.get_or_insert_with(|| {
-                self.materials.model.material(Material::lambert("none", GREY))
+                let grey = self.materials.model.material(Material::lambert("none", [GREY; 3]));
+                self.materials.uncoloured.insert(grey);
+                grey
             }),
         };
         if self.block.is_full() || (self.block.material, self.block.group) != (material, group) {
@@ -166,8 +178,7 @@ impl Reader {
             let index = number.wrapping_sub(1);
             if i == 0 {
                 let [x, y, z] = self.positions[index].to_array();
-                let [r, g, b] = self.colours.get(index).map_or([1.0; 3], Vec3::to_array);
-                format!("v {x} {y} {z} {r} {g} {b}\n")
+                format!("v {x} {y} {z}\n")
             } else if i == 1 {
                 let uv = self.uvs.get(index).copied().unwrap_or_default().as_dvec2();
                 format!("vt {} {}\n", uv.x, uv.y)
@@ -255,9 +266,6 @@ impl Reader {
             let at = |values: &[f64]| DVec3::from_slice(&values[3 * i..]);
             let place = (model.positions.len(), 1);
             model.positions.push(at(&mesh.positions));
-            let colour = at(&mesh.vertex_color).as_vec3().extend(1.0);
-            let colour = (colour != Vec4::ONE).then_some(colour);
-            pad(&mut model.colours, colour, place, Vec4::ONE);
             let uv = DVec2::from_slice(&mesh.texcoords[2 * i..]).as_vec2();
             pad(&mut model.uvs[0], (corner.numbers[1] > 0).then_some(uv), place, Vec2::ZERO);
             let normal = at(&mesh.normals).as_vec3();
@@ -266,8 +274,9 @@ impl Reader {
         })
     }
 
-    /// Sets the normals of smoothing groups and returns the model.
-    fn into_model(self) -> Model {
+    /// Sets the colours of vertices and the normals of smoothing groups, and returns the model.
+    fn into_model(mut self) -> Model {
+        self.add_colours();
         let mut model = self.materials.model;
         if !self.sums.is_empty() {
             model.normals.resize(model.positions.len(), Vec3::ZERO);
@@ -278,6 +287,32 @@ impl Reader {
             }
         }
         model
+    }
+
+    fn add_colours(&mut self) {
+        let values = self.colours.iter().flatten();
+        let Some(largest) = values.map(|colour| colour.max_element()).reduce(f32::max) else {
+            return;
+        };
+        // Slightly more than 1 is a rounding error.
+        let full = if largest >= 2.0 { 255.0 } else { 1.0 };
+        let decoded = |v: f32| linear_from_srgb(f64::from((v / full).clamp(0.0, 1.0))) as f32;
+        let Materials { model, uncoloured, .. } = &mut self.materials;
+        let mut colours = vec![None; model.positions.len()];
+        for (corner, &vertex) in &self.vertices {
+            let colour = self.colours.get(corner.numbers[0] as usize - 1).copied().flatten();
+            colours[vertex as usize] = colour.map(|c| Vec3::from(c.to_array().map(decoded)));
+        }
+        for (triangle, material) in model.triangles.iter().zip(&model.triangle_materials) {
+            if uncoloured.contains(material)
+                && triangle.iter().any(|&i| colours[i as usize].is_some())
+            {
+                let base = &mut model.materials[*material as usize].base;
+                *base = Vec3::ONE.extend(base.w);
+            }
+        }
+        model.colours =
+            colours.into_iter().map(|colour| colour.unwrap_or(Vec3::ONE).extend(1.0)).collect();
     }
 }
 

@@ -84,7 +84,12 @@ pub(super) fn for_each(
         if lines < line {
             return Ok(());
         }
-        let text = String::from_utf8_lossy(&text);
+        let bytes: &[u8] = if line == 1 {
+            resource::without_mark(&text).map_err(|problem| fault(path, line, problem))?
+        } else {
+            &text
+        };
+        let text = String::from_utf8_lossy(bytes);
         let (key, text) = split_word(text.trim());
         read(Statement { path, line, key, text })?;
     }

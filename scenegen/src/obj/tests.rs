@@ -4,10 +4,13 @@
 
 use std::io::Cursor;
 
+use glam::Vec4;
+
 use super::materials::Map;
+use super::statements::Statement;
 use super::*;
-use crate::mesh::Reflection;
-use crate::texture::TextureRef;
+use crate::mesh::{AlphaMode, Reflection};
+use crate::texture::{TextureRef, linear_from_srgb};
 
 /// Loads an OBJ file with other files in its folder.
 fn loaded(obj: &str, files: &[(&str, &[u8])]) -> Result<Model, Error> {
@@ -96,12 +99,14 @@ fn maps_of_roughness_and_metalness_are_read() {
 
 #[test]
 fn texture_options_are_separated_from_the_name() {
-    let map = Map::read("1 -o 0.5 0.25 -s 2 3 1 -clamp on -bm 0.3 my file.png").expect("map");
+    let path = Path::new("a.mtl");
+    let read = |text| Map::read(Statement { path, line: 1, key: "map_Kd", text });
+    let map = read("-o 0.5 0.25 -s 2 3 1 -clamp on -bm 0.3 my file.png").expect("map");
     assert_eq!(map.file, "my file.png");
     assert_eq!((map.offset, map.scale), (Vec2::new(0.5, 0.25), Vec2::new(2.0, 3.0)));
     assert!(map.clamp);
-    assert!(Map::read("1 -s 1 1 1").is_none());
-    assert!(Map::read("1").is_none());
+    assert!(read("-s 1 1 1").is_none());
+    assert!(read("").is_none());
 }
 
 #[test]
@@ -123,7 +128,127 @@ fn vertices_before_the_first_colour_are_white() {
     let text = "v 0 0 0\nv 1 0 0 0.5 -1 nan\nv 0 1 0 1 0.25 -1 0\nf 3 2 1\n";
     let model = loaded(text, &[]).expect("a triangle");
     let colours: Vec<_> = model.triangles[0].map(|i| model.colours[i as usize]).to_vec();
-    assert_eq!(colours, [Vec4::new(0.25, 0.0, 0.0, 1.0), Vec4::ONE, Vec4::ONE]);
+    let quarter = linear_from_srgb(0.25) as f32;
+    assert_eq!(colours, [Vec4::new(quarter, 0.0, 0.0, 1.0), Vec4::ONE, Vec4::ONE]);
+}
+
+/// The linear colour of a grey image and its alpha, as a PNG.
+fn png(grey: u8, alpha: u8) -> Vec<u8> {
+    let mut bytes = Cursor::new(Vec::new());
+    let image = image::GrayAlphaImage::from_pixel(2, 2, image::LumaA([grey, alpha]));
+    image.write_to(&mut bytes, image::ImageFormat::Png).expect("PNG");
+    bytes.into_inner()
+}
+
+/// A triangle, its vertices with more numbers, in a material of this library with pictures `t.png` and `a.png`.
+fn painted(more: &str, library: &str) -> Model {
+    let obj = format!(
+        "mtllib a.mtl\nv 0 0 0 {more}\nv 1 0 0 {more}\nv 0 1 0 {more}\nvt 0 0\nusemtl m\nf 1/1 2/1 3/1\n"
+    );
+    let (t, a) = (png(128, 51), png(204, 255));
+    let files: [(&str, &[u8]); 3] = [("a.mtl", library.as_bytes()), ("t.png", &t), ("a.png", &a)];
+    loaded(&obj, &files).expect("a triangle")
+}
+
+#[test]
+fn vertex_colours_are_srgb_in_bytes_or_shares() {
+    let grey = linear_from_srgb(128.0 / 255.0) as f32;
+    for (more, expected) in [
+        ("128 128 128", grey),
+        ("127.5 127.5 127.5", linear_from_srgb(0.5) as f32),
+        ("0.5019608 0.5019608 0.5019608", grey),
+        // Rounding errors above 1 are no bytes.
+        ("1.000001 1.000001 1.000001", 1.0),
+        ("1 1 1", 1.0),
+    ] {
+        for library in ["newmtl m\n", "newmtl m\nKd 0 0 0\n", "newmtl m\nKd 1 1 1\n", ""] {
+            let model = painted(more, library);
+            let base = model.materials[model.triangle_materials[0] as usize].base.truncate();
+            let seen = base * model.colours[0].truncate();
+            assert!((seen - expected).abs().max_element() < 1e-6, "{more}, {library}: {seen}");
+        }
+    }
+    let error = loaded("v 0 0 0 1 1 256\n", &[]).expect_err("no colour").to_string();
+    assert!(error.contains("line 1") && error.contains("256"), "{error}");
+    // Without colours, the grey stays.
+    assert_eq!(painted("", "").materials[0].base.x, GREY);
+    assert_eq!(painted("", "newmtl m\nKd 0 0 0\n").materials[0].base.x, 0.0);
+}
+
+#[test]
+fn a_factor_of_zero_beside_a_map_shows_the_map() {
+    for (factor, expected) in [("Kd 0 0 0", 1.0), ("", 1.0), ("Kd 0.5 0.5 0.5", 0.5)] {
+        for maps in ["map_Kd t.png", "map_kd t.png", "MAP_KD -s 2 2 2 t.png"] {
+            let model = painted("", &format!("newmtl m\n{factor}\n{maps}\n"));
+            assert_eq!(model.materials[0].base, Vec4::new(expected, expected, expected, 1.0));
+            assert!(model.materials[0].base_texture.is_some());
+        }
+    }
+    let library = "newmtl m\nKe 0 0 0\nmap_Ke t.png\nPr 0\nmap_Pr t.png\nPm 0\nmap_Pm t.png\nd 0\nmap_d a.png\n";
+    let material = &painted("", library).materials[0];
+    assert_eq!((material.emissive, material.roughness), (Vec3::ONE, 1.0));
+    assert_eq!((material.metallic, material.base.w), (1.0, 1.0));
+    let material = &painted("", "newmtl m\nKe 0 0 0\nPr 0\nPm 0\nd 0\n").materials[0];
+    assert_eq!((material.emissive, material.roughness), (Vec3::ZERO, 0.0));
+    assert_eq!((material.metallic, material.base.w), (0.0, 0.0));
+}
+
+#[test]
+fn opacity_is_what_its_writer_meant() {
+    for (library, expected) in [
+        ("newmtl m\nTr 1.000000\nmap_Kd t.png\n", 1.0),
+        ("newmtl m\nTr 1\n", 1.0),
+        ("newmtl m\nTr 0.25\n", 0.75),
+        ("newmtl m\nTr 0\n", 1.0),
+        ("newmtl m\nTr 1\nd 1\n", 1.0),
+        ("newmtl m\nd 1\nTr 1\n", 1.0),
+        ("newmtl m\nd 0.25\nTr 0\n", 0.25),
+        ("newmtl m\nTr 0.75\nd 0.75\n", 0.75),
+        ("newmtl m\nd 0\n", 0.0),
+        ("# Converted by Meshlab Group\nnewmtl m\nTr 1.0\nmap_Kd t.png\n", 1.0),
+        ("# Converted by Meshlab Group\nnewmtl m\nTr 0.25\n", 0.25),
+    ] {
+        let model = painted("", library);
+        let material = &model.materials[0];
+        assert_eq!(material.base.w, expected, "{library}");
+        assert_eq!(material.alpha == AlphaMode::Blend, expected < 1.0, "{library}");
+        let is_noted = model.notes.iter().any(|note| note.contains("Tr 1"));
+        assert_eq!(is_noted, !library.contains("d 1") && library.starts_with("newmtl m\nTr 1"));
+    }
+    // An image with an alpha channel may be the map of colour and of opacity.
+    let alpha = |library| {
+        let model = painted("", library);
+        let material = &model.materials[0];
+        assert_eq!(material.alpha, AlphaMode::Blend);
+        let texel = |texture: Option<TextureRef>| {
+            let texture = texture?;
+            let image = &model.textures[texture.texture as usize];
+            Some(image.sample(Vec2::splat(0.5), &texture.sampler, 0.0))
+        };
+        texel(material.base_texture).map_or(1.0, |texel| texel.w)
+            * texel(material.alpha_texture).map_or(1.0, |texel| texel.x)
+    };
+    assert!((alpha("newmtl m\nmap_Kd t.png\nmap_d t.png\n") - 0.2).abs() < 1e-6);
+    assert!((alpha("newmtl m\nmap_d a.png\n") - 0.8).abs() < 1e-6);
+}
+
+#[test]
+fn byte_order_marks_are_skipped() {
+    let (t, mark) = (png(128, 255), "\u{feff}");
+    let library = format!("{mark}newmtl m\nmap_Kd t.png\n");
+    let files: [(&str, &[u8]); 2] = [("a.mtl", library.as_bytes()), ("t.png", &t)];
+    for first in ["v 0 0 0\nmtllib a.mtl".to_owned(), "mtllib a.mtl\nv 0 0 0".to_owned()] {
+        let obj = format!("{mark}{first}\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl m\nf 1/1 2/1 3/1\n");
+        let model = loaded(&obj, &files).expect("a triangle");
+        assert_eq!(model.positions[0], DVec3::ZERO);
+        assert!(model.materials[0].base_texture.is_some() && model.notes.is_empty());
+    }
+    let folder = tempfile::tempdir().expect("folder");
+    let path = folder.path().join("wide.obj");
+    let wide: Vec<u8> = "\u{feff}v 0 0 0\n".encode_utf16().flat_map(u16::to_le_bytes).collect();
+    std::fs::write(&path, wide).expect("write");
+    let error = load(&path).expect_err("UTF-16").to_string();
+    assert!(error.contains("line 1") && error.contains("UTF-16"), "{error}");
 }
 
 #[test]

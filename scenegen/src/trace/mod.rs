@@ -194,6 +194,15 @@ impl Tracer<'_> {
         self.surface.is_missed_by(camera.centre, directions)
     }
 
+    /// True if a ray through the centre of a pixel meets a surface with alpha of at least one half.
+    pub(crate) fn meets_surface(&self, camera: &Camera) -> bool {
+        let centre = |x: u32, y: u32| DVec2::new(f64::from(x), f64::from(y)) + 0.5;
+        let meets = |direction| self.first_solid(camera.centre, direction, None).is_some();
+        (0..camera.height)
+            .into_par_iter()
+            .any(|y| (0..camera.width).any(|x| meets(camera.direction(centre(x, y)))))
+    }
+
     fn shaded(&self) -> ShadedSurface<'_> {
         ShadedSurface { surface: self.surface, model: self.model, flags: self.flags }
     }

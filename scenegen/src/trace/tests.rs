@@ -301,3 +301,59 @@ fn image_and_gradient_skies_agree_and_so_does_sampling() {
     let (formula, sampled) = (mean(Ambient::Open), mean(Ambient::Occlusion(64)));
     assert!((formula - sampled).abs() < 1.0, "{formula} and {sampled}");
 }
+
+#[test]
+fn a_scene_that_no_view_shows_is_an_error() {
+    let folder = tempfile::tempdir().expect("folder");
+    let options = |rig| Options {
+        rig,
+        size: Some((16, 16)),
+        train: Some(3),
+        test: Some(1),
+        grid: 1,
+        ..Options::default()
+    };
+    let check = |file: &str, rig, is_seen: bool| match (
+        Scene::prepare(&Source::File(folder.path().join(file)), &options(rig)),
+        is_seen,
+    ) {
+        (Ok(_), true) => {}
+        (Err(error), false) => {
+            let error = error.to_string();
+            assert!(error.contains(file) && error.contains("shows a surface"), "{error}");
+        }
+        (Ok(_), false) => panic!("{file} is seen"),
+        (Err(error), true) => panic!("{error}"),
+    };
+    let write =
+        |name: &str, text: String| std::fs::write(folder.path().join(name), text).expect("write");
+    write("a.obj", "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\nf 1 2 3\n".to_owned());
+    // Surfaces may be faint, or met by no ray through the centre of a pixel.
+    for (opacity, is_seen) in [("1", true), ("0.25", true), ("0", false)] {
+        write("a.mtl", format!("newmtl m\nd {opacity}\n"));
+        check("a.obj", None, is_seen);
+    }
+    let (ahead, back) = ([0, 0, 0, 1], [0, 1, 0, 0]);
+    let corners: [f32; 9] = [-1.0, -1.0, 0.0, 1.0, -1.0, 0.0, 0.0, 1.0, 0.0];
+    let bytes: Vec<u8> = corners.iter().flat_map(|value| value.to_le_bytes()).collect();
+    let uri = base64::Engine::encode(&base64::engine::general_purpose::STANDARD, bytes);
+    for (mesh, camera, is_seen) in
+        [(ahead, ahead, true), (ahead, back, false), (back, ahead, false)]
+    {
+        let text = serde_json::json!({
+            "asset": { "version": "2.0" },
+            "scenes": [{ "nodes": [0, 1] }],
+            "nodes": [
+                { "mesh": 0, "translation": [0, 0, -5], "rotation": mesh },
+                { "camera": 0, "rotation": camera },
+            ],
+            "cameras": [{ "type": "perspective", "perspective": { "yfov": 0.8, "znear": 0.1 } }],
+            "meshes": [{ "primitives": [{ "attributes": { "POSITION": 0 } }] }],
+            "accessors": [{ "bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3" }],
+            "bufferViews": [{ "buffer": 0, "byteLength": 36 }],
+            "buffers": [{ "byteLength": 36, "uri": format!("data:;base64,{uri}") }],
+        });
+        write("b.gltf", text.to_string());
+        check("b.gltf", Some(RigKind::File), is_seen);
+    }
+}

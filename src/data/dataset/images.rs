@@ -126,7 +126,12 @@ impl ImageSource {
     }
 
     fn channels(&self) -> u64 {
-        3 + u64::from(self.header.has_alpha || self.is_carved()) + u64::from(self.is_masked())
+        3 + u64::from(self.may_be_transparent()) + u64::from(self.is_masked())
+    }
+
+    /// Whether loaded images may have transparent pixels.
+    pub(crate) fn may_be_transparent(&self) -> bool {
+        self.header.has_alpha || self.is_carved()
     }
 
     /// Whether loaded images have a mask: from a file, or of the field of view of the lens.

@@ -87,6 +87,7 @@ pub(super) fn prepare(
     let (name, automatic) = (case.choices.entry.name, case.choices.automatic);
     let mut dataset = case.inputs.into_owned().dataset;
     let views = DatasetViews::new(dataset.train.clone(), size.image_cache, DECODERS);
+    views.check_visible(&dataset.root)?;
     let test = DatasetViews::new(dataset.test.clone(), 0, TEST_DECODERS);
     // Once the first rows are made, training needs no points.
     dataset.points = companion
