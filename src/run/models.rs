@@ -113,6 +113,9 @@ pub fn read_model(path: &Path, observer: &dyn Observer) -> Result<Gaussians, Fai
             observer.say(format_args!("note: {}: {number} rows {what}", path.display()));
         }
     }
+    for note in &file.notes {
+        observer.say(format_args!("note: {}: {note}", path.display()));
+    }
     Ok(file.gaussians)
 }
 
