@@ -228,12 +228,22 @@ fn splats(
         return Err(LoadError::damaged(path, "attributes", "they have different counts"));
     }
     // Many exporters copy the numbers of a splat PLY.
-    for (name, values, most, meant) in [
-        ("SCALE", &scales, f32::INFINITY, "negative, so that it looks like a logarithm"),
-        ("OPACITY", &opacities, MOST_OPACITY, "not between 0 and 1, so that it looks like a logit"),
+    for (name, values, most, cause) in [
+        (
+            "SCALE",
+            &scales,
+            f32::INFINITY,
+            "logarithm; glTF stores scales themselves, which are never negative",
+        ),
+        (
+            "OPACITY",
+            &opacities,
+            MOST_OPACITY,
+            "logit; glTF stores opacities themselves, from 0 to 1",
+        ),
     ] {
         if let Some(value) = values.iter().find(|value| **value < 0.0 || **value > most) {
-            let problem = format!("{value} is {meant}; glTF has the values themselves");
+            let problem = format!("{value} looks like a {cause}");
             return Err(LoadError::damaged(path, format!("{SPLATS}:{name}"), problem));
         }
     }

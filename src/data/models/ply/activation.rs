@@ -21,20 +21,23 @@ pub(super) fn undo(model: &mut Gaussians) -> Vec<String> {
         for value in &mut model.opacity_logits {
             *value = quantised_logit(*value);
         }
-        notes.push("its opacities are all between 0 and 1, so that they are read as they are, not as logits".to_owned());
+        notes.push(
+            "its opacities lie between 0 and 1, so that they are read as opacities, not as logits"
+                .to_owned(),
+        );
     }
     if are_scales && are_opacities {
         for value in model.log_scales.as_flattened_mut() {
             *value = log_of_scale(*value);
         }
         notes.push(
-            "none of its scales is negative, so that they are read as they are, not as logarithms"
+            "none of its scales is negative, so that they are read as standard deviations, not as logarithms"
                 .to_owned(),
         );
     } else if are_scales {
         notes.push(format!(
-            "none of its scales is negative, and as the logarithms that a splat PLY holds they make large Gaussians \
-             (standard deviations from {:.3} up); if they are standard deviations, write their logarithms",
+            "its scales may be standard deviations, of which a splat PLY holds the logarithms: none is negative, and every \
+             Gaussian is read as larger than {:.3}; if they are, export their logarithms",
             least.exp()
         ));
     }

@@ -110,8 +110,8 @@ fn activated_values_are_recognised() {
         ("as it is", &[], false, &[]),
         ("in millimetres", &[&millimetres], false, &[]),
         ("opacities", &[&opacities], true, &["opacities"]),
-        ("scales", &[&scales], false, &["write their logarithms"]),
-        ("both", &[&opacities, &scales], true, &["opacities", "as they are, not as logarithms"]),
+        ("scales", &[&scales], false, &["export their logarithms"]),
+        ("both", &[&opacities, &scales], true, &["opacities", "not as logarithms"]),
         (
             "both in millimetres",
             &[&millimetres, &opacities, &scales],
