@@ -229,21 +229,11 @@ fn splats(
     }
     // Many exporters copy the numbers of a splat PLY.
     for (name, values, most, cause) in [
-        (
-            "SCALE",
-            &scales,
-            f32::INFINITY,
-            "logarithm; glTF stores scales themselves, which are never negative",
-        ),
-        (
-            "OPACITY",
-            &opacities,
-            MOST_OPACITY,
-            "logit; glTF stores opacities themselves, from 0 to 1",
-        ),
+        ("SCALE", &scales, f32::INFINITY, "a logarithm; glTF stores scales"),
+        ("OPACITY", &opacities, MOST_OPACITY, "a logit; glTF stores opacities"),
     ] {
         if let Some(value) = values.iter().find(|value| **value < 0.0 || **value > most) {
-            let problem = format!("{value} looks like a {cause}");
+            let problem = format!("{value} looks like {cause} as they are");
             return Err(LoadError::damaged(path, format!("{SPLATS}:{name}"), problem));
         }
     }
