@@ -5,19 +5,23 @@ use crate::models::quantise::{log_of_scale, quantised_logit};
 use crate::models::spatial_order::frame;
 use densify_core::gaussians::Gaussians;
 
-/// The largest opacity of a model is above this. As logits, 0.9 to 1 are opacities of 0.71 to 0.73.
+/// Whatever the scales, numbers from 0 to 1 are opacities if the largest is above this. As logits, 0.9 to 1 are opacities of
+/// 0.71 to 0.73.
 const NEAR_OPAQUE: f32 = 0.9;
-/// Opacities of a model differ by more than this; logits between 0 and 1 are opacities of 0.5 to 0.73.
+/// They must also differ by more than this; logits between 0 and 1 are opacities of 0.5 to 0.73.
 const SPREAD: f32 = 0.25;
 
 /// Turns plain values into logits and logarithms where there is no doubt; returns notes on them, and on what is in doubt.
 pub(super) fn undo(model: &mut Gaussians) -> Vec<String> {
     let (faintest, most_opaque) = range(&model.opacity_logits);
     let (least, most) = range(model.log_scales.as_flattened());
-    let are_opacities = faintest >= 0.0 && (NEAR_OPAQUE..=1.0).contains(&most_opaque);
-    let are_scales = least >= 0.0 && least < most && !are_logarithms(model);
+    let may_be_opacities = faintest >= 0.0 && most_opaque > 0.0 && most_opaque <= 1.0;
+    let are_opacities =
+        may_be_opacities && most_opaque > NEAR_OPAQUE && most_opaque - faintest > SPREAD;
+    let varies = least < most || (are_opacities && most > 0.0);
+    let are_scales = least >= 0.0 && varies && !are_logarithms(model);
     let mut notes = Vec::new();
-    if are_opacities && (are_scales || most_opaque - faintest > SPREAD) {
+    if are_opacities || (may_be_opacities && are_scales) {
         for value in &mut model.opacity_logits {
             *value = quantised_logit(*value);
         }
@@ -26,7 +30,7 @@ pub(super) fn undo(model: &mut Gaussians) -> Vec<String> {
                 .to_owned(),
         );
     }
-    if are_scales && are_opacities {
+    if are_scales && may_be_opacities {
         for value in model.log_scales.as_flattened_mut() {
             *value = log_of_scale(*value);
         }

@@ -104,9 +104,11 @@ fn activated_values_are_recognised() {
         m.means.as_flattened_mut().iter_mut().for_each(|v| *v *= 1e4);
         m.log_scales.as_flattened_mut().iter_mut().for_each(|v| *v += 10.0_f32.ln() * 4.0);
     };
+    let faint = |m: &mut Gaussians| m.opacity_logits.iter_mut().for_each(|v| *v *= 0.8);
+    let one_size = |m: &mut Gaussians| m.log_scales.fill([0.05; 3]);
     let opaque = |m: &mut Gaussians| m.opacity_logits.fill(1.0);
     type Change<'a> = &'a dyn Fn(&mut Gaussians);
-    let cases: [(&str, &[Change<'_>], bool, &[&str]); 7] = [
+    let cases: [(&str, &[Change<'_>], bool, &[&str]); 9] = [
         ("as it is", &[], false, &[]),
         ("in millimetres", &[&millimetres], false, &[]),
         ("opacities", &[&opacities], true, &["opacities"]),
@@ -118,6 +120,8 @@ fn activated_values_are_recognised() {
             true,
             &["opacities", "scales"],
         ),
+        ("faint", &[&opacities, &faint, &scales], true, &["opacities", "scales"]),
+        ("one size", &[&opacities, &one_size], true, &["opacities", "scales"]),
         ("opaque", &[&opaque, &scales], true, &["opacities", "scales"]),
     ];
     for (case, changes, is_undone, words) in cases {

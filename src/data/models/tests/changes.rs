@@ -44,9 +44,10 @@ fn rounding_is_no_change() {
 #[test]
 fn what_a_format_does_not_hold_is_measured() {
     type Change = fn(&mut Gaussians);
-    let cases: [(&str, Change, &[&str], &str); 8] = [
+    let cases: [(&str, Change, &[&str], &str); 9] = [
         ("kilometres", |m| grow(m, -8.0), &LOSSY[..2], "scales"),
         ("tenths", |m| grow(m, 11.0), &LOSSY[..2], "scales"),
+        ("haze", |m| m.opacity_logits.fill(-5.0), &LOSSY, "opacities"),
         ("bright", |m| colour(m, 0, 6.0), &LOSSY[..2], "colours"),
         ("glossy", |m| colour(m, 4, 2.0), &LOSSY[..2], "colours"),
         ("mirror", |m| colour(m, 4, 6.0), &["spz", "compressed-ply"], "colours"),
