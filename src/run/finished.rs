@@ -6,7 +6,7 @@ use densify_policies::policy::Needs;
 
 use crate::failure::{Failure, ModelProblem, notes};
 pub use crate::models::{
-    is_model, iteration, iteration_so_far, model_file, name_of, names_of, read_model,
+    is_model, iteration, iteration_so_far, model_file, name_of, names_of, read_model, write_model,
 };
 use crate::observer::{Observer, say_notes};
 use crate::resolved::RunConfig;

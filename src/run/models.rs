@@ -1,13 +1,14 @@
 //! Files of models: single files, and those saved by a run.
 
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use crate::failure::{Failure, ModelProblem};
 use crate::observer::Observer;
-use densify_core::files;
+use densify_core::files::{self, WriteError};
 use densify_core::gaussians::Gaussians;
 use densify_data::dataset::is_archive;
-use densify_data::models;
+use densify_data::models::{self, Format, fitting_format, is_unfit};
 use densify_train::checkpoint::newest_step;
 use densify_train::output::{is_in_use, model_path, saved_iterations};
 
@@ -115,7 +116,43 @@ pub fn read_model(path: &Path, observer: &dyn Observer) -> Result<Gaussians, Fai
             observer.say(format_args!("note: {}: {number} rows {what}", path.display()));
         }
     }
+    for note in &file.notes {
+        observer.say(format_args!("note: {}: {note}", path.display()));
+    }
     Ok(file.gaussians)
+}
+
+/// Writes a model in another format, and notes what the format changes of it. An error leaves an existing file as it is.
+///
+/// # Errors
+/// When the format does not hold the model, or the disk fails.
+pub fn write_model(
+    format: &Format,
+    path: &Path,
+    model: &Gaussians,
+    observer: &dyn Observer,
+) -> Result<(), Failure> {
+    let write = |out: &mut dyn Write| {
+        format.write(model, out).map_err(|error| match error {
+            // The format cannot hold the model; the disk is not at fault.
+            error if is_unfit(&error) => WriteError::Source(Failure::input(error)),
+            error => WriteError::Io(error),
+        })
+    };
+    files::write_checked(path, write, |written| {
+        let (name, changes) = (format.name, format.changes(model, written)?);
+        if changes.is_unfit() {
+            // The file is given up, so that others can be tried in its place.
+            let other = fitting_format(model, written).name;
+            return Err(Failure::input(format!(
+                "{name} does not hold this model: {changes}; choose another format, such as {other}"
+            )));
+        }
+        if changes.is_noted() {
+            observer.say(format_args!("note: {name}: {changes}; ply and glb hold all values"));
+        }
+        Ok(())
+    })
 }
 
 #[cfg(test)]

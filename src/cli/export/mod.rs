@@ -10,14 +10,14 @@ use clap::{ArgMatches, Args};
 use super::console::Console;
 use super::render::{RenderingArgs, refuse_scene_options};
 use super::threads::open_machine;
-use densify_core::files::{FileError, write_atomically};
+use densify_core::files::FileError;
 use densify_core::gaussians::Gaussians;
 use densify_core::numbers::gaussians;
-use densify_data::models::{Format, export_formats, find, find_by_extension, is_unfit};
+use densify_data::models::{Format, export_formats, find, find_by_extension};
 use densify_inspect::Reference;
 use densify_run::RunConfig;
 use densify_run::failure::{Failure, INPUT};
-use densify_run::finished::{model_file, read_model};
+use densify_run::finished::{model_file, read_model, write_model};
 use table::WrittenFile;
 
 /// Stands for every format.
@@ -91,7 +91,10 @@ pub(super) fn run(
     let mut written = Vec::new();
     let mut unfit = None;
     for (format, path) in &files {
-        match write(format, path, &model) {
+        let shown = path.display().to_string();
+        let result = write_model(format, path, &model, console);
+        match result.map_err(|error| if error.code == INPUT { error.within(&shown) } else { error })
+        {
             Ok(()) => {}
             // Another format may be able to hold the model.
             Err(failure) if failure.code == INPUT && files.len() > 1 => {
@@ -183,16 +186,6 @@ fn output_stem(model: &Path) -> String {
 pub(super) fn format_from_extension(output: &Path) -> Result<&'static Format, Failure> {
     find_by_extension(output)
         .map_err(|error| Failure::input(format!("-o: {error}, and name it with --format NAME")))
-}
-
-fn write(format: &Format, path: &Path, model: &Gaussians) -> Result<(), Failure> {
-    write_atomically(path, |out| format.write(model, out)).map_err(|error| match error {
-        // The format cannot hold the model; the disk is not at fault.
-        FileError::Io { source, .. } if is_unfit(&source) => {
-            Failure::input(format!("{}: {source}", path.display()))
-        }
-        error => error.into(),
-    })
 }
 
 /// Fails if the output would replace something that it must not.

@@ -52,9 +52,22 @@ pub fn write_atomically_from<E: From<FileError>>(
     path: &Path,
     write: impl FnOnce(&mut dyn Write) -> Result<(), WriteError<E>>,
 ) -> Result<(), E> {
+    write_checked(path, write, |_| Ok(()))
+}
+
+/// Does the same as [`write_atomically_from`], but gives the complete file its name only if `check`, which is given
+/// its temporary path, accepts it.
+///
+/// # Errors
+/// Those of [`write_atomically_from`] and of `check`.
+pub fn write_checked<E: From<FileError>>(
+    path: &Path,
+    write: impl FnOnce(&mut dyn Write) -> Result<(), WriteError<E>>,
+    check: impl FnOnce(&Path) -> Result<(), E>,
+) -> Result<(), E> {
     let folder = folder_of(path);
     std::fs::create_dir_all(folder).map_err(FileError::io("create the folder", folder))?;
-    replace(folder, path, write).map_err(|error| match error {
+    replace(folder, path, write, check).map_err(|error| match error {
         WriteError::Io(error) => FileError::io("write", path)(error).into(),
         WriteError::Source(error) => error,
     })
@@ -64,6 +77,7 @@ fn replace<E>(
     folder: &Path,
     path: &Path,
     write: impl FnOnce(&mut dyn Write) -> Result<(), WriteError<E>>,
+    check: impl FnOnce(&Path) -> Result<(), E>,
 ) -> Result<(), WriteError<E>> {
     let mut builder = tempfile::Builder::new();
     builder.prefix(TEMPORARY);
@@ -77,6 +91,7 @@ fn replace<E>(
     write(&mut buffered)?;
     buffered.flush()?;
     drop(buffered);
+    check(file.path()).map_err(WriteError::Source)?;
     attempt(Operation::Sync, path)?;
     file.as_file().sync_all()?;
     attempt(Operation::Rename, path)?;

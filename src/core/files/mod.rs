@@ -7,7 +7,7 @@ mod read;
 
 pub use atomic::{
     RUN_FOLDER_DEPTH, WriteError, is_temporary, remove_incomplete, write_atomically,
-    write_atomically_from,
+    write_atomically_from, write_checked,
 };
 pub use error::FileError;
 pub use read::{

@@ -12,6 +12,7 @@ mod sog;
 mod splat;
 mod spz;
 
+mod changes;
 mod quantise;
 mod recognise;
 mod rows;
@@ -28,9 +29,10 @@ use densify_policies::parameters::nearest;
 #[doc(hidden)]
 pub use inventory;
 
+pub use changes::Changes;
 pub use recognise::{Match, ModelFile, Reader, main_file, read_model};
 pub use rows::SplatFile;
-pub use write::{ModelWriter, Shape, is_unfit};
+pub use write::{ModelWriter, Shape, fitting_format, is_unfit};
 
 /// The format that training writes.
 pub const PLY: &Format = &ply::FORMAT;

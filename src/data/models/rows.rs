@@ -12,7 +12,7 @@ const MAX_BAD_ROWS: f64 = 0.01;
 const ZERO_QUATERNION: f32 = 1e-12;
 
 /// A model read from a file, with a count of the repairs.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct SplatFile {
     /// The Gaussians, in the file's order and coordinates; bit for bit where the format stores f32.
     pub gaussians: Gaussians,
@@ -20,6 +20,8 @@ pub struct SplatFile {
     pub dropped: usize,
     /// Gaussians whose zero quaternion was replaced with the identity.
     pub repaired: usize,
+    /// What was read otherwise than the format says, or may have to be, each in a sentence.
+    pub notes: Vec<String>,
 }
 
 /// One decoded Gaussian.
@@ -44,13 +46,14 @@ pub(super) struct Rows {
 impl Rows {
     pub(super) fn new(sh_degree: u8) -> Self {
         let gaussians = Gaussians { sh_degree, ..Gaussians::default() };
-        Self { file: SplatFile { gaussians, dropped: 0, repaired: 0 }, total: 0 }
+        let file = SplatFile { gaussians, ..SplatFile::default() };
+        Self { file, total: 0 }
     }
 
     /// Adds a Gaussian if its values are finite. Infinite values that some programs write on purpose become finite
     /// first: the log-scale of a flat Gaussian, and the opacity logit of a transparent or opaque one.
     pub(super) fn push(&mut self, row: Row<'_>) {
-        let SplatFile { gaussians, dropped, repaired } = &mut self.file;
+        let SplatFile { gaussians, dropped, repaired, .. } = &mut self.file;
         let row = Row {
             log_scale: row.log_scale.map(|log| if log == f32::NEG_INFINITY { FLAT } else { log }),
             opacity_logit: match row.opacity_logit {

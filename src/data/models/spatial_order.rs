@@ -3,8 +3,8 @@
 use densify_core::curve::morton_code;
 use densify_core::gaussians::Gaussians;
 
-/// The rows of a model in the order of the curve. Its scale follows the median, so outliers have no effect.
-pub(super) fn spatial_order(model: &Gaussians) -> Vec<usize> {
+/// The centre and the spread of a model along each axis: medians, so that outliers have no effect.
+pub(super) fn frame(model: &Gaussians) -> [(f64, f64); 3] {
     let middle = model.len() / 2;
     let mut frame = [(0.0, 1.0); 3];
     let mut values = Vec::with_capacity(model.len());
@@ -12,13 +12,19 @@ pub(super) fn spatial_order(model: &Gaussians) -> Vec<usize> {
         values.clear();
         values.extend(model.means.iter().map(|mean| f64::from(mean[axis])));
         if values.is_empty() {
-            return Vec::new();
+            break;
         }
         *centre = *values.select_nth_unstable_by(middle, f64::total_cmp).1;
         values.iter_mut().for_each(|value| *value = (*value - *centre).abs());
         // 0 if half of all rows are equal in this coordinate.
         *spread = values.select_nth_unstable_by(middle, f64::total_cmp).1.max(f64::MIN_POSITIVE);
     }
+    frame
+}
+
+/// The rows of a model in the order of the curve, whose scale is that of the [`frame`].
+pub(super) fn spatial_order(model: &Gaussians) -> Vec<usize> {
+    let frame = frame(model);
     let place = |row: usize| {
         let mean = model.means[row].map(f64::from);
         morton_code(std::array::from_fn(|i| (mean[i] - frame[i].0) / (2.0 * frame[i].1)))

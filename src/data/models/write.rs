@@ -4,9 +4,10 @@ use std::io::{self, Write};
 use std::ops::Range;
 use std::path::Path;
 
-use super::Format;
 use super::spatial_order::spatial_order;
-use densify_core::files::{FileError, WriteError, write_atomically_from};
+use super::{Changes, Format, PLY, compress_formats, read_model};
+use crate::error::LoadError;
+use densify_core::files::{FileError, WriteError, write_atomically, write_atomically_from};
 use densify_core::gaussians::Gaussians;
 use densify_core::pieces::pieces;
 
@@ -66,6 +67,15 @@ pub fn is_unfit(error: &io::Error) -> bool {
     error.raw_os_error().is_none() && error.kind() == io::ErrorKind::InvalidInput
 }
 
+/// The smallest format that holds a model; each is tried in the file `scratch`.
+pub fn fitting_format(model: &Gaussians, scratch: &Path) -> &'static Format {
+    let fits = |format: &&Format| {
+        write_atomically(scratch, |out| format.write(model, out)).is_ok()
+            && format.changes(model, scratch).is_ok_and(|changes| !changes.is_unfit())
+    };
+    compress_formats().into_iter().rev().find(fits).unwrap_or(PLY)
+}
+
 /// The error of a format that cannot hold the model.
 pub(super) fn unfit(problem: impl Into<String>) -> io::Error {
     io::Error::new(io::ErrorKind::InvalidInput, problem.into())
@@ -112,6 +122,22 @@ impl Format {
             writer.rows(model, out)?;
         }
         writer.finish(out)
+    }
+
+    /// What a file that [`write`](Self::write) has made of `model` changes of it; nothing if the format is exact.
+    ///
+    /// # Errors
+    /// When the file cannot be read.
+    pub fn changes(&self, model: &Gaussians, file: &Path) -> Result<Changes, LoadError> {
+        let Some(writer) = self.writer.map(|make| make()).filter(|writer| writer.is_lossy()) else {
+            return Ok(Changes::default());
+        };
+        let order = if writer.wants_spatial_order() {
+            spatial_order(model)
+        } else {
+            (0..model.len()).collect()
+        };
+        Ok(Changes::measure(model, &order, &read_model(file)?.gaussians))
     }
 
     /// Writes a model to a file that appears only when it is complete. `rows` is asked for one

@@ -1,12 +1,15 @@
 //! Determines the number of Gaussians that fit in a file of a given size.
 
 use std::io::{self, Write};
+use std::path::Path;
 
 use super::{Options, Target};
 use densify_core::gaussians::Gaussians;
 use densify_core::numbers::grouped;
 use densify_data::models::{Format, is_unfit};
+use densify_run::Observer;
 use densify_run::failure::{Failure, INPUT, OTHER};
+use densify_run::finished::write_model;
 use densify_train::importance::{footprints, largest};
 
 /// Fraction of the size that an estimate aims at: training changes the compression ratio.
@@ -61,6 +64,30 @@ pub(super) fn check(options: &Options<'_>, model: &Gaussians) -> Result<(), Fail
     }
 }
 
+/// The formats that hold the model, each tried in the file `scratch`; says what they change, and which ones do not hold it.
+///
+/// # Errors
+/// When none holds it, or the disk fails.
+pub(super) fn fitting(
+    options: &Options<'_>,
+    model: &Gaussians,
+    scratch: &Path,
+    observer: &dyn Observer,
+) -> Result<Vec<&'static Format>, Failure> {
+    let (mut fitting, mut unfit) = (Vec::new(), None);
+    for &format in options.formats {
+        match write_model(format, scratch, model, observer) {
+            Ok(()) => fitting.push(format),
+            Err(failure) if failure.code == INPUT && options.formats.len() > 1 => {
+                observer.say(format_args!("note: not tried: {failure}"));
+                unfit = Some(failure);
+            }
+            Err(failure) => return Err(failure),
+        }
+    }
+    unfit.filter(|_| fitting.is_empty()).map_or(Ok(fitting), Err)
+}
+
 /// A format, and the number of rows of the untrained model that reach the target in it.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Packing {
@@ -75,19 +102,16 @@ pub(super) struct Packing {
 /// it is every variant that holds at least four fifths of the maximum number of rows. Empty if not even one row fits.
 ///
 /// # Errors
-/// If no format can represent the model, or writing fails for another reason.
+/// If writing fails.
 pub(super) fn packings(options: &Options<'_>, model: &Gaussians) -> Result<Vec<Packing>, Failure> {
-    let (mut best, mut unfit) = (None, None);
+    let mut best = None;
     for &format in options.formats {
         let most = best.map_or(0, |(_, rows)| rows);
-        match rows_that_fit(options.to, format, model) {
-            Ok(Some(rows)) if rows > most => best = Some((format, rows)),
-            Ok(_) => {}
-            Err(failure) if failure.code == INPUT => unfit = unfit.or(Some(failure)),
-            Err(failure) => return Err(failure),
+        if let Some(rows) = rows_that_fit(options.to, format, model)?.filter(|&rows| rows > most) {
+            best = Some((format, rows));
         }
     }
-    let Some((format, rows)) = best else { return unfit.map_or(Ok(Vec::new()), Err) };
+    let Some((format, rows)) = best else { return Ok(Vec::new()) };
     let packing = Packing { format, rows, is_whole: rows == model.len() };
     let variants = format.variants();
     // Variants differ only in the bands above 0.

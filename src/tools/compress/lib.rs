@@ -120,6 +120,9 @@ pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compre
     evaluator.check_coordinates(&model, options.model, observer)?;
     let whole = evaluator.evaluate(model.clone(), PLY, fit::file_size(PLY, &model)?)?;
     let scratch = create_scratch_file(options.output)?;
+    let named = options.formats;
+    let formats = fit::fitting(options, &model, &scratch, observer)?;
+    let options = &Options { formats: &formats, ..options.clone() };
     let search = Search { options, observer, evaluator, scratch, model };
     let (mut attempts, mut best_stages) = (Vec::<Attempt>::new(), Vec::new());
     let mut best: Option<(usize, &Format, Gaussians)> = None;
@@ -145,7 +148,7 @@ pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compre
     let Some((best, format, small)) = best else {
         return Err(fit::too_small(options, &search.model));
     };
-    let file = file(options.output, options.formats, format);
+    let file = file(options.output, named, format);
     write_atomically(&file, |out| format.write(&small, out))?;
     Ok(Compressed { whole, stages: best_stages, attempts, best, file })
 }

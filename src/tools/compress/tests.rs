@@ -64,6 +64,24 @@ fn a_size_that_no_gaussian_fits_is_refused_before_training() {
     assert_eq!(check(one), Ok(()));
 }
 
+#[test]
+fn formats_that_do_not_hold_the_model_are_not_tried() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let scratch = folder.path().join("scratch");
+    let mut model = colourful(400).with_degree(0);
+    model.log_scales.fill([8.0; 3]);
+    let spz = densify_data::models::find("spz").expect("a format");
+    let fitting = |formats: &[&'static Format]| {
+        let options = options(Target::Rows(9), Path::new(""), formats);
+        fit::fitting(&options, &model, &scratch, &Silent)
+    };
+    let names = |formats: Vec<&Format>| formats.iter().map(|format| format.name).collect();
+    let found: Vec<&str> = fitting(&[spz, sog(), PLY]).map(names).expect("two hold it");
+    assert_eq!(found, ["sog", "ply"]);
+    let refused = fitting(&[spz]).expect_err("it does not").to_string();
+    assert!(refused.contains("spz does not hold") && refused.contains("such as"), "{refused}");
+}
+
 /// Less accurate variants are smaller, so that more rows fit. Variants that hold fewer than four fifths of the most rows
 /// are not tried. If all rows fit with the default accuracy, the most accurate variant that holds them is tried.
 #[test]

@@ -93,13 +93,35 @@ fn every_format_is_written_compared_and_read_back() {
     let outcome = call(&format!("export {} -o {} --format all", text(&remote), text(&others))).ok();
     assert!(outcome.stdout.contains("not written") && outcome.stdout.contains("of the PLY"));
     let names: Vec<_> = files(&others).into_keys().collect();
-    let expected =
-        ["compressed.ply", "glb", "ply", "sog"].map(|extension| format!("re.mote.{extension}"));
+    let expected = ["glb", "ply", "sog"].map(|extension| format!("re.mote.{extension}"));
     assert!(expected.iter().all(|name| names.contains(name)), "{names:?}");
-    assert!(!names.iter().any(|name| name.ends_with("spz")), "{names:?}");
+    // The others of its chunk would lie in one plane.
+    let unfit = |name: &String| name.ends_with("spz") || name.contains("compressed");
+    assert!(!names.iter().any(unfit), "{names:?}");
     let refused =
         call(&format!("export {} -o {}", text(&remote), text(&root.path().join("x.spz"))));
     refused.refused("remote", &["x.spz", "no room", "choose another format"]);
     let near = format!("export {} -o {} --near 0.1", text(&run), text(&again));
     call(&near).refused("near", &["--near", "a run brings its own"]);
+}
+
+/// SPZ clamps scales: of a model in thousandths of its unit, nothing is written, and the format named instead holds it.
+#[test]
+fn a_model_beyond_the_range_of_a_format_is_refused() {
+    let scene = Photographs::colmap_text();
+    let (root, run) = scratch();
+    train(scene.path(), &run, 20, "--budget 320 --quiet").ok();
+    let [model, to] = ["tiny.ply", "tiny.spz"].map(|name| root.path().join(name));
+    let mut tiny = gaussians(&densify::train::output::model_path(&run, 20));
+    tiny.means.as_flattened_mut().iter_mut().for_each(|value| *value *= 1e-4);
+    tiny.log_scales.as_flattened_mut().iter_mut().for_each(|log| *log += 1e-4_f32.ln());
+    write_ply(&tiny, &model);
+    std::fs::write(&to, "old").unwrap();
+    let export = |to: &Path| call(&format!("export {} -o {} --overwrite", text(&model), text(to)));
+    let refused = export(&to);
+    refused.refused("spz", &["tiny.spz", "the scales of", "% of what shows", "such as"]);
+    assert_eq!(read(&to), b"old");
+    let other = refused.stderr.trim().rsplit(' ').next().unwrap();
+    let outcome = export(&root.path().join(format!("tiny.{}", other.replace('-', ".")))).ok();
+    assert!(!outcome.stdout.contains("what shows"), "{outcome:?}");
 }

@@ -16,12 +16,15 @@ use crate::models::rows::{Row, Rows, SplatFile};
 use crate::models::unpack::read_exactly;
 use crate::models::{siblings, spz};
 use densify_core::files::most_unpacked;
-use densify_core::gaussians::{Gaussians, MAX_SH_DEGREE, sh_coefficients, sigmoid};
+use densify_core::gaussians::{MAX_SH_DEGREE, sh_coefficients, sigmoid};
 
 /// The extension of splats in SPZ.
 const SPZ: &str = "KHR_gaussian_splatting_compression_spz_2";
 /// Extensions that a file may require: those of splats, and those without effect on them.
 const KNOWN: [&str; 4] = [SPLATS, SPZ, "KHR_materials_unlit", "KHR_mesh_quantization"];
+
+/// Largest opacity: 1, and errors of rounding.
+const MOST_OPACITY: f32 = 1.001;
 
 /// The parts of a document that splats need.
 #[derive(Default, Deserialize)]
@@ -131,7 +134,7 @@ fn read(
         views: &document.buffer_views,
         buffers: contents,
     };
-    let mut found = SplatFile { gaussians: Gaussians::default(), dropped: 0, repaired: 0 };
+    let mut found = SplatFile::default();
     let mut primitives = 0;
     let roots = document.scenes.get(document.scene).map(|scene| scene.nodes.as_slice());
     for (mesh, transform) in nodes::placed_meshes(path, &document.nodes, roots)? {
@@ -223,6 +226,16 @@ fn splats(
         || others.into_iter().any(|values| values.len() != 3 * count)
     {
         return Err(LoadError::damaged(path, "attributes", "they have different counts"));
+    }
+    // Many exporters copy the numbers of a splat PLY.
+    for (name, values, most, cause) in [
+        ("SCALE", &scales, f32::INFINITY, "a logarithm; glTF stores scales"),
+        ("OPACITY", &opacities, MOST_OPACITY, "a logit; glTF stores opacities"),
+    ] {
+        if let Some(value) = values.iter().find(|value| **value < 0.0 || **value > most) {
+            let problem = format!("{value} looks like {cause} as they are");
+            return Err(LoadError::damaged(path, format!("{SPLATS}:{name}"), problem));
+        }
     }
     let mut rows = Rows::new(sh_degree);
     let mut sh = Vec::with_capacity(3 * sh_coefficients(sh_degree));

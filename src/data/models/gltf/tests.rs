@@ -1,10 +1,12 @@
-//! Numbers of accessors.
+//! Numbers of accessors, and those that are no scales or opacities.
 
 use std::path::Path;
 
 use serde_json::json;
 
 use super::accessors::{Accessor, Buffers, View};
+use super::layout::{SPLATS, coefficient};
+use crate::models::read_model;
 
 /// A normalised minimum is −1, like the value above it (glTF 2.0, section 3.11); without normalisation it keeps its
 /// value.
@@ -29,5 +31,51 @@ fn signed_integers_keep_their_minimum_unless_normalised() {
             let numbers = buffers.numbers("ROTATION", 0, 3).unwrap();
             assert_eq!(numbers, expected, "type {component_type}, normalised: {normalized}");
         }
+    }
+}
+
+/// Exporters that copy a PLY leave logarithms and logits.
+#[test]
+fn logarithms_and_logits_are_refused_with_the_reason() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("model.gltf");
+    let read = |scale: f32, opacity: f32| {
+        let (mut data, mut views, mut accessors) = (Vec::new(), Vec::new(), Vec::new());
+        let mut attributes = serde_json::Map::new();
+        for (name, shape, values) in [
+            ("POSITION".to_owned(), "VEC3", &[0.0; 3][..]),
+            (format!("{SPLATS}:ROTATION"), "VEC4", &[0.0, 0.0, 0.0, 1.0]),
+            (format!("{SPLATS}:SCALE"), "VEC3", &[0.5, scale, 0.5]),
+            (format!("{SPLATS}:OPACITY"), "SCALAR", &[opacity]),
+            (coefficient(0, 0), "VEC3", &[0.0; 3]),
+        ] {
+            attributes.insert(name, json!(views.len()));
+            accessors.push(json!({
+                "bufferView": views.len(), "componentType": 5126, "count": 1, "type": shape,
+            }));
+            let bytes = 4 * values.len();
+            views.push(json!({"buffer": 0, "byteOffset": data.len(), "byteLength": bytes}));
+            data.extend(values.iter().flat_map(|value| value.to_le_bytes()));
+        }
+        std::fs::write(folder.path().join("data.bin"), &data).unwrap();
+        let primitive = json!({"attributes": attributes, "extensions": {SPLATS: {}}});
+        let document = json!({
+            "buffers": [{"uri": "data.bin", "byteLength": data.len()}], "bufferViews": views,
+            "accessors": accessors, "nodes": [{"mesh": 0}], "meshes": [{"primitives": [primitive]}],
+        });
+        std::fs::write(&path, document.to_string()).unwrap();
+        read_model(&path).map(|file| file.gaussians).map_err(|error| error.to_string())
+    };
+    // Rounding may lead beyond 1.
+    for (scale, opacity) in [(0.2, 0.9), (0.0, 0.0), (80.0, 1.0), (0.2, 1.000_001)] {
+        assert_eq!(read(scale, opacity).map(|model| model.len()), Ok(1), "{scale}, {opacity}");
+    }
+    for (scale, opacity, words) in [
+        (0.2, 2.197, ["model.gltf", ":OPACITY", "2.197", "logit"]),
+        (0.2, -3.0, ["model.gltf", ":OPACITY", "-3", "logit"]),
+        (-1.6, 0.9, ["model.gltf", ":SCALE", "-1.6", "logarithm"]),
+    ] {
+        let message = read(scale, opacity).unwrap_err();
+        assert!(words.iter().all(|word| message.contains(word)), "{message}");
     }
 }

@@ -2,14 +2,31 @@
 
 use std::path::Path;
 
+use super::activation;
 use super::layout::{properties, sh_degree};
 use crate::error::LoadError;
 use crate::models::rows::{Row, Rows, SplatFile};
-use crate::ply::Ply;
+use crate::ply::{Element, Ply};
 use densify_core::gaussians::sh_coefficients;
 
-const REMEDY: &str = "a splat PLY needs x y z, f_dc_0..2, opacity, scale_0..2 and rot_0..3 \
-                      (a point cloud is not a splat file)";
+/// The way out if a property is missing, by the program that left it out.
+fn remedy(vertices: &Element) -> &'static str {
+    let has = |name: &str| vertices.find(&[name]).is_some();
+    match (has("opacity") && has("scale_1"), has("f_dc_0")) {
+        (true, true) if !has("scale_2") => {
+            "its Gaussians are flat, as 2DGS trains them; SuperSplat opens it and exports a PLY that has a third scale, of \
+             almost 0, which densify reads"
+        }
+        (true, false) => {
+            "its Gaussians have plain colours; nerfstudio exports the coefficients with `ns-export gaussian-splat \
+             --ply-color-mode sh_coeffs`; of red, green and blue between 0 and 1 they are (colour - 0.5) / 0.2820948"
+        }
+        _ => {
+            "a splat PLY needs x y z, f_dc_0..2, opacity, scale_0..2 and rot_0..3 (a point cloud is not a splat file; \
+             a dataset's initial points are read by `densify train`)"
+        }
+    }
+}
 
 /// Reads a splat PLY.
 ///
@@ -25,7 +42,7 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
     })?;
     let rest = 3 * (sh_coefficients(sh_degree) - 1);
     let columns = properties(sh_degree)
-        .map(|name| vertices.column(path, &name, REMEDY))
+        .map(|name| vertices.column(path, &name, remedy(&vertices)))
         .collect::<Result<Vec<_>, _>>()?;
 
     let mut rows = Rows::new(sh_degree);
@@ -37,7 +54,9 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
         }
         push(&mut rows, &values, &mut sh, rest);
     })?;
-    rows.finish(path)
+    let mut file = rows.finish(path)?;
+    file.notes = activation::undo(&mut file.gaussians);
+    Ok(file)
 }
 
 /// Adds a Gaussian with these [`properties`]. `sh` is scratch.

@@ -6,6 +6,7 @@ use super::read::read;
 use crate::models::PLY;
 use crate::models::tests::{model, saved, written};
 use crate::points::read_points;
+use densify_core::gaussians::{Gaussians, sigmoid};
 
 /// One splat in ASCII and in big endian. Its properties are shuffled, have other types, are mixed with unknown ones and
 /// a list, and follow another element.
@@ -83,6 +84,73 @@ fn infinite_opacities_and_flat_gaussians_are_read() {
     assert!(found.gaussians.log_scales[2][1].to_bits() == (-20f32).to_bits());
 }
 
+/// Programs that leave out the logit, the logarithm, or both, or that have one opacity for all.
+#[test]
+fn activated_values_are_recognised() {
+    let mut model = model(200, 0);
+    for row in 0..200 {
+        let share = row as f32 / 200.0;
+        model.means[row] = [60.0 * share, 30.0 * (7.0 * share).sin(), 0.0];
+        model.log_scales[row] = [-2.0 - share, -3.0, -6.0 * share];
+        model.opacity_logits[row] = 9.0 * share - 4.0;
+    }
+    let opacities = |m: &mut Gaussians| {
+        m.opacity_logits.iter_mut().for_each(|v| *v = sigmoid(*v));
+    };
+    let scales = |m: &mut Gaussians| {
+        m.log_scales.as_flattened_mut().iter_mut().for_each(|v| *v = v.exp());
+    };
+    let millimetres = |m: &mut Gaussians| {
+        m.means.as_flattened_mut().iter_mut().for_each(|v| *v *= 1e4);
+        m.log_scales.as_flattened_mut().iter_mut().for_each(|v| *v += 10.0_f32.ln() * 4.0);
+    };
+    let faint = |m: &mut Gaussians| m.opacity_logits.iter_mut().for_each(|v| *v *= 0.8);
+    let one_size = |m: &mut Gaussians| m.log_scales.fill([0.05; 3]);
+    let opaque = |m: &mut Gaussians| m.opacity_logits.fill(1.0);
+    type Change<'a> = &'a dyn Fn(&mut Gaussians);
+    let cases: [(&str, &[Change<'_>], bool, &[&str]); 9] = [
+        ("as it is", &[], false, &[]),
+        ("in millimetres", &[&millimetres], false, &[]),
+        ("opacities", &[&opacities], true, &["opacities"]),
+        ("scales", &[&scales], false, &["export their logarithms"]),
+        ("both", &[&opacities, &scales], true, &["opacities", "not as logarithms"]),
+        (
+            "both in millimetres",
+            &[&millimetres, &opacities, &scales],
+            true,
+            &["opacities", "scales"],
+        ),
+        ("faint", &[&opacities, &faint, &scales], true, &["opacities", "scales"]),
+        ("one size", &[&opacities, &one_size], true, &["opacities", "scales"]),
+        ("opaque", &[&opaque, &scales], true, &["opacities", "scales"]),
+    ];
+    for (case, changes, is_undone, words) in cases {
+        let mut stated = model.clone();
+        changes.iter().for_each(|change| change(&mut stated));
+        let (_folder, path) = saved("file.ply", written(PLY, &stated).unwrap());
+        let found = read(&path).unwrap();
+        assert_eq!(found.notes.len(), words.len(), "{case}: {:?}", found.notes);
+        for (note, word) in found.notes.iter().zip(words) {
+            assert!(note.contains(word), "{case}: {word:?} is not in {note}");
+        }
+        if !is_undone {
+            assert_eq!(found.gaussians, stated, "{case}");
+            continue;
+        }
+        for row in 0..200 {
+            let near = |a: f32, b: f32| (a - b).abs() < 1e-4 * a.abs().max(1.0);
+            let opacity = sigmoid(found.gaussians.opacity_logits[row]);
+            let stated_opacity = stated.opacity_logits[row];
+            assert!(near(opacity, stated_opacity), "{case}: {opacity} for {stated_opacity}");
+            let size = |log: f32| if words.len() > 1 { log.exp() } else { log };
+            let fits = |i: usize| {
+                near(size(found.gaussians.log_scales[row][i]), stated.log_scales[row][i])
+            };
+            assert!((0..3).all(fits), "{case}, row {row}");
+        }
+    }
+}
+
 #[test]
 fn other_ply_files_are_refused_with_the_reason() {
     let good = String::from_utf8_lossy(&written(PLY, &model(1, 0)).unwrap()).into_owned();
@@ -92,7 +160,12 @@ fn other_ply_files_are_refused_with_the_reason() {
     };
     for (case, contents, words) in [
         ("points", header("property float opacity\n", ""), &["opacity", "point cloud"][..]),
-        ("2-D splats", header("property float scale_2\n", ""), &["scale_2"]),
+        ("2-D splats", header("property float scale_2\n", ""), &["scale_2", "2DGS", "SuperSplat"]),
+        (
+            "plain colours",
+            good.replace("float f_dc_", "uchar colour_"),
+            &["f_dc_0", "plain colours", "--ply-color-mode sh_coeffs"],
+        ),
         (
             "degree",
             header("property float opacity\n", "property float f_rest_0\nproperty float opacity\n"),

@@ -2,6 +2,7 @@
 
 #![allow(clippy::float_cmp, reason = "results are exact")]
 
+mod changes;
 mod reading;
 mod round_trips;
 

@@ -12,7 +12,7 @@ use crate::models::{Shape, export_formats, find, find_by_extension, read_model};
 use densify_core::gaussians::{Gaussians, sh_coefficients, sigmoid};
 
 /// A model as training makes them: in a few units, most Gaussians small, colours that depend little on direction.
-fn plausible(rows: usize, sh_degree: u8) -> Gaussians {
+pub(super) fn plausible(rows: usize, sh_degree: u8) -> Gaussians {
     let mut random = ChaCha8Rng::seed_from_u64(rows as u64);
     let mut value = |reach: f32| random.random_range(-reach..reach);
     let mut model = Gaussians { sh_degree, ..Gaussians::default() };

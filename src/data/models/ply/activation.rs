@@ -1,0 +1,67 @@
+//! Recognises opacities and scales that a program has written as they are. A splat PLY has logits and logarithms instead,
+//! but exporters of several feed-forward models leave out one conversion or both.
+
+use crate::models::quantise::{log_of_scale, quantised_logit};
+use crate::models::spatial_order::frame;
+use densify_core::gaussians::Gaussians;
+
+/// Whatever the scales, numbers from 0 to 1 are opacities if the largest is above this. As logits, 0.9 to 1 are opacities of
+/// 0.71 to 0.73.
+const NEAR_OPAQUE: f32 = 0.9;
+/// They must also differ by more than this; logits between 0 and 1 are opacities of 0.5 to 0.73.
+const SPREAD: f32 = 0.25;
+
+/// Turns plain values into logits and logarithms where there is no doubt; returns notes on them, and on what is in doubt.
+pub(super) fn undo(model: &mut Gaussians) -> Vec<String> {
+    let (faintest, most_opaque) = range(&model.opacity_logits);
+    let (least, most) = range(model.log_scales.as_flattened());
+    let may_be_opacities = faintest >= 0.0 && most_opaque > 0.0 && most_opaque <= 1.0;
+    let are_opacities =
+        may_be_opacities && most_opaque > NEAR_OPAQUE && most_opaque - faintest > SPREAD;
+    let varies = least < most || (are_opacities && most > 0.0);
+    let are_scales = least >= 0.0 && varies && !are_logarithms(model);
+    let mut notes = Vec::new();
+    if are_opacities || (may_be_opacities && are_scales) {
+        for value in &mut model.opacity_logits {
+            *value = quantised_logit(*value);
+        }
+        notes.push(
+            "its opacities lie between 0 and 1, so that they are read as opacities, not as logits"
+                .to_owned(),
+        );
+    }
+    if are_scales && may_be_opacities {
+        for value in model.log_scales.as_flattened_mut() {
+            *value = log_of_scale(*value);
+        }
+        notes.push(
+            "none of its scales is negative, so that they are read as standard deviations, not as logarithms"
+                .to_owned(),
+        );
+    } else if are_scales {
+        notes.push(format!(
+            "its scales may be standard deviations, of which a splat PLY holds the logarithms: none is negative, and every \
+             Gaussian is read as larger than {:.3}; if they are, export their logarithms",
+            least.exp()
+        ));
+    }
+    notes
+}
+
+/// True if scales are plausible as logarithms: some Gaussians are much larger than others, but most are smaller than the
+/// model.
+fn are_logarithms(model: &Gaussians) -> bool {
+    let mut largest: Vec<f32> =
+        model.log_scales.iter().map(|logs| logs.iter().copied().fold(0.0, f32::max)).collect();
+    let middle = largest.len() / 2;
+    let median = f64::from(*largest.select_nth_unstable_by(middle, f32::total_cmp).1);
+    let extent = frame(model).iter().map(|(_, spread)| *spread).fold(0.0, f64::max);
+    // Below ln 2, the standard deviations of half of all Gaussians lie between 1 and 2.
+    median > std::f64::consts::LN_2 && median.exp() < extent
+}
+
+/// The smallest and the largest value.
+fn range(values: &[f32]) -> (f32, f32) {
+    let start = (f32::INFINITY, f32::NEG_INFINITY);
+    values.iter().fold(start, |(least, most), &value| (least.min(value), most.max(value)))
+}
