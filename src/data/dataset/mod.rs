@@ -9,6 +9,7 @@ mod colmap;
 mod exif;
 mod folders;
 mod formats;
+mod frame_lists;
 mod image_cache;
 pub mod images;
 mod jpeg;
@@ -139,7 +140,7 @@ struct Scene {
 }
 
 /// One posed image in the dataset's own coordinates.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 struct Frame {
     name: String,
     /// Id of the frame in tracks.

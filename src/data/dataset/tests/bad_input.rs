@@ -185,6 +185,20 @@ fn no_damaged_byte_makes_it_panic() {
 /// Pointer to a field of transforms.json, its replacement (empty: the field is removed), and words of the message.
 const TRANSFORMS: &[Replacement] = &[
     ("/test_filenames", "[1]", "transforms.json, test_filenames, list of file names"),
+    ("/train_filenames", "3", "transforms.json, train_filenames, list of file names"),
+    (
+        "/train_filenames",
+        "[\"images/a.png\", \"images/z.png\", \"images/y.png\"]",
+        "transforms.json, train_filenames, 2 of its names, images/y.png",
+    ),
+    ("/val_filenames", "[\"a.png\"]", "transforms.json, val_filenames, 1 of its names, a.png"),
+    ("/test_filenames", "[\"../a.png\"]", "transforms.json, test_filenames, `..`"),
+    ("/train_filenames", "[]", "transforms.json, train_filenames, no frame to train on"),
+    (
+        "/test_filenames",
+        "[\"images/a.png\", \"images/b.png\", \"images/c.png\"]",
+        "transforms.json, test_filenames, no frame to train on",
+    ),
     ("/frames", "3", "transforms.json, frames"),
     ("/frames", "[]", "transforms.json, no image"),
     ("/frames/1", "3", "frames[1]"),
