@@ -100,6 +100,16 @@ pub enum Note {
         /// The first of their views.
         names: String,
     },
+    /// There are several COLMAP models, of which the largest is read unless another is
+    /// [chosen](LoadOptions::sparse).
+    OtherModels {
+        /// The model that is read.
+        model: String,
+        /// Number of its images.
+        images: u64,
+        /// The others, with numbers of images.
+        others: Vec<(String, u64)>,
+    },
     /// Undistortion crops photographs, unless the [field of view is kept](LoadOptions::keep_fov).
     Cropped {
         /// Largest share that is lost `[%]`.
@@ -136,7 +146,7 @@ struct Scene {
     own_split: bool,
     /// As [`Dataset::surface_bytes`], if the reader knows it.
     surface_bytes: Option<u64>,
-    notes: Vec<String>,
+    notes: Vec<Note>,
 }
 
 /// One posed image in the dataset's own coordinates.

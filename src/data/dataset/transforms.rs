@@ -21,6 +21,7 @@ use super::lens::{Distortion, Lens, Plane};
 use super::mask_files::MaskFile;
 use super::paths::{DataPath, Root, relative};
 use super::pose::{check_lens, checked_pose};
+use super::prepare::texts;
 use super::{Frame, LoadError, LoadOptions, Scene, Split, colmap};
 
 /// The pair of files that defines its own test split.
@@ -41,7 +42,7 @@ pub(super) const FORMAT: DatasetFormat = DatasetFormat {
 };
 
 const PAIR: [&str; 2] = ["transforms_train.json", "transforms_test.json"];
-const SINGLE: &str = "transforms.json";
+pub(super) const SINGLE: &str = "transforms.json";
 
 const MAX_FRAMES: usize = 1_000_000;
 const REMEDY: &str = "correct the file or export it again";
@@ -185,7 +186,7 @@ fn read(
     }
     let points_file = points_file((root, folders), &top, declared, &mut notes)?;
     let (own_split, listing) = (lists.decide(), path.clone());
-    let rest = Scene::default();
+    let (notes, rest) = (texts(notes), Scene::default());
     let mut scene = Scene { frames, first_missing, notes, points_file, listing, own_split, ..rest };
     if declared != Declared::Test
         && let Some(file) = &scene.points_file
@@ -415,8 +416,9 @@ impl<'a> Fields<'a> {
         let is_fisheye = named == Some(FISHEYE)
             || self.inherited("is_fisheye").is_some_and(|value| value.as_bool() != Some(false));
         if let Some(model) = named.filter(|model| *model != FISHEYE && !PINHOLES.contains(model)) {
-            let problem = format!("{model:?} is not one of {}, {FISHEYE}", PINHOLES.join(", "));
-            return Err(LoadError::lens(self.path, &self.full("camera_model"), problem));
+            let supported = format!("{}, {FISHEYE}", PINHOLES.join(", "));
+            let field = self.full("camera_model");
+            return Err(LoadError::lens_model(self.path, &field, model, &supported));
         }
         let (plane, fields) = if is_fisheye {
             (Plane::Equidistant, &FISHEYE_FIELDS[..])
