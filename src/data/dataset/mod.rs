@@ -26,6 +26,7 @@ mod prepare;
 mod realitycapture;
 mod source_file;
 mod tracks;
+mod transfer;
 mod transforms;
 mod undistort;
 mod view_list;
