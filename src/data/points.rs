@@ -9,8 +9,8 @@ use crate::ply::{Element, Ply, Scalar};
 
 /// Colour of points that have none.
 const GREY: u8 = 128;
-/// Largest real colour of a cloud whose full value is 1.
-const BRIGHTEST: f64 = 2.0;
+/// Largest real colour of a cloud whose full value is 1; in one of 0 to 255 all would be black.
+const BRIGHTEST: f64 = 16.0;
 
 /// A coloured point cloud in structure of arrays.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -97,14 +97,17 @@ fn full_scale(path: &Path, vertices: &Element, channels: [usize; 3]) -> Result<f
     {
         return Ok(kinds[0].largest());
     }
-    let mut most = 0.0_f64;
+    let (mut most, mut is_whole) = (0.0_f64, true);
     Ply::open(path)?.each_row(vertices, &channels, |row| {
-        most = row.iter().copied().filter(|v| v.is_finite()).fold(most, f64::max);
+        for value in row.iter().filter(|value| value.is_finite()) {
+            most = most.max(*value);
+            is_whole &= value.fract() == 0.0;
+        }
     })?;
     let largest = kinds.map(Scalar::largest).into_iter().fold(0.0, f64::max);
     let is_real = largest.is_infinite();
-    // Lights may exceed 1 a little, and no picture of 0 to 255 is as dark as that.
-    let scales = [(is_real, BRIGHTEST, 1.0), (true, 255.0, 255.0), (true, 65_535.0, 65_535.0)];
+    let brightest = if is_whole { 1.0 } else { BRIGHTEST };
+    let scales = [(is_real, brightest, 1.0), (true, 255.0, 255.0), (true, 65_535.0, 65_535.0)];
     let scale = scales.into_iter().find(|(applies, limit, _)| *applies && most <= *limit);
     match scale {
         Some((.., full)) => Ok(full),
@@ -129,6 +132,7 @@ mod tests {
             ("ushort", "0 32896 65535", [0, 128, 255]),
             ("float", "0 0.5 1", [0, 128, 255]),
             ("double", "-1 nan 1.5", [0, 0, 255]),
+            ("float", "3.7 0.5 0.25", [255, 128, 64]),
             ("double", "-1 nan 7", [0, 0, 7]),
             ("int", "200 100 50", [200, 100, 50]),
             ("uint32", "0 128 255", [0, 128, 255]),

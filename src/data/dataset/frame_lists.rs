@@ -91,9 +91,11 @@ impl FrameLists {
         for (field, names) in FIELDS.iter().zip(&self.lists) {
             let unmatched = || names.iter().flat_map(HashMap::values).filter(|(_, is)| !is);
             if let Some(name) = unmatched().map(|(name, _)| name).min() {
-                let count = unmatched().count();
-                let problem =
-                    format!("{count} of its names are the file_path of no frame (first: {name})");
+                let more = match unmatched().count() - 1 {
+                    0 => String::new(),
+                    more => format!(", nor {more} more of its names"),
+                };
+                let problem = format!("no frame has the file_path {name:?}{more}");
                 return Some((field, problem));
             }
         }

@@ -153,9 +153,10 @@ fn image_count(root: &Root, model: &str) -> Result<u64, LoadError> {
 /// The path of a model's file, which may not be a link out of `root`: binary, if there is one, else text.
 fn file(root: &Root, folder: &Path, name: &str) -> Result<PathBuf, LoadError> {
     let [binary, text] = ["bin", "txt"].map(|ending| folder.join(format!("{name}.{ending}")));
-    let others = ["cameras.bin", "images.bin"];
-    let prefers_text = text.is_file() || !others.iter().any(|name| folder.join(name).is_file());
-    let path = if !binary.is_file() && prefers_text { text } else { binary };
+    // A missing file is one of the kind that the others are.
+    let others = ["cameras.bin", "images.bin"].map(|name| folder.join(name));
+    let is_binary = binary.is_file() || !text.is_file() && others.iter().any(|file| file.is_file());
+    let path = if is_binary { binary } else { text };
     let inside = path.strip_prefix(root.path()).unwrap_or(&path).to_string_lossy();
     root.existing(DataPath { file: &path, field: "the file", value: &inside })?;
     Ok(path)

@@ -203,9 +203,9 @@ const TRANSFORMS: &[Replacement] = &[
     (
         "/train_filenames",
         "[\"images/a.png\", \"images/z.png\", \"images/y.png\"]",
-        "transforms.json, train_filenames, 2 of its names, images/y.png",
+        "transforms.json, train_filenames, no frame has, images/y.png, nor 1 more",
     ),
-    ("/val_filenames", "[\"a.png\"]", "transforms.json, val_filenames, 1 of its names, a.png"),
+    ("/val_filenames", "[\"a.png\"]", "transforms.json, val_filenames, no frame has, a.png"),
     ("/test_filenames", "[\"../a.png\"]", "transforms.json, test_filenames, `..`"),
     ("/train_filenames", "[]", "transforms.json, train_filenames, no frame to train on"),
     (

@@ -27,11 +27,8 @@ fn copy(made: &Made, from: &str, to: &str, images: usize) {
     }
 }
 
-fn others(data: &Dataset) -> Option<(&str, u64, &[(String, u64)])> {
-    data.notes.iter().find_map(|note| match note {
-        Note::OtherModels { model, images, others } => Some((&**model, *images, &others[..])),
-        _ => None,
-    })
+fn other_models(data: &Dataset) -> Option<&Note> {
+    data.notes.iter().find(|note| matches!(note, Note::OtherModels { .. }))
 }
 
 #[test]
@@ -42,22 +39,25 @@ fn the_largest_of_several_models_is_read() {
         copy(&made, "sparse/10", "sparse/0", 1);
         let data = load(&made);
         assert_eq!(data.train.len(), 3);
-        let smaller = [("sparse/0".to_owned(), 1), ("sparse/2".to_owned(), 2)];
-        assert_eq!(others(&data), Some(("sparse/10", 3, &smaller[..])));
+        let others = vec![("sparse/0".to_owned(), 1), ("sparse/2".to_owned(), 2)];
+        let note = Note::OtherModels { model: "sparse/10".to_owned(), images: 3, others };
+        assert_eq!(other_models(&data), Some(&note));
         assert!(!data.notes.iter().any(|note| note.contains("poses of")), "{:?}", data.notes);
         let chosen = LoadOptions { sparse: Some("sparse/2".into()), ..LoadOptions::default() };
         let data = load_with(&made, &chosen);
-        assert_eq!((names(&data.train), others(&data)), (vec!["a.png", "b.png"], None));
+        assert_eq!((names(&data.train), other_models(&data)), (vec!["a.png", "b.png"], None));
         assert_noted(&data, "2 of 3 images");
         // Of equal ones the first is read, and no number is needed.
         fs::remove_dir_all(made.file("sparse/0")).unwrap();
         copy(&made, "sparse/10", "sparse/9", 3);
-        assert_eq!(others(&load(&made)).unwrap().0, "sparse/9");
+        let others = vec![("sparse/2".to_owned(), 2), ("sparse/10".to_owned(), 3)];
+        let note = Note::OtherModels { model: "sparse/9".to_owned(), images: 3, others };
+        assert_eq!(other_models(&load(&made)), Some(&note));
         for model in ["sparse/9", "sparse/10"] {
             fs::remove_dir_all(made.file(model)).unwrap();
         }
         let data = load(&made);
-        assert_eq!((data.train.len(), others(&data)), (2, None));
+        assert_eq!((data.train.len(), other_models(&data)), (2, None));
         let chosen = LoadOptions { sparse: Some("sparse/7".into()), ..LoadOptions::default() };
         refused("no such model", &made, &chosen, "sparse/7, the dataset has sparse/2, ColmapModel");
     }
