@@ -201,12 +201,14 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
             held_out: false,
         });
     }
-    let mut notes: Vec<Note> = choice.others.into_iter().collect();
+    let mut notes: Vec<Note> = choice.others.iter().cloned().collect();
     let (posed, others) = (frames.len(), folders.count_others(&frames));
     if others > 0 {
-        let model = match &notes[..] {
-            [Note::OtherModels { model, .. }] => format!("{model} has"),
-            _ => "COLMAP has found".to_owned(),
+        let is_one_of_several = !notes.is_empty() || options.sparse.is_some();
+        let folder = choice.folder.strip_prefix(root.path()).unwrap_or(&choice.folder);
+        let model = match is_one_of_several {
+            true => format!("{} has", folder.display()),
+            false => "COLMAP has found".to_owned(),
         };
         notes.push(Note::Text(format!(
             "{model} the poses of {posed} of {} images; the others are not used",

@@ -46,7 +46,7 @@ fn the_largest_of_several_models_is_read() {
         let chosen = LoadOptions { sparse: Some("sparse/2".into()), ..LoadOptions::default() };
         let data = load_with(&made, &chosen);
         assert_eq!((names(&data.train), other_models(&data)), (vec!["a.png", "b.png"], None));
-        assert_noted(&data, "2 of 3 images");
+        assert_noted(&data, "sparse/2 has the poses of 2 of 3 images");
         // Of equal ones the first is read, and no number is needed.
         fs::remove_dir_all(made.file("sparse/0")).unwrap();
         copy(&made, "sparse/10", "sparse/9", 3);
