@@ -55,6 +55,8 @@ pub enum LoadRemedy {
     LargerTestEvery,
     /// Keep the usable field of view of a lens that folds over.
     KeepFieldOfView,
+    /// Name a folder that holds a COLMAP model.
+    ColmapModel,
 }
 
 impl LoadError {
@@ -103,6 +105,17 @@ impl LoadError {
     /// A lens that cannot be converted to a pinhole.
     pub(crate) fn lens(path: &Path, field: &str, problem: impl Display) -> Self {
         let remedy = "undistort the images first, e.g. with `colmap image_undistorter`";
+        Self::malformed(path, field, problem, remedy)
+    }
+
+    /// A lens model that is not one of those supported.
+    pub(crate) fn lens_model(path: &Path, field: &str, model: &str, supported: &str) -> Self {
+        let problem = format!("the camera model {model} is not one of {supported}");
+        if model != "EQUIRECTANGULAR" {
+            return Self::lens(path, field, problem);
+        }
+        let remedy = "cut the panoramas into the faces of a cube and reconstruct the scene from these, as COLMAP's \
+                      `panorama_sfm.py` does";
         Self::malformed(path, field, problem, remedy)
     }
 

@@ -5,10 +5,12 @@ use std::path::Path;
 use glam::DVec3;
 
 use crate::error::LoadError;
-use crate::ply::Ply;
+use crate::ply::{Element, Ply, Scalar};
 
 /// Colour of points that have none.
 const GREY: u8 = 128;
+/// Largest real colour of a cloud whose full value is 1; in one of 0 to 255 all would be black.
+const BRIGHTEST: f64 = 16.0;
 
 /// A coloured point cloud in structure of arrays.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -67,9 +69,9 @@ pub fn read_points(path: &Path) -> Result<PointCloud, LoadError> {
         ["blue", "diffuse_blue", "b"],
     ]
     .map(|names| vertices.find(&names));
-    let mut full = [1.0; 3];
+    let mut full = 1.0;
     if let [Some(r), Some(g), Some(b)] = channels {
-        full = [r, g, b].map(|column| vertices.properties[column].kind.full_scale());
+        full = full_scale(path, &vertices, [r, g, b])?;
         columns.extend([r, g, b]);
     }
     let mut points = PointCloud::default();
@@ -77,11 +79,44 @@ pub fn read_points(path: &Path) -> Result<PointCloud, LoadError> {
         points.positions.push(DVec3::new(row[0], row[1], row[2]));
         points.colours.push(match row[3..] {
             // The cast turns NaN into 0 and saturates.
-            [r, g, b] => [r / full[0], g / full[1], b / full[2]].map(|v| (255.0 * v + 0.5) as u8),
+            [r, g, b] => [r, g, b].map(|v| (255.0 * (v / full) + 0.5) as u8),
             _ => [GREY; 3],
         });
     })?;
     Ok(points)
+}
+
+/// The value of a full colour channel: of bytes their largest, else the smallest usual one that no colour exceeds, as
+/// programs write colours of 0 to 255 as any type.
+///
+/// # Errors
+/// When real colours exceed all usual values.
+fn full_scale(path: &Path, vertices: &Element, channels: [usize; 3]) -> Result<f64, LoadError> {
+    let kinds = channels.map(|column| vertices.properties[column].kind);
+    if matches!(kinds, [Scalar::U8, Scalar::U8, Scalar::U8] | [Scalar::I8, Scalar::I8, Scalar::I8])
+    {
+        return Ok(kinds[0].largest());
+    }
+    let (mut most, mut is_whole) = (0.0_f64, true);
+    Ply::open(path)?.each_row(vertices, &channels, |row| {
+        for value in row.iter().filter(|value| value.is_finite()) {
+            most = most.max(*value);
+            is_whole &= value.fract() == 0.0;
+        }
+    })?;
+    let largest = kinds.map(Scalar::largest).into_iter().fold(0.0, f64::max);
+    let is_real = largest.is_infinite();
+    let brightest = if is_whole { 1.0 } else { BRIGHTEST };
+    let scales = [(is_real, brightest, 1.0), (true, 255.0, 255.0), (true, 65_535.0, 65_535.0)];
+    let scale = scales.into_iter().find(|(applies, limit, _)| *applies && most <= *limit);
+    match scale {
+        Some((.., full)) => Ok(full),
+        None if is_real => {
+            let problem = format!("they reach {most}, which is no colour of 0 to 1, 255 or 65535");
+            Err(LoadError::damaged(path, "colours of the vertices", problem))
+        }
+        None => Ok(largest),
+    }
 }
 
 #[cfg(test)]
@@ -96,7 +131,19 @@ mod tests {
             ("uchar", "0 128 255", [0, 128, 255]),
             ("ushort", "0 32896 65535", [0, 128, 255]),
             ("float", "0 0.5 1", [0, 128, 255]),
-            ("double", "-1 nan 7", [0, 0, 255]),
+            ("double", "-1 nan 1.5", [0, 0, 255]),
+            ("float", "3.7 0.5 0.25", [255, 128, 64]),
+            ("double", "-1 nan 7", [0, 0, 7]),
+            ("int", "200 100 50", [200, 100, 50]),
+            ("uint32", "0 128 255", [0, 128, 255]),
+            ("short", "-1 3 255", [0, 3, 255]),
+            ("ushort", "200 100 50", [200, 100, 50]),
+            ("float", "200 100 50", [200, 100, 50]),
+            ("float64", "0 127.6 3", [0, 128, 3]),
+            ("uint", "0 32896 65535", [0, 128, 255]),
+            ("float", "0 32896 65535", [0, 128, 255]),
+            ("int", "0 1073741824 2147483647", [0, 128, 255]),
+            ("char", "0 64 127", [0, 129, 255]),
         ] {
             let text = format!(
                 "ply\nformat ascii 1.0\nelement vertex 1\nproperty {kind} red\nproperty {kind} green\nproperty {kind} blue\n\
@@ -107,10 +154,28 @@ mod tests {
             assert_eq!(points.positions, [DVec3::new(1.0, 2.0, 3.0)], "{kind}");
             assert_eq!(points.colours, [expected], "{kind}");
         }
+        let text = |blue| {
+            format!(
+                "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n\
+                 property float r\nproperty float g\nproperty float b\nend_header\n1 2 3 0 0.5 {blue}\n"
+            )
+        };
+        std::fs::write(&path, text("inf")).unwrap();
+        assert_eq!(read_points(&path).unwrap().colours, [[0, 128, 255]]);
+        std::fs::write(&path, text("1e6")).unwrap();
+        let message = read_points(&path).unwrap_err().to_string();
+        assert!(message.contains("file.ply: colours") && message.contains("1000000"), "{message}");
         let flat = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nend_header\n1 2";
         std::fs::write(&path, flat).unwrap();
         let message = read_points(&path).unwrap_err().to_string();
         assert!(message.contains("property z"), "{message}");
+    }
+
+    #[test]
+    #[ignore = "needs shared data"]
+    fn shared_colours_of_type_int_are_read() {
+        let points = read_points(&densify_fixtures::shared("../cases/ply/int255.ply")).unwrap();
+        assert_eq!(points.colours, [[200, 100, 50]; 4]);
     }
 
     #[test]

@@ -1,15 +1,21 @@
 //! Finds image files in `images`, `images_2`/`_4`/`_8`, or the folder given by `--images`.
 
-use std::fs::DirEntry;
-use std::path::PathBuf;
+use std::collections::HashSet;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use unicode_normalization::UnicodeNormalization;
 
 use super::LoadError;
 use super::mask_files;
 use super::paths::{DataPath, Root, is_absolute, relative};
-use super::{LoadOptions, Resolution};
+use super::{Frame, LoadOptions, Resolution};
 
 /// Extensions that are tried for names without one, as in NeRF-synthetic files.
 const ENDINGS: [&str; 8] = ["", ".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG"];
+
+/// Extensions of photographs that COLMAP reads.
+const PHOTOGRAPHS: [&str; 7] = ["jpg", "jpeg", "png", "webp", "tif", "tiff", "bmp"];
 
 /// The folders of one dataset.
 #[derive(Debug)]
@@ -146,13 +152,20 @@ impl Folders {
         }
     }
 
-    /// Number of files directly in the folder of images, masks not counted.
-    pub(super) fn count(&self) -> usize {
-        let images = || self.root.path().join("images");
-        let folder = self.chosen.as_ref().map_or_else(images, |folder| folder.path().to_owned());
-        let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
-        let is_file = |entry: &DirEntry| entry.file_type().is_ok_and(|kind| !kind.is_dir());
-        entries.filter(|entry| is_file(entry) && !mask_files::is_mask(&entry.file_name())).count()
+    /// Number of photographs in the folder of images that are not those of frames.
+    pub(super) fn count_others(&self, frames: &[Frame]) -> usize {
+        let images = self.root.path().join("images");
+        let reduced = self.reduced.as_ref().map(|(folder, _)| folder.path().to_owned());
+        let own = if images.is_dir() { images } else { reduced.unwrap_or(images) };
+        let folder = self.chosen.as_ref().map_or(own, |folder| folder.path().to_owned());
+        let mut names = Vec::new();
+        // Other folders of the dataset hold no further photographs.
+        let is_deep = !self.chosen.as_ref().is_some_and(|folder| folder.contains(&self.root));
+        add_photographs(&folder, "", is_deep, &mut names);
+        // Names may have several Unicode spellings.
+        let spelled = |name: &str| name.nfc().collect::<String>();
+        let used: HashSet<String> = frames.iter().map(|frame| spelled(&frame.name)).collect();
+        names.iter().filter(|name| !used.contains(&spelled(name))).count()
     }
 
     pub(super) fn fell_back_note(&self, count: usize) -> String {
@@ -174,5 +187,28 @@ impl Folders {
     pub(super) fn below_root(&self, value: &str) -> String {
         let value = relative(value);
         if self.within_images { format!("images/{value}") } else { value }
+    }
+}
+
+/// Adds the names of the photographs in a folder and, if `is_deep`, below it: neither masks nor what is hidden.
+fn add_photographs(folder: &Path, inside: &str, is_deep: bool, names: &mut Vec<String>) {
+    for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
+        let file = entry.file_name();
+        let name = file.to_string_lossy();
+        let path = format!("{inside}{name}");
+        if name.starts_with('.') || mask_files::is_mask(&file) {
+            continue;
+        }
+        let is_photograph = || {
+            let ending = Path::new(&file).extension().unwrap_or_default().to_ascii_lowercase();
+            PHOTOGRAPHS.iter().any(|known| ending == *known)
+        };
+        if entry.file_type().is_ok_and(|kind| kind.is_dir()) {
+            if is_deep && !mask_files::FOLDERS.contains(&&*name) {
+                add_photographs(&entry.path(), &format!("{path}/"), true, names);
+            }
+        } else if is_photograph() {
+            names.push(path);
+        }
     }
 }

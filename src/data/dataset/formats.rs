@@ -29,7 +29,9 @@ pub fn formats() -> &'static [&'static DatasetFormat] {
 /// # Errors
 /// When no format does, or a file is unreadable or contradicts itself.
 pub(super) fn read_scene(root: &Root, options: &LoadOptions) -> Result<Scene, LoadError> {
-    for format in formats() {
+    // Only COLMAP has models to choose from.
+    let chosen = options.sparse.is_some();
+    for format in formats().iter().filter(|format| !chosen || format.name == colmap::FORMAT.name) {
         if let Some(scene) = (format.read)(root, options)? {
             return Ok(scene);
         }

@@ -17,6 +17,7 @@ use super::jpeg;
 pub use super::mask::{Hides, Mask};
 use super::options::MaskMode;
 pub use super::source_file::SourceFile;
+use super::transfer;
 use super::undistort::Undistortion;
 use crate::picture_file;
 use densify_core::files;
@@ -286,9 +287,16 @@ fn parse_header(
     Ok(ImageHeader { width, height, has_alpha, turn: None, decoded_bytes, file_bytes })
 }
 
-/// Decodes an image whose header has been checked.
+/// Decodes a photograph whose header has been checked.
 pub(super) fn decode(source: &SourceFile) -> Result<DynamicImage, LoadError> {
-    decode_file(&source.path, source.open()?)
+    let mut file = source.open()?;
+    let exponent = transfer::exponent(BufReader::new(&mut file));
+    file.rewind().map_err(LoadError::io(&source.path))?;
+    let mut image = decode_file(&source.path, file)?;
+    if let Some(exponent) = exponent {
+        transfer::to_srgb(&mut image, exponent);
+    }
+    Ok(image)
 }
 
 /// Reads the header of an image, passes it to `check`, and decodes the image from the same open file.

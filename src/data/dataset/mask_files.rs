@@ -16,7 +16,7 @@ const LAYER: &str = ".mask.png";
 const DYNAMIC: &str = "dynamic_mask_";
 
 /// Folders of masks in the dataset, in order of precedence.
-const FOLDERS: [&str; 4] = ["masks", "mask", "segmentation", "dynamic_masks"];
+pub(super) const FOLDERS: [&str; 4] = ["masks", "mask", "segmentation", "dynamic_masks"];
 
 /// The file of a mask.
 #[derive(Debug, Clone)]

@@ -9,6 +9,7 @@ mod colmap;
 mod exif;
 mod folders;
 mod formats;
+mod frame_lists;
 mod image_cache;
 pub mod images;
 mod jpeg;
@@ -25,6 +26,7 @@ mod prepare;
 mod realitycapture;
 mod source_file;
 mod tracks;
+mod transfer;
 mod transforms;
 mod undistort;
 mod view_list;
@@ -100,6 +102,16 @@ pub enum Note {
         /// Names of the first of their views.
         names: String,
     },
+    /// There are several COLMAP models, of which the largest is read unless another is
+    /// [chosen](LoadOptions::sparse).
+    OtherModels {
+        /// The model that is read.
+        model: String,
+        /// Number of its images.
+        images: u64,
+        /// The others, with numbers of images.
+        others: Vec<(String, u64)>,
+    },
     /// Undistortion crops photographs, unless the [field of view is kept](LoadOptions::keep_fov).
     Cropped {
         /// Largest share that is lost `[%]`.
@@ -136,11 +148,11 @@ struct Scene {
     own_split: bool,
     /// As [`Dataset::surface_bytes`], if the reader knows it.
     surface_bytes: Option<u64>,
-    notes: Vec<String>,
+    notes: Vec<Note>,
 }
 
 /// One posed image in the dataset's own coordinates.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 struct Frame {
     name: String,
     /// Id of the frame in tracks.

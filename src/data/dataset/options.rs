@@ -12,6 +12,8 @@ pub struct LoadOptions {
     /// Folder of the images instead of the one named in the dataset's files, relative to the dataset. Images outside
     /// the dataset's folder can only be used with this option.
     pub images: Option<PathBuf>,
+    /// Folder of the COLMAP model, relative to the dataset; `None`: the model with the most images.
+    pub sparse: Option<PathBuf>,
     /// Training resolution; `None`: the size of the images.
     pub resolution: Option<Resolution>,
     /// Rule for holding out test views.

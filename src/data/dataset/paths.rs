@@ -48,6 +48,11 @@ impl Root {
         &self.shown
     }
 
+    /// Whether another folder is this one or lies in it.
+    pub(super) fn contains(&self, other: &Self) -> bool {
+        other.canonical.starts_with(&self.canonical)
+    }
+
     /// The full path, after all checks that do not need the file system. The file need not exist.
     pub(super) fn join(&self, named: DataPath<'_>) -> Result<PathBuf, LoadError> {
         match lexical_fault(named.value) {

@@ -27,7 +27,7 @@ pub(super) fn prepare(
     // Sorted bytewise, as other trainers do for their test splits.
     frames.sort_by(|a, b| (a.name.as_bytes(), a.held_out).cmp(&(b.name.as_bytes(), b.held_out)));
     refuse_duplicates(&scene.listing, &frames)?;
-    let mut notes = texts(std::mem::take(&mut scene.notes));
+    let mut notes = std::mem::take(&mut scene.notes);
     let photographs = photographs(&scene.listing, &frames, options, &mut notes)?;
     if frames.iter().all(|frame| frame.mask.is_none()) {
         notes.extend(unused_masks_note(path).map(Note::Text));

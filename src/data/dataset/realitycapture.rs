@@ -23,6 +23,7 @@ use super::lens::models::Term;
 use super::lens::{Distortion, Lens, Projection};
 use super::paths::{DataPath, Root, relative};
 use super::pose::{check_lens, checked_pose};
+use super::prepare::texts;
 use super::transforms::usual_points;
 use super::{Frame, LoadError, LoadOptions, Scene};
 use densify_core::files;
@@ -156,7 +157,7 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
     let points_file = usual_points(root, path, &mut notes)?;
     let points = points_file.as_deref().map(crate::points::read_points).transpose()?;
     let (points, listing) = (points.unwrap_or_default(), path.to_owned());
-    let rest = Scene::default();
+    let (notes, rest) = (texts(notes), Scene::default());
     Ok(Some(Scene { listing, frames, first_missing, points, points_file, notes, ..rest }))
 }
 

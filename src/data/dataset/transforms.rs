@@ -5,7 +5,6 @@
 //! at the top level or in the frame; those in the frame take precedence.
 //! One file, because both layouts share the fields of a frame.
 
-use std::collections::HashSet;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
@@ -14,14 +13,16 @@ use serde_json::{Map, Value};
 
 use super::folders::{Folders, ImageFile};
 use super::formats::DatasetFormat;
+use super::frame_lists::{self, FrameLists};
 use super::images::{self, ImageHeader};
 use super::json;
 use super::lens::models::{FISHEYE_FIELDS, OPENCV_FIELDS};
 use super::lens::{Distortion, Lens, Projection};
 use super::mask_files::MaskFile;
-use super::paths::{DataPath, Root, is_absolute, relative};
+use super::paths::{DataPath, Root, relative};
 use super::pose::{check_lens, checked_pose};
-use super::{Frame, LoadError, LoadOptions, Scene, colmap};
+use super::prepare::texts;
+use super::{Frame, LoadError, LoadOptions, Scene, Split, colmap};
 
 /// The pair of files that defines its own test split.
 pub(super) const SPLIT_FORMAT: DatasetFormat = DatasetFormat {
@@ -41,7 +42,7 @@ pub(super) const FORMAT: DatasetFormat = DatasetFormat {
 };
 
 const PAIR: [&str; 2] = ["transforms_train.json", "transforms_test.json"];
-const SINGLE: &str = "transforms.json";
+pub(super) const SINGLE: &str = "transforms.json";
 
 const MAX_FRAMES: usize = 1_000_000;
 const REMEDY: &str = "correct the file or export it again";
@@ -67,8 +68,8 @@ fn read_pair(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadEr
         return Ok(None);
     }
     let folders = Folders::new(root, options, false)?;
-    let mut scene = read(root, &folders, PAIR[0], false)?;
-    let test = read(root, &folders, PAIR[1], true)?;
+    let mut scene = read(root, &folders, PAIR[0], Declared::Train)?;
+    let test = read(root, &folders, PAIR[1], Declared::Test)?;
     scene.frames.extend(test.frames);
     scene.notes.extend(test.notes);
     scene.own_split = true;
@@ -83,11 +84,31 @@ fn read_single(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, Load
     if !root.path().join(SINGLE).is_file() {
         return Ok(None);
     }
-    read(root, &Folders::new(root, options, false)?, SINGLE, false).map(Some)
+    let declared = match options.split {
+        Split::Every(_) => Declared::Train,
+        Split::None | Split::Eval => Declared::InLists,
+    };
+    read(root, &Folders::new(root, options, false)?, SINGLE, declared).map(Some)
 }
 
-/// Reads the file `name`. As in nerfstudio, the test split is in `test_filenames`, else in `val_filenames`.
-fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Scene, LoadError> {
+/// What decides on the split of the frames of a file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Declared {
+    /// All are for training.
+    Train,
+    /// All are for tests.
+    Test,
+    /// The [lists](FrameLists) in the file.
+    InLists,
+}
+
+/// Reads the file `name`.
+fn read(
+    root: &Root,
+    folders: &Folders,
+    name: &str,
+    declared: Declared,
+) -> Result<Scene, LoadError> {
     let path = root.path().join(name);
     root.existing(DataPath { file: &path, field: "the file", value: name })?;
     let Value::Object(top) = json::read(&path)? else {
@@ -100,11 +121,10 @@ fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Sc
     if list.len() > MAX_FRAMES {
         return Err(top.fault("frames", "there are more than a million"));
     }
-    let mut own_split = false;
-    let tests = match top.held_out(folders, "test_filenames")? {
-        Some(names) => Some(names),
-        None => top.held_out(folders, "val_filenames")?,
-    };
+    let mut lists = FrameLists::default();
+    if declared == Declared::InLists {
+        top.frame_lists(folders, &mut lists)?;
+    }
     let (mut frames, mut missing, mut fell_back) = (Vec::new(), Vec::new(), 0);
     let mut first_missing = None;
     for (index, entry) in list.iter().enumerate() {
@@ -118,7 +138,13 @@ fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Sc
         };
         let field = fields.full("file_path");
         let named = DataPath { file: &path, field: &field, value: file };
-        let Some(found) = folders.image(named)? else {
+        let found = folders.image(named)?;
+        let (trained, tested) = match declared {
+            Declared::Train => (true, false),
+            Declared::Test => (false, true),
+            Declared::InLists => lists.splits(file, found.as_ref()),
+        };
+        let Some(found) = found else {
             first_missing.get_or_insert_with(|| folders.first_path(named));
             missing.push(file.to_owned());
             continue;
@@ -130,12 +156,7 @@ fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Sc
             None => folders.mask(&found, named)?,
         };
         let (lens, header) = fields.lens(&found.path, found.reduced)?;
-        let is_test = |tests: &HashSet<String>| {
-            tests.contains(&relative(file)) || tests.contains(&found.name)
-        };
-        let held_out = held_out || tests.as_ref().is_some_and(is_test);
-        own_split |= held_out;
-        frames.push(Frame {
+        let frame = Frame {
             name: found.name,
             id: None,
             origin: format!("{}: frame {file}", path.display()),
@@ -147,10 +168,15 @@ fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Sc
             header,
             rotation,
             translation,
-            held_out,
-        });
+            held_out: tested,
+        };
+        frames.extend((trained && tested).then(|| Frame { held_out: false, ..frame.clone() }));
+        frames.extend((trained || tested).then_some(frame));
     }
-    let mut notes = Vec::new();
+    if let Some((field, problem)) = lists.fault() {
+        return Err(top.fault(field, problem));
+    }
+    let mut notes = lists.notes(name);
     if let Some(first) = missing.first() {
         let count = missing.len();
         notes.push(format!("{name}: {count} of {} frames have no image file and are skipped ({first} is the first)", list.len()));
@@ -158,11 +184,13 @@ fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Sc
     if fell_back > 0 {
         notes.push(folders.fell_back_note(fell_back));
     }
-    let points_file = points_file((root, folders), &top, held_out, &mut notes)?;
-    let listing = path.clone();
-    let rest = Scene::default();
+    let points_file = points_file((root, folders), &top, declared, &mut notes)?;
+    let (own_split, listing) = (lists.decide(), path.clone());
+    let (notes, rest) = (texts(notes), Scene::default());
     let mut scene = Scene { frames, first_missing, notes, points_file, listing, own_split, ..rest };
-    if !held_out && let Some(file) = &scene.points_file {
+    if declared != Declared::Test
+        && let Some(file) = &scene.points_file
+    {
         scene.points = crate::points::read_points(file)?;
     }
     Ok(scene)
@@ -172,7 +200,7 @@ fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Sc
 fn points_file(
     (root, folders): (&Root, &Folders),
     top: &Fields<'_>,
-    held_out: bool,
+    declared: Declared,
     notes: &mut Vec<String>,
 ) -> Result<Option<PathBuf>, LoadError> {
     if let Some(value) = top.text("ply_file_path")? {
@@ -193,7 +221,7 @@ fn points_file(
             "{file}: the initial points {value:?} are not in the dataset's folder and are left out"
         )));
     }
-    if held_out { Ok(None) } else { usual_points(root, top.path, notes) }
+    if declared == Declared::Test { Ok(None) } else { usual_points(root, top.path, notes) }
 }
 
 /// The file of initial points under one of the [usual names](POINT_FILES), for pose files that name none.
@@ -242,27 +270,19 @@ impl<'a> Fields<'a> {
         }
     }
 
-    /// A list of file names: each as listed, and as the name of its view.
-    fn held_out(
-        &self,
-        folders: &Folders,
-        field: &str,
-    ) -> Result<Option<HashSet<String>>, LoadError> {
-        let Some(value) = self.own(field) else {
-            return Ok(None);
-        };
-        let fault = || self.fault(field, "it is not a list of file names");
-        let mut names = HashSet::new();
-        for name in value.as_array().ok_or_else(fault)? {
-            let value = name.as_str().ok_or_else(fault)?;
-            names.insert(relative(value));
-            // Only these may be written differently in the frame.
-            if is_absolute(value) || value.contains('\\') {
-                let named = DataPath { file: self.path, field, value };
-                names.extend(folders.image(named)?.map(|found| found.name));
-            }
+    /// Reads the lists that the file has.
+    fn frame_lists(&self, folders: &Folders, lists: &mut FrameLists) -> Result<(), LoadError> {
+        for (list, field) in frame_lists::FIELDS.into_iter().enumerate() {
+            let Some(value) = self.own(field) else { continue };
+            let fault = || self.fault(field, "it is not a list of file names");
+            let names = value.as_array().ok_or_else(fault)?.iter();
+            let named = |value: &'a Value| {
+                let value = value.as_str().ok_or_else(fault)?;
+                Ok(DataPath { file: self.path, field, value })
+            };
+            lists.add(folders, list, &names.map(named).collect::<Result<Vec<_>, LoadError>>()?)?;
         }
-        Ok(Some(names))
+        Ok(())
     }
 
     /// The mask that a frame names.
@@ -396,8 +416,9 @@ impl<'a> Fields<'a> {
         let is_fisheye = named == Some(FISHEYE)
             || self.inherited("is_fisheye").is_some_and(|value| value.as_bool() != Some(false));
         if let Some(model) = named.filter(|model| *model != FISHEYE && !PINHOLES.contains(model)) {
-            let problem = format!("{model:?} is not one of {}, {FISHEYE}", PINHOLES.join(", "));
-            return Err(LoadError::lens(self.path, &self.full("camera_model"), problem));
+            let supported = format!("{}, {FISHEYE}", PINHOLES.join(", "));
+            let field = self.full("camera_model");
+            return Err(LoadError::lens_model(self.path, &field, model, &supported));
         }
         let (plane, fields) = if is_fisheye {
             (Projection::Equidistant, &FISHEYE_FIELDS[..])

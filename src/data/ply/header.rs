@@ -83,8 +83,8 @@ impl Scalar {
         }
     }
 
-    /// Value of a full colour channel: the largest of an integer type, else 1.
-    pub(crate) fn full_scale(self) -> f64 {
+    /// The largest value of an integer type, and infinity of another.
+    pub(crate) fn largest(self) -> f64 {
         match self {
             Self::I8 => 127.0,
             Self::U8 => 255.0,
@@ -92,7 +92,7 @@ impl Scalar {
             Self::U16 => 65_535.0,
             Self::I32 => f64::from(i32::MAX),
             Self::U32 => f64::from(u32::MAX),
-            Self::F32 | Self::F64 => 1.0,
+            Self::F32 | Self::F64 => f64::INFINITY,
         }
     }
 }

@@ -6,5 +6,5 @@
 mod header;
 mod rows;
 
-pub(crate) use header::Element;
+pub(crate) use header::{Element, Scalar};
 pub(crate) use rows::Ply;

@@ -38,6 +38,16 @@ pub(crate) fn dataset(s: Spelling, note: &Note) -> String {
             "note: cameras far from all others, {count} left out (use {} to train on them): {names}",
             s.text("far_cameras", "keep")
         ),
+        Note::OtherModels { model, images, others } => {
+            let others: Vec<String> =
+                others.iter().map(|(model, images)| format!("{model} ({images})")).collect();
+            format!(
+                "note: of several COLMAP models, {model} is used, with the most images ({images}), not {} ({} chooses \
+                 another)",
+                others.join(", "),
+                s.text("sparse", "DIR")
+            )
+        }
         Note::Cropped { percent, photographs } => format!(
             "note: up to {percent:.0} % of {photographs} photographs is cropped by undistortion ({} keeps the whole \
              field of view)",

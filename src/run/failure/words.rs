@@ -87,6 +87,10 @@ fn load_remedy(remedy: LoadRemedy, s: Spelling) -> String {
              e.g. with `colmap image_undistorter`",
             s.switch("keep_fov"),
         ),
+        LoadRemedy::ColmapModel => (
+            "name with {} a folder that holds cameras and images, as .bin or .txt",
+            s.option("sparse"),
+        ),
     };
     words.replace("{}", &option)
 }

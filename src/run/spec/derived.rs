@@ -19,6 +19,7 @@ impl DataSpec {
     pub fn load_options(&self, tracks: bool) -> LoadOptions {
         LoadOptions {
             images: self.images.clone(),
+            sparse: self.sparse.clone(),
             resolution: self.resolution,
             split: match self.test_every {
                 Some(every) => Split::Every(every),
@@ -43,9 +44,12 @@ impl RunSpec {
     /// When a path is not UTF-8 and therefore cannot be in a TOML file.
     pub fn table(&self) -> Result<Table, Failure> {
         let Self { start, data, output, .. } = self;
-        for (option, path) in
-            [("scene", &start.scene), ("images", &data.images), ("output", &output.output)]
-        {
+        for (option, path) in [
+            ("scene", &start.scene),
+            ("images", &data.images),
+            ("sparse", &data.sparse),
+            ("output", &output.output),
+        ] {
             if let Some(path) = path.as_ref().filter(|path| path.to_str().is_none()) {
                 return Err(OptionProblem::NotUtf8 { option, path: path.clone() }.into());
             }

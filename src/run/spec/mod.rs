@@ -125,6 +125,10 @@ run_spec! {
         /// Folder of the photographs, if it is not the dataset's own (relative to the dataset)
         images: Option<PathBuf> = None, Free, value "DIR";
 
+        /// Folder of the COLMAP model, such as sparse/1 (relative to the dataset; default: of several, the one with the
+        /// most images)
+        sparse: Option<PathBuf> = None, Fixed, value "DIR";
+
         /// Use only the views that this file names, one per line. A tab and four numbers from 0 to 1 after a name
         /// (left, top, right, bottom) select a part of the view. Views are split into training and test views before
         /// the others are left out

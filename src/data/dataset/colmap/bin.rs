@@ -132,8 +132,8 @@ impl<'a> Reader<'a> {
 /// Reads cameras.bin.
 pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, Lens>, LoadError> {
     let mut reader = Reader::open(path)?;
-    // Id, model, size, and at least three parameters.
-    let count = reader.count("number of cameras", 4 + 4 + 16 + 24, MAX_IMAGES)?;
+    // Id, model, size, and at least two parameters.
+    let count = reader.count("number of cameras", 4 + 4 + 16 + 16, MAX_IMAGES)?;
     let mut cameras = HashMap::new();
     for _ in 0..count {
         let id = reader.u32("camera id")?;
@@ -150,11 +150,21 @@ pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, Lens>, LoadError> {
     Ok(cameras)
 }
 
+/// Reads the number of images.
+fn image_count_of(reader: &mut Reader<'_>) -> Result<u64, LoadError> {
+    // Id, pose, camera, the NUL of an empty name, number of observations.
+    reader.count("number of images", 4 + 56 + 4 + 1 + 8, MAX_IMAGES)
+}
+
+/// Number of images in images.bin.
+pub(super) fn image_count(path: &Path) -> Result<u64, LoadError> {
+    image_count_of(&mut Reader::open(path)?)
+}
+
 /// Reads images.bin without its observations.
 pub(super) fn images(path: &Path) -> Result<Vec<Image>, LoadError> {
     let mut reader = Reader::open(path)?;
-    // Id, pose, camera, the NUL of an empty name, number of observations.
-    let count = reader.count("number of images", 4 + 56 + 4 + 1 + 8, MAX_IMAGES)?;
+    let count = image_count_of(&mut reader)?;
     let mut images = Vec::new();
     for _ in 0..count {
         let id = reader.u32("image id")?;

@@ -1,4 +1,4 @@
-//! Reads COLMAP sparse models: `images/` beside `sparse/0/{cameras,images,points3D}.{bin,txt}`.
+//! Reads COLMAP sparse models: `images/` beside `sparse/N/{cameras,images,points3D}.{bin,txt}`.
 //!
 //! Rigs and frames of newer COLMAP versions are ignored, because `images.bin` still contains the poses.
 
@@ -7,6 +7,7 @@ mod camera;
 mod txt;
 
 use std::collections::HashMap;
+use std::fs;
 use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DVec3};
@@ -17,13 +18,13 @@ use super::lens::Lens;
 use super::paths::{DataPath, Root, relative};
 use super::pose::{checked_pose, checked_quaternion};
 use super::tracks::{TrackSampler, Tracks};
-use super::{Frame, LoadError, LoadOptions, PointCloud, Scene};
+use super::{Frame, LoadError, LoadOptions, LoadRemedy, Note, PointCloud, Scene, transforms};
 
 pub(super) const FORMAT: DatasetFormat = DatasetFormat {
     name: "colmap",
     title: "COLMAP",
     file: "sparse/0/cameras.bin",
-    files: "sparse/0/cameras.bin or .txt, or sparse/cameras.bin or .txt",
+    files: "sparse/0/cameras.bin or .txt, also with another number or none, or below colmap/",
     read,
 };
 
@@ -72,13 +73,97 @@ struct Model {
     tracks: Tracks,
 }
 
-/// The folder of the model, if there is one: `sparse/0`, else `sparse`.
-fn find(root: &Path) -> Option<PathBuf> {
-    ["sparse/0", "sparse"].iter().map(|folder| root.join(folder)).find(|folder| {
-        ["cameras.bin", "cameras.txt", "images.bin", "images.txt"]
-            .iter()
-            .any(|name| folder.join(name).is_file())
-    })
+/// Folders of models, in order of precedence; the second is nerfstudio's.
+const PARENTS: [&str; 2] = ["sparse", "colmap/sparse"];
+
+/// Whether a folder has files of a model.
+fn is_model(folder: &Path) -> bool {
+    let files = ["cameras.bin", "cameras.txt", "images.bin", "images.txt"];
+    files.iter().any(|name| folder.join(name).is_file())
+}
+
+/// The models of a dataset, relative to its folder: COLMAP numbers them, as images may not all be connected.
+fn models(root: &Path) -> Vec<String> {
+    for parent in PARENTS {
+        let entries = fs::read_dir(root.join(parent)).into_iter().flatten().flatten();
+        let mut names: Vec<String> =
+            entries.filter_map(|entry| entry.file_name().into_string().ok()).collect();
+        names.sort_by_cached_key(|name| (name.parse().unwrap_or(u32::MAX), name.clone()));
+        let folders = names.iter().map(|name| format!("{parent}/{name}"));
+        let folders = folders.chain([parent.to_owned()]);
+        let models: Vec<String> = folders.filter(|folder| is_model(&root.join(folder))).collect();
+        // nerfstudio's own file takes precedence over the model that it was made from.
+        if !models.is_empty() && (parent == PARENTS[0] || !root.join(transforms::SINGLE).exists()) {
+            return models;
+        }
+    }
+    Vec::new()
+}
+
+/// The model to read, and those that are not: the user's choice, or the first of those with the most images.
+#[derive(Debug)]
+struct Choice {
+    folder: PathBuf,
+    /// Folder that the model's files may not leave.
+    root: Root,
+    others: Option<Note>,
+}
+
+/// Chooses the model, if there is one.
+fn choose(root: &Root, chosen: Option<&Path>) -> Result<Option<Choice>, LoadError> {
+    let models = models(root.path());
+    if let Some(folder) = chosen {
+        let folder = root.path().join(folder);
+        if !is_model(&folder) {
+            let there = if models.is_empty() { "none".to_owned() } else { models.join(", ") };
+            let problem =
+                format!("{}: this is no COLMAP model (the dataset has {there})", folder.display());
+            return Err(LoadError::Remedied { problem, remedy: LoadRemedy::ColmapModel });
+        }
+        return Ok(Some(Choice { root: Root::new(&folder)?, folder, others: None }));
+    }
+    let several = models.len() > 1;
+    // A single model is not counted, as it is read anyway.
+    let count = |model: &String| if several { image_count(root, model) } else { Ok(0) };
+    let counts = models.iter().map(count).collect::<Result<Vec<u64>, _>>()?;
+    let mut counted: Vec<(String, u64)> = models.into_iter().zip(counts).collect();
+    let most = counted.iter().map(|(_, count)| *count).max();
+    let Some(largest) = counted.iter().position(|(_, count)| Some(*count) == most) else {
+        return Ok(None);
+    };
+    let (model, images) = counted.remove(largest);
+    let folder = root.path().join(&model);
+    let others = several.then_some(Note::OtherModels { model, images, others: counted });
+    Ok(Some(Choice { folder, root: root.clone(), others }))
+}
+
+/// Number of images in a model.
+fn image_count(root: &Root, model: &str) -> Result<u64, LoadError> {
+    let images = file(root, &root.path().join(model), "images")?;
+    if !images.is_file() {
+        return Ok(0);
+    }
+    if is_binary(&images) {
+        bin::image_count(&images)
+    } else {
+        Ok(txt::images(&images)?.len() as u64)
+    }
+}
+
+/// The path of a model's file, which may not be a link out of `root`: binary, if there is one, else text.
+fn file(root: &Root, folder: &Path, name: &str) -> Result<PathBuf, LoadError> {
+    let [binary, text] = ["bin", "txt"].map(|ending| folder.join(format!("{name}.{ending}")));
+    // A missing file is one of the kind that the others are.
+    let others = ["cameras.bin", "images.bin"].map(|name| folder.join(name));
+    let is_binary = binary.is_file() || !text.is_file() && others.iter().any(|file| file.is_file());
+    let path = if is_binary { binary } else { text };
+    let inside = path.strip_prefix(root.path()).unwrap_or(&path).to_string_lossy();
+    root.existing(DataPath { file: &path, field: "the file", value: &inside })?;
+    Ok(path)
+}
+
+fn is_binary(path: &Path) -> bool {
+    path.extension().is_some_and(|ending| ending == "bin")
 }
 
 /// Reads the model in a folder, if there is one.
@@ -86,9 +171,9 @@ fn find(root: &Path) -> Option<PathBuf> {
 /// # Errors
 /// When a file is missing, damaged, or contradicts another.
 fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> {
-    let Some(folder) = find(root.path()) else { return Ok(None) };
+    let Some(choice) = choose(root, options.sparse.as_deref())? else { return Ok(None) };
     let folders = Folders::new(root, options, true)?;
-    let ([cameras, images, points], model) = model(root, &folder, options.tracks)?;
+    let ([cameras, images, points], model) = model(&choice, options.tracks)?;
     let mut frames = Vec::with_capacity(model.images.len());
     let mut reduced_missing = 0;
     for image in model.images {
@@ -116,15 +201,25 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
             held_out: false,
         });
     }
-    let mut notes = Vec::new();
-    let (posed, there) = (frames.len(), folders.count());
-    if posed < there {
-        notes.push(format!(
-            "COLMAP has found the poses of {posed} of {there} images; the others are not used"
-        ));
+    let mut notes: Vec<Note> = choice.others.iter().cloned().collect();
+    let (posed, others) = (frames.len(), folders.count_others(&frames));
+    if others > 0 {
+        let is_one_of_several = !notes.is_empty() || options.sparse.is_some();
+        let folder = choice.folder.strip_prefix(root.path()).unwrap_or(&choice.folder);
+        let model = match is_one_of_several {
+            true => format!("{} has", folder.display()),
+            false => "COLMAP has found".to_owned(),
+        };
+        notes.push(Note::Text(format!(
+            "{model} the poses of {posed} of {} images; the others are not used",
+            posed + others
+        )));
     }
     if reduced_missing > 0 {
-        notes.push(folders.fell_back_note(reduced_missing));
+        notes.push(Note::Text(folders.fell_back_note(reduced_missing)));
+    }
+    if !points.is_file() {
+        notes.push(Note::Text(format!("{} does not exist: there are no points", points.display())));
     }
     Ok(Some(Scene {
         listing: images,
@@ -137,27 +232,21 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
     }))
 }
 
-/// The paths and contents of a model's three files.
+/// The paths and contents of a model's three files. One without points need not have their file.
 fn model(
-    root: &Root,
-    folder: &Path,
+    Choice { folder, root, .. }: &Choice,
     with_tracks: bool,
 ) -> Result<([PathBuf; 3], Model), LoadError> {
-    let binary = ["cameras.bin", "images.bin"].iter().any(|name| folder.join(name).is_file());
-    let ending = if binary { "bin" } else { "txt" };
-    let file = |name: &str| folder.join(format!("{name}.{ending}"));
-    let (cameras, images, points) = (file("cameras"), file("images"), file("points3D"));
-    // These files may not be links out of the dataset either.
-    for path in [&cameras, &images, &points] {
-        let inside = path.strip_prefix(root.path()).unwrap_or(path).to_string_lossy();
-        root.existing(DataPath { file: path, field: "the file", value: &inside })?;
-    }
+    let path = |name: &str| file(root, folder, name);
+    let (cameras, images, points) = (path("cameras")?, path("images")?, path("points3D")?);
     let mut sampler = with_tracks.then(TrackSampler::new);
     let tracks = sampler.as_mut();
-    let (lenses, posed, cloud) = if binary {
-        (bin::cameras(&cameras)?, bin::images(&images)?, bin::points(&points, tracks)?)
-    } else {
-        (txt::cameras(&cameras)?, txt::images(&images)?, txt::points(&points, tracks)?)
+    let lenses = if is_binary(&cameras) { bin::cameras } else { txt::cameras }(&cameras)?;
+    let posed = if is_binary(&images) { bin::images } else { txt::images }(&images)?;
+    let cloud = match points.is_file() {
+        false => PointCloud::default(),
+        true if is_binary(&points) => bin::points(&points, tracks)?,
+        true => txt::points(&points, tracks)?,
     };
     let tracks = sampler.map(TrackSampler::finish).unwrap_or_default();
     Ok(([cameras, images, points], Model { cameras: lenses, images: posed, points: cloud, tracks }))
@@ -166,8 +255,8 @@ fn model(
 /// Adds the tracks of the COLMAP model in a folder to a scene of another format, if the images that both list have the
 /// same poses, as `densify scenegen` writes them. Otherwise the model is ignored, as it may belong to another scene.
 pub(super) fn adopt_tracks(root: &Root, scene: &mut Scene) {
-    let Some(folder) = find(root.path()) else { return };
-    let Ok((_, model)) = model(root, &folder, true) else { return };
+    let Ok(Some(choice)) = choose(root, None) else { return };
+    let Ok((_, model)) = model(&choice, true) else { return };
     let by_name: HashMap<String, &Image> =
         model.images.iter().map(|image| (relative(&image.name), image)).collect();
     let mut matched = false;

@@ -129,11 +129,14 @@ pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, Lens>, LoadError> {
     Ok(cameras)
 }
 
-/// Reads images.txt. An image has two lines, the second of which lists its observations and may be empty.
+/// Reads images.txt. An image has two lines, the second of which lists its observations; it may be empty, and some
+/// programs leave it out.
 pub(super) fn images(path: &Path) -> Result<Vec<Image>, LoadError> {
     let mut lines = Lines::open(path)?;
     let mut images = Vec::new();
-    while lines.advance_to_record()? {
+    // Whether the line of the next image has been read.
+    let mut is_ahead = false;
+    while is_ahead || lines.advance_to_record()? {
         let text = lines.text()?;
         let mut words = text.split_whitespace();
         let id: u32 = lines.number(&mut words, "image id")?;
@@ -151,6 +154,11 @@ pub(super) fn images(path: &Path) -> Result<Vec<Image>, LoadError> {
             return Err(lines.fault("images", "there are more than a million"));
         }
         lines.advance()?;
+        let is_comment = lines.line.trim_ascii_start().starts_with(b"#");
+        is_ahead = !is_comment && has_words(lines.text()?);
+        if is_ahead || is_comment {
+            continue;
+        }
         let words = lines.text()?.split_whitespace().take(10).count();
         if words % 3 != 0 && words < 10 {
             return Err(lines.fault("observations", "they do not come in triples (X, Y, point id)"));
@@ -163,6 +171,11 @@ pub(super) fn images(path: &Path) -> Result<Vec<Image>, LoadError> {
         }
     }
     Ok(images)
+}
+
+/// Whether something on a line is not a number, as the name of an image. Long lines are those of observations.
+fn has_words(text: &str) -> bool {
+    text.split_whitespace().take(100).any(|word| word.parse::<f64>().is_err())
 }
 
 /// The rest of a line after its first `count` words.

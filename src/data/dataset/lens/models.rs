@@ -58,6 +58,17 @@ pub(crate) const MODELS: [LensModel; 11] = [
     model("THIN_PRISM_FISHEYE", 2, Equidistant, &[A(0), A(1), P(0), P(1), A(2), A(3), S(0), S(1)]),
 ];
 
+/// Models that are not supported, by number from that of the first (COLMAP 4, `sensor/models.h`).
+const UNSUPPORTED: [&str; 7] = [
+    "RAD_TAN_THIN_PRISM_FISHEYE",
+    "SIMPLE_DIVISION",
+    "DIVISION",
+    "SIMPLE_FISHEYE",
+    "FISHEYE",
+    "EUCM",
+    "EQUIRECTANGULAR",
+];
+
 /// Distortion fields of nerfstudio's and instant-ngp's pinholes: OpenCV's terms under OpenCV's names.
 pub(crate) const OPENCV_FIELDS: [(&str, Term); 8] = [
     ("k1", A(0)),
@@ -77,9 +88,7 @@ impl LensModel {
     /// The model with a name of COLMAP's text files.
     pub(crate) fn named(file: &Path, camera: &str, name: &str) -> Result<&'static Self, LoadError> {
         MODELS.iter().find(|model| model.name == name).ok_or_else(|| {
-            let all = MODELS.map(|model| model.name).join(", ");
-            let problem = format!("the camera model {name} is not one of {all}");
-            LoadError::lens(file, camera, problem)
+            LoadError::lens_model(file, camera, name, &MODELS.map(|model| model.name).join(", "))
         })
     }
 
@@ -89,9 +98,9 @@ impl LensModel {
         camera: &str,
         number: i32,
     ) -> Result<&'static Self, LoadError> {
-        match usize::try_from(number).ok().and_then(|number| MODELS.get(number)) {
-            Some(model) => Ok(model),
-            None if number == 11 => Self::named(file, camera, "RAD_TAN_THIN_PRISM_FISHEYE"),
+        let mut names = MODELS.iter().map(|model| model.name).chain(UNSUPPORTED);
+        match usize::try_from(number).ok().and_then(|number| names.nth(number)) {
+            Some(name) => Self::named(file, camera, name),
             None => Self::named(file, camera, &format!("number {number}")),
         }
     }

@@ -21,6 +21,8 @@ const CAMERAS: &[Replacement] = &[
         "camera 1, field of view",
     ),
     ("PINHOLE", "MAGIC", "MAGIC, image_undistorter"),
+    ("PINHOLE 20 12 15 16 10 6", "EQUIRECTANGULAR 20 10 20 10", "EQUIRECTANGULAR, faces of a cube"),
+    ("PINHOLE 20 12 15 16 10 6", "EUCM 20 12 15 16 10 6 0 1", "EUCM, image_undistorter"),
     (" 10 6\n", " 10\n", "cameras.txt, line 2"),
     (" 10 6\n", " 10 6 1\n", "cameras.txt, camera 1, more parameters"),
     (" 15 ", " 0 ", "cameras.txt, camera 1, fx"),
@@ -44,7 +46,8 @@ const IMAGES: &[Replacement] = &[
     ("0.8 0 0.6 0", "0.9 0 0.6 0", "image b.png, quaternion"),
     (" 1 b.png", " 5 b.png", "images.txt, b.png, camera 5"),
     (" 1 b.png", "", "images.txt, line 4"),
-    ("1.5 2.5 -1 3 4 7\n", "", "images.txt, triples"),
+    ("1.5 2.5 -1 3 4 7", "1.5 2.5 -1 3 4", "images.txt, triples"),
+    ("1.5 2.5 -1 3 4 7", "1.5 2.5 x", "images.txt, line 3, image id, 1.5"),
     ("b.png", "a.png", "images.txt, a.png, twice"),
     ("b.png", "../b.png", "images.txt, ../b.png, `..`"),
     ("b.png", "/etc/passwd", "images.txt, absolute"),
@@ -81,7 +84,6 @@ fn colmap_text() {
                 |m| m.remove("sparse/0/cameras.txt"),
                 "cameras.txt, check that it exists",
             ),
-            ("no points", |m| m.remove("sparse/0/points3D.txt"), "points3D.txt"),
             ("zero images", |m| m.write("sparse/0/images.txt", "# none\n"), "images.txt, no image"),
             (
                 "no image",
@@ -132,7 +134,13 @@ type Patch = (&'static str, fn(&mut Vec<u8>), &'static str);
 
 const COLMAP_BINARY: &[Patch] = &[
     ("cameras", |b| b[12] = 11, "cameras.bin, camera 1, PRISM_FISHEYE, image_undistorter"),
-    ("cameras", |b| b[12] = 77, "camera 1, number 77"),
+    ("cameras", |b| b[12] = 12, "camera 1, model SIMPLE_DIVISION is, image_undistorter"),
+    ("cameras", |b| b[12] = 13, "camera 1, model DIVISION is, image_undistorter"),
+    ("cameras", |b| b[12] = 14, "camera 1, model SIMPLE_FISHEYE is, image_undistorter"),
+    ("cameras", |b| b[12] = 15, "camera 1, model FISHEYE is, image_undistorter"),
+    ("cameras", |b| b[12] = 16, "camera 1, model EUCM is, image_undistorter"),
+    ("cameras", panorama, "camera 1, model EQUIRECTANGULAR is, faces of a cube"),
+    ("cameras", |b| b[12] = 18, "camera 1, number 18, image_undistorter"),
     ("cameras", |b| b[23] = 1, "camera 1, impossible"),
     ("cameras", |b| b.truncate(50), "cameras.bin"),
     ("cameras", Vec::clear, "cameras.bin, truncated"),
@@ -150,6 +158,12 @@ const COLMAP_BINARY: &[Patch] = &[
     ("points3D", |b| b.truncate(b.len() - 1), "points3D.bin"),
     ("points3D", |b| b[51..59].fill(0xff), "points3D.bin, truncated"),
 ];
+
+/// Two parameters, as COLMAP writes them: the size once more.
+fn panorama(cameras: &mut Vec<u8>) {
+    cameras[12] = 17;
+    cameras.truncate(8 + 24 + 16);
+}
 
 #[test]
 fn colmap_binary() {
@@ -185,6 +199,20 @@ fn no_damaged_byte_causes_a_panic() {
 /// Pointer to a field of transforms.json, its replacement (empty: the field is removed), and words of the message.
 const TRANSFORMS: &[Replacement] = &[
     ("/test_filenames", "[1]", "transforms.json, test_filenames, list of file names"),
+    ("/train_filenames", "3", "transforms.json, train_filenames, list of file names"),
+    (
+        "/train_filenames",
+        "[\"images/a.png\", \"images/z.png\", \"images/y.png\"]",
+        "transforms.json, train_filenames, no frame has, images/y.png, nor 1 more",
+    ),
+    ("/val_filenames", "[\"a.png\"]", "transforms.json, val_filenames, no frame has, a.png"),
+    ("/test_filenames", "[\"../a.png\"]", "transforms.json, test_filenames, `..`"),
+    ("/train_filenames", "[]", "transforms.json, train_filenames, no frame to train on"),
+    (
+        "/test_filenames",
+        "[\"images/a.png\", \"images/b.png\", \"images/c.png\"]",
+        "transforms.json, test_filenames, no frame to train on",
+    ),
     ("/frames", "3", "transforms.json, frames"),
     ("/frames", "[]", "transforms.json, no image"),
     ("/frames/1", "3", "frames[1]"),
@@ -212,7 +240,8 @@ const TRANSFORMS: &[Replacement] = &[
     ("/fl_x", "0", "intrinsics, fx"),
     ("/w", "20.5", "w, 20.5"),
     ("/w", "-20", "w, -20"),
-    ("/camera_model", "\"EQUIRECTANGULAR\"", "camera_model, EQUIRECTANGULAR, image_undistorter"),
+    ("/camera_model", "\"EQUIRECTANGULAR\"", "camera_model, EQUIRECTANGULAR, faces of a cube"),
+    ("/camera_model", "\"VR180_L\"", "camera_model, VR180_L, image_undistorter"),
     ("/camera_model", "7", "camera_model, string"),
     ("/k1", "-5.0", "folds over, a.png, largest usable field, KeepFieldOfView"),
     ("/k1", "-1e9", "folds over, a.png, calibrate again"),

@@ -86,6 +86,73 @@ fn splits() {
     }
 }
 
+/// nerfstudio's lists, as letters of frames, and what is trained on, tested and noted.
+#[test]
+fn frames_are_split_as_their_lists_say() {
+    let file = |letter: char| format!("images/{letter}.png");
+    let all = |letters: &str| letters.chars().map(file).collect::<Vec<_>>();
+    let eval = LoadOptions { split: Split::Eval, ..LoadOptions::default() };
+    let every = LoadOptions { split: Split::Every(NonZeroU32::MAX), ..LoadOptions::default() };
+    let reduced =
+        LoadOptions { resolution: Some(Resolution::Divisor(2)), ..LoadOptions::default() };
+    for ([train, validation, test], (trained, tested), note) in [
+        ([Some("b"), None, None], ("b", ""), "2 of 3 frames, in no list, images/a.png"),
+        ([Some("b"), Some(""), Some("")], ("b", ""), "none for tests, no view is held out"),
+        ([Some("b"), Some("a"), None], ("b", "a"), "1 of 3 frames, in no list, images/c.png"),
+        ([Some("b"), Some("c"), Some("a")], ("b", "a"), "1 of 3 frames, validation, images/c.png"),
+        ([Some("abc"), Some("c"), None], ("abc", "c"), "1 of 3 frames, for training and for tests"),
+        ([None, Some("c"), Some("a")], ("b", "a"), "1 of 3 frames, validation, images/c.png"),
+        ([None, Some("c"), Some("")], ("ab", "c"), ""),
+        ([None, None, Some("ac")], ("b", "ac"), ""),
+    ] {
+        let made = Made::transforms(|json| {
+            for (field, list) in ["train", "val", "test"].iter().zip([train, validation, test]) {
+                if let Some(list) = list {
+                    json[format!("{field}_filenames")] = all(list).into();
+                }
+            }
+        });
+        for name in NAMES {
+            image(&made.file("images_2").join(name), (10, 6), 7);
+        }
+        for options in [&LoadOptions::default(), &eval, &reduced] {
+            let data = load_with(&made, options);
+            assert_eq!(names(&data.train), all(trained), "{trained}, {tested}");
+            assert_eq!(names(&data.test), all(tested), "{trained}, {tested}");
+            if !note.is_empty() {
+                assert_noted(&data, note);
+            }
+        }
+        // All frames take part in another split.
+        let data = load_with(&made, &every);
+        assert_eq!(names(&data.train), all("bc"));
+        assert_eq!(names(&data.test), all("a"));
+    }
+}
+
+/// Lists name frames as paths of any spelling, also those whose photograph is missing.
+#[test]
+fn lists_and_frames_may_spell_paths_differently() {
+    let made = Made::transforms(|json| {
+        json["frames"][0]["file_path"] = "images\\a.png".into();
+        json["frames"][2]["file_path"] = "images/c".into();
+        json["train_filenames"] = vec!["./images/a.png", "images\\b.png", "images/./c.png"].into();
+    });
+    assert_eq!(load(&made).train.len(), 3);
+    made.remove("images/b.png");
+    let data = load(&made);
+    assert_eq!(data.train.len(), 2);
+    assert_noted(&data, "1 of 3 frames have no image file");
+    // Paths of another machine.
+    let made = Made::transforms(|json| {
+        json["frames"][1]["file_path"] = "/home/x/images/b.png".into();
+        json["train_filenames"] = vec!["images/a.png", "C:\\x\\images\\b.png"].into();
+    });
+    let images = Some("images".into());
+    let data = load_with(&made, &LoadOptions { images, ..LoadOptions::default() });
+    assert_eq!(data.train.len(), 2);
+}
+
 #[test]
 fn resolutions() {
     let options =

@@ -2,6 +2,7 @@
 
 mod archives;
 mod bad_input;
+mod colmap;
 mod exif;
 mod formats;
 mod lenses;

@@ -58,3 +58,16 @@ fn real_datasets_load() {
         }
     }
 }
+
+/// Cases after public reports.
+#[test]
+#[ignore = "needs shared data"]
+fn shared_cases_load_as_they_say() {
+    let case = |name: &str| Dataset::load(&shared("../cases").join(name), &LoadOptions::default());
+    for (name, train, test) in [("split/both", 10, 3), ("split/subset", 4, 4)] {
+        let data = case(name).unwrap_or_else(|e| panic!("{name}: {e}"));
+        assert_eq!((data.train.len(), data.test.len()), (train, test), "{name}");
+    }
+    let message = case("colmap/eq1").unwrap_err().to_string();
+    assert!(message.contains("EQUIRECTANGULAR") && message.contains("cube"), "{message}");
+}

@@ -1,0 +1,129 @@
+//! nerfstudio's lists of the frames to train on, to validate with and to test on.
+//!
+//! What is listed for training is trained on, and nothing else; without such a list, all that no other list names. Test
+//! views are the frames listed for tests or, without any, those for validation, which are never trained on unless listed
+//! for that too.
+
+use std::collections::HashMap;
+use std::path::PathBuf;
+
+use super::LoadError;
+use super::folders::{Folders, ImageFile};
+use super::paths::{DataPath, relative};
+
+/// The lists, in the order of [`FrameLists::lists`].
+pub(super) const FIELDS: [&str; 3] = ["train_filenames", "val_filenames", "test_filenames"];
+
+/// Names of a list by the image that they name, and whether a frame has it.
+type Names = HashMap<PathBuf, (String, bool)>;
+
+/// The lists of a file, with what they say about its frames.
+#[derive(Debug, Default)]
+pub(super) struct FrameLists {
+    lists: [Option<Names>; 3],
+    /// Frames that are not used, because no list or only that for validation names them.
+    unlisted: Vec<String>,
+    validation: Vec<String>,
+    /// Frames that are both trained on and tested.
+    both: Vec<String>,
+    /// Number of frames whose image exists, and of those that are trained on.
+    frames: usize,
+    trained: usize,
+}
+
+/// What identifies a frame: its image or, if that is missing, the path as listed.
+fn key(value: &str, found: Option<&ImageFile>) -> PathBuf {
+    found.map_or_else(|| relative(&value.replace('\\', "/")).into(), |found| found.path.clone())
+}
+
+impl FrameLists {
+    /// Adds the list of a field.
+    pub(super) fn add(
+        &mut self,
+        folders: &Folders,
+        list: usize,
+        names: &[DataPath<'_>],
+    ) -> Result<(), LoadError> {
+        let mut keyed = Names::new();
+        for &named in names {
+            let found = folders.image(named)?;
+            keyed.insert(key(named.value, found.as_ref()), (named.value.to_owned(), false));
+        }
+        self.lists[list] = Some(keyed);
+        Ok(())
+    }
+
+    /// Whether a frame is trained on, and whether it is tested.
+    pub(super) fn splits(&mut self, file: &str, found: Option<&ImageFile>) -> (bool, bool) {
+        let key = key(file, found);
+        let [train, validation, test] = self.lists.each_mut().map(|list| {
+            let entry = list.as_mut().and_then(|names| names.get_mut(&key));
+            entry.map(|(_, matched)| *matched = true).is_some()
+        });
+        let has_train = self.lists[0].is_some();
+        let tested = if self.names_any(2) { test } else { validation };
+        let trained = if has_train { train } else { !(validation || test) };
+        if found.is_some() {
+            self.frames += 1;
+            self.trained += usize::from(trained);
+            let group = match (trained, tested) {
+                (true, true) => Some(&mut self.both),
+                (false, false) if validation => Some(&mut self.validation),
+                (false, false) => Some(&mut self.unlisted),
+                _ => None,
+            };
+            group.into_iter().for_each(|group| group.push(file.to_owned()));
+        }
+        (trained, tested)
+    }
+
+    fn names_any(&self, list: usize) -> bool {
+        self.lists[list].as_ref().is_some_and(|names| !names.is_empty())
+    }
+
+    /// Whether the lists define which frames are tested.
+    pub(super) fn decide(&self) -> bool {
+        self.lists[0].is_some() || self.names_any(1) || self.names_any(2)
+    }
+
+    /// The field that is wrong and its problem: a name that no frame has, or no frame to train on.
+    pub(super) fn fault(&self) -> Option<(&'static str, String)> {
+        for (field, names) in FIELDS.iter().zip(&self.lists) {
+            let unmatched = || names.iter().flat_map(HashMap::values).filter(|(_, is)| !is);
+            if let Some(name) = unmatched().map(|(name, _)| name).min() {
+                let more = match unmatched().count() - 1 {
+                    0 => String::new(),
+                    more => format!(", nor {more} more of its names"),
+                };
+                let problem = format!("no frame has the file_path {name:?}{more}");
+                return Some((field, problem));
+            }
+        }
+        let leaves_none = self.trained == 0 && self.frames > 0;
+        let decisive =
+            (0..3).find(|&list| self.lists[list].is_some() && (list == 0 || self.names_any(list)));
+        let problem = || "it leaves no frame to train on".to_owned();
+        decisive.filter(|_| leaves_none).map(|list| (FIELDS[list], problem()))
+    }
+
+    /// What the user must know about frames that are used differently than without lists.
+    pub(super) fn notes(&self, file: &str) -> Vec<String> {
+        let mut notes = Vec::new();
+        let mut note = |group: &[String], words: &str| {
+            if let Some(first) = group.first() {
+                let (count, all) = (group.len(), self.frames);
+                notes.push(format!("{file}: {count} of {all} frames {words} (first: {first})"));
+            }
+        };
+        note(&self.unlisted, "are in no list of filenames and are not used");
+        note(&self.validation, "are held out for validation: neither trained on nor tested");
+        note(
+            &self.both,
+            "are listed for training and for tests, so that their scores are not those of new views",
+        );
+        if self.lists[0].is_some() && !self.names_any(1) && !self.names_any(2) {
+            notes.push(format!("{file}: frames are listed for training and none for tests, so that no view is held out"));
+        }
+        notes
+    }
+}

@@ -1,0 +1,158 @@
+//! The transfer function that a PNG states, such as that of linear values, and the conversion to sRGB.
+//!
+//! Of several statements the chunk `cICP` counts before `iCCP`, `sRGB` and `gAMA` (PNG, 3rd edition, 4.3).
+
+use std::io::{BufRead, Read, Seek};
+
+use image::{DynamicImage, ImageBuffer, Pixel};
+
+const SIGNATURE: [u8; 8] = *b"\x89PNG\r\n\x1a\n";
+/// Number of linear values in `cICP` (ITU-T H.273, table 3).
+const LINEAR: u8 = 8;
+/// The exponent of `gAMA` for which sRGB is written, and its relative tolerance, as programs round it.
+const SRGB: f64 = 1.0 / 2.2;
+const TOLERANCE: f64 = 0.05;
+
+/// The exponent of the values of a PNG, unless they are sRGB or in doubt. A value is light to the power of it.
+pub(super) fn exponent(mut input: impl BufRead + Seek) -> Option<f64> {
+    let bytes = |input: &mut dyn Read| {
+        let mut bytes = [0; 8];
+        input.read_exact(&mut bytes).ok().map(|()| bytes)
+    };
+    if bytes(&mut input)? != SIGNATURE {
+        return None;
+    }
+    let (mut stated, mut is_known) = (None, false);
+    loop {
+        let [a, b, c, d, kind @ ..] = bytes(&mut input)?;
+        let mut rest = i64::from(u32::from_be_bytes([a, b, c, d])) + 4;
+        match &kind {
+            b"cICP" | b"gAMA" if rest == 8 => {
+                let [a, b, c, d, ..] = bytes(&mut input)?;
+                if &kind == b"cICP" {
+                    return (b == LINEAR).then_some(1.0);
+                }
+                stated = Some(f64::from(u32::from_be_bytes([a, b, c, d])) / 1e5);
+                rest = 0;
+            }
+            b"iCCP" | b"sRGB" => is_known = true,
+            b"IDAT" | b"IEND" => break,
+            _ => {}
+        }
+        input.seek_relative(rest).ok()?;
+    }
+    let is_other = |exponent: &f64| *exponent > 0.0 && (exponent / SRGB - 1.0).abs() > TOLERANCE;
+    stated.filter(|exponent| !is_known && is_other(exponent))
+}
+
+/// Converts values that are light to the power of `exponent` to sRGB.
+pub(super) fn to_srgb(image: &mut DynamicImage, exponent: f64) {
+    use DynamicImage::*;
+    let srgb = |value: f64| {
+        let light = value.powf(1.0 / exponent);
+        if light <= 0.003_130_8 { 12.92 * light } else { 1.055 * light.powf(1.0 / 2.4) - 0.055 }
+    };
+    let eight: Vec<u8> =
+        (0..=255).map(|v| (255.0 * srgb(f64::from(v) / 255.0)).round() as u8).collect();
+    let deep = || -> Vec<u16> {
+        (0..=u16::MAX).map(|v| (65_535.0 * srgb(f64::from(v) / 65_535.0)).round() as u16).collect()
+    };
+    match image {
+        ImageLuma8(image) => replace(image, &eight),
+        ImageLumaA8(image) => replace(image, &eight),
+        ImageRgb8(image) => replace(image, &eight),
+        ImageRgba8(image) => replace(image, &eight),
+        ImageLuma16(image) => replace(image, &deep()),
+        ImageLumaA16(image) => replace(image, &deep()),
+        ImageRgb16(image) => replace(image, &deep()),
+        ImageRgba16(image) => replace(image, &deep()),
+        // No PNG has other values.
+        _ => {}
+    }
+}
+
+/// Replaces all values but alpha by those of a table.
+fn replace<P: Pixel>(image: &mut ImageBuffer<P, Vec<P::Subpixel>>, table: &[P::Subpixel])
+where
+    P::Subpixel: Into<usize>,
+{
+    for pixel in image.pixels_mut() {
+        pixel.apply_without_alpha(|value| table[value.into()]);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Cursor;
+
+    use image::{ImageFormat, Luma, Rgb, Rgba};
+
+    use super::super::images::ImageSource;
+    use super::*;
+
+    type Chunk<'a> = (&'a [u8; 4], &'a [u8]);
+
+    /// A PNG with chunks after its header.
+    fn png(image: &DynamicImage, chunks: &[Chunk<'_>]) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        image.write_to(&mut Cursor::new(&mut bytes), ImageFormat::Png).unwrap();
+        let mut more = Vec::new();
+        for (kind, data) in chunks {
+            let chunk = [&kind[..], data].concat();
+            let mut sum = flate2::Crc::new();
+            sum.update(&chunk);
+            more.extend((data.len() as u32).to_be_bytes());
+            more.extend(chunk);
+            more.extend(sum.sum().to_be_bytes());
+        }
+        bytes.splice(33..33, more);
+        bytes
+    }
+
+    /// A quarter of full light is 137 in sRGB.
+    #[test]
+    fn values_become_srgb_as_the_file_says() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.png");
+        let rgb = DynamicImage::from(ImageBuffer::from_pixel(2, 2, Rgb([64_u8, 0, 255])));
+        let deep = DynamicImage::from(ImageBuffer::from_pixel(2, 2, Rgb([16_448_u16, 0, 65_535])));
+        let gamma = |exponent: u32| exponent.to_be_bytes();
+        let (linear, usual, old) = (gamma(100_000), gamma(45_455), gamma(55_556));
+        let zero = gamma(0);
+        let cases: [(&DynamicImage, &[Chunk<'_>], u8); 10] = [
+            (&rgb, &[], 64),
+            (&rgb, &[(b"gAMA", &linear)], 137),
+            (&deep, &[(b"gAMA", &linear[..])], 137),
+            (&rgb, &[(b"gAMA", &usual)], 64),
+            (&rgb, &[(b"gAMA", &zero)], 64),
+            (&rgb, &[(b"gAMA", &old)], 81),
+            (&rgb, &[(b"sRGB", &[0]), (b"gAMA", &linear)], 64),
+            (&rgb, &[(b"gAMA", &linear), (b"sRGB", &[0])], 64),
+            (&rgb, &[(b"cICP", &[1, 8, 0, 1])], 137),
+            (&rgb, &[(b"gAMA", &linear), (b"cICP", &[1, 13, 0, 1])], 64),
+        ];
+        for (image, chunks, red) in cases {
+            std::fs::write(&path, png(image, chunks)).unwrap();
+            let loaded = ImageSource::whole(path.clone()).load().unwrap();
+            assert_eq!(loaded.rgb[..3], [red, 0, 255], "{chunks:?}");
+        }
+        // Alpha stays, and grey is grey.
+        let clear = ImageBuffer::from_pixel(2, 2, Rgba([64_u8, 64, 64, 64]));
+        let grey = ImageBuffer::from_pixel(2, 2, Luma([64_u8]));
+        for (image, alpha) in [(clear.into(), Some(vec![64; 4])), (grey.into(), None)] {
+            std::fs::write(&path, png(&image, &[(b"gAMA", &linear)])).unwrap();
+            let loaded = ImageSource::whole(path.clone()).load().unwrap();
+            assert_eq!((&loaded.rgb[..3], loaded.alpha), (&[137; 3][..], alpha));
+        }
+    }
+
+    #[test]
+    fn cut_files_state_nothing() {
+        let grey = ImageBuffer::from_pixel(2, 2, Luma([64_u8])).into();
+        let whole = png(&grey, &[(b"gAMA", &100_000_u32.to_be_bytes())]);
+        assert_eq!(exponent(Cursor::new(&whole)), Some(1.0));
+        for at in 0..40 {
+            assert_eq!(exponent(Cursor::new(&whole[..at])), None);
+        }
+    }
+}
