@@ -5,7 +5,7 @@
 //! progress goes to an [`Observer`]; errors stay data until they are shown.
 //!
 //! From below, each module using only those before it: failure, spec, companion, observer, process, host, models,
-//! coordinate_check, resolved, finished, session.
+//! coordinate_check, near_plane, resolved, finished, session.
 
 mod companion;
 pub mod coordinate_check;
@@ -13,6 +13,7 @@ pub mod failure;
 pub mod finished;
 mod host;
 mod models;
+mod near_plane;
 mod observer;
 mod process;
 mod resolved;
@@ -21,6 +22,7 @@ pub mod spec;
 
 pub use companion::{Companion, CompanionSize};
 pub use host::Host;
+pub use near_plane::NearPlane;
 pub use observer::{Between, Interrupt, Observer, Silent, say_notes};
 pub use process::{MemoryLimit, ProcessMemory, grant};
 pub use resolved::{

@@ -184,10 +184,8 @@ run_spec! {
         init_points: Option<Rows> = None, Fixed, value "N";
 
         /// Nearest distance to a camera at which anything is drawn, as a fraction of the scene's
-        /// extent
-        // The original's 0.2 for an extent of 5. Nearer Gaussians become fog before one camera: with
-        // 0.01, test views lost up to 10 dB to it.
-        near: Fraction = Fraction(0.04), Fixed, value "FRACTION";
+        /// extent (default: 0.04, or less where the views show points that are nearer)
+        near: Option<Fraction> = None, Fixed, value "FRACTION";
     }
 
     /// Limits of memory and quality.
