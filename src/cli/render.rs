@@ -9,6 +9,7 @@ use densify_policies::policy::Needs;
 use super::console::Console;
 use super::film::{self, FilmArgs};
 use super::threads::open_machine;
+use densify_core::camera_path;
 use densify_data::views::ViewSource;
 use densify_inspect::{CameraRoute, Channels, FilmSource, PictureFolder, file_names};
 use densify_run::failure::Failure;
@@ -62,9 +63,9 @@ pub(super) struct RenderArgs {
 #[derive(Debug, Clone, Args)]
 pub(super) struct RenderingArgs {
     /// Nearest distance to a camera at which Gaussians of a file are drawn, as a fraction of the
-    /// scene's extent
+    /// scene's extent (default: 0.04, or less where the views show points that are nearer)
     #[arg(long, value_name = "FRACTION", help_heading = "Scene")]
-    pub(super) near: Fraction,
+    pub(super) near: Option<Fraction>,
     #[command(flatten)]
     pub(super) device: DeviceSpec,
     #[command(flatten)]
@@ -98,11 +99,11 @@ pub(super) fn run(
     };
     let path = args.film.path.as_ref();
     // A camera path from a file needs no dataset.
-    if let Some(route @ CameraRoute::File(_)) = path
+    if let Some(route @ CameraRoute::File(file)) = path
         && args.scene.is_none()
         && is_model(&args.model)
     {
-        let source = argument.open_without_dataset(&args.rendering, console)?;
+        let source = argument.open_without_dataset(file, &args.rendering, console)?;
         return film::run(&args.film, route, &args.output, channels, source, console);
     }
     let mut opened = argument.open(&args.rendering, Needs::default(), matches, console)?;
@@ -178,19 +179,22 @@ impl ModelArgument<'_> {
         };
         let model = model_file(self.model, self.iteration)?;
         let RenderingArgs { near, data, .. } = rendering;
-        open(&model, scene, data.clone(), (near.0, machine), needs, console)
+        open(&model, scene, data.clone(), (*near, machine), needs, console)
     }
 
-    /// Opens a file without a dataset.
+    /// Opens a file without a dataset, for the camera path of another file.
     fn open_without_dataset(
         &self,
+        path: &Path,
         rendering: &RenderingArgs,
         console: &Console,
     ) -> Result<FilmSource, Failure> {
         let machine = open_machine(&rendering.device, console)?;
         let model = model_file(self.model, self.iteration)?;
+        // A path that cannot be read is reported when it is filmed.
+        let cameras = camera_path::read(path).map_or_else(|_| Vec::new(), |saved| saved.cameras());
         let (backend, normalisation, sh_degree) =
-            open_alone(&model, (rendering.near.0, machine), console)?;
+            open_alone(&model, (rendering.near, machine), &cameras, console)?;
         let background = rendering.data.background.fixed();
         Ok(FilmSource { backend, sh_degree, background, normalisation, cameras: Vec::new() })
     }

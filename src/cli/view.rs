@@ -73,7 +73,7 @@ pub(super) fn run(args: &ViewArgs, matches: &ArgMatches, console: &Console) -> R
         other: args.other.as_deref(),
         dataset: args.scene.clone(),
         iteration: args.iteration,
-        near: near.0,
+        near: *near,
         data: data.clone(),
     };
     let scene = view::open(options, machine, console)?;

@@ -3,17 +3,20 @@
 use std::path::{Path, PathBuf};
 
 use densify_policies::policy::Needs;
+use glam::DVec3;
 
 use crate::failure::{Failure, ModelProblem, notes};
 pub use crate::models::{
     is_model, iteration, iteration_so_far, model_file, name_of, names_of, read_model, write_model,
 };
+use crate::near_plane::NearPlane;
 use crate::observer::{Observer, say_notes};
 use crate::resolved::RunConfig;
-use crate::spec::{DataSpec, DeviceSpec};
+use crate::spec::{DataSpec, DeviceSpec, Fraction};
+use densify_core::camera::Camera;
 use densify_core::gaussians::Gaussians;
-use densify_data::dataset::normalise::{EXTENT, Normalisation};
-use densify_data::dataset::{Dataset, View, builtin};
+use densify_data::dataset::normalise::Normalisation;
+use densify_data::dataset::{Dataset, SeenDepths, View, builtin};
 use densify_data::views::DatasetViews;
 use densify_render::{Backend, BackendError, Device, MomentStorage, Setup, Storage};
 use densify_train::evaluate::Split;
@@ -125,12 +128,13 @@ pub fn open_run(
     let was_moved = moved_to.is_some();
     let path = moved_to.unwrap_or_else(|| config.scene_path());
     let model = model_path(run, iteration);
-    let near = config.spec.start.near.0;
+    let near = config.spec.start.near;
     open(&model, &path, config.spec.data, (near, machine), needs, observer)
         .map_err(|failure| if was_moved { failure } else { or_moved(failure, &path) })
 }
 
-/// Opens a model, written by any program, with a dataset. The near plane is given as a fraction of the extent.
+/// Opens a model, written by any program, with a dataset. Without `near`, the near plane is the [usual one](NearPlane) of
+/// the dataset.
 ///
 /// # Errors
 /// When the model, the dataset or the device cannot be opened.
@@ -138,34 +142,59 @@ pub fn open(
     model: &Path,
     dataset: &Path,
     data: DataSpec,
-    (near, machine): (f64, Machine),
+    (near, machine): (Option<Fraction>, Machine),
     needs: Needs,
     observer: &dyn Observer,
 ) -> Result<Opened, Failure> {
     let dataset = load(dataset, &data, observer)?;
     let model = read_model(model, observer)?;
     let sh_degree = model.sh_degree;
-    let near = (near * dataset.extent()) as f32;
+    let near = near_plane(near, &dataset, observer);
     let backend = machine.backend_for(&dataset, model, near, needs)?;
     Ok(Opened { sh_degree, backend, dataset, data })
 }
 
-/// Opens a model without a dataset, for cameras in its own coordinates. Also returns its normalisation and degree. The
-/// near plane is given as a fraction of its extent.
+/// Opens a model without a dataset, for cameras in its own coordinates. Also returns its normalisation and degree.
+/// Without `near`, the near plane follows from the opaque Gaussians that the cameras see.
 ///
 /// # Errors
 /// When the model or the device cannot be opened.
 pub fn open_alone(
     model: &Path,
-    (near, machine): (f64, Machine),
+    (near, machine): (Option<Fraction>, Machine),
+    cameras: &[Camera],
     observer: &dyn Observer,
 ) -> Result<(Box<dyn Backend>, Normalisation, u8), Failure> {
     let model = read_model(model, observer)?;
     let normalisation = Normalisation::fit_model(&model);
     let model = normalisation.model_from_world(model);
-    let near = (near * EXTENT) as f32;
+    let near = say_near_plane(
+        NearPlane::from_depths(near, &seen(&model, &normalisation, cameras)),
+        observer,
+    );
     let backend = machine.device.backend(&model, &machine.setup(&model, near))?;
     Ok((backend, normalisation, model.sh_degree))
+}
+
+/// The depths at which cameras in a model's own coordinates see its solid Gaussians, in a normalised scene.
+fn seen(model: &Gaussians, normalisation: &Normalisation, cameras: &[Camera]) -> SeenDepths {
+    let rows = model.means.iter().zip(&model.opacity_logits);
+    let solid = rows.filter(|(_, logit)| **logit > 0.0);
+    let centres: Vec<_> = solid.map(|(mean, _)| DVec3::from(mean.map(f64::from))).collect();
+    let to_scene = |camera| normalisation.scene_from_world_camera(camera);
+    SeenDepths::measure(&centres, &cameras.iter().map(to_scene).collect::<Vec<_>>())
+}
+
+/// The [near plane](NearPlane) of a model in a dataset `[scene units]`, with a line for the user where one is due.
+pub fn near_plane(given: Option<Fraction>, dataset: &Dataset, observer: &dyn Observer) -> f32 {
+    say_near_plane(NearPlane::choose(given, dataset), observer)
+}
+
+fn say_near_plane(near: NearPlane, observer: &dyn Observer) -> f32 {
+    if let Some(line) = near.line(observer.spelling()) {
+        observer.say(format_args!("{line}"));
+    }
+    near.distance()
 }
 
 /// Reads the dataset at `path` and passes its notes to the observer.

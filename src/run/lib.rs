@@ -5,7 +5,8 @@
 //! progress goes to an [`Observer`]; errors stay data until they are shown.
 //!
 //! Modules from bottom to top, each of which uses only those before it: failure, spec, companion, observer, process,
-//! host, models, coordinate_check, resolved, finished, session.
+//! host, models, coordinate_check, near_plane, resolved,
+//! finished, session.
 
 mod companion;
 pub mod coordinate_check;
@@ -13,6 +14,7 @@ pub mod failure;
 pub mod finished;
 mod host;
 mod models;
+mod near_plane;
 mod observer;
 mod process;
 mod resolved;
@@ -21,6 +23,7 @@ pub mod spec;
 
 pub use companion::{Companion, CompanionSize};
 pub use host::Host;
+pub use near_plane::NearPlane;
 pub use observer::{Between, Interrupt, Observer, Silent, say_notes};
 pub use process::{MemoryLimit, ProcessMemory, grant};
 pub use resolved::{

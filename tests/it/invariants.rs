@@ -245,6 +245,7 @@ const MODULES: [(&str, &[&str]); 5] = [
             "process",
             "host",
             "spec",
+            "near_plane",
             "resolved",
             "finished",
             "session",

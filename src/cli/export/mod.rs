@@ -136,9 +136,9 @@ fn open_reference(
 ) -> Result<Reference, Failure> {
     let (data, near) = if is_run {
         let spec = RunConfig::read(&args.model)?.spec;
-        (spec.data, spec.start.near.0)
+        (spec.data, spec.start.near)
     } else {
-        (args.rendering.data.clone(), args.rendering.near.0)
+        (args.rendering.data.clone(), args.rendering.near)
     };
     let machine = open_machine(&args.rendering.device, console)?;
     Reference::open(&args.model, model, scene, data, (near, machine), console)

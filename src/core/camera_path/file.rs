@@ -6,12 +6,15 @@ use glam::{DMat3, DMat4, DQuat, DVec3};
 use serde::Deserialize;
 
 use super::{CameraPath, Keyframe};
+use crate::camera::Camera;
 use crate::files;
 
 /// Maximum size of a file `[bytes]`.
 const MAX_BYTES: u64 = 64 << 20;
 /// Maximum number of keyframes, and of frames, of a path.
 const MAX_KEYFRAMES: usize = 100_000;
+/// The size of a frame where only what it shows matters `[px]`.
+const ANY_SIZE: (u32, u32) = (1600, 900);
 /// Maximum width and height of a frame `[px]`.
 pub const MAX_SIDE: u32 = 16_384;
 
@@ -47,6 +50,14 @@ pub struct SavedCameraPath {
     pub fps: Option<u32>,
     /// Width and height of a frame `[px]`, if given.
     pub size: Option<(u32, u32)>,
+}
+
+impl SavedCameraPath {
+    /// The cameras of all frames, with pictures of the path's size or else of another one.
+    pub fn cameras(&self) -> Vec<Camera> {
+        let size = self.size.unwrap_or(ANY_SIZE);
+        (0..self.frames).map(|frame| self.path.frame(frame, self.frames).camera(size)).collect()
+    }
 }
 
 /// The fields of the file that are used.

@@ -24,6 +24,7 @@ mod photographs;
 mod pose;
 mod prepare;
 mod realitycapture;
+mod seen_depths;
 mod source_file;
 mod tracks;
 mod transfer;
@@ -61,6 +62,7 @@ use mask_files::MaskFile;
 use normalise::Normalisation;
 pub use options::{FarCameras, LoadOptions, MaskMode, Resolution, Split};
 use paths::Root;
+pub use seen_depths::SeenDepths;
 pub(crate) use tracks::MIN_VIEWS;
 pub use tracks::Tracks;
 pub use view_list::view_line;
@@ -215,6 +217,13 @@ impl Dataset {
     /// training cameras. It is the same for every normalised scene.
     pub fn extent(&self) -> f64 {
         normalise::EXTENT
+    }
+
+    /// The depths at which the views see the points.
+    pub fn seen_depths(&self) -> SeenDepths {
+        let cameras: Vec<Camera> =
+            self.train.iter().chain(&self.test).map(|view| view.camera).collect();
+        SeenDepths::measure(&self.points.positions, &cameras)
     }
 
     /// Largest width and largest height of all views `[px]`.

@@ -69,6 +69,13 @@ pub(crate) fn accumulation(s: Spelling, taken: Accumulation) -> String {
     format!("sums     accumulation={taken}: {note}")
 }
 
+/// Points that are nearer than the near plane.
+pub(crate) fn hidden_points(s: Spelling, near: f64, hidden: &str, is_given: bool) -> String {
+    let remedy = if is_given { "; a smaller number shows it" } else { "" };
+    let near = s.set("near", near);
+    format!("note: {hidden} of what the views show lies nearer than {near}, and is hidden{remedy}")
+}
+
 /// The note that a model's colours are truncated to a lower degree.
 pub(crate) fn degree_cut(s: Spelling, own: u8, degree: u8) -> String {
     format!(

@@ -14,6 +14,7 @@ use super::inputs::{Evidence, Inputs, Reading, open_device};
 use super::size::MIN_ROWS;
 use crate::failure::{Failure, OptionProblem, SizeProblem};
 use crate::host::Host;
+use crate::near_plane::NearPlane;
 use crate::spec::knobs::Knobs;
 use crate::spec::{AbsolutePath, Budget, InitChoice, RunSpec, ShDegree};
 use densify_core::budget::RowBudget;
@@ -50,6 +51,7 @@ pub(crate) struct Choices {
     pub(crate) knobs: Knobs,
     pub(crate) degree: Degree,
     pub(crate) exposure: Exposure,
+    pub(crate) near: NearPlane,
     /// Choices that the run makes while it trains.
     pub(crate) automatic: AutoChoices,
     /// Threads that train and measure.
@@ -68,9 +70,10 @@ pub(crate) enum Init {
 }
 
 impl Choices {
-    /// Messages about the choices that depend on the scene's colours.
+    /// Messages about the choices that depend on the scene.
     pub(super) fn lines(&self, spelling: Spelling) -> impl Iterator<Item = String> {
-        self.degree.line().into_iter().chain(self.exposure.line(spelling))
+        let near = self.near.line(spelling).into_iter();
+        near.chain(self.degree.line()).chain(self.exposure.line(spelling))
     }
 }
 
@@ -154,7 +157,9 @@ impl<'a> Case<'a> {
         };
         let threads = spec.device.threads.map(|threads| threads.0 as usize);
         let threads = threads.unwrap_or_else(rayon::current_num_threads);
-        let choices = Choices { entry, parameters, knobs, degree, exposure, automatic, threads };
+        let near = NearPlane::choose(spec.start.near, &inputs.dataset);
+        let choices =
+            Choices { entry, parameters, knobs, degree, exposure, near, automatic, threads };
         let mut case = Self { spec, inputs: Cow::Owned(inputs), choices };
         let driver = case.driver_bytes(host)?;
         let inputs = case.inputs.to_mut();

@@ -48,7 +48,7 @@ impl Case<'_> {
     pub(crate) fn backend_setup(&self, size: &RunSize, needs: Needs) -> Setup {
         Setup {
             budget: self.budget(size.rows),
-            near: (self.spec.start.near.0 * self.inputs.dataset.extent()) as f32,
+            near: self.choices.near.distance(),
             tile_cap: Some(size.tile_cap),
             record_cap: self.record_cap(size),
             threads: self.spec.device.threads.map(|threads| threads.0 as usize),

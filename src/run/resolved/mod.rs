@@ -45,7 +45,7 @@ pub(crate) struct ResolvedRun<'a> {
     pub(crate) init: Init,
     /// `--memory` made the degree lower than requested.
     pub(crate) degree_lowered: bool,
-    /// Lines for the user: the reasons for the size, and the choices that depend on the scene's colours.
+    /// Lines for the user: the reasons for the size, and the choices that depend on the scene.
     pub(crate) reasons: Vec<String>,
 }
 
@@ -95,8 +95,8 @@ impl<'a> ResolvedRun<'a> {
 
     fn new(case: Case<'a>, size: &Size, degree_lowered: bool, host: Host<'_>) -> Self {
         let spelling = host.observer.spelling();
-        let colours = case.choices.lines(spelling);
-        let reasons = colours.chain(size.lines(&case, spelling)).collect();
+        let scene = case.choices.lines(spelling);
+        let reasons = scene.chain(size.lines(&case, spelling)).collect();
         let init = case.first_rows(size.setting.rows);
         Self { init, size: size.setting, degree_lowered, reasons, case }
     }

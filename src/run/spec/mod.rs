@@ -187,10 +187,9 @@ run_spec! {
         /// Number of random points to start from (default: half the budget, at most 100k)
         init_points: Option<Rows> = None, Fixed, value "N";
 
-        /// Smallest distance from a camera at which anything is rendered, as a fraction of the scene's extent
-        // The original's 0.2 for an extent of 5. Nearer Gaussians become fog in front of a single camera: with 0.01,
-        // test views lost up to 10 dB to it.
-        near: Fraction = Fraction(0.04), Fixed, value "FRACTION";
+        /// Smallest distance from a camera at which anything is rendered, as a fraction of the scene's
+        /// extent (default: 0.04, or less where the views show points that are nearer)
+        near: Option<Fraction> = None, Fixed, value "FRACTION";
     }
 
     /// Limits of memory and quality.

@@ -10,7 +10,7 @@ use densify_data::views::ViewSource;
 use densify_run::Observer;
 use densify_run::coordinate_check::CoordinateCheck;
 use densify_run::failure::Failure;
-use densify_run::finished::{Machine, load, views_of};
+use densify_run::finished::{Machine, load, near_plane, views_of};
 use densify_train::evaluate::Split;
 use densify_train::exposure::fitted;
 use densify_train::metrics::psnr;
@@ -30,7 +30,7 @@ impl Evaluator {
     pub(super) fn open(options: &Options<'_>, observer: &dyn Observer) -> Result<Self, Failure> {
         let machine = Machine::open(&options.device, observer)?;
         let dataset = load(options.scene, &options.data, observer)?;
-        let near = (options.near.0 * dataset.extent()) as f32;
+        let near = near_plane(options.near, &dataset, observer);
         let background = options.data.background.fixed();
         let fits_exposure = options.exposure.is_some();
         Ok(Self { dataset, machine, near, background, fits_exposure })

@@ -46,8 +46,8 @@ pub struct Options<'a> {
     pub data: DataSpec,
     /// Exposure model, if the model was trained with an exposure per photograph.
     pub exposure: Option<ExposureModel>,
-    /// Near plane, as a fraction of the scene's extent.
-    pub near: Fraction,
+    /// Near plane, as a fraction of the scene's extent; `None`: the usual one of the dataset.
+    pub near: Option<Fraction>,
     /// Device to compute on.
     pub device: DeviceSpec,
     /// Size to reach.

@@ -41,7 +41,7 @@ fn options<'a>(to: Target, scene: &'a Path, formats: &'a [&'static Format]) -> O
         scene,
         data: DataSpec::default(),
         exposure: None,
-        near: Fraction(0.04),
+        near: None,
         device: DeviceSpec { backend: BackendChoice::Cpu, ..DeviceSpec::default() },
         to,
         iterations: 12,

@@ -8,8 +8,8 @@ use densify_data::views::ViewSource;
 use densify_render::Backend;
 use densify_run::coordinate_check::CoordinateCheck;
 use densify_run::failure::Failure;
-use densify_run::finished::{Machine, load, views_of};
-use densify_run::{DataSpec, Observer};
+use densify_run::finished::{Machine, load, near_plane, views_of};
+use densify_run::{DataSpec, Fraction, Observer};
 use densify_train::evaluate::Split;
 use densify_train::metrics::psnr_between;
 
@@ -25,8 +25,8 @@ pub struct Reference {
 }
 
 impl Reference {
-    /// Loads the dataset at `scene` and renders `model`, which was read from `file`. `near` is a fraction of the
-    /// scene's extent. Unless the dataset or `data` selects test views, every 8th photograph is held out.
+    /// Loads the dataset at `scene` and renders `model`, which was read from `file`. Without `near`, the near plane is
+    /// the usual one of the dataset. Unless the dataset or `data` selects test views, every 8th photograph is held out.
     ///
     /// # Errors
     /// When the dataset cannot be loaded or the model cannot be rendered.
@@ -35,12 +35,12 @@ impl Reference {
         model: &Gaussians,
         scene: &Path,
         mut data: DataSpec,
-        (near, machine): (f64, Machine),
+        (near, machine): (Option<Fraction>, Machine),
         observer: &dyn Observer,
     ) -> Result<Self, Failure> {
         data.eval = data.test_every.is_none();
         let dataset = load(scene, &data, observer)?;
-        let near = (near * dataset.extent()) as f32;
+        let near = near_plane(near, &dataset, observer);
         let mut backend = machine.backend(&dataset, model.clone(), near)?;
         let (background, sh_degree) = (data.background.fixed(), model.sh_degree);
         let views = views_of(&dataset, Split::Test)?;

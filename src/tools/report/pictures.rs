@@ -13,9 +13,9 @@ use densify_data::dataset::Dataset;
 use densify_data::views::{DatasetViews, ViewSource};
 use densify_html::EmbeddedImage;
 use densify_render::Backend;
-use densify_run::Observer;
 use densify_run::failure::Failure;
 use densify_run::finished::{Machine, load, or_moved, read_model, views_of};
+use densify_run::{NearPlane, Observer};
 use densify_study::window::Window;
 use densify_train::evaluate::{Comparison, FittedScore, Split};
 use densify_train::output::model_path;
@@ -96,7 +96,7 @@ pub(super) fn render(
         observer.say(format_args!("pictures {}", run.name));
         let model = read_model(&model_path(&run.folder, run.iteration), observer)?;
         let degree = model.sh_degree;
-        let near = (run.config.spec.start.near.0 * dataset.extent()) as f32;
+        let near = NearPlane::choose(run.config.spec.start.near, &dataset).distance();
         let backend = machine.backend(&dataset, model, near)?;
         let mut renderer = Renderer { backend, background, degree };
         // The first run chooses the views; their photographs come first.

@@ -9,12 +9,12 @@ use super::scene::{LoadedScene, ModelInfo, NO_MODEL, Scene};
 use densify_core::camera_path::Keyframe;
 use densify_core::gaussians::{Gaussians, logit};
 use densify_data::dataset::normalise::{EXTENT, Normalisation};
-use densify_data::dataset::{Dataset, PointCloud, builtin};
+use densify_data::dataset::{Dataset, PointCloud, SeenDepths, builtin};
 use densify_run::failure::Failure;
 use densify_run::finished::{
-    Machine, is_model, iteration_so_far, load, name_of, names_of, or_moved, read_model,
+    Machine, is_model, iteration_so_far, load, name_of, names_of, near_plane, or_moved, read_model,
 };
-use densify_run::{DataSpec, Observer, RunConfig};
+use densify_run::{DataSpec, Fraction, NearPlane, Observer, RunConfig};
 use densify_train::checkpoint::checkpoint_path;
 use densify_train::init::{initialise, random_points};
 use densify_train::output::{CONFIG_FILE, model_path};
@@ -40,8 +40,9 @@ pub struct ViewOptions<'a> {
     pub dataset: Option<PathBuf>,
     /// Iteration of the run's saved model; by default the last one.
     pub iteration: Option<u32>,
-    /// Near plane for a model file or a dataset, as a fraction of the scene's extent.
-    pub near: f64,
+    /// Near plane for a model file or a dataset, as a fraction of the scene's extent; `None`: the usual one of the
+    /// dataset.
+    pub near: Option<Fraction>,
     /// Options for reading the dataset; a run has its own.
     pub data: DataSpec,
 }
@@ -60,7 +61,7 @@ pub fn open(
     machine: Machine,
     observer: &dyn Observer,
 ) -> Result<LoadedScene, Failure> {
-    let ViewOptions { path, other, dataset, iteration, near, data } = options;
+    let ViewOptions { path, other, dataset, iteration, near: given, data } = options;
     let paths: Vec<&Path> = std::iter::once(path).chain(other).collect();
     if other.is_some()
         && let Some(path) = paths.iter().find(|path| !is_model(path) && !is_run(path))
@@ -72,13 +73,21 @@ pub fn open(
         return Err(Failure::input("--iteration is for a run's folder; leave it out"));
     }
     let mut first_config = None;
+    // Of models that do not state their own.
+    let near;
     let mut loaded = if is_model(path) {
         let model = read_model(path, observer)?;
-        let mut loaded = match dataset {
+        let mut loaded;
+        (loaded, near) = match dataset {
             Some(dataset) => {
-                scene_of_dataset(machine, path, load(&dataset, &data, observer)?, &data)
+                let dataset = load(&dataset, &data, observer)?;
+                let near = near_plane(given, &dataset, observer);
+                (scene_of_dataset(machine, path, dataset, &data), near)
             }
-            None => scene_without_cameras(machine, path, &model, &data)?,
+            None => {
+                let near = NearPlane::from_depths(given, &SeenDepths::default()).distance();
+                (scene_without_cameras(machine, path, &model, &data)?, near)
+            }
         };
         loaded.add_model(names[0].clone(), model, near, None)?;
         loaded
@@ -88,9 +97,10 @@ pub fn open(
         let folder = dataset.unwrap_or_else(|| config.scene_path());
         let dataset = load(&folder, &config.spec.data, observer)
             .map_err(|failure| if is_named { failure } else { or_moved(failure, &folder) })?;
+        near = near_plane(config.spec.start.near, &dataset, observer);
         let mut loaded = scene_of_dataset(machine, path, dataset, &config.spec.data);
         let name = format!("{}, iteration {iteration}", names[0]);
-        loaded.add_model_of_run(name, model, (path, iteration, &config))?;
+        loaded.add_model_of_run(name, model, (path, iteration, &config), near)?;
         first_config = Some(config);
         loaded
     } else {
@@ -101,6 +111,7 @@ pub fn open(
             Some(_) => failure,
             None => not_viewable(path).and(&failure.to_string()),
         })?;
+        let near = near_plane(given, &dataset, observer);
         return scene_of_points(machine, path, dataset, &data, near);
     };
     if let Some(other) = other {
@@ -110,7 +121,7 @@ pub fn open(
         } else {
             let (model, config, iteration) = read_run(other, None, observer)?;
             let name = format!("{name}, iteration {iteration}");
-            loaded.add_model_of_run(name, model, (other, iteration, &config))?;
+            loaded.add_model_of_run(name, model, (other, iteration, &config), near)?;
             if let Some(note) = first_config.and_then(|first| data_difference(&first, &config)) {
                 observer.say(format_args!("note: {}: {note}", other.display()));
             }
@@ -206,7 +217,7 @@ fn scene_of_points(
     path: &Path,
     dataset: Dataset,
     data: &DataSpec,
-    near: f64,
+    near: f32,
 ) -> Result<LoadedScene, Failure> {
     let cameras = || dataset.train.iter().map(|view| view.camera).collect::<Vec<_>>();
     let is_random = dataset.points.is_empty();
@@ -231,7 +242,7 @@ pub(super) fn scene_of(folder: &Path) -> Scene {
         other: None,
         dataset: None,
         iteration: None,
-        near: 0.04,
+        near: None,
         data: DataSpec::default(),
     };
     open(options, Machine::default(), &densify_run::Silent).expect("a scene").scene
@@ -250,38 +261,41 @@ pub(super) fn scene_of_one_view() -> (tempfile::TempDir, Scene) {
 }
 
 impl LoadedScene {
-    /// Adds a model in the dataset's own coordinates.
+    /// Adds a model in the dataset's own coordinates, with its near plane `[scene units]`.
     fn add_model(
         &mut self,
         name: String,
         model: Gaussians,
-        near: f64,
+        near: f32,
         checkpoint: Option<PathBuf>,
     ) -> Result<(), Failure> {
         let model = self.scene.normalisation.model_from_world(model);
         self.add_model_in_scene(name, &model, near, checkpoint)
     }
 
-    /// Adds the model of a run.
+    /// Adds the model of a run, which states its near plane unless somebody has edited its file.
     fn add_model_of_run(
         &mut self,
         name: String,
         model: Gaussians,
         (run, iteration, config): (&Path, u32, &RunConfig),
+        near: f32,
     ) -> Result<(), Failure> {
         let checkpoint = Some(checkpoint_path(run, iteration)).filter(|path| path.is_file());
-        self.add_model(name, model, config.spec.start.near.0, checkpoint)
+        let own = config.spec.start.near;
+        let near = own.map_or(near, |near| (near.0 * EXTENT) as f32);
+        self.add_model(name, model, near, checkpoint)
     }
 
-    /// Adds a model in scene coordinates. The near plane is a fraction of the scene's extent.
+    /// Adds a model in scene coordinates, with its near plane `[scene units]`.
     fn add_model_in_scene(
         &mut self,
         name: String,
         model: &Gaussians,
-        near: f64,
+        near: f32,
         checkpoint: Option<PathBuf>,
     ) -> Result<(), Failure> {
-        let (sh_degree, near) = (model.sh_degree, (near * EXTENT) as f32);
+        let sh_degree = model.sh_degree;
         let backend = self.scene.machine.backend_in_scene(model, near, (1, 1))?;
         self.add(ModelInfo { name, rows: model.len(), sh_degree, near, checkpoint }, backend);
         Ok(())

@@ -47,7 +47,7 @@ fn every_run_appears_once_in_the_log_and_the_table() {
         ", two seeds",
         " of 4 |",
         "\nsh_degree = 0\n",
-        "\nnear = 0.04\n",
+        "\ninit_rates = \"fine\"\n",
     ] {
         assert!(table.contains(word), "{word} is not in {table}");
     }
@@ -64,7 +64,10 @@ fn every_run_appears_once_in_the_log_and_the_table() {
     let page = read_text(&output.join("compare.html"));
     super::reporting::assert_self_contained(&page);
     assert_eq!(page.matches("src=\"data:image/").count(), 5);
-    assert!(page.contains("<td>vanilla</td>") && page.contains("near = 0.04"), "{page}");
+    assert!(
+        page.contains("<td>vanilla</td>") && page.contains("init_rates = &quot;fine&quot;"),
+        "{page}"
+    );
 
     // Repeating the call trains nothing and changes no file.
     let before = files(&output);

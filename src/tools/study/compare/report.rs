@@ -232,7 +232,9 @@ mod tests {
         };
         let set = "policy_set.diet = { rho = 0.5 }";
         let text = options(&[run("diet", set), run("mcmc", set)]);
-        for words in ["iterations = 9\n", "near = 0.04", "alpha_min = \"1/64\"", "rho = 0.5"] {
+        for words in
+            ["iterations = 9\n", "init_rates = \"fine\"", "alpha_min = \"1/64\"", "rho = 0.5"]
+        {
             assert!(text.contains(words), "{words}: {text}");
         }
         assert!(!text.contains("\npolicy = "), "{text}");
