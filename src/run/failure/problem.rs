@@ -78,8 +78,6 @@ pub enum SizeProblem {
 pub enum ModelProblem {
     /// The model of an option has no Gaussian.
     EmptyModel { option: &'static str, file: PathBuf },
-    /// The path is the folder of a run; this file is its model.
-    ModelOfRun { file: PathBuf },
     /// Too few Gaussians of the model of `init` lie in a training view.
     InitOutOfView { file: PathBuf, seen: usize, rows: usize },
     /// No Gaussian of the model of `freeze` lies in a training view.

@@ -275,7 +275,6 @@ impl ModelProblem {
                 file(option, model),
                 s.option(option)
             ),
-            Self::ModelOfRun { file } => format!("its model is {}", file.display()),
             Self::InitOutOfView { file: model, seen, rows } => format!(
                 "{}: only {} of its {} Gaussians lie in any training view; it must be in the coordinates of the \
                  dataset: {COORDINATES}",

@@ -215,6 +215,9 @@ impl<'a> Case<'a> {
 
     fn init(&self) -> InitChoice {
         let start = &self.spec.start;
+        if let Some(file) = &self.inputs.init_file {
+            return InitChoice::Model(file.clone());
+        }
         match &start.init {
             Some(init) => init.clone(),
             None if self.inputs.dataset.points.is_empty() || start.init_points.is_some() => {

@@ -127,6 +127,7 @@ impl RunConfig {
             }
             Init::Model(file) => InitChoice::Model(file.clone()),
         });
+        spec.start.freeze.clone_from(&inputs.frozen_file);
         spec.start.near = Some(choices.near.fraction);
         let rates = Table::try_from(training.rates).map_err(Failure::input)?;
         spec.schedule.lr = assignments(&in_shortest_decimals(rates));

@@ -1,13 +1,11 @@
 //! The inputs of a run, opened once: device, dataset, and the sizes of the models that it starts from.
 
-use std::path::Path;
-
 use crate::companion::Companion;
 use crate::failure::{Failure, OptionProblem, notes};
 use crate::host::Host;
 use crate::observer::{Observer, say_notes};
 use crate::spec::knobs::Knobs;
-use crate::spec::{InitChoice, RunSpec, StartSpec};
+use crate::spec::{AbsolutePath, InitChoice, RunSpec, StartSpec};
 use densify_data::dataset::images::ImageDemand;
 use densify_data::dataset::{Dataset, ReportedExposures, Tracks, View};
 use densify_data::track_colours::{self, MIN_TRACKS, TrackColours};
@@ -15,7 +13,7 @@ use densify_render::{Accumulation, BackendKind, Device};
 use densify_train::init::usable_points;
 
 use super::config::ModelSize;
-use super::models::size_of_model;
+use super::models::{file_of, size_of_model};
 
 /// Everything that a run reads and runs on.
 #[derive(Clone)]
@@ -25,9 +23,11 @@ pub(crate) struct Inputs {
     pub(crate) dataset: Dataset,
     /// The memory that training and test images take.
     pub(crate) images: [ImageDemand; 2],
-    /// Size of the model that `--init` names, if it names one.
+    /// File and size of the model of `--init`, if there is one.
+    pub(super) init_file: Option<AbsolutePath>,
     pub(crate) init_model: Option<ModelSize>,
-    /// Size of the model that `--freeze` names, if it names one.
+    /// File and size of the model of `--freeze`, if there is one.
+    pub(crate) frozen_file: Option<AbsolutePath>,
     pub(crate) frozen_model: Option<ModelSize>,
     /// Number of Gaussians of a run that starts from all points of the dataset.
     pub(super) usable_points: usize,
@@ -81,16 +81,21 @@ impl Inputs {
         observer.say(format_args!("scene    {}: {}", scene.display(), dataset.describe()));
         let usable_points = usable_points(&dataset.points);
         let StartSpec { init, freeze, .. } = &spec.start;
-        let size = |flag, file: Option<&Path>| {
-            file.map(|file| size_of_model(flag, file, observer)).transpose()
+        let init = match init {
+            Some(InitChoice::Model(path)) => Some(path),
+            Some(InitChoice::Points | InitChoice::Random) | None => None,
         };
-        let [init_model, frozen_model] = match reading.models {
-            Some(models) => models,
-            None => [
-                size("init", init.as_ref().and_then(InitChoice::file))?,
-                size("freeze", freeze.as_ref().map(|file| &*file.0))?,
-            ],
+        let (files, [init_model, frozen_model]) = match reading.models {
+            Some(models) => ([init, freeze.as_ref()].map(Option::<&_>::cloned), models),
+            None => {
+                let init = start_model("init", init, observer)?;
+                let freeze = start_model("freeze", freeze.as_ref(), observer)?;
+                let (init_file, init_model) = init.unzip();
+                let (frozen_file, frozen_model) = freeze.unzip();
+                ([init_file, frozen_file], [init_model, frozen_model])
+            }
         };
+        let [init_file, frozen_file] = files;
         // Tracks have a separate line in the ledger, and are freed before training.
         let apart = dataset.tracks.bytes() + reading.tolerance;
         let resident = (host.process.resident)().map(|now| now.saturating_sub(apart));
@@ -107,7 +112,9 @@ impl Inputs {
             images: image_demand(&dataset),
             device,
             dataset,
+            init_file,
             init_model,
+            frozen_file,
             frozen_model,
             usable_points,
             track_bytes,
@@ -129,6 +136,18 @@ impl Inputs {
 fn image_demand(dataset: &Dataset) -> [ImageDemand; 2] {
     let demand = |views: &[View]| ImageDemand::total(views.iter().map(|view| &view.source));
     [demand(&dataset.train), demand(&dataset.test)]
+}
+
+/// The file of the model that an option names, and its size.
+fn start_model(
+    option: &'static str,
+    named: Option<&AbsolutePath>,
+    observer: &dyn Observer,
+) -> Result<Option<(AbsolutePath, ModelSize)>, Failure> {
+    let Some(named) = named else { return Ok(None) };
+    let file = file_of(option, named, observer)?;
+    let size = size_of_model(option, &file.0, observer)?;
+    Ok(Some((file, size)))
 }
 
 /// Opens the device, checks that it supports the knobs that are set, and sets the knob `accumulation` to the method in

@@ -6,14 +6,35 @@ use super::case::Case;
 use super::config::ModelSize;
 use super::fit::RunSize;
 use crate::failure::{Failure, ModelProblem};
-use crate::models::{model_file, read_model};
+use crate::models::{is_model, iteration_so_far, read_model};
 use crate::observer::Observer;
+use crate::spec::AbsolutePath;
 use densify_core::gaussians::{Gaussians, sh_coefficients};
 use densify_render::{MomentStorage, Setup, Storage};
 use densify_train::importance::needs;
+use densify_train::output::{CONFIG_FILE, model_path, saved_iterations};
 
 /// Pairs per row while importance is measured; views with more are rendered in bands.
 const PAIRS_PER_ROW: usize = 3;
+
+/// The file of the model that an option names: for the folder of a run, its last model.
+///
+/// # Errors
+/// When the run has saved no model. Names the option.
+pub(super) fn file_of(
+    option: &'static str,
+    named: &AbsolutePath,
+    observer: &dyn Observer,
+) -> Result<AbsolutePath, Failure> {
+    let AbsolutePath(path) = named;
+    let is_run = path.join(CONFIG_FILE).is_file() || saved_iterations(path).is_ok();
+    if is_model(path) || !is_run {
+        return Ok(named.clone());
+    }
+    let iteration = iteration_so_far(path, None, observer);
+    let (iteration, _) = iteration.map_err(|failure| failure.within_option(option, None))?;
+    Ok(AbsolutePath(model_path(path, iteration)))
+}
 
 /// Rows and degree of the model in a file. Reads all of it, so that a damaged file is found before anything is decided.
 ///
@@ -37,14 +58,7 @@ pub(crate) fn read(
     file: &Path,
     observer: &dyn Observer,
 ) -> Result<Gaussians, Failure> {
-    read_model(file, observer).map_err(|failure| {
-        let failure = failure.within_option(option, None);
-        match model_file(file, None) {
-            // The folder of a run.
-            Ok(model) if model != file => failure.with(ModelProblem::ModelOfRun { file: model }),
-            _ => failure,
-        }
-    })
+    read_model(file, observer).map_err(|failure| failure.within_option(option, None))
 }
 
 /// Bytes of a model's rows as they are read.

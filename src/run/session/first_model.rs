@@ -124,7 +124,7 @@ pub(super) fn append_to_frozen(
     observer: &dyn Observer,
 ) -> Result<Gaussians, Failure> {
     let ResolvedRun { case, size, .. } = run;
-    let Some(AbsolutePath(file)) = &case.spec.start.freeze else {
+    let Some(AbsolutePath(file)) = &case.inputs.frozen_file else {
         return Ok(others);
     };
     let model = read("freeze", file, &Silent)?;

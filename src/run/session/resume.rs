@@ -110,6 +110,13 @@ fn overlay(mut given: Partial, saved: &RunConfig, origin: &str) -> Result<RunSpe
             _ => {}
         }
     }
+    // A run's folder stands for the model of it that was read.
+    for option in ["init", "freeze"] {
+        let path = |options: &Partial| options.get(option).and_then(Value::as_str).map(PathBuf::from);
+        if path(&given).zip(path(&lower)).is_some_and(|(given, saved)| saved.starts_with(given)) {
+            given.remove(option);
+        }
+    }
     // A device or an accumulation that this call chooses is compared with that of the saved run once the device is
     // open.
     if given.get("backend").is_some() || given.get("gpu").is_some() {

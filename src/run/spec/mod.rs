@@ -170,7 +170,7 @@ run_spec! {
         scene: Option<PathBuf> = None, Free;
 
         /// Source of the first Gaussians: one on each of the dataset's points, random places, or a model in the
-        /// dataset's coordinates, by any program (default: points if the dataset has any, else random)
+        /// dataset's coordinates: a file by any program, or a run's folder (default: points if the dataset has any, else random)
         ///
         /// If the model has more Gaussians than the budget, those that contribute most to the training views are kept.
         /// Its colours are cut or extended to --sh-degree
@@ -179,9 +179,9 @@ run_spec! {
         /// Learning rates of a run from a model; --lr changes single ones
         init_rates: InitRates = InitRates::Fine, Fixed, value "WHICH";
 
-        /// A model in the dataset's coordinates, by any program, whose Gaussians are rendered but never change: they
-        /// are neither trained, moved nor removed. The Gaussians of --init are trained beside them; the budget counts
-        /// both
+        /// A model in the dataset's coordinates (a file by any program, or a run's folder) whose Gaussians are rendered
+        /// but never change: they are neither trained, moved nor removed. The Gaussians of --init are trained beside
+        /// them; the budget counts both
         freeze: Option<AbsolutePath> = None, Fixed, value "MODEL";
 
         /// Number of random points to start from (default: half the budget, at most 100k)

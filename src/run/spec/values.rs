@@ -1,7 +1,7 @@
 //! Types of options that are more than a number or a word: their spelling on the command line and in files, and their
 //! range.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::str::FromStr;
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
@@ -180,16 +180,6 @@ impl FromStr for ShDegree {
                 degree(decided).map(|degree| Self::Auto(Some(degree))).ok_or_else(wrong)
             }
             None => degree(text).map(Self::Fixed).ok_or_else(wrong),
-        }
-    }
-}
-
-impl InitChoice {
-    /// The file of a model.
-    pub fn file(&self) -> Option<&Path> {
-        match self {
-            Self::Model(file) => Some(&file.0),
-            Self::Points | Self::Random => None,
         }
     }
 }

@@ -5,7 +5,7 @@ use std::path::Path;
 use densify::train::output::model_path;
 
 use super::{
-    Outcome, call, count, files, gaussians, json, read, records, resume, scratch, text, train,
+    Outcome, call, count, files, gaussians, json, read, read_text, records, resume, scratch, text, train,
     write_ply,
 };
 use crate::photographs::Photographs;
@@ -45,13 +45,18 @@ fn a_run_can_start_from_any_model() {
     assert_eq!(rows(&again, 20), rows(&run, 150));
 
     // Other formats work the same way.
-    {
-        let spz = root.path().join("model.spz");
-        call(&format!("export {} -o {}", text(&run), text(&spz))).ok();
-        let (outcome, other) = init(&spz, "other", "--budget 300");
-        outcome.ok();
-        assert!(first_loss(&other) < 1.1 * from_model + 0.01, "{}", first_loss(&other));
-    }
+    let spz = root.path().join("model.spz");
+    call(&format!("export {} -o {}", text(&run), text(&spz))).ok();
+    let (outcome, other) = init(&spz, "other", "--budget 300");
+    outcome.ok();
+    assert!(first_loss(&other) < 1.1 * from_model + 0.01, "{}", first_loss(&other));
+
+    // A run's folder stands for its last model, whose file is recorded; the same command continues the run.
+    let (outcome, of_run) = init(&run, "of-run", "--budget 300");
+    outcome.ok();
+    assert!(read(&model_path(&of_run, 20)) == read(&model_path(&again, 20)));
+    assert!(read_text(&of_run.join("config.toml")).contains(text(&ply)));
+    resume(scene.path(), &of_run, &format!("--init {} --iterations 24", text(&run))).ok();
 
     // Resumed from a checkpoint after the file is gone, the run writes the same model, byte for byte.
     let whole = read(&model_path(&again, 20));
@@ -135,6 +140,11 @@ fn frozen_gaussians_never_change_even_when_resumed() {
     resume(scene.path(), &beside, "").ok();
     assert!(read(&model_path(&beside, 300)) == whole);
 
+    // A run's folder stands for its last model.
+    let of_run = root.path().join("of-run");
+    let outcome = train(scene.path(), &of_run, 2, &format!("--freeze {} {flags}", text(&run))).ok();
+    assert!(outcome.stdout.contains(&format!("frozen   {frozen} Gaussians of ")), "{outcome:?}");
+
     // Invalid combinations are refused.
     let refused = |flags: &str, words: &[&str]| {
         let outcome = train(scene.path(), &root.path().join("no"), 2, flags);
@@ -194,8 +204,11 @@ fn unsuitable_models_are_refused_or_reported() {
     assert_refused(&start(&absent, ""), root.path(), &["--init", "absent.ply"]);
     let photograph = scene.file("images/view_00.png");
     assert_refused(&start(&photograph, ""), root.path(), &["--init", "view_00.png"]);
-    let saved = text(&file).to_owned();
-    assert_refused(&start(&run, ""), root.path(), &["--init", "meta.json", &saved]);
+    assert_refused(&start(scene.path(), ""), root.path(), &["--init", "meta.json"]);
+    std::fs::create_dir(root.path().join("early")).unwrap();
+    std::fs::write(root.path().join("early/config.toml"), "").unwrap();
+    let early = root.path().join("early");
+    assert_refused(&start(&early, ""), root.path(), &["--init", "early", "has no model"]);
     assert_refused(&start(&file, "--init-points 9"), root.path(), &["--init-points 9", "random"]);
     let cut = root.path().join("cut.ply");
     std::fs::write(&cut, &read(&file)[..2_000]).unwrap();
