@@ -9,12 +9,13 @@ use clap::{ArgMatches, Args};
 use super::console::Console;
 use super::render::{ModelArgument, RenderingArgs};
 use densify_core::numbers::{grouped, percent};
+use densify_data::views::ViewSource;
 use densify_inspect::{Bound, Limit, LimitError, Limits, measured_values};
 use densify_run::RunConfig;
 use densify_run::coordinate_check::CoordinateCheck;
 use densify_run::failure::{Failure, INPUT, LIMIT};
 use densify_run::finished::{is_model, iteration};
-use densify_train::evaluate::{Comparison, FittedScore, Mean, Split, evaluate};
+use densify_train::evaluate::{Comparison, Evaluated, FittedScore, Mean, Split, evaluate};
 use densify_train::metrics::Lpips;
 use densify_train::metrics::geometry::{self, Geometry};
 use densify_train::output::{write_geometry, write_scores};
@@ -99,14 +100,17 @@ pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> R
         console.result(format_args!("{name:width$}  {psnr:9.3}  {ssim:.4}  {flip:.4}{lpips}"));
     };
     let (backend, degree) = (opened.backend.as_mut(), opened.sh_degree);
-    CoordinateCheck::measure(backend, &views, (background, degree))?.note(None, model, console);
     let has_exposures = run.as_ref().is_some_and(|(config, _)| config.resolved.has_exposures);
     let fits_exposure = args.fit_exposure || has_exposures;
     let comparison = Comparison { lpips: lpips.as_ref(), fits_exposure };
-    let scores = evaluate(backend, &views, background, degree, comparison, |view| {
-        line(&view.name, view.psnr, view.ssim, view.flip, view.lpips);
+    let mut check = CoordinateCheck::new(views.count());
+    let scores = evaluate(backend, &views, background, degree, comparison, |evaluated| {
+        let Evaluated { view, score, rendering, image } = evaluated;
+        line(&score.name, score.psnr, score.ssim, score.flip, score.lpips);
+        check.add(view, rendering, image, background);
         ControlFlow::Continue(())
     })?;
+    check.note(None, model, console);
     let mean = Mean::over(&scores);
     line("mean", mean.psnr, mean.ssim, mean.flip, mean.lpips);
     if let Some(FittedScore { psnr, ssim, flip, lpips }) = mean.fitted {

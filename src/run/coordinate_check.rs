@@ -22,13 +22,35 @@ const CONTRAST: f64 = 0.02;
 const MIN_COVERAGE: f64 = 1e-3;
 
 /// The correlation of a model's renderings with the photographs.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct CoordinateCheck {
-    /// Mean over views; `None` if the renderings or the photographs have only one colour.
-    correlation: Option<f64>,
+    /// Indices of the views to compare.
+    views: Vec<usize>,
+    /// Their correlations; views in which the rendering or the photograph has only one colour are left out.
+    correlations: Vec<f64>,
 }
 
 impl CoordinateCheck {
+    /// A check of renderings that are added one by one, of a model in a dataset with this number of views.
+    pub fn new(views: usize) -> Self {
+        let count = views.min(MAX_VIEWS);
+        let views = (0..count).map(|place| place * views / count).collect();
+        Self { views, correlations: Vec::new() }
+    }
+
+    /// Compares a rendering with its photograph if the check needs this view.
+    pub fn add(
+        &mut self,
+        view: usize,
+        rendering: &Rendering,
+        image: &Image8,
+        background: [f32; 3],
+    ) {
+        if self.views.contains(&view) {
+            self.correlations.extend(compare(rendering, image, background));
+        }
+    }
+
     /// Compares the model in a backend with some of the photographs.
     ///
     /// # Errors
@@ -38,16 +60,19 @@ impl CoordinateCheck {
         views: &impl ViewSource,
         (background, sh_degree): ([f32; 3], u8),
     ) -> Result<Self, Failure> {
-        let count = views.count().min(MAX_VIEWS);
-        let mut found = Vec::new();
-        for place in 0..count {
-            let view = place * views.count() / count;
+        let mut check = Self::new(views.count());
+        for view in check.views.clone() {
             let image = views.image(view).map_err(Failure::input)?;
             let rendering = backend.render(views.camera(view), background, sh_degree)?;
-            found.extend(compare(&rendering, &image, background));
+            check.add(view, &rendering, &image, background);
         }
-        let mean = found.iter().sum::<f64>() / found.len().max(1) as f64;
-        Ok(Self { correlation: (!found.is_empty()).then_some(mean) })
+        Ok(check)
+    }
+
+    /// Mean over the views; `None` if no view could be compared.
+    fn correlation(&self) -> Option<f64> {
+        let (sum, count) = (self.correlations.iter().sum::<f64>(), self.correlations.len());
+        (count > 0).then(|| sum / count as f64)
     }
 
     /// Fails if the model of `file` is in other coordinates than the dataset, and tells the user if it may be. `option`
@@ -56,12 +81,12 @@ impl CoordinateCheck {
     /// # Errors
     /// When the correlation is too low.
     pub fn require(
-        self,
+        &self,
         option: Option<&'static str>,
         file: &Path,
         observer: &dyn Observer,
     ) -> Result<(), Failure> {
-        match self.correlation {
+        match self.correlation() {
             Some(correlation) if correlation < REFUSED_BELOW => {
                 let file = file.to_owned();
                 Err(ModelProblem::OtherCoordinates { option, file, correlation }.into())
@@ -74,8 +99,8 @@ impl CoordinateCheck {
     }
 
     /// Tells the user if the model may be in other coordinates than the dataset.
-    pub fn note(self, option: Option<&'static str>, file: &Path, observer: &dyn Observer) {
-        if let Some(correlation) = self.correlation.filter(|&value| value < DOUBTED_BELOW) {
+    pub fn note(&self, option: Option<&'static str>, file: &Path, observer: &dyn Observer) {
+        if let Some(correlation) = self.correlation().filter(|&value| value < DOUBTED_BELOW) {
             let note = notes::other_coordinates(observer.spelling(), option, file, correlation);
             observer.say(format_args!("{note}"));
         }
@@ -197,8 +222,9 @@ mod tests {
             [(None, false, 0), (Some(0.9), false, 0), (Some(0.2), false, 1), (Some(0.05), true, 0)]
         {
             let heard = Heard::default();
-            let found =
-                CoordinateCheck { correlation }.require(Some("init"), Path::new("m.ply"), &heard);
+            let correlations = Vec::from_iter(correlation);
+            let check = CoordinateCheck { views: vec![0], correlations };
+            let found = check.require(Some("init"), Path::new("m.ply"), &heard);
             assert_eq!(found.is_err(), refused, "{correlation:?}");
             let message = found.err().map_or_else(String::new, |failure| failure.to_string());
             assert!(message.is_empty() || message.contains("coordinates"), "{message}");

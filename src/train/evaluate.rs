@@ -9,7 +9,7 @@ pub use crate::metrics::EvaluateError;
 use crate::metrics::{Lpips, MetricError, flip, psnr, ssim};
 use densify_core::image::Image8;
 use densify_data::views::ViewSource;
-use densify_render::Backend;
+use densify_render::{Backend, Rendering};
 
 /// Part of a dataset.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Deserialize)]
@@ -140,6 +140,19 @@ impl Comparison<'_> {
     }
 }
 
+/// A view that has been evaluated.
+#[derive(Clone, Copy)]
+pub struct Evaluated<'a> {
+    /// Index of the view.
+    pub view: usize,
+    /// The scores of the rendering.
+    pub score: &'a ViewScore,
+    /// The rendering.
+    pub rendering: &'a Rendering,
+    /// The photograph.
+    pub image: &'a Image8,
+}
+
 /// Renders every view and compares it with its image. `after_view` is called after each view and may stop the
 /// evaluation.
 ///
@@ -151,7 +164,7 @@ pub fn evaluate(
     background: [f32; 3],
     sh_degree: u8,
     comparison: Comparison<'_>,
-    mut after_view: impl FnMut(&ViewScore) -> ControlFlow<()>,
+    mut after_view: impl FnMut(Evaluated<'_>) -> ControlFlow<()>,
 ) -> Result<Vec<ViewScore>, EvaluateError> {
     let count = views.count();
     let mut scores = Vec::new();
@@ -172,7 +185,8 @@ pub fn evaluate(
             None
         };
         let score = ViewScore { name: name(), psnr, ssim, flip, lpips, fitted };
-        let flow = after_view(&score);
+        let flow =
+            after_view(Evaluated { view, score: &score, rendering: &rendering, image: &image });
         scores.push(score);
         if flow.is_break() {
             return Err(EvaluateError::Stopped);

@@ -112,7 +112,8 @@ fn overlay(mut given: Partial, saved: &RunConfig, origin: &str) -> Result<RunSpe
     }
     // A run's folder stands for the model of it that was read.
     for option in ["init", "freeze"] {
-        let path = |options: &Partial| options.get(option).and_then(Value::as_str).map(PathBuf::from);
+        let path =
+            |options: &Partial| options.get(option).and_then(Value::as_str).map(PathBuf::from);
         if path(&given).zip(path(&lower)).is_some_and(|(given, saved)| saved.starts_with(given)) {
             given.remove(option);
         }

@@ -5,8 +5,9 @@ use std::path::Path;
 use super::{Attempt, Options};
 use densify_core::gaussians::Gaussians;
 use densify_data::dataset::Dataset;
-use densify_data::models::Format;
+use densify_data::models::{Format, PLY};
 use densify_data::views::ViewSource;
+use densify_render::Backend;
 use densify_run::Observer;
 use densify_run::coordinate_check::CoordinateCheck;
 use densify_run::failure::Failure;
@@ -36,18 +37,23 @@ impl Evaluator {
         Ok(Self { dataset, machine, near, background, fits_exposure })
     }
 
-    /// Checks that the model is in the coordinates of the dataset.
-    pub(super) fn check_coordinates(
+    /// Measures the original model, which was read from `file`, and would be of this size as a PLY.
+    ///
+    /// # Errors
+    /// As [`evaluate`](Self::evaluate), and when the model is not in the coordinates of the dataset.
+    pub(super) fn evaluate_original(
         &self,
-        model: &Gaussians,
+        model: Gaussians,
         file: &Path,
+        bytes: u64,
         observer: &dyn Observer,
-    ) -> Result<(), Failure> {
-        let degree = model.sh_degree;
-        let mut backend = self.machine.backend(&self.dataset, model.clone(), self.near)?;
+    ) -> Result<Attempt, Failure> {
+        let rendering = (self.background, model.sh_degree);
         let views = views_of(&self.dataset, Split::Train)?;
-        let check = CoordinateCheck::measure(backend.as_mut(), &views, (self.background, degree))?;
-        check.require(None, file, observer)
+        let mut backend = self.machine.backend(&self.dataset, model, self.near)?;
+        CoordinateCheck::measure(backend.as_mut(), &views, rendering)?
+            .require(None, file, observer)?;
+        self.measure(backend.as_mut(), rendering.1, PLY, bytes)
     }
 
     /// Measures a model whose file has this size.
@@ -57,8 +63,19 @@ impl Evaluator {
         format: &Format,
         bytes: u64,
     ) -> Result<Attempt, Failure> {
-        let (rows, sh_degree) = (model.len(), model.sh_degree);
+        let sh_degree = model.sh_degree;
         let mut backend = self.machine.backend(&self.dataset, model, self.near)?;
+        self.measure(backend.as_mut(), sh_degree, format, bytes)
+    }
+
+    fn measure(
+        &self,
+        backend: &mut dyn Backend,
+        sh_degree: u8,
+        format: &Format,
+        bytes: u64,
+    ) -> Result<Attempt, Failure> {
+        let rows = backend.rows();
         let mut mean = |split: Split| {
             let views = views_of(&self.dataset, split)?;
             let mut sum = 0.0;

@@ -117,8 +117,8 @@ pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compre
     }
     let model = read_model(options.model, observer)?;
     fit::check(options, &model)?;
-    evaluator.check_coordinates(&model, options.model, observer)?;
-    let whole = evaluator.evaluate(model.clone(), PLY, fit::file_size(PLY, &model)?)?;
+    let bytes = fit::file_size(PLY, &model)?;
+    let whole = evaluator.evaluate_original(model.clone(), options.model, bytes, observer)?;
     let scratch = create_scratch_file(options.output)?;
     let named = options.formats;
     let formats = fit::fitting(options, &model, &scratch, observer)?;

@@ -5,8 +5,8 @@ use std::path::Path;
 use densify::train::output::model_path;
 
 use super::{
-    Outcome, call, count, files, gaussians, json, read, read_text, records, resume, scratch, text, train,
-    write_ply,
+    Outcome, call, count, files, gaussians, json, read, read_text, records, resume, scratch, text,
+    train, write_ply,
 };
 use crate::photographs::Photographs;
 
