@@ -66,7 +66,7 @@ pub(super) fn file(batch: &Batch, with_memory: bool) -> Result<EngineFile, Failu
     }
     let text = toml::to_string(&HqJob { name: "densify".to_owned(), task: tasks });
     let text = text.map_err(Failure::input)?;
-    Ok(EngineFile { path: batch.folder.join("hq").join("job.toml"), text })
+    Ok(EngineFile { stage: 0, path: batch.folder.join("hq").join("job.toml"), text })
 }
 
 /// Submits the job and returns its ID.

@@ -140,6 +140,8 @@ impl Batch {
 
 /// A file for a scheduler.
 struct EngineFile {
+    /// Index of the stage that it starts, or starts with.
+    stage: usize,
     path: PathBuf,
     text: String,
 }
@@ -177,7 +179,7 @@ pub fn submit(
         Engine::Hq => vec![hq::file(batch, submission.with_memory)?],
     };
     if submission.dry_run {
-        for EngineFile { path, text } in &files {
+        for EngineFile { path, text, .. } in &files {
             observer.say(format_args!("# {}\n{text}", path.display()));
         }
         return Ok(());
@@ -192,18 +194,37 @@ pub fn submit(
     }
     let logs = batch.logs();
     fs::create_dir_all(&logs).map_err(FileError::io("create the folder", &logs))?;
-    for EngineFile { path, text } in &files {
+    let mut written = vec![logs.clone()];
+    for EngineFile { path, text, .. } in &files {
+        if !path.exists() {
+            written.push(path.clone());
+        }
         write_atomically(path, |out| out.write_all(text.as_bytes()))?;
     }
-    let jobs = match submission.engine {
-        Engine::Hq => files.iter().map(hq::submit).collect::<Result<_, _>>()?,
-        _ => slurm::submit(&files)?,
+    let mut jobs = Vec::new();
+    let submitted = match submission.engine {
+        Engine::Hq => files.iter().try_for_each(|file| hq::submit(file).map(|job| jobs.push(job))),
+        _ => slurm::submit(&files, &mut jobs),
     };
+    if submitted.is_err() && jobs.is_empty() {
+        remove_written(&written, &batch.folder);
+    }
+    submitted?;
     observer.say(format_args!("job      {}", jobs.join(", ")));
     let text = toml::to_string(&Submitted { engine: submission.engine, jobs });
     let text = text.map_err(Failure::input)?;
     write_atomically(&batch.folder.join(SUBMITTED_FILE), |out| out.write_all(text.as_bytes()))?;
     Ok(())
+}
+
+/// Removes files and empty folders, and the folders above them up to `root` that are then empty.
+pub fn remove_written(paths: &[PathBuf], root: &Path) {
+    for path in paths {
+        // A folder that is not empty stays, as does what cannot be removed.
+        let _ = if path.is_dir() { fs::remove_dir(path) } else { fs::remove_file(path) };
+        let mut folders = path.ancestors().skip(1).take_while(|folder| folder.starts_with(root));
+        while folders.next().is_some_and(|folder| fs::remove_dir(folder).is_ok()) {}
+    }
 }
 
 /// Runs a program of a scheduler and returns its output.

@@ -97,11 +97,15 @@ impl PlannedRun {
         Ok(())
     }
 
-    /// Writes the run to a file for an engine.
-    pub(super) fn write(&self, output: &Path) -> Result<(), Failure> {
+    /// The file that describes the run to an engine.
+    pub(super) fn task_file(&self, output: &Path) -> PathBuf {
+        task_file(output, &self.name())
+    }
+
+    /// Writes the file that describes the run to an engine.
+    pub(super) fn write(&self, path: &Path) -> Result<(), Failure> {
         let text = toml::to_string(self).map_err(Failure::input)?;
-        write_atomically(&task_file(output, &self.name()), |out| out.write_all(text.as_bytes()))?;
-        Ok(())
+        Ok(write_atomically(path, |out| out.write_all(text.as_bytes()))?)
     }
 
     /// Reads the run of this name from its file.

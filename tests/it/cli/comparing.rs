@@ -195,6 +195,16 @@ fn scheduler_runs_match_local_ones_and_are_collected_by_repeating_the_call() {
     let shown = submit("--dry-run", text(&bin)).ok().stdout;
     assert!(shown.contains("0 of 8 done") && !output.exists(), "{shown}");
     submit("", text(&bin)).refused("no Slurm", &["sbatch", "PATH"]);
+    assert!(!output.exists(), "a refused submission left files");
+    write_program(&bin, "scontrol", "echo; echo 'MaxArraySize            = 3'");
+    let shown_in_parts = submit("--dry-run", &path).ok().stdout;
+    for (name, tasks) in [("", "0,1,2"), ("-2", "0,1,2"), ("-3", "0,1")] {
+        assert!(shown_in_parts.contains(&format!("slurm/runs{name}.sh\n")), "{shown_in_parts}");
+        let header = format!("--job-name=densify-runs{name}\n");
+        let script = shown_in_parts.split(&header).nth(1).expect("a script");
+        assert!(script.split("names=").next().unwrap().contains(&format!("--array={tasks}\n")));
+    }
+    std::fs::remove_file(bin.join("scontrol")).expect("an existing file");
     write_program(&bin, "sbatch", "echo 7");
     let stdout = submit("", &path).ok().stdout;
     assert!(stdout.contains("job      7") && stdout.contains("again to collect"), "{stdout}");
