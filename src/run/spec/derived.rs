@@ -98,7 +98,7 @@ impl RunSpec {
     /// starts from a model, and overlaid with `--lr`.
     ///
     /// # Errors
-    /// When there is no such rate, or it is not a positive number.
+    /// When there is no such rate, or its value is not allowed.
     pub fn learning_rates(&self, of_policy: &RateOverrides) -> Result<RateOptions, Failure> {
         let fail = |problem: &str| Failure::from(OptionProblem::value("lr", problem.trim()));
         let iterations = self.schedule.iterations.0;
@@ -122,10 +122,7 @@ impl RunSpec {
             table.insert(name, number.into());
         }
         let rates: RateOptions = table.try_into().map_err(|error| fail(&format!("{error}")))?;
-        match rates.invalid() {
-            Some(name) => Err(fail(&format!("{name} must be a positive number"))),
-            None => Ok(rates),
-        }
+        rates.problem().map_or(Ok(rates), |problem| Err(fail(&problem)))
     }
 
     /// The policy, and the parameters that are set for it.
@@ -197,7 +194,8 @@ mod tests {
         for (bad, part) in [
             ("{ opacity = \"x\" }", "NAME=RATE"),
             ("{ colour = 1 }", "colour"),
-            ("{ quat = 0 }", "quat"),
+            ("{ quat = -1 }", "quat"),
+            ("{ quat_end = 0 }", "quat_end"),
             ("{ quat = inf }", "quat"),
         ] {
             let message = spec("lr", bad).unwrap_err().to_string();

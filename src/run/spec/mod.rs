@@ -257,7 +257,8 @@ run_spec! {
 
         /// Set a learning rate: mean_start, mean_end, log_scale, quat, opacity, sh_dc, sh_rest; for all but the means
         /// also NAME_end; fade: final factor of opacity, sh_dc and sh_rest, which starts to act after the share
-        /// fade_from of the run; boost: initial factor of all (1 for runs of 30,000); may be repeated
+        /// fade_from of the run; boost: initial factor of all (1 for runs of 30,000). A rate of 0 freezes its values. May
+        /// be repeated
         #[serde(with = "as_table")]
         lr: Vec<Assignment> = Vec::new(), Fixed, value "NAME=RATE";
 

@@ -24,19 +24,20 @@ pub use densify_policies::parameters::REFERENCE_ITERATIONS;
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RateOptions {
-    /// Means at the start of the run `[fraction of the extent per step]`, > 0.
+    /// Means at the start of the run `[fraction of the extent per step]`, ≥ 0. A step size that is 0 at the start is 0
+    /// in the whole run: its values are frozen.
     pub mean_start: f64,
     /// Means at the end of the run `[fraction of the extent per step]`, > 0.
     pub mean_end: f64,
-    /// Log-scales, > 0.
+    /// Log-scales, ≥ 0.
     pub log_scale: f32,
-    /// Quaternions, > 0.
+    /// Quaternions, ≥ 0.
     pub quat: f32,
-    /// Opacity logits, > 0. The first release of 3DGS used 0.05; those since October 2024 use 0.025.
+    /// Opacity logits, ≥ 0. The first release of 3DGS used 0.05; those since October 2024 use 0.025.
     pub opacity: f32,
-    /// Spherical-harmonic coefficients of band 0, > 0.
+    /// Spherical-harmonic coefficients of band 0, ≥ 0.
     pub sh_dc: f32,
-    /// Spherical-harmonic coefficients of bands 1–3, > 0.
+    /// Spherical-harmonic coefficients of bands 1–3, ≥ 0.
     pub sh_rest: f32,
     /// Log-scales at the end of the run, > 0. For this and the next four, `None` means the same as at the start.
     pub log_scale_end: Option<f32>,
@@ -151,7 +152,9 @@ impl RateOptions {
     /// Step sizes of iteration `step` (1-based), in a scene with an extent in `[scene units]`.
     pub fn at(&self, step: u32, iterations: u32, extent: f32) -> LearningRates {
         let t = f64::from(step.min(iterations)) / f64::from(iterations.max(1));
-        let between = |start: f64, end: f64| ((1.0 - t) * start.ln() + t * end.ln()).exp();
+        let between = |start: f64, end: f64| {
+            if start > 0.0 { ((1.0 - t) * start.ln() + t * end.ln()).exp() } else { 0.0 }
+        };
         let mean = between(self.mean_start, self.mean_end) * f64::from(extent);
         let factor = self.boost.powf(1.0 - t);
         let late = (t - self.fade_from).max(0.0) / (1.0 - self.fade_from).max(f64::MIN_POSITIVE);
@@ -171,28 +174,33 @@ impl RateOptions {
         }
     }
 
-    /// The name of the first step size that is not a positive finite number.
-    pub fn invalid(&self) -> Option<&'static str> {
+    /// What is wrong with the first value that is not allowed, with its name.
+    pub fn problem(&self) -> Option<String> {
         let end = |end: Option<f32>| f64::from(end.unwrap_or(1.0));
-        [
+        let starts = [
             ("mean_start", self.mean_start),
-            ("mean_end", self.mean_end),
-            ("boost", self.boost),
-            ("fade", self.fade),
-            ("fade_from", self.fade_from),
             ("log_scale", f64::from(self.log_scale)),
             ("quat", f64::from(self.quat)),
             ("opacity", f64::from(self.opacity)),
             ("sh_dc", f64::from(self.sh_dc)),
             ("sh_rest", f64::from(self.sh_rest)),
+        ];
+        let others = [
+            ("mean_end", self.mean_end),
+            ("boost", self.boost),
+            ("fade", self.fade),
+            ("fade_from", self.fade_from),
             ("log_scale_end", end(self.log_scale_end)),
             ("quat_end", end(self.quat_end)),
             ("opacity_end", end(self.opacity_end)),
             ("sh_dc_end", end(self.sh_dc_end)),
             ("sh_rest_end", end(self.sh_rest_end)),
-        ]
-        .into_iter()
-        .find_map(|(name, rate)| (!(rate.is_finite() && rate > 0.0)).then_some(name))
+        ];
+        let negative = starts.iter().find(|(_, rate)| !(rate.is_finite() && *rate >= 0.0));
+        let not_positive = others.iter().find(|(_, value)| !(value.is_finite() && *value > 0.0));
+        negative
+            .map(|(name, _)| format!("{name} must be a positive number, or 0 to freeze its values"))
+            .or_else(|| not_positive.map(|(name, _)| format!("{name} must be a positive number")))
     }
 }
 

@@ -39,6 +39,24 @@ fn mean_rate_falls_log_linearly_between_its_ends() {
 }
 
 #[test]
+fn a_rate_of_0_freezes_its_values_for_the_whole_run() {
+    let rates = RateOptions {
+        mean_start: 0.0,
+        opacity: 0.0,
+        opacity_end: Some(0.1),
+        ..RateOptions::default()
+    };
+    assert_eq!(rates.problem(), None);
+    for step in [1, 500, 1_000] {
+        let LearningRates { mean, opacity, quat, .. } = rates.at(step, 1_000, 2.0);
+        assert!(mean == 0.0 && opacity == 0.0 && quat > 0.0, "{mean}, {opacity}, {quat}");
+    }
+    let named = |rates: RateOptions| rates.problem().expect("a problem");
+    assert!(named(RateOptions { mean_end: 0.0, ..rates }).contains("mean_end"));
+    assert!(named(RateOptions { quat: -1.0, ..rates }).contains("quat"));
+}
+
+#[test]
 fn steps_scale_with_the_run() {
     assert_eq!(scaled(1_000, 30_000), 1_000);
     assert_eq!(scaled(1_000, 3_000), 100);

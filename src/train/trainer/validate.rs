@@ -27,8 +27,8 @@ pub(super) fn check_options(
     if !(scene.extent.is_finite() && scene.extent > 0.0) {
         return bad(format!("the scene's extent is {}; it must be positive", scene.extent));
     }
-    if let Some(rate) = options.rates.invalid() {
-        return bad(format!("learning rate `{rate}` must be a positive number"));
+    if let Some(problem) = options.rates.problem() {
+        return bad(format!("learning rates: {problem}"));
     }
     let (rows, budget) = (backend.rows(), backend.budget());
     let frozen = options.frozen;

@@ -51,6 +51,15 @@ fn a_run_can_start_from_any_model() {
     outcome.ok();
     assert!(first_loss(&other) < 1.1 * from_model + 0.01, "{}", first_loss(&other));
 
+    // A learning rate of 0 freezes what it is for.
+    let (outcome, still) = init(&ply, "still", "--budget 300 --lr mean_start=0");
+    outcome.ok();
+    let [before, after] = [&ply, &model_path(&still, 20)].map(|file| gaussians(file));
+    let moved =
+        |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    assert!(moved(before.means.as_flattened(), after.means.as_flattened()) < 1e-5);
+    assert!(moved(&before.sh, &after.sh) > 1e-3);
+
     // A run's folder stands for its last model, whose file is recorded; the same command continues the run.
     let (outcome, of_run) = init(&run, "of-run", "--budget 300");
     outcome.ok();
