@@ -14,10 +14,17 @@ use densify_run::failure::Failure;
 pub(super) struct PoliciesArgs {
     /// Policy to explain: its decisions, source and parameters
     name: Option<String>,
+    /// A second word, which is not expected
+    #[arg(hide = true)]
+    more: Option<String>,
 }
 
 pub(super) fn run(args: &PoliciesArgs, console: &Console) -> Result<(), Failure> {
     if let Some(name) = &args.name {
+        if let Some(more) = &args.more {
+            let name = if find(name).is_ok() { name } else { more };
+            return Err(Failure::input(format!("give one name: `densify policies {name}`")));
+        }
         let entry = find(name)?;
         console.result(entry.manual().trim_end());
         let parameters = entry.parameters();

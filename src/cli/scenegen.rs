@@ -12,6 +12,7 @@ use image::{DynamicImage, RgbaImage};
 use super::console::Console;
 use super::threads;
 use densify_core::numbers::grouped;
+use densify_data::dataset::builtin;
 use densify_run::Threads;
 use densify_run::failure::Failure;
 use densify_train::pictures::write_png;
@@ -36,7 +37,7 @@ pub(super) struct ScenegenArgs {
     #[arg(long)]
     list: bool,
     /// Folder to write the scene to
-    #[arg(short, long, value_name = "DIR", help_heading = "Output", required_unless_present_any = ["list", "contact_sheet"])]
+    #[arg(short, long, value_name = "DIR", help_heading = "Output")]
     output: Option<PathBuf>,
     /// Write one PNG with eight views
     #[arg(long, value_name = "FILE", help_heading = "Output", conflicts_with = "list")]
@@ -221,13 +222,24 @@ pub(super) fn run(args: &ScenegenArgs, console: &Console) -> Result<(), Failure>
     }
     let source = match (&args.preset, &args.input) {
         (Some(name), _) => Source::Preset(name.clone()),
-        (None, Some(path)) => Source::File(path.clone()),
+        (None, Some(path)) => match builtin::meant(path) {
+            Some(name) => {
+                return Err(Failure::input(format!(
+                    "{} does not exist; --preset {name} renders the built-in scene, and \
+                     `densify train scene:{name}` needs no files",
+                    path.display()
+                )));
+            }
+            None => Source::File(path.clone()),
+        },
         (None, None) => {
             return Err(Failure::input("name a mesh, or a built-in scene with --preset"));
         }
     };
-    if let Some(output) = &args.output {
-        check_target(output, args.overwrite)?;
+    match &args.output {
+        Some(output) => check_target(output, args.overwrite)?,
+        None if args.contact_sheet.is_some() => {}
+        None => return Err(Failure::input("give the folder to write the scene to, with --output")),
     }
     threads::limit(args.threads);
     let scene = Scene::prepare(&source, &args.options())?;

@@ -186,6 +186,11 @@ impl Dataset {
         if let Some(name) = builtin::name(path) {
             return builtin::load(path, name, options);
         }
+        if let Some(name) = builtin::meant(path) {
+            return Err(LoadError::Data(format!(
+                "{name} does not exist; the built-in scene of this name is scene:{name}"
+            )));
+        }
         if archive::is_zip(path) {
             return archive::load(path, options);
         }

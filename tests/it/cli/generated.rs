@@ -199,6 +199,11 @@ fn invalid_input_is_refused_and_writes_nothing() {
 
 #[test]
 fn presets_are_listed() {
+    // Built-in scenes without the option or the prefix that names them.
+    call("scenegen room").refused("a built-in scene", &["--preset room", "train scene:room"]);
+    call("scenegen scene:town:4").refused("a built-in scene", &["--preset town:4"]);
+    call("train room").refused("a built-in scene", &["scene:room"]);
+    call("scenegen no.obj").refused("no output", &["--output"]);
     let stdout = call("scenegen --list").ok().stdout;
     for name in ["spheres", "thin", "chirp", "table", "layers", "room", "glossy", "cornell", "town"]
     {

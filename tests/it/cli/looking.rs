@@ -212,4 +212,5 @@ fn policies_are_listed_and_explained() {
         assert!(manual.contains(entry.manual().lines().next().unwrap_or("?")), "{manual}");
     }
     call("policies diett").refused("misspelt", &["diett", "diet"]);
+    call("policies show diet").refused("a word too many", &["`densify policies diet`"]);
 }

@@ -5,6 +5,8 @@ mod rendered;
 
 use std::path::Path;
 
+use densify_scenegen::PresetSpec;
+
 pub use rendered::GroundTruth;
 pub use rendered::cache_folder;
 pub(super) use rendered::{load, surface_bytes};
@@ -15,6 +17,12 @@ pub(crate) const PREFIX: &str = "scene:";
 /// The name of a built-in scene, if the path is one.
 pub fn name(path: &Path) -> Option<&str> {
     path.to_str()?.strip_prefix(PREFIX)
+}
+
+/// The built-in scene that the user may have meant by a path that does not exist.
+pub fn meant(path: &Path) -> Option<&str> {
+    let name = name(path).or_else(|| path.to_str())?;
+    (!path.exists() && name.parse::<PresetSpec>().is_ok()).then_some(name)
 }
 
 /// The name of a built-in scene for use in a file name: `scene:town:4` becomes `town-4`.
