@@ -76,6 +76,16 @@ pub(crate) fn hidden_points(s: Spelling, near: f64, hidden: &str, is_given: bool
     format!("note: {hidden} of what the views show lies nearer than {near}, and is hidden{remedy}")
 }
 
+/// The part of the promised memory that is only for speed.
+pub(crate) fn for_speed(s: Spelling, needed: u64, speed: u64) -> String {
+    format!(
+        "needed   {}; the other {} are for speed (longer tile lists, decoded images): with {} they are the first to go",
+        Bytes(needed),
+        Bytes(speed),
+        s.option("memory")
+    )
+}
+
 /// The note that a model's colours are truncated to a lower degree.
 pub(crate) fn degree_cut(s: Spelling, own: u8, degree: u8) -> String {
     format!(

@@ -5,7 +5,7 @@ use std::fmt;
 use super::ResolvedRun;
 use super::case::Case;
 use super::size::{self, MIB, RESOLUTIONS};
-use crate::failure::Failure;
+use crate::failure::{Failure, notes};
 use crate::host::Host;
 use crate::spec::{ByteCount, RunSpec};
 use densify_core::memory::Ledger;
@@ -44,6 +44,10 @@ pub fn plan(spec: &RunSpec, host: Host<'_>) -> Result<Plan, Failure> {
     let ledger = case.ledger_of(&size)?;
     reasons.push(case.memory_table(&ledger, host.observer.spelling()));
     let limited = case.inputs.device.limited_bytes(&ledger);
+    let needed = size::needed_bytes(&case, &size)?;
+    if case.memory().is_none() && needed + MIB < limited {
+        reasons.push(notes::for_speed(host.observer.spelling(), needed, limited - needed));
+    }
     let memory = case.memory().unwrap_or(limited.next_multiple_of(MIB));
     let alternatives = alternatives(&case, memory, size.rows)?;
     Ok(Plan { ledger, lines: reasons, alternatives })

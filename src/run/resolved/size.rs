@@ -254,6 +254,14 @@ pub(super) fn rows_at(
     Ok(fit.map(|fit| fit.setting.rows))
 }
 
+/// Bytes in which a run of these rows and this degree fits, with the shortest tile lists and without decoded images
+/// that are kept. What a larger size takes beyond them is for speed.
+pub(super) fn needed_bytes(case: &Case<'_>, size: &RunSize) -> Result<u64, Failure> {
+    let request = request(case, u64::MAX)?;
+    let request = SizeRequest { image_cache: Some(case.image_cache().unwrap_or(0)), ..request };
+    bytes(case, &request.setting(size.rows, size.sh_degree, request.pairs[0]))
+}
+
 /// Bytes of a run of this size that count towards `--memory`.
 fn bytes(case: &Case<'_>, setting: &RunSize) -> Result<u64, Failure> {
     Ok(case.inputs.device.limited_bytes(&case.ledger_of(setting)?))

@@ -36,6 +36,22 @@ fn budget(outcome: &Outcome) -> &str {
     lines.find(|line| line.starts_with("budget ")).expect("a budget")
 }
 
+/// `plan` says how much of the memory is only for speed; the rest holds the same Gaussians.
+#[test]
+fn the_memory_that_a_budget_needs_holds_it() {
+    let scene = Photographs::colmap_text();
+    let planned = plan(scene.path(), "--budget 300k").ok().stdout;
+    let needed = planned.split("\nneeded   ").nth(1).expect("a line");
+    let (needed, speed) = needed.split_once(" MiB; the other ").expect("two sizes");
+    let mebibytes = |text: &str| text.replace(',', "").parse::<f64>().expect("a number");
+    let (needed, speed) = (mebibytes(needed), mebibytes(speed.split(' ').next().unwrap()));
+    assert!(speed > 100.0 && planned.contains("with --memory they"), "{planned}");
+    let at = |memory: f64| plan(scene.path(), &format!("--budget 300k --memory {memory}MiB"));
+    assert!(budget(&at(needed.ceil() + 1.0).ok()).starts_with("budget   300,000 rows"));
+    assert!(!budget(&at(needed.ceil() - 1.0).ok()).starts_with("budget   300,000 rows"));
+    assert!(!at(needed.ceil() + 1.0).stdout.contains("\nneeded"));
+}
+
 #[test]
 fn plan_matches_train_and_writes_nothing() {
     let scene = Photographs::colmap_text();

@@ -67,7 +67,7 @@ pub(super) const IMAGE_SHARE_DIVISOR: u64 = 8;
 
 impl SizeRequest {
     /// A size with this many pairs per row, and at most 1 / [`IMAGE_SHARE_DIVISOR`] of the memory for images.
-    fn setting(&self, rows: usize, sh_degree: u8, pairs: usize) -> RunSize {
+    pub(super) fn setting(&self, rows: usize, sh_degree: u8, pairs: usize) -> RunSize {
         let most = self.max_pairs.max(rows);
         let tile_cap = self.tile_cap.unwrap_or_else(|| rows.saturating_mul(pairs).min(most));
         let share = self.memory / IMAGE_SHARE_DIVISOR;
