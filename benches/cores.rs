@@ -2,7 +2,7 @@
 //!
 //! A step consists of parallel regions, one after the other, and of serial work between them. In a
 //! region, a core takes the next task as soon as it is free. Contention for memory and the cost of
-//! waking cores are not modelled, so these are upper bounds.
+//! waking cores are not modelled, so the predicted speed-ups are upper bounds.
 //! `cargo bench --bench cores [-- ROWS@SIZE...]`
 
 #![expect(clippy::print_stdout, reason = "the output is a table")]
@@ -31,7 +31,7 @@ struct Step {
 }
 
 impl Step {
-    /// Medians over the steps with the same number of tasks as the last one; the numbers vary with the
+    /// Medians over the steps with the same numbers of tasks as the last step; these numbers vary with the
     /// pixels selected as candidates.
     fn median(mut steps: Vec<StepTasks>) -> Self {
         let task_counts = |step: &StepTasks| -> Vec<usize> {
@@ -121,7 +121,7 @@ fn print_regions(step: &Step) {
         }
     }
     println!(
-        "  region               times  tasks       ms  share %  largest task %  of {CORES:?} cores busy %"
+        "  region               times  tasks       ms  share %  largest task %  busy % of {CORES:?}"
     );
     for name in names {
         let regions = || step.regions.iter().filter(|region| region.0 == name);

@@ -19,8 +19,8 @@ use densify::render::{AdapterChoice, AdapterKind, Backend, BackendError, Setup};
 use pulp::{Arch, Simd, WithSimd};
 use steps::{median, ms};
 
-/// Multiply-adds on twelve independent vectors; two units with a latency of four cycles need eight to
-/// stay busy.
+/// Multiply-adds on twelve independent vectors; two units with a latency of four cycles need eight such
+/// vectors to stay busy.
 struct MultiplyAdds {
     rounds: u32,
 }

@@ -1,5 +1,5 @@
-//! Accumulation of a row's gradients over tiles: in slots, always in the same order, or by atomics, in any order. It is
-//! chosen when a device is opened.
+//! Accumulation of a row's gradients over tiles: in slots, always in the same order, or by atomics, in any order. The
+//! kind is chosen when a device is opened.
 
 use std::fmt;
 

@@ -6,13 +6,13 @@
 // at every iteration, gradients are summed until it does (summed.rs).
 
 @group(0) @binding(1) var<storage, read> state: State;
-// Parameters of all rows; moments and waiting gradients of the rows that are not frozen.
+// Parameters of all rows; moments and waiting gradients of the rows that are not frozen, with indices called `own`.
 @group(0) @binding(2) var<storage, read_write> params: array<f32>;
 @group(0) @binding(3) var<storage, read_write> first: array<f32>;
 @group(0) @binding(4) var<storage, read_write> second: array<f32>;
 @group(0) @binding(5) var<storage, read_write> waiting: array<f32>;
-// Number of steps of each row, as two halves of a word. Lower half: of all parameters but bands 1-3; upper half: of
-// bands 1-3, if they have a schedule of their own.
+// Each row's ages, its numbers of optimiser steps, in the halves of a word. Lower half: the age of all parameters but
+// bands 1-3; upper half: that of bands 1-3, if they have a schedule of their own.
 @group(0) @binding(6) var<storage, read_write> ages: array<u32>;
 // See project_bwd.wgsl.
 @group(0) @binding(7) var<storage, read> gradient: array<vec4<f32>>;
@@ -23,7 +23,7 @@ const LOG_SCALE_LEAST: f32 = -13.8;
 const LOG_SCALE_MOST: f32 = 2.3;
 const LEAST_SHARE: f32 = 5.9604645e-8;
 
-// Bits of frame.draw.z.
+// Bits of frame.draw.z. REST: bands 1-3; MAIN: all other parameters.
 const MAIN_STEPS: u32 = 1u;
 const REST_STEPS: u32 = 2u;
 const MAIN_WAITED: u32 = 4u;
@@ -171,7 +171,7 @@ fn confine(base: u32) {
     let q = vec4(params[base + 6u], params[base + 7u], params[base + 8u], params[base + 9u]);
     let norm2 = dot(q, q);
     // A quaternion this short has lost its direction, and is reset to the identity. Here and below,
-    // NaN stays NaN, for the audit to find.
+    // NaN stays NaN, so that the audit finds it.
     var unit = q / sqrt(norm2);
     if below(norm2, 1e-12) {
         unit = vec4(1.0, 0.0, 0.0, 0.0);
@@ -192,7 +192,7 @@ fn confine_to(at: u32, least: f32, most: f32) {
     }
 }
 
-// Δμ = R·S²·Rᵀ·ξ · share · factor.
+// Adds noise to a row's mean: Δμ = R·S²·Rᵀ·ξ · share · strength. The share falls from 1 to 0 as the opacity rises.
 fn add_noise(row: u32, base: u32) {
     let opacity = sigmoid(params[base + 10u]);
     let share = 1.0 / (1.0 + exp_exact(frame.noise.y * (opacity - frame.noise.z)));

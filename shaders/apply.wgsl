@@ -1,7 +1,7 @@
-// Stage 9: executes a compiled plan in place, in chunks of operations, as in src/render/cpu/apply.rs.
-// Pass 1 writes families, updates and seeds, no row twice; pass 2 moves rows from the end into holes
-// and sorts the rows. Each buffer is edited separately; buffers without frozen rows start at the first
-// row that is not frozen.
+// Stage 9: executes a compiled plan in place, in chunks of operations, as in src/render/cpu/apply.rs. Pass 1 writes
+// families (the children of grown rows), updates and seeds (new rows), each row at most once; pass 2 moves rows from
+// the end into holes and sorts the rows. Each buffer is edited separately; buffers without frozen rows start at the
+// first row that is not frozen.
 
 // Words per operation.
 const WORDS: u32 = 20u;
@@ -65,8 +65,8 @@ fn longest(s: vec3<f32>) -> u32 {
     return best;
 }
 
-// Log-scales after the rule at ops[at], which three terms follow. Rule 0: the first term is added to
-// all; 1: the first is added to the longest, the second to the others; 2: each to its own axis; 3: all are set
+// Log-scales changed by the rule at ops[at], whose three terms follow in `ops`. Rule 0: the first term is added to
+// all; 1: the first is added to the longest axis, the second to the others; 2: each to its own axis; 3: all are set
 // to the first.
 fn scales_of(s: vec3<f32>, at: u32) -> vec3<f32> {
     let rule = ops[at];
@@ -91,7 +91,7 @@ fn logit_of(opacity: f32, complement: f32) -> f32 {
     return log(opacity) - log(complement);
 }
 
-// A logit after a rule. Rule 0: unchanged; 1: set to `value`; 2: opacity times `value`; 3: `value` siblings
+// A logit changed by a rule. Rule 0: unchanged; 1: set to `value`; 2: opacity times `value`; 3: `value` siblings
 // together transmit as much light as the parent.
 fn logit_after(logit: f32, rule: u32, value: f32) -> f32 {
     let opacity = sigmoid(logit);
@@ -104,7 +104,7 @@ fn logit_after(logit: f32, rule: u32, value: f32) -> f32 {
         }
         case 3u: {
             let left = pow(complement, 1.0 / value);
-            // 1 − left; by a series for small opacities, where the difference would cancel.
+            // 1 − left; computed by a series if it is small, because the difference would cancel.
             let ln_left = -minus_ln_complement(opacity, complement) / value;
             let part = select(1.0 - left, -expm1_small(ln_left), ln_left > -0.1);
             return logit_of(part, left);
@@ -153,7 +153,7 @@ fn put(row: u32, mean: vec3<f32>, log_scale: vec3<f32>, quat: vec4<f32>, logit: 
     rows[base + 10u] = logit;
 }
 
-// Families; launch.a: their number, launch.b: seed, launch.c: step. Words of an operation: parent; index in
+// Writes families; launch.a: their number, launch.b: seed, launch.c: step. Words of an operation: parent; index in
 // `ops` of the first child's row; number of children; index of the first child in its family; 1 if the
 // parent is overwritten by child 0; placement (0: offset, 1: sampled, 2: along the longest axis,
 // 3: along all axes) and three numbers for it; scale rule and three numbers; opacity rule and its
@@ -211,7 +211,7 @@ fn offset_of(op: u32, child: u32, parent: u32, log_scale: vec3<f32>, quat: vec4<
     }
 }
 
-// Updates; launch.a: their number. Words of an operation: row; scale rule and three numbers; opacity rule
+// Writes updates; launch.a: their number. Words of an operation: row; scale rule and three numbers; opacity rule
 // and its number; 1 if the mean is set; the mean; 1 if band 0 is set; its three coefficients; unused ×5.
 @compute @workgroup_size(256)
 fn rewrite(@builtin(global_invocation_id) id: vec3<u32>) {
@@ -235,7 +235,7 @@ fn rewrite(@builtin(global_invocation_id) id: vec3<u32>) {
     rows[base + 10u] = logit_after(rows[base + 10u], ops[op + 5u], real(op + 6u));
 }
 
-// Seeds; launch.a: their number. Words of an operation: row; mean; log-scales; quaternion; logit; three
+// Writes seeds; launch.a: their number. Words of an operation: row; mean; log-scales; quaternion; logit; three
 // coefficients of band 0; unused ×5. The other coefficients have been cleared.
 @compute @workgroup_size(256)
 fn sow(@builtin(global_invocation_id) id: vec3<u32>) {
@@ -268,13 +268,13 @@ fn decay(@builtin(global_invocation_id) id: vec3<u32>) {
     if launch.d != NONE && !(signals[launch.d + row - ops[0]] > 0.0) {
         return;
     }
-    let loss = bitcast<f32>(launch.b);
+    let decrease = bitcast<f32>(launch.b);
     let base = 12u * row;
     let logit = rows[base + 10u];
     // Values that are not finite are left for the audit to find.
-    if loss > 0.0 && below(logit, LARGEST) {
+    if decrease > 0.0 && below(logit, LARGEST) {
         let opacity = sigmoid(logit);
-        let left = max(opacity - loss, OPACITY_LEAST);
+        let left = max(opacity - decrease, OPACITY_LEAST);
         rows[base + 10u] = min(logit, logit_of(left, sigmoid(-logit) + (opacity - left)));
     }
     for (var k = 0u; k < 3u; k++) {

@@ -1,5 +1,5 @@
-// Finds rows with a number that is not finite; see src/render/audit.rs. Numbers are read as bits:
-// WGSL may assume that there is no NaN. One row per invocation.
+// Finds rows with a number that is not finite; see src/render/audit.rs. Numbers are read as bits,
+// because WGSL may assume that there is no NaN. One row per invocation.
 
 // Per row: 0, or 1 + the index of its first number that is not finite.
 @group(0) @binding(1) var<storage, read_write> marks: array<u32>;
@@ -7,8 +7,8 @@
 
 const NOT_FINITE: u32 = 0x7f800000u;
 
-// launch.a: number of rows; launch.b: numbers per row; launch.c: index of the first number among a row's parameters;
-// launch.d: the first row that has numbers.
+// launch.a: number of rows; launch.b: numbers per row; launch.c: index of the first of them among the parameters
+// of a row; launch.d: the first row that has numbers in this buffer.
 @compute @workgroup_size(256)
 fn audit(@builtin(global_invocation_id) id: vec3<u32>) {
     let own = index_of(id);

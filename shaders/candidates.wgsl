@@ -13,8 +13,8 @@
 @group(0) @binding(8) var<storage, read_write> points: array<vec4<f32>>;
 
 
-// launch.a: the band, launch.b: number of pixels, launch.c: the surface is at the largest blend weight (0) or at
-// transmittance 1/2 (1), launch.d: index in `points` of the first pixel's point.
+// launch.a: the band of tiles, launch.b: number of pixels, launch.c: the surface is at the largest blend weight (0) or
+// at transmittance 1/2 (1), launch.d: index in `points` of the first pixel's point.
 @compute @workgroup_size(256)
 fn surface(@builtin(global_invocation_id) id: vec3<u32>) {
     let i = index_of(id);
@@ -67,8 +67,8 @@ fn surface_row(tile: u32, at: vec2<f32>, is_median: bool) -> u32 {
     return best;
 }
 
-// The point of the ray through `at` that is closest to the row's mean in its Mahalanobis metric;
-// w: its depth.
+// The point of the ray through `at` that is closest to the row's mean in the row's Mahalanobis
+// metric; w: the point's depth.
 fn closest_approach(row: u32, at: vec2<f32>) -> vec4<f32> {
     let ratio = (at - frame.lens.zw) / frame.lens.xy;
     // This vector has camera z = 1, so the parameter along the ray is the depth.
@@ -96,8 +96,8 @@ fn closest_approach(row: u32, at: vec2<f32>) -> vec4<f32> {
 @group(0) @binding(9) var<storage, read> finish: array<vec2<u32>>;
 // The error per pixel, or three planes of its gradient.
 @group(0) @binding(10) var<storage, read> map: array<f32>;
-// The known leading digits of the smallest error to be selected; the number of pixels still to
-// select among those with these digits; the number of pixels written. Then a histogram of the next digit.
+// The known leading digits of the smallest error to be selected; the number of pixels still to be selected among
+// those whose errors begin with these digits; the number of pixels written. Then a histogram of the next digit.
 @group(0) @binding(11) var<storage, read_write> selection: array<atomic<u32>>;
 // The number of selected pixels; then, in no particular order, bits of the error and index of each.
 @group(0) @binding(12) var<storage, read_write> worst: array<vec2<u32>>;

@@ -15,12 +15,12 @@
 // The same sums over the whole image.
 @group(0) @binding(6) var<storage, read_write> exposure_total: array<vec4<f32>>;
 
-// Invocations of the kernels that compute sums.
+// Number of invocations per group in the kernels that compute sums.
 const ADDERS: u32 = 64u;
 
 var<workgroup> reduced: array<mat4x4<f32>, ADDERS>;
 
-// The image with the photograph's exposure.
+// Applies the photograph's exposure to the image.
 @compute @workgroup_size(256)
 fn expose(@builtin(global_invocation_id) id: vec3<u32>) {
     let at = index_of(id);
@@ -45,7 +45,7 @@ fn reduced_sum(lane: u32) -> mat4x4<f32> {
     return reduced[0];
 }
 
-// dL/dpixel with respect to the image before the exposure, and the sums of the group.
+// Computes dL/dpixel of the image before the exposure, and the sums of the group.
 @compute @workgroup_size(64)
 fn expose_bwd(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -78,7 +78,7 @@ fn expose_bwd(
     }
 }
 
-// The sums over the image; a single group.
+// Computes the sums over the image; a single group.
 @compute @workgroup_size(64)
 fn total_exposure(@builtin(local_invocation_index) lane: u32) {
     let groups = (frame.image.x * frame.image.y + GROUP - 1u) / GROUP;

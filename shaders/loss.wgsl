@@ -25,8 +25,9 @@
 const C1: f32 = 0.01 * 0.01;
 const C2: f32 = 0.03 * 0.03;
 const SSIM_WEIGHT: f32 = 0.2;
+// Radius of the window [px].
 const REACH: i32 = 5;
-// Side of a tile with its margin.
+// Side of a tile with its margin of REACH pixels.
 const SIDE: u32 = 26u;
 // Bits of frame.draw.w.
 const HAS_ALPHA: u32 = 1u;
@@ -35,8 +36,8 @@ const WITH_ERROR: u32 = 4u;
 const BY_PIXEL: u32 = 8u;
 const EXPOSED: u32 = 16u;
 
-// Weights of value k (of 18) in the eight windows centred on values 5 to 12, computed from those of value
-// k − 1: this reads the table once instead of eight times.
+// Weights of value k (of 18) in the eight windows centred on values 5 to 12, computed from the weights of
+// value k − 1: this reads the table once instead of eight times.
 fn next_weights(before: mat2x4<f32>, k: u32) -> mat2x4<f32> {
     var weights = array<f32, 11>(
         0.0010283802, 0.007598758, 0.036000773, 0.10936069, 0.21300553, 0.26601174,
@@ -78,7 +79,7 @@ fn difference(pixel: vec2<i32>, channel: u32) -> vec2<f32> {
 
 // Values read by eight neighbouring windows.
 const SPAN: u32 = 18u;
-// Runs of eight windows in the columns of a tile with its margin, and in the lines of the tile.
+// Numbers of runs of eight windows in the columns of a tile with its margin, and in the lines of the tile.
 const COLUMNS: u32 = SIDE * TILE / 8u;
 const LINES: u32 = TILE * TILE / 8u;
 
@@ -169,8 +170,8 @@ fn ssim_of(
     );
 }
 
-// SSIM, its derivatives, and the sums of the tile. Bits of the weights of |e| and of 1 − SSIM: in the
-// error (launch.a, launch.b) and in the error for row scores (launch.c, launch.d).
+// Computes SSIM, its derivatives, and the sums of the tile. Bits of the weights of |e| and of 1 − SSIM: in the
+// pixel's error (launch.a, launch.b) and in its error for row scores (launch.c, launch.d).
 @compute @workgroup_size(256)
 fn similarity(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -301,7 +302,7 @@ fn reduced_sum(lane: u32) -> vec2<f32> {
     return reduced[0];
 }
 
-// dL/dpixel.
+// Computes dL/dpixel.
 @compute @workgroup_size(256)
 fn pixel_gradient(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -367,7 +368,7 @@ fn pixel_gradient(
     }
 }
 
-// The mean |e| and SSIM of the image; a single group.
+// Computes the mean |e| and the mean SSIM of the image; a single group.
 @compute @workgroup_size(256)
 fn total(@builtin(local_invocation_index) lane: u32) {
     var sums = vec2(0.0);

@@ -6,7 +6,7 @@
 // One record per slot: the values of `splat_sums`.
 @group(0) @binding(7) var<storage, read_write> records: array<f32>;
 
-// An invocation's contribution to the sums of loaded splat i, the kth of a round.
+// Stores an invocation's contribution to the sums of loaded splat i, the kth splat of a round.
 fn store_splat(
     k: u32,
     i: u32,
@@ -14,7 +14,7 @@ fn store_splat(
     lane: u32,
     quad: Quad,
     map_here: vec4<f32>,
-    pixels: ptr<function, Open>,
+    pixels: ptr<function, ForwardPixels>,
 ) {
     var sums = array<f32, COLUMNS>();
     if i < count {
@@ -37,7 +37,7 @@ fn replay(
     }
     let quad = quad_of(tile, lane);
     let map_here = map_at(quad);
-    var pixels = Open(vec4(1.0), quad.inside);
+    var pixels = ForwardPixels(vec4(1.0), quad.inside);
     let begin = tile_starts[tile];
     let end = tile_starts[tile + 1u];
     var completed = true;
@@ -71,7 +71,7 @@ fn replay(
 @group(0) @binding(10) var<storage, read> all_records: array<f32>;
 @group(0) @binding(11) var<storage, read_write> row_sums: array<f32>;
 
-// Sums a row's records in order; launch.a: the band.
+// Sums a row's records in order; launch.a: the band of tiles.
 @compute @workgroup_size(256)
 fn gather_columns(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = index_of(id);

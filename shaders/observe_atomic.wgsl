@@ -3,14 +3,14 @@
 // The pixel map; see `PixelMap` in the policies.
 @group(0) @binding(6) var<storage, read> map: array<f32>;
 
-// The subgroup's contribution to the sums of splat i of the `count` loaded ones.
+// Adds the subgroup's contribution to the sums of splat i of the `count` loaded ones.
 fn add_splat(
     i: u32,
     count: u32,
     m: Member,
     quad: Quad,
     map_here: vec4<f32>,
-    pixels: ptr<function, Open>,
+    pixels: ptr<function, ForwardPixels>,
 ) {
     if i >= count {
         return;
@@ -39,7 +39,7 @@ fn replay_atomic(
     let m = member(lane);
     let quad = quad_of(tile, lane);
     let map_here = map_at(quad);
-    var pixels = Open(vec4(1.0), quad.inside);
+    var pixels = ForwardPixels(vec4(1.0), quad.inside);
     let end = tile_starts[tile + 1u];
     var completed = true;
     var first = tile_starts[tile];
@@ -51,7 +51,7 @@ fn replay_atomic(
         if m.place < count {
             load_splat(m.place, row_of_slot[list[first + m.place]], quad.corner);
         }
-        // Four per round, unrolled by hand as in rasterize_bwd_atomic.wgsl.
+        // Four splats per round, unrolled by hand as in rasterize_bwd_atomic.wgsl.
         var i = 0u;
         for (; i < count; i += 4u) {
             add_splat(i, count, m, quad, map_here, &pixels);

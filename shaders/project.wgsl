@@ -1,9 +1,9 @@
 // Stage 1: projects rows to splats, one row per invocation, as in src/render/cpu/project.rs.
 
-// Three vectors per row: mean, l1, shear | l3, log2 of the opacity, depth, unused | colour, unused.
+// Three vectors per row: projected mean, l1, shear | l3, log2 of the opacity, depth, unused | colour, unused.
 @group(0) @binding(6) var<storage, read_write> splats: array<vec4<f32>>;
-// The tiles that the row's ellipse touches: columns x0 | x1 << 16, rows y0 | y1 << 16, a bit for each
-// of 8 × 4 blocks of tiles starting at (x0, y0), and the log2 of a block's width | height << 16.
+// The tiles that the row's ellipse touches: columns x0 | x1 << 16, lines y0 | y1 << 16, a bit for each
+// of 8 × 4 blocks of tiles starting at (x0, y0), and the log2 of a block's width | that of its height << 16.
 @group(0) @binding(7) var<storage, read_write> footprints: array<vec4<u32>>;
 // Bits of the depth; NONE for rows that are not on screen.
 @group(0) @binding(8) var<storage, read_write> depths: array<u32>;

@@ -21,7 +21,7 @@ struct Accumulated {
     blue: vec4<f32>,
     depth: vec4<f32>,
     stop: vec4<u32>,
-    // The largest weight, and the index of its splat in the list.
+    // The largest blend weight, and the index of its splat in the tile's list.
     most: vec4<f32>,
     most_at: vec4<u32>,
 }
@@ -32,7 +32,7 @@ fn blend_splat(
     count: u32,
     n: u32,
     quad: Quad,
-    pixels: ptr<function, Open>,
+    pixels: ptr<function, ForwardPixels>,
     accumulated: ptr<function, Accumulated>,
 ) {
     if k >= count {
@@ -67,7 +67,7 @@ fn rasterize(
     let quad = quad_of(tile, lane);
     let begin = tile_starts[tile];
     let end = tile_starts[tile + 1u];
-    var pixels = Open(vec4(1.0), quad.inside);
+    var pixels = ForwardPixels(vec4(1.0), quad.inside);
     let zero = vec4(0.0);
     var accumulated = Accumulated(zero, zero, zero, zero, vec4(NONE), zero, vec4(0u));
     var completed = true;
@@ -81,7 +81,7 @@ fn rasterize(
             load_splat(m.place, row_of_slot[list[first + m.place]], quad.corner);
         }
         wait_for_all();
-        // Four per round, unrolled by hand: compilers do not unroll a body of this size, and the number
+        // Four splats per round, unrolled by hand: compilers do not unroll a body of this size, and the number
         // of rounds is limited (see expect_end).
         var k = 0u;
         for (; k < count && is_needed(any(pixels.unfinished)); k += 4u) {

@@ -4,7 +4,7 @@
 // One record per slot.
 @group(0) @binding(8) var<storage, read_write> records: array<f32>;
 
-// An invocation's contribution to the gradients of loaded splat i, the kth of a round.
+// Stores an invocation's contribution to the gradients of loaded splat i, the kth splat of a round.
 fn store_splat(
     k: u32,
     i: i32,
@@ -12,7 +12,7 @@ fn store_splat(
     lane: u32,
     quad: Quad,
     own: Upstream,
-    pixels: ptr<function, Behind>,
+    pixels: ptr<function, BackwardPixels>,
 ) {
     // Initialised explicitly: naga does not reset a variable in each round of a loop.
     var sums = array<f32, FIELDS>();
@@ -41,7 +41,7 @@ fn rasterize_bwd(
     var pixels = behind_all(quad, own, length);
 
     let m = member(lane);
-    let reached = largest_of_all(m, last_of(pixels));
+    let reached = largest_of_all(m, splats_needed(pixels));
     // No pixel blends a splat behind the first `reached` ones.
     var i = reached + lane;
     for (; i < length; i += MEMBERS) {
@@ -58,8 +58,8 @@ fn rasterize_bwd(
         let first = (batches - 1u - n) * BATCH;
         let count = min(BATCH, reached - first);
         load_batch(begin + first, count, lane, quad.corner);
-        // Four splats per round, back to front, the last one first. Unrolled by hand: compilers do not
-        // unroll a body of this size.
+        // Four splats per round, back to front. Unrolled by hand: compilers do not unroll a body of this
+        // size.
         var top = i32(count);
         for (; top > 0; top -= i32(SPLATS)) {
             store_splat(0u, top - 1, first, lane, quad, own, &pixels);
@@ -87,7 +87,7 @@ fn rasterize_bwd(
 @group(0) @binding(11) var<storage, read> all_records: array<f32>;
 @group(0) @binding(12) var<storage, read_write> row_sums: array<f32>;
 
-// Sums a row's records, which are contiguous, in order; launch.a: the band.
+// Sums a row's records, which are contiguous, in order; launch.a: the band of tiles.
 @compute @workgroup_size(256)
 fn gather(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = index_of(id);

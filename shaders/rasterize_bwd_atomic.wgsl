@@ -1,14 +1,14 @@
 // Stage 5 with atomics: pixel gradients are added straight to each row's sums, without records. The
 // sums are those of rasterize_bwd.wgsl, but their terms are added in no fixed order.
 
-// The subgroup's contribution to the gradients of loaded splat i; the first is at index n of the list.
+// Adds the subgroup's contribution to the gradients of loaded splat i; the first loaded splat has index n in the list.
 fn add_splat(
     i: u32,
     n: u32,
     m: Member,
     quad: Quad,
     own: Upstream,
-    pixels: ptr<function, Behind>,
+    pixels: ptr<function, BackwardPixels>,
 ) {
     // Initialised explicitly: naga does not reset a variable in each round of a loop.
     var sums = array<f32, FIELDS>();
@@ -34,7 +34,7 @@ fn rasterize_bwd_atomic(
     let own = upstream(quad);
     let block = block_of(quad);
     var pixels = behind_all(quad, own, tile_starts[tile + 1u] - begin);
-    let reached = largest_of_all(m, last_of(pixels));
+    let reached = largest_of_all(m, splats_needed(pixels));
     let batches = (reached + m.members - 1u) / m.members;
     var completed = true;
     var n = 0u;
@@ -44,7 +44,7 @@ fn rasterize_bwd_atomic(
         if m.place < count {
             load_splat(m.place, row_of_slot[list[begin + first + m.place]], quad.corner);
         }
-        // A subgroup covers only a part of the tile, and many of the tile's splats do not reach it.
+        // A subgroup covers only a part of the tile, and many of the tile's splats do not reach that part.
         let seen = subgroupBallot(m.place < count && may_reach(own_splat, block));
         var word = (count + 31u) / 32u;
         for (; word > 0u; word--) {

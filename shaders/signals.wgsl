@@ -16,7 +16,7 @@
 @group(0) @binding(10) var<storage, read> mask_offsets: array<f32>;
 
 const EXPONENT_SCALE: f32 = 0.8493218;
-// A view counts as support if the row's largest weight in it is at least this.
+// A view counts as support of a row if the row's largest weight in the view is at least this.
 override SUPPORT_WEIGHT: f32;
 
 // Numbers of the signals, which index frame.planes; policies/src/signals.rs has the table.
@@ -89,7 +89,7 @@ fn accumulate(@builtin(global_invocation_id) id: vec3<u32>) {
     add(MEAN_GRADIENT_Z, row, by_mean.z);
     add(MEAN_GRADIENT_NORM, row, norm3(by_mean));
     if ABS_X_AT > 0u {
-        // The sums are of scaled values (see project_bwd.wgsl), and the first lacks its factor l1.
+        // The sums are of scaled values (see project_bwd.wgsl), and the first sum lacks its factor l1.
         let unscale = 1.0 / EXPONENT_SCALE;
         let l1 = splats[3u * row].z * unscale;
         let by_x = l1 * unscale * row_sums[at + ABS_X_AT];
@@ -138,7 +138,7 @@ fn score(error: f32, weight: f32) -> f32 {
     return score;
 }
 
-// The norm, computed from scaled components: the squares of small gradients would underflow.
+// The norm, computed from scaled components because the squares of small gradients would underflow.
 fn norm2(v: vec2<f32>) -> f32 {
     let most = max(abs(v.x), abs(v.y));
     if !(most > 0.0) {

@@ -42,7 +42,8 @@ const ARGS_ROW_DIGITS: u32 = 6u;
 const ARGS_ENTRY_BLOCKS: u32 = 9u;
 const ARGS_ENTRY_DIGITS: u32 = 12u;
 
-// The numbers to sum (launch.a of scan_blocks and scan_sums).
+// The numbers to sum (launch.a of scan_blocks and scan_sums). COUNTS_AGAIN: the entries of a band that the
+// total already includes.
 const FLAGS: u32 = 0u;
 const COUNTS_ALL: u32 = 1u;
 const COUNTS_BAND: u32 = 2u;
@@ -88,7 +89,7 @@ fn sum_before(lane: u32, value: u32) -> u32 {
     return before;
 }
 
-// The number of values of which `what` forms prefix sums.
+// The number of values to sum; `what`: see FLAGS.
 fn count_of(what: u32) -> u32 {
     switch what {
         case FLAGS: { return frame.model.x; }
@@ -166,7 +167,7 @@ fn scan_sums(@builtin(local_invocation_index) lane: u32) {
     }
 }
 
-// launch.b: number of encoded bands.
+// Stores the results that depend on the total; launch.b: number of encoded bands.
 fn conclude(total: u32) {
     switch launch.a {
         case FLAGS: {
@@ -217,7 +218,7 @@ fn summed(i: u32) -> u32 {
 
 // --- Rows ---------------------------------------------------------------------------------------
 
-// Lists the rows on screen, in order, with their depths.
+// Lists the rows on screen, in ascending order, with their depths.
 @compute @workgroup_size(256)
 fn compact(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = index_of(id);
@@ -413,7 +414,7 @@ fn count_digits(
 
 // Each invocation's counts of digits d and d + 8, in the halves of one word.
 var<workgroup> counters: array<u32, 2048>;
-// Start of each digit within its block.
+// Start of each digit's items within the block.
 var<workgroup> digit_starts: array<u32, 16>;
 
 @compute @workgroup_size(256)

@@ -29,11 +29,11 @@
 //! | package | purpose | may depend on |
 //! |---|---|---|
 //! | [`cli`] | command-line arguments and messages | all below |
-//! | [`blocks`], [`compress`], [`launch`], … | tools over many runs, or after one | `run` and below |
+//! | [`blocks`], [`compress`], [`launch`], … | tools that make several runs, or use finished ones | `run` and below |
 //! | [`run`] | a run: its options, the values chosen for them, and its execution | all below |
 //! | [`train`] | the loop, schedule, metrics, checkpoints | all below |
 //! | [`render`] | rasterisers, native and on a GPU | `core`, policies, shaders |
-//! | [`data`] | datasets and models as files | `core`, scene generator |
+//! | [`data`] | datasets and models as files | `core`, policies, scene generator |
 //! | [`core`] | cameras, Gaussians, memory ledger, atomic file writing | nothing of this workspace |
 //!
 //! Features, all on by default: `gpu` (the GPU backend), `selftest` (the float64 renderer and the command that

@@ -113,7 +113,7 @@ pub fn mean_over_views(sum: &[f32], views: &[f32]) -> Vec<f32> {
     sum.iter().zip(views).map(mean).collect()
 }
 
-/// Adds `weight` times the mean of the colour gradient over views.
+/// Adds to `gradient` the mean of the colour gradient over views, times `weight`.
 ///
 /// # Errors
 /// When the policy has not declared [`Signal::ColourGradient`].
@@ -155,7 +155,7 @@ pub fn split_by(factor: f32) -> Offspring {
 /// A long-axis split: two halves of the parent along its longest axis replace it.
 ///
 /// With d = `share`, the children are placed at ±3d standard deviations; their longest axis is 1 − d
-/// times the parent's, the others √(1 − d²) times. As 3d + 3(1 − d) = 3, the outer ends stay in place
+/// times the parent's, the others √(1 − d²) times. As 3d + 3(1 − d) = 3, the ends of the parent stay in place
 /// (*Improving Densification in 3D Gaussian Splatting*, 2025). Opacities are multiplied by `opacity`.
 pub fn split_long_axis(share: f32, opacity: f32) -> Offspring {
     Offspring {
@@ -254,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn halves_keep_the_ends_of_their_parent() {
+    fn long_axis_halves_keep_the_extent_of_their_parent() {
         let half = split_long_axis(0.45, 0.6);
         let (Placement::LongAxis { sigmas }, ScaleRule::LongAxis { long, other }) =
             (half.placement, half.scale)

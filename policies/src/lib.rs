@@ -31,11 +31,11 @@
 //! | `inject_noise_to_position` | [`Needs::noise`](policy::Needs::noise) |
 //! | `cap_max` | the budget of the run, the same for every policy |
 //!
-//! A *row* is one Gaussian's index in the parameter arrays.
+//! A *row* is one Gaussian in the parameter arrays.
 //!
 //! # Writing a policy
 //!
-//! A policy is one file with five parts; the example below has them all.
+//! A policy is one file with five parts; the example below has all but the last.
 //!
 //! 1. **A manual page**: the leading `//!` block, with a table of the parameters. `densify policies NAME`
 //!    prints it, and [`conformance::check_manual`] compares it with the code. The cell `range` holds
@@ -59,7 +59,7 @@
 //! - The plan keeps the budget. A call that would exceed it is refused and counted as denied; a refusal
 //!   is not an error. At the budget, prune first, then grow: a pruned row frees its slot within the
 //!   same plan.
-//! - Each row has at most one edit in a plan. Rows are named by their index before the edit.
+//! - Each row has at most one edit in a plan. Rows are identified by their index before the edit.
 //! - Signals may hold any value, such as zero views, or NaN from a broken Gaussian. The functions of
 //!   [`sample`] sort NaN last.
 //! - Runs are reproducible: draw random numbers only from the

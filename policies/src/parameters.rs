@@ -76,7 +76,7 @@ pub fn parse_value(text: &str) -> Value {
 const MIN_INTERVAL: i64 = 100;
 
 /// The name of a parameter that counts steps. Its default refers to a run of 30,000 steps and scales with the
-/// length of the run; a value that is set does not.
+/// length of the run; a value set by the user does not.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StepParameter {
     /// A step of the run, or a number of steps: scales in proportion.

@@ -92,7 +92,7 @@ impl Camera {
     }
 
     /// The world-space direction through an image point `[px]`. Its component along the camera's axis is 1, so
-    /// that a ray parameter along it is a depth.
+    /// that ray parameters are depths.
     pub fn direction(&self, pixel: DVec2) -> DVec3 {
         let m = &self.world_from_camera;
         let image = DVec2::new((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy);

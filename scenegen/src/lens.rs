@@ -53,7 +53,7 @@ impl Lens {
         r * (1.0 + s * (a + s * (b + s * (c + s * d))))
     }
 
-    /// The angle `[rad]` that is imaged at a distance; the maximum if there is none.
+    /// The angle `[rad]` that is imaged at distance `radius`; the largest angle if none is.
     fn angle(&self, radius: f64) -> f64 {
         let (mut low, mut high) = (0.0, MAX_ANGLE.to_radians());
         // 60 halvings reduce the interval below rounding.
@@ -64,7 +64,7 @@ impl Lens {
         0.5 * (low + high)
     }
 
-    /// The angle `[rad]` up to which each direction is imaged at a point of its own.
+    /// The angle `[rad]` up to which no two directions are imaged at the same point.
     pub(crate) fn invertible_angle(&self) -> f64 {
         let angle = |step: u32| MAX_ANGLE.to_radians() * f64::from(step) / f64::from(STEPS);
         let rises = |step: &u32| self.radius(angle(step + 1)) > self.radius(angle(*step));
@@ -119,9 +119,9 @@ impl FromStr for Lens {
 mod tests {
     use super::*;
 
-    /// By hand: 30 degrees to the side are imaged at θ(1 + kθ²) focal lengths by a fisheye.
+    /// By hand: a fisheye images a direction 30 degrees to the side at θ(1 + kθ²) focal lengths.
     #[test]
-    fn a_lens_images_by_its_formula() {
+    fn images_follow_the_formula_of_the_lens() {
         let ray = DVec2::new(30.0_f64.to_radians().tan(), 0.0);
         let angle = 30.0_f64.to_radians();
         for (text, expected) in [

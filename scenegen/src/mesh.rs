@@ -85,7 +85,7 @@ pub struct Material {
     pub alpha_texture: Option<TextureRef>,
     /// Green multiplies roughness (linear).
     pub roughness_texture: Option<TextureRef>,
-    /// Blue multiplies metalness (linear); in glTF it is the same texture.
+    /// Blue multiplies metalness (linear); in glTF it is the same texture as for roughness.
     pub metallic_texture: Option<TextureRef>,
     /// Tangent-space normals (linear).
     pub normal_texture: Option<TextureRef>,
@@ -99,7 +99,7 @@ pub struct Material {
     pub double_sided: bool,
     /// True for thin structures, which can be excluded from the initial points.
     pub thin: bool,
-    /// True if the emission is also a [`Light`], so that sampled light must not count it twice.
+    /// True if the emission is also a [`Light`], so that secondary rays must not count it again.
     pub is_light: bool,
 }
 

@@ -11,7 +11,7 @@ pub struct Nearest {
     pub distance: f64,
     /// The nearest point, world coordinates.
     pub point: DVec3,
-    /// Index of its triangle in the model.
+    /// Index of the triangle that contains the nearest point, in the model.
     pub triangle: u32,
 }
 

@@ -1,5 +1,5 @@
-//! Traces packets of rays. The rays of a pixel, or from its points to a light, are nearly parallel, so they
-//! share one traversal of the tree.
+//! Traces packets of rays. A pixel's camera rays are nearly parallel, and so are the shadow rays from its points
+//! to a light; each such packet shares one traversal of the tree.
 //!
 //! A node is entered if any of the rays could hit its box. This is tested with interval bounds of all rays
 //! (Boulos, Wald and Shirley, "Geometric and Arithmetic Culling Methods for Entire Ray Packets", 2006).
@@ -48,9 +48,9 @@ fn set_lanes(mut lanes: u32) -> impl Iterator<Item = usize> {
 struct PacketBounds {
     /// Axes along which all rays go backward.
     backward: BVec3A,
-    /// The origin that reaches the near plane of a box first.
+    /// For each axis, the origin that reaches the near plane of a box first.
     first: Vec3A,
-    /// The origin that reaches the far plane of a box last.
+    /// For each axis, the origin that reaches the far plane of a box last.
     last: Vec3A,
     /// Bounds of the reciprocal directions.
     inverse: (Vec3A, Vec3A),
@@ -94,11 +94,11 @@ impl PacketBounds {
     }
 }
 
-/// Rays side by side in the space that they share.
+/// Rays side by side, whose sheared spaces have the same axes.
 struct RayPacket<'a> {
     rays: &'a [LocalRay],
     sheared: [ShearedRay; LANES],
-    /// The coordinate axes that are x, y and z of the sheared space.
+    /// The coordinate axes that are x, y and z of the sheared spaces.
     axes: [usize; 3],
     /// Origins along these axes.
     origin: [[f32; LANES]; 3],
@@ -107,7 +107,7 @@ struct RayPacket<'a> {
 }
 
 impl<'a> RayPacket<'a> {
-    /// `None` for a single ray, or if the largest components of the rays differ.
+    /// `None` for a single ray, or if the largest components of the directions differ in axis or sign.
     fn new(rays: &'a [LocalRay]) -> Option<Self> {
         if !(2..=LANES).contains(&rays.len()) {
             return None;
@@ -156,7 +156,7 @@ impl<'a> RayPacket<'a> {
             let w = b[0][lane] * a[1][lane] - b[1][lane] * a[0][lane];
             let below = (u < 0.0) | (v < 0.0) | (w < 0.0);
             let above = (u > 0.0) | (v > 0.0) | (w > 0.0);
-            // Zeros are evaluated again in f64.
+            // If one is zero, `intersect` evaluates them again in f64.
             let exact = (u == 0.0) | (v == 0.0) | (w == 0.0);
             may |= if (below & above) & !exact { 0 } else { BITS[lane] };
         }
@@ -278,8 +278,8 @@ impl Surface {
         best
     }
 
-    /// The rays of at most [`LANES`] that have an [`Surface::occluder`], as bits. The triangle `hint` is tested
-    /// first, and is set to the last occluder found.
+    /// Which of at most [`LANES`] rays have an occluder (see [`Surface::occluder`]), as bits. The triangle `hint` is
+    /// tested first, and is set to the last occluder found.
     pub(crate) fn occluded_each(
         &self,
         rays: &[LocalRay],

@@ -22,7 +22,7 @@ struct Part {
     colour: Vec3,
 }
 
-/// Selects the views with passers-by: the rounded share of all `views`, drawn by the seed.
+/// Selects the views with passers-by: a share of all `views`, rounded to a whole number, at random by the seed.
 pub(crate) fn select_views(seed: u64, views: usize, share: f64) -> Vec<bool> {
     let mut order: Vec<usize> = (0..views).collect();
     order.sort_by_key(|&view| (Draws::new(seed, &[STREAM, view as u64, 1]).bits(), view));
@@ -102,7 +102,7 @@ fn figure(camera: &Camera, depth: f64, draws: &mut Draws) -> [Part; 4] {
     ]
 }
 
-/// Sum of the radiance, and share of the rays, of a pixel that hit a figure nearer than `scene_depth`.
+/// The figures in a pixel that are nearer than `scene_depth`: their radiance times their coverage, and the coverage.
 fn trace(parts: &[Part], camera: &Camera, corner: DVec2, scene_depth: f64) -> (Vec3, f32) {
     let axes = camera.world_from_camera.transpose();
     let (mut sum, mut hits) = (Vec3::ZERO, 0);
@@ -145,7 +145,7 @@ mod tests {
     fn the_share_and_the_seed_select_the_views() {
         for (share, expected) in [(0.0, 0), (0.3, 6), (1.0, 20)] {
             let selected = select_views(1, 20, share);
-            assert_eq!(selected.iter().filter(|&&is| is).count(), expected, "{share}");
+            assert_eq!(selected.iter().filter(|&&chosen| chosen).count(), expected, "{share}");
         }
         assert_ne!(select_views(1, 20, 0.3), select_views(2, 20, 0.3));
     }

@@ -161,7 +161,7 @@ pub(crate) fn noise(at: DVec2, cells: u32, octaves: u32, seed: u64) -> f64 {
     sum / total
 }
 
-/// A colour between two by noise: a surface with detail at all scales.
+/// A colour between `from` and `to`, chosen by noise: a surface with detail at all scales.
 pub(crate) fn marbled(at: DVec2, cells: u32, seed: u64, from: [f32; 3], to: [f32; 3]) -> Vec3 {
     let share = ((noise(at, cells, 4, seed) - 0.5) * 2.2 + 0.5).clamp(0.0, 1.0);
     Vec3::from(from).lerp(Vec3::from(to), share as f32)
@@ -191,7 +191,7 @@ pub(crate) fn icosphere(level: u32) -> (Vec<DVec3>, Vec<[u32; 3]>) {
             corners.push(DVec3::from(corner).normalize());
         }
     }
-    // Triangles are the triples of corners whose sides are edges, which have the shortest distance.
+    // Triangles are the triples of corners that are pairwise an edge apart, the shortest distance of corners.
     let edge = 2.0 / (1.0 + g * g).sqrt() + 1e-9;
     let near = |i: usize, j: usize| corners[i].distance(corners[j]) < edge;
     let mut triangles = Vec::new();

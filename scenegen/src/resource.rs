@@ -31,7 +31,7 @@ pub(crate) const MAX_DECODED: u64 = 1 << 30;
 pub(crate) const EXPANSION: u64 = 1100;
 /// Maximum number of texels of all textures of a model.
 const MAX_TEXELS: u64 = 1 << 29;
-/// Longest reference `[bytes]`.
+/// Longest reference to a file `[bytes]`.
 const MAX_NAME: usize = 4096;
 
 /// Opens a file for reading. Pipes, sockets and devices are refused at once instead of waiting for them.
@@ -131,7 +131,7 @@ impl Folder {
         self.read(element, &self.resolve(element, &decoded)?)
     }
 
-    /// Reads a resolved file of an element.
+    /// Reads the file at the resolved `path`, to which `element` refers.
     pub(crate) fn read(&self, element: &str, path: &Path) -> Result<Vec<u8>, Error> {
         if path.exists() {
             return read(path);
@@ -192,7 +192,7 @@ pub fn data_uri(uri: &str) -> Option<Vec<u8>> {
     head.ends_with(";base64").then(|| GeneralPurpose::new(&alphabet, PADDING).decode(body).ok())?
 }
 
-/// The text behind a byte-order mark, or the whole text if it has none.
+/// The text after a byte-order mark, or the whole text if it has none.
 ///
 /// # Errors
 /// When the mark is not that of UTF-8.

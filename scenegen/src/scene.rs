@@ -1,6 +1,6 @@
 //! Prepares a scene from a source and options, so that its views can be rendered.
 //!
-//! Over 400 lines, as geometry, cameras, light and exposure each depend on those before.
+//! The file exceeds 400 lines because geometry, cameras, light and exposure each depend on the ones before.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -224,18 +224,18 @@ impl Scene {
             Lighting::new(&model.lights, &surface, sky, (ambient, options.shadows, grid))
         };
         let mut exposure = options.exposure.unwrap_or(1.0);
-        // The unit of the file's lights or sky is unknown.
+        // Lights and skies from files have an unknown unit.
         if has_own_lights || options.sky.is_some() {
-            let is_fill = options.sky.is_none();
+            let sky_is_fill = options.sky.is_none();
             if options.exposure.is_none() {
-                let only = light(if is_fill { Sky::uniform(0.0) } else { sky.clone() }, 1);
+                let unfilled = light(if sky_is_fill { Sky::uniform(0.0) } else { sky.clone() }, 1);
                 let (surface, model, flags) = (&surface, &model, &flags);
                 let tracer =
-                    Tracer { surface, model, flags, lighting: &only, exposure: 1.0, seed: 0 };
+                    Tracer { surface, model, flags, lighting: &unfilled, exposure: 1.0, seed: 0 };
                 exposure = exposure_for(&tracer, &train);
             }
-            // Fill light in the unit of the file's lights.
-            if is_fill {
+            // The built-in sky becomes fill light, in the unit of the file's lights.
+            if sky_is_fill {
                 sky = sky.dimmed(0.4 / exposure);
             }
         }
@@ -271,7 +271,7 @@ impl Scene {
     fn check_visible(&self) -> Result<(), Error> {
         let tracer = self.tracer();
         let cameras = || self.views.iter().map(|view| &view.camera);
-        // One ray for each pixel finds most surfaces soon; what is slender or faint may need all of them.
+        // One ray per pixel finds most surfaces quickly; slender or faint ones may need all rays of a pixel.
         let is_visible = cameras().any(|camera| tracer.meets_surface(camera))
             || cameras().any(|camera| {
                 tracer.render(camera, 0, None).rgba.chunks_exact(4).any(|pixel| pixel[3] > 0)

@@ -1,7 +1,7 @@
 //! Shading of surfaces by Lambert's law and glTF's metallic-roughness model (glTF 2.0 specification, appendix
 //! B), lit by the scene's lights and the sky.
 //!
-//! Over 400 lines, as lights, materials and reflection all work on the point being shaded.
+//! The file exceeds 400 lines because lights, materials and reflection all work on the point being shaded.
 
 use std::f32::consts::PI;
 use std::sync::OnceLock;
@@ -112,8 +112,8 @@ impl Lighting {
         Self { lights: lights.collect(), sky, ambient, shadows, grid: grid.max(1) }
     }
 
-    /// Radiance of at most [`LANES`] points of a pixel towards their viewers. They share a packet of shadow rays
-    /// to each light.
+    /// Radiance of at most [`LANES`] points of a pixel towards the viewer. For each light, the points share one
+    /// packet of shadow rays.
     pub(crate) fn radiance(
         &self,
         shaded: &ShadedSurface<'_>,
@@ -291,8 +291,8 @@ impl Lighting {
 }
 
 impl<'a> Point<'a> {
-    /// Evaluates the material at a hit, and its alpha, which is 0 where it is masked out. `width` is the width of
-    /// the ray's cone there, in local units.
+    /// The hit point with its material evaluated, and its alpha, which is 0 where the material is masked out.
+    /// `width` is the width of the ray's cone at the point, in local units.
     pub(crate) fn read(
         shaded: &ShadedSurface<'a>,
         ray: &LocalRay,
@@ -457,7 +457,7 @@ impl TrianglePoint<'_> {
         material.base * self.texel(material.base_texture.as_ref()) * tint
     }
 
-    /// The surface's alpha, from that of the base colour.
+    /// The surface's alpha; `base` is the alpha of the base colour.
     fn alpha(&self, material: &Material, base: f32) -> f32 {
         if material.alpha == AlphaMode::Opaque {
             return 1.0;
@@ -651,7 +651,7 @@ fn integrated_albedo(cos: f32, alpha: f32) -> (f32, f32) {
     (scale / count, bias / count)
 }
 
-/// Height-correlated Smith shadowing and masking, over 4 cos cos (Heitz, JCGT 2014).
+/// Height-correlated Smith shadowing and masking, divided by 4 · `cos_view` · `cos_light` (Heitz, JCGT 2014).
 fn visibility(cos_view: f32, cos_light: f32, alpha: f32) -> f32 {
     let a2 = alpha * alpha;
     let v = cos_light * (cos_view * cos_view * (1.0 - a2) + a2).sqrt();

@@ -55,7 +55,7 @@ impl Sky {
     pub(crate) fn radiance(&self, direction: Vec3) -> Vec3 {
         match self {
             Self::Gradient { zenith, ground, up } => {
-                let (mean, half) = parts(zenith, ground);
+                let (mean, half) = mean_and_half_difference(zenith, ground);
                 mean + half * direction.dot(Vec3::from(*up))
             }
             Self::Image(image) => image.radiance(direction),
@@ -67,7 +67,7 @@ impl Sky {
     pub(crate) fn irradiance(&self, normal: Vec3) -> Vec3 {
         match self {
             Self::Gradient { zenith, ground, up } => {
-                let (mean, half) = parts(zenith, ground);
+                let (mean, half) = mean_and_half_difference(zenith, ground);
                 PI * (mean + (2.0 / 3.0) * half * normal.dot(Vec3::from(*up)))
             }
             Self::Image(image) => PI * image.blurred(normal, 1.0),
@@ -78,7 +78,7 @@ impl Sky {
     pub(crate) fn blurred(&self, direction: Vec3, roughness: f32) -> Vec3 {
         match self {
             Self::Gradient { zenith, ground, up } => {
-                let (mean, half) = parts(zenith, ground);
+                let (mean, half) = mean_and_half_difference(zenith, ground);
                 let sharpness = 1.0 - roughness * roughness / 3.0;
                 mean + half * (sharpness * direction.dot(Vec3::from(*up)))
             }
@@ -88,7 +88,7 @@ impl Sky {
 }
 
 /// Mean of zenith and ground, and half their difference.
-fn parts(zenith: &[f32; 3], ground: &[f32; 3]) -> (Vec3, Vec3) {
+fn mean_and_half_difference(zenith: &[f32; 3], ground: &[f32; 3]) -> (Vec3, Vec3) {
     let (zenith, ground) = (Vec3::from(*zenith), Vec3::from(*ground));
     (0.5 * (zenith + ground), 0.5 * (zenith - ground))
 }

@@ -1,7 +1,7 @@
 //! Textures: colour spaces, wrap modes, filters and texture transforms.
 //!
 //! Texels are filtered in linear light. Minification uses mipmaps, so that a fine texture has the same colour
-//! from every distance; a trainer would learn the noise of a shimmering ground truth.
+//! from every distance; otherwise a trainer would learn the noise of a shimmering ground truth.
 
 use std::sync::OnceLock;
 
@@ -206,7 +206,7 @@ fn neighbours(u: f32, size: u32, wrap: Wrap) -> (u32, u32, f32) {
     let x = u * size as f32 - 0.5;
     let first = if x < 0.0 { -1 } else { x as i64 };
     let last = i64::from(size) - 1;
-    // At most one of the two is beyond an edge, by one texel. Mirrored, it is the texel at the edge.
+    // At most one of the two is beyond an edge, by one texel; its mirror image is the texel at the edge.
     let at = |i: i64, repeated: i64| match wrap {
         _ if (0..=last).contains(&i) => i as u32,
         Wrap::Repeat => repeated as u32,

@@ -1,8 +1,8 @@
-//! Builds the tree over a mesh's triangles in parts, as the library's builder needs three times the memory of
-//! its result.
+//! Builds the tree over a mesh's triangles in parts, as the builder of the library (obvhs) needs three times the
+//! memory of its result.
 //!
-//! Triangles are repeatedly halved at the median along the widest axis. The parts are attached to the nodes of
-//! these splits, and the library's optimiser then improves the whole tree.
+//! The triangles are repeatedly split in halves at the median along the widest axis. The trees of the parts are
+//! attached to the nodes of these splits, and the library's optimiser then improves the whole tree.
 
 use obvhs::aabb::Aabb;
 use obvhs::bvh2::Bvh2;
@@ -16,8 +16,8 @@ const PART: usize = 1 << 16;
 /// Share of the nodes, those with the largest boxes, that the last optimisation tries to move.
 const IMPROVED: f32 = 0.1;
 
-/// Builds the tree over `count` triangles with boxes `box_of`. Leaves hold up to eight triangles, and
-/// `primitive_indices` their indices.
+/// Builds the tree over `count` triangles with boxes `box_of`. Leaves hold up to eight triangles;
+/// `primitive_indices` lists the triangles in the order of the leaves.
 pub(crate) fn build(count: usize, box_of: impl Fn(u32) -> Aabb) -> Bvh2 {
     build_in_parts(count, PART, &box_of)
 }
@@ -69,7 +69,7 @@ fn build_below(
 
 /// Adds the tree of a part to the whole tree, with its root at `place`.
 fn graft(tree: &mut Bvh2, place: usize, part: &Bvh2, ids: &[u32]) {
-    // The root's node exists already, so node i of the part moves to i + nodes.
+    // The part's root takes the existing node `place`; its other nodes i move to i + nodes.
     let (nodes, primitives) = (tree.nodes.len() - 1, tree.primitive_indices.len());
     let mut moved = part.nodes.iter().map(|node| {
         let shift = if node.is_leaf() { primitives } else { nodes };
@@ -102,8 +102,8 @@ fn build_part(ids: &[u32], box_of: &impl Fn(u32) -> Aabb) -> Bvh2 {
     part
 }
 
-/// Runs the optimiser's own schedule on nodes in any order, as the optimiser itself looks for the largest boxes
-/// among the first nodes only.
+/// Runs the optimiser's schedule on the nodes with the largest boxes, wherever they are stored; the optimiser's
+/// own function looks for them among the first nodes only.
 fn improve(tree: &mut Bvh2) {
     let mut optimiser = ReinsertionOptimizer::default();
     let mut largest: Vec<(f32, u32)> = Vec::new();
@@ -125,7 +125,7 @@ fn improve(tree: &mut Bvh2) {
     }
 }
 
-/// Number of levels of the tree. The library's own bound is that of the tree before optimisation, and its stacks
+/// Number of levels of the tree. The library's own bound holds only before optimisation, and its traversal stacks
 /// panic when full.
 pub(crate) fn depth(bvh: &Bvh2) -> usize {
     let mut deepest = 1;

@@ -1,11 +1,11 @@
 //! Tests with the meshes of the shared data: valid files render, files that need unsupported extensions are
 //! refused by name, and each malformed file has the outcome listed in `malformed.tsv`.
 //!
-//! Most files with a validator's report have no scene, so each is read twice: unchanged, and with a
-//! scene of all its meshes (or, without any, of its accessors or buffer views as positions and
-//! indices) and a buffer of zeros. Some files that the validator rejects load nevertheless: their
-//! errors are in metadata that is not read, in alignments that this reader does not need, or in morph
-//! targets without weight. Files that it accepts load, or have no triangle to render.
+//! Most files with a validator's report have no scene, so each is read twice: unchanged, and with a buffer of
+//! zeros and a scene of all its meshes (if it has none, of meshes made from its accessors or buffer views). Some
+//! files that the validator rejects load nevertheless: their errors are in metadata that is not read, in
+//! alignments that this reader does not need, or in morph targets without weight. Files that the validator
+//! accepts load, or have no triangle to render.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -83,10 +83,10 @@ fn shared_meshes_that_need_other_software_are_refused_by_name() {
     }
 }
 
-/// The pictures of the files in a folder of the shared cases; those of one list show the same.
+/// All files of one list must give the same images.
 #[test]
 #[ignore = "needs the shared cases: set DENSIFY_SHARED"]
-fn shared_cases_show_what_their_files_mean() {
+fn shared_cases_of_equal_meaning_give_the_same_images() {
     let root = shared("..").join("../cases");
     let views = |file: &str| {
         let scene = prepare(&root.join(file)).unwrap_or_else(|e| panic!("{file}: {e}"));
@@ -114,8 +114,8 @@ fn shared_cases_show_what_their_files_mean() {
 const LOADS: &str = "it loads";
 const EMPTY: &str = "no triangle to render";
 
-/// The files with an unusual outcome, read unchanged and with a scene. Otherwise files of the validator, which have no
-/// scene, are empty when read unchanged, and all files load.
+/// The files with an unusual outcome, for each of the two readings. All others load, except that the validator's
+/// files, which have no scene, are empty when read unchanged.
 const OUTCOMES: &str = include_str!("malformed.tsv");
 
 /// The rows of [`OUTCOMES`] for files that are read in this way: file and outcome.
@@ -169,8 +169,8 @@ fn with_a_scene(path: &Path) -> Option<Vec<u8>> {
     Some(bytes)
 }
 
-/// Adds a complaint if the outcome is not that of the file's row, or `others` if it has none. Each row is used
-/// once.
+/// Adds a complaint if the outcome is not that of the file's row, or `others` if the file has no row. Each row is
+/// used once.
 fn check_outcome(
     rows: &mut Vec<(&str, &str)>,
     others: &str,

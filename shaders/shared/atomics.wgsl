@@ -2,7 +2,7 @@
 // its pixels, then adds the result to the sums of the splat's row, one invocation per field.
 // slots.wgsl replaces this file if terms must be added in a fixed order.
 
-// Adds the subgroup's contribution to the sums of loaded splat i's row; `maximum`: the field that is
+// Adds the subgroup's contribution to the sums of loaded splat i's row; `maximum`: the field that holds
 // the largest of its values, all >= 0, instead of their sum; NONE if there is no such field.
 fn add_to_row(m: Member, i: u32, found: array<f32, FIELDS>, stride: u32, maximum: u32) {
     var sums = found;

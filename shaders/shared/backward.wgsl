@@ -2,7 +2,7 @@
 // src/render/cpu/rasterize_bwd.rs derives the sums.
 
 @group(0) @binding(6) var<storage, read> finish: array<vec2<u32>>;
-// Planes of dL/dpixel: red, green, blue, and, if MORE is set, alpha and depth. If it is not set, a plane of
+// Planes of dL/dpixel: red, green, blue, and, if MORE is set, alpha and depth. If MORE is not set, a plane of
 // the pixels' errors follows, provided that records have a sum of errors.
 @group(0) @binding(7) var<storage, read> pixel_gradient: array<f32>;
 
@@ -21,7 +21,7 @@ struct Upstream {
 
 // The state of the pixels behind the current splat: the transmittance there, the product of dL/dpixel with the colour
 // seen there, and the index in the list at which the pixels stopped.
-struct Behind {
+struct BackwardPixels {
     light: vec4<f32>,
     seen: vec4<f32>,
     stop: vec4<u32>,
@@ -49,11 +49,11 @@ fn upstream(quad: Quad) -> Upstream {
     return g;
 }
 
-// The state behind all splats of a list.
-fn behind_all(quad: Quad, own: Upstream, length: u32) -> Behind {
+// The state of the pixels behind all splats of a list.
+fn behind_all(quad: Quad, own: Upstream, length: u32) -> BackwardPixels {
     let b = frame.background;
     let seen = own.red * b.x + own.green * b.y + own.blue * b.z;
-    var pixels = Behind(vec4(1.0), seen, vec4(0u));
+    var pixels = BackwardPixels(vec4(1.0), seen, vec4(0u));
     for (var p = 0u; p < 4u; p++) {
         if quad.inside[p] {
             let finished = finish[quad.place[p]];
@@ -70,19 +70,19 @@ fn maximum() -> u32 {
 }
 
 // The number of splats, from the front, that are needed until all pixels have stopped.
-fn last_of(pixels: Behind) -> u32 {
+fn splats_needed(pixels: BackwardPixels) -> u32 {
     return max(max(pixels.stop.x, pixels.stop.y), max(pixels.stop.z, pixels.stop.w));
 }
 
-// Sums of splat n of the list over the pixels, from which its gradients follow, with q = α·dL/dα and
-// w = α·T; updates the state for the next splat in front. Returns false if the splat is blended into
+// Computes the sums over the pixels from which the gradients of splat n of the list follow, with q = α·dL/dα
+// and w = α·T; updates the state for the next splat in front. Returns false if the splat is blended into
 // none of the pixels.
 fn backpropagate(
     splat: Splat,
     n: u32,
     quad: Quad,
     own: Upstream,
-    pixels: ptr<function, Behind>,
+    pixels: ptr<function, BackwardPixels>,
     sums: ptr<function, array<f32, FIELDS>>,
 ) -> bool {
     let at = falloff(splat, quad);

@@ -20,7 +20,7 @@ fn wait_for_all() {
     workgroupBarrier();
 }
 
-// True if an invocation must continue with the loaded splats; `wants`: true if its own pixels need them.
+// True if an invocation must process more of the loaded splats; `wants`: true if its own pixels need them.
 fn is_needed(wants: bool) -> bool {
     return wants;
 }
@@ -39,7 +39,7 @@ fn largest_of_all(m: Member, x: u32) -> u32 {
     return workgroupUniformLoad(&largest_known);
 }
 
-// Loads a row's splat to index `place`; `corner`: that of the tile [px].
+// Loads a row's splat to index `place`; `corner`: the tile's corner [px].
 fn load_splat(place: u32, row: u32, corner: vec2<u32>) {
     let splat = splat_of(row, corner);
     batch[3u * place] = splat.a;

@@ -1,9 +1,9 @@
 // A splat's sums over the pixels of an auxiliary view, for observe.wgsl and observe_atomic.wgsl.
 
-// Values per splat: sum of the pixel map, number of pixels, sum of blend weights, sum of distances from the mean [px],
-// largest weight.
+// Values (columns) per splat: sum of the pixel map, number of pixels, sum of blend weights, sum of distances from the
+// mean [px], largest weight.
 const COLUMNS: u32 = 5u;
-// The field that is a maximum; the others are sums.
+// The value that is a maximum; the others are sums.
 const MAXIMUM: u32 = 4u;
 
 // The pixel map at an invocation's pixels; 0 outside the image.
@@ -22,7 +22,7 @@ fn splat_sums(
     splat: Splat,
     quad: Quad,
     map_here: vec4<f32>,
-    pixels: ptr<function, Open>,
+    pixels: ptr<function, ForwardPixels>,
 ) -> array<f32, COLUMNS> {
     let w = blend(falloff(splat, quad).exponent, pixels);
     let x = quad.x - splat.a.x;

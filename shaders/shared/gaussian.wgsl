@@ -8,7 +8,7 @@
 @group(0) @binding(5) var<storage, read> sh3: array<f32>;
 
 const BLUR: f32 = 0.3;
-// √(½·log₂ e): splats have conic factors scaled by it, so that exp becomes exp2.
+// √(½·log₂ e): the conic factors of splats are scaled by this, so that exp becomes exp2.
 const EXPONENT_SCALE: f32 = 0.8493218;
 const COLOUR_MAX: f32 = 1e6;
 

@@ -1,5 +1,5 @@
-// Shared by the kernels that work tile by tile (rasterize, rasterize_bwd, observe and the atomic ones):
-// their inputs, the pixels of an invocation, and a splat's blending there.
+// Shared by the kernels that work tile by tile (rasterize, rasterize_bwd, observe and their atomic variants): their
+// inputs, the pixels of an invocation, and the blending of a splat into these.
 //
 // One tile per group of 64 invocations. Each invocation has a square of four pixels, the components of a vec4: a
 // splat is read once for all four, and their contributions to its sums are added in registers.
@@ -11,7 +11,7 @@
 @group(0) @binding(4) var<storage, read> tile_starts: array<u32>;
 @group(0) @binding(5) var<storage, read> splats: array<vec4<f32>>;
 
-// Invocations of a tile.
+// Number of invocations of a tile.
 const MEMBERS: u32 = 64u;
 
 // Length of the longest record.
@@ -27,9 +27,9 @@ struct Splat {
 
 // The pixels of an invocation.
 struct Quad {
-    // Corner of the tile in the image [px].
+    // First pixel of the tile in the image [px].
     corner: vec2<u32>,
-    // Centres, relative to that corner [px].
+    // Centres, relative to the tile's corner [px].
     x: vec4<f32>,
     y: vec4<f32>,
     // Indices in the image, for pixels inside the image.
@@ -68,14 +68,14 @@ fn quad_of(tile: u32, lane: u32) -> Quad {
     );
 }
 
-// The splat of a row; `corner`: that of the tile [px].
+// The splat of a row; `corner`: the tile's corner [px].
 fn splat_of(row: u32, corner: vec2<u32>) -> Splat {
     let a = splats[3u * row];
     let within = vec4(a.xy - vec2<f32>(corner), a.zw);
     return Splat(within, splats[3u * row + 1u], splats[3u * row + 2u]);
 }
 
-// A splat at the pixels: their whitened coordinates relative to its mean, and log2 of its alpha there.
+// A splat at the pixels: the pixels' whitened coordinates relative to the splat's mean, and log2 of its alpha there.
 struct Falloff {
     u: vec4<f32>,
     z: vec4<f32>,
@@ -90,13 +90,13 @@ fn falloff(splat: Splat, quad: Quad) -> Falloff {
 }
 
 // The state of pixels from front to back: the transmittance, and whether they have not stopped yet.
-struct Open {
+struct ForwardPixels {
     light: vec4<f32>,
     unfinished: vec4<bool>,
 }
 
 // Blends a splat into the pixels and returns its weights; pixels that stop before it get 0.
-fn blend(exponent: vec4<f32>, pixels: ptr<function, Open>) -> vec4<f32> {
+fn blend(exponent: vec4<f32>, pixels: ptr<function, ForwardPixels>) -> vec4<f32> {
     let reached = (*pixels).unfinished & (exponent >= vec4(-LOG2_REACH));
     if !any(reached) {
         return vec4(0.0);

@@ -7,14 +7,14 @@
 const SPLATS: u32 = 4u;
 const BATCH: u32 = 8u;
 
-// Half of the invocations. Compilers unroll a loop of this many rounds, as is necessary: rounds are
-// limited (see expect_end), and a tile of 3,000 splats would exceed the limit.
+// Half of the invocations. Compilers unroll a loop of this many rounds. They must, because the number of
+// rounds is limited (see expect_end), and a tile of 3,000 splats would exceed the limit.
 const ROUND: u32 = 32u;
-// Distance from one sum's parts to the next one's: one more than there are parts, so that invocations
-// that add different sums read different banks.
+// Distance from the parts of one sum to those of the next: one more than there are parts, so that
+// invocations that add different sums read different memory banks.
 const PITCH: u32 = 65u;
 
-// Part n·PITCH + lane: the invocation's part of sum n.
+// Element n·PITCH + lane: the part of sum n from invocation `lane`.
 var<workgroup> parts: array<f32, 3900>;
 // Slots of the loaded splats.
 var<workgroup> slots: array<u32, BATCH>;
@@ -45,7 +45,7 @@ fn reduced(given: f32, first: u32, is_maximum: bool) -> f32 {
     return sum;
 }
 
-// Sum n of all parts, or their maximum.
+// The sum of all parts of sum n, or the largest of them.
 fn summed(n: u32, is_maximum: bool) -> f32 {
     let half = reduced(0.0, n * PITCH, is_maximum);
     return reduced(half, n * PITCH + ROUND, is_maximum);

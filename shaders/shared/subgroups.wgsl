@@ -23,7 +23,7 @@ fn block_of(quad: Quad) -> Block {
 }
 
 // True if a splat may reach a pixel of the block, judged by its ellipse's bounding box. The box is
-// widened, so that rounding loses no splat, and a box with NaN counts as reaching.
+// widened, so that rounding loses no splat, and a box with NaN counts as reaching the block.
 fn may_reach(splat: Splat, block: Block) -> bool {
     let radius = sqrt(max(splat.b.y + LOG2_REACH, 0.0));
     let down = radius / splat.b.x;
@@ -45,7 +45,7 @@ fn member(lane: u32) -> Member {
 fn wait_for_all() {
 }
 
-// True if an invocation must continue with the loaded splats: others may need the one that it has loaded.
+// True if an invocation must process more of the loaded splats: others may need the one that it has loaded.
 fn is_needed(wants: bool) -> bool {
     return subgroupAny(wants);
 }
@@ -55,7 +55,7 @@ fn largest_of_all(m: Member, x: u32) -> u32 {
     return subgroupMax(x);
 }
 
-// Loads a row's splat to index `place`, which is this invocation's; `corner`: that of the tile [px].
+// Loads a row's splat to index `place`, which is this invocation's; `corner`: the tile's corner [px].
 fn load_splat(place: u32, row: u32, corner: vec2<u32>) {
     own_row = row;
     own_splat = splat_of(row, corner);

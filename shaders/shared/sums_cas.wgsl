@@ -1,4 +1,4 @@
-// The sums of rows, on devices with atomics for integers only: additions compare and exchange the bits
+// The sums of each row, on devices with atomics for integers only: additions compare and exchange the bits
 // of f32. The order of additions varies, and with it the last bits of a sum.
 
 @group(0) @binding(8) var<storage, read_write> row_sums: array<atomic<u32>>;
@@ -19,7 +19,7 @@ fn add(at: u32, x: f32) {
     }
 }
 
-// Replaces a sum by the larger of itself and x >= 0; the bits of such numbers sort like the numbers.
+// Replaces a value by the larger of itself and x, both >= 0; the bits of such numbers sort like the numbers.
 fn raise(at: u32, x: f32) {
     atomicMax(&row_sums[at], bitcast<u32>(x));
 }

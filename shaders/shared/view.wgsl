@@ -10,7 +10,7 @@ struct Frame {
     lens: vec4<f32>,
     // Smallest and largest x/z, y/z in J: (x, y, x, y).
     ratio: vec4<f32>,
-    // w: depth from which gradient signals have full weight.
+    // The background's colour; w: depth from which gradient signals have full weight.
     background: vec4<f32>,
     // Width, height [px], number of tile columns, number of tiles.
     image: vec4<u32>,
@@ -20,7 +20,7 @@ struct Frame {
     rates: vec4<f32>,
     // Step sizes of band 0 and of bands 1-3; derivative of the opacity and of the scale term per row.
     more_rates: vec4<f32>,
-    // The noise term: strength times step size, sharpness, opacity.
+    // The noise term: strength times step size, sharpness, opacity at which the noise is halved.
     noise: vec4<f32>,
     // The combination of errors into a score: exponent of a pixel's error, weight of edges, exponents of
     // the sum of weights and of a view's score.
@@ -30,7 +30,7 @@ struct Frame {
     // Number of frozen rows: they come first, never change, and have no entries in the arrays used only
     // for training; unused ×3.
     frozen: vec4<u32>,
-    // Plane of each signal's accumulators; NONE if it is not requested.
+    // Plane that accumulates each signal in this step; NONE if the signal is not requested.
     planes: array<vec4<u32>, 8>,
 }
 

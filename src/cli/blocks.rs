@@ -72,8 +72,8 @@ struct PlanArgs {
     /// Width of the margin around its cell that a block also trains, as a share of the usual width of a cell
     #[arg(long, value_name = "FRACTION", default_value = "0.1")]
     margin: Fraction,
-    /// Options of `densify train` for every run, after `--`; --iterations is for one run over the whole scene, and each
-    /// block trains a share of them in proportion to its share of the views
+    /// Options of `densify train` for every run, after `--`; --iterations is the length of one run over the whole
+    /// scene, of which each block trains a part in proportion to its share of the views
     #[arg(last = true, value_name = "TRAIN OPTIONS")]
     train: Vec<String>,
 }
@@ -120,7 +120,7 @@ struct StatusArgs {
     folder: PathBuf,
 }
 
-/// Merges the blocks into one model, with the Gaussians of each block that lie in its cell.
+/// Merges the blocks into one model, which takes from each block the Gaussians in the block's cell.
 #[derive(Debug, Args)]
 struct MergeArgs {
     /// Folder of the plan
@@ -170,7 +170,7 @@ fn run_plan(args: &PlanArgs, console: &Console) -> Result<(), Failure> {
     Ok(())
 }
 
-/// One row per task: its size, its share of the work, and its memory.
+/// One line per task: its size, its share of the work, and its memory.
 fn format_table(blocks: &BlockPlan) -> String {
     let mut text = String::new();
     let mut row = |cells: [String; 7]| {
@@ -254,7 +254,7 @@ fn run_merge(args: &MergeArgs, console: &Console) -> Result<(), Failure> {
     let blocks = BlockPlan::read(&args.folder)?;
     let merged = merge(&args.folder, &blocks, &args.output, format, args.partial, console)?;
     if !merged.missing.is_empty() {
-        console.say(format_args!("note: left out as not complete: {}", merged.missing.join(", ")));
+        console.say(format_args!("note: incomplete, left out: {}", merged.missing.join(", ")));
     }
     console.result(format_args!(
         "{} ({}): {} Gaussians, {}",

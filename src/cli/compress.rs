@@ -19,14 +19,14 @@ use densify_run::{RunConfig, Whole};
 /// Reduces a trained model to a number of Gaussians, or to a file size.
 ///
 /// Prunes the Gaussians that contribute least to the training views, at most half of them at once, and trains the rest
-/// in between. For a file it tries the model's SH degree and lower ones, and coarser colour where the format has it:
-/// these leave room for more Gaussians. It keeps the attempt whose file reproduces the training views best. Held-out
-/// views are measured, too, but do not affect the choice. The table that it prints shows quality against size: of the
-/// whole model, of the file after each intermediate pruning, and of the attempts at the final size.
+/// in between. For a file size it tries the model's SH degree and lower ones, and coarser colour where the format has
+/// it: these leave room for more Gaussians. It keeps the attempt whose file reproduces the training views best.
+/// Held-out views are measured, too, but do not affect the choice. The printed table shows quality against size: of
+/// the whole model, of the file after each intermediate pruning, and of the attempts at the final size.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct CompressArgs {
-    /// Folder that `densify train` wrote, or a file (of SOG also a folder) of Gaussian splats
+    /// Folder that `densify train` wrote, or a file of Gaussian splats (for SOG, also a folder)
     #[arg(value_name = "RUN_OR_MODEL")]
     model: PathBuf,
     /// Maximum size of the file, such as 5MiB or 800kB, or a number of Gaussians, such as 20k
@@ -35,7 +35,7 @@ pub(super) struct CompressArgs {
     /// File to write; its extension selects the format, as for `densify export`
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
-    /// Format of the file, or any: the one that holds the most Gaussians; its extension is then added to FILE
+    /// Format of the file, or any for the one that holds the most Gaussians, whose extension is then added to FILE
     /// `[default: the one with FILE's extension]`
     #[arg(long, value_name = "NAME")]
     format: Option<String>,
@@ -165,7 +165,7 @@ fn format_table(compressed: &Compressed) -> String {
         let name = if place == *best { "written" } else { "tried" };
         (name, attempt)
     });
-    for (name, attempt) in stages.iter().map(|attempt| ("on the way", attempt)).chain(others) {
+    for (name, attempt) in stages.iter().map(|attempt| ("in between", attempt)).chain(others) {
         let share = percent(attempt.bytes as f64 / whole.bytes as f64);
         line(name, attempt, &format!("  {share} of the PLY"));
     }
@@ -177,7 +177,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn target_is_bytes_with_a_unit_and_gaussians_without() {
+    fn targets_with_a_unit_are_bytes_and_other_targets_are_gaussians() {
         assert_eq!(parse_target("5MiB"), Ok(Target::Bytes(5 << 20)));
         assert_eq!(parse_target("800kB"), Ok(Target::Bytes(800_000)));
         assert_eq!(parse_target("20k"), Ok(Target::Rows(20_000)));

@@ -31,7 +31,7 @@ use densify_train::output::{write_geometry, write_scores};
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct EvalArgs {
-    /// Folder that `densify train` wrote, or a file (of SOG also a folder) of Gaussian splats
+    /// Folder that `densify train` wrote, or a file of Gaussian splats (for SOG, also a folder)
     #[arg(value_name = "RUN_OR_MODEL")]
     model: PathBuf,
     /// Saved iteration of the run `[default: the last]`
@@ -51,11 +51,11 @@ pub(super) struct EvalArgs {
     /// (always on if the run learned exposures)
     #[arg(long)]
     fit_exposure: bool,
-    /// Exit with code 4 if a value is smaller: psnr, ssim, flip, lpips, or the path of a number in
+    /// Exit with code 4 if KEY is below VALUE; KEY is psnr, ssim, flip, lpips, or the path of a number in
     /// geometry.json, such as centres.f_score_one_percent; may be repeated
     #[arg(long, value_name = "KEY=VALUE")]
     fail_below: Vec<Limit>,
-    /// Exit with code 4 if a value is larger, such as flip or depth.rmse; may be repeated
+    /// Exit with code 4 if KEY, such as flip or depth.rmse, is above VALUE; may be repeated
     #[arg(long, value_name = "KEY=VALUE")]
     fail_above: Vec<Limit>,
     #[command(flatten)]
@@ -75,7 +75,7 @@ Examples:
 pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> Result<(), Failure> {
     let model = &args.model;
     let limits = Limits { lowest: &args.fail_below, highest: &args.fail_above };
-    // A folder without config.toml is not a run, whatever else it holds.
+    // A folder without config.toml is refused, whatever else it holds: it is not a run.
     let run = if is_model(model) {
         None
     } else {

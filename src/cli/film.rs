@@ -77,7 +77,7 @@ fn in_option_names(error: FilmError) -> Failure {
     match error {
         FilmError::Path(error) => Failure::input(format!("--path: {error}")),
         FilmError::NoSize => {
-            Failure::input(format!("--path: {error}; say it with --size WIDTHxHEIGHT"))
+            Failure::input(format!("--path: {error}; set it with --size WIDTHxHEIGHT"))
         }
         FilmError::OutOfMemory { .. } => {
             Failure::new(DEVICE, format!("{error}; give a smaller --size"))

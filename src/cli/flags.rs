@@ -9,7 +9,7 @@ use toml::{Table, Value};
 use densify_run::failure::Failure;
 use densify_run::{Partial, RunSpec};
 
-/// Gives every option of a run in `command` its default in [`RunSpec`].
+/// Gives every option of a run in `command` the default that it has in [`RunSpec`].
 pub(super) fn with_defaults(command: Command) -> Command {
     let defaults = RunSpec::default().table().unwrap_or_default();
     command.mut_args(|arg| {

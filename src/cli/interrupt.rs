@@ -39,13 +39,15 @@ impl Interrupts {
 }
 
 fn register() -> Arc<AtomicUsize> {
-    let (last, any) = (Arc::new(AtomicUsize::new(0)), Arc::new(AtomicBool::new(false)));
+    let last = Arc::new(AtomicUsize::new(0));
+    let was_interrupted = Arc::new(AtomicBool::new(false));
     for signal in [SIGINT, SIGTERM] {
-        // In this order, so that the first signal finds `any` unset. Where registration fails, a signal ends the
-        // process as it does by default.
-        let _ = flag::register_conditional_shutdown(signal, SIGNAL_EXIT_BASE + signal, any.clone());
+        // In this order, so that the first signal finds `was_interrupted` unset. Where registration fails, a signal
+        // ends the process as it does by default.
+        let exit_code = SIGNAL_EXIT_BASE + signal;
+        let _ = flag::register_conditional_shutdown(signal, exit_code, was_interrupted.clone());
         let _ = flag::register_usize(signal, last.clone(), signal.unsigned_abs() as usize);
-        let _ = flag::register(signal, any.clone());
+        let _ = flag::register(signal, was_interrupted.clone());
     }
     last
 }

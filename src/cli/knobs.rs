@@ -22,7 +22,7 @@ pub(super) fn run(_: &KnobsArgs, console: &Console) -> Result<(), Failure> {
             console.result(format_args!("  {:<18}  {}", "", describe_values(knob)));
         }
     }
-    console.result("presets: --preset NAME, knobs that go together");
+    console.result("presets: --preset NAME sets several knobs or options together");
     for preset in PRESETS {
         console.result(format_args!("  {preset}"));
         if let Some(Measured { command, .. }) = preset.measured {
@@ -37,5 +37,5 @@ fn describe_values(knob: &Knob) -> String {
     let unit = if knob.unit.is_empty() { String::new() } else { format!(" {}", knob.unit) };
     let on =
         knob.only_on.map_or_else(String::new, |only| format!("; {} backend only", only.name()));
-    format!("{}{unit}, of {}{on}", knob.default, knob.domain)
+    format!("default {}{unit}, allowed {}{on}", knob.default, knob.domain)
 }

@@ -150,7 +150,7 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
     };
     let quiet = match &arguments.command {
         Command::Train(train) | Command::Plan(train) => train.quiet,
-        // The runs of the selftest are not the user's, and it prints the device itself.
+        // The user did not ask for the runs that the selftest makes, and the selftest prints the device itself.
         Command::Selftest(_) => true,
         _ => false,
     };
@@ -213,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn usage_errors_have_code_2_and_help_0() {
+    fn usage_errors_exit_with_code_2_and_help_with_code_0() {
         assert_eq!(run_with(["densify", "--help"]), 0);
         assert_eq!(run_with(["densify", "--version"]), 0);
         assert_eq!(run_with(["densify", "train"]), failure::INPUT);

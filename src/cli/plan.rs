@@ -16,8 +16,8 @@ pub(super) fn run(
 ) -> Result<(), Failure> {
     if args.resume {
         return Err(Failure::input(
-            "--resume: a resumed run has the size that it began with (config.toml); leave it out \
-             to plan a new one",
+            "--resume: a resumed run has the size that it began with (config.toml); leave --resume \
+             out to plan a new run",
         ));
     }
     let follower = Follower::new(console);

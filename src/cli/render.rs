@@ -28,7 +28,7 @@ use densify_train::evaluate::Split;
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct RenderArgs {
-    /// Folder that `densify train` wrote, or a file (of SOG also a folder) of Gaussian splats
+    /// Folder that `densify train` wrote, or a file of Gaussian splats (for SOG, also a folder)
     #[arg(value_name = "RUN_OR_MODEL")]
     model: PathBuf,
     /// Folder or ZIP archive of the dataset: needed for a run whose dataset has moved, and for a file unless --path is
@@ -138,7 +138,8 @@ pub(super) fn refuse_scene_options(matches: &ArgMatches) -> Result<(), Failure> 
     {
         None => Ok(()),
         Some(name) => Err(Failure::input(format!(
-            "--{} is for a file with --scene DIR (a run brings its own); name the dataset of a file, or leave it out",
+            "--{} is for a file with --scene DIR (a run brings its own); add --scene DIR to a file, or leave the \
+             option out",
             name.replace('_', "-")
         ))),
     }
@@ -182,7 +183,7 @@ impl ModelArgument<'_> {
         open(&model, scene, data.clone(), (*near, machine), needs, console)
     }
 
-    /// Opens a file without a dataset, for the camera path of another file.
+    /// Opens a model file without a dataset, for a camera path with its own cameras from the file `path`.
     fn open_without_dataset(
         &self,
         path: &Path,
@@ -191,7 +192,7 @@ impl ModelArgument<'_> {
     ) -> Result<FilmSource, Failure> {
         let machine = open_machine(&rendering.device, console)?;
         let model = model_file(self.model, self.iteration)?;
-        // A path that cannot be read is reported when it is filmed.
+        // If the camera path cannot be read, `film::run` reports the error.
         let cameras = camera_path::read(path).map_or_else(|_| Vec::new(), |saved| saved.cameras());
         let (backend, normalisation, sh_degree) =
             open_alone(&model, (rendering.near, machine), &cameras, console)?;

@@ -17,10 +17,10 @@ use densify_run::failure::Failure;
 /// Writes the results of one or more runs as one HTML file.
 ///
 /// The file is self-contained and loads nothing: it can be mailed, and opens in any browser. It holds the
-/// scores, the worst and the best held-out views with a slider between photograph and render, a turn around the
-/// scene, curves of loss, Gaussians, PSNR and memory, the edits, what was left out, and the settings. Runs that
-/// differ only in their seed are averaged, with 95 % intervals from three runs on; the first of each group is
-/// shown, and groups of the same scene share their diagrams.
+/// scores, the worst and the best held-out views with a slider between photograph and render, an orbit of the
+/// scene, curves of loss, Gaussians, PSNR and memory, the edits, the automatic reductions, and the settings. Runs
+/// that differ only in their seed form a group: their results are averaged, with 95 % intervals from three runs
+/// on, and the pictures are those of the smallest seed. Groups of the same scene share their diagrams.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct ReportArgs {

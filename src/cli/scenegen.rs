@@ -61,15 +61,15 @@ pub(super) struct ScenegenArgs {
     /// Horizontal field of view in degrees
     #[arg(long, value_name = "DEGREES", help_heading = "Cameras")]
     fov: Option<f64>,
-    /// Distance of the cameras, 1 being where the scene fills the image; with --rig inside, the
-    /// radius of their path as a share of the room; with --rig survey, a factor on its height
+    /// Distance of the cameras, relative to the distance at which the scene fills the image; with --rig inside, the
+    /// radius of the cameras' path as a share of the room; with --rig survey, a factor on the height of the path
     #[arg(long, value_name = "FACTOR", help_heading = "Cameras")]
     radius: Option<f64>,
     /// Photograph training views through a lens, fisheye:K1[,K2,K3,K4] or radial:K1[,K2], with the coefficients of
     /// COLMAP's OPENCV_FISHEYE and OPENCV. Test views keep the pinhole camera
     #[arg(long, value_name = "LENS", help_heading = "Cameras")]
     lens: Option<Lens>,
-    /// Put people into this share of the training views, each in another place, and mask them
+    /// Put people into this share of the training views, at another place in each view, and mask them
     #[arg(long, value_name = "SHARE", help_heading = "Cameras", default_value_t = 0.0)]
     passers_by: f64,
     /// Random displacement of the cameras, as a share of their distance
@@ -106,7 +106,7 @@ pub(super) struct ScenegenArgs {
     /// Number of initial points, on surfaces with detail that at least three views see
     #[arg(long, value_name = "N", help_heading = "Points", default_value_t = 5000)]
     points: usize,
-    /// Standard deviation of the noise on their coordinates, as a share of the scene's diagonal
+    /// Standard deviation of the noise on the points' coordinates, as a share of the scene's diagonal
     #[arg(long, value_name = "SHARE", help_heading = "Points", default_value_t = 0.001)]
     point_noise: f64,
     /// Share of the points that are at random places

@@ -92,7 +92,7 @@ fn check_tolerances(tested: &[SubjectReport]) -> Result<usize, Failure> {
         OTHER,
         format!(
             "{failed} of {count} figures are beyond their tolerances; please report the table above, and \
-             where it is a GPU that fails, train with --backend cpu until it is known why"
+             if a GPU fails, train with --backend cpu until the cause is known"
         ),
     ))
 }
@@ -149,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn figures_beyond_their_tolerance_have_code_1() {
+    fn figures_beyond_their_tolerance_exit_with_code_1() {
         let finding = |error| Finding {
             case: 7,
             kind: "image".into(),

@@ -19,7 +19,7 @@ use densify_view::{FIRST_PORT, ListenAddress, Server, ViewOptions};
 /// Serves a page on this machine, with the pictures that `densify render` makes: turn the model with mouse,
 /// fingers or keys, visit the photographs' cameras, compare render and photograph, see depth, opacity,
 /// and Gaussians coloured by their training statistics, and save a camera path for `densify render --path`.
-/// Two runs are shown with a slider between them. Ctrl-C ends it.
+/// Two runs are shown with a slider between them. Ctrl-C closes the page.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct ViewArgs {
@@ -49,8 +49,9 @@ pub(super) struct ViewArgs {
 }
 
 const EXAMPLES: &str = "\
-Options under Scene are for a file or a scene; a run brings its own. On another machine, without --host:
-ssh -L 8080:127.0.0.1:8080 NAME, then http://127.0.0.1:8080/ here.
+Options under Scene are for a file or a scene; a run brings its own. To view the page from another
+machine without --host, run on that machine: ssh -L 8080:127.0.0.1:8080 NAME, with the name of this one, and open
+http://127.0.0.1:8080/.
 
 Examples:
   densify view output/garden-diet
@@ -85,8 +86,8 @@ pub(super) fn run(args: &ViewArgs, matches: &ArgMatches, console: &Console) -> R
     console.result(format_args!("page     {}", server.url()));
     if server.is_public() {
         console.say(
-            "note: whoever knows this address can look; from another machine, put the name of this one before \
-             the port",
+            "note: anyone who knows this address can open the page; on another machine, replace its host by the \
+             name of this machine",
         );
     }
     console.say("         Ctrl-C ends it");

@@ -1,4 +1,4 @@
-//! Replaces commands whose cargo feature this program was built without: they only print an error.
+//! Replacements for commands whose cargo feature this program was built without: they only print an error.
 
 use std::ffi::OsString;
 

@@ -23,7 +23,7 @@ impl Spelling {
         }
     }
 
-    /// An option that is on or off, switched on.
+    /// An option without a value, switched on.
     pub fn switch(self, name: &str) -> String {
         match self {
             Self::Terminal => self.option(name),
@@ -47,7 +47,7 @@ impl Spelling {
         }
     }
 
-    /// One member of an option that has several, with its value.
+    /// One `member=value` pair of an option that takes several.
     pub fn member(self, name: &str, member: &str, value: impl Display) -> String {
         match self {
             Self::Terminal => format!("{} {member}={value}", self.option(name)),

@@ -1,4 +1,4 @@
-//! Descriptions of adapters, also in programs built without the GPU backend.
+//! Descriptions of graphics adapters, also compiled into programs without the GPU backend.
 
 use super::Accumulation;
 
@@ -28,11 +28,11 @@ pub struct AdapterSummary {
     pub driver: String,
     /// The kind of adapter.
     pub kind: AdapterKind,
-    /// Largest buffer that a kernel can use `[bytes]`.
+    /// Largest buffer that a kernel can bind `[bytes]`.
     pub largest_binding: u64,
-    /// Largest buffer `[bytes]`.
+    /// Largest buffer that can be allocated `[bytes]`.
     pub largest_buffer: u64,
-    /// Missing features and limits; empty if the adapter is usable.
+    /// Features and limits that the kernels need and the adapter lacks; empty if it is usable.
     pub missing: Vec<String>,
     /// The supported methods of accumulating gradients, the fastest last; [`Accumulation::Slots`] is always supported.
     pub accumulations: Vec<Accumulation>,

@@ -41,7 +41,7 @@ impl<'a> Photograph<'a> {
 /// The error and the number of a pixel.
 pub(super) type RankedPixel = (f32, u32);
 
-/// Number of pixels ranked per candidate, so that enough remain after spacing.
+/// Number of pixels ranked per candidate, so that enough remain after spacing, which keeps only local maxima.
 const RANKED_PER_CANDIDATE: usize = 16;
 /// Values per candidate in a checkpoint.
 const VALUES: usize = 8;
@@ -90,15 +90,15 @@ impl Candidates {
     }
 
     /// The request and the number of candidates to collect in the view of `step`, if any.
-    pub(super) fn to_take(&self, step: u32, rows: usize) -> Option<(CandidateRequest, usize)> {
+    pub(super) fn due(&self, step: u32, rows: usize) -> Option<(CandidateRequest, usize)> {
         let r = self.request.filter(|r| r.from < step && step < r.until)?;
         let count = rows / r.rows_per_candidate.max(1) as usize;
         let room = r.capacity.saturating_sub(self.list.len());
         Some((r, count.min(room))).filter(|&(_, count)| count > 0)
     }
 
-    /// The `count` pixels with the largest error, in descending order, ties by pixel number. `error(x, y)` is `None`
-    /// where no candidate is allowed.
+    /// The `count` pixels with the largest error, in descending order, ties by pixel number; only local maxima if
+    /// `spaced`. `error(x, y)` is `None` where no candidate is allowed.
     #[cfg_attr(
         not(any(test, feature = "gpu")),
         expect(dead_code, reason = "used by the GPU backend only")
@@ -125,8 +125,8 @@ impl Candidates {
         self.worst_by([width, height], count, spaced, rank, &error)
     }
 
-    /// Like [`worst`](Self::worst), for a list of pixels with their errors, which includes at least the worst
-    /// [`ranked`] of them.
+    /// Like [`worst`](Self::worst), for a list of pixels with their errors that includes at least the
+    /// [`count_to_rank`] worst pixels of the image.
     #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "used by the GPU backend only"))]
     pub(super) fn worst_of(
         &mut self,
@@ -156,9 +156,9 @@ impl Candidates {
         rank: impl FnOnce(&mut Vec<RankedPixel>, usize) -> usize,
         error: impl Fn(usize, usize) -> Option<f32>,
     ) -> Vec<(usize, usize, f32)> {
-        let ranked = ranked(count, spaced);
-        let held = rank(&mut self.ranking, ranked);
-        let kept = keep_worst(&mut self.ranking[..held], ranked);
+        let wanted = count_to_rank(count, spaced);
+        let written = rank(&mut self.ranking, wanted);
+        let kept = keep_worst(&mut self.ranking[..written], wanted);
         let ranking = &mut self.ranking[..kept];
         ranking.sort_unstable_by(worse);
         let is_peak = |e: f32, pixel: u32| {
@@ -186,20 +186,20 @@ fn worse(a: &RankedPixel, b: &RankedPixel) -> Ordering {
     b.0.total_cmp(&a.0).then(a.1.cmp(&b.1))
 }
 
-/// Moves the `most` worst pixels to the head, in any order, and returns their number.
-pub(super) fn keep_worst(ranking: &mut [RankedPixel], most: usize) -> usize {
-    if ranking.len() > most {
-        ranking.select_nth_unstable_by(most, worse);
+/// Moves the `count` worst pixels, or all if there are fewer, to the head in any order, and returns their number.
+pub(super) fn keep_worst(ranking: &mut [RankedPixel], count: usize) -> usize {
+    if ranking.len() > count {
+        ranking.select_nth_unstable_by(count, worse);
     }
-    ranking.len().min(most)
+    ranking.len().min(count)
 }
 
 /// The number of pixels to rank for `count` candidates.
-pub(super) fn ranked(count: usize, spaced: bool) -> usize {
+pub(super) fn count_to_rank(count: usize, spaced: bool) -> usize {
     if spaced { count.saturating_mul(RANKED_PER_CANDIDATE) } else { count }
 }
 
-/// The weights of |e| and 1 − SSIM in the loss's error map; `None` if the error is not based on it.
+/// The weights of |e| and 1 − SSIM in the loss's error map; `None` if the error is the gradient instead.
 pub(super) fn error_weights(mode: ErrorMode) -> Option<[f32; 2]> {
     match mode {
         ErrorMode::Gradient => None,

@@ -164,7 +164,7 @@ impl Device {
         }
     }
 
-    /// The number of f32 columns that the host must allocate while `columns` columns are read; 0 if the backend
+    /// The number of f32 columns that the host must allocate to read signals of `columns` columns; 0 if the backend
     /// lends its own memory.
     pub fn columns_on_host(&self, columns: usize) -> usize {
         match self {

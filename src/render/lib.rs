@@ -50,7 +50,8 @@ pub use state::{StateArray, StateError, Tensor, Values};
 pub struct LearningRates {
     /// Means `[scene units per step]`.
     pub mean: f32,
-    /// Means, without the boost that short runs get; noise is proportional to it `[scene units per step]`.
+    /// The rate of the means without the boost of short runs. Noise on the means is proportional to this rate
+    /// `[scene units per step]`.
     pub noise: f32,
     /// Log-scales `[ln scene units per step]`.
     pub log_scale: f32,
@@ -77,8 +78,8 @@ pub struct StepInput<'a> {
     pub target: &'a Image8,
     /// Background colour, sRGB-encoded in `[0, 1]`; targets with alpha are composited on it as well.
     pub background: [f32; 3],
-    /// The exposure of the photograph, in a backend [set up](Setup::exposures) for it: the loss compares the
-    /// transformed rendering, whose background is left unchanged.
+    /// The exposure of the photograph; requires a backend [set up](Setup::exposures) for exposures. The loss compares
+    /// the photograph with the rendering after this transform, which keeps the background unchanged.
     pub exposure: Option<&'a ColourTransform>,
     /// Spherical-harmonic degree to evaluate and train, <= the model's.
     pub sh_degree: u8,
@@ -124,7 +125,7 @@ pub struct AuxOutput {
     pub loss: f32,
     /// The requested columns, in order. Shape of each: `[rows]`.
     pub columns: Vec<(AuxColumn, Vec<f32>)>,
-    /// Surface points; the error of each is its pixel's alpha.
+    /// Surface points; the field `error` of each holds the alpha of its pixel.
     pub points: Vec<Candidate>,
 }
 
@@ -137,11 +138,11 @@ pub struct StepOutput {
     pub l1: f32,
     /// Mean structural similarity.
     pub ssim: f32,
-    /// Rows whose projection is on screen.
+    /// Number of rows whose projection is on screen.
     pub visible: usize,
-    /// Rendered (row, tile) pairs.
+    /// Number of rendered (row, tile) pairs.
     pub entries: u64,
-    /// Bands in which the tile lists were processed: 1 unless they exceeded the cap.
+    /// Number of bands in which the tile lists were processed: 1 unless the lists exceeded the cap.
     pub bands: u32,
     /// Gradient of the loss with respect to the exposure, if there is one.
     pub exposure: Option<ColourGradient>,
@@ -168,7 +169,8 @@ fn assert_same_size(camera: &Camera, image: &Image8) {
     assert_eq!(camera, image, "camera and image differ in size");
 }
 
-/// Panics unless a plan fits the rows, in release builds too: the memory plan depends on it.
+/// Panics unless an edit plan fits the current rows and the budget. Checked in release builds too, because the memory
+/// limit depends on it.
 fn assert_fits(ops: &RowOps, rows: usize, budget: RowBudget) {
     assert_eq!(ops.first_row, budget.frozen, "a plan for another number of frozen rows");
     assert_eq!(ops.rows_before, rows, "a plan for another number of rows");
@@ -193,7 +195,7 @@ pub trait Backend: Send {
     /// The planned bytes of each buffer.
     fn ledger(&self) -> &Ledger;
 
-    /// Starts a new epoch; `WeightMax` is kept per epoch.
+    /// Starts a new epoch; the signal `WeightMax` is accumulated per epoch.
     fn begin_epoch(&mut self);
 
     /// Runs a forward pass, a backward pass and an optimiser step, and accumulates signals.
@@ -214,8 +216,8 @@ pub trait Backend: Send {
     /// See [`BackendError`].
     fn take_signals(&mut self, wanted: SignalSet) -> Result<Signals, BackendError>;
 
-    /// Returns the signals after they have been read. Their memory may belong to the backend, which must otherwise
-    /// allocate it again.
+    /// Hands signals back to the backend after they have been read. Their memory may belong to the backend, which
+    /// must otherwise allocate it again.
     fn give_back(&mut self, signals: Signals) {
         drop(signals);
     }
@@ -223,7 +225,7 @@ pub trait Backend: Send {
     /// The candidates collected since the last reset.
     fn candidates(&self) -> &[Candidate];
 
-    /// Executes a plan of iteration `step` in place, on parameters, moments and ages.
+    /// Executes the edit plan of iteration `step` in place, on parameters and all other arrays of rows.
     ///
     /// # Errors
     /// See [`BackendError`].
@@ -331,8 +333,8 @@ pub trait Backend: Send {
     /// When the array or a row does not exist: a bug in the caller.
     fn save_rows(&self, name: &str, rows: Range<usize>) -> Result<Tensor, BackendError>;
 
-    /// Restores an array that [`save`](Self::save) returned, in a backend set up with the same options for the
-    /// [model](Self::download) of that step. With all arrays restored, later steps are bit-identical.
+    /// Restores an array that [`save`](Self::save) returned. The backend must be set up with the same options and with
+    /// the [model](Self::download) of the same step. Once all arrays are restored, later steps are bit-identical.
     ///
     /// # Errors
     /// [`StateError`] when this backend has no such array, or one of another type or shape. The
@@ -350,6 +352,7 @@ pub trait Backend: Send {
     /// When a row does not exist: a bug in the caller.
     fn restore_rows(&mut self, tensor: Tensor, rows: Range<usize>) -> Result<(), StateError>;
 
-    /// Wall time of each stage of the last step, in order; one entry per execution of a stage.
+    /// Wall time of each stage of the last step, in order. A stage that is executed several times may have several
+    /// entries.
     fn stage_times(&self) -> &[(&'static str, Duration)];
 }

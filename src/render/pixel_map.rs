@@ -52,7 +52,7 @@ pub(super) fn sample_pixels(
 }
 
 /// Three standard deviations along the longer axis of a projected covariance [a b; b c], rounded up
-/// `[px]`. Computed from its factor 1/l1 = √(det/c), r = b/c, 1/l3 = √c.
+/// `[px]`. Computed from its factors 1/l1 = √(det/c), shear = b/c and 1/l3 = √c.
 pub(super) fn radius_px(inv_l1: f32, shear: f32, inv_l3: f32) -> f32 {
     let c = inv_l3 * inv_l3;
     let b = shear * c;
@@ -93,13 +93,13 @@ pub(super) fn edge_at(luma: &[u8], [width, height]: [usize; 2], pixel: usize) ->
     (9 * at(x, y) - sum).clamp(0, 255) as u8
 }
 
-/// The weight that one unit of edge strength adds to a pixel, such that the mean edge adds `weight`. `sum` is the sum
-/// of edge strengths over all `pixels`.
+/// The weight that one unit of edge strength adds to a pixel, such that the mean edge strength adds `weight`. `sum`
+/// is the sum of edge strengths over all `pixels`.
 pub(super) fn edge_factor(weight: f32, sum: u64, pixels: usize) -> f32 {
     if sum == 0 { 0.0 } else { (f64::from(weight) * pixels as f64 / sum as f64) as f32 }
 }
 
-/// The weights of all pixels by [`ErrorScore::edge`]. Shape: `[height, width]`.
+/// The weights that [`ErrorScore::edge`] gives to all pixels. Shape: `[height, width]`.
 #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "used by the GPU backend only"))]
 pub(super) fn edge_weights(target: &Image8, background: [f32; 3], score: &ErrorScore) -> Vec<f32> {
     let edges = edges(target, background);
@@ -125,7 +125,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn maps_are_stretched_to_one() {
+    fn values_are_stretched_to_the_range_0_to_1() {
         let mut values = [3.0, 1.0, 2.0];
         stretch(&mut values);
         assert_eq!(values, [1.0, 0.0, 0.5]);

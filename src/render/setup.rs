@@ -8,21 +8,21 @@ use super::cpu::InstructionSet;
 /// The settings of a backend of either kind. The default has room for one row.
 #[derive(Debug, Clone)]
 pub struct Setup {
-    /// The largest number of rows, >= 1 and >= the model's. Frozen rows have memory only for rendering.
+    /// The largest number of rows, >= 1 and >= the model's. For frozen rows only the memory for rendering is allocated.
     pub budget: RowBudget,
     /// Near plane `[scene units]`, > 0: rows closer to the camera are not rendered.
     pub near: f32,
     /// Maximum number of (row, tile) pairs in memory at a time; an image with more is processed in bands. `None` means
     /// 16 per row, or as many as the device can hold. Raised to the budget if smaller, as one tile's list must fit.
     pub tile_cap: Option<usize>,
-    /// Maximum number of gradient records, one per pair, in memory at a time, >= 1; the backward pass processes more
-    /// pairs in parts (native backend).
+    /// Maximum number of gradient records, one per pair, in memory at a time, >= 1; if there are more pairs, the
+    /// backward pass processes them in parts (native backend).
     pub record_cap: usize,
     /// Instruction set of the kernels (native backend).
     pub instructions: InstructionSet,
     /// Processor threads; `None` means one per core.
     pub threads: Option<usize>,
-    /// The largest image to render (width, height) `[px]`. Larger ones work, but need more memory than the
+    /// The largest image to render (width, height) `[px]`. Larger images work, but need more memory than the
     /// ledger lists.
     pub largest_image: (u32, u32),
     /// Photographs kept in GPU memory instead of being uploaded at every step.
@@ -81,7 +81,7 @@ pub struct KeptPhotographs {
 }
 
 impl KeptPhotographs {
-    /// Bytes per photograph on the device, given the largest size: of its pixels and of its mask.
+    /// Bytes reserved per photograph on the device, given the size of the largest: for its pixels and for its mask.
     pub fn bytes((width, height): (u32, u32), with_masks: bool) -> [u64; 2] {
         let pixels = u64::from(width) * u64::from(height);
         [4 * pixels, if with_masks { pixels.next_multiple_of(4) } else { 0 }]
@@ -128,7 +128,7 @@ pub enum MomentStorage {
 /// renderers of Gaussian splats use as well.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Shortcuts {
-    /// Alpha below this is not blended; above 0.
+    /// A splat is not blended into pixels where its alpha is below this; above 0.
     pub alpha_min: f32,
     /// A pixel is finished before its transmittance falls to this; above 0.
     pub transmittance_min: f32,

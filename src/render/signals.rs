@@ -12,7 +12,7 @@ use densify_policies::policy::{
 use densify_core::gaussians::{ModelArray, dc_to_rgb};
 
 /// Values per record that training itself needs: Σq, Σq·u, Σq·z, Σq·u², Σq·u·z, Σq·z² and the
-/// gradient with respect to the colour.
+/// gradient with respect to the colour. `cpu/rasterize_bwd.rs` defines q, u, z and the blend weight w.
 pub(super) const BASE: usize = 9;
 
 /// The optional values of a record, in the order of the record.
@@ -57,11 +57,11 @@ impl Field {
 
     /// The index of this value in a complete record; depth and error share one.
     pub(super) const fn number(self) -> usize {
-        let is_late = self as usize >= Self::Error as usize;
-        BASE + self as usize - is_late as usize
+        let is_after_depth = self as usize >= Self::Error as usize;
+        BASE + self as usize - is_after_depth as usize
     }
 
-    /// The shaders' constant for the index in a record.
+    /// Name of the shaders' constant that holds the index of this value in a record.
     #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "used by the GPU backend only"))]
     pub(super) const fn constant(self) -> &'static str {
         match self {
@@ -139,10 +139,10 @@ pub(super) fn counts_dominant(needs: &Needs) -> bool {
     needs.signals.contains(Signal::DominantPixels) || needs.aux.as_ref().is_some_and(in_views)
 }
 
-/// Converts an accumulated value to the policy's signal. A minimum is accumulated as the largest inverse, which
+/// Converts an accumulated value to the policy's signal. A minimum is accumulated as the largest reciprocal, which
 /// starts at 0 like all other values.
-pub(super) fn as_read(signal: Signal, kept: f32) -> f32 {
-    if signal.kind() == SignalKind::Minimum { 1.0 / kept } else { kept }
+pub(super) fn value_of(signal: Signal, accumulated: f32) -> f32 {
+    if signal.kind() == SignalKind::Minimum { 1.0 / accumulated } else { accumulated }
 }
 
 /// The planes of the requested signals.
@@ -183,7 +183,7 @@ impl SignalPlanes {
         Self { first, count, full_depth, score, swapped: false }
     }
 
-    /// The planes of a signal, whose value is their maximum.
+    /// The planes of a signal; its value is the maximum over them.
     pub(super) fn of_signal(&self, signal: Signal) -> Range<usize> {
         self.first[signal as usize].map_or(0..0, |first| first..first + planes(signal.kind()))
     }
@@ -208,24 +208,24 @@ impl SignalPlanes {
     }
 
     /// The planes that checkpoints save, by name.
-    pub(super) fn kept(&self) -> Vec<(String, usize)> {
-        let mut kept = Vec::new();
+    pub(super) fn saved(&self) -> Vec<(String, usize)> {
+        let mut saved = Vec::new();
         for signal in Signal::ALL {
             let Some(current) = self.current(signal) else { continue };
             match signal.kind() {
                 SignalKind::Sum | SignalKind::Count | SignalKind::Maximum | SignalKind::Minimum => {
-                    kept.push((format!("{signal:?}"), current));
+                    saved.push((format!("{signal:?}"), current));
                 }
                 SignalKind::EpochMaximum => {
                     let both = self.of_signal(signal);
                     let previous = both.start + both.end - 1 - current;
-                    kept.push((format!("{signal:?}.previous"), previous));
-                    kept.push((format!("{signal:?}.current"), current));
+                    saved.push((format!("{signal:?}.previous"), previous));
+                    saved.push((format!("{signal:?}.current"), current));
                 }
                 SignalKind::Present | SignalKind::Attribute(_) => {}
             }
         }
-        kept
+        saved
     }
 }
 
@@ -280,7 +280,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn exactly_the_attributes_are_parameters_and_their_widths_agree() {
+    fn exactly_the_attribute_signals_are_read_from_parameters_and_widths_agree() {
         for signal in Signal::ALL {
             let found = ParameterSignal::new(signal).map(|found| found.parameters.len());
             let width = match signal.kind() {

@@ -1,6 +1,6 @@
 //! A backend's state other than the model, as named arrays for checkpoints.
 //!
-//! An array has one entry per row in use, in the order of the rows, whatever the backend's own layout. The
+//! An array of rows has one entry per row in use, in the order of the rows, whatever the backend's own layout. The
 //! parameters of a row are in this order: mean 3, log-scale 3, quaternion (w, x, y, z) 4,
 //! opacity logit 1, then three per spherical-harmonic coefficient (red, green, blue).
 
@@ -44,7 +44,7 @@ pub struct Tensor {
 impl Tensor {
     /// Returns whether the array of this name holds the optimiser's [ages](Self::ages).
     pub fn has_ages(name: &str) -> bool {
-        // Of the native and the GPU backend.
+        // The names in the native and in the GPU backend.
         matches!(name, "ages" | "device.ages")
     }
 

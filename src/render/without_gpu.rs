@@ -1,4 +1,4 @@
-//! Stands in for the GPU backend in programs built without the feature `gpu`: there is no adapter.
+//! Stands in for the GPU backend in programs built without the feature `gpu`: it finds no adapter.
 
 use densify_policies::policy::Needs;
 

@@ -1,5 +1,5 @@
 //! Detects models whose coordinates are not those of the photographs. Their renderings correlate with the photographs
-//! no more than by chance; even those of a poor model of the scene correlate better.
+//! no more than by chance; even renderings of a poor model of the scene correlate better.
 
 use std::path::Path;
 
@@ -107,9 +107,9 @@ impl CoordinateCheck {
     }
 }
 
-/// The correlation of a rendering with its photograph. It is computed over all pixels, where outlines count, and over
-/// the pixels that the model covers, for models of a part of the scene; the larger one is returned. `None` if either
-/// image has only one colour.
+/// The correlation of a rendering with its photograph. It is computed over all pixels, so that outlines count, and over
+/// the pixels that the model covers, for models of a part of the scene; the larger correlation is returned. `None` if
+/// either image has only one colour.
 fn compare(rendering: &Rendering, image: &Image8, background: [f32; 3]) -> Option<f64> {
     let covered = rendering.alpha.iter().map(|&alpha| f64::from(alpha)).sum::<f64>();
     if covered < MIN_COVERAGE * rendering.alpha.len() as f64 {
@@ -147,9 +147,10 @@ fn correlation(
         }
     }
     let variance = |square: f64, mean: f64| square / sum - (mean / sum).powi(2);
-    let (of_model, of_truth) = (variance(xx, x), variance(yy, y));
-    let varies = sum > 0.0 && of_model > CONTRAST * CONTRAST && of_truth > CONTRAST * CONTRAST;
-    varies.then(|| (xy / sum - x / sum * (y / sum)) / (of_model * of_truth).sqrt())
+    let (model_variance, truth_variance) = (variance(xx, x), variance(yy, y));
+    let least = CONTRAST * CONTRAST;
+    let varies = sum > 0.0 && model_variance > least && truth_variance > least;
+    varies.then(|| (xy / sum - x / sum * (y / sum)) / (model_variance * truth_variance).sqrt())
 }
 
 #[cfg(test)]

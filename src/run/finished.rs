@@ -39,7 +39,7 @@ impl Machine {
         Ok(Self { threads: spec.threads.map(|threads| threads.0 as usize), device })
     }
 
-    /// A backend with a model in the dataset's own coordinates, to render its views. `near` is a distance
+    /// A backend with a model in the dataset's own coordinates, to render the dataset's views. `near` is a distance
     /// `[scene units]`.
     pub fn backend(
         &self,
@@ -63,7 +63,7 @@ impl Machine {
         Ok(self.device.backend(&model, &setup)?)
     }
 
-    /// A backend with a model in scene coordinates that can only render.
+    /// A backend that can only render, with a model in scene coordinates.
     pub fn backend_in_scene(
         &self,
         model: &Gaussians,
@@ -74,7 +74,7 @@ impl Machine {
         self.device.backend(model, &setup)
     }
 
-    /// A backend with a model in scene coordinates, for measuring signals with steps that do not change it.
+    /// A backend with a model in scene coordinates, for measuring signals with steps that do not change the model.
     pub fn backend_to_measure(
         &self,
         model: &Gaussians,
@@ -133,8 +133,8 @@ pub fn open_run(
         .map_err(|failure| if was_moved { failure } else { or_moved(failure, &path) })
 }
 
-/// Opens a model, written by any program, with a dataset. Without `near`, the near plane is the [usual one](NearPlane) of
-/// the dataset.
+/// Opens a model, written by any program, with a dataset. Without `near`, the near plane is the [usual one](NearPlane)
+/// of the dataset.
 ///
 /// # Errors
 /// When the model, the dataset or the device cannot be opened.
@@ -155,7 +155,7 @@ pub fn open(
 }
 
 /// Opens a model without a dataset, for cameras in its own coordinates. Also returns its normalisation and degree.
-/// Without `near`, the near plane follows from the opaque Gaussians that the cameras see.
+/// Without `near`, the near plane follows from the Gaussians of opacity above 0.5 that the cameras see.
 ///
 /// # Errors
 /// When the model or the device cannot be opened.
@@ -169,23 +169,25 @@ pub fn open_alone(
     let normalisation = Normalisation::fit_model(&model);
     let model = normalisation.model_from_world(model);
     let near = say_near_plane(
-        NearPlane::from_depths(near, &seen(&model, &normalisation, cameras)),
+        NearPlane::from_depths(near, &seen_depths(&model, &normalisation, cameras)),
         observer,
     );
     let backend = machine.device.backend(&model, &machine.setup(&model, near))?;
     Ok((backend, normalisation, model.sh_degree))
 }
 
-/// The depths at which cameras in a model's own coordinates see its solid Gaussians, in a normalised scene.
-fn seen(model: &Gaussians, normalisation: &Normalisation, cameras: &[Camera]) -> SeenDepths {
+/// The depths at which cameras in a model's own coordinates see its Gaussians of opacity above 0.5, in a normalised
+/// scene.
+fn seen_depths(model: &Gaussians, normalisation: &Normalisation, cameras: &[Camera]) -> SeenDepths {
     let rows = model.means.iter().zip(&model.opacity_logits);
-    let solid = rows.filter(|(_, logit)| **logit > 0.0);
-    let centres: Vec<_> = solid.map(|(mean, _)| DVec3::from(mean.map(f64::from))).collect();
+    let opaque = rows.filter(|(_, logit)| **logit > 0.0);
+    let centres: Vec<_> = opaque.map(|(mean, _)| DVec3::from(mean.map(f64::from))).collect();
     let to_scene = |camera| normalisation.scene_from_world_camera(camera);
     SeenDepths::measure(&centres, &cameras.iter().map(to_scene).collect::<Vec<_>>())
 }
 
-/// The [near plane](NearPlane) of a model in a dataset `[scene units]`, with a line for the user where one is due.
+/// The [near plane](NearPlane) of a model in a dataset `[scene units]`; tells the user if it is unusual or hides
+/// points.
 pub fn near_plane(given: Option<Fraction>, dataset: &Dataset, observer: &dyn Observer) -> f32 {
     say_near_plane(NearPlane::choose(given, dataset), observer)
 }
@@ -200,7 +202,7 @@ fn say_near_plane(near: NearPlane, observer: &dyn Observer) -> f32 {
 /// Reads the dataset at `path` and passes its notes to the observer.
 ///
 /// # Errors
-/// When it cannot be read.
+/// When the dataset cannot be read.
 pub fn load(path: &Path, data: &DataSpec, observer: &dyn Observer) -> Result<Dataset, Failure> {
     let dataset = Dataset::load(path, &data.load_options(false))?;
     say_notes(observer, &dataset.notes);
@@ -211,7 +213,7 @@ impl Opened {
     /// Measures the model against the known surface in `views`; `None` if no surface is known.
     ///
     /// # Errors
-    /// When the surface cannot be read, `is_stopped` returns true, or as [`geometry::measure`].
+    /// When the surface cannot be read or `is_stopped` returns true, and as [`geometry::measure`].
     pub fn geometry(
         &mut self,
         views: &DatasetViews,
@@ -232,7 +234,7 @@ impl Opened {
     /// The views of a split.
     ///
     /// # Errors
-    /// When it has none.
+    /// When the split has none.
     pub fn views(&self, split: Split) -> Result<DatasetViews, Failure> {
         views_of(&self.dataset, split)
     }
@@ -241,7 +243,7 @@ impl Opened {
 /// The views of a split of a dataset.
 ///
 /// # Errors
-/// When it has none.
+/// When the split has none.
 pub fn views_of(dataset: &Dataset, split: Split) -> Result<DatasetViews, Failure> {
     let views: &[View] = match split {
         Split::Train => &dataset.train,

@@ -16,7 +16,7 @@ pub struct Host<'a> {
 }
 
 impl<'a> Host<'a> {
-    /// A host that measures the process as the operating system reports it.
+    /// A host that measures the memory of the process as the operating system reports it.
     pub fn new(observer: &'a dyn Observer) -> Self {
         Self { observer, process: ProcessMemory::SYSTEM, companion: None }
     }

@@ -5,8 +5,7 @@
 //! progress goes to an [`Observer`]; errors stay data until they are shown.
 //!
 //! Modules from bottom to top, each of which uses only those before it: failure, spec, companion, observer, process,
-//! host, models, coordinate_check, near_plane, resolved,
-//! finished, session.
+//! host, models, coordinate_check, near_plane, resolved, finished, session.
 
 mod companion;
 pub mod coordinate_check;

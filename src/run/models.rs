@@ -20,7 +20,7 @@ pub fn is_model(path: &Path) -> bool {
 /// The iteration asked for, or the last one saved.
 ///
 /// # Errors
-/// When the run has not saved that iteration, or none.
+/// When the run has not saved that iteration, or has saved none.
 pub fn iteration(run: &Path, asked: Option<u32>) -> Result<u32, Failure> {
     let saved = saved_iterations(run).map_err(|error| -> Failure {
         match newest_step(run) {
@@ -38,7 +38,7 @@ pub fn iteration(run: &Path, asked: Option<u32>) -> Result<u32, Failure> {
     }
 }
 
-/// As [`iteration`], for a run that may still be training; also returns true if it is, and tells the observer.
+/// As [`iteration`], for a run that may still be training; also returns true if it is training, and tells the observer.
 ///
 /// # Errors
 /// As [`iteration`].
@@ -47,18 +47,18 @@ pub fn iteration_so_far(
     asked: Option<u32>,
     observer: &dyn Observer,
 ) -> Result<(u32, bool), Failure> {
-    let trains = is_in_use(run);
-    if trains && saved_iterations(run).is_err() {
+    let is_training = is_in_use(run);
+    if is_training && saved_iterations(run).is_err() {
         return Err(ModelProblem::StillTraining { run: run.to_owned() }.into());
     }
     let iteration = iteration(run, asked)?;
-    if trains {
+    if is_training {
         let run = run.display();
         observer.say(format_args!(
             "note: {run} is being trained; this is its model of iteration {iteration}"
         ));
     }
-    Ok((iteration, trains))
+    Ok((iteration, is_training))
 }
 
 /// The last part of a path, to be shown without revealing the names of the folders above it.
@@ -122,10 +122,11 @@ pub fn read_model(path: &Path, observer: &dyn Observer) -> Result<Gaussians, Fai
     Ok(file.gaussians)
 }
 
-/// Writes a model in another format, and notes what the format changes of it. An error leaves an existing file as it is.
+/// Writes a model in another format, and tells the observer what the format changes. An error leaves an existing file
+/// as it is.
 ///
 /// # Errors
-/// When the format does not hold the model, or the disk fails.
+/// When the format cannot hold the model, or the disk fails.
 pub fn write_model(
     format: &Format,
     path: &Path,
@@ -142,10 +143,10 @@ pub fn write_model(
     files::write_checked(path, write, |written| {
         let (name, changes) = (format.name, format.changes(model, written)?);
         if changes.is_unfit() {
-            // The file is given up, so that others can be tried in its place.
+            // The file is discarded, so that the caller can try another format.
             let other = fitting_format(model, written).name;
             return Err(Failure::input(format!(
-                "{name} does not hold this model: {changes}; choose another format, such as {other}"
+                "{name} cannot hold this model: {changes}; choose another format, such as {other}"
             )));
         }
         if changes.is_noted() {

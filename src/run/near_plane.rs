@@ -1,7 +1,7 @@
-//! The near plane: as given, or before what the views show.
+//! The near plane: as given by the user, or in front of nearly all points that the views show.
 //!
-//! The extent of the cameras says nothing about the distance of the nearest surface: in a corridor of 120 m, 0.04 of it is
-//! 2.6 m, and the walls on both sides are nearer.
+//! The extent of the cameras says nothing about the distance of the nearest surface: in a corridor of 120 m, 0.04 of
+//! the extent is 2.6 m, and the walls on both sides are nearer.
 
 use densify_core::spelling::Spelling;
 use densify_data::dataset::normalise::EXTENT;
@@ -10,27 +10,27 @@ use densify_data::dataset::{Dataset, SeenDepths};
 use crate::failure::notes;
 use crate::spec::Fraction;
 
-/// The farthest near plane that is chosen `[fraction of the extent]`: the original's 0.2 for an extent of 5. Nearer
-/// Gaussians become fog before one camera: with 0.01, test views lost up to 10 dB to it.
+/// The farthest near plane that is chosen `[fraction of the extent]`: the original's 0.2 for an extent of 5. With
+/// nearer planes, Gaussians become fog in front of single cameras: with 0.01, test views lost up to 10 dB to this fog.
 const FARTHEST: f64 = 0.04;
-/// The nearest one: the smallest size of a Gaussian made from a point.
+/// The nearest near plane that is chosen `[fraction of the extent]`: the smallest size of a Gaussian made from a point.
 const NEAREST: f64 = 2e-4;
-/// The share of what is seen that may be nearer, as reconstructions have stray points.
-const STRAY: f64 = 0.005;
-/// The near plane as a fraction of the depth beyond which all else is seen: the points are a sample of the surfaces, and
-/// other cameras may be nearer.
-const BEFORE: f64 = 0.5;
+/// The share of what the views show that may be nearer than the plane: reconstructions have stray points.
+const STRAY_SHARE: f64 = 0.005;
+/// The near plane as a fraction of the depth of the nearest points other than stray ones: points only sample the
+/// surfaces, and cameras of other views may be nearer to these surfaces.
+const DEPTH_FACTOR: f64 = 0.5;
 
 /// The near plane of a run, or of a model with the dataset that it is shown with.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct NearPlane {
     /// Distance from the camera `[fraction of the extent]`.
     pub fraction: Fraction,
-    /// It was given.
+    /// The user gave it.
     is_given: bool,
-    /// The share of what the views show that lies nearer.
+    /// The share of what the views show that is nearer than this plane.
     hidden: f64,
-    /// The share that lies nearer than the farthest plane that would be chosen.
+    /// The share of what the views show that is nearer than [`FARTHEST`].
     hidden_at_farthest: f64,
 }
 
@@ -42,7 +42,7 @@ impl NearPlane {
 
     /// As [`choose`](Self::choose), from depths in a normalised scene.
     pub fn from_depths(given: Option<Fraction>, seen: &SeenDepths) -> Self {
-        let nearest = seen.quantile(STRAY).map(|depth| BEFORE * depth / EXTENT);
+        let nearest = seen.quantile(STRAY_SHARE).map(|depth| DEPTH_FACTOR * depth / EXTENT);
         let fraction = given.unwrap_or(Fraction(match nearest {
             Some(nearest) if nearest < FARTHEST => two_digits(nearest.max(NEAREST)),
             _ => FARTHEST,
@@ -60,7 +60,7 @@ impl NearPlane {
         (self.fraction.0 * EXTENT) as f32
     }
 
-    /// A line for the user where the plane is nearer than usual, or hides points.
+    /// A line for the user if the chosen plane is nearer than usual, or the plane hides points.
     pub fn line(&self, spelling: Spelling) -> Option<String> {
         let near = self.fraction.0;
         let percent = |share: f64| format!("{:.2} %", 100.0 * share);
@@ -68,7 +68,7 @@ impl NearPlane {
         if !self.is_given && near < FARTHEST {
             let usual = percent(self.hidden_at_farthest);
             return Some(format!(
-                "near     {near} of the extent: {FARTHEST} would hide {usual} of what the views show, this {hidden}"
+                "near     {near} of the extent: hides {hidden} of what the views show; {FARTHEST} would hide {usual}"
             ));
         }
         (self.hidden > 0.0).then(|| notes::hidden_points(spelling, near, &hidden, self.is_given))
@@ -90,7 +90,7 @@ mod tests {
 
     use super::*;
 
-    /// The depths of a wall at each depth, seen by a camera that shows nothing else.
+    /// The depths seen by cameras that each see only one wall, at one of these depths.
     fn walls(depths: &[f64]) -> SeenDepths {
         let at = |z: f64, i: usize| z * (2.0 * (i as f64 + 0.5) / 32.0 - 1.0);
         let mut points = Vec::new();
@@ -104,13 +104,13 @@ mod tests {
     }
 
     #[test]
-    fn it_follows_what_is_seen_and_is_never_farther_than_usual() {
+    fn the_chosen_plane_follows_the_seen_depths_up_to_the_farthest() {
         let chosen = |depths: &[f64]| NearPlane::from_depths(None, &walls(depths));
         let fraction = |depths: &[f64]| chosen(depths).fraction.0;
         assert_eq!(fraction(&[0.1, 3.0]), FARTHEST);
         assert_eq!(chosen(&[0.1, 3.0]).line(Spelling::Terminal), None);
         assert_eq!(chosen(&[]).fraction.0, FARTHEST, "nothing is known");
-        // 0.5 · 0.022 / 1.1, whichever views see it.
+        // 0.5 · 0.0221 / 1.1, though only one view in four sees this wall.
         assert_eq!(fraction(&[0.0221, 3.0, 3.0, 3.0]), 0.01);
         assert_eq!(fraction(&[1e-7, 3.0]), NEAREST);
         // One view in 300 is a third of a percent: stray points.
@@ -125,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_given_stays_and_what_it_hides_is_said() {
+    fn a_given_plane_is_kept_and_what_it_hides_is_reported() {
         let given = NearPlane::from_depths(Some(Fraction(0.3)), &walls(&[0.1, 3.0]));
         assert_eq!(given.distance(), (0.3 * EXTENT) as f32);
         let line = given.line(Spelling::Terminal).expect("points lie nearer");
@@ -135,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn fractions_have_two_digits() {
+    fn fractions_are_cut_to_two_digits() {
         for (number, expected) in
             [(0.0123, 0.012), (0.00999, 0.0099), (0.01, 0.01), (2e-4, 2e-4), (0.039_999, 0.039)]
         {

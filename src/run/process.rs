@@ -75,7 +75,7 @@ fn control_group() -> Option<u64> {
     group_left(&read("memory.max")?, &read("memory.current")?, &read("memory.stat")?)
 }
 
-/// Cached files count as used, but are evicted first.
+/// Memory left to a control group. Cached files are part of its current use, but are evicted first.
 fn group_left(max: &str, current: &str, stat: &str) -> Option<u64> {
     // "max": no limit.
     let max: u64 = max.trim().parse().ok()?;

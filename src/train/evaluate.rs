@@ -53,13 +53,13 @@ pub struct Mean {
     /// LPIPS: distance of network features, 0 for equal images; if its weights were available.
     #[serde(rename = "LPIPS", default, skip_serializing_if = "Option::is_none")]
     pub lpips: Option<f64>,
-    /// Means for renderings with the exposures of their photographs, if requested.
+    /// Mean scores of the renderings with the exposures that fit the photographs best, if requested.
     #[serde(flatten)]
     pub fitted: Option<FittedScore>,
 }
 
-/// Scores of a rendering, or means of several. In [`ViewScore`] and [`Mean`], they are those after fitting a factor and
-/// an offset per channel to the photograph.
+/// Scores of a rendering, or means of several. In [`ViewScore`] and [`Mean`], they are the scores after a factor and an
+/// offset per channel were fitted to the photograph.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct FittedScore {
     /// Peak signal-to-noise ratio `[dB]`.
@@ -76,7 +76,7 @@ pub struct FittedScore {
     pub lpips: Option<f64>,
 }
 
-/// Reads a PSNR. That of equal images is infinite, which JSON writes as null.
+/// Reads a PSNR; for equal images it is infinite, which JSON writes as null.
 fn or_infinite<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
     Ok(Option::deserialize(from)?.unwrap_or(f64::INFINITY))
 }
@@ -115,7 +115,7 @@ impl Mean {
 pub struct Comparison<'a> {
     /// Network for LPIPS; without one, LPIPS is not measured.
     pub lpips: Option<&'a Lpips>,
-    /// Renderings are also compared with the exposure that fits the photograph best.
+    /// True if renderings are compared a second time, with the exposure that fits the photograph best.
     pub fits_exposure: bool,
 }
 

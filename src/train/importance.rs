@@ -18,7 +18,7 @@ fn request() -> AuxRequest {
 
 /// Memory for [`importance`] in addition to the backend and an image `[bytes]`.
 pub fn bytes(rows: usize) -> u64 {
-    // The column of a view, the sums, and the order of the rows.
+    // Per row: its weight in a view, its sum, and its place in the order.
     rows as u64 * (size_of::<f32>() + size_of::<f64>() + size_of::<usize>()) as u64
 }
 
@@ -85,7 +85,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_largest_stay_in_their_order() {
+    fn the_largest_values_keep_their_order() {
         assert_eq!(largest(&[1.0, 3.0, 0.0, 3.0, 2.0], 3), [1, 3, 4]);
         assert_eq!(largest(&[1.0, 1.0, 1.0], 2), [0, 1]);
         assert_eq!(largest(&[1.0], 5), [0]);

@@ -18,7 +18,7 @@
 //! parent's mask.
 //!
 //! **Pruning.** Gaussians with σ(m) ≤ `min_mask` are pruned at every growth step, every `mask_every` steps
-//! until the end of the run, and after its last step. Until then they are transparent.
+//! until the end of the run, and after its last step. Until they are pruned, they are transparent.
 //!
 //! `random_keep` is a control that measures the effect of the masks: it disables them, and at `grow_until`
 //! prunes Gaussians at random until this number is left.

@@ -28,7 +28,7 @@ fn rows_whose_mask_has_fallen_are_pruned() {
 }
 
 #[test]
-fn masks_prune_at_every_growth_and_every_thousand_steps_to_the_end() {
+fn pruning_by_mask_is_due_at_growth_steps_and_every_thousand_steps() {
     let due = |set: &str, iterations| {
         let scene = SceneInfo { iterations, ..Event::new(1, 1, 1).scene };
         due_steps("compact-3dgs", &format!("reset_every = 0\n{set}"), &scene)
@@ -83,7 +83,7 @@ fn the_control_prunes_at_random_to_the_given_number() {
 }
 
 #[test]
-fn every_choice_conforms() {
+fn other_parameter_values_conform() {
     assert_conforms(
         "compact-3dgs",
         &["min_mask = 0.9\nmask_every = 100", "random_keep = 5", "governor = true"],

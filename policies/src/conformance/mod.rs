@@ -24,7 +24,8 @@
 //! - the manual page lists all parameters with their defaults and ranges.
 //!
 //! The suite cannot tell whether your rules match the paper. Test the identities of your policy yourself:
-//! children that conserve opacity, splits that keep their ends, curves that end at the budget.
+//! children that together are as opaque as their parent, splits that together keep its extent, curves that
+//! end at the budget.
 
 use std::fmt;
 

@@ -147,9 +147,9 @@ fn observe(
         let columns: Vec<_> = columns.cloned().collect();
         // With `sees_all`, a policy that requested no points is shown all of them; one that requested some gets only
         // those.
-        let most =
+        let max_points =
             if sees_all && request.points == 0 { usize::MAX } else { request.points as usize };
-        let points = &view.points[..most.min(view.points.len())];
+        let points = &view.points[..max_points.min(view.points.len())];
         let view = AuxView { step, rows, loss: view.loss, columns: &columns, points };
         let observed = catch_panic(|| policy.observe(&view)).map_err(unexpected_error)?;
         observed.map_err(|error| match error {

@@ -1,4 +1,4 @@
-//! Synthetic statistics, plausible or broken. Of the model only the number of rows is tracked.
+//! Synthetic statistics, plausible or broken. The number of rows is all that is tracked of the model.
 
 use crate::plan::RowOps;
 use crate::policy::{

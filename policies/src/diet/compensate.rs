@@ -55,8 +55,8 @@ impl Diet {
             let _ = plan.append(seed);
         }
         let errors: Vec<f32> = valid.iter().map(|(error, _)| *error).collect();
-        let most = event_quota(self.params.rho_c, self.insert, now.step, plan.budget());
-        let worst = top_k(&errors, most);
+        let quota = event_quota(self.params.rho_c, self.insert, now.step, plan.budget());
+        let worst = top_k(&errors, quota);
         let missing = worst.len().saturating_sub(plan.room());
         self.evict(now, plan, importance, (missing, exempt))?;
         for index in worst {

@@ -29,7 +29,7 @@
 //! `rows_per_candidate` Gaussians, together with the surface points seen there. At each insertion the worst
 //! pixels collected since the last one become new Gaussians with the ground-truth colour: at most
 //! `rho_c` · budget over the whole run, an equal part at each insertion. Where there is no room, the
-//! least important Gaussians are evicted. The list is then cleared.
+//! least important Gaussians are evicted. The list of collected pixels is then cleared.
 //!
 //! **Pruning**, every `prune_every` steps until growth and compensation have ended, evicts Gaussians above
 //! the budget. (This happens only if the loaded model was too large.)
@@ -42,7 +42,7 @@
 //!
 //! Each event is one plan in which pruning frees slots before new Gaussians take them, so the budget holds
 //! at all times. The published code exceeds it between insertion and the next pruning; this is not
-//! offered. Opacities are never reset. The published settings also use a learning rate of 0.025 for
+//! reproduced. Opacities are never reset. The published settings also use a learning rate of 0.025 for
 //! opacities, which is an option of the trainer.
 //!
 //! ## Choices
@@ -52,7 +52,7 @@
 //!   limit `rho`, as in the paper and the code.
 //! - `split`: how a candidate larger than `small` is split.
 //!   - `random`: two samples of the parent, with scales divided by `split_factor`, as in the original.
-//!   - `long-axis`: two halves along the parent's longest axis with unchanged ends and `child_opacity`
+//!   - `long-axis`: two halves along the parent's longest axis that keep its two ends, with `child_opacity`
 //!     times its opacity, as in `igs`. With d = `split_share` they are placed at ±3d standard
 //!     deviations; their longest axis is 1 − d times the parent's, the others √(1 − d²).
 //! - `shift`: the offset of a clone from its parent. Σ sums over the views since the last growth, dL/dμ is
@@ -282,8 +282,8 @@ impl DensityPolicy for Diet {
             return Ok(());
         }
         self.fresh.resize(view.rows, 0.0);
-        for (most, &weight) in self.fresh.iter_mut().zip(view.column(AuxColumn::WeightMax)?) {
-            *most = most.max(weight);
+        for (so_far, &weight) in self.fresh.iter_mut().zip(view.column(AuxColumn::WeightMax)?) {
+            *so_far = so_far.max(weight);
         }
         Ok(())
     }
@@ -320,13 +320,13 @@ impl DensityPolicy for Diet {
         let is_candidate = |row: u32| grows && gradient[row as usize] >= self.params.tau as f32;
         if grows {
             let without_room = candidates.len().saturating_sub(plan.room());
-            let most = match self.params.growth {
+            let max_evicted = match self.params.growth {
                 Growth::Turnover => {
                     event_quota(self.params.rho, self.grow, now.step, plan.budget())
                 }
                 Growth::All => usize::MAX,
             };
-            self.evict(now, plan, importance, (without_room.min(most), &is_candidate))?;
+            self.evict(now, plan, importance, (without_room.min(max_evicted), &is_candidate))?;
             for row in candidates {
                 // A refusal is counted by the plan.
                 let _ = plan.grow(row, self.offspring(now, row as usize)?);

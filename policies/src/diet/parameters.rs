@@ -56,9 +56,9 @@ pub struct DietParams {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Growth {
-    /// Room, plus this event's part of `rho` · budget by eviction.
+    /// As many as have room, plus this event's part of `rho` · budget, for which other rows are evicted.
     Turnover,
-    /// Room, plus all other rows, which are evicted.
+    /// As many as have room, plus one for each row that can be evicted.
     All,
 }
 

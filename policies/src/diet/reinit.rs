@@ -23,7 +23,7 @@ impl Diet {
     /// Replaces all rows by the surface points. Without any point the model is kept.
     pub(super) fn reinit(&mut self, extent: f32, plan: &mut EditPlan) {
         let surface = std::mem::take(&mut self.surface);
-        let most = share_of_budget(self.params.reinit_share, plan.budget());
-        replace_model(&surface, most, self.params.newborn_opacity as f32, extent, plan);
+        let max_rows = share_of_budget(self.params.reinit_share, plan.budget());
+        replace_model(&surface, max_rows, self.params.newborn_opacity as f32, extent, plan);
     }
 }

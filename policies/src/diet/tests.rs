@@ -53,7 +53,7 @@ fn the_gradient_mixes_screen_and_colour() {
 
 #[test]
 fn at_the_budget_the_least_important_are_replaced() {
-    // A tenth of 20: two rows, the least important of the rows that are not candidates.
+    // 9.4 / 94 is a tenth of the budget of 20: two rows, the least important of those that are not candidates.
     let event =
         event(600, 20, 20).with(Signal::ScreenGradient, &gradient_sums(20, &[0, 2, 9, 12, 19]));
     let done = run(&event, "rho = 9.4");
@@ -190,7 +190,7 @@ fn if_all_rows_are_new_the_oldest_are_evicted() {
 }
 
 #[test]
-fn clones_shift_by_the_rule() {
+fn each_shift_rule_gives_the_documented_offset() {
     let event = event(600, 3, 10)
         .with(Signal::ScreenGradient, &[3.0, 2.0, 1.0])
         .with(Signal::ScaleMax, &[0.05, 0.05, 1.0])
@@ -416,7 +416,7 @@ fn the_model_is_replaced_by_surface_points() {
     assert_eq!(done.ops.counts, EditCounts { removed: 9, added: 8, updated: 0, denied: 0 });
     assert_eq!((done.ops.rows_after, done.ops.cause.as_str()), (8, "reinit"));
     assert!(!done.ops.reset_signals.is_empty() && done.ops.reset_candidates);
-    // Neighbours of 0: 1, 2, 3; of 1: 1, 1, 2.
+    // Distances to the three nearest neighbours: of point 0: 1, 2, 3; of point 1: 1, 1, 2.
     let seeds: Vec<Seed> = done.ops.seeds.iter().map(|(_, seed)| *seed).collect();
     let sizes = [(14.0_f32 / 3.0).sqrt(), 2.0_f32.sqrt()];
     for (seed, size) in seeds.iter().zip(sizes) {
@@ -447,13 +447,13 @@ fn coinciding_and_isolated_points_have_a_size() {
         let done = run(&Event { views, ..event.clone() }, "reinit_at = 5000");
         done.ops.seeds.iter().map(|(_, seed)| seed.scales[1]).collect()
     };
-    // The extent is 10.
+    // 2e-4 and 0.02 of the extent of 10.
     assert_eq!(scales(vec![point, point]), [2e-3, 2e-3]);
     assert_eq!(scales(vec![point, nowhere]), [0.2]);
 }
 
 #[test]
-fn every_choice_conforms() {
+fn other_parameter_values_conform() {
     assert_conforms(
         "diet",
         &[

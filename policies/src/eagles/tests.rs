@@ -74,7 +74,7 @@ fn growth_is_that_of_vanilla() {
 }
 
 #[test]
-fn a_prune_passes_over_rows_that_the_same_event_grew() {
+fn rows_that_grow_in_an_event_are_not_pruned_in_it() {
     // The ⅓ quantile is 1; rows 0 and 1 are at or below it, and row 0 is cloned.
     let event = Event { budget: 9, ..event(625, &[0.5, 1.0, 3.0, 4.0]) }
         .with(Signal::ScreenGradient, &[1.0, 0.0, 0.0, 0.0]);
@@ -92,7 +92,7 @@ fn the_control_prunes_the_same_number_at_random() {
 }
 
 #[test]
-fn every_choice_conforms() {
+fn other_parameter_values_conform() {
     assert_conforms(
         "eagles",
         &[

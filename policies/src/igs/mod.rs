@@ -21,7 +21,7 @@
 //!
 //! A candidate is **split along its longest axis**. With d = `split_share`, two children are placed at
 //! ±3d standard deviations; their longest axis is 1 − d times the parent's, the others √(1 − d²)
-//! times, so that both ends stay in place. Their opacity is the parent's times `child_opacity`.
+//! times, so that both ends of the parent stay in place. Their opacity is the parent's times `child_opacity`.
 //!
 //! **Pruning** follows the splits of the same step; the next growth step uses the room it makes, and
 //! Gaussians below the opacity limit may be drawn before they are pruned. Each growth step prunes Gaussians
@@ -42,8 +42,9 @@
 //!
 //! - **`sums`.** The published values of `sum` and `sum_more`, 5 and 20, give 1,500 + 375 optimiser steps in the second
 //!   half of 30,000 iterations, but 350 + 88 in a run of 7,000. By default (`"scaled"`) both are multiplied by
-//!   iterations / 30,000 and rounded, at least 1, so that a short run has about as many optimiser steps if
-//!   it has enough iterations; 7,000 gives 1 and 5. `"fixed"` uses the same values in a run of any length.
+//!   iterations / 30,000 and rounded, at least 1, so that a short run has about as many optimiser steps as a
+//!   full one if it has enough iterations; a run of 7,000 uses 1 and 5. `"fixed"` uses the same values in a
+//!   run of any length.
 //! - The published code splits, then prunes. A plan has one edit per Gaussian: if a Gaussian is drawn and
 //!   its children would be pruned in the same event, it is pruned itself. The result is the same.
 //! - `recover` counts optimiser steps and does not scale with the length of the run, but is at most half

@@ -81,8 +81,8 @@ fn each_view_has_the_same_weight() {
 #[test]
 fn candidates_are_drawn_in_proportion_to_edge_scores() {
     let edges: Vec<f32> = (0..4000).map(|row| if row % 2 == 0 { 1.0 } else { 9.0 }).collect();
-    // Room for about 100 splits; 10 are expected of rows with weak edges, with a standard deviation of 3, five of which
-    // are allowed.
+    // Room for about 100 splits. About 10 of these should be of rows with weak edges; five standard deviations (3 each)
+    // more are allowed.
     let split = run(&event(14_400, &edges, 4114), "").split;
     let weak = split.iter().filter(|row| *row % 2 == 0).count();
     assert!((90..=110).contains(&split.len()) && weak <= 25, "{weak} of {}", split.len());
@@ -170,7 +170,7 @@ fn a_fifth_is_pruned_after_each_of_two_resets() {
     let opacity = [0.5, 0.01, 0.4, 0.3, 0.02, 0.2, 0.9, 0.03, 0.8, 0.7];
     let event = event(3300, &[1.0; 10], 10).with(Signal::Opacity, &opacity);
     let done = run(&event, "");
-    // Below the quantile, which is at place 0.2 · 9 = 1.8 in the order of opacity.
+    // The rows below the quantile, which is at place 0.2 · 9 = 1.8 in ascending order of opacity.
     assert_eq!(done.pruned, [1, 4]);
     assert_eq!(done.ops.cause, "recovery-prune+grow");
     assert!(!done.ops.reset_signals.is_empty());
@@ -276,7 +276,7 @@ fn the_optimiser_steps_less_often_towards_the_end() {
     assert_eq!(plain.needs(&scene).cadence, Cadence::default());
 }
 
-/// Iterations at which the optimiser steps, in the two quarters after `sum_from`.
+/// Number of iterations at which the optimiser steps, in each of the two quarters after `sum_from`.
 fn optimiser_steps(set: &str, iterations: u32) -> [usize; 2] {
     let scene = SceneInfo { iterations, ..Event::new(1, 1, 1).scene };
     let policy = build("igs", set, &scene);
@@ -306,7 +306,7 @@ fn the_number_of_optimiser_steps_is_kept_in_short_runs() {
     let fixed = "sums = \"fixed\"";
     assert_eq!(optimiser_steps(fixed, 30_000), [1500, 375]);
     assert_eq!(optimiser_steps(fixed, 7000), [350, 88]);
-    // Values that are set scale too.
+    // Values set by the user scale too.
     assert_eq!(optimiser_steps("sum = 30", 7000), [250, 350]);
     assert_eq!(optimiser_steps(&format!("sum = 30\n{fixed}"), 7000), [59, 88]);
     // 20 · 400 / 3 is clamped to the maximum.
@@ -316,7 +316,7 @@ fn the_number_of_optimiser_steps_is_kept_in_short_runs() {
 }
 
 #[test]
-fn every_choice_conforms() {
+fn other_parameter_values_conform() {
     assert_conforms(
         "igs",
         &[

@@ -31,7 +31,7 @@
 //! - `volume` is V: `plain`, as in the published code; or `clipped`, as in the paper, min(V / V90, 1),
 //!   where V90 is the 90th percentile.
 //! - `victims = "random"` is a control that measures the effect of the criterion: it prunes the same number
-//!   at random. It renders no view, and is identical up to the first prune.
+//!   at random. It renders no view, and its run is identical to the real one up to the first prune.
 //!
 //! ## Under a budget
 //!
@@ -41,7 +41,7 @@
 //!
 //! ## Differences from the published code
 //!
-//! - The published code divides V by a volume V_ref that 90 % of the Gaussians exceed. It is the same for
+//! - The published code divides V by a volume V_ref that 90 % of the Gaussians exceed. V_ref is the same for
 //!   all Gaussians and does not change their order, so it is left out.
 //! - ⌊share · N⌋ of N Gaussians are pruned; the published code also prunes those of equal significance.
 //!   The last Gaussian is never pruned.

@@ -144,7 +144,7 @@ fn growth_is_that_of_vanilla() {
 }
 
 #[test]
-fn a_prune_passes_over_rows_that_the_same_event_grew() {
+fn rows_that_grow_in_an_event_are_not_pruned_in_it() {
     // Row 0 has the lowest significance and is cloned; of four rows two are pruned.
     let mut event =
         Event { budget: 9, ..event(600, 4) }.with(Signal::ScreenGradient, &[1.0, 0.0, 0.0, 0.0]);
@@ -176,7 +176,7 @@ fn without_a_view_nothing_is_pruned() {
 }
 
 #[test]
-fn every_choice_conforms() {
+fn other_parameter_values_conform() {
     assert_conforms(
         "lightgaussian",
         &[

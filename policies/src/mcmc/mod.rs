@@ -20,7 +20,7 @@
 //! A Gaussian drawn n times becomes N = n + 1 equal ones that together render like the original. Each
 //! has the opacity o′ = 1 − (1 − o)^(1/N), at least `min_opacity`, and standard deviations multiplied
 //! by o / Σₖ C(N, k)·(−1)^(k−1)·o′^k/√k, k from 1 to N (equation 9 of the paper with its double sum
-//! evaluated). N is capped at `most_shares` in these formulas. Mean, rotation and colour are copied.
+//! simplified). N is capped at `most_shares` in these formulas. Mean, rotation and colour are copied.
 //!
 //! **At every step** two terms are added to the loss, `opacity_term` · mean opacity and
 //! `scale_term` · mean standard deviation, so that Gaussians which are not needed fade and shrink.

@@ -210,6 +210,6 @@ fn terms_and_noise_are_scaled_by_the_camera_radius() {
 }
 
 #[test]
-fn every_choice_conforms() {
+fn other_parameter_values_conform() {
     assert_conforms("mcmc", &["growth = 1.0\nnoise = 0.0", "min_opacity = 0.5\nmost_shares = 2"]);
 }

@@ -30,7 +30,7 @@ fn the_curve_fills_the_budget_without_a_threshold() {
     assert_eq!((done.ops.rows_after, done.pruned.len()), (100, 0));
     assert_eq!(done.cloned[..3], [59, 58, 57]);
     assert_eq!((done.ops.cause.as_str(), done.ops.reset_signals.is_empty()), ("grow", false));
-    // Each row has at most one child in an event, and after its end the curve allows the whole budget.
+    // After its end the curve allows the whole budget, but each row has at most one child in an event.
     let late = Event { step: 8600, ..event.clone() };
     assert_eq!(run(&late, "curve_until = 8500").ops.rows_after, 120);
     let low = Event { budget: 99, ..late };
@@ -50,7 +50,7 @@ fn the_curve_fills_the_budget_without_a_threshold() {
 }
 
 #[test]
-fn events_come_at_their_steps() {
+fn events_follow_the_schedule() {
     let scene = Event::new(1, 10, 10).scene;
     let due = due_steps("merit", "grow_until = 900\ngrow_every = 200", &scene);
     assert_eq!(due, [600, 800]);
@@ -145,7 +145,7 @@ fn needs_list_only_used_signals() {
 }
 
 #[test]
-fn every_choice_conforms() {
+fn other_parameter_values_conform() {
     assert_conforms(
         "merit",
         &[

@@ -22,8 +22,8 @@
 //! **Sampling** at step `sample_at`. A Gaussian's importance is the sum of its blend weights α·T over all
 //! pixels of all training views, or 0 if it dominates no pixel. (`importance` = "density" divides the sum of
 //! each view by the number of pixels, as published for outdoor scenes.) Of the Gaussians with an importance
-//! above 0, the share `sample_share` is drawn without replacement, in proportion to it, and all others are
-//! pruned. The remaining ones restart: round, sized by the distance to their three nearest neighbours, with
+//! above 0, the share `sample_share` is drawn without replacement, in proportion to importance, and all others
+//! are pruned. The remaining ones restart: round, sized by the distance to their three nearest neighbours, with
 //! opacity `restart_opacity`, without view-dependent colour and without optimiser moments. (Published shares:
 //! 0.5, and 0.3 for Tanks & Temples and Deep Blending.)
 //!
@@ -152,12 +152,12 @@ impl DensityPolicy for MiniSplatting {
     fn needs(&self, scene: &SceneInfo) -> Needs {
         let growth = self.growth.needs(scene);
         let rebuilds = self.params.first_reinit_at > 0 || self.params.second_reinit_at > 0;
-        let most = self.reinit_rows(scene.budget);
+        let max_rows = self.reinit_rows(scene.budget);
         let opacity = Some(Rate::constant(self.params.opacity_rate));
         let aux = AuxRequest {
             map: PixelMap::default(),
             columns: vec![AuxColumn::WeightSum, AuxColumn::PixelCount, AuxColumn::DominantPixels],
-            points: if rebuilds { points_per_view(most, scene.train_views) } else { 0 },
+            points: if rebuilds { points_per_view(max_rows, scene.train_views) } else { 0 },
         };
         Needs {
             signals: growth.signals.with(Signal::DominantPixels).with(Signal::Position),
@@ -201,9 +201,9 @@ impl DensityPolicy for MiniSplatting {
     fn plan(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
         let surface = std::mem::take(&mut self.surface);
         if self.is_reinit(now.step) {
-            let most = self.reinit_rows(plan.budget());
+            let max_rows = self.reinit_rows(plan.budget());
             let opacity = self.params.restart_opacity as f32;
-            replace_model(&surface, most, opacity, now.scene.extent, plan);
+            replace_model(&surface, max_rows, opacity, now.scene.extent, plan);
             return Ok(());
         }
         if is_at(self.params.sample_at, now.step) {

@@ -153,7 +153,7 @@ fn the_control_keeps_the_same_number_at_random() {
 }
 
 #[test]
-fn every_choice_conforms() {
+fn other_parameter_values_conform() {
     assert_conforms(
         "mini-splatting",
         &[

@@ -74,7 +74,7 @@ impl Needs {
     /// Checks that every number is finite and in its range.
     ///
     /// # Errors
-    /// The first that is not, with its value.
+    /// The first number that is not, with its value.
     pub fn check(&self) -> Result<(), String> {
         at_least("full_depth", self.full_depth.into(), 0.0)?;
         self.error_score.check()?;

@@ -76,15 +76,15 @@ impl ErrorScore {
 
     pub(super) fn check(&self) -> Result<(), String> {
         at_least("error_score.edge", self.edge.into(), 0.0)?;
-        for (name, value, lowest, most) in [
+        for (name, value, lowest, highest) in [
             ("power", self.power, f32::MIN_POSITIVE, 16.0),
             ("footprint", self.footprint, 0.0, 1.0),
             ("view_power", self.view_power, f32::MIN_POSITIVE, 1.0),
         ] {
-            if !(lowest..=most).contains(&value) {
+            if !(lowest..=highest).contains(&value) {
                 let above = if lowest > 0.0 { "above 0" } else { "at least 0" };
                 return Err(format!(
-                    "error_score.{name} is {value}; it must be {above}, at most {most}"
+                    "error_score.{name} is {value}; it must be {above}, at most {highest}"
                 ));
             }
         }

@@ -80,13 +80,13 @@ fn every_corruption_is_found() {
             ops.updates[0].1.opacity = OpacityRule::Set(0.0);
         }),
         ("seed in a child's slot", |ops| ops.seeds[0].0 = 1),
-        ("seed in the slot of a moved row", |ops| ops.seeds[0].0 = 3),
+        ("seed in a slot that a row moves to", |ops| ops.seeds[0].0 = 3),
         ("bad seed", |ops| ops.seeds[0].1.scales[1] = f32::NAN),
-        ("move out of the middle", |ops| ops.moves[0].0 = 4),
-        ("move of nothing", |ops| ops.moves[0].0 = 10),
-        ("move twice", |ops| ops.moves[0].0 = 9),
+        ("move from before the tail", |ops| ops.moves[0].0 = 4),
+        ("move from beyond the model", |ops| ops.moves[0].0 = 10),
+        ("a row moved twice", |ops| ops.moves[0].0 = 9),
         ("move to a child's slot", |ops| ops.moves[0].1 = 1),
-        ("move beyond the model", |ops| ops.moves[0].1 = 8),
+        ("move to beyond the model", |ops| ops.moves[0].1 = 8),
         ("move missing", |ops| ops.moves.truncate(1)),
     ];
     let passed: Vec<&str> = corruptions

@@ -126,7 +126,7 @@ fn calls() -> impl Strategy<Value = (usize, usize, Vec<Call>)> {
     })
 }
 
-/// The content of a slot in the naive model.
+/// The content of a slot in the plain vector.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Occupant {
     Row(u32),

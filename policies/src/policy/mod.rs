@@ -106,7 +106,7 @@ pub type PolicyState = serde_json::Value;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SceneInfo {
     /// Size of the scene `[scene units]`, > 0: 1.1 times the largest distance of a training camera from the mean
-    /// of all, or the substitute described at [`Signal::Position`]. Size thresholds are fractions of it.
+    /// of all cameras, or the substitute described at [`Signal::Position`]. Size thresholds are fractions of it.
     pub extent: f32,
     /// Number of training views, >= 1; also the length of an epoch in steps.
     pub train_views: u32,

@@ -18,10 +18,10 @@
 //! pruned. A sum of weights would spare large faint Gaussians; the largest weight tells whether a Gaussian
 //! matters anywhere. The paper's light variant, with fewer Gaussians, is `min_weight` = 0.25.
 //!
-//! `victims = "random"` is a control that measures the effect of the importance: it prunes at random. It is
-//! identical up to the first prune, which removes the same number. As most unimportant Gaussians remain after
-//! it, the second prune would remove more than in the real run: set `random_keep` to the number that the real
-//! run had after its second prune.
+//! `victims = "random"` is a control that measures the effect of the importance: it prunes at random. Its run is
+//! identical to the real one up to the first prune, which removes the same number. As most unimportant Gaussians
+//! remain after that prune, the second prune would remove more than in the real run: set `random_keep` to the
+//! number that the real run had after its second prune.
 //!
 //! ## Under a budget
 //!

@@ -24,7 +24,7 @@ fn event(step: u32, views: &[&[f32]]) -> Event {
 }
 
 #[test]
-fn rows_below_the_weight_in_every_view_are_pruned() {
+fn rows_below_min_weight_in_every_view_are_pruned() {
     // Maxima: 0.0099, 0.01, 0.5, 0, 0.02. The sum of row 0 is larger than that of row 1.
     let views: [&[f32]; 2] = [&[0.0099, 0.01, 0.0, 0.0, 0.02], &[0.0099, 0.0, 0.5, f32::NAN, 0.0]];
     for step in [16_000, 24_000] {
@@ -65,8 +65,8 @@ fn growth_is_that_of_vanilla() {
 }
 
 #[test]
-fn a_prune_passes_over_rows_that_the_same_event_grew() {
-    // Rows 0 and 1 are below the weight, and row 0 is cloned.
+fn rows_that_grow_in_an_event_are_not_pruned_in_it() {
+    // Rows 0 and 1 are below `min_weight`, and row 0 is cloned.
     let event = Event { budget: 9, ..event(600, &[&[0.0, 0.0, 0.5]]) }
         .with(Signal::ScreenGradient, &[1.0, 0.0, 0.0]);
     let done = run(&event, "first_at = 600");
@@ -76,13 +76,13 @@ fn a_prune_passes_over_rows_that_the_same_event_grew() {
 
 #[test]
 fn the_control_prunes_the_same_number_at_random() {
-    // 300 of 1,000 are below the weight.
+    // 300 of 1,000 are below `min_weight`.
     let weights: Vec<f32> = (0..1000).map(|row| if row < 300 { 0.001 } else { 0.5 }).collect();
     let event = event(16_000, &[&weights]);
     assert!(run(&event, "").pruned.iter().all(|row| *row < 300));
     let random = run(&event, "victims = \"random\"");
     assert_eq!(random.ops.rows_after, 700);
-    // 30 % of those pruned are below the weight: 90 ± 5·√44.1 (hypergeometric).
+    // 30 % of the pruned rows should be below `min_weight`: 90 ± 5·√44.1 (hypergeometric).
     let low = random.pruned.iter().filter(|row| **row < 300).count();
     assert!(low.abs_diff(90) < 34, "{low}");
 }
@@ -93,7 +93,7 @@ fn the_second_prune_of_the_control_may_keep_a_given_number() {
     let set = "victims = \"random\"\nrandom_keep = 3";
     let event = event(24_000, &[&[0.0, 0.5, 0.5, 0.5, 0.5]]);
     assert_eq!(run(&event, set).ops.rows_after, 3);
-    // Not at the first prune, and not by the real policy; a smaller model is left as it is.
+    // `random_keep` does not apply to the first prune or the real policy; a smaller model is left as it is.
     assert_eq!(run(&Event { step: 16_000, ..event.clone() }, set).ops.rows_after, 4);
     assert_eq!(run(&event, "random_keep = 3").ops.rows_after, 4);
     assert_eq!(run(&event, "victims = \"random\"\nrandom_keep = 1").ops.rows_after, 1);
@@ -109,7 +109,7 @@ fn without_a_view_nothing_is_pruned() {
 }
 
 #[test]
-fn every_choice_conforms() {
+fn other_parameter_values_conform() {
     assert_conforms(
         "radsplat",
         &[

@@ -168,7 +168,7 @@ mod tests {
 
     #[test]
     fn distances_to_an_ellipsoid_match_values_worked_out_by_hand() {
-        // A ball; the end of each axis; inside.
+        // Points outside a ball, beyond the ends of axes, and inside an ellipsoid.
         assert_distance([0.0, -2.0, 0.0], [1.0; 3], 1.0);
         assert_distance([2.0, 2.0, 1.0], [1.0; 3], 2.0);
         assert_distance([5.0, 0.0, 0.0], [3.0, 2.0, 1.0], 2.0);

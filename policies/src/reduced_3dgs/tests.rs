@@ -182,7 +182,7 @@ fn the_control_prunes_the_same_number_at_random() {
 
 #[test]
 fn the_control_may_end_at_a_given_number() {
-    // From 810 to 10 over the four prunes at 27,000 to 30,000: a third each.
+    // From 810 to 10 over the four prunes at 27,000 to 30,000: each leaves a third.
     let xs: Vec<f32> = (0..810).map(|row| 10.0 * row as f32).collect();
     let left = |step, rows: usize, set: &str| {
         let set = format!("victims = \"random\"\nrandom_keep = 10\n{set}");
@@ -197,7 +197,7 @@ fn the_control_may_end_at_a_given_number() {
     assert_eq!(left(15_000, 810, ""), 615);
     let one = "victims = \"random\"\nrandom_keep = 1";
     assert_eq!(run(&event(30_000, &xs[..30]), one).ops.rows_after, 1);
-    // During growth it prunes as many as the rule would, here none.
+    // During growth the control prunes as many as the real policy would, here none.
     assert_eq!(left(14_000, 810, "grow_every = 0"), 810);
 }
 
@@ -208,7 +208,7 @@ fn mean_and_deviation_match_values_worked_out_by_hand() {
 }
 
 #[test]
-fn every_choice_conforms() {
+fn other_parameter_values_conform() {
     assert_conforms(
         "reduced-3dgs",
         &[

@@ -35,7 +35,7 @@
 //! ## Differences from the published code
 //!
 //! - The published code draws from all Gaussians and prunes the dead ones (too faint or too large) among those
-//!   drawn. It also uses scores from before splits removed parents, so that they belong to other Gaussians.
+//!   drawn. Its scores date from before splits removed the parents, so their indices refer to other Gaussians.
 //!   `prune = "published"` does both; the default, `candidates`, draws from the dead by their own scores.
 //! - Dead Gaussians do not grow.
 //! - Colour, map and sums come from one render per view; the published code renders twice.
@@ -56,15 +56,15 @@
 //! | small | 0.01 | >= 0 | scene extent | largest size that is cloned; larger ones are split |
 //! | split_factor | 1.6 | 1 to 100 | | a split divides the scales by this |
 //! | views | 10 | >= 0 | views | views rendered per event; 0: all |
-//! | error_weight | 50.0 | >= 0 | | weight of the error in M |
-//! | edge_weight | 50.0 | >= 0 | | weight of the edges in M |
+//! | error_weight | 50.0 | >= 0 | | weight of the error in M_v |
+//! | edge_weight | 50.0 | >= 0 | | weight of the edges in M_v |
 //! | gradient_weight | 25.0 | >= 0 | | coefficient of g_p |
 //! | opacity_weight | 100.0 | >= 0 | | coefficient of the opacity |
 //! | depth_weight | 5.0 | >= 0 | | coefficient of the depth |
 //! | radius_weight | 10.0 | >= 0 | | coefficient of the radius |
 //! | scale_weight | 25.0 | >= 0 | | coefficient of the product of the standard deviations |
 //! | distance_weight | 50.0 | >= 0 | | coefficient of the sum of distances |
-//! | map_weight | 10.0 | >= 0 | | coefficient of the sum of M |
+//! | map_weight | 10.0 | >= 0 | | coefficient of the sum of M_v |
 //! | count_weight | 0.1 | >= 0 | | coefficient of the number of pixels |
 //! | blend_weight | 50.0 | >= 0 | | coefficient of the sum of blend weights |
 //! | min_opacity | 0.005 | 0 to 1 | | Gaussians below this opacity are dead |

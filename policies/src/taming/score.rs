@@ -6,7 +6,7 @@
 use super::TamingParams;
 use crate::policy::{AuxColumn, AuxView, PolicyResult, Signal, Snapshot};
 
-/// Factor on a view's loss in the published code. It matters only relative to the 10⁻⁶ in pruning.
+/// Factor on a view's loss in the published code. It matters only relative to the 10⁻⁶ added to scores in pruning.
 const VIEW_WEIGHT: f32 = 50.0;
 
 /// Sums over the views of the current event. Shape: `[rows]` each.

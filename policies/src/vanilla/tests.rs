@@ -134,6 +134,6 @@ fn the_governor_follows_the_curve_and_not_the_threshold() {
 }
 
 #[test]
-fn every_choice_conforms() {
+fn other_parameter_values_conform() {
     assert_conforms("vanilla", &["governor = true", "grow_every = 0"]);
 }

@@ -11,8 +11,8 @@ use super::{fault, remedy};
 use crate::error::Error;
 use crate::resource::{Folder, data_uri};
 
-/// Maximum number of elements of an accessor without data of its own (sparse accessors start as zeros), as
-/// nothing in the file bounds it.
+/// Maximum number of elements of an accessor without a buffer view. Its elements start as zeros, so the file's
+/// size does not bound their number.
 const MAX_ZEROS: usize = 1 << 24;
 
 /// The contents of a file's buffers, each read at its first use.

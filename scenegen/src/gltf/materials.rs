@@ -42,8 +42,8 @@ impl Reader<'_> {
         };
         let pbr = &source.pbr_metallic_roughness;
         let base_texture = texture(pbr.base_color_texture.as_ref().map(texture_use), true)?;
-        let has_holes = source.alpha_mode != Checked::Valid(JsonAlpha::Opaque);
-        if has_holes && base_texture.is_none() && pbr.base_color_texture.is_some() {
+        let is_transparent = source.alpha_mode != Checked::Valid(JsonAlpha::Opaque);
+        if is_transparent && base_texture.is_none() && pbr.base_color_texture.is_some() {
             let feature = format!("{name}: the texture that says where it is transparent");
             let remedy = "store it as PNG or JPEG, with one of the first two sets of coordinates";
             return Err(Error::unsupported(path, &feature, remedy));

@@ -1,8 +1,8 @@
 //! Loads glTF 2.0, as `.gltf` with files or data URIs and as `.glb`.
 //!
 //! The types of the `gltf` crate describe the JSON. Indices, offsets and counts are checked here, as the
-//! crate's readers do not check them. Whatever places surfaces is applied or refused; animations are ignored:
-//! nodes are where the file places them. Occlusion textures are ignored, as the tracer can compute occlusion.
+//! crate's readers do not check them. Everything that places surfaces is applied or refused, except animations:
+//! nodes stay where the file places them. Occlusion textures are ignored, as the tracer can compute occlusion.
 //!
 //! Errors that cannot change the result are ignored: alignments, bounds of accessors, targets of
 //! buffer views, names of attributes that are not read, morph targets without weight, and objects that the
@@ -30,7 +30,7 @@ const MAX_JSON: usize = 64 << 20;
 /// Maximum number of nodes, meshes, accessors, buffers, images or materials.
 const MAX_ITEMS: usize = 1_000_000;
 const REMEDY: &str = "correct the file or export it again";
-/// Extensions that files may require.
+/// Extensions that are applied.
 const SUPPORTED: [&str; 7] = [
     nodes::INSTANCING,
     "KHR_lights_punctual",
@@ -41,8 +41,8 @@ const SUPPORTED: [&str; 7] = [
     "KHR_texture_transform",
 ];
 
-/// Extensions that place or add surfaces, also in files that do not require them. (Compressed meshes are
-/// refused where there is no uncompressed copy.)
+/// Unsupported extensions that place or add surfaces: refused even in files that use but do not require them.
+/// (Compressed meshes are refused only if there is no uncompressed copy.)
 const GEOMETRY: [&str; 4] =
     ["CESIUM_RTC", "CESIUM_z_up", "FRAUNHOFER_external_model", "NV_displacement_micromap"];
 
@@ -82,7 +82,7 @@ pub(crate) fn load(path: &Path) -> Result<Model, Error> {
     if text.len() > MAX_JSON {
         return Err(fault(path, "JSON", "it is larger than 64 MiB"));
     }
-    refuse_required(path, text)?;
+    refuse_unsupported(path, text)?;
     let root = parse(path, text)?;
     for (what, count) in [
         ("nodes", root.nodes.len()),
@@ -194,9 +194,9 @@ fn split<'a>(path: &Path, bytes: &'a [u8]) -> Result<(&'a [u8], Option<&'a [u8]>
     }
 }
 
-/// Refuses unsupported versions and required extensions. This comes first, as the changes they make may look
-/// like errors.
-fn refuse_required(path: &Path, text: &[u8]) -> Result<(), Error> {
+/// Refuses unsupported versions, unsupported extensions that the file requires, and any use of [`GEOMETRY`]. This
+/// comes first, as what they change in a file may look like an error.
+fn refuse_unsupported(path: &Path, text: &[u8]) -> Result<(), Error> {
     #[derive(serde::Deserialize)]
     #[serde(rename_all = "camelCase")]
     struct Head {

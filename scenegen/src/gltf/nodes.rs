@@ -29,7 +29,7 @@ pub(super) enum Places {
 struct Placed {
     index: usize,
     world: DAffine3,
-    /// Levels above it.
+    /// Number of nodes above this one.
     depth: usize,
     is_shown: bool,
 }
@@ -57,13 +57,13 @@ impl Reader<'_> {
         };
         let mut worlds = vec![None; root.nodes.len()];
         let mut order: Vec<Placed> = Vec::new();
-        let below = |index: &usize| Placed {
+        let at_top = |index: &usize| Placed {
             index: *index,
             world: DAffine3::IDENTITY,
             depth: 0,
             is_shown: true,
         };
-        let mut open: Vec<Placed> = roots.iter().rev().map(below).collect();
+        let mut open: Vec<Placed> = roots.iter().rev().map(at_top).collect();
         while let Some(Placed { index, world: parent, depth, is_shown }) = open.pop() {
             let name = format!("node {index}");
             let Some(node) = root.nodes.get(index) else {
@@ -124,8 +124,8 @@ impl Reader<'_> {
         Ok(())
     }
 
-    /// For each joint of a skin, the transform from the mesh to the world. That of the mesh's node does not count
-    /// (glTF 2.0, 3.7.3.2).
+    /// For each joint of a skin, the transform from the mesh to the world. The transform of the mesh's own node does
+    /// not count (glTF 2.0, 3.7.3.2).
     fn joints(
         &mut self,
         index: usize,
@@ -252,7 +252,7 @@ fn extension<'a>(node: &'a json::Node, name: &str) -> Option<&'a Value> {
     node.extensions.as_ref()?.others.get(name)
 }
 
-/// The transform of a matrix in columns.
+/// The transform of a matrix given by its columns.
 fn affine(columns: &[f32; 16]) -> DAffine3 {
     DAffine3::from_mat4(DMat4::from_cols_array(&columns.map(f64::from)))
 }

@@ -71,24 +71,24 @@ impl Reader<'_> {
             return Err(self.fault(element, format!("index {index} of {count} vertices")));
         }
         let triangles = triangles(mode, &indices);
-        // The matrices of a pose: one for all vertices, or one for each.
+        // All matrices, and how many make one pose: one for all vertices, or one for each vertex.
         let skinned;
-        let (matrices, each) = match places {
+        let (matrices, per_pose) = match places {
             Places::Instances(all) => (all, 1),
             Places::Joints(joints) => {
                 skinned = self.skinned(&source, joints, count)?;
                 (&skinned, count)
             }
         };
-        let poses = matrices.len() / each;
+        let poses = matrices.len() / per_pose;
         if self.model.triangles.len() + poses * triangles.len() > MAX_TRIANGLES
             || self.model.positions.len() + poses * count > u32::MAX as usize
         {
             return Err(self.fault(element, "the scene has more than 2^26 triangles"));
         }
         let material = self.material(primitive.material.map(|index| index.value()))?;
-        for pose in matrices.chunks(each) {
-            let of = |vertex: usize| if each == 1 { 0 } else { vertex };
+        for pose in matrices.chunks(per_pose) {
+            let of = |vertex: usize| if per_pose == 1 { 0 } else { vertex };
             let normal_matrices: Vec<_> =
                 pose.iter().map(|world| world.matrix3.inverse().transpose()).collect();
             let mirrored: Vec<bool> =
@@ -165,7 +165,8 @@ impl Reader<'_> {
         weights.map(target).collect()
     }
 
-    /// An attribute with morph targets applied; `None` if the primitive lacks it. `count` is that of the positions.
+    /// An attribute with morph targets applied; `None` if the primitive lacks it. `count` is the number of
+    /// positions; `None` for the positions themselves.
     fn attribute(
         &mut self,
         source: &Source<'_>,
@@ -201,7 +202,7 @@ impl Reader<'_> {
         Ok(Some(values))
     }
 
-    /// For each vertex, the mean of its joints' transforms by their weights (glTF 2.0, 3.7.3.3), which need not sum to 1.
+    /// For each vertex, the weighted mean of its joints' transforms (glTF 2.0, 3.7.3.3). Weights need not sum to 1.
     fn skinned(
         &mut self,
         source: &Source<'_>,

@@ -90,15 +90,15 @@ fn append(json: &mut Value, bin: &mut Vec<u8>, kind: &str, values: &[f32]) -> us
     accessors.len() - 1
 }
 
-/// The square with a skin: its left corners at the joint in node 2, its right ones at equal parts of node 2 and 3.
-/// `weights` are those of the right corners.
+/// The square with a skin: its left corners follow the joint in node 2, its right corners those in nodes 2 and 3
+/// with these `weights`.
 fn skinned(weights: [f32; 2]) -> (Value, Vec<u8>) {
     let (mut json, mut bin) = square();
     let [a, b] = weights;
     let joints = append(&mut json, &mut bin, "VEC4", &[[0.0, 1.0, 0.0, 0.0]; 4].concat());
     let (left, right) = ([3.0, 0.0, 0.0, 0.0], [a, b, 0.0, 0.0]);
     let weights = append(&mut json, &mut bin, "VEC4", &[left, right, right, left].concat());
-    // The second joint is half as large: its inverse bind matrix doubles.
+    // The second joint is scaled by one half, and its inverse bind matrix by two.
     let mut binds = [0.0; 32];
     for (i, value) in
         [(0, 1.0), (5, 1.0), (10, 1.0), (15, 1.0), (16, 2.0), (21, 2.0), (26, 2.0), (31, 1.0)]
@@ -108,7 +108,7 @@ fn skinned(weights: [f32; 2]) -> (Value, Vec<u8>) {
     let binds = append(&mut json, &mut bin, "MAT4", &binds);
     json["scenes"][0]["nodes"] = json!([0, 1]);
     json["nodes"] = json!([
-        // The place of the mesh's own node does not count.
+        // The transform of the mesh's own node does not count.
         { "mesh": 0, "skin": 0, "translation": [100, 100, 100] },
         { "translation": [2, 0, 0], "children": [2] },
         { "children": [3] },
@@ -145,21 +145,21 @@ fn interleaved_accessors_and_nodes_are_read() {
         assert!(area(&model).distance(-4.0 * DVec3::Y) < 1e-6, "{}", area(&model));
         assert!(model.positions[2].distance(DVec3::new(3.0, 2.0, 5.0)) < 1e-6);
     }
-    // Mirrored in x, the front stays the same.
+    // Mirrored in x, it still faces +z.
     let model = with("/nodes/0", json!({ "mesh": 0, "scale": [-1, 1, 1] })).expect("node");
     assert_eq!(area(&model), DVec3::Z);
-    // Mirrored along the view, it faces the other way.
+    // Mirrored in z, it faces the other way.
     let model = with("/nodes/0", json!({ "mesh": 0, "scale": [1, 1, -1] })).expect("node");
     assert_eq!(area(&model), -DVec3::Z);
 }
 
 #[test]
-fn strips_fans_and_instances_have_the_same_area() {
+fn fans_sparse_strips_and_child_nodes_are_read() {
     let (mut json, bin) = square();
     json["meshes"][0]["primitives"][0]["mode"] = json!(6);
     json["meshes"][0]["primitives"][0].as_object_mut().expect("object").remove("indices");
     assert_eq!(area(&load_bytes(&glb(&json, &bin)).expect("fan")), DVec3::Z);
-    // A strip of the corners 0, 1, 3, 2: as sparse changes of the corners 2 and 3.
+    // A strip needs the corners in the order 0, 1, 3, 2: a sparse accessor swaps the last two.
     json["meshes"][0]["primitives"][0]["mode"] = json!(5);
     let mut sparse = bin.clone();
     sparse.extend([2, 3, 0, 0]);
@@ -251,7 +251,7 @@ fn bad_values_are_errors_that_name_the_element() {
     bin[16..20].copy_from_slice(&f32::NAN.to_le_bytes());
     let message = load_bytes(&glb(&json, &bin)).expect_err("NaN").to_string();
     assert!(message.contains("vertex 1"), "{message}");
-    // A truncated file is an error or loads.
+    // A truncated file may load or be refused, but must not panic.
     let (json, bin) = square();
     let whole = glb(&json, &bin);
     for length in 0..whole.len() {
@@ -260,7 +260,7 @@ fn bad_values_are_errors_that_name_the_element() {
 }
 
 #[test]
-fn required_extensions_are_refused_by_name() {
+fn unsupported_required_extensions_are_refused_by_name() {
     for (name, remedy) in [
         ("KHR_draco_mesh_compression", "Draco"),
         ("EXT_meshopt_compression", "meshopt"),
@@ -324,12 +324,12 @@ fn skins_place_vertices_at_joints_times_inverse_binds() {
         }
         assert!(model.notes.is_empty(), "{:?}", model.notes);
     }
-    // Without inverse bind matrices they are identities: the second joint halves the corners.
+    // Missing inverse bind matrices are identities, so the second joint halves the square.
     let (mut json, bin) = skinned([0.0, 1.0]);
     json["skins"][0].as_object_mut().expect("object").remove("inverseBindMatrices");
     let model = load_bytes(&glb(&json, &bin)).expect("a skin");
     assert_eq!(model.positions[2], DVec3::new(2.5, 0.5, 4.0));
-    // More than four joints have more sets; a set that is mirrored turns the triangles over, as with nodes.
+    // A second set of joints is read; mirrored joints reverse the winding, as mirrored nodes do.
     let (mut json, bin) = skinned([1.0, 0.0]);
     let attributes = &mut json["meshes"][0]["primitives"][0]["attributes"];
     let (joints, weights) = (attributes["JOINTS_0"].clone(), attributes["WEIGHTS_0"].clone());
@@ -397,7 +397,7 @@ fn morph_targets_with_weights_are_applied() {
 }
 
 #[test]
-fn instances_are_placed_below_their_node() {
+fn instances_are_relative_to_their_node() {
     let (mut json, mut bin) = square();
     let half = 0.5_f32.sqrt();
     let at = append(&mut json, &mut bin, "VEC3", &[0.0, 0.0, 0.0, 5.0, 0.0, 0.0]);
@@ -410,7 +410,7 @@ fn instances_are_placed_below_their_node() {
             "mesh": 0, "translation": [0, 10, 0], "children": [1],
             "extensions": { nodes::INSTANCING: { "attributes": attributes } },
         },
-        // Children are no instances.
+        // Children are not instanced.
         { "mesh": 0 },
     ]);
     let model = load_bytes(&glb(&json, &bin)).expect("instances");
@@ -459,7 +459,7 @@ fn byte_order_marks_are_skipped() {
     let text = format!("\u{feff}{text}");
     assert_eq!(area(&load_bytes(text.as_bytes()).expect("a mark")), DVec3::Z);
     let mut whole = glb(&json, &bin);
-    // A GLB may have one before its JSON.
+    // A GLB may have a mark before its JSON.
     whole.splice(20..20, *b"\xef\xbb\xbf ");
     let length = u32::from_le_bytes([whole[12], whole[13], whole[14], whole[15]]) + 4;
     whole[12..16].copy_from_slice(&length.to_le_bytes());
@@ -480,7 +480,7 @@ fn geometry_that_only_extensions_define_is_refused() {
     let primitive = "/meshes/0/primitives/0";
     let compressed = json!({ DRACO: { "bufferView": 0, "attributes": {} } });
     for (pointer, value, part) in [
-        // A file that does not require Draco must have a copy without it.
+        // A file that does not require Draco must have an uncompressed copy.
         (&*format!("{primitive}/extensions"), compressed.clone(), None),
         (
             "/accessors/0",
@@ -520,7 +520,7 @@ fn geometry_that_only_extensions_define_is_refused() {
 }
 
 #[test]
-fn textures_with_holes_are_not_ignored() {
+fn unsupported_textures_of_transparent_materials_are_refused() {
     let (mut json, bin) = square();
     json["textures"] = json!([{ "extensions": { "KHR_texture_basisu": { "source": 0 } } }]);
     json["meshes"][0]["primitives"][0]["material"] = json!(0);

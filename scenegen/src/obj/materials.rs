@@ -14,15 +14,15 @@ use crate::texture::{TextureRef, Wrap};
 /// Linear base colour of materials without a colour, and of faces without a material.
 pub(super) const GREY: f32 = 0.6;
 
-/// A material's statements by their keys in lower case, as some programs write them: line, key and text. Of several with
-/// one key, the last counts.
+/// A material's statements (line, key as written, text) by key in lower case, as programs differ in case. Of several
+/// statements with the same key, the last counts.
 type Entries = HashMap<String, (usize, String, String)>;
 
 /// The materials of all libraries of an OBJ file.
 pub(super) struct Materials {
     folder: Folder,
-    /// The model's indices of materials; `None` for those already noted as missing.
-    numbers: HashMap<String, Option<u32>>,
+    /// The model's indices of materials by name; `None` for those already noted as missing.
+    indices: HashMap<String, Option<u32>>,
     /// The model's indices of textures, by file and colour space (true for sRGB).
     textures: HashMap<(PathBuf, bool), u32>,
     /// The model's indices of materials with neither colour nor texture, which show vertex colours if there are any.
@@ -33,17 +33,17 @@ pub(super) struct Materials {
 
 impl Materials {
     pub(super) fn new(obj: &Path) -> Result<Self, Error> {
-        let (numbers, textures) = (HashMap::new(), HashMap::new());
+        let (indices, textures) = (HashMap::new(), HashMap::new());
         let (uncoloured, model) = (HashSet::new(), Model::default());
-        Ok(Self { folder: Folder::around(obj)?, numbers, textures, uncoloured, model })
+        Ok(Self { folder: Folder::around(obj)?, indices, textures, uncoloured, model })
     }
 
     /// The model's index of a material. An undefined material is noted once.
-    pub(super) fn number(&mut self, name: &str) -> Option<u32> {
-        if let Some(&number) = self.numbers.get(name) {
-            return number;
+    pub(super) fn index_of(&mut self, name: &str) -> Option<u32> {
+        if let Some(&index) = self.indices.get(name) {
+            return index;
         }
-        self.numbers.insert(name.to_owned(), None);
+        self.indices.insert(name.to_owned(), None);
         let name = shortened(name);
         self.model.notes.push(format!("material {name} is not defined; it is replaced by grey"));
         None
@@ -119,7 +119,7 @@ impl Materials {
         let mut texture =
             |map: Option<&Map>, srgb| map.map(|map| self.texture(path, map, srgb)).transpose();
         let (base_map, alpha_map) = (map("map_kd"), map("map_d"));
-        // The opacity of an image that is used twice is its alpha channel.
+        // An image that is the map of both colour and opacity holds the opacity in its alpha channel.
         let file = |map: &Option<Map>| map.as_ref().map(|map| map.file.clone());
         let shares_alpha = alpha_map.is_some() && file(&alpha_map) == file(&base_map);
         let base_texture = texture(base_map.as_ref(), true)?;
@@ -170,7 +170,7 @@ impl Materials {
                 "material {name}: bump maps are not supported; store a normal map (norm) instead"
             ));
         }
-        self.numbers.insert(name.to_owned(), Some(number));
+        self.indices.insert(name.to_owned(), Some(number));
         Ok(())
     }
 
@@ -201,7 +201,7 @@ impl Materials {
     }
 }
 
-/// The factor of a map or, without a map, the value itself. For what a map defines, exporters write 0 or nothing.
+/// The factor of a map or, without a map, the value itself. Beside a map, exporters write 0 or nothing; both mean 1.
 fn factor(given: Option<Vec3>, has_map: bool, default: f32) -> Vec3 {
     match given {
         Some(value) if !has_map || value != Vec3::ZERO => value,
@@ -210,14 +210,14 @@ fn factor(given: Option<Vec3>, has_map: bool, default: f32) -> Vec3 {
     }
 }
 
-/// The first numbers of a statement, at most `most`; a single one counts three times.
+/// The first numbers of a statement, at most `most`; a single number is used for all three components.
 fn numbers(statement: Statement<'_>, most: usize) -> Result<Vec3, Error> {
     let fault = |problem: &str| statement.fault(format!("{} {problem}", statement.key));
     let number = |word: &str| match word.parse::<f32>() {
         Ok(value) if value.is_finite() => Ok(value.max(0.0)),
         _ => Err(fault("is not a finite number")),
     };
-    // The halo of `d -halo 0.5` is ignored.
+    // The option `-halo` of `d -halo 0.5` is ignored.
     let words = statement.words().filter(|word| *word != "-halo").take(most);
     match words.map(number).collect::<Result<Vec<_>, _>>()?[..] {
         [r, g, b] => Ok(Vec3::new(r, g, b)),

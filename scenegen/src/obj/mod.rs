@@ -1,18 +1,17 @@
 //! Loads Wavefront OBJ files with their MTL libraries through `tobj`.
 //!
 //! Every statement is checked first, because errors of `tobj` do not name the line, and it misreads indices
-//! of 0 and files in which only some vertices have colours, texture coordinates or normals. Faces are passed
-//! in blocks, as `tobj` holds about 100 bytes per face until an object ends. Its objects share no vertices, so
+//! of 0 and files in which only some vertices have colours, texture coordinates or normals. `tobj` gets the
+//! faces in blocks, as it holds about 100 bytes per face until an object ends. Its objects share no vertices, so
 //! the vertices of the blocks are merged here. Polygons are triangulated by ear clipping rather than as fans.
 //!
 //! Faces are visible from both sides. Materials are diffuse unless they have one of the PBR keys `Pr`,
 //! `Pm`, `map_Pr` or `map_Pm`. `norm` is a tangent-space normal map as in glTF; height maps (`bump`,
-//! `map_bump`) are ignored with a note. Where programs disagree with the format, theirs is the meaning: a factor
-//! of 0 beside its map shows the map, `d` takes precedence over `Tr`, and a `Tr` that would hide a material does
-//! not.
+//! `map_bump`) are ignored with a note. Where common programs deviate from the format, they are followed: a map
+//! whose factor is 0 is shown, `d` takes precedence over `Tr`, and a `Tr` that would hide a material is ignored.
 //!
-//! Vertex colours (`v x y z r g b`) are sRGB, from 0 to 1, or to 255 if one of them is at least 2. They replace
-//! the grey, or black, of materials without a texture.
+//! Vertex colours (`v x y z r g b`) are sRGB, from 0 to 1, or from 0 to 255 if any value is at least 2. They
+//! replace a missing or black colour of materials without a texture.
 //!
 //! A corner without a normal is flat, or smooth within its smoothing group (`s 1`). A smooth normal is the mean
 //! of the normals of the group's faces, weighted by their angles (Thürmer and Wüthrich, "Computing Vertex
@@ -118,7 +117,7 @@ impl Reader {
                     })?,
                 };
             }
-            "usemtl" => self.material = self.materials.number(statement.value()),
+            "usemtl" => self.material = self.materials.index_of(statement.value()),
             "mtllib" => self.materials.read_libraries(statement)?,
             // Lines, points, groups and curves are not rendered.
             _ => {}
@@ -149,7 +148,7 @@ impl Reader {
     fn face(&mut self, statement: Statement<'_>) -> Result<(), Error> {
         let mut corners: Vec<Corner> =
             statement.words().map(|word| self.corner(statement, word)).collect::<Result<_, _>>()?;
-        // A point or line written as a face.
+        // A point or line written as a face is not rendered.
         if corners.len() < 3 {
             return Ok(());
         }

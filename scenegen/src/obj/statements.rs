@@ -135,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn a_line_without_end_is_refused() {
+    fn a_line_longer_than_16_mib_is_refused() {
         let mut text = b"v 0 0 0\n".to_vec();
         text.resize(text.len() + MAX_LINE as usize, b'x');
         assert_eq!(read(&text).expect("the longest line").lines().count(), 2);

@@ -27,7 +27,7 @@ fn loaded(obj: &str, files: &[(&str, &[u8])]) -> Result<Model, Error> {
 const ROOF: &str = "v 0 0 0\nv 0 1 0\nv 1 0 0\nv 1 1 0\nv 0 0 -1\nv 0 1 -1\n";
 
 #[test]
-fn smoothing_groups_share_normals_and_no_group_is_flat() {
+fn smoothing_groups_share_normals_and_other_faces_are_flat() {
     let normals = |text: &str| {
         let model = loaded(&format!("{ROOF}{text}"), &[]).expect("a roof");
         let at = |i: u32| model.normals.get(i as usize).copied().unwrap_or_default();
@@ -132,7 +132,7 @@ fn vertices_before_the_first_colour_are_white() {
     assert_eq!(colours, [Vec4::new(quarter, 0.0, 0.0, 1.0), Vec4::ONE, Vec4::ONE]);
 }
 
-/// The linear colour of a grey image and its alpha, as a PNG.
+/// A PNG of one grey and one alpha.
 fn png(grey: u8, alpha: u8) -> Vec<u8> {
     let mut bytes = Cursor::new(Vec::new());
     let image = image::GrayAlphaImage::from_pixel(2, 2, image::LumaA([grey, alpha]));
@@ -140,7 +140,8 @@ fn png(grey: u8, alpha: u8) -> Vec<u8> {
     bytes.into_inner()
 }
 
-/// A triangle, its vertices with more numbers, in a material of this library with pictures `t.png` and `a.png`.
+/// A triangle with material `m` of this library, which may use the images `t.png` and `a.png`. The numbers `more`
+/// follow each vertex's position.
 fn painted(more: &str, library: &str) -> Model {
     let obj = format!(
         "mtllib a.mtl\nv 0 0 0 {more}\nv 1 0 0 {more}\nv 0 1 0 {more}\nvt 0 0\nusemtl m\nf 1/1 2/1 3/1\n"
@@ -151,13 +152,13 @@ fn painted(more: &str, library: &str) -> Model {
 }
 
 #[test]
-fn vertex_colours_are_srgb_in_bytes_or_shares() {
+fn vertex_colours_are_srgb_from_0_to_255_or_0_to_1() {
     let grey = linear_from_srgb(128.0 / 255.0) as f32;
     for (more, expected) in [
         ("128 128 128", grey),
         ("127.5 127.5 127.5", linear_from_srgb(0.5) as f32),
         ("0.5019608 0.5019608 0.5019608", grey),
-        // Rounding errors above 1 are no bytes.
+        // A rounding error above 1 does not mean a range up to 255.
         ("1.000001 1.000001 1.000001", 1.0),
         ("1 1 1", 1.0),
     ] {
@@ -194,7 +195,7 @@ fn a_factor_of_zero_beside_a_map_shows_the_map() {
 }
 
 #[test]
-fn opacity_is_what_its_writer_meant() {
+fn opacity_follows_the_conventions_of_exporters() {
     for (library, expected) in [
         ("newmtl m\nTr 1.000000\nmap_Kd t.png\n", 1.0),
         ("newmtl m\nTr 1\n", 1.0),

@@ -4,7 +4,7 @@
 //! untrusted: sizes are checked before anything is decoded, NaN becomes black, and infinity the largest half
 //! float.
 //!
-//! Blurred copies are made once, so that surfaces without occlusion need no secondary rays. Each copy is the
+//! Blurred copies are made once, so that light without occlusion needs no secondary rays. Each copy is the
 //! image averaged with a power of the cosine as weight. The exponent k for a roughness is chosen such that the
 //! mean cosine (k + 1) / (k + 2) is 1 − roughness² / 3; the roughest copy is therefore irradiance / pi.
 
@@ -21,10 +21,10 @@ use crate::resource::{self, EXPANSION, MAX_DECODED};
 
 /// Largest radiance: the largest half float.
 const BRIGHTEST: f32 = 65_504.0;
-/// Number of columns of the image that is averaged; half as many rows. This and the next are sufficient for the
-/// sharpest lobe, which is about 20 degrees wide.
+/// Number of columns of the image that is averaged; it has half as many rows. `CELLS` and `AVERAGES` are sufficient
+/// for the sharpest lobe, which is about 20 degrees wide.
 const CELLS: usize = 96;
-/// Number of columns of the averages.
+/// Number of columns of a blurred copy.
 const AVERAGES: usize = 48;
 /// Number of blurred copies, for roughness 1/4, 2/4, 3/4 and 1.
 const LEVELS: usize = 4;

@@ -53,8 +53,8 @@ pub struct InitPoints {
     /// True surface points in world coordinates: `positions` before noise, and for outliers the points that
     /// their features show. Shape: `[points]`.
     pub found_at: Vec<DVec3>,
-    /// Indices of the training views that see each point, ascending. Outliers are in front of all of their
-    /// cameras. Shape: `[points]`.
+    /// Indices of the training views that see each true surface point and have the noisy point in front of their
+    /// camera, ascending. Shape: `[points]`.
     pub seen_by: Vec<Vec<u32>>,
     /// Number of outliers.
     pub outliers: usize,
@@ -95,7 +95,7 @@ impl<'a> PointCollector<'a> {
             return;
         }
         let mut draws = Draws::new(self.tracer.seed, &[0x706f_696e_7473, view as u64]);
-        // Systematic sampling: one draw per equal share of the weights.
+        // Systematic sampling: one candidate per equal share of the total weight.
         let step = total / wanted.ceil();
         let mut next = step * draws.unit64();
         let mut sum = 0.0;

@@ -46,7 +46,7 @@ pub(crate) enum Build {
     },
 }
 
-/// A preset's geometry, light and cameras.
+/// Geometry, light and camera arrangement of a preset or file.
 pub(crate) struct Staging {
     pub(crate) model: Model,
     pub(crate) sky: Sky,

@@ -40,7 +40,7 @@ const DRAWS: usize = 400_000;
 const HEIGHTS: usize = 20;
 const TURNS: usize = 24;
 
-/// Bins directions of the upper hemisphere by height and turn, and integrates a density over the bins.
+/// Bins directions of the upper hemisphere by height and turn, and tests the counts against a density.
 fn check_directions(
     what: &str,
     mut draw: impl FnMut(&mut Draws) -> Vec3,
@@ -101,7 +101,7 @@ fn visible_normals_follow_their_density() {
 }
 
 #[test]
-fn units_are_uniform_and_streams_differ() {
+fn units_are_uniform_and_streams_are_independent() {
     let mut counts = vec![0_u64; 256];
     let mut pairs = vec![0_u64; 256];
     for stream in 0..400_u64 {

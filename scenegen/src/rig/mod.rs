@@ -1,7 +1,7 @@
 //! Camera placement.
 //!
-//! Training and test views follow different paths. No camera is inside a solid or closer to a surface than
-//! [`Rig::clearance`] of the geometry's diagonal, as a view from inside a wall is useless as ground truth.
+//! Training and test views follow different paths. Except for a file's own cameras, no camera is inside a solid
+//! or closer to a surface than [`Rig::clearance`] allows, as a view from inside a wall is useless as ground truth.
 
 mod survey;
 
@@ -51,19 +51,20 @@ pub struct Rig {
     /// Horizontal field of view `[degrees]`.
     pub fov: f64,
     /// Distance from the centre, in multiples of the distance at which the scene's bounding sphere fills the
-    /// image. For `Inside`, the path's radius as a share of the room; for `Survey`, a factor on its height.
+    /// image. For `Inside`, the path's radius as a share of half the room; for `Survey`, a factor on the cameras'
+    /// height.
     pub radius: f64,
     /// Lowest and highest elevation `[degrees]`.
     pub elevation: [f64; 2],
     /// Range of azimuths, centred on +z `[degrees]`.
     pub arc: f64,
-    /// Standard deviation of camera positions, as a share of their distance.
+    /// Standard deviation of camera positions, as a share of the distance to the point looked at.
     pub jitter: f64,
-    /// Smallest distance from any surface, as a share of the diagonal.
+    /// Smallest distance from any surface, as a share of the geometry's diagonal.
     pub clearance: f64,
     /// The point that the cameras look at; by default the centre of the bounding box.
     pub target: Option<[f64; 3]>,
-    /// Radius that fills the image; by default that of the bounding sphere.
+    /// Radius around the target that fills the image; by default that of the bounding sphere.
     pub focus: Option<f64>,
     /// Seed of the jitter.
     pub seed: u64,
@@ -228,7 +229,7 @@ impl Rig {
         let count = f64::from(if test { self.test } else { self.train });
         let (i, low, high) =
             (f64::from(number), self.elevation[0].to_radians(), self.elevation[1].to_radians());
-        // Test views lie between training views in every coordinate.
+        // Test views are shifted by half a step, so that they lie between training views.
         let shift = if test { 0.5 } else { 0.0 };
         let along = |share: f64| self.arc.to_radians() * (share - 0.5);
         match self.kind {
@@ -291,7 +292,7 @@ impl Rig {
     }
 }
 
-/// True if a point is inside a solid, as most surfaces seen from there show their back.
+/// True if a point is inside a solid: most surfaces that it sees show their backs.
 fn is_inside(surface: &Surface, place: DVec3) -> bool {
     const RAYS: i32 = 26;
     let (mut fronts, mut backs) = (0, 0);

@@ -11,14 +11,14 @@ use crate::surface::Surface;
 /// Range of angles below the horizon of the views from above `[degrees]`.
 const DOWN: [f64; 2] = [45.0, 65.0];
 /// Range of angles above the horizon of the street views `[degrees]`.
-const AHEAD: [f64; 2] = [-4.0, 10.0];
+const STREET_PITCH: [f64; 2] = [-4.0, 10.0];
 /// Distance of street views from the street's centre line, alternating sides `[share of eye height]`.
 const ASIDE: f64 = 0.35;
-/// One view in this many is a street view.
+/// One of this many views is a street view.
 const STREET: u32 = 3;
 /// Share of a view that must show a surface.
 const SHOWN: f64 = 0.65;
-/// Columns and rows of the rays that are tested for this.
+/// Columns and rows of the rays by which this share is measured.
 const RAYS: [u32; 2] = [12, 9];
 /// Fractional part of the golden ratio. The fractional parts of its multiples are spread evenly over `[0, 1)`.
 const SPREAD: f64 = 0.618_033_988_749_895;
@@ -102,7 +102,7 @@ impl Rig {
             let side = if test { 0.0 } else { f64::from(place % 2) * 2.0 - 1.0 };
             let place = middle + side * ASIDE * survey.eye * ahead.cross(DVec3::Y);
             let turn = f64::from(i) + shift + attempt as f64;
-            let [low, high] = AHEAD.map(f64::to_radians);
+            let [low, high] = STREET_PITCH.map(f64::to_radians);
             let pitch = low + (turn * SPREAD).fract() * (high - low);
             let reach = 0.2 * survey.height[1];
             (place, place + reach * on_sphere(turn * GOLDEN, pitch))
@@ -177,8 +177,8 @@ pub(super) fn shows_enough(surface: &Surface, camera: &Camera, attempt: u64) -> 
         surface.cast(camera.centre, camera.direction(at), f64::INFINITY).is_some()
     };
     let met = (0..columns * rows).filter(meets).count();
-    let still_asked = 1.0 - attempt as f64 / ATTEMPTS as f64;
-    met as f64 >= SHOWN * still_asked * f64::from(columns * rows)
+    let still_required = 1.0 - attempt as f64 / ATTEMPTS as f64;
+    met as f64 >= SHOWN * still_required * f64::from(columns * rows)
 }
 
 #[cfg(test)]

@@ -5,7 +5,7 @@
 //! is called its slot.
 //!
 //! Vertices are converted to local coordinates in which the geometry's largest half side is 1024. Single
-//! precision is then equivalent for meshes of any size and position, and the absolute tolerances of the tree's
+//! precision is then equally accurate for meshes of any size and position, and the absolute tolerances of the tree's
 //! builder (1e-4) are below an ulp of the geometry.
 //!
 //! Boxes passed to the builder exceed their triangles by [`PADDING`], so that rounding in the box tests cannot
@@ -186,8 +186,8 @@ impl Surface {
         self.bvh.primitive_indices[slot as usize]
     }
 
-    /// The local ray for a world ray. Its origin is moved to the point where it enters the bounding box, to use
-    /// single precision for the geometry and not for the distance to it. `None` if it misses the box.
+    /// The local ray for a world ray. Its origin is moved to the point where it enters the bounding box: single
+    /// precision then does not have to cover the distance to the box. `None` if the ray misses the box.
     pub(crate) fn enter(&self, origin: DVec3, direction: DVec3, range: f64) -> Option<LocalRay> {
         self.enter_after(origin, direction, range).map(|(ray, _)| ray)
     }
@@ -201,8 +201,8 @@ impl Surface {
     ) -> Option<(LocalRay, f32)> {
         let (o, d) = (self.local_from_world(origin), direction * self.scale);
         let half = 0.5 * (self.bounds.1 - self.bounds.0) * self.scale + DVec3::splat(1.0);
-        // Infinite along axes perpendicular to the ray. NaN exactly on the box's side, which is outside of the
-        // geometry, so that the ray may miss it.
+        // Infinite along axes perpendicular to the ray. A ray exactly in a side of the box then gives NaN and may
+        // miss the box: the geometry is one unit farther in.
         let inverse = d.recip();
         let (a, b) = ((-half - o) * inverse, (half - o) * inverse);
         let near = a.min(b).max_element().max(0.0);

@@ -28,7 +28,7 @@ fn soup(count: usize, seed: u64) -> Vec<[DVec3; 3]> {
         let (p, size) = (point(&mut draws), 10.0_f64.powf(0.3 - 3.0 * draws.unit64()));
         let (u, v) = (size * point(&mut draws), size * point(&mut draws));
         all.push(match i % 12 {
-            // A point, a line, a line with its corners in a different order, a needle.
+            // A point, a line, a line with two equal corners, a needle.
             0 => [p, p, p],
             1 => [p, p + u, p + 2.0 * u],
             2 => [p, p + u, p],
@@ -154,7 +154,7 @@ fn no_ray_leaks_through_a_sphere() {
         let hit = surface.cast(inside, direction, f64::INFINITY);
         leaks += u32::from(hit.is_none_or(|hit| (hit.t - 1.0).abs() > 1e-3));
         if i % 10 == 0 {
-            // From outside, past the target: something must be hit before the inside.
+            // From outside, back through the target: the sphere must be hit before the point inside.
             let outside = inside + 3.0 * direction.normalize() * 1.7;
             leaks += u32::from(surface.cast(outside, inside - outside, 1.0).is_none());
         }
@@ -179,7 +179,7 @@ fn trees_of_any_depth_are_traversed() {
     for (triangles, expected) in [(chain, 40), (same, 0)] {
         let surface = Surface::new(&model(&triangles)).expect("triangles");
         for stack in [surface.depth, SHALLOW + 1] {
-            // Both kinds of stack.
+            // With a traversal stack on the stack and on the heap.
             let built = Surface::new(&model(&triangles)).expect("triangles");
             let surface = Surface { depth: stack.max(built.depth), ..built };
             let target = triangles[expected];
@@ -216,7 +216,7 @@ fn the_nearest_point_agrees_with_brute_force() {
 }
 
 #[test]
-fn nearest_points_of_a_triangle() {
+fn nearest_points_on_one_triangle_are_exact() {
     let triangle = [DVec3::ZERO, 2.0 * DVec3::X, 2.0 * DVec3::Y];
     for (place, expected) in [
         (DVec3::new(0.5, 0.5, 3.0), DVec3::new(0.5, 0.5, 0.0)),
@@ -255,7 +255,7 @@ fn size_and_position_of_a_mesh_do_not_matter() {
 }
 
 #[test]
-fn surfaces_between_two_points_block() {
+fn a_surface_between_two_points_blocks_their_segment() {
     let wall = [DVec3::new(0., -9., -9.), DVec3::new(0., 9., -9.), DVec3::new(0., 0., 9.)];
     let surface = Surface::new(&model(&[wall])).expect("triangles");
     assert!(surface.blocked(DVec3::NEG_X, DVec3::X));
@@ -265,8 +265,8 @@ fn surfaces_between_two_points_block() {
 }
 
 #[test]
-fn packets_find_the_same_as_single_rays() {
-    let (mut met, mut hidden_of_all) = (0, 0);
+fn packets_find_the_same_hits_as_single_rays() {
+    let (mut met, mut packets) = (0, 0);
     for (count, seed) in [(1, 11), (7, 12), (60, 13), (1500, 14)] {
         let surface = Surface::new(&model(&soup(count, seed))).expect("triangles");
         let mut draws = Draws::new(seed, &[1]);
@@ -299,18 +299,18 @@ fn packets_find_the_same_as_single_rays() {
                 }
                 assert!(found[rays.len()..].iter().all(Option::is_none));
                 assert_eq!(hidden.checked_shr(rays.len() as u32).unwrap_or(0), 0);
-                hidden_of_all += 1;
+                packets += 1;
             }
         }
     }
-    assert!(met > hidden_of_all, "{met} rays of {hidden_of_all} packets hit anything");
+    assert!(met > packets, "{met} rays of {packets} packets hit anything");
 }
 
 #[test]
 fn no_ray_hits_a_mesh_that_its_pyramid_misses() {
     let surface = Surface::new(&model(&soup(40, 21))).expect("triangles");
     let mut draws = Draws::new(22, &[]);
-    let (mut beside, mut wrong) = (0, Vec::new());
+    let (mut missing, mut wrong) = (0, Vec::new());
     for _ in 0..4000 {
         let (eye, aim) = (2.5 * point(&mut draws), 1.5 * point(&mut draws));
         let (u, v) = (0.2 * point(&mut draws), 0.2 * point(&mut draws));
@@ -319,12 +319,12 @@ fn no_ray_hits_a_mesh_that_its_pyramid_misses() {
         if !surface.is_missed_by(eye, corners) {
             continue;
         }
-        beside += 1;
+        missing += 1;
         for _ in 0..20 {
             let direction = at(2.0 * draws.unit64() - 1.0, 2.0 * draws.unit64() - 1.0);
             wrong.extend(surface.cast(eye, direction, f64::INFINITY));
         }
     }
-    assert!(beside > 200, "only {beside} pyramids miss everything");
+    assert!(missing > 200, "only {missing} pyramids miss everything");
     assert!(wrong.is_empty(), "{} rays hit something", wrong.len());
 }

@@ -131,35 +131,35 @@ impl Tracer<'_> {
     /// with these factors on the channels.
     pub(crate) fn render(&self, camera: &Camera, view: u64, gains: Option<[f32; 3]>) -> Frame {
         let mut frame = Frame::empty(camera.width, camera.height);
-        let row = camera.width as usize;
+        let width = camera.width as usize;
         let mut exposed = vec![0; if gains.is_some() { frame.rgba.len() } else { 0 }];
         let gains = gains.map(Vec3::from);
-        let per_band = if gains.is_some() { 4 * BAND * row } else { 0 };
+        let per_band = if gains.is_some() { 4 * BAND * width } else { 0 };
         let mut rest = &mut exposed[..];
         let exposed_bands: Vec<&mut [u8]> = (0..(camera.height as usize).div_ceil(BAND))
             .map(|_| rest.split_off_mut(..per_band.min(rest.len())).unwrap_or_default())
             .collect();
         let bands = frame
             .rgba
-            .par_chunks_mut(4 * BAND * row)
+            .par_chunks_mut(4 * BAND * width)
             .zip(exposed_bands)
-            .zip(frame.depth.par_chunks_mut(BAND * row))
-            .zip(frame.normals.par_chunks_mut(BAND * row))
-            .zip(frame.triangles.par_chunks_mut(BAND * row));
+            .zip(frame.depth.par_chunks_mut(BAND * width))
+            .zip(frame.normals.par_chunks_mut(BAND * width))
+            .zip(frame.triangles.par_chunks_mut(BAND * width));
         bands.enumerate().for_each(|(band, ((((rgba, exposed), depth), normals), triangles))| {
             let top = band * BAND;
-            let rows = depth.len() / row;
-            for left in (0..row).step_by(TILE) {
-                let tile = (left, top, TILE.min(row - left), rows);
+            let rows = depth.len() / width;
+            for left in (0..width).step_by(TILE) {
+                let tile = (left, top, TILE.min(width - left), rows);
                 // With a lens the sides of a tile are not planes.
                 if camera.lens.is_none() && self.is_empty(camera, tile) {
                     continue;
                 }
                 let places = (0..rows).flat_map(|y| (left..left + tile.2).map(move |x| (x, y)));
                 for (x, y) in places {
-                    let i = y * row + x;
+                    let i = y * width + x;
                     let pixel = DVec2::new(x as f64, (top + y) as f64);
-                    let draws = Draws::new(self.seed, &[view, ((top + y) * row + x) as u64]);
+                    let draws = Draws::new(self.seed, &[view, ((top + y) * width + x) as u64]);
                     let (light, coverage, hint) = self.pixel(camera, pixel, draws);
                     rgba[4 * i..4 * i + 4].copy_from_slice(&encoded(light, coverage));
                     if let Some(gains) = gains {

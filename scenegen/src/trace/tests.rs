@@ -99,7 +99,7 @@ fn lights_have_the_expected_irradiance() {
 }
 
 #[test]
-fn a_sphere_has_its_depth_and_normals() {
+fn a_sphere_has_the_expected_depth_and_normals() {
     let mut model = Model::default();
     let material = model.material(Material::default());
     let (centre, radius) = (DVec3::new(0.5, -0.3, 0.2), 1.3);
@@ -213,7 +213,7 @@ fn depth_is_that_of_the_first_surface_of_at_least_half_opacity() {
             double_sided: !one_sided,
             ..Material::default()
         });
-        // Its front is below.
+        // Its front faces down.
         model.quad(DVec3::new(-1.0, 1.0, -1.0), 2.0 * DVec3::X, 2.0 * DVec3::Z, lid);
         let frame = render(&model, &camera, Sky::uniform(1.0), Ambient::Open);
         let found = f64::from(frame.depth[middle]);
@@ -245,7 +245,7 @@ fn images_are_the_same_at_any_number_of_threads() {
 
 #[test]
 fn cameras_are_outside_of_solids() {
-    // A block fills most of the room of an inside rig.
+    // The cameras are inside a room, a large part of which is filled by a block.
     let mut model = Model::default();
     let material = model.material(Material::default());
     model.cuboid(DVec3::ZERO, -DVec3::splat(2.0), DQuat::IDENTITY, material);
@@ -267,7 +267,7 @@ fn cameras_are_outside_of_solids() {
 }
 
 #[test]
-fn image_and_gradient_skies_agree_and_so_does_sampling() {
+fn image_skies_agree_with_gradients_and_sampling_with_the_closed_form() {
     let mut model = floor(Material::lambert("grey", [0.5; 3]));
     let shiny = Material {
         reflection: Reflection::MetalRough,
@@ -290,7 +290,7 @@ fn image_and_gradient_skies_agree_and_so_does_sampling() {
             assert!(a.abs_diff(*b) <= 1, "{ambient:?}: {a} and {b}");
         }
     }
-    // One bright side, on an empty floor: on average sampling agrees with the closed form.
+    // For a sky with one bright side over an empty floor, sampling agrees with the closed form on average.
     let model = floor(Material::lambert("grey", [0.5; 3]));
     let side = image(64, &|i| if i % 64 < 32 { Vec3::splat(2.0) } else { Vec3::ZERO });
     let mean = |ambient| {
@@ -328,7 +328,7 @@ fn a_scene_that_no_view_shows_is_an_error() {
     let write =
         |name: &str, text: String| std::fs::write(folder.path().join(name), text).expect("write");
     write("a.obj", "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\nf 1 2 3\n".to_owned());
-    // Surfaces may be faint, or met by no ray through the centre of a pixel.
+    // A faint surface is visible, a fully transparent one is not.
     for (opacity, is_seen) in [("1", true), ("0.25", true), ("0", false)] {
         write("a.mtl", format!("newmtl m\nd {opacity}\n"));
         check("a.obj", None, is_seen);

@@ -22,11 +22,11 @@ use crate::write::SCENE_FILE;
 
 /// Longest `scene.json` that is read `[bytes]`.
 const LONGEST_RECORD: u64 = 1 << 24;
-/// Largest relative difference of equal depths, as depth files hold f32.
+/// Largest relative difference of depths that count as equal, as depth files hold f32.
 const SAME_DEPTH: f64 = 1e-5;
 /// The remedy for damaged files.
 const REMEDY: &str = "write the scene again with densify scenegen --overwrite";
-/// Offset into the surface for measuring its thickness, in diagonals.
+/// Offset into the surface for measuring its thickness, as a share of the diagonal.
 const STEP: f64 = 1e-7;
 
 /// The geometry that a scene was rendered from.
@@ -66,7 +66,7 @@ impl GroundTruth {
     /// The ground truth in a folder; `None` if the folder does not hold a scene of this program.
     ///
     /// # Errors
-    /// When it does, but its mesh cannot be read.
+    /// When the folder holds such a scene, but its mesh cannot be read.
     pub fn open(root: &Path) -> Result<Option<Self>, Error> {
         let mesh = root.join("mesh.ply");
         if !Self::is_in(root) {

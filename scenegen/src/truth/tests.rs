@@ -24,34 +24,34 @@ fn folders_agree_with_their_scene() {
     write(&scene, &target, false, |_| ()).expect("write");
     let views = scene.views.clone();
     let frame = scene.render(2);
-    let here = GroundTruth::of_scene(scene);
-    let there = GroundTruth::open(&target).expect("read").expect("a scene");
+    let in_memory = GroundTruth::of_scene(scene);
+    let in_folder = GroundTruth::open(&target).expect("read").expect("a scene");
     let corners = |truth: &GroundTruth| truth.surface().triangles().concat();
-    let (a, b) = (corners(&here), corners(&there));
+    let (a, b) = (corners(&in_memory), corners(&in_folder));
     assert_eq!(a.len(), b.len());
     assert!(a.iter().zip(&b).all(|(a, b)| a.distance(*b) < 1e-6), "another mesh");
-    assert!(here.has_thin() && there.has_thin());
+    assert!(in_memory.has_thin() && in_folder.has_thin());
     let test = views.iter().find(|view| view.split == Split::Test).expect("a test view");
-    let g_buffer = here.g_buffer(&test.name, &test.camera).expect("traced");
+    let g_buffer = in_memory.g_buffer(&test.name, &test.camera).expect("traced");
     assert!(g_buffer.depth == frame.depth && g_buffer.normals == frame.normals);
     for name in ["test/r_000.png", "images/test/r_000.png", "./images/test/r_000"] {
-        assert!(there.g_buffer(name, &test.camera).expect("read") == g_buffer, "{name}");
+        assert!(in_folder.g_buffer(name, &test.camera).expect("read") == g_buffer, "{name}");
     }
     // The files are read instead of tracing the mesh.
     let (from, to) = (target.join("depth/train/r_000.exr"), target.join("depth/test/r_000.exr"));
     fs::copy(from, to).expect("copy");
-    let other = there.g_buffer(&test.name, &test.camera).expect("read");
+    let other = in_folder.g_buffer(&test.name, &test.camera).expect("read");
     assert!(other.depth != g_buffer.depth && other.normals == g_buffer.normals);
     // Without a file, or for a different size, the mesh is traced.
     let close = |a: &GBuffer, b: &GBuffer| {
         let apart = a.depth.iter().zip(&b.depth).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         assert!(apart < 1e-4, "{apart}");
     };
-    close(&there.g_buffer("nothing.png", &test.camera).expect("traced"), &g_buffer);
+    close(&in_folder.g_buffer("nothing.png", &test.camera).expect("traced"), &g_buffer);
     let half = Camera { width: 20, height: 16, ..test.camera };
     close(
-        &there.g_buffer(&test.name, &half).expect("traced"),
-        &here.g_buffer("", &half).expect("traced"),
+        &in_folder.g_buffer(&test.name, &half).expect("traced"),
+        &in_memory.g_buffer("", &half).expect("traced"),
     );
     assert!(GroundTruth::open(root.path()).expect("no scene").is_none());
     // Files of other programs with these names are ignored.

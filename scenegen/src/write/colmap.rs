@@ -1,7 +1,7 @@
 //! Writes COLMAP's text model under `sparse/0`; image names are relative to `images`.
 //!
-//! Features are at the exact projections of true surface points, and only the points have noise. Reprojection
-//! errors therefore come from the noise alone.
+//! Features are the exact projections of true surface points; only the 3D points have noise or are outliers.
+//! Reprojection errors therefore come from these alone.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -20,7 +20,7 @@ pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(
     let mut images = String::from(
         "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n",
     );
-    // The points that each view sees, and for each point its views with the index of the feature.
+    // The points that each view sees; and each point's track: its views, with the feature's index in each.
     let mut seen: Vec<Vec<usize>> = vec![Vec::new(); scene.views.len()];
     let mut tracks: Vec<Vec<(usize, usize)>> = vec![Vec::new(); points.positions.len()];
     for (point, views) in points.seen_by.iter().enumerate() {
@@ -59,8 +59,8 @@ pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(
     for (point, (p, [r, g, b])) in points.positions.iter().zip(&points.colours).enumerate() {
         let error = reprojection_error(scene, points, point);
         let _ = write!(cloud, "{} {} {} {} {r} {g} {b} {error}", point + 1, p.x, p.y, p.z);
-        for (view, place) in &tracks[point] {
-            let _ = write!(cloud, " {} {place}", view + 1);
+        for (view, feature) in &tracks[point] {
+            let _ = write!(cloud, " {} {feature}", view + 1);
         }
         cloud.push('\n');
     }

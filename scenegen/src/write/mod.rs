@@ -118,13 +118,13 @@ pub fn check_target(target: &Path, overwrite: bool) -> Result<(), Error> {
     holds_scene(target, overwrite).map(|_| ())
 }
 
-/// Gives the folder the usual permissions, as temporary folders are accessible to their owner only.
+/// Gives the folder the permissions of its subfolders, as temporary folders are accessible to their owner only.
 fn make_readable(folder: &Path) -> Result<(), Error> {
     #[cfg(unix)]
     {
         use std::os::unix::fs::PermissionsExt;
-        let like = folder.join("sparse");
-        let mode = fs::metadata(&like).map_err(Error::write(&like))?.permissions().mode();
+        let subfolder = folder.join("sparse");
+        let mode = fs::metadata(&subfolder).map_err(Error::write(&subfolder))?.permissions().mode();
         let permissions = fs::Permissions::from_mode(mode);
         fs::set_permissions(folder, permissions).map_err(Error::write(folder))?;
     }

@@ -43,8 +43,8 @@ pub(crate) fn mesh_header(faces: u32, has_flags: bool) -> String {
 }
 
 /// Writes the triangles as traced, in world coordinates, each with its own corners and a flag for thin
-/// structures. Corners are f64, which meshes far from the origin need. Streams to the file, which is larger than
-/// the mesh.
+/// structures. Corners are f64, which meshes far from the origin need. Streams, because the file is larger than
+/// the mesh in memory.
 pub(super) fn write_mesh(path: &Path, scene: &Scene) -> Result<(), Error> {
     // Indices of corners have 32 bits.
     let count = scene.model.triangles.len() as u32;

@@ -20,7 +20,7 @@ fn small() -> Scene {
     Scene::prepare(&Source::Preset("spheres".into()), &options).expect("preset")
 }
 
-/// Writes `small` with its own options and with `options`, to two folders.
+/// Writes the scene [`small`] to two folders: with its own options, and with `options`.
 fn written(options: Options) -> (tempfile::TempDir, [std::path::PathBuf; 2]) {
     let plain = small();
     let other = Scene::prepare(&Source::Preset("spheres".into()), &options).expect("preset");
@@ -73,7 +73,7 @@ fn passers_by_are_in_some_training_views_and_masked() {
     }
     assert!(!a.join("masks").exists());
     let pixels = |path: std::path::PathBuf| image::open(path).expect("PNG").into_rgba8();
-    let mut walked = 0;
+    let mut masked = 0;
     for name in
         ["train/r_000", "train/r_001", "train/r_002", "train/r_003", "test/r_000", "test/r_001"]
     {
@@ -81,7 +81,7 @@ fn passers_by_are_in_some_training_views_and_masked() {
         let [plain, other] = [&a, &b].map(|folder| pixels(folder.join(&image)));
         let mask = image::open(b.join(format!("masks/{name}.png"))).expect("a mask").into_luma8();
         let hidden = mask.iter().filter(|&&value| value == 0).count();
-        walked += usize::from(hidden > 0);
+        masked += usize::from(hidden > 0);
         assert!(hidden == 0 || (20..300).contains(&hidden), "{name}: {hidden} of 480 pixels");
         let mut changed = 0;
         for ((plain, other), mask) in plain.pixels().zip(other.pixels()).zip(mask.pixels()) {
@@ -90,7 +90,7 @@ fn passers_by_are_in_some_training_views_and_masked() {
         }
         assert!(2 * changed >= hidden, "{name}: {changed} of {hidden}");
     }
-    assert_eq!(walked, 2);
+    assert_eq!(masked, 2);
     let top: Value = serde_json::from_slice(&read(&b, "transforms.json")).expect("JSON");
     for frame in top["frames"].as_array().expect("frames") {
         assert!(b.join(text(&frame["mask_path"])).is_file(), "{frame}");
@@ -140,9 +140,9 @@ fn exposures_vary_in_training_views_only() {
         let pairs = plain.chunks_exact(4).zip(exposed.chunks_exact(4));
         let mut compared = 0;
         for (plain, exposed) in pairs.filter(|(plain, _)| plain[3] > 0) {
-            assert_eq!(plain[3], exposed[3], "coverage stays");
+            assert_eq!(plain[3], exposed[3], "alpha changed");
             for c in 0..3 {
-                // Values that are not clipped and for which steps of eight bits are small.
+                // Only values that are not clipped and are large compared with a step of eight bits.
                 if exposed[c] < 255 && plain[c] < 255 && plain[c] > 60 && exposed[c] > 60 {
                     let ratio = light(exposed[c]) / light(plain[c]) / factors[c];
                     assert!((ratio - 1.0).abs() < 0.05, "{number}: {plain:?} {exposed:?}");
@@ -157,7 +157,7 @@ fn exposures_vary_in_training_views_only() {
 }
 
 #[test]
-fn everything_is_written_and_nothing_else_is_left() {
+fn all_files_are_written_and_no_temporary_folder_is_left() {
     let scene = small();
     let root = tempfile::tempdir().expect("folder");
     let target = root.path().join("deep").join("scene");
@@ -291,9 +291,9 @@ fn nerfstudio_can_open_the_files() {
     let root = tempfile::tempdir().expect("folder");
     let mut zoomed = small();
     zoomed.views[1].camera.fx *= 1.5;
-    let mut alone = small();
-    alone.views.truncate(4);
-    for (name, scene) in [("small", small()), ("zoomed", zoomed), ("alone", alone)] {
+    let mut train_only = small();
+    train_only.views.truncate(4);
+    for (name, scene) in [("small", small()), ("zoomed", zoomed), ("train only", train_only)] {
         let folder = root.path().join(name);
         write(&scene, &folder, false, |_| ()).expect("write");
         let file = fs::read(folder.join("transforms.json")).expect("transforms.json");
@@ -308,7 +308,7 @@ fn nerfstudio_can_open_the_files() {
             assert_eq!(focal(i), Some(view.camera.fx), "{name}: {}", view.name);
         }
     }
-    // Its default factor converts stored depth to world units.
+    // nerfstudio's default factor, 1e-3, converts stored depth to world units.
     let stored = fs::read(root.path().join("small/depth/test/r_000.npy")).expect("depth");
     let depth = &small().render(4).depth;
     let stored = stored[stored.len() - 4 * depth.len()..].as_chunks().0.iter();
@@ -355,12 +355,12 @@ fn colmap_tracks_and_reprojection_errors_are_consistent() {
             let [w, x, y, z, tx, ty, tz] = [1, 2, 3, 4, 5, 6, 7].map(|i| number(&view[i]));
             let local = DQuat::from_xyzw(x, y, z, w) * place + DVec3::new(tx, ty, tz);
             let lens = &lenses[&view[8]];
-            let feature = &features[3 * track[1].parse::<usize>().expect("a place")..][..3];
+            let feature = &features[3 * track[1].parse::<usize>().expect("an index")..][..3];
             assert_eq!(feature[2], point[0], "the feature is another point's");
             assert!(local.z > 0.0, "{point:?} lies behind {}", view[9]);
-            let drawn = DVec2::new(lens[0] * local.x, lens[1] * local.y) / local.z
+            let projected = DVec2::new(lens[0] * local.x, lens[1] * local.y) / local.z
                 + DVec2::new(lens[2], lens[3]);
-            drawn.distance(DVec2::new(number(&feature[0]), number(&feature[1])))
+            projected.distance(DVec2::new(number(&feature[0]), number(&feature[1])))
         });
         let distances: Vec<f64> = distances.collect();
         observed += distances.len();
@@ -374,7 +374,7 @@ fn colmap_tracks_and_reprojection_errors_are_consistent() {
     let features: usize = views.values().map(|(_, features)| features.len() / 3).sum();
     assert_eq!((errors.len(), features), (300, observed));
     errors.sort_by(f64::total_cmp);
-    // The room is about 50 px wide in its views: noise of a thousandth moves points by less than a pixel, and
-    // outliers move by many.
+    // The room is about 50 px wide in its views: noise of a thousandth of the diagonal moves points by less than
+    // a pixel, and outliers are many pixels off.
     assert!((0.01..1.0).contains(&errors[150]) && errors[290] > 5.0, "{errors:?}");
 }

@@ -27,7 +27,7 @@ pub(super) fn write(scene: &Scene, root: &Path) -> Result<(), Error> {
     Ok(())
 }
 
-/// The views of a split, with the intrinsics `first` at the top; views with different ones have their own.
+/// The views of a split, with the intrinsics `first` at the top; a view lists those of its own that differ.
 fn synthetic(scene: &Scene, first: &Value, split: Split) -> Value {
     let frame = |view: &View| {
         let mut frame = frame_with_pose(view, format!("./images/{}", view.name));
@@ -40,8 +40,8 @@ fn synthetic(scene: &Scene, first: &Value, split: Split) -> Value {
     top
 }
 
-/// All views. nerfstudio applies intrinsics at the top to all views, so they are there only if all views have
-/// the same.
+/// All views. nerfstudio applies intrinsics at the top to all views, so they are written there only if all views
+/// share them.
 fn nerfstudio(scene: &Scene, first: &Value) -> Value {
     let shared = scene.views.iter().all(|view| intrinsics(scene, &view.camera) == *first);
     let image = |view: &View| format!("images/{}.png", view.name);
@@ -113,7 +113,7 @@ fn intrinsics(scene: &Scene, camera: &Camera) -> Value {
     fields
 }
 
-/// Camera to world with OpenGL axes: x right, y up, z backward. Rows.
+/// The rows of the camera-to-world matrix with OpenGL axes: x right, y up, z backward.
 fn world_from_opengl(camera: &Camera) -> [[f64; 4]; 4] {
     let m = camera.world_from_camera;
     let columns = [m.x_axis, -m.y_axis, -m.z_axis, camera.centre];

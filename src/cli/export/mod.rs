@@ -26,12 +26,12 @@ const ALL: &str = "all";
 /// Writes a trained model in another format, or in all.
 ///
 /// The model keeps the coordinates of the dataset. A file appears only when it is complete. With
-/// --format all, or --scene, prints the size of each file; with --scene also how closely its renderings of
-/// the held-out views, after reading it back, match those of the original model.
+/// --format all, or --scene, prints the size of each file; with --scene, also reads each file back and prints
+/// how closely its renderings of the held-out views match those of the original model.
 #[derive(Debug, Args)]
 #[command(after_help = after_help())]
 pub(super) struct ExportArgs {
-    /// Folder that `densify train` wrote, or a file (of SOG also a folder) of Gaussian splats
+    /// Folder that `densify train` wrote, or a file of Gaussian splats (for SOG, also a folder)
     #[arg(value_name = "RUN_OR_MODEL")]
     model: PathBuf,
     /// File to write; with --format all, a folder
@@ -46,8 +46,8 @@ pub(super) struct ExportArgs {
     /// Replace files that exist
     #[arg(long)]
     overwrite: bool,
-    /// Folder or ZIP archive of the dataset whose held-out views are compared; every 8th photograph if
-    /// neither the dataset nor an option selects them
+    /// Folder or ZIP archive of the dataset whose held-out views are compared: every 8th photograph, unless
+    /// the dataset or an option selects others
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
     #[command(flatten)]

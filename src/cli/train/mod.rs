@@ -70,7 +70,7 @@ Examples:
   densify train data/room --iterations 3000 --policy diet --policy-set diet.rho=0.2
   densify train --config output/garden-diet/config.toml -o runs/again
   densify train data/garden --resume
-  densify train data/garden --view            and look at it meanwhile";
+  densify train data/garden --view            and watch the run in the browser";
 
 impl TrainArgs {
     /// The host of the run: its observer, and the memory of the page if there is one.

@@ -101,7 +101,7 @@ impl Case {
 }
 
 #[test]
-fn a_run_whose_first_files_fail_leaves_nothing() {
+fn a_run_that_cannot_write_its_first_files_leaves_nothing() {
     let case = Case::new();
     let files = [
         (Operation::Create, "run", 0),

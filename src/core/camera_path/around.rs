@@ -11,8 +11,8 @@ use crate::camera::Camera;
 const KEYFRAMES: u32 = 48;
 /// Number of turns of a spiral.
 const TURNS: f64 = 2.0;
-/// Directions count as coplanar if at most this fraction of their squared length is normal to the plane: a mean
-/// roll of 13°.
+/// Directions count as coplanar if at most this fraction of their squared length is normal to the plane, that is,
+/// for a mean roll of up to 13°.
 const MAX_NORMAL_FRACTION: f64 = 0.05;
 /// Coplanar directions count as collinear if at most this fraction is along their second axis.
 const MAX_LINE_FRACTION: f64 = 0.1;
@@ -41,8 +41,8 @@ impl Rig {
         let centre = mean(&Camera::centre);
         let forward = mean(&Camera::forward).normalize_or(cameras[0].forward());
         let up = mean(&|camera| -camera.rotation.row(1)).normalize_or(-cameras[0].rotation.row(1));
-        // Least squares: Σ (I − ffᵀ) (x − c) = 0. A small weight on the mean position keeps it solvable when all
-        // cameras look the same way.
+        // Least squares: Σ (I − ffᵀ) (x − c) = 0. A small weight on the mean position keeps the system
+        // solvable when all cameras look the same way.
         let (mut matrix, mut right) = (DMat3::IDENTITY * 1e-9, centre * 1e-9);
         for camera in cameras {
             let f = camera.forward();
@@ -85,7 +85,7 @@ pub struct Orientation {
 /// Estimates the common orientation of cameras.
 ///
 /// # Panics
-/// Without cameras.
+/// If there are no cameras.
 pub fn orientation(cameras: &[Camera]) -> Orientation {
     let Rig { up, focus, looks_inward, .. } = Rig::new(cameras);
     Orientation { up, focus, looks_inward }
@@ -101,7 +101,7 @@ fn outer(d: DVec3) -> DMat3 {
 fn plane_normal(directions: impl Iterator<Item = DVec3> + Clone) -> Option<DVec3> {
     let scatter = directions.map(outer).fold(DMat3::ZERO, |sum, part| sum + part);
     let total = scatter.x_axis.x + scatter.y_axis.y + scatter.z_axis.z;
-    // Power iteration finds the largest axis of a matrix, and the smallest one by its inverse.
+    // Power iteration finds the longest axis of a matrix, and the shortest one with its inverse.
     let axis = |matrix: DMat3| {
         (0..64).try_fold(DVec3::new(0.36, 0.48, 0.8), |axis, _| (matrix * axis).try_normalize())
     };
@@ -116,7 +116,7 @@ fn plane_normal(directions: impl Iterator<Item = DVec3> + Clone) -> Option<DVec3
 /// from its middle, a circle around their centre that looks outward.
 ///
 /// # Panics
-/// Without cameras.
+/// If there are no cameras.
 pub fn orbit(cameras: &[Camera]) -> CameraPath {
     let rig = Rig::new(cameras);
     let level = |v: DVec3| v - rig.up * v.dot(rig.up);
@@ -143,7 +143,7 @@ pub fn orbit(cameras: &[Camera]) -> CameraPath {
 /// quantile of their offsets (*Local Light Field Fusion*, Mildenhall et al. 2019).
 ///
 /// # Panics
-/// Without cameras.
+/// If there are no cameras.
 pub fn spiral(cameras: &[Camera]) -> CameraPath {
     let rig = Rig::new(cameras);
     let right = rig.forward.cross(rig.up).normalize_or(rig.forward.any_orthonormal_vector());

@@ -11,9 +11,9 @@ use crate::files;
 
 /// Maximum size of a file `[bytes]`.
 const MAX_BYTES: u64 = 64 << 20;
-/// Maximum number of keyframes, and of frames, of a path.
+/// Maximum number of keyframes of a path, and of its frames.
 const MAX_KEYFRAMES: usize = 100_000;
-/// The size of a frame where only what it shows matters `[px]`.
+/// The size of frames if the file gives none `[px]`; only the poses and the aspect ratio matter then.
 const ANY_SIZE: (u32, u32) = (1600, 900);
 /// Maximum width and height of a frame `[px]`.
 pub const MAX_SIDE: u32 = 16_384;
@@ -53,7 +53,7 @@ pub struct SavedCameraPath {
 }
 
 impl SavedCameraPath {
-    /// The cameras of all frames, with pictures of the path's size or else of another one.
+    /// The cameras of all frames, with images of the path's size, or of an arbitrary size if it has none.
     pub fn cameras(&self) -> Vec<Camera> {
         let size = self.size.unwrap_or(ANY_SIZE);
         (0..self.frames).map(|frame| self.path.frame(frame, self.frames).camera(size)).collect()
@@ -94,7 +94,7 @@ pub fn read(path: &Path) -> Result<SavedCameraPath, CameraPathError> {
 
 pub(super) fn parse(text: &str) -> Result<SavedCameraPath, String> {
     let saved: SavedFile = serde_json::from_str(text)
-        .map_err(|e| format!("it is no camera path of nerfstudio ({e}); save one in its viewer"))?;
+        .map_err(|e| format!("it is not a nerfstudio camera path ({e}); save one in its viewer"))?;
     if let Some(kind) = saved.camera_type.filter(|kind| !kind.eq_ignore_ascii_case("perspective")) {
         return Err(format!("camera_type is {kind:?}; only perspective cameras can be rendered"));
     }

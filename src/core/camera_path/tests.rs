@@ -94,7 +94,7 @@ fn a_spiral_stays_within_the_cameras_and_looks_ahead() {
 }
 
 #[test]
-fn a_single_camera_is_enough() {
+fn a_single_camera_is_enough_for_a_path() {
     let one = circle(1, DVec3::ZERO, true);
     for path in [orbit(&one), spiral(&one)] {
         for frame in 0..5 {
@@ -152,13 +152,13 @@ fn nerfstudio_files_are_read() {
     let SavedCameraPath { path, frames, fps, size } = parse(text).unwrap();
     assert_eq!((path.is_loop, frames, fps, size), (true, 1, Some(24), None));
     // Duration times rate.
-    let lasting = text.replace(r#""seconds": null"#, r#""seconds": 2.02, "render_width": 6.0"#);
-    let SavedCameraPath { frames, size, .. } = parse(&lasting).unwrap();
+    let timed = text.replace(r#""seconds": null"#, r#""seconds": 2.02, "render_width": 6.0"#);
+    let SavedCameraPath { frames, size, .. } = parse(&timed).unwrap();
     assert_eq!((frames, size), (48, Some((6, 4))));
     let key = path.keyframes[0];
     assert_eq!(key.centre, DVec3::new(7.0, 8.0, 9.0));
     let camera = key.camera((40, 40));
-    // Its z axis, (0, −1, 0), points backward, and its y axis, (0, 0, 1), upward.
+    // In the file, its z axis, (0, −1, 0), points backward, and its y axis, (0, 0, 1), upward.
     assert!(camera.forward().distance(DVec3::Y) < 1e-9, "{}", camera.forward());
     assert!((-camera.rotation.row(1)).distance(DVec3::Z) < 1e-9);
     assert!((camera.fy - 20.0).abs() < 1e-9);
@@ -171,8 +171,8 @@ fn invalid_files_are_refused_with_the_reason() {
     };
     let unit = "1,0,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,1";
     for (text, reason) in [
-        ("{}".to_owned(), "no camera path"),
-        ("[1, 2".to_owned(), "no camera path"),
+        ("{}".to_owned(), "not a nerfstudio camera path"),
+        ("[1, 2".to_owned(), "not a nerfstudio camera path"),
         (r#"{"camera_path": []}"#.to_owned(), "0 cameras"),
         (pose("1, 2", "50"), "2 numbers"),
         (pose(unit, "0"), "fov is 0"),

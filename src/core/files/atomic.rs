@@ -55,8 +55,8 @@ pub fn write_atomically_from<E: From<FileError>>(
     write_checked(path, write, |_| Ok(()))
 }
 
-/// Does the same as [`write_atomically_from`], but gives the complete file its name only if `check`, which is given
-/// its temporary path, accepts it.
+/// Does the same as [`write_atomically_from`], but gives the complete file its name only if `check`, which receives
+/// the file's temporary path, accepts it.
 ///
 /// # Errors
 /// Those of [`write_atomically_from`] and of `check`.
@@ -105,15 +105,15 @@ fn replace<E>(
 /// The depth of a run's folders: `point_cloud/iteration_N`.
 pub const RUN_FOLDER_DEPTH: u32 = 2;
 
-/// Removes temporary files from a folder and from its subfolders down to a depth of `deeper`.
-pub fn remove_incomplete(folder: &Path, deeper: u32) {
+/// Removes temporary files from a folder and from its subfolders down to `depth` levels below it.
+pub fn remove_incomplete(folder: &Path, depth: u32) {
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
     for entry in entries {
         let (name, path) = (entry.file_name(), entry.path());
         // Links are not followed: their targets belong to the user.
         match entry.file_type() {
-            Ok(kind) if kind.is_dir() && !is_temporary(&name) && deeper > 0 => {
-                remove_incomplete(&path, deeper - 1);
+            Ok(kind) if kind.is_dir() && !is_temporary(&name) && depth > 0 => {
+                remove_incomplete(&path, depth - 1);
             }
             Ok(kind) if kind.is_file() && is_temporary(&name) => _ = std::fs::remove_file(&path),
             _ => {}

@@ -25,7 +25,7 @@ pub use faults::{Fault, attempt, with_fault};
 pub struct WatchedFile<'a, W> {
     /// The writer.
     pub file: W,
-    /// Its path, which selects the fault.
+    /// The path of its file, which decides whether the fault applies.
     pub path: &'a Path,
 }
 
@@ -63,23 +63,24 @@ mod faults {
     }
 
     #[derive(Default)]
-    struct Plan {
+    struct Injection {
         fault: Option<Fault>,
-        met: u32,
+        /// Number of times that the fault has occurred.
+        count: u32,
         /// True if every write accepts at most one byte.
-        short: bool,
+        short_writes: bool,
     }
 
     thread_local! {
-        static PLAN: RefCell<Plan> = RefCell::default();
+        static INJECTION: RefCell<Injection> = RefCell::default();
     }
 
     /// Runs `f` with a fault, or with short writes if there is none. Also returns the number of times that the fault
     /// occurred.
     pub fn with_fault<T>(fault: Option<Fault>, f: impl FnOnce() -> T) -> (T, u32) {
-        PLAN.replace(Plan { fault, met: 0, short: fault.is_none() });
+        INJECTION.replace(Injection { fault, count: 0, short_writes: fault.is_none() });
         let done = f();
-        (done, PLAN.take().met)
+        (done, INJECTION.take().count)
     }
 
     /// Fails if the operation has a fault.
@@ -87,7 +88,7 @@ mod faults {
     /// # Errors
     /// The error of the fault.
     pub fn attempt(operation: Operation, path: &Path) -> io::Result<()> {
-        PLAN.with_borrow_mut(|plan| match &mut plan.fault {
+        INJECTION.with_borrow_mut(|injection| match &mut injection.fault {
             Some(fault)
                 if fault.operation == operation
                     && path.to_string_lossy().replace('\\', "/").ends_with(fault.file) =>
@@ -96,7 +97,7 @@ mod faults {
                     fault.spared -= 1;
                     return Ok(());
                 }
-                plan.met += 1;
+                injection.count += 1;
                 Err(fault.kind.into())
             }
             _ => Ok(()),
@@ -104,7 +105,7 @@ mod faults {
     }
 
     pub(super) fn shortened(bytes: &[u8]) -> &[u8] {
-        let short = PLAN.with_borrow(|plan| plan.short);
-        if short { &bytes[..bytes.len().min(1)] } else { bytes }
+        let short_writes = INJECTION.with_borrow(|injection| injection.short_writes);
+        if short_writes { &bytes[..bytes.len().min(1)] } else { bytes }
     }
 }

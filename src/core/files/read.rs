@@ -5,7 +5,7 @@ use std::fs::{File, OpenOptions};
 use std::io::{self, Read};
 use std::path::Path;
 
-/// The message about text in another encoding, often caused by a file name in it.
+/// The message about text in another encoding, often caused by a file name in the text.
 pub(super) const NOT_UTF8: &str = "it is not text in UTF-8; save it as UTF-8, and rename files whose names are in another encoding";
 /// The maximum size of a file of options `[bytes]`.
 pub const MAX_OPTIONS: u64 = 4 << 20;
@@ -110,7 +110,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn text_is_read_up_to_its_limit_and_other_contents_are_named() {
+    fn text_is_read_up_to_its_limit_and_other_contents_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("text");
         let read = |bytes: &[u8]| {

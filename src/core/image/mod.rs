@@ -13,7 +13,7 @@ pub struct Image8 {
     pub height: u32,
     /// sRGB-encoded, row-major, RGB interleaved. Shape: `[height, width, 3]`.
     pub rgb: Vec<u8>,
-    /// Straight (not premultiplied) alpha, if the file has any.
+    /// Straight (not premultiplied) alpha, if the image has any.
     /// Shape: `[height, width]`.
     pub alpha: Option<Vec<u8>>,
     /// Weight of each pixel in the loss, if there is a mask: 0 ignores it, 255 counts it in full.
@@ -59,7 +59,7 @@ impl Image8 {
         (self.rgb.len() + length(&self.alpha) + length(&self.mask)) as u64
     }
 
-    /// An image without pixels yet: memory is reserved, with the channels of `like`.
+    /// An image that has the channels of `like` and no pixels yet, but memory reserved for them.
     pub fn blank(width: u32, height: u32, like: &Self) -> Self {
         let pixels = width as usize * height as usize;
         let channel =

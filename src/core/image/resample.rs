@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn fractional_shares_keep_the_mean() {
+    fn partly_covered_pixels_count_in_proportion() {
         let out = shrink(&grey(3, 1, &[30, 60, 240]), 2, 1);
         // Pixel 0 covers the first and half of the second: (30 + 30) / 1.5.
         assert_eq!(out, grey(2, 1, &[40, 180]));
@@ -148,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn uncovered_colour_does_not_bleed() {
+    fn colours_of_transparent_pixels_do_not_bleed() {
         let image =
             Image8 { alpha: Some(vec![255, 0]), mask: Some(vec![0, 255]), ..grey(2, 1, &[200, 0]) };
         let out = shrink(&image, 1, 1);

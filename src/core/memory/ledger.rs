@@ -126,7 +126,7 @@ fn peak(lines: &[&LedgerLine]) -> u64 {
     sum(lines.iter().zip(held).filter(|(_, is_held)| *is_held).map(|(line, _)| line.bytes))
 }
 
-/// Finds the lines whose buffers exist at the peak: those of the process, and of the largest phase.
+/// Finds the lines whose buffers exist at the peak: those of the process and those of the largest phase.
 ///
 /// Only the largest line counts in each of [`Section::Passing`], [`Section::Before`] and [`Section::After`], as these
 /// never exist at the same time. GPU memory exists at the same time as [`Section::After`], but not [`Section::Before`].
@@ -213,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn of_passing_buffers_only_the_largest_counts() {
+    fn only_the_largest_passing_buffer_counts() {
         assert_eq!(sample().total(), (40 << 20) + 1536);
         let mut full = Ledger::default();
         full.add_to(Section::Renderer, "a", u64::MAX);
@@ -251,7 +251,7 @@ mod tests {
     #[test]
     fn the_table_is_aligned_and_adds_up() {
         let mut ledger = sample();
-        // Each would be rounded down, and the sum up.
+        // Each size alone would be rounded down, but the sum is rounded up.
         for what in ["a", "b", "c"] {
             ledger.add_to(Section::Policy, what, 40 << 10);
         }

@@ -1,7 +1,7 @@
 //! Datasets in ZIP archives, unpacked into a temporary folder that is removed with the dataset's last view.
 //!
-//! Readers then see a folder, and photographs are decoded as fast as from one. Archives are untrusted: no name leads out
-//! of the folder, no links are created, and the unpacked size is bounded before and during unpacking.
+//! The readers of all formats then see a folder, from which photographs are decoded as fast as from any other. Archives
+//! are untrusted: no name leads out of the folder, no links are created, and the unpacked size is bounded before and during unpacking.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufReader, Read};
@@ -20,8 +20,8 @@ use densify_core::memory::Bytes;
 
 /// Largest number of files in an archive.
 const MAX_FILES: usize = 4_000_000;
-/// Maximum number of nested folders above the dataset's folder that contain only the next one.
-const MAX_OUTER: usize = 8;
+/// Maximum number of nested folders around the dataset's folder, each of which contains only the next one.
+const MAX_OUTER_FOLDERS: usize = 8;
 /// Names of files and folders that operating systems add to archives.
 const SYSTEM_FILES: [&str; 4] = ["__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini"];
 const REMEDY: &str = "pack the folder again, or unpack it and name the folder";
@@ -30,9 +30,8 @@ const REMEDY: &str = "pack the folder again, or unpack it and name the folder";
 #[derive(Debug)]
 pub(super) struct Unpacked {
     archive: PathBuf,
-    /// The temporary folder.
-    all: TempDir,
-    /// The dataset's folder inside it.
+    temporary: TempDir,
+    /// The dataset's folder inside the temporary folder.
     folder: PathBuf,
     bytes: u64,
 }
@@ -63,7 +62,7 @@ pub(super) fn load(path: &Path, options: &LoadOptions) -> Result<Dataset, LoadEr
             *text = unpacked.named(text);
         }
     }
-    let (bytes, place) = (Bytes(unpacked.bytes), unpacked.all.path().display());
+    let (bytes, place) = (Bytes(unpacked.bytes), unpacked.temporary.path().display());
     dataset.notes.push(Note::Text(format!(
         "{} is unpacked in {place} ({bytes}) while this command runs",
         path.display()
@@ -84,7 +83,7 @@ impl Unpacked {
         let mut archive = open(path)?;
         let most = max_unpacked_bytes(path)?;
         let bytes = check(path, &mut archive, most)?;
-        let all = tempfile::Builder::new()
+        let temporary = tempfile::Builder::new()
             .prefix("densify-zip-")
             .tempdir()
             .map_err(|error| no_room(path, &std::env::temp_dir(), bytes, &error))?;
@@ -92,7 +91,7 @@ impl Unpacked {
         for index in 0..archive.len() {
             let mut file = archive.by_index(index).map_err(|error| broken(path, &error))?;
             let Some(name) = data_name(path, &file)? else { continue };
-            let target = all.path().join(&name);
+            let target = temporary.path().join(&name);
             let made = target.parent().map_or(Ok(()), fs::create_dir_all);
             // A second file of the same name must not replace the first.
             let made =
@@ -101,7 +100,7 @@ impl Unpacked {
                 io::ErrorKind::AlreadyExists | io::ErrorKind::NotADirectory => {
                     malformed(path, &name, "another file has this name")
                 }
-                _ => no_room(path, all.path(), bytes, &error),
+                _ => no_room(path, temporary.path(), bytes, &error),
             })?;
             // The length in the table of contents is only a claim.
             let mut input = (&mut file).take(left + 1);
@@ -109,12 +108,12 @@ impl Unpacked {
                 Copying::Reading(error) => {
                     malformed(path, &name, format!("it cannot be unpacked: {error}"))
                 }
-                Copying::Writing(error) => no_room(path, all.path(), bytes, &error),
+                Copying::Writing(error) => no_room(path, temporary.path(), bytes, &error),
             })?;
             left = left.checked_sub(copied).ok_or_else(|| bomb(path, most))?;
         }
-        let folder = innermost(all.path());
-        Ok(Self { archive: path.to_owned(), all, folder, bytes })
+        let folder = innermost(temporary.path());
+        Ok(Self { archive: path.to_owned(), temporary, folder, bytes })
     }
 
     /// The dataset's folder.
@@ -125,7 +124,7 @@ impl Unpacked {
     /// Replaces the temporary folder with the archive's name in a message.
     pub(super) fn named(&self, text: &str) -> String {
         let archive = self.archive.to_string_lossy();
-        [&*self.folder, self.all.path()].iter().fold(text.to_owned(), |text, folder| {
+        [&*self.folder, self.temporary.path()].iter().fold(text.to_owned(), |text, folder| {
             text.replace(&*folder.to_string_lossy(), &archive)
         })
     }
@@ -140,14 +139,15 @@ impl Unpacked {
             LoadError::NoMasks { listing, inverted } => {
                 LoadError::NoMasks { listing: self.shown(&listing), inverted }
             }
-            // The list is a file of the user's.
+            // The view list is the user's own file, outside the archive.
             LoadError::ViewList { .. } => error,
         }
     }
 
     /// Replaces the temporary folder with the archive's name in a path.
     pub(super) fn shown(&self, path: &Path) -> PathBuf {
-        let rest = path.strip_prefix(&self.folder).or_else(|_| path.strip_prefix(self.all.path()));
+        let rest =
+            path.strip_prefix(&self.folder).or_else(|_| path.strip_prefix(self.temporary.path()));
         rest.map_or_else(|_| path.to_owned(), |rest| self.archive.join(rest))
     }
 }
@@ -215,7 +215,7 @@ fn data_name<R: Read>(
 /// Descends through folders that contain nothing but one folder.
 fn innermost(folder: &Path) -> PathBuf {
     let mut folder = folder.to_owned();
-    for _ in 0..MAX_OUTER {
+    for _ in 0..MAX_OUTER_FOLDERS {
         let mut entries = fs::read_dir(&folder).into_iter().flatten().flatten();
         match (entries.next(), entries.next()) {
             (Some(only), None) if only.path().is_dir() => folder = only.path(),

@@ -38,7 +38,7 @@ impl Exif {
 
     /// Reads the fields of an open file, from its start.
     pub(super) fn read(file: File) -> Self {
-        // The length bounds the allocations, whatever lengths the file claims.
+        // The length of the file bounds the allocations, whatever lengths its fields claim.
         let is_readable = file.metadata().is_ok_and(|data| data.len() <= MAX_BYTES);
         let fields =
             is_readable.then(|| exif::Reader::new().read_from_container(&mut BufReader::new(file)));
@@ -84,7 +84,7 @@ pub struct ReportedExposures {
     pub stops: Vec<Option<f64>>,
     /// Number of views with implausible values.
     pub implausible: usize,
-    /// The first of them and its value, for messages.
+    /// Name and implausible value of the first such view, for messages.
     pub example: Option<String>,
 }
 

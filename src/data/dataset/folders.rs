@@ -114,7 +114,7 @@ impl Folders {
         Ok(None)
     }
 
-    /// The image whose path is the longest suffix of an absolute path that exists below the folder.
+    /// The image below the folder whose path is the longest existing suffix of an absolute path.
     fn image_by_suffix(
         &self,
         folder: &Root,
@@ -152,14 +152,14 @@ impl Folders {
         }
     }
 
-    /// Number of photographs in the folder of images that are not those of frames.
+    /// Number of photographs in the folder of images that belong to no frame.
     pub(super) fn count_others(&self, frames: &[Frame]) -> usize {
         let images = self.root.path().join("images");
         let reduced = self.reduced.as_ref().map(|(folder, _)| folder.path().to_owned());
         let own = if images.is_dir() { images } else { reduced.unwrap_or(images) };
         let folder = self.chosen.as_ref().map_or(own, |folder| folder.path().to_owned());
         let mut names = Vec::new();
-        // Other folders of the dataset hold no further photographs.
+        // If the dataset lies in the chosen folder, its subfolders are not searched: they hold no further photographs.
         let is_deep = !self.chosen.as_ref().is_some_and(|folder| folder.contains(&self.root));
         add_photographs(&folder, "", is_deep, &mut names);
         // Names may have several Unicode spellings.
@@ -190,7 +190,7 @@ impl Folders {
     }
 }
 
-/// Adds the names of the photographs in a folder and, if `is_deep`, below it: neither masks nor what is hidden.
+/// Adds the names of the photographs in a folder and, if `is_deep`, in its subfolders. Masks and hidden files are left out.
 fn add_photographs(folder: &Path, inside: &str, is_deep: bool, names: &mut Vec<String>) {
     for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
         let file = entry.file_name();

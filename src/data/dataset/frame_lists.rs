@@ -1,8 +1,8 @@
 //! nerfstudio's lists of the frames to train on, to validate with and to test on.
 //!
-//! What is listed for training is trained on, and nothing else; without such a list, all that no other list names. Test
-//! views are the frames listed for tests or, without any, those for validation, which are never trained on unless listed
-//! for that too.
+//! Only the frames listed for training are trained on; without a list for training, all frames that no other list names.
+//! Test views are the frames listed for tests or, if there are none, those listed for validation. A frame listed for
+//! validation is trained on only if it is listed for training, too.
 
 use std::collections::HashMap;
 use std::path::PathBuf;
@@ -14,20 +14,22 @@ use super::paths::{DataPath, relative};
 /// The lists, in the order of [`FrameLists::lists`].
 pub(super) const FIELDS: [&str; 3] = ["train_filenames", "val_filenames", "test_filenames"];
 
-/// Names of a list by the image that they name, and whether a frame has it.
+/// The names in a list by the image that each refers to, and whether a frame has this image.
 type Names = HashMap<PathBuf, (String, bool)>;
 
-/// The lists of a file, with what they say about its frames.
+/// The lists of a file, and how its frames are used according to them.
 #[derive(Debug, Default)]
 pub(super) struct FrameLists {
     lists: [Option<Names>; 3],
-    /// Frames that are not used, because no list or only that for validation names them.
+    /// Frames that are not used, because no list names them.
     unlisted: Vec<String>,
+    /// Frames that are not used, because only the list for validation names them.
     validation: Vec<String>,
     /// Frames that are both trained on and tested.
     both: Vec<String>,
-    /// Number of frames whose image exists, and of those that are trained on.
+    /// Number of frames whose image exists.
     frames: usize,
+    /// Number of these frames that are trained on.
     trained: usize,
 }
 
@@ -53,7 +55,7 @@ impl FrameLists {
         Ok(())
     }
 
-    /// Whether a frame is trained on, and whether it is tested.
+    /// Whether a frame is trained on, and whether it is tested on.
     pub(super) fn splits(&mut self, file: &str, found: Option<&ImageFile>) -> (bool, bool) {
         let key = key(file, found);
         let [train, validation, test] = self.lists.each_mut().map(|list| {
@@ -81,8 +83,8 @@ impl FrameLists {
         self.lists[list].as_ref().is_some_and(|names| !names.is_empty())
     }
 
-    /// Whether the lists define which frames are tested.
-    pub(super) fn decide(&self) -> bool {
+    /// Whether the lists define which frames are tested on.
+    pub(super) fn define_the_split(&self) -> bool {
         self.lists[0].is_some() || self.names_any(1) || self.names_any(2)
     }
 
@@ -106,7 +108,7 @@ impl FrameLists {
         decisive.filter(|_| leaves_none).map(|list| (FIELDS[list], problem()))
     }
 
-    /// What the user must know about frames that are used differently than without lists.
+    /// Notes for the user about frames that would be used differently without lists.
     pub(super) fn notes(&self, file: &str) -> Vec<String> {
         let mut notes = Vec::new();
         let mut note = |group: &[String], words: &str| {

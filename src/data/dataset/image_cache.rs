@@ -348,7 +348,7 @@ mod tests {
     }
 
     #[test]
-    fn a_background_error_surfaces_at_get_with_the_name() {
+    fn get_returns_the_error_of_a_background_thread_with_the_file_name() {
         let folder = tempfile::tempdir().unwrap();
         let sources = sources(folder.path(), 3);
         let bytes = std::fs::read(&sources[1].file.path).unwrap();

@@ -132,7 +132,7 @@ impl ImageSource {
 
     /// Whether loaded images may have transparent pixels.
     pub(crate) fn may_be_transparent(&self) -> bool {
-        self.header.has_alpha || self.is_carved()
+        self.header.has_alpha || self.masks_become_transparent()
     }
 
     /// Whether loaded images have a mask: from a file, or of the field of view of the lens.
@@ -143,7 +143,7 @@ impl ImageSource {
     }
 
     /// Returns true if the mask becomes transparency.
-    fn is_carved(&self) -> bool {
+    fn masks_become_transparent(&self) -> bool {
         self.mask.as_ref().is_some_and(|mask| mask.mode == MaskMode::Background)
     }
 

@@ -68,7 +68,7 @@ mod tests {
     }
 
     #[test]
-    fn whole_files_decode_like_in_the_crate_image() {
+    fn complete_files_decode_as_in_the_crate_image() {
         let bytes = sample();
         let expected = image::load_from_memory(&bytes).unwrap();
         assert_eq!(decode(&bytes).unwrap(), expected);

@@ -33,7 +33,7 @@ pub enum Hides {
 impl Mask {
     /// Decodes the mask at its own size; weight 0 is hidden. `check` may refuse its header first.
     ///
-    /// The decoded mask is not kept: masks of all photographs together would exceed the promised memory.
+    /// The decoded mask is not kept: masks of all photographs together would exceed the planned memory.
     pub(super) fn read_weights(
         &self,
         check: impl FnOnce(ImageHeader) -> Result<(), LoadError>,
@@ -129,7 +129,7 @@ mod tests {
 
     /// Masked pixels and transparent pixels of the photograph are both transparent.
     #[test]
-    fn carved_pixels_are_transparent() {
+    fn masks_of_background_become_transparency() {
         let folder = tempfile::tempdir().unwrap();
         let [path, plain, mask] = ["a.png", "b.png", "m.png"].map(|name| folder.path().join(name));
         let alpha = |x, _| image::Rgba([10_u8, 20, 30, if x == 0 { 102 } else { 255 }]);
@@ -150,7 +150,7 @@ mod tests {
         }
     }
 
-    /// The alpha channel counts only where brightness is the same everywhere.
+    /// The alpha channel counts only if all pixels have the same brightness.
     #[test]
     fn a_mask_may_be_an_alpha_channel() {
         let read = |pixels: [[u8; 2]; 2]| {

@@ -22,7 +22,7 @@ pub(super) const FOLDERS: [&str; 4] = ["masks", "mask", "segmentation", "dynamic
 #[derive(Debug, Clone)]
 pub(super) struct MaskFile {
     pub(super) path: PathBuf,
-    /// True if all values but 0 hide a pixel; otherwise 0 hides it, and other values in part.
+    /// True if all values but 0 hide a pixel completely; otherwise 0 hides it completely and grey in part.
     pub(super) hides_all_but_black: bool,
 }
 
@@ -33,7 +33,7 @@ impl MaskFile {
     }
 }
 
-/// Returns true if a file beside photographs is a mask of one.
+/// Returns true if a file beside photographs is the mask of a photograph.
 pub(super) fn is_mask(name: &OsStr) -> bool {
     name.to_str().is_some_and(|name| name.ends_with(LAYER) || name.starts_with(DYNAMIC))
 }
@@ -98,7 +98,7 @@ impl Folders {
         Ok(None)
     }
 
-    /// The root folder of an image, and below it the paths of the image and of its full-size original.
+    /// The root folder of an image, and the paths below this folder of the image and of its full-size original.
     fn image_places(&self, image: &ImageFile) -> (&Root, Vec<String>) {
         let root = self.chosen.as_ref().unwrap_or(&self.root);
         let path = image.path.strip_prefix(root.path()).unwrap_or(&image.path);

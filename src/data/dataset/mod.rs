@@ -111,7 +111,7 @@ pub enum Note {
         model: String,
         /// Number of its images.
         images: u64,
-        /// The others, with numbers of images.
+        /// The models that are not read, with their numbers of images.
         others: Vec<(String, u64)>,
     },
     /// Undistortion crops photographs, unless the [field of view is kept](LoadOptions::keep_fov).
@@ -168,7 +168,7 @@ struct Frame {
     reduced: Option<u32>,
     mask: Option<MaskFile>,
     lens: Lens,
-    /// Header of the image, where the pose file states no image size and the lens is for that of the image.
+    /// Header of the image, if the pose file states no image size, so that the lens is for the size of the image.
     header: Option<ImageHeader>,
     rotation: DMat3,
     translation: DVec3,

@@ -16,14 +16,14 @@ pub const EXTENT: f64 = 1.1;
 /// Cameras count as being at one place if their radius is below this fraction of their distance from the origin:
 /// the precision of f64 is 2.2e-16, and poses of other programs have a few digits less.
 const SAME_PLACE: f64 = 1e-12;
-/// Distance from the origin, in extents, beyond which f32 world coordinates are too coarse. At 1e4 their rounding is
-/// about half a pixel, for a focal length of 1,500 px and distance 10.
+/// Distance from the origin, in extents, beyond which f32 world coordinates are too coarse. At 1e4 they are rounded by up
+/// to 5e-4 extents: half a pixel, for a focal length of 1,500 px and a point 1.5 extents away.
 const F32_OFFSET: f64 = 1e4;
 
 /// A camera is an outlier if its distance from the median position exceeds this many times the median of all these
 /// distances. Drone flights and walks around an object stay below 5.
 const OUTLIER_DISTANCE: f64 = 10.0;
-/// If a larger share of the cameras is that far away, they are a part of the scene.
+/// If a larger share of the cameras is that far away, these cameras are a part of the scene.
 const MAX_OUTLIERS: f64 = 0.05;
 /// Smallest number of cameras among which outliers can be recognised.
 const MIN_CAMERAS: usize = 10;
@@ -192,7 +192,7 @@ mod tests {
         assert_eq!(far_of(39, &[500.0]), [39]);
         assert_eq!(far_of(39, &[40.0, -1e30]), [39, 40]);
         assert_eq!(far_of(39, &[25.0]), [0; 0]);
-        // More than a few are a part of the scene, and a handful of cameras is not enough.
+        // Three far cameras are a part of the scene, and among nine cameras no outlier is recognised.
         assert_eq!(far_of(38, &[500.0, 510.0, 520.0]), [0; 0]);
         assert_eq!(far_of(8, &[500.0]), [0; 0]);
         assert_eq!(outliers(&vec![DVec3::ONE; 30]), [false; 30]);
@@ -231,7 +231,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rig_at_one_place_falls_back_to_the_points_then_to_one() {
+    fn if_all_cameras_are_at_one_place_the_points_set_the_unit_and_without_points_it_stays() {
         let centre = DVec3::new(1e6, 0.1, 7.0);
         let points: Vec<_> = [2.0, 4.0, 1000.0].iter().map(|&d| centre + DVec3::Y * d).collect();
         assert!((Normalisation::fit(&[centre; 3], &points).scale - 0.25).abs() < 1e-9);

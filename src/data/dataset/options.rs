@@ -44,7 +44,7 @@ pub enum Resolution {
     Width(u32),
 }
 
-/// Treatment of views whose camera is far from all others, which are mostly errors of structure from motion. They never
+/// Treatment of views whose camera is far from all others, mostly by an error of structure from motion. Such views never
 /// count for the extent of the scene.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
@@ -63,7 +63,7 @@ pub enum MaskMode {
     /// Unknown: they do not count, and anything may be there
     #[default]
     Ignore,
-    /// Empty: they are trained to show the background, which carves away what is not in the mask
+    /// Empty: they are trained to show the background, which removes what the mask hides
     Background,
 }
 

@@ -103,7 +103,7 @@ impl Root {
 
     /// The entry of a folder with this name in any Unicode spelling.
     fn entry(&self, folder: PathBuf, name: &str) -> Option<PathBuf> {
-        // Folders outside are not even listed.
+        // Folders outside the root are not even listed.
         if !folder.canonicalize().ok()?.starts_with(&self.canonical) {
             return None;
         }

@@ -39,8 +39,8 @@ pub(super) fn photographs(
     options: &LoadOptions,
     notes: &mut Vec<Note>,
 ) -> Result<Vec<Photograph>, LoadError> {
-    let carves = options.mask_mode == MaskMode::Background;
-    if (options.invert_masks || carves) && frames.iter().all(|frame| frame.mask.is_none()) {
+    let is_background = options.mask_mode == MaskMode::Background;
+    if (options.invert_masks || is_background) && frames.iter().all(|frame| frame.mask.is_none()) {
         let listing = listing.to_owned();
         return Err(LoadError::NoMasks { listing, inverted: options.invert_masks });
     }
@@ -298,7 +298,7 @@ fn check_mask(mask: &Mask, found: ImageHeader, image: ImageHeader) -> Result<(),
 
 /// Returns true if a mask hides all of a view; `several` is true if its photograph has more than one view.
 fn is_hidden(view: &View, several: bool, mask: &GrayImage, lens: &Lens) -> bool {
-    /// Maximum number of pixels along a side of a mask that are tested against each of several views.
+    /// Number of pixels along the longer side of a mask, up to a factor of 2, that are tested against each of several views.
     const SAMPLED_SIDE: u32 = 512;
     let (width, height) = mask.dimensions();
     let stride = if several { (width.max(height) / SAMPLED_SIDE).max(1) } else { 1 } as usize;
@@ -381,7 +381,7 @@ mod tests {
     }
 
     #[test]
-    fn faces_are_named_before_the_ending() {
+    fn the_name_of_a_face_goes_before_the_file_extension() {
         for (name, named) in
             [("a/b.c.png", "a/b.c@up.png"), ("a.b/c", "a.b/c@up"), (".png", ".png@up")]
         {

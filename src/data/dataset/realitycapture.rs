@@ -5,7 +5,7 @@
 //! down and the top of its image is north (+y); heading turns it clockwise about the vertical, pitch raises its view
 //! towards the horizon, roll tilts it (Capturing Reality, *Registration export and camera orientations*). `f` is the
 //! focal length for an image whose longer side is 36 mm; `px` and `py` are the offset of the principal point from the
-//! centre, in longer sides. The distortion is Brown's: k1 to k4 of r² to r⁸; t1 and t2 are OpenCV's p2 and p1, the order
+//! centre, in units of the longer side. The distortion is Brown's: k1 to k4 of r² to r⁸; t1 and t2 are OpenCV's p2 and p1, the order
 //! in which RealityCapture's own OpenCV export writes them.
 //!
 //! The table is parsed here rather than by a CSV crate: the export writes plain commas and decimal points whatever the
@@ -106,7 +106,7 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
         (Vec::new(), Vec::new(), 0, None);
     for (number, line) in lines {
         if frames.len() + missing.len() == MAX_FRAMES {
-            return fault("the file", "it lists more than a million");
+            return fault("the file", "it lists more than a million photographs");
         }
         let row = Row { path, number, columns: &columns, cells: cells(line) };
         let name = row.text("name").trim();
@@ -161,7 +161,7 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
     Ok(Some(Scene { listing, frames, first_missing, points, points_file, notes, ..rest }))
 }
 
-/// Column names in lower case, with the older of two names.
+/// Column names in lower case; those of RealityScan 2 are replaced with the older ones.
 struct Columns(Vec<String>);
 
 impl Columns {

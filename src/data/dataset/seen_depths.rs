@@ -10,10 +10,10 @@ use densify_core::camera::Camera;
 
 /// Cells along each side of a picture.
 const CELLS: usize = 16;
-/// Most cameras, and most pairs of a camera and a point, that are used, equally spaced: 1 MiB, and a fifth of a second of
-/// one thread.
-const MOST_CAMERAS: usize = 1 << 10;
-const MOST_PAIRS: usize = 1 << 24;
+/// Maximum number of cameras that are used, equally spaced in their list: the depths then take 1 MiB.
+const MAX_CAMERAS: usize = 1 << 10;
+/// Maximum number of pairs of a camera and a point that are used: a fifth of a second of one thread.
+const MAX_PAIRS: usize = 1 << 24;
 
 /// The depth of the nearest point in each cell of each picture, ascending.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -23,8 +23,8 @@ impl SeenDepths {
     /// Measures the depths of points before cameras in the same coordinates.
     pub fn measure(points: &[DVec3], cameras: &[Camera]) -> Self {
         let cameras: Vec<&Camera> =
-            cameras.iter().step_by(stride(cameras.len(), MOST_CAMERAS)).collect();
-        let stride = stride(points.len(), MOST_PAIRS / cameras.len().max(1));
+            cameras.iter().step_by(stride(cameras.len(), MAX_CAMERAS)).collect();
+        let stride = stride(points.len(), MAX_PAIRS / cameras.len().max(1));
         let mut depths: Vec<f32> = cameras
             .into_par_iter()
             .flat_map_iter(|camera| {
@@ -55,7 +55,7 @@ impl SeenDepths {
     }
 }
 
-/// The distance between the values to use, so that at most `most` are.
+/// The distance between the values that are used, so that at most `most` of `values` are.
 fn stride(values: usize, most: usize) -> usize {
     values.div_ceil(most.max(1)).max(1)
 }
@@ -87,7 +87,7 @@ mod tests {
     }
 
     #[test]
-    fn depths_count_by_what_they_cover_not_by_their_points() {
+    fn depths_count_by_covered_area_not_by_number_of_points() {
         // A wall of few points hides a denser one.
         let points: Vec<DVec3> = wall(5.0, 200).chain(wall(2.0, CELLS)).collect();
         let seen = SeenDepths::measure(&points, &[camera()]);
@@ -104,10 +104,10 @@ mod tests {
 
     #[test]
     fn many_points_and_cameras_are_thinned_evenly() {
-        let cameras = vec![camera(); 3 * MOST_CAMERAS];
+        let cameras = vec![camera(); 3 * MAX_CAMERAS];
         let points: Vec<DVec3> = wall(3.0, 256).collect();
         let seen = SeenDepths::measure(&points, &cameras);
-        assert!(seen.0.len() <= MOST_CAMERAS * CELLS * CELLS);
+        assert!(seen.0.len() <= MAX_CAMERAS * CELLS * CELLS);
         assert_eq!((seen.quantile(0.0), seen.quantile(0.999)), (Some(3.0), Some(3.0)));
     }
 }

@@ -52,7 +52,7 @@ impl SourceFile {
         self.real.metadata().map_or(0, |data| data.len())
     }
 
-    /// EXIF fields; read from the file only if that has not been done before.
+    /// EXIF fields; read from the file only if they have not been read before.
     pub(super) fn exif(&self) -> Exif {
         match &self.exif {
             Some(exif) => Exif::clone(exif),

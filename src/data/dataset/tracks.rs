@@ -1,7 +1,7 @@
 //! Tracks: the views in which a reconstruction has found a point.
 //!
-//! They are read only on request and sampled while being read, because statistics need some thousands and a
-//! reconstruction may have millions.
+//! They are read only on request and sampled while being read, because statistics need some thousands of tracks and
+//! a reconstruction may have millions.
 
 use glam::DVec3;
 
@@ -39,7 +39,7 @@ impl Tracks {
     }
 
     /// Moves tracks to normalised coordinates and restricts them to training views. `view_of` returns the training view
-    /// that shows a point, from the id of its photograph.
+    /// that shows a point, given the id of the view's photograph.
     pub(super) fn in_training_views(
         self,
         normalisation: &Normalisation,
@@ -122,7 +122,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn many_tracks_are_thinned_evenly_and_short_ones_left_out() {
+    fn many_tracks_are_thinned_evenly_and_tracks_of_few_views_left_out() {
         let mut sampler = TrackSampler::new();
         for i in 0..5 * THINNED_TRACKS {
             let views = if i % 2 == 0 { 5 } else { 3 };

@@ -1,19 +1,20 @@
 //! The transfer function that a PNG states, such as that of linear values, and the conversion to sRGB.
 //!
-//! Of several statements the chunk `cICP` counts before `iCCP`, `sRGB` and `gAMA` (PNG, 3rd edition, 4.3).
+//! If several chunks state it, `cICP` takes precedence over `iCCP`, `sRGB` and `gAMA` (PNG, 3rd edition, 4.3).
 
 use std::io::{BufRead, Read, Seek};
 
 use image::{DynamicImage, ImageBuffer, Pixel};
 
 const SIGNATURE: [u8; 8] = *b"\x89PNG\r\n\x1a\n";
-/// Number of linear values in `cICP` (ITU-T H.273, table 3).
+/// Code of linear values in `cICP` (ITU-T H.273, table 3).
 const LINEAR: u8 = 8;
-/// The exponent of `gAMA` for which sRGB is written, and its relative tolerance, as programs round it.
+/// The exponent in `gAMA` that programs write for sRGB.
 const SRGB: f64 = 1.0 / 2.2;
+/// Relative tolerance of this exponent, because programs round it.
 const TOLERANCE: f64 = 0.05;
 
-/// The exponent of the values of a PNG, unless they are sRGB or in doubt. A value is light to the power of it.
+/// The exponent of a PNG's values, which are light to the power of the exponent; `None` if they are sRGB or in doubt.
 pub(super) fn exponent(mut input: impl BufRead + Seek) -> Option<f64> {
     let bytes = |input: &mut dyn Read| {
         let mut bytes = [0; 8];
@@ -136,7 +137,7 @@ mod tests {
             let loaded = ImageSource::whole(path.clone()).load().unwrap();
             assert_eq!(loaded.rgb[..3], [red, 0, 255], "{chunks:?}");
         }
-        // Alpha stays, and grey is grey.
+        // Alpha does not change, and grey images remain grey.
         let clear = ImageBuffer::from_pixel(2, 2, Rgba([64_u8, 64, 64, 64]));
         let grey = ImageBuffer::from_pixel(2, 2, Luma([64_u8]));
         for (image, alpha) in [(clear.into(), Some(vec![64; 4])), (grey.into(), None)] {
@@ -147,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn cut_files_state_nothing() {
+    fn truncated_files_state_no_exponent() {
         let grey = ImageBuffer::from_pixel(2, 2, Luma([64_u8])).into();
         let whole = png(&grey, &[(b"gAMA", &100_000_u32.to_be_bytes())]);
         assert_eq!(exponent(Cursor::new(&whole)), Some(1.0));

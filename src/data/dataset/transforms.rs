@@ -3,7 +3,7 @@
 //!
 //! Poses are `world_from_camera` with OpenGL axes (x right, y up, looking along −z). Intrinsics are
 //! at the top level or in the frame; those in the frame take precedence.
-//! One file, because both layouts share the fields of a frame.
+//! This module reads both formats, because their frames have the same fields.
 
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
@@ -68,8 +68,8 @@ fn read_pair(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadEr
         return Ok(None);
     }
     let folders = Folders::new(root, options, false)?;
-    let mut scene = read(root, &folders, PAIR[0], Declared::Train)?;
-    let test = read(root, &folders, PAIR[1], Declared::Test)?;
+    let mut scene = read(root, &folders, PAIR[0], DeclaredSplit::Train)?;
+    let test = read(root, &folders, PAIR[1], DeclaredSplit::Test)?;
     scene.frames.extend(test.frames);
     scene.notes.extend(test.notes);
     scene.own_split = true;
@@ -85,15 +85,15 @@ fn read_single(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, Load
         return Ok(None);
     }
     let declared = match options.split {
-        Split::Every(_) => Declared::Train,
-        Split::None | Split::Eval => Declared::InLists,
+        Split::Every(_) => DeclaredSplit::Train,
+        Split::None | Split::Eval => DeclaredSplit::InLists,
     };
     read(root, &Folders::new(root, options, false)?, SINGLE, declared).map(Some)
 }
 
-/// What decides on the split of the frames of a file.
+/// What decides which frames of a file are for training and which are for tests.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Declared {
+enum DeclaredSplit {
     /// All are for training.
     Train,
     /// All are for tests.
@@ -107,7 +107,7 @@ fn read(
     root: &Root,
     folders: &Folders,
     name: &str,
-    declared: Declared,
+    declared: DeclaredSplit,
 ) -> Result<Scene, LoadError> {
     let path = root.path().join(name);
     root.existing(DataPath { file: &path, field: "the file", value: name })?;
@@ -122,7 +122,7 @@ fn read(
         return Err(top.fault("frames", "there are more than a million"));
     }
     let mut lists = FrameLists::default();
-    if declared == Declared::InLists {
+    if declared == DeclaredSplit::InLists {
         top.frame_lists(folders, &mut lists)?;
     }
     let (mut frames, mut missing, mut fell_back) = (Vec::new(), Vec::new(), 0);
@@ -140,9 +140,9 @@ fn read(
         let named = DataPath { file: &path, field: &field, value: file };
         let found = folders.image(named)?;
         let (trained, tested) = match declared {
-            Declared::Train => (true, false),
-            Declared::Test => (false, true),
-            Declared::InLists => lists.splits(file, found.as_ref()),
+            DeclaredSplit::Train => (true, false),
+            DeclaredSplit::Test => (false, true),
+            DeclaredSplit::InLists => lists.splits(file, found.as_ref()),
         };
         let Some(found) = found else {
             first_missing.get_or_insert_with(|| folders.first_path(named));
@@ -185,10 +185,10 @@ fn read(
         notes.push(folders.fell_back_note(fell_back));
     }
     let points_file = points_file((root, folders), &top, declared, &mut notes)?;
-    let (own_split, listing) = (lists.decide(), path.clone());
+    let (own_split, listing) = (lists.define_the_split(), path.clone());
     let (notes, rest) = (texts(notes), Scene::default());
     let mut scene = Scene { frames, first_missing, notes, points_file, listing, own_split, ..rest };
-    if declared != Declared::Test
+    if declared != DeclaredSplit::Test
         && let Some(file) = &scene.points_file
     {
         scene.points = crate::points::read_points(file)?;
@@ -200,7 +200,7 @@ fn read(
 fn points_file(
     (root, folders): (&Root, &Folders),
     top: &Fields<'_>,
-    declared: Declared,
+    declared: DeclaredSplit,
     notes: &mut Vec<String>,
 ) -> Result<Option<PathBuf>, LoadError> {
     if let Some(value) = top.text("ply_file_path")? {
@@ -221,7 +221,7 @@ fn points_file(
             "{file}: the initial points {value:?} are not in the dataset's folder and are left out"
         )));
     }
-    if declared == Declared::Test { Ok(None) } else { usual_points(root, top.path, notes) }
+    if declared == DeclaredSplit::Test { Ok(None) } else { usual_points(root, top.path, notes) }
 }
 
 /// The file of initial points under one of the [usual names](POINT_FILES), for pose files that name none.
@@ -304,8 +304,8 @@ impl<'a> Fields<'a> {
                 root.existing_on_any_system(named)?.ok_or_else(missing)?,
             ));
         }
-        // The path is from another machine: the end of the path is looked for in this folder, then the usual places.
-        // The bare file name does not count, as a photograph may have the same.
+        // The path is from another machine: its suffixes are looked for in the dataset's folder, then the mask is looked
+        // for in the usual places. The bare file name does not count, as a photograph may have the same name.
         for value in named.suffixes()?.filter(|end| end.contains('/')) {
             if let Some(found) = root.existing(DataPath { value: &value, ..named })? {
                 return Ok(MaskFile::black_hides(found));

@@ -11,8 +11,8 @@ const MAX_BYTES: u64 = 1 << 30;
 /// Separator between a name and a part.
 const TAB: char = '\t';
 
-/// The views of a photograph that a list names, cropped to the listed parts; all views without a list. `None` if no view
-/// is left.
+/// The views of a photograph that a list names, cropped to the listed parts; all views if there is no list. `None` if
+/// no view is left.
 pub(super) fn select(list: Option<&mut ViewList>, views: Vec<View>) -> Option<Vec<View>> {
     let Some(list) = list else { return Some(views) };
     let select = |view: View| {
@@ -81,7 +81,7 @@ impl ViewList {
         }
         if train.is_empty() {
             let problem = format!(
-                "none of the {} listed views is trained on; list others, or hold out fewer",
+                "none of the {} listed views is trained on; list others, or hold out fewer views",
                 self.entries.len()
             );
             return Err(fault(&self.file, problem));

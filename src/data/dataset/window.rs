@@ -116,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn a_windowed_view_shows_the_same_as_the_whole_view_there() {
+    fn a_windowed_view_shows_the_same_as_its_part_of_the_whole_view() {
         let made = Made::colmap_txt();
         let dataset = Dataset::load(made.path(), &LoadOptions::default()).expect("a dataset");
         let (width, height) = (60, 40);

@@ -68,7 +68,7 @@ fn rate(rates: &LearningRates, p: usize) -> f32 {
 
 /// Steps the parameters in `planes` of the sixteen rows of a block.
 #[inline(always)]
-#[expect(clippy::too_many_arguments, reason = "a kernel: each is a buffer of its own")]
+#[expect(clippy::too_many_arguments, reason = "a kernel: each argument is a buffer of its own")]
 pub(super) fn step<S: Simd>(
     s: S,
     params: &mut [f32],

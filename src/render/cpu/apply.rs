@@ -74,7 +74,7 @@ pub(super) fn apply(model: &mut Model<'_>, ops: &RowOps, rng: &PolicyRng) {
 }
 
 impl Model<'_> {
-    /// Writes the children of a parent, then the parent itself.
+    /// Writes a family: the children of a parent, then the parent itself.
     fn write_family(&mut self, row: u32, offspring: &Offspring, children: &[u32], rng: &PolicyRng) {
         let parent = row as usize;
         let mean: [f32; 3] = self.params.get_n(parent, plane::MEAN);
@@ -170,10 +170,10 @@ impl Model<'_> {
             // Non-finite numbers are left to the audit, and a decay of 0 must leave every bit unchanged.
             if decay.opacity > 0.0 && was.is_finite() {
                 let opacity = sigmoid(was);
-                let left = (opacity - decay.opacity).max(MIN_DECAYED_OPACITY);
+                let decayed = (opacity - decay.opacity).max(MIN_DECAYED_OPACITY);
                 // 1 − o from the logit, so that nothing cancels.
-                let off = sigmoid(-was) + (opacity - left);
-                self.params.set(row, plane::OPACITY, was.min((left / off).ln()));
+                let transparency = sigmoid(-was) + (opacity - decayed);
+                self.params.set(row, plane::OPACITY, was.min((decayed / transparency).ln()));
             }
             if decay.scale > 0.0 {
                 let scales = self.params.get_n::<3>(row, plane::LOG_SCALE).map(|x| x + shrunk);

@@ -1,8 +1,8 @@
-//! Batches of splats from a tile's list, copied side by side with the values that are constant over a patch or over
-//! all patches.
+//! Batches of splats from a tile's list, copied side by side with the parts of their coordinates that are constant
+//! within a patch or the same in all patches.
 //!
-//! A batch is filled before any of its patches is rendered. The patches that a splat reaches are then known long
-//! before the loop over them ends, so that a mispredicted loop exit does not have to wait for arithmetic.
+//! A batch is filled before any of its patches is rendered. Which splats reach a patch is then known before the loop
+//! over these splats starts, so that the loop's exit depends on a finished bit mask, not on arithmetic in flight.
 
 use std::sync::atomic::AtomicU64;
 

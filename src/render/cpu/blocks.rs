@@ -60,7 +60,8 @@ pub(super) enum RowEdit<'a> {
 pub(super) struct Blocks<T = f32> {
     /// Numbers per row.
     pub(super) planes: usize,
-    /// The first row, a multiple of [`ROWS_PER_TASK`], so that blocks and tasks are aligned with those of all rows.
+    /// The first row, a multiple of [`ROWS_PER_TASK`], so that blocks and tasks are aligned with those of arrays that
+    /// store all rows.
     pub(super) first: usize,
     data: Vec<T>,
 }
@@ -99,12 +100,12 @@ impl<T: Copy + Default> Blocks<T> {
         &mut self.data[..numbers]
     }
 
-    /// A read-only view of these blocks.
+    /// A read-only view of the blocks of the rows before `rows`.
     pub(super) fn view(&self, rows: usize) -> BlockView<'_, T> {
         BlockView { stride: self.stride(), data: &self.data[..self.numbers(rows)] }
     }
 
-    /// These blocks, split for the optimiser's tasks.
+    /// The blocks of the rows before `rows`, split for the optimiser's tasks.
     pub(super) fn tasks(
         &mut self,
         rows: usize,
@@ -144,7 +145,7 @@ impl<T: Copy + Default> Blocks<T> {
         }
     }
 
-    /// Moves row `order[i]` to row i; rows before the first stay.
+    /// Moves row `order[i]` to row i, for the rows that are stored.
     fn reorder(&mut self, order: &[u32]) {
         let order = order.get(self.first..).unwrap_or_default();
         let mut values = vec![T::default(); order.len()];
@@ -159,12 +160,12 @@ impl<T: Copy + Default> Blocks<T> {
         }
     }
 
-    /// Copies some planes of some rows, row-major; 0 for rows before the first. Shape: `[rows.len(), planes.len()]`.
+    /// Copies some planes of some rows, row-major; 0 for rows that are not stored. Shape: `[rows.len(), planes.len()]`.
     pub(super) fn to_rows(&self, rows: Range<usize>, planes: Range<usize>) -> Vec<T> {
         let mut values = Vec::with_capacity(rows.len() * planes.len());
-        let without = rows.end.min(self.first).saturating_sub(rows.start);
-        values.resize(without * planes.len(), T::default());
-        for row in rows.start + without..rows.end {
+        let missing = rows.end.min(self.first).saturating_sub(rows.start);
+        values.resize(missing * planes.len(), T::default());
+        for row in rows.start + missing..rows.end {
             values.extend(planes.clone().map(|plane| self.get(row, plane)));
         }
         values
@@ -172,9 +173,9 @@ impl<T: Copy + Default> Blocks<T> {
 
     /// Sets the numbers that [`to_rows`](Self::to_rows) returns.
     pub(super) fn set_rows(&mut self, rows: Range<usize>, planes: Range<usize>, values: &[T]) {
-        let without = rows.end.min(self.first).saturating_sub(rows.start);
-        let mut values = values.iter().skip(without * planes.len());
-        for row in rows.start + without..rows.end {
+        let missing = rows.end.min(self.first).saturating_sub(rows.start);
+        let mut values = values.iter().skip(missing * planes.len());
+        for row in rows.start + missing..rows.end {
             for (plane, &value) in planes.clone().zip(&mut values) {
                 self.set(row, plane, value);
             }
@@ -218,11 +219,11 @@ impl<T> BlockTask<'_, T> {
     }
 }
 
-/// Splits a buffer for the tasks of a region into parts of equal length, except the last; an empty buffer gives every
-/// task an empty part.
+/// Splits a buffer for the tasks of a parallel loop into parts of equal length, except the last; an empty buffer gives
+/// every task an empty part.
 ///
-/// The type is the same for both cases: with two types of iterators, a region over ten buffers would be
-/// compiled for each of a thousand combinations.
+/// The iterator's type is the same for buffers with and without data: with two types, a loop over ten buffers
+/// would be compiled for each of a thousand combinations.
 pub(super) fn parts<T: Send>(
     buffer: &mut [T],
     per_task: usize,
@@ -230,8 +231,8 @@ pub(super) fn parts<T: Send>(
 ) -> impl IndexedParallelIterator<Item = &mut [T]> {
     assert!(buffer.len() <= per_task * tasks, "{} over {per_task} · {tasks}", buffer.len());
     let per_task = per_task.max(1);
-    let without = buffer.len().div_ceil(per_task)..tasks;
-    let nothing = without.into_par_iter().map(|_| <&mut [T]>::default());
+    let idle_tasks = buffer.len().div_ceil(per_task)..tasks;
+    let nothing = idle_tasks.into_par_iter().map(|_| <&mut [T]>::default());
     buffer.par_chunks_mut(per_task).chain(nothing)
 }
 

@@ -98,13 +98,13 @@ pub(super) fn ledger(sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
         "projected splats",
         budget as u64 * size_of::<Splat>() as u64 + padded / WIDTH as u64 * 2,
     );
-    let sums = (summed_rows(options) * signals.sums()) as u64 * float;
+    let sums = (summed_rows(options) * signals.sum_width()) as u64 * float;
     ledger.add_to(Section::Gradients, "splat gradients, signals at events", sums);
     ledger.add_to(Section::Tiles, "entries", TileLists::bytes(budget, cap as usize, grid.tiles()));
     let records = record_cap(options) as u64 * stride as u64 * float;
     ledger.add_to(Section::Tiles, "gradients per entry", records);
-    let by_pixel = signals.layout().has(Field::Error).then_some(needs.error_score);
-    let loss = LossBuffers::bytes(grid.width, grid.height, threads, by_pixel);
+    let for_rows = signals.layout().has(Field::Error).then_some(needs.error_score);
+    let loss = LossBuffers::bytes(grid.width, grid.height, threads, for_rows);
     let per_tile = size_of::<TileCanvas>() + size_of::<TileGradient>();
     ledger.add_to(Section::Renderer, "image and image gradient", (grid.tiles() * per_tile) as u64);
     let loss_and_backward = loss + (threads * size_of::<BlendedBatch>()) as u64;
@@ -135,7 +135,7 @@ mod tests {
     use densify_core::gaussians::Gaussians;
 
     #[test]
-    fn what_is_allocated_is_what_the_ledger_says() {
+    fn allocated_bytes_are_those_of_the_ledger() {
         let formats = [
             (ParameterStorage::F32, MomentStorage::F32, 59 * 4, 2 * 59 * 4),
             (ParameterStorage::F16, MomentStorage::Both8, 3 * 4 + 56 * 2, 2 * 59),
@@ -170,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn without_memory_for_training_renderings_are_the_same() {
+    fn renderings_are_the_same_without_memory_for_training() {
         let model = Gaussians {
             sh_degree: 0,
             means: vec![[0.0, 0.1, 2.0], [0.3, 0.0, 3.0]],
@@ -196,7 +196,7 @@ mod tests {
 
     /// Budgets around 2³¹ and 2³² rows, and one beyond what a slot number can address.
     #[test]
-    fn huge_budgets_are_refused_and_do_not_wrap() {
+    fn huge_budgets_do_not_wrap_and_the_largest_is_refused() {
         let model = Gaussians { sh_degree: 3, ..Gaussians::default() };
         for budget in [1 << 31, (1_usize << 32) - 1, 1 << 32, 1 << 40] {
             let options = Setup { threads: Some(1), ..Setup::new(budget) };

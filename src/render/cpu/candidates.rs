@@ -25,13 +25,13 @@ const LINES: usize = 2;
 /// Number of lists merged per task.
 const LISTS: usize = 8;
 
-/// Writes the `most` worst pixels of an image to the head of `ranking`, in any order, and returns their number. Each
+/// Writes the `count` worst pixels of an image to the head of `ranking`, in any order, and returns their number. Each
 /// task keeps its own worst pixels; their lists are merged until one is left.
 pub(super) fn rank(
     threads: &Threads,
     ranking: &mut Vec<RankedPixel>,
     [width, height]: [usize; 2],
-    most: usize,
+    count: usize,
     error: impl Fn(usize, usize) -> Option<f32> + Send + Sync,
 ) -> usize {
     let pixels = width * height;
@@ -50,7 +50,7 @@ pub(super) fn rank(
                 found += 1;
             }
         }
-        keep_worst(&mut ranking[..found], most)
+        keep_worst(&mut ranking[..found], count)
     });
     while kept.len() > 1 {
         let tasks = ranking.par_chunks_mut(LISTS * part).zip(kept.par_chunks(LISTS));
@@ -60,15 +60,15 @@ pub(super) fn rank(
                 ranking.copy_within(i * part..i * part + kept, found);
                 found += kept;
             }
-            keep_worst(&mut ranking[..found], most)
+            keep_worst(&mut ranking[..found], count)
         });
         part *= LISTS;
     }
     kept.first().copied().unwrap_or(0)
 }
 
-/// The row that represents the surface at pixel centre `at`: the one with the largest blend weight, or the one at which
-/// transmittance falls below ½.
+/// The row that represents the surface at pixel centre `at`: depending on `mode`, the row with the largest blend
+/// weight, or the row at which transmittance falls below ½.
 pub(super) fn surface_row(
     splats: &[Splat],
     list: &[AtomicU64],
@@ -104,7 +104,7 @@ pub(super) fn surface_row(
 }
 
 /// The point on the ray through pixel centre `at` that is closest to the Gaussian of `row` in its
-/// Mahalanobis metric, with its depth; `None` if that is not beyond the near plane.
+/// Mahalanobis metric, with its depth; `None` if the depth is not beyond the near plane.
 pub(super) fn closest_approach(
     params: &Parameters,
     row: usize,

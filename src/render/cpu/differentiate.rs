@@ -1,6 +1,6 @@
 //! Gradients and losses outside of training; see [`Differentiable`].
 
-use super::loss::ImageTerms;
+use super::loss::ErrorRequests;
 use super::optimise::Differentiate;
 use super::rasterize::{DARK, DepthPlane};
 use super::tiles::Grid;
@@ -67,7 +67,7 @@ impl Differentiable for CpuBackend {
                 }
             });
         }
-        let value = self.image_loss(&grid, target, background, ImageTerms::default());
+        let value = self.image_loss(&grid, target, background, ErrorRequests::default());
         let mut gradient = vec![0.0; rendering.rgb.len()];
         for (tile, from) in self.gradient[..grid.tiles()].iter().enumerate() {
             for_each_pixel(&grid, tile, |patch, lane, at| {

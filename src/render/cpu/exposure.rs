@@ -1,8 +1,8 @@
-//! The exposure of the current photograph. Between stages 3 and 4 it transforms the rendered colours; after stage 4
-//! it backpropagates the gradient to the colours before the transform, and sums up the transform's own gradient.
-//! Steps without an exposure skip both.
+//! The exposure of the current photograph: a colour transform. Between stages 3 and 4 the rendered colours are
+//! transformed. After stage 4 the gradient is backpropagated to the colours before the transform, and the gradient
+//! with respect to the transform itself is summed up. Steps without an exposure skip both passes.
 //!
-//! A task is a row of tiles. Each returns its own sums, which are added in order.
+//! A task processes a row of tiles and returns its own sums, which are added in order.
 
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;

@@ -1,9 +1,10 @@
 //! The tiles that a splat's ellipse covers. The ellipse is the region where alpha is at least the blending threshold,
 //! 1/255 by default.
 //!
-//! In each row of tiles, the ellipse's leftmost and rightmost points bound the tiles, so that no tile is listed
-//! whose pixels are not near the ellipse. The result is stored as a few bits, which the projection computes for a
-//! vector of rows at a time. For larger ellipses the tiles are found one by one, by the same function on one lane.
+//! In each row of tiles, the ellipse's leftmost and rightmost points bound the tiles, so that only tiles with pixels
+//! near the ellipse are listed. The result is stored as a few bits, which the projection computes for a
+//! vector of splats at a time. If an ellipse is too large for these bits, its tiles are found one by one, by the same
+//! function on one lane.
 
 use std::ops::Range;
 
@@ -18,7 +19,7 @@ use super::tiles::{Grid, TILE};
 const SLACK: f32 = 0.02;
 
 /// The tiles of a band that a splat covers: the number of the first tile, and a bit for each of the
-/// [`REACH_X`] × [`REACH_Y`] tiles to its right and below; or [`FAR`](Self::FAR).
+/// [`REACH_X`] × [`REACH_Y`] tiles to its right and below; or [`TOO_LARGE`](Self::TOO_LARGE).
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(super) struct Footprint(pub(super) [u32; 2]);
 
@@ -28,9 +29,10 @@ const _: () = assert!(REACH_X * REACH_Y == 32, "bits of a footprint");
 
 impl Footprint {
     /// The splat is larger than the bits allow: its ellipse must be evaluated again.
-    const FAR: Self = Self([u32::MAX, 0]);
+    const TOO_LARGE: Self = Self([u32::MAX, 0]);
 
-    /// Calls `f` with the number, relative to the band, of every tile that the splat covers, in ascending order.
+    /// Finds the footprint, and calls `f` with the number, relative to the band, of every tile that the splat covers,
+    /// in ascending order.
     #[inline]
     pub(super) fn new(
         splat: &Splat,
@@ -39,8 +41,8 @@ impl Footprint {
         f: impl FnMut(usize),
     ) -> Self {
         if splat.tiles == 0 {
-            far_tiles(splat, grid, band, f);
-            return Self::FAR;
+            tiles_of_large_splat(splat, grid, band, f);
+            return Self::TOO_LARGE;
         }
         let [x, y] =
             Ellipse::<Scalar>::new(splat).first_tile(grid).map(|first| first.lane() as usize);
@@ -67,8 +69,8 @@ impl Footprint {
         band: &Range<usize>,
         mut f: impl FnMut(usize),
     ) {
-        if self == Self::FAR {
-            far_tiles(splat, grid, band, f);
+        if self == Self::TOO_LARGE {
+            tiles_of_large_splat(splat, grid, band, f);
             return;
         }
         let Self([corner, mut bits]) = self;
@@ -80,9 +82,9 @@ impl Footprint {
     }
 }
 
-/// The tiles of a splat that is too large for the bits of a footprint.
+/// Calls `f` with the tiles of a splat that is too large for the bits of a footprint.
 #[inline(never)]
-fn far_tiles(splat: &Splat, grid: &Grid, band: &Range<usize>, mut f: impl FnMut(usize)) {
+fn tiles_of_large_splat(splat: &Splat, grid: &Grid, band: &Range<usize>, mut f: impl FnMut(usize)) {
     let ellipse = Ellipse::<Scalar>::new(splat);
     let bounds = ellipse.bounds(grid);
     let (first, last) = (band.start / grid.columns, band.end.div_ceil(grid.columns));
@@ -302,9 +304,9 @@ mod tests {
     }
 
     #[test]
-    fn footprint_bits_are_the_tiles_found_one_by_one() {
+    fn footprint_bits_list_the_tiles_that_are_found_one_by_one() {
         let mut rng = ChaCha8Rng::seed_from_u64(3);
-        let (mut far, mut cut) = (0, 0);
+        let (mut large, mut cut) = (0, 0);
         for (width, height, size) in
             [(200, 300, 12.0), (200, 300, 60.0), (17, 3, 30.0), (900, 40, 20.0)]
         {
@@ -320,7 +322,7 @@ mod tests {
                     let one_by_one = listed(splat, &grid, 0..grid.tiles());
                     splat.tiles = bits;
                     assert_eq!(listed(splat, &grid, 0..grid.tiles()), one_by_one, "{splat:?}");
-                    far += usize::from(bits == 0 && !one_by_one.is_empty());
+                    large += usize::from(bits == 0 && !one_by_one.is_empty());
                     let Bounds { sides: [[x0, x1], [y0, y1]], .. } =
                         Ellipse::<Scalar>::new(splat).bounds(&grid);
                     let rectangle = (x1.lane() - x0.lane() + 1.0) * (y1.lane() - y0.lane() + 1.0);
@@ -333,7 +335,7 @@ mod tests {
                 }
             }
         }
-        assert!(far > 100 && cut > 1000, "{far} far, {cut} with corners cut");
+        assert!(large > 100 && cut > 1000, "{large} too large, {cut} with corners cut");
     }
 
     /// No tile with a pixel inside the ellipse is left out.

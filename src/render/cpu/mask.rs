@@ -13,7 +13,7 @@ use super::simd::WIDTH;
 use crate::{StateError, Tensor};
 use densify_core::gaussians::{logit, sigmoid};
 
-/// Plane of the mask's logit, relative to its start, so that 0 is a new mask.
+/// Plane of the mask's logit m, stored as the difference from its initial value, so that a new mask is 0.
 const OFFSET: usize = 0;
 /// Planes of its two moments.
 const FIRST: usize = 1;

@@ -1,8 +1,8 @@
 //! The native backend: rayon over tiles and rows, SIMD with run-time dispatch, one file per stage.
 //!
 //! It is the default on machines without a GPU and the reference for the shaders. With the same inputs
-//! and the same seed, results are byte-identical at any thread count: work is split at fixed places, every
-//! sum has a fixed order, and no sum is accumulated by two threads.
+//! and the same seed, results are byte-identical at any thread count: work is split at fixed places, and every
+//! floating-point sum has a fixed order and is accumulated by one thread.
 //!
 //! All buffers are allocated once, at the size of the budget; the ledger lists them.
 
@@ -61,7 +61,7 @@ use densify_core::budget::RowBudget;
 use densify_core::camera::Camera;
 use densify_core::gaussians::{Gaussians, ModelArray};
 use densify_core::memory::Ledger;
-use loss::{ImageTerms, LossBuffers};
+use loss::{ErrorRequests, LossBuffers};
 use mask::Masks;
 use moments::Moments;
 use parameters::Parameters;
@@ -102,7 +102,7 @@ pub struct CpuBackend {
     shortcuts: Shortcuts,
     params: Parameters,
     moments: Moments,
-    /// Number of optimiser steps per row, in one plane; tasks with only frozen rows are not stored.
+    /// Number of optimiser steps per row, in one plane; not stored for tasks that have only frozen rows.
     ages: Blocks<u16>,
     bias: BiasCorrection,
     summed: GradientSums,
@@ -114,7 +114,7 @@ pub struct CpuBackend {
     dominant: Vec<AtomicU32>,
     /// Shape: `[budget]`.
     splats: Vec<Splat>,
-    /// Bit per lane: on screen in the current view. Shape: `[blocks]`.
+    /// One bit per lane of each block, set if the row is on screen in the current view. Shape: `[blocks]`.
     visible: Vec<u16>,
     lists: TileLists,
     /// Shape: `[tiles]`.
@@ -122,11 +122,11 @@ pub struct CpuBackend {
     /// Shape: `[tiles]`.
     gradient: Vec<TileGradient>,
     loss: LossBuffers,
-    /// The bits of one record per entry, up to the cap. Shape: `[record cap, stride of the records]`.
+    /// One record per entry, up to the cap, as bits of f32. Shape: `[record cap, stride of the records]`.
     records: Vec<AtomicU32>,
     record_cap: usize,
-    /// The sum of each row's records. Between steps the memory is lent to the host's copy of the signals, and is
-    /// large enough for them. Shape: `[budget, stride of the records]`, or more.
+    /// The sum of each row's records. Between steps the memory is lent to the signals that a policy reads, for which
+    /// it is large enough. Shape: `[budget, stride of the records]`, or more.
     sums: Vec<f32>,
     clock: StageClock,
 }
@@ -154,7 +154,7 @@ impl CpuBackend {
         budget::reserve(&ledger)?;
         let trained = budget::trained(options);
         let signals = Accumulators::new(trained.clone(), &options.needs);
-        let (stride, sums) = (signals.layout().stride(), signals.sums());
+        let (stride, sum_width) = (signals.layout().stride(), signals.sum_width());
         let (cap, record_cap) = (budget::tile_cap(options), budget::record_cap(options));
         let per_row = planes(model.sh_degree);
         let storage = options.storage;
@@ -187,7 +187,7 @@ impl CpuBackend {
             loss: LossBuffers::new(),
             records: bytemuck::zeroed_vec(record_cap * stride),
             record_cap,
-            sums: vec![0.0; budget::summed_rows(options) * sums],
+            sums: vec![0.0; budget::summed_rows(options) * sum_width],
             clock: StageClock::default(),
         })
     }
@@ -198,7 +198,7 @@ impl CpuBackend {
     /// # Panics
     /// When the backend has more than one thread.
     pub fn record_tasks(&mut self) {
-        self.threads.record();
+        self.threads.start_recording();
     }
 
     /// The tasks of the last training step; empty unless they are [recorded](Self::record_tasks).
@@ -214,11 +214,11 @@ impl CpuBackend {
         if let Some(exposure) = exposure {
             self.expose(&frame.grid, exposure);
         }
-        let picks = self.candidates.to_take(input.step, self.rows);
+        let picks = self.candidates.due(input.step, self.rows);
         let weights = picks.and_then(|(request, _)| error_weights(request.error));
-        let by_pixel = self.signals.layout().has(Field::Error).then_some(self.signals.planes.score);
-        let terms = ImageTerms { error: weights, by_pixel };
-        let value = self.image_loss(&frame.grid, target, background, terms);
+        let for_rows = self.signals.layout().has(Field::Error).then_some(self.signals.planes.score);
+        let errors = ErrorRequests { for_candidates: weights, for_rows };
+        let value = self.image_loss(&frame.grid, target, background, errors);
         let by_exposure =
             exposure.map(|exposure| self.exposure_bwd(&frame.grid, exposure, background));
         if let Some((request, count)) = picks {
@@ -381,7 +381,7 @@ impl Inspect for CpuBackend {
     }
 
     fn render_counts(&mut self, camera: &Camera) -> Result<Rendering, BackendError> {
-        let frame = self.forward(camera, [0.0; 3], 0, DepthPlane::RowCount, None)?;
+        let frame = self.forward(camera, [0.0; 3], 0, DepthPlane::BlendedCount, None)?;
         Ok(self.rendering(&frame))
     }
 }

@@ -218,8 +218,8 @@ impl MomentTask<'_> {
         [&mut m.0, &mut v.0]
     }
 
-    /// Stores the opened planes unless they are stored as f32; the first moments as multiples of the roots of the
-    /// second as stored.
+    /// Converts the opened planes back to the stored format, if this is not f32. First moments become multiples of the
+    /// roots of the second moments as stored.
     #[inline(always)]
     pub(super) fn close(
         &mut self,

@@ -1,9 +1,9 @@
 //! Auxiliary views: training views that are rendered for a policy's event, with statistics per Gaussian.
 //!
 //! Blending is replayed front to back with the arithmetic of the forward pass. Each row's sums over the pixels that
-//! it is blended into, and its largest weight, go to one record per (row, tile); these are added in order of tile
-//! number. Records and sums use the backward pass's buffers, and the pixel map uses the alpha plane of the image
-//! gradient.
+//! it is blended into, and its largest weight, go to one record per (row, tile); the records of a row are added in
+//! order of tile number. Records and sums use the backward pass's buffers, and the pixel map uses the alpha plane of
+//! the image gradient.
 
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
@@ -11,7 +11,7 @@ use densify_policies::policy::{AuxColumn, AuxRequest, Candidate, DepthMode, Pixe
 use pulp::{Simd, WithSimd};
 
 use super::batch::{BATCH, Batch, CORNER_X, CORNER_Y, LANE_X, LANE_Y};
-use super::loss::ImageTerms;
+use super::loss::ErrorRequests;
 use super::passes::{Frame, for_each_pixel, scalars};
 use super::project::Splat;
 use super::rasterize::{
@@ -27,7 +27,8 @@ use crate::candidates::Photograph;
 use crate::pixel_map::{pixel_map, radius_px, sample_pixels};
 use densify_core::image::Image8;
 
-/// Values per record: sum of the pixel map, number of pixels, sum of blend weights, sum of distances, largest weight.
+/// Values per record: sum of the pixel map, number of pixels, sum of blend weights, sum of the pixels' distances from
+/// the projected mean, largest weight.
 const STRIDE: usize = 5;
 /// The index of the largest weight, the only value that is not a sum.
 const MAXIMUM: usize = STRIDE - 1;
@@ -55,9 +56,8 @@ impl CpuBackend {
             if let Some(exposure) = exposure {
                 self.expose(&frame.grid, exposure);
             }
-            let loss =
-                scalars(self.image_loss(&frame.grid, target, background, ImageTerms::default()))
-                    .loss;
+            let no_errors = ErrorRequests::default();
+            let loss = scalars(self.image_loss(&frame.grid, target, background, no_errors)).loss;
             let points = self.sample_points(&frame, input);
             let columns = if request.columns.is_empty() {
                 Vec::new()

@@ -23,8 +23,8 @@ use crate::LearningRates;
 use crate::signals::{Field, RecordLayout, SignalPlanes};
 use densify_core::gaussians::sh_coefficients;
 
-/// Tolerance of a quaternion's squared length where it is stored in fewer bits. If it were normalised and rounded at
-/// each step, even a row without a gradient would rotate randomly.
+/// Tolerance of a quaternion's squared length if parameters are stored in fewer bits. If quaternions were normalised
+/// and rounded at each step, even a row without a gradient would rotate randomly.
 const NARROW_SLACK: f32 = 1.0 / 16.0;
 
 /// An optimiser step for consecutive blocks.
@@ -32,7 +32,7 @@ pub(super) struct Optimise<'a> {
     pub(super) params: ParameterTask<'a>,
     pub(super) moments: MomentTask<'a>,
     /// Random numbers for stochastic rounding.
-    pub(super) storing: &'a PolicyRng,
+    pub(super) rounding_rng: &'a PolicyRng,
     pub(super) ages: &'a mut [u16],
     /// Signal accumulators of these blocks; empty if there are none.
     pub(super) signals: &'a mut [f32],
@@ -68,9 +68,9 @@ impl WithSimd for Optimise<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        let Self { params: mut stored, mut moments, ages, signals, planes: to, sums, .. } = self;
+        let Self { params: mut stored, mut moments, ages, signals, sums, .. } = self;
         let Self { layout, visible, view, rates, bias, due, terms, noise, .. } = self;
-        let Self { mut masks, mut summed, .. } = self;
+        let Self { mut masks, mut summed, planes: signal_planes, .. } = self;
         let trained = planes(view.sh_degree);
         let mut gradient = BlockGradient::ZERO;
         let mut was_zero = true;
@@ -103,7 +103,7 @@ impl WithSimd for Optimise<'_> {
                 for (to, pixels) in gradient.dominant.iter_mut().zip(pixels) {
                     *to = pixels.load(Relaxed) as f32;
                 }
-                to.accumulate(s, block, &gradient, view);
+                signal_planes.accumulate(s, block, &gradient, view);
             }
             if let Some(masks) = &mut masks {
                 let ages = &ages[b * WIDTH..(b + 1) * WIDTH];
@@ -122,7 +122,7 @@ impl WithSimd for Optimise<'_> {
             let (main, rest) = (0..trained.min(plane::SH_REST), plane::SH_REST..trained);
             let g = &gradient.params;
             match summed.rest_ages(lanes.clone()) {
-                // Bands 1–3 step with the others.
+                // Bands 1–3 step with the other parameters.
                 None if due.main => {
                     adam::step(s, params, [m, v], ages, g, 0..trained, rates, bias);
                 }
@@ -143,7 +143,7 @@ impl WithSimd for Optimise<'_> {
                     noise.add(params, first, self.rows.saturating_sub(b * WIDTH).min(WIDTH));
                 }
             }
-            // Loss terms, masks, noise and clamping have also changed the frozen rows of this block.
+            // Restore the frozen rows of this block, which loss terms, masks, noise and clamping have changed too.
             if frozen > 0 {
                 for plane in (0..trained * WIDTH).step_by(WIDTH) {
                     params[plane..plane + frozen].copy_from_slice(&kept.0[plane..plane + frozen]);
@@ -155,7 +155,8 @@ impl WithSimd for Optimise<'_> {
             }
             if is_narrow && (due.main || due.rest) {
                 let first_row = self.first_row + b * WIDTH;
-                let [mut of_params, mut of_m, mut of_v] = Draws::of_block(self.storing, first_row);
+                let [mut of_params, mut of_m, mut of_v] =
+                    Draws::of_block(self.rounding_rng, first_row);
                 stored.close(b, trained, &scratch, &mut of_params);
                 moments.close(b, trained, &moment_scratch, [&mut of_m, &mut of_v]);
             }
@@ -214,7 +215,7 @@ impl ModelGradient {
 /// Computes the gradients of a whole model without a step.
 pub(super) struct Differentiate<'a> {
     pub(super) params: ParameterView<'a>,
-    /// Records with every field.
+    /// Sums of records with every field except the error.
     pub(super) sums: &'a [f32],
     pub(super) visible: &'a [u16],
     pub(super) view: &'a ViewParams,

@@ -6,7 +6,7 @@
 //!
 //! Kernels read and write planes of f32. They access f32 blocks directly; the planes of other blocks are
 //! converted to scratch memory ([`open`](ParameterTask::open)) and stored from there with stochastic
-//! rounding ([`close`](ParameterTask::close)). Edits, which happen once, are rounded to nearest.
+//! rounding ([`close`](ParameterTask::close)). Edits are rare, and are rounded to nearest.
 
 use std::ops::Range;
 
@@ -19,9 +19,9 @@ use super::simd::WIDTH;
 use crate::ParameterStorage;
 use densify_core::gaussians::Gaussians;
 
-/// Planes of the means, which are always f32.
+/// Number of planes of the means, which are always f32.
 const MEANS: usize = plane::LOG_SCALE;
-/// Planes of bounded parameters.
+/// Number of planes of bounded parameters.
 const BOUNDED: usize = plane::SH - plane::LOG_SCALE;
 
 /// Fractional bits of a bounded plane: 14 for quaternions within ±2, 11 for the others within ±16.
@@ -253,7 +253,7 @@ impl ParameterTask<'_> {
         &mut scratch.0
     }
 
-    /// Stores the opened planes, unless they are stored as f32.
+    /// Converts the opened planes back to the stored formats, if these are not f32.
     #[inline(always)]
     pub(super) fn close(
         &mut self,

@@ -1,5 +1,5 @@
 //! The passes over a view: forward, image loss, backward, optimiser and candidates. Each splits its work into tasks
-//! at fixed places and runs the stages' kernels on them. The file is one piece because the passes share a frame.
+//! at fixed places and runs the stages' kernels on them. All are in one file because they share a frame.
 
 use std::ops::Range;
 use std::sync::atomic::Ordering::Relaxed;
@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use super::batch::Batch;
 use super::blocks::parts;
 use super::candidates;
-use super::loss::{ImageTerms, LossValue};
+use super::loss::{ErrorRequests, LossValue};
 use super::optimise::Optimise;
 use super::project::{Project, ViewParams};
 use super::rasterize::{
@@ -43,7 +43,7 @@ pub(super) struct Frame {
 impl CpuBackend {
     pub(super) fn resize_images(&mut self, grid: &Grid) {
         let tiles = grid.tiles();
-        // Never shrinks, so that views of alternating sizes do not initialise the difference again and again.
+        // Never shrinks, so that views of alternating sizes do not initialise the additional tiles each time.
         if self.canvas.len() < tiles {
             self.canvas.resize(tiles, TileCanvas::EMPTY);
             self.gradient.resize(tiles, TileGradient { planes: [DARK; 5] });
@@ -55,12 +55,12 @@ impl CpuBackend {
         grid: &Grid,
         target: &Image8,
         background: [f32; 3],
-        terms: ImageTerms,
+        requests: ErrorRequests,
     ) -> LossValue {
         let Self { threads, loss, arch, canvas, gradient, clock, .. } = self;
         let (canvas, gradient) = (&canvas[..grid.tiles()], &mut gradient[..grid.tiles()]);
         let value = threads.install(|| {
-            loss.run(threads, *arch, grid, canvas, target, background, gradient, terms)
+            loss.run(threads, *arch, grid, canvas, target, background, gradient, requests)
         });
         clock.lap("loss");
         value
@@ -338,7 +338,7 @@ impl CpuBackend {
         let due = self.summed.advance(input);
         let (planes, layout) = (signals.planes, signals.layout());
         let signal_stride = signals.blocks.stride();
-        let storing = PolicyRng::new(input.seed, input.step);
+        let rounding_rng = PolicyRng::new(input.seed, input.step);
         // Tasks of frozen rows only are skipped.
         let first_row = moments.first();
         let blocks = first_row / WIDTH..rows.div_ceil(WIDTH);
@@ -365,7 +365,7 @@ impl CpuBackend {
                         params,
                         moments,
                         masks,
-                        storing: &storing,
+                        rounding_rng: &rounding_rng,
                         ages,
                         signals,
                         planes,

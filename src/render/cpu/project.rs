@@ -9,7 +9,7 @@
 //!   Inside a splat's footprint the error of u does not depend on which axis is eliminated; the
 //!   choice here makes z constant along an image row.
 //!
-//! The file is not split because the backward pass reuses intermediate results of the forward pass.
+//! The functions are in one file because the backward pass (`project_bwd`) reuses them and their results.
 
 use bytemuck::{Pod, Zeroable};
 use pulp::{Simd, WithSimd};
@@ -219,7 +219,7 @@ pub(super) fn conic<S: Simd>(g: &Geometry<S>) -> [V<S>; 3] {
     [(d / g.det).sqrt(), b / d, l3]
 }
 
-/// The unit vector from the camera to each mean, and 1/distance; both 0 where they coincide.
+/// The unit vector from the camera to each mean, and 1/distance; both are 0 for a mean at the camera.
 #[inline(always)]
 pub(super) fn direction<S: Simd>(
     s: S,
@@ -323,7 +323,7 @@ impl WithSimd for Project<'_> {
                 // The allowed decrease of the exponent; <= 0 if even the centre is too faint.
                 let reach = log2_opacity + self.log2_reach;
                 let opaque = V::zero(s).lt(reach);
-                // The determinant overflows where a row is about 4·10⁹ px wide, and its factors are then invalid.
+                // The determinant overflows if a splat is about 4·10⁹ px wide; its conic factors are then invalid.
                 let alive = in_front.and(opaque).and(sound).and(below(g.det, f32::MAX));
                 if !alive.any() {
                     continue;
@@ -384,9 +384,9 @@ impl WithSimd for Project<'_> {
                 }
                 alive.keep(V::splat(s, 1.0)).store(&mut on_screen[at..]);
             }
-            let live = WIDTH.min(self.rows - b * WIDTH);
+            let used_lanes = WIDTH.min(self.rows - b * WIDTH);
             self.seen[b] = 0;
-            for lane in 0..live {
+            for lane in 0..used_lanes {
                 if on_screen[lane] == 0.0 {
                     continue;
                 }

@@ -1,7 +1,7 @@
 //! Stage 6: from splat gradients to parameter gradients.
 //!
 //! The forward projection is evaluated again instead of stored. With the sums of stage 5 in
-//! whitened coordinates, M = Σ q·[u z]ᵀ[u z], the covariance's gradient is G = ½·L·M·Lᵀ. It is not
+//! whitened coordinates, M = Σ q·[u z]ᵀ[u z], the covariance's gradient is G = ½·L·M·Lᵀ. G is not
 //! formed: for a needle 1,000 px long its entries cancel along the needle's axis. With
 //! W = Lᵀ·V, whose entries are at most 1, and wₖ its columns (one per axis of the Gaussian),
 //! - dL/d(log sₖ) = wₖᵀ·M·wₖ,
@@ -35,7 +35,7 @@ pub(super) struct BlockGradient {
     pub(super) mean2d_abs: [[f32; WIDTH]; 2],
     /// 1 / depth in the camera `[1/scene unit]`.
     pub(super) inv_z: [f32; WIDTH],
-    /// The record sums by value; undefined for values that the layout lacks.
+    /// The sum of the records, one line per value; undefined for values that the layout lacks.
     pub(super) sums: [[f32; WIDTH]; RecordLayout::MOST],
     /// 1 for visible rows, 0 for others.
     pub(super) visible: [f32; WIDTH],
@@ -83,12 +83,12 @@ impl BlockGradient {
             }
         }
         for at in (0..WIDTH).step_by(S::F32_LANES) {
-            self.lanes(s, block, at, layout, view);
+            self.compute_lanes(s, block, at, layout, view);
         }
     }
 
     #[inline(always)]
-    fn lanes<S: Simd>(
+    fn compute_lanes<S: Simd>(
         &mut self,
         s: S,
         block: &[f32],

@@ -1,6 +1,6 @@
 //! Stage 3: from tile lists to pixels. Front to back alpha blending (Kerbl et al. 2023, section 3 and
 //! appendix C): alpha = min(0.99, o·exp(−p)), skipped below 1/255. A pixel is finished before the first
-//! splat that would reduce its transmittance to 1e-4 or below. Both limits can be set ([`Blending`]).
+//! splat that would reduce its transmittance to 1e-4 or below. The thresholds 1/255 and 1e-4 can be set ([`Blending`]).
 //!
 //! A task renders one tile. It processes one batch of splats after another, and for each batch one patch of 4×4 pixels
 //! after another. A patch is a vector that stays in registers while the batch is blended into it. Most splats are a
@@ -19,7 +19,7 @@ use super::simd::{V, WIDTH, exp2_of, load_of, store_of};
 use super::tiles::{Entry, Grid, TILE};
 use crate::Shortcuts;
 
-/// The largest alpha, which keeps 1 − alpha, and so the transmittance, recoverable.
+/// The largest alpha. It keeps 1 − alpha above 0, so that the backward pass can recover transmittances by division.
 pub(super) const ALPHA_MAX: f32 = 0.99;
 /// The thresholds of blending, which must be the same in the forward and the backward pass.
 #[derive(Debug, Clone, Copy)]
@@ -44,8 +44,8 @@ pub(super) enum DepthPlane {
     Unused,
     /// Depth, weighted as in blending.
     Depth,
-    /// The number of rows.
-    RowCount,
+    /// The number of Gaussians blended into the pixel.
+    BlendedCount,
 }
 
 /// Planes of a rendered tile: red, green, blue, final transmittance, depth.
@@ -69,8 +69,8 @@ pub(super) const fn in_plane(x: usize, y: usize) -> (usize, usize) {
     (y / PATCH * ACROSS + x / PATCH, y % PATCH * PATCH + x % PATCH)
 }
 
-/// Copies row `y` of a tile out of its plane, patch by patch to its destination: loading the whole row right
-/// afterwards would stall on all four stores.
+/// Copies row `y` of a tile directly to its destination, patch by patch. Returning the row by value would stall: the
+/// whole row would be loaded right after the four stores that assemble it.
 #[inline(always)]
 pub(super) fn copy_row_of_plane(plane: &Plane, y: usize, row: &mut [f32; TILE]) {
     for (x, pixels) in (0..TILE).step_by(PATCH).zip(row.as_chunks_mut::<PATCH>().0) {
@@ -185,7 +185,7 @@ impl Rasterize<'_> {
     #[inline(always)]
     #[expect(clippy::too_many_lines, reason = "a numeric kernel")]
     fn blend<S: Simd, const WITH_MORE: bool, const N: usize>(self, s: S) {
-        let counts = self.depth_plane == DepthPlane::RowCount;
+        let counts = self.depth_plane == DepthPlane::BlendedCount;
         let Self { splats, list, place, background, dominant, canvas, blending, batch, .. } = self;
         let c = |x: f32| V::splat(s, x);
         let (faintest, least_light) = (c(-blending.log2_reach), c(blending.transmittance_min));

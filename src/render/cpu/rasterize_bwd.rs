@@ -8,12 +8,12 @@
 //!
 //! A batch of splats is walked twice. The first walk goes front to back, one patch at a time as in the forward
 //! pass. It computes each alpha, its weight as if nothing were in front of the batch, and the product of all 1 − α;
-//! dividing the transmittance behind the batch by it gives the one in front. The second walk goes back to front, one
-//! splat at a time, and computes the gradients, whose sums then stay in registers.
+//! the transmittance behind the batch, divided by this product, is that in front of the batch. The second walk goes
+//! back to front, one splat at a time, and computes the gradients, whose sums then stay in registers.
 //!
-//! In the whitened coordinates (u, z) = Lᵀ·d of the forward pass, the parameters' gradients need only these sums of a
-//! tile: q, q·u, q·z, q·u², q·u·z, q·z² with q = α·dL/dα, and w·g for the colour. The covariance's gradient
-//! is ½·L·M·Lᵀ with M the matrix of second moments; it is never formed, see `project_bwd`.
+//! In the whitened coordinates (u, z) = Lᵀ·d of the forward pass, the parameters' gradients need only the sums, over
+//! the pixels of a tile, of q, q·u, q·z, q·u², q·u·z, q·z² with q = α·dL/dα, and of w·g for the colour. The
+//! covariance's gradient is ½·L·M·Lᵀ with M the matrix of second moments; it is never formed, see `project_bwd`.
 //!
 //! Records are summed per row in order of tile number, so that the sum does not depend on the number of threads.
 
@@ -51,7 +51,7 @@ mod extra {
     pub(super) const WEIGHTS: u8 = 2;
     /// The largest weight.
     pub(super) const LARGEST: u8 = 4;
-    /// The sum of the weighted error, together with the two above.
+    /// The sum of the weighted error, together with [`WEIGHTS`] and [`LARGEST`].
     pub(super) const ERROR: u8 = 8 | WEIGHTS | LARGEST;
     pub(super) const ERROR_ABS: u8 = ERROR | ABS;
     /// Everything except the error, with the gradients of alpha and depth.
@@ -91,8 +91,8 @@ impl WithSimd for RasterizeBwd<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
         let has = |field| self.layout.has(field);
-        // Without vectors there are only two kernels: eleven, unrolled lane by lane, would be a tenth of the
-        // program. Values that are not requested are not written.
+        // For the scalar instruction set only two kernels are compiled: all eleven, unrolled lane by lane, would be a
+        // tenth of the program. Values that are not requested are computed, but not written.
         if const { S::F32_LANES == 1 } {
             if has(Field::Depth) {
                 self.backpropagate::<S, { extra::ALL }>(s);
@@ -141,7 +141,7 @@ const PAIRS: usize = BATCH * PATCHES;
 #[repr(C, align(64))]
 pub(super) struct BlendedBatch {
     alpha: [[f32; WIDTH]; PAIRS],
-    /// α·Π(1 − α), the product over the splats of the batch in front.
+    /// α·Π(1 − α); the product is over the splats of the batch in front of this one.
     weight: [[f32; WIDTH]; PAIRS],
 }
 

@@ -2,10 +2,10 @@
 //!
 //! If every entry of the lists has a record, it is stored in the entry's slot, so that the records of a row are
 //! adjacent. However, records take three quarters of the memory of an entry and are only needed until they are
-//! summed. With fewer records, a band is processed in parts, each a run of tiles: its records are written in the order
-//! of the lists and added to the sums of their rows before the next part. A tile with more entries than records is
-//! processed once for each piece of its list. A row's records are always added in order of tile number, so that parts,
-//! like bands, cost time but do not change the result.
+//! summed. If there are fewer records than entries, a band is processed in parts, each a run of tiles: its records are
+//! written in the order of the lists and added to the sums of their rows before the next part. A tile with more entries
+//! than there are records is processed once for each piece of its list. A row's records are always added in order of
+//! tile number, so that parts, like bands, cost time but do not change the result.
 
 use std::ops::Range;
 use std::sync::atomic::AtomicU32;
@@ -32,7 +32,8 @@ pub(super) struct TileRecords<'a> {
     /// Bits of the records. Shape: `[cap, stride]`.
     bits: &'a [AtomicU32],
     stride: usize,
-    /// The record of the list's first entry, which may be outside of the buffer; `None` for records by slot.
+    /// The index of the record of the list's first entry, which may be outside of the buffer; `None` if each record is
+    /// in its entry's slot.
     first: Option<usize>,
 }
 
@@ -83,7 +84,7 @@ fn divide(firsts: &[u32], cap: usize) -> Vec<Part> {
         let fit = firsts[start + 1..].partition_point(|&first| first as usize - from <= cap);
         let end = start + fit.max(1);
         let mut entries = from..firsts[end] as usize;
-        // Gives several parts only if this is a single tile with more than `cap` entries.
+        // These entries become several parts only if they belong to a single tile and exceed `cap`.
         while !entries.is_empty() {
             let some = entries.start..entries.end.min(entries.start + cap);
             entries.start = some.end;

@@ -28,7 +28,7 @@ impl Terms {
         (!terms.is_none()).then_some(per_row)
     }
 
-    /// Adds to the gradient of a block: d o/d(logit) = o·(1 − o), d s/d(log s) = s.
+    /// Adds the derivatives of the terms to the gradient of a block: d o/d(logit) = o·(1 − o), d s/d(log s) = s.
     #[inline(always)]
     pub(super) fn add<S: Simd>(&self, s: S, params: &[f32], gradient: &mut [f32]) {
         let one = V::splat(s, 1.0);

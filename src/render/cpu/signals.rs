@@ -1,4 +1,4 @@
-//! Stage 8: accumulates the signals that a policy requests over views. Only requested signals have memory.
+//! Stage 8: accumulates the requested signals over views. Only requested signals have memory.
 
 use std::ops::Range;
 
@@ -15,7 +15,7 @@ use super::rasterize_bwd::field;
 use super::simd::{V, WIDTH, each};
 use super::threads::Threads;
 use super::{BLOCKS_PER_TASK, ROWS_PER_TASK};
-use crate::signals::{Field, ParameterSignal, RecordLayout, SignalPlanes, as_read};
+use crate::signals::{Field, ParameterSignal, RecordLayout, SignalPlanes, value_of};
 
 /// The accumulators of the requested signals.
 #[derive(Debug)]
@@ -60,7 +60,7 @@ impl SignalPlanes {
                 };
             }
             let mean = each!(i in 3 => lanes(s, &g.params, plane::MEAN + i, at));
-            // Infinite, and therefore clamped to 1, if all depths have full weight.
+            // The quotient is infinite, and clamped to 1, if all depths have full weight (`full_depth` is 0).
             let one = V::splat(s, 1.0);
             let depth = (one / (line!(g.inv_z) * self.full_depth)).min(one);
             let weight = depth * depth;
@@ -144,7 +144,7 @@ impl Accumulators {
     }
 
     /// Numbers per row of the buffer that holds summed records in a step and, between steps, the signals being read.
-    pub(super) fn sums(&self) -> usize {
+    pub(super) fn sum_width(&self) -> usize {
         self.layout().stride().max(self.requested.width())
     }
 
@@ -192,7 +192,7 @@ impl Accumulators {
                     return present(signal, row, params, masks, ages);
                 }
                 let parts = planes.clone().map(|plane| self.blocks.get(row, plane));
-                as_read(signal, parts.reduce(f32::max).unwrap_or(0.0))
+                value_of(signal, parts.reduce(f32::max).unwrap_or(0.0))
             };
             let of_row = |row: usize, numbers: &mut [f32]| match &attribute {
                 Some(attribute) => {

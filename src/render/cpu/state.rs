@@ -1,5 +1,5 @@
-//! The native backend's state as named arrays. Lanes beyond the last row are left out, and frozen rows without state
-//! are zero.
+//! The native backend's state as named arrays. Lanes beyond the last row are left out, and frozen rows that have no
+//! state are saved as zeros.
 
 use std::ops::Range;
 
@@ -23,7 +23,7 @@ impl CpuBackend {
         let of_rows = MOMENTS.into_iter().chain([AGES]).map(StateArray::of_rows);
         let mut arrays: Vec<StateArray> = of_rows.collect();
         arrays.extend(self.masks.is_declared().then(|| StateArray::of_rows(MASKS)));
-        let signals = self.signals.planes.kept();
+        let signals = self.signals.planes.saved();
         arrays.extend(
             signals.into_iter().map(|(name, _)| StateArray::of_rows(format!("{SIGNAL}{name}"))),
         );
@@ -96,5 +96,5 @@ impl CpuBackend {
 
 fn signal_plane(signals: &Accumulators, name: &str) -> Option<usize> {
     let name = name.strip_prefix(SIGNAL)?;
-    signals.planes.kept().into_iter().find(|(signal, _)| signal == name).map(|(_, plane)| plane)
+    signals.planes.saved().into_iter().find(|(signal, _)| signal == name).map(|(_, plane)| plane)
 }

@@ -1,7 +1,7 @@
 //! Gradients summed between optimiser steps, for policies that step less often than every
 //! iteration ([`Cadence`]). Other policies need no buffer and pay nothing.
 //!
-//! A step uses the sum of the gradients of all views since the last one. SH bands 1–3 may
+//! A step uses the sum of the gradients of all views since the last step. SH bands 1–3 may
 //! step less often than all other parameters; they then need their own step counts per row
 //! (ages), because Adam's bias correction depends on the number of steps.
 
@@ -59,7 +59,7 @@ const GRADIENTS: &str = "gradients";
 pub(super) const WAITING: &str = "waiting";
 const REST_AGES: &str = "rest_ages";
 
-/// The first plane to sum for a cadence; `planes` if none is.
+/// The first plane to sum for a cadence; `planes` if no plane is summed.
 fn first_plane(planes: usize, longest: Cadence) -> usize {
     match longest {
         Cadence { all: 2.., .. } => 0,

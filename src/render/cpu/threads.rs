@@ -26,11 +26,11 @@ pub struct StepTasks {
 }
 
 #[derive(Debug, Default)]
-struct Recorder(Mutex<Record>);
+struct Recorder(Mutex<Recording>);
 
 /// The recording of one step. Its vectors are reused, as allocations would distort the durations.
 #[derive(Debug, Default)]
-struct Record {
+struct Recording {
     total: Duration,
     /// The name of each region and the index of its first task.
     regions: Vec<(&'static str, usize)>,
@@ -55,7 +55,7 @@ impl Threads {
     }
 
     /// Starts recording.
-    pub(super) fn record(&self) {
+    pub(super) fn start_recording(&self) {
         assert_eq!(self.count(), 1, "tasks are recorded on one thread");
         self.recorder.get_or_init(Recorder::default);
     }
@@ -168,42 +168,42 @@ fn timed<R>(recorder: Option<&Recorder>, run: impl FnOnce() -> R) -> R {
 }
 
 impl Recorder {
-    fn record(&self) -> MutexGuard<'_, Record> {
+    fn lock(&self) -> MutexGuard<'_, Recording> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn begin_step(&self) -> Instant {
-        let mut record = self.record();
-        record.regions.clear();
-        record.tasks.clear();
+        let mut recording = self.lock();
+        recording.regions.clear();
+        recording.tasks.clear();
         Instant::now()
     }
 
     fn end_step(&self, start: Instant) {
-        self.record().total = start.elapsed();
+        self.lock().total = start.elapsed();
     }
 
     fn begin_region(&self, region: &'static str, tasks: usize) {
-        let mut record = self.record();
-        let first = record.tasks.len();
-        record.regions.push((region, first));
-        record.tasks.reserve(tasks);
-        record.last = Some(Instant::now());
+        let mut recording = self.lock();
+        let first = recording.tasks.len();
+        recording.regions.push((region, first));
+        recording.tasks.reserve(tasks);
+        recording.last = Some(Instant::now());
     }
 
     /// Reads the clock once per task, so that the time between two tasks counts as part of the second. It is the wall
     /// clock, as reading processor time takes twenty times as long.
     fn end_task(&self) {
-        let mut record = self.record();
+        let mut recording = self.lock();
         let now = Instant::now();
-        let task = record.last.replace(now).map_or(Duration::ZERO, |last| now - last);
-        record.tasks.push(task);
+        let task = recording.last.replace(now).map_or(Duration::ZERO, |last| now - last);
+        recording.tasks.push(task);
     }
 
     fn tasks(&self) -> StepTasks {
-        let record = self.record();
-        let mut rest = &record.tasks[..];
-        let mut regions: Vec<_> = record
+        let recording = self.lock();
+        let mut rest = &recording.tasks[..];
+        let mut regions: Vec<_> = recording
             .regions
             .iter()
             .rev()
@@ -214,7 +214,7 @@ impl Recorder {
             })
             .collect();
         regions.reverse();
-        StepTasks { total: record.total, regions }
+        StepTasks { total: recording.total, regions }
     }
 }
 
@@ -238,7 +238,7 @@ mod tests {
         let expected = ([0, 1, 4], vec![0, 2], 10);
         assert_eq!(run(), expected);
         assert_eq!(threads.recorded(), StepTasks::default());
-        threads.record();
+        threads.start_recording();
         for _ in 0..2 {
             assert_eq!(run(), expected);
             let StepTasks { total, regions } = threads.recorded();

@@ -2,9 +2,9 @@
 //! its ellipse covers; each list is then sorted by depth, ties by row.
 //!
 //! Tiles are numbered row by row. Entries are counted per (chunk of rows, tile), and a prefix sum
-//! gives each its position, so that threads write without synchronisation. Rows are processed in memory
+//! gives each entry its position, so that threads write without synchronisation. Rows are processed in memory
 //! order: sorting all rows by depth first and processing them in that order costs a cache miss per
-//! row and pass, and took ten times as long. The short lists are sorted where they are used.
+//! row and pass, and took ten times as long. The lists are short, and are sorted by the tasks that use them.
 //!
 //! An entry also has a *slot*: its position in the order by row and then by tile. The
 //! backward pass writes an entry's gradient into its slot, so that the gradients of a row are adjacent.
@@ -14,11 +14,11 @@
 //! consecutive tiles whose lists fit. Tiles are independent, and each row's gradients are summed in
 //! order of tile number, so that bands do not change the result.
 //!
-//! The file is one piece because counting, placing and emitting share the counters and their division.
+//! Counting, placing and emitting are in one file because they share the counters and the division into chunks.
 //!
-//! Counting stores the tiles of a row as bits in the memory of its slots. The ellipses of larger rows are evaluated
-//! again when entries are emitted, by the same function on the same values; as Rust never contracts floating-point
-//! expressions, the two passes agree.
+//! Counting stores the tiles of a row as bits in the memory of its slots. Ellipses too large for these bits are
+//! evaluated again when entries are emitted, by the same function on the same values; as Rust never contracts
+//! floating-point expressions, the two passes agree.
 
 use std::ops::Range;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
@@ -106,15 +106,16 @@ impl Visible<'_> {
 pub(super) struct TileLists {
     /// Tile after tile: (depth bits, slot) until the tile is sorted, then (row, slot). Shape: `[cap]`.
     entries: Vec<AtomicU64>,
-    /// The row of each slot; after sorting, its [position](Self::store_positions) if that is needed. Shape: `[cap]`.
+    /// The row of each slot; after sorting, if needed, the [position](Self::store_positions) of the slot's entry.
+    /// Shape: `[cap]`.
     row_of_slot: Vec<AtomicU32>,
     /// First slot and number of slots of each visible row. Between counting and emitting, a [`Footprint`] instead.
     /// Shape: `[budget]`.
     slots: Vec<[u32; 2]>,
     /// First entry of each tile of the band. Shape: `[tiles of the band + 1]`.
     starts: Vec<u32>,
-    /// Number of entries per (chunk of rows, tile). While entries are emitted, their positions in the tile's list
-    /// instead. Shape: `[chunks, tiles of the band]`, or more.
+    /// Number of entries per (chunk of rows, tile). While entries are emitted, the position of the chunk's next entry
+    /// in the tile's list instead. Shape: `[chunks, tiles of the band]`, or more.
     counters: Vec<u32>,
     /// Number of entries per chunk of rows.
     lengths: Vec<u64>,
@@ -223,8 +224,8 @@ impl TileLists {
     }
 
     /// Computes from the counters of `tiles` tiles where each list starts, and replaces the counters by the positions
-    /// in the list at which the entries of each chunk start. Counters are read in memory order: chunk by chunk for
-    /// one tile, each read would be a cache miss.
+    /// in the list at which the entries of each chunk start. Counters are read in memory order: if all chunks of one
+    /// tile were read before the next tile, each read would be a cache miss.
     fn find_places(&mut self, threads: &Threads, tiles: usize) {
         let run = tiles_per_run(tiles);
         let mut runs: Vec<Vec<&mut [u32]>> = Vec::new();
@@ -324,7 +325,8 @@ impl TileLists {
         &self.starts[..=tiles]
     }
 
-    /// Stores for each slot the position of its entry in the band. Only after sorting, which uses the same memory.
+    /// Stores for each slot the position of its entry in the band. Call it only after sorting, which uses the same
+    /// memory.
     pub(super) fn store_positions(&self, threads: &Threads, tiles: usize) {
         threads.each("positions", 0..tiles, |tile| {
             let first = self.first_of(tile);
@@ -379,7 +381,7 @@ fn tiles_per_run(tiles: usize) -> usize {
 mod tests {
     use super::*;
 
-    /// Full-HD images that every row fills, with numbers of rows whose entries exceed 31 and 32 bits.
+    /// Full-HD images that every Gaussian covers, with numbers of rows whose entries exceed 31 and 32 bits.
     #[test]
     fn bands_are_cut_without_overflow() {
         const TILES: u64 = 120 * 68;

@@ -55,7 +55,7 @@ impl AdapterSummary {
     }
 
     /// Largest budget that this adapter supports at an SH degree: each array of rows (the geometry, a band of
-    /// coefficients, the gradients) must fit one buffer.
+    /// coefficients, the gradients) must fit into one buffer.
     pub fn largest_budget(&self, sh_degree: u8) -> u64 {
         let largest = self.largest_binding.min(self.largest_buffer);
         (largest / widest_row(sh_degree)).min(MAX_ROWS)
@@ -70,7 +70,7 @@ pub fn may_be_present() -> bool {
     !cfg!(target_os = "linux") || NODES.iter().any(|node| std::path::Path::new(node).exists())
 }
 
-/// Largest number of rows whose numbers have 32-bit indices in the shaders.
+/// Largest number of rows for which all indices in the shaders fit into 32 bits.
 const MAX_ROWS: u64 = 1 << 25;
 
 /// Limits that the kernels rely on; every WebGPU device has them.

@@ -80,7 +80,7 @@ fn check_sizes(
     sizes: &Sizes,
 ) -> Result<(), BackendError> {
     let most = device.largest_binding();
-    // The buffer of photographs is only copied from and to, and is no larger than the device supports.
+    // No kernel binds the buffer of photographs, which is no larger than the device's largest buffer.
     let bound_buffers = planned.iter().filter(|p| p.name != "photographs");
     let Some(worst) = bound_buffers.max_by_key(|p| p.bytes).filter(|p| p.bytes > most) else {
         return Ok(());

@@ -112,7 +112,7 @@ impl GpuBackend {
 
 impl GpuDevice {
     /// Compares the device with the native backend, once per set of kernels that a policy's needs require. Afterwards
-    /// the memory of the driver is part of the process's.
+    /// the memory of the process includes the driver's.
     ///
     /// # Errors
     /// As [`GpuBackend::new`].

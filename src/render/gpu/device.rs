@@ -101,7 +101,7 @@ pub(super) struct Device {
 }
 
 impl Device {
-    /// Opens the chosen adapter with all of its limits and some features beyond those that steps need.
+    /// Opens the chosen adapter with all of its limits, and with the features `more` besides those that steps need.
     fn open(choice: &AdapterChoice, more: Features) -> Result<Self, BackendError> {
         let mut all = enumerate();
         let summaries: Vec<_> = all.iter().map(|(_, summary)| summary.clone()).collect();
@@ -152,7 +152,7 @@ impl Device {
         Ok(compiled)
     }
 
-    /// Runs `check` once for each record layout.
+    /// Runs `check` unless the device has already passed it for this record layout.
     pub(super) fn check_once(
         &self,
         records: RecordLayout,
@@ -188,7 +188,7 @@ impl Device {
         self.check().err().unwrap_or(BackendError::Device { device, why })
     }
 
-    /// Runs `create` and returns the device's errors.
+    /// Runs `create` and returns the errors that the device reports meanwhile; `what` and `bytes` describe the result.
     pub(super) fn guarded<T>(
         &self,
         what: &'static str,
@@ -211,7 +211,7 @@ impl Device {
         Ok(created)
     }
 
-    /// Largest buffer that a kernel can use `[bytes]`.
+    /// Largest buffer that a kernel can bind `[bytes]`.
     pub(super) fn largest_binding(&self) -> u64 {
         self.summary.largest_binding.min(self.summary.largest_buffer)
     }

@@ -1,6 +1,6 @@
 //! Executes a compiled edit plan on the device, in place: encodes its operations as words, in chunks of fixed size,
-//! and dispatches them. `shaders/apply.wgsl` documents the encoding. Both are in one file because they must agree on
-//! chunks and order.
+//! and dispatches them. `shaders/apply.wgsl` documents the encoding. Encoding and dispatching are in one file because
+//! they must agree on chunks and order.
 
 use densify_policies::plan::{
     Decay, OpacityRule, ParentFate, Placement, RowOps, ScaleRule, Update,
@@ -54,8 +54,8 @@ fn opacity_words(rule: OpacityRule, siblings: u32) -> [u32; 2] {
     }
 }
 
-/// Encodes families in chunks of `room` words: the operations, then the slots of their children. A family too large
-/// for a chunk is split; only its last part rewrites the parent.
+/// Encodes families, each a parent with its children, in chunks of `room` words: the operations, then the slots of the
+/// children. A family too large for a chunk is split; only its last part rewrites the parent.
 fn family_chunks(ops: &RowOps, room: usize) -> Vec<(usize, Vec<u32>)> {
     let mut chunks = Vec::new();
     let mut heads: Vec<[u32; WORDS]> = Vec::new();
@@ -135,7 +135,7 @@ fn family_chunks(ops: &RowOps, room: usize) -> Vec<(usize, Vec<u32>)> {
 /// device can execute in parallel.
 ///
 /// In a cycle of length k each element moves down by one place, which is the product of two reflections: j to −j,
-/// then j to −j − 1.
+/// then j to −j − 1 (modulo k).
 fn rounds_of_swaps(order: &[u32]) -> [Vec<[u32; 2]>; 2] {
     let mut rounds = [Vec::new(), Vec::new()];
     let mut is_done = vec![false; order.len()];
@@ -187,8 +187,8 @@ impl GpuBackend {
         pairs: &[[u32; 2]],
         arrays: impl Iterator<Item = &'a RowLaunch<Launch>> + Clone,
     ) {
-        // Rows are counted from the first row of each array. Plans contain no frozen rows, which some arrays do not
-        // store.
+        // Kernels count rows from the first that the array stores. Some arrays do not store frozen rows, which plans
+        // never contain.
         let mut firsts: Vec<u32> = arrays.clone().map(|array| array.first_row).collect();
         firsts.sort_unstable();
         firsts.dedup();
@@ -218,7 +218,7 @@ impl GpuBackend {
         }
     }
 
-    /// Clears the SH bands of rows beyond their degree, and their moments.
+    /// Clears the SH bands of rows above their new degree, and the moments of these bands.
     fn drop_bands(&self, updates: &[(u32, Update)]) {
         for degree in 0..self.sizes.sh_degree {
             let of_degree = updates.iter().filter(|(_, u)| u.sh_degree == Some(degree));
@@ -362,7 +362,7 @@ mod tests {
     }
 
     #[test]
-    fn families_cut_into_chunks_are_the_same_families() {
+    fn chunks_encode_every_family_completely() {
         let mut plan = EditPlan::new(40, 400);
         for row in 0..40 {
             let offspring = Offspring {

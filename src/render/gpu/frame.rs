@@ -50,7 +50,7 @@ pub(super) struct State {
 }
 
 impl State {
-    /// (row, tile) pairs of all bands.
+    /// Number of (row, tile) pairs of all bands.
     pub(super) fn entries(&self) -> u64 {
         u64::from(self.entries_high) << 32 | u64::from(self.entries_low)
     }
@@ -70,7 +70,8 @@ impl State {
     }
 }
 
-/// Bits of `Frame::draw[2]`: parameter groups that step, groups with waiting gradients, and terms of policies.
+/// Bits of `Frame::draw[2]`: parameter groups that step, groups with waiting gradients, whether bands 1–3 have their
+/// own ages, and the terms that a policy adds.
 pub(super) mod due {
     pub(in super::super) const MAIN_STEPS: u32 = 1;
     pub(in super::super) const REST_STEPS: u32 = 2;

@@ -35,7 +35,7 @@ pub(super) struct Launches<L = Launch> {
     by_kernel: HashMap<String, Vec<L>>,
     /// Numbers per record.
     pub(super) record: u32,
-    /// True if gradients are accumulated in slots: they are gathered, and no sums are cleared.
+    /// True if gradients are accumulated in slots: they are then gathered from there, and the sums need no clearing.
     pub(super) in_slots: bool,
     /// True if the pixels that each row dominates are counted.
     pub(super) counts_dominant: bool,
@@ -70,7 +70,7 @@ pub(super) struct Audit<L> {
     pub(super) first_row: u32,
     /// Numbers per row.
     pub(super) numbers: u32,
-    /// Mark of a row's first number: the parameter's index, plus [`MOMENTS`] for a moment.
+    /// What marks the row if its first number is not finite: the parameter's index, plus [`MOMENTS`] for a moment.
     pub(super) mark: u32,
 }
 
@@ -166,8 +166,8 @@ impl<L> Launches<L> {
     }
 }
 
-/// A kernel's name without `_atomic`: of two kernels that differ in how gradients are accumulated, a device has
-/// one.
+/// A kernel's name without `_atomic`, which distinguishes two versions of a kernel that accumulate gradients in
+/// different ways. A device has only one of them.
 pub(super) fn base_name(kernel: &str) -> &str {
     kernel.strip_suffix("_atomic").unwrap_or(kernel)
 }

@@ -13,7 +13,7 @@ use densify_core::memory::{Ledger, Section};
 
 /// Largest number of (row, tile) pairs that this device can hold at a time, for a policy's needs.
 pub(super) fn max_pairs(device: &Device, needs: &Needs) -> u64 {
-    // Numbers per pair in the largest buffer that grows with them: records, or lists.
+    // Numbers per pair in the largest buffer that grows with the number of pairs: the records, or else the lists.
     let numbers = match device.accumulation {
         Accumulation::Slots => RecordLayout::new(needs.signals).stride() as u64,
         Accumulation::SubgroupCas | Accumulation::SubgroupAtomics => 1,
@@ -43,7 +43,7 @@ pub(super) fn sizes(device: &Device, sh_degree: u8, options: &Setup) -> Sizes {
     sizes
 }
 
-/// Memory on the device, and on the host for the device.
+/// The ledger of a backend: its memory on the device and on the host.
 pub(super) fn ledger(sizes: &Sizes, needs: &Needs) -> Ledger {
     let mut ledger = sizes.ledger();
     let pixels = u64::from(sizes.image.0) * u64::from(sizes.image.1);
@@ -60,7 +60,7 @@ pub(super) fn ledger(sizes: &Sizes, needs: &Needs) -> Ledger {
     ledger
 }
 
-/// Memory on the host while it measures an auxiliary view of this number of pixels `[bytes]`.
+/// Memory on the host while an auxiliary view of this number of pixels is measured `[bytes]`.
 fn aux_bytes(request: &AuxRequest, pixels: u64) -> u64 {
     let sampling = if request.points > 0 { 20 } else { 0 };
     // The copied image, its map, error, edges and luma.

@@ -3,8 +3,8 @@
 //! Parameters stay on the device. A step is encoded and submitted once. Numbers that differ between views
 //! (visible rows, tile entries, bands) are counted on the device and drive indirect dispatches; a few scalars
 //! come back with the loss. If a view has more tile entries than the cap, the image is processed in bands. As
-//! many bands are encoded as the previous step needed; a step that needs more changes nothing, reports it, and
-//! is repeated with enough.
+//! many bands are encoded as the previous step needed; a step that needs more bands changes nothing, reports
+//! this, and is repeated with enough bands.
 //!
 //! With [`Accumulation::Slots`](super::Accumulation::Slots) every sum has a fixed order, and runs on the same
 //! device are reproducible byte for byte. Otherwise the order of a row's sums over tiles varies.
@@ -43,7 +43,7 @@ use densify_policies::policy::{Cadence, Candidate, MaskTerm, SignalKind, SignalS
 
 use super::candidates::Candidates;
 use super::cpu::{BiasCorrection, MAX_SIDE};
-use super::signals::{ParameterSignal, SignalPlanes, as_read};
+use super::signals::{ParameterSignal, SignalPlanes, value_of};
 use super::{
     AdapterSummary, AuxInput, AuxOutput, Backend, BackendError, Inspect, NonFinite, Rendering,
     Setup, Shortcuts, StateArray, StateError, StepInput, StepOutput, Tensor, assert_fits,
@@ -98,9 +98,9 @@ pub struct GpuBackend {
     cadence: Cadence,
     waiting: Waiting,
     candidates: Candidates,
-    /// Photographs that stay on the device, by view: the first ones used. The others are uploaded at every step.
-    /// They are never replaced: views come in a new random order in each epoch, so that a photograph would often be
-    /// evicted before it is used again.
+    /// Photographs that stay on the device, by view: those used first, as many as fit. They are never replaced: views
+    /// come in a new random order in each epoch, so that a photograph would often be evicted before it is used again.
+    /// All other photographs are uploaded at every step.
     photographs: HashMap<usize, ResidentPhotograph>,
     /// Derivative sums of the last step's exposure, if it had one; see `shaders/exposure.wgsl`.
     exposure_sums: [[f32; 4]; 4],
@@ -266,7 +266,7 @@ impl Backend for GpuBackend {
                     |a: Vec<f32>, b: Vec<f32>| a.iter().zip(&b).map(|(a, b)| a.max(*b)).collect();
                 let mut kept =
                     columns?.into_iter().reduce(max).unwrap_or_else(|| vec![0.0; self.rows]);
-                kept.iter_mut().for_each(|value| *value = as_read(signal, *value));
+                kept.iter_mut().for_each(|value| *value = value_of(signal, *value));
                 kept
             };
             if let Some(column) = signals.get_mut(signal) {
@@ -357,13 +357,13 @@ impl Inspect for GpuBackend {
         colours: &[[f32; 3]],
     ) -> Result<Rendering, BackendError> {
         assert_eq!(colours.len(), self.rows, "one colour per row");
-        // The colours temporarily replace band 0, which needs no device memory.
+        // The colours temporarily replace band 0, which needs no additional device memory.
         let (band, rows) = (ModelArray::Sh.parameters(0), 0..self.rows);
         let own = self.parameters_of(&band, rows.clone())?;
         let painted: Vec<f32> = colours.as_flattened().iter().copied().map(rgb_to_dc).collect();
         self.set_parameters(&band, rows.clone(), &painted)?;
         let rendering = self.render(camera, background, 0);
-        // If restoring fails, the device has failed: no step is taken with these colours.
+        // If restoring fails, the device has failed, so that no step is ever taken with these colours.
         self.set_parameters(&band, rows, &own)?;
         rendering
     }

@@ -1,7 +1,7 @@
 //! Measures single views for a policy: candidates for new rows while training, and auxiliary views at its events. In
 //! training the device lists the pixels with the largest errors, from which the host selects; in auxiliary views the
-//! host samples pixels from a copy of the image. The device then finds their surface points, and sums over each row's
-//! pixels.
+//! host samples pixels from a copy of the image. The device then finds the surface points of these pixels and, in
+//! auxiliary views, computes sums over each row's pixels.
 
 use densify_policies::policy::{
     AuxColumn, AuxRequest, Candidate, CandidateRequest, DepthMode, ErrorMode,
@@ -12,7 +12,7 @@ use super::frame::Frame;
 use super::passes::{Search, Shape};
 use super::rows::GRADIENT;
 use super::sizes::OPS_BYTES;
-use crate::candidates::{Photograph, ranked};
+use crate::candidates::{Photograph, count_to_rank};
 use crate::cpu::EXPONENT_SCALE;
 use crate::pixel_map::{pixel_map, radius_px, sample_pixels};
 use crate::{AuxInput, AuxOutput, BackendError, assert_same_size};
@@ -34,7 +34,7 @@ impl GpuBackend {
     ) -> Option<Search> {
         // The result, which begins with its length, borrows the buffer of the rows' gradients.
         let room = (GRADIENT / 2 * self.sizes.trained() as usize - 1).min(u32::MAX as usize);
-        let wanted = ranked(count, request.spaced);
+        let wanted = count_to_rank(count, request.spaced);
         (wanted <= room).then_some(Search {
             pixels: width * height,
             wanted: wanted as u32,

@@ -29,10 +29,10 @@ const DIGITS_OF_ROWS: u32 = 4;
 const DIGITS_OF_ENTRIES: u32 = 5;
 /// The launch of `scatter` that writes the order of rows.
 const TO_ORDER: usize = 2;
-/// Band that stands for the whole image.
+/// Band number that stands for the whole image.
 const WHOLE: u32 = u32::MAX;
 
-/// Numbers per row of an auxiliary view.
+/// Numbers that an auxiliary view sums per row.
 const COLUMNS: u32 = 5;
 
 /// The sizes that determine the commands.
@@ -82,7 +82,7 @@ impl<'e> Recorder<'e> {
         self.stages.begin(&mut self.pass, name);
     }
 
-    /// Ends the pass and returns the names of its stages; the last is the end.
+    /// Ends the pass and returns the names of its stages; the last, empty name marks the end.
     pub(super) fn end(mut self) -> Vec<&'static str> {
         self.stage("");
         self.stages.names
@@ -277,8 +277,8 @@ impl Passes<'_> {
         to.run(l.get("adam_geometry"), [0; 4], groups);
     }
 
-    /// Writes the pixels with the largest errors to the gradients of the rows: their number, then the error bits and
-    /// the index of each, as many as fit. Pixels whose error equals that of the last one wanted are included.
+    /// Writes the pixels with the largest errors to the buffer of the rows' gradients: their number, then the error
+    /// bits and the index of each, as many as fit. Pixels whose error equals that of the last one wanted are included.
     pub(super) fn worst(&self, to: &mut Recorder<'_>, search: &Search) {
         let l = self.launches;
         let &Search { pixels, wanted, room, min_alpha, of_gradient } = search;
@@ -304,7 +304,7 @@ impl Passes<'_> {
         }
     }
 
-    /// Sums, for each row, over the pixels of a view that it is blended into.
+    /// Computes the columns of an auxiliary view: for each row, sums over the pixels that it is blended into.
     pub(super) fn columns(&self, to: &mut Recorder<'_>) {
         let l = self.launches;
         let groups = self.shape.rows.div_ceil(256);

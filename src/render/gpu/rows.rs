@@ -1,5 +1,5 @@
 //! The table of the device's arrays with an entry per row: name, width, line of the ledger, and how edits, checkpoints
-//! and the audit treat it.
+//! and the audit treat each array.
 
 use std::ops::Range;
 
@@ -68,11 +68,11 @@ pub(super) struct Traits {
     /// Line of the ledger.
     pub(super) line: &'static str,
     pub(super) edited: Edited,
-    /// True if checkpoints save it as this array; parameters are saved as the model, signals one by one.
+    /// True if checkpoints save the array under its name; parameters are saved as the model, and signals one by one.
     pub(super) is_saved: bool,
     /// The kind of its numbers, if the audit searches it for numbers that are not finite.
     pub(super) audited: Option<NumberKind>,
-    /// True if only training uses it, so that frozen rows are not stored.
+    /// True if only training uses the array, which then does not store frozen rows.
     pub(super) is_for_training: bool,
 }
 

@@ -170,8 +170,8 @@ impl Sizes {
         if self.with_error {
             add(Section::Renderer, "loss", "error", 4 * pixels);
         }
-        // Allocated even without exposures: the loss always binds it, and the placeholder cannot stand in for several
-        // bindings of a kernel that writes to it.
+        // Allocated even without exposures: the loss always binds it together with `error`, to which it writes. The
+        // placeholder can stand in for only one of the two.
         add(Section::Renderer, "small buffers", "exposure", exposure::TRANSFORM);
         if self.exposures {
             let sums = exposure::SUMS * exposure::groups(pixels);
@@ -198,7 +198,7 @@ impl Sizes {
         all
     }
 
-    /// Size of each resident photograph and of its mask `[bytes]`.
+    /// Size of each photograph kept on the device, and of its mask `[bytes]`.
     pub(super) fn photograph_bytes(&self) -> [u64; 2] {
         KeptPhotographs::bytes(self.image, self.photographs.with_masks)
     }

@@ -31,12 +31,12 @@ impl GpuBackend {
 
     fn signal_plane(&self, name: &str) -> Option<usize> {
         let name = name.strip_prefix(SIGNAL)?;
-        self.planes.kept().into_iter().find(|(known, _)| known == name).map(|(_, plane)| plane)
+        self.planes.saved().into_iter().find(|(known, _)| known == name).map(|(_, plane)| plane)
     }
 
     pub(super) fn state_arrays(&self) -> Vec<StateArray> {
         let buffers = self.saved_arrays().map(|array| format!("{BUFFER}{}", array.name));
-        let signals = self.planes.kept().into_iter().map(|(name, _)| format!("{SIGNAL}{name}"));
+        let signals = self.planes.saved().into_iter().map(|(name, _)| format!("{SIGNAL}{name}"));
         let mut arrays: Vec<StateArray> = buffers.chain(signals).map(StateArray::of_rows).collect();
         arrays.push(StateArray::small(WAITING));
         if self.candidates.request.is_some() {

@@ -71,7 +71,7 @@ impl GpuBackend {
             passes.backward(to);
             passes.optimise(to, degree, signals, mask);
         };
-        let state = if let Some((request, count)) = self.candidates.to_take(input.step, self.rows) {
+        let state = if let Some((request, count)) = self.candidates.due(input.step, self.rows) {
             let weights = error_weights(request.error);
             if weights.is_some() {
                 frame.draw[3] |= target_flags::WITH_ERROR;

@@ -75,7 +75,7 @@ impl GpuBackend {
     }
 
     /// Copies a view's photograph to the buffer that the loss reads, and keeps it on the device if there is room.
-    /// Returns its bits of [`target`]. A view always has the same photograph.
+    /// Returns its bits of [`target`]. A view always has the same photograph, though its size may change.
     pub(super) fn load_photograph(&mut self, view: usize, image: &Image8) -> u32 {
         let size = [image.width, image.height];
         let resident = self.photographs.get(&view).copied();
@@ -95,7 +95,7 @@ impl GpuBackend {
         flags
     }
 
-    /// Copies a photograph between its slot and the buffers that the loss reads, to the slot if `keep`.
+    /// Copies a photograph between its slot and the buffers that the loss reads: to the slot if `keep`, else from it.
     fn copy_photograph(&self, photograph: ResidentPhotograph, keep: bool) {
         let ResidentPhotograph { slot, size: [width, height], flags } = photograph;
         let pixels = u64::from(width) * u64::from(height);

@@ -42,8 +42,8 @@ pub(crate) fn dataset(s: Spelling, note: &Note) -> String {
             let others: Vec<String> =
                 others.iter().map(|(model, images)| format!("{model} ({images})")).collect();
             format!(
-                "note: of several COLMAP models, {model} is used, with the most images ({images}), not {} ({} chooses \
-                 another)",
+                "note: of several COLMAP models, {model} is used because it has the most images ({images}), not {} ({} \
+                 chooses another)",
                 others.join(", "),
                 s.text("sparse", "DIR")
             )
@@ -69,7 +69,7 @@ pub(crate) fn accumulation(s: Spelling, taken: Accumulation) -> String {
     format!("sums     accumulation={taken}: {note}")
 }
 
-/// Points that are nearer than the near plane.
+/// The note that part of what the views show is nearer than the near plane.
 pub(crate) fn hidden_points(s: Spelling, near: f64, hidden: &str, is_given: bool) -> String {
     let remedy = if is_given { "; a smaller number shows it" } else { "" };
     let near = s.set("near", near);
@@ -108,7 +108,7 @@ pub(crate) fn other_coordinates(
     )
 }
 
-/// The hint on how to learn exposures if the tracks leave it undecided.
+/// The hint on how to learn exposures if the tracks do not show whether they differ.
 pub(crate) fn learn_exposures(s: Spelling) -> String {
     format!("{} learns exposures anyway", s.text("exposure", "on"))
 }
@@ -148,8 +148,8 @@ pub(crate) fn degree_lowered(
     start: usize,
 ) -> String {
     format!(
-        "note: degree {degree} instead of {wanted}, at which only {} rows fit and the scene starts with {}; \
-         {} enforces it",
+        "note: degree {degree} instead of {wanted}: at degree {wanted} only {} rows fit, but the scene starts with {}; \
+         {} enforces degree {wanted}",
         grouped(at_wanted),
         grouped(start),
         s.set("sh_degree", wanted)

@@ -36,7 +36,7 @@ pub enum OptionProblem {
         only_on: BackendKind,
         default: &'static str,
     },
-    /// `full` disables what this option makes automatic.
+    /// `full` disables automatic reductions, but this option asks for one.
     AutomaticWithFull { option: &'static str },
     /// An automatic budget cannot remove frozen Gaussians.
     AutoBudgetWithFreeze,
@@ -54,7 +54,7 @@ pub enum SizeProblem {
     TooManyViews,
     /// Frozen Gaussians leave no room in the budget.
     FreezeFillsBudget { frozen: usize, budget: usize },
-    /// `tile_cap` and the knob both set the length of tile lists.
+    /// `tile_cap` and the knob `pairs_per_row` both set the length of tile lists.
     TileCapConflict { cap: usize, pairs: usize },
     /// A resumed run needs more than its memory limit.
     OverMemory { memory: u64, needed: u64, remedies: Vec<Vec<Remedy>> },
@@ -130,7 +130,7 @@ pub enum TrainingProblem {
     Stopped { by: &'static str, step: Option<u32> },
     /// The checkpoint at the end could not be written.
     CheckpointFailed { error: String },
-    /// The file of the model as it was before an error of the policy, or the error of saving it.
+    /// The file with the model as it was before the policy failed, or the error of saving that model.
     ModelSaved { saved: Result<PathBuf, String> },
     /// Measuring failed; the run itself is complete.
     OnlyMeasuringFailed { run: PathBuf },
@@ -159,7 +159,7 @@ pub enum Problem {
     Load(LoadError),
 }
 
-/// The remedy for an error of training: of its folder, its first Gaussians or its views.
+/// The remedy for an error of training: in the output folder, the first Gaussians or the views.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TrainRemedy {
     /// Another folder, or replacing the run in this one.
@@ -189,7 +189,7 @@ pub enum BackendRemedy {
     SmallerImages,
     /// Listing the available adapters, or the native backend.
     ListAdapters,
-    /// Either no adapter, or the GPU backend.
+    /// Naming no adapter, or not choosing the native backend.
     NoAdapterOrGpu,
     /// A program with the GPU backend.
     BuildWithGpu,

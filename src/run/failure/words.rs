@@ -1,5 +1,5 @@
-//! The message of every [`Problem`], with options in the user's spelling. They share one file so that they can be
-//! compared.
+//! The message of every [`Problem`], with options in the user's spelling. The messages share one file so that they can
+//! be compared.
 
 use std::path::Path;
 
@@ -74,7 +74,7 @@ fn load_remedy(remedy: LoadRemedy, s: Spelling) -> String {
             s.option("images"),
         ),
         LoadRemedy::ImagesFolderOfBoth => (
-            "give with {} a folder that contains both at their original paths, or remove one of the two",
+            "use {} to name a folder that contains both files at their original paths, or remove one of the two",
             s.option("images"),
         ),
         LoadRemedy::InvertMasks(true) => ("give {}, or remove the masks", s.switch("invert_masks")),
@@ -88,7 +88,7 @@ fn load_remedy(remedy: LoadRemedy, s: Spelling) -> String {
             s.switch("keep_fov"),
         ),
         LoadRemedy::ColmapModel => (
-            "name with {} a folder that holds cameras and images, as .bin or .txt",
+            "use {} to name a folder that holds cameras and images, as .bin or .txt",
             s.option("sparse"),
         ),
     };
@@ -181,8 +181,8 @@ impl OptionProblem {
                 s.member("knob", "accumulation", given)
             ),
             Self::KnobOfOtherBackend { knob: name, value, backend, only_on, default } => format!(
-                "{knob}: knob {name}={value}: the {} backend does not have it; the nearest that works there is \
-                 {name}={default}, or use {}",
+                "{knob}: knob {name}={value}: the {} backend does not have this knob; leave it at {name}={default}, \
+                 or use {}",
                 backend.name(),
                 s.text("backend", only_on.choice().word())
             ),
@@ -225,7 +225,7 @@ impl SizeProblem {
             Self::TooManyViews => "the scene has more than 4 billion views".to_owned(),
             Self::FreezeFillsBudget { frozen, budget: rows } => format!(
                 "{freeze}: its {} Gaussians leave no room in a budget of {}, which counts them too; give a larger \
-                 {budget}, or {freeze} fewer",
+                 {budget}, or freeze fewer",
                 grouped(*frozen),
                 grouped(*rows)
             ),
@@ -248,12 +248,12 @@ impl SizeProblem {
                 };
                 let [needed, resident, left] = [*needed, *resident, *left].map(Bytes);
                 format!(
-                    "this run takes {needed} of the host's memory, of which the process has {resident}; {limit} leaves \
-                     it {left}; {remedy}"
+                    "this run takes {needed} of the host's memory, of which the process already has {resident}; \
+                     {limit} leaves the process {left} more; {remedy}"
                 )
             }
             Self::NoSize { memory: given } => {
-                format!("{}: no size of a run can be computed", memory(given))
+                format!("{}: no size fits, and no sufficient limit is known", memory(given))
             }
             Self::NoModelFits { memory: given, rows, sh_degree, needed, remedies } => format!(
                 "{} holds no model of this scene: {} rows at degree {sh_degree} take {needed} MiB; give {}",
@@ -309,7 +309,7 @@ impl ModelProblem {
             ),
             Self::DatasetMoved => {
                 // Training takes the scene as a positional argument, other commands with this flag.
-                let scene = short(s, "scene", "--scene");
+                let scene = flag_or_keyword(s, "scene", "--scene");
                 format!("if the dataset has moved, say where it is with {scene}")
             }
             Self::NoModelYet { run, step } => {
@@ -326,8 +326,8 @@ impl ModelProblem {
                 format!("{iteration}: {run} has saved only {}", saved.join(", "))
             }
             Self::StillTraining { run } => format!(
-                "{} is being trained and has saved no model yet; wait until it has, or train with {} to look at it \
-                 before its end",
+                "{} is being trained and has saved no model yet; wait until one is saved, or train with {} to look at \
+                 models before the end of the run",
                 run.display(),
                 iterations("1000,2000")
             ),
@@ -347,8 +347,8 @@ impl ResumeProblem {
         let folder = output_option(s);
         match self {
             Self::InterruptedReplacement { output, staged } => format!(
-                "{resume}: {} holds a run that was to replace the one there and was interrupted: {}; resume it by \
-                 naming that folder with {folder}, or remove it",
+                "{resume}: {} holds an interrupted run, in {}, that was to replace the run there; resume the \
+                 interrupted run by naming its folder with {folder}, or remove that folder",
                 output.display(),
                 staged.display()
             ),
@@ -468,11 +468,11 @@ pub(super) fn model_name(s: Spelling, option: Option<&str>, file: &Path) -> Stri
 
 /// The output folder, in its short form on a terminal.
 fn output_option(s: Spelling) -> String {
-    short(s, "output", "-o")
+    flag_or_keyword(s, "output", "-o")
 }
 
-/// An option that has a special flag on a terminal.
-fn short(s: Spelling, name: &str, flag: &str) -> String {
+/// An option whose flag on a terminal is `flag` instead of its usual one.
+fn flag_or_keyword(s: Spelling, name: &str, flag: &str) -> String {
     match s {
         Spelling::Terminal => flag.to_owned(),
         Spelling::Keyword => s.option(name),

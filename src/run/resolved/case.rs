@@ -26,8 +26,8 @@ use densify_train::trainer::{AutoChoices, growth_signals};
 
 /// Maximum number of random initial points without `--init-points` (Kerbl et al. 2023 use 100,000).
 const RANDOM_POINTS: usize = 100_000;
-/// Resident memory by which a process that resumes a run may exceed the one that began it `[bytes]`. The ledger keeps more
-/// room than this for the allocator.
+/// Resident memory by which a process that resumes a run may exceed the one that began it `[bytes]`. The ledger keeps
+/// more room than this for the allocator.
 const RESUME_TOLERANCE: u64 = 1 << 20;
 /// Threads that decode training views ahead of the trainer.
 pub(crate) const DECODERS: usize = 2;
@@ -80,11 +80,11 @@ impl Choices {
 impl<'a> Case<'a> {
     /// A new run.
     pub(super) fn for_new_run(spec: &'a RunSpec, host: Host<'_>) -> Result<Self, Failure> {
-        let is_exposed = spec.schedule.exposure != ExposureChoice::Off;
+        let may_learn_exposures = spec.schedule.exposure != ExposureChoice::Off;
         let reading = Reading {
-            tracks: spec.size.sh_degree == Some(ShDegree::Auto(None)) || is_exposed,
+            tracks: spec.size.sh_degree == Some(ShDegree::Auto(None)) || may_learn_exposures,
             colours: true,
-            exif: is_exposed,
+            exif: may_learn_exposures,
             ..Reading::default()
         };
         Self::open(spec, &reading, host, |evidence| {
@@ -100,14 +100,14 @@ impl<'a> Case<'a> {
         has_checkpoint: bool,
         host: Host<'_>,
     ) -> Result<Self, Failure> {
-        let finds_exposures = spec.schedule.exposure != ExposureChoice::Off && !has_checkpoint;
+        let decides_exposures = spec.schedule.exposure != ExposureChoice::Off && !has_checkpoint;
         let found = &saved.resolved;
         let reading = Reading {
-            // The checkpoint contains their rows; the files may no longer exist.
+            // A checkpoint contains the rows of both models, so their files may no longer exist.
             models: Some([found.init_model, found.frozen]),
-            tracks: finds_exposures,
+            tracks: decides_exposures,
             colours: true,
-            exif: finds_exposures,
+            exif: decides_exposures,
             tolerance: RESUME_TOLERANCE,
         };
         Self::open(spec, &reading, host, |evidence| {

@@ -1,5 +1,5 @@
-//! `config.toml`: a run with a value for every option, and the findings behind them. Only this module converts a
-//! resolved run to the file and back.
+//! `config.toml`: a run with a value for every option, and the findings behind these values. Only this module converts
+//! a resolved run to the file and back.
 
 use std::path::{Path, PathBuf};
 
@@ -106,7 +106,7 @@ impl RunConfig {
         let ResolvedRun { case, size, init, degree_lowered, .. } = run;
         let (inputs, choices, asked) = (&case.inputs, &case.choices, case.spec);
         let mut spec = asked.clone();
-        // The output is the folder of the file.
+        // The output folder is the one that holds the file.
         spec.output.output = None;
         let budget = asked.size.budget.unwrap_or(Budget::Rows(size.rows));
         spec.size.budget = Some(budget.limited_to(size.rows));
@@ -132,7 +132,7 @@ impl RunConfig {
         let rates = Table::try_from(training.rates).map_err(Failure::input)?;
         spec.schedule.lr = assignments(&in_shortest_decimals(rates));
         spec.schedule.knob = assignments(&choices.knobs.table());
-        // Parameters of other policies stay, as one file may serve several.
+        // Parameters of other policies stay, as one file may serve several policies.
         let name = choices.entry.name;
         spec.density.policy_set.retain(|set| set.path.first().is_none_or(|policy| policy != name));
         spec.density.policy_set.extend(assignments(&training.parameters).into_iter().map(|set| {

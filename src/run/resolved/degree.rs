@@ -54,8 +54,8 @@ impl Degree {
         match self.source {
             DegreeSource::Given => None,
             DegreeSource::Spread(found) => Some(format!(
-                "colour   degree {} (auto): between their views a twentieth of {} points differ by {:.1}/255 or \
-                 more",
+                "colour   degree {} (auto): the colour of a twentieth of {} points varies by {:.1}/255 or more \
+                 between the views that see them",
                 self.highest(),
                 grouped(found.tracks),
                 found.twentieth,

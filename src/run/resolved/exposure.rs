@@ -45,7 +45,7 @@ impl Exposure {
     }
 
     /// Decides by the option, or with `auto` by the colours of tracks. Initial gains come from these colours, and from
-    /// EXIF for views without them.
+    /// EXIF for views without known colours.
     pub(super) fn decide(spec: &RunSpec, evidence: &Evidence) -> Self {
         let Evidence { colours, reported, .. } = evidence;
         let colours = colours.as_ref();
@@ -82,7 +82,8 @@ impl Exposure {
         }
         if let ExifUse::Contradicted { by } = found.exif_use {
             found.notes.push(format!(
-                "the exposures in EXIF are {by:.1} stops (rms) from what the colours of points show, and are not used"
+                "the exposures in EXIF differ by {by:.1} stops (rms) from what the colours of points show, and are \
+                 not used"
             ));
         }
         if let Some(example) = &reported.example {
@@ -119,8 +120,8 @@ impl Exposure {
             }),
             ExposureSource::Given => None,
             ExposureSource::Tracks(found) => Some(format!(
-                "exposure {word} (auto): by the colours of {} points, {} views differ by {:.2} stops (rms); \
-                 with gains, colours differ by {:.1}/255 instead of {:.1}/255{}",
+                "exposure {word} (auto): judged by the colours of {} points, the exposures of {} views differ by \
+                 {:.2} stops (rms); with gains, colours differ by {:.1}/255 instead of {:.1}/255{}",
                 grouped(found.tracks),
                 found.views,
                 found.stops,
@@ -129,10 +130,10 @@ impl Exposure {
                 self.exif_views(),
             )),
             ExposureSource::Undecided => Some(format!(
-                "exposure {word} (auto): fewer than {MIN_TRACKS} points of a reconstruction are known in enough \
-                 views to say{}; {}",
+                "exposure {word} (auto): undecided, because fewer than {MIN_TRACKS} points of a reconstruction \
+                 are known in enough views{}; {}",
                 if self.reported >= MIN_STOPS {
-                    format!(", but by EXIF photographs differ by {:.2} stops (rms)", self.reported)
+                    format!(", but in EXIF, exposures differ by {:.2} stops (rms)", self.reported)
                 } else {
                     String::new()
                 },
@@ -173,13 +174,13 @@ mod tests {
     }
 
     #[test]
-    fn where_no_tracks_are_known_exposures_begin_from_exif() {
+    fn without_tracks_exposures_start_from_exif() {
         let found = decided(ExposureChoice::On, &two_stops_apart());
         assert_eq!(
             found.line(Spelling::Terminal).as_deref(),
             Some("exposure on, from the EXIF of 2 views")
         );
-        // A stop up and a stop down, by the power 1/2.4 of the encoding.
+        // A stop up and a stop down; the encoding raises light to the power 1/2.4.
         let up = 2.0_f32.powf(1.0 / 2.4);
         let begun = Exposures::new(ExposureModel::Channels, &found.gains);
         for (view, gain) in [up, 1.0 / up, 1.0].into_iter().enumerate() {
@@ -202,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn exif_alone_switches_nothing_on_but_is_reported() {
+    fn exif_alone_does_not_turn_exposures_on_but_is_reported() {
         let found = decided(ExposureChoice::Auto, &two_stops_apart());
         assert!(!found.is_on && found.gains.is_empty());
         let line = found.line(Spelling::Terminal).unwrap();

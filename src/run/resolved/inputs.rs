@@ -97,8 +97,8 @@ impl Inputs {
         };
         let [init_file, frozen_file] = files;
         // Tracks have a separate line in the ledger, and are freed before training.
-        let apart = dataset.tracks.bytes() + reading.tolerance;
-        let resident = (host.process.resident)().map(|now| now.saturating_sub(apart));
+        let uncounted = dataset.tracks.bytes() + reading.tolerance;
+        let resident = (host.process.resident)().map(|now| now.saturating_sub(uncounted));
         let peak = (host.process.peak)();
         let tracks = std::mem::take(&mut dataset.tracks);
         let has_colours = reading.colours && tracks.count() >= MIN_TRACKS;
@@ -167,11 +167,11 @@ pub(super) fn open_device(
     let device = Device::open(spec.device.backend, spec.device.gpu.as_deref(), accumulation)?;
     observer.say(format_args!("{}", notes::device(observer.spelling(), &device)));
     check_knobs(knobs, device.kind())?;
-    if let Some(taken) = device.accumulation() {
+    if let Some(method) = device.accumulation() {
         knobs
-            .set("accumulation", taken.name())
+            .set("accumulation", method.name())
             .map_err(|error| OptionProblem::value("knob", error))?;
-        observer.say(format_args!("{}", notes::accumulation(observer.spelling(), taken)));
+        observer.say(format_args!("{}", notes::accumulation(observer.spelling(), method)));
     }
     Ok(device)
 }

@@ -7,7 +7,7 @@ use glam::DVec3;
 
 use super::case::{Case, DECODERS};
 use super::fit::RunSize;
-use super::measuring::Measuring;
+use super::geometry_measurement::GeometryMeasurement;
 use super::models::{first_bytes, reading_bytes};
 use crate::companion::CompanionSize;
 use densify_core::gaussians::sh_coefficients;
@@ -30,8 +30,8 @@ const PROGRAM_STEP: u64 = 8 << 20;
 /// Memory that the system's allocator keeps between two uses. Measured at up to 5 MiB.
 const ALLOCATOR_RESERVE: u64 = 6 << 20;
 /// Bytes per row that a policy derives from its signals before it plans: means, orders, sums of weights and random
-/// numbers. Columns of auxiliary views are counted twice for policies that derive more from them. Sorting rows
-/// afterwards takes no more than this, when it is free again.
+/// numbers. Columns of auxiliary views are counted twice, as policies derive as many values from them. Sorting rows
+/// afterwards takes no more than these bytes, which are free again by then.
 const PLANNING_BYTES: u64 = 20;
 /// Bytes per thread of both thread pools together: the used part of its stack, and the buffers that it keeps. Measured
 /// at 44 to 52 KiB with 64 to 256 threads.
@@ -85,8 +85,8 @@ impl Case<'_> {
     pub(crate) fn ledger(&self, size: &RunSize, needs: &Needs) -> Ledger {
         let threads = self.choices.threads.max(MIN_THREADS);
         let degree = size.sh_degree;
-        let options = self.backend_setup(size, needs.clone());
-        let mut ledger = self.inputs.device.memory_plan(degree, &options, threads);
+        let setup = self.backend_setup(size, needs.clone());
+        let mut ledger = self.inputs.device.memory_plan(degree, &setup, threads);
         let [train, test] = self.inputs.images;
         let held = train.held(size.image_cache);
         ledger.add_to(Section::Images, "decoded training views", held);
@@ -155,11 +155,11 @@ impl Case<'_> {
             let one = |images: &ImageDemand| images.held(0) + images.decoding(1);
             let tested = if measures_test { one(&test) } else { 0 };
             let image = tested.max(if self.inputs.init_model.is_some() { one(&train) } else { 0 });
-            // Finding the least important rows takes the order of all rows, and their opacities twice or, after that, a
-            // plan.
+            // Finding the least important rows takes the order of all rows, and besides it first two copies of their
+            // opacities, then a plan.
             let row = float + (2 * float).max(bytes_per_row(&Needs::default()) as u64);
-            let asked = if self.choices.automatic.rows { budget * row } else { 0 };
-            pass("measuring a view", rendering + image + scratch_bytes(width, threads) + asked);
+            let removal = if self.choices.automatic.rows { budget * row } else { 0 };
+            pass("measuring a view", rendering + image + scratch_bytes(width, threads) + removal);
         }
         let process = self.process_bytes();
         if let Some(beyond) = self.inputs.peak.and_then(|peak| peak.checked_sub(process)) {
@@ -168,9 +168,10 @@ impl Case<'_> {
         ledger.add_to(Section::Process, "program and dataset", process);
         let stacks = threads as u64 * THREAD_BYTES;
         ledger.add_to(Section::Process, format!("up to {threads} threads"), stacks);
-        let Some(measuring) = self.measuring(size, threads) else { return ledger };
-        let counted = measuring.added_to(&ledger, size.rows, degree);
-        // Measuring must not lower the number of rows: if the memory limit is too small for it, it is skipped.
+        let Some(measurement) = self.geometry_measurement(size, threads) else { return ledger };
+        let counted = measurement.added_to(&ledger, size.rows, degree);
+        // The measurement must not lower the number of rows: if the memory limit is too small, the measurement is
+        // skipped.
         match self.memory() {
             Some(memory) if self.inputs.device.limited_bytes(&counted) > memory => ledger,
             _ => counted,
@@ -178,10 +179,14 @@ impl Case<'_> {
     }
 
     /// The measurement at the end, if views are held out and the surface is known.
-    pub(crate) fn measuring(&self, size: &RunSize, threads: usize) -> Option<Measuring> {
+    pub(crate) fn geometry_measurement(
+        &self,
+        size: &RunSize,
+        threads: usize,
+    ) -> Option<GeometryMeasurement> {
         let surface =
             self.inputs.dataset.surface_bytes.filter(|_| !self.inputs.dataset.test.is_empty())?;
-        let options = Setup {
+        let setup = Setup {
             photographs: KeptPhotographs::default(),
             // Nothing is trained, so moments may be small.
             storage: Storage { moments: MomentStorage::Both8, ..Storage::default() },
@@ -189,7 +194,7 @@ impl Case<'_> {
             ..self.backend_setup(size, geometry::needs())
         };
         let (device, views) = (self.inputs.device.clone(), self.inputs.dataset.test.len());
-        Some(Measuring { device, options, threads, surface, views })
+        Some(GeometryMeasurement { device, setup, threads, surface, views })
     }
 
     /// Bytes of signals on the host, of the plan, and of values that the policy derives from the signals.
@@ -197,9 +202,9 @@ impl Case<'_> {
         let float = size_of::<f32>() as u64;
         let candidate = size_of::<densify_policies::policy::Candidate>() as u64;
         let seed = size_of::<densify_policies::plan::Seed>() as u64;
-        // The native backend lets the policy read its own arrays of signals.
+        // From the native backend, the policy reads the backend's own arrays of signals.
         let signals = self.inputs.device.columns_on_host(needs.signals.width()) as u64;
-        // One auxiliary view's columns, and as many that a policy derives from them; all views' points.
+        // The columns of one auxiliary view, and as many that a policy derives from these; the points of all views.
         let aux = needs.aux.as_ref();
         let columns = aux.map_or(0, |request| 2 * request.columns.len()) as u64;
         let points = aux.map_or(0, |request| u64::from(request.points));

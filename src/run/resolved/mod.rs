@@ -1,6 +1,6 @@
 //! A run with every choice made. [`Inputs`] are the device and the dataset; a [`Case`] adds the description and the
-//! choices that do not depend on its size; a [`ResolvedRun`] adds the size. The ledger is a function of inputs, choices
-//! and size. Nothing is written.
+//! choices that do not depend on the run's size; a [`ResolvedRun`] adds the size. The ledger is a function of inputs,
+//! choices and size. Nothing is written.
 
 mod case;
 mod config;
@@ -8,9 +8,9 @@ mod degree;
 mod estimate;
 mod exposure;
 mod fit;
+mod geometry_measurement;
 mod inputs;
 mod ledger;
-mod measuring;
 mod models;
 mod plan;
 mod remedy;
@@ -25,8 +25,8 @@ pub(crate) use config::tests::sample;
 pub use config::{DegreeSource, ExposureSource, Findings, ModelSize, RunConfig};
 pub use estimate::{estimate, host_bytes};
 pub(crate) use fit::RunSize;
-pub(crate) use measuring::Measuring;
-pub(crate) use models::{measuring_setup, read};
+pub(crate) use geometry_measurement::GeometryMeasurement;
+pub(crate) use models::{importance_setup, read};
 pub use plan::{Alternatives, Plan, plan};
 pub use size::DEFAULT_BUDGET;
 pub(crate) use training::ResolvedTraining;
@@ -62,7 +62,7 @@ impl<'a> ResolvedRun<'a> {
     }
 
     /// Resolves a resumed run with the choices of `saved`. `spec` is the saved description overlaid with the options
-    /// given now. Only a checkpoint contains the exposures; without one, the initial ones are determined again.
+    /// given now. Only a checkpoint contains the exposures; without it, the initial exposures are determined again.
     ///
     /// # Errors
     /// As [`for_new_run`](Self::for_new_run).

@@ -83,7 +83,7 @@ pub(super) fn first_bytes(
     if model.rows <= case.budget(size.rows).trainable() {
         return reading;
     }
-    let setup = measuring_setup(model.rows, case, size);
+    let setup = importance_setup(model.rows, case, size);
     let backend = case.inputs.device.memory_plan(model.sh_degree, &setup, threads).on_host();
     let [train, _] = case.inputs.images;
     let image = train.held(0) + train.decoding(1);
@@ -92,7 +92,7 @@ pub(super) fn first_bytes(
 }
 
 /// The backend that measures the importance of this many rows.
-pub(crate) fn measuring_setup(rows: usize, case: &Case<'_>, size: &RunSize) -> Setup {
+pub(crate) fn importance_setup(rows: usize, case: &Case<'_>, size: &RunSize) -> Setup {
     let needs = needs();
     let pairs = rows.saturating_mul(PAIRS_PER_ROW).min(case.inputs.device.most_pairs(&needs));
     Setup {

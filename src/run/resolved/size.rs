@@ -25,7 +25,7 @@ const DEFAULT_IMAGE_CACHE: u64 = 1 << 30;
 const PAIRS_PER_ROW: usize = 16;
 /// Minimum number of trained rows of a useful model, unless the user asks for fewer.
 pub(super) const MIN_ROWS: usize = 1_000;
-/// Memory in messages is rounded up to this `[bytes]`.
+/// Memory in messages is rounded up to a multiple of this `[bytes]`.
 pub(super) const MIB: u64 = 1 << 20;
 /// Image sizes that `densify plan` shows as alternatives.
 pub(super) const RESOLUTIONS: [Resolution; 3] =
@@ -200,20 +200,21 @@ impl ResolvedRun<'_> {
         };
         let mut base = case.spec.clone();
         // `--memory` is no remedy on a GPU: there it limits the device's memory.
-        let less = (!is_resumed && case.inputs.device.kind() == BackendKind::Cpu).then(|| {
-            base.size.memory = Some(ByteCount(most / MIB * MIB));
-            Remedy::Memory(most / MIB)
-        });
+        let lower_limit =
+            (!is_resumed && case.inputs.device.kind() == BackendKind::Cpu).then(|| {
+                base.size.memory = Some(ByteCount(most / MIB * MIB));
+                Remedy::Memory(most / MIB)
+            });
         let mut found = if is_resumed {
             Vec::new()
-        } else if less.is_some()
+        } else if lower_limit.is_some()
             && case.with(&base).and_then(|case| on_host(&case)).unwrap_or(false)
         {
             vec![Vec::new()]
         } else {
             remedies(case, &base, &Remedy::NEW, on_host)
         };
-        found.iter_mut().for_each(|changes| changes.splice(0..0, less).for_each(drop));
+        found.iter_mut().for_each(|changes| changes.splice(0..0, lower_limit).for_each(drop));
         let needed = ledger.on_host();
         let problem =
             SizeProblem::OverGrant { needed, resident: now, limit: by, left, remedies: found };

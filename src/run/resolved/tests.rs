@@ -45,8 +45,8 @@ fn check(case: &Case<'_>, rows: usize) -> Result<(), TestCaseError> {
         prop_assert!(held >= Some(rows), "{rows} rows take {bytes}, which hold {held:?}");
     }
     for memory in [bytes, bytes + bytes / 3] {
-        let open = size::rows_at(case, memory, 3, rows).expect("it is solved").expect("it fits");
-        for asked in [rows, open] {
+        let most = size::rows_at(case, memory, 3, rows).expect("it is solved").expect("it fits");
+        for asked in [rows, most] {
             let (found, taken) = sized_for(asked, Some(ByteCount(memory)));
             prop_assert!(taken <= memory, "{found} rows take {taken} of {memory}");
             prop_assert_eq!(found, asked, "{} bytes", memory);
@@ -75,7 +75,7 @@ fn detailed_edits_are_counted_if_they_are_declared() {
     assert_eq!(detailed - plain, detailed_plan - plain_plan);
 }
 
-/// The lines of a small run's ledger, independent of what else this process has done, and its total.
+/// The lines and the total of a small run's ledger, independent of what else this process has done.
 fn plain_ledger(made: &Made, exposure: &str) -> (Vec<(Section, String, u64)>, u64) {
     let scene = made.path().to_str().expect("UTF-8");
     let spec = described(&[
@@ -97,7 +97,7 @@ fn plain_ledger(made: &Made, exposure: &str) -> (Vec<(Section, String, u64)>, u6
     (ledger.lines.into_iter().map(|line| (line.section, line.what, line.bytes)).collect(), total)
 }
 
-/// The memory of a run without exposures, masks and lenses is a fixed number: they take no byte where they are not used.
+/// The memory of a run without exposures, masks and lenses is a fixed number: unused features take no byte.
 #[cfg(all(unix, target_pointer_width = "64"))]
 #[test]
 fn unused_features_of_photographs_take_no_memory() {
@@ -109,7 +109,7 @@ fn unused_features_of_photographs_take_no_memory() {
         let found = other.iter().filter(|line| !plain.contains(line));
         found.map(|(_, what, _)| what.clone()).collect::<Vec<_>>()
     };
-    // No track is known in enough views to decide.
+    // No track is known in enough views, so `auto` decides against exposures.
     let auto = differing(&plain_ledger(&made, "auto").0);
     let exposed = differing(&plain_ledger(&made, "on").0);
     let folder = made.path().join("masks");
@@ -148,8 +148,8 @@ proptest! {
         let policies = densify_policies::registry::policies().expect("the registry is sound");
         let policy = policy.get(&policies).name;
         let mut backends = vec![("cpu", PRESETS)];
-        // On a GPU only a preset without knobs of the native backend, and one case: software drivers take minutes to
-        // compile the kernels of each policy.
+        // A GPU is tested only with a preset without knobs of the native backend, and in one case: software drivers
+        // take minutes to compile the kernels of each policy.
         let is_on_gpu = !adapters().is_empty() && !ON_GPU.swap(true, Relaxed);
         backends.extend(is_on_gpu.then_some(("gpu", &PRESETS[1..2])));
         for (backend, presets) in backends {
@@ -162,7 +162,7 @@ proptest! {
             shared.extend(given.map(|name| (name, 90_000.into())));
             let spec = described(&shared);
             let case = Case::for_new_run(&spec, Host::default()).expect("a scene");
-            // Both set the length of tile lists.
+            // `tile_cap` and `pairs_per_row` both set the length of tile lists.
             let contradicts = |preset: &&Preset| {
                 let sets_pairs = preset.levels.iter().any(|(knob, _)| *knob == "pairs_per_row");
                 given == Some("tile_cap") && sets_pairs

@@ -9,7 +9,7 @@ use crate::coordinate_check::CoordinateCheck;
 use crate::failure::{Failure, ModelProblem, OptionProblem, notes};
 use crate::finished::views_of;
 use crate::observer::{Observer, Silent};
-use crate::resolved::{Init, ResolvedRun, measuring_setup, read};
+use crate::resolved::{Init, ResolvedRun, importance_setup, read};
 use crate::spec::AbsolutePath;
 use densify_core::gaussians::Gaussians;
 use densify_core::numbers::grouped;
@@ -88,7 +88,7 @@ fn load(file: &Path, run: &ResolvedRun<'_>, observer: &dyn Observer) -> Result<G
     let (whole, room) = (model.len(), case.budget(size.rows).trainable());
     if whole > room {
         let views = views_of(dataset, Split::Train)?;
-        let setup = measuring_setup(whole, case, size);
+        let setup = importance_setup(whole, case, size);
         let mut backend = case.inputs.device.backend(&model, &setup)?;
         let background = case.spec.data.background.fixed();
         let importance = importance(backend.as_mut(), &views, background, model.sh_degree)?;
@@ -155,11 +155,11 @@ fn in_view(model: &Gaussians, dataset: &Dataset) -> usize {
     model.means.par_iter().filter(|mean| shows(mean)).count()
 }
 
-/// Fails if the model of `--init` is in other coordinates than the photographs. Beside frozen Gaussians it may be a
-/// small part of the scene, so the user is only told.
+/// Fails if the model of `--init` is in other coordinates than the photographs. Beside frozen Gaussians the model may
+/// be a small part of the scene, so that the user is then only told.
 ///
 /// # Errors
-/// In this case, and when a view cannot be read or rendered.
+/// When the model is in other coordinates, or a view cannot be read or rendered.
 pub(super) fn check_coordinates(
     file: &Path,
     run: &ResolvedRun<'_>,

@@ -20,21 +20,21 @@ use densify_train::output::{geometry_of, model_path, write_geometry};
 pub(super) fn measure(session: Session<'_>, folder: &Path) -> Result<(), Failure> {
     // The rest of the session keeps the folder locked.
     let (run, observer) = (session.run, session.observer);
-    let Some(measuring) = run.measuring else { return Ok(()) };
+    let Some(measurement) = run.geometry_measurement else { return Ok(()) };
     let iteration = run.trainer.steps_done();
     if geometry_of(folder, iteration)?.is_some() || observer.interrupt().is_some() {
         return Ok(());
     }
-    let [host, device] = measuring.bytes(run.trainer.rows(), run.config.sh_degree);
+    let [host, device] = measurement.bytes(run.trainer.rows(), run.config.sh_degree);
     let process = run.ledger.lines.iter().filter(|line| line.section == Section::Process);
     let host = host + process.map(|line| line.bytes).sum::<u64>();
     drop(run.trainer);
     // A complete run does not fail because too little memory is available now: the measurement is skipped.
-    let granted = (run.process.grant)(measuring.threads).zip((run.process.resident)());
+    let granted = (run.process.grant)(measurement.threads).zip((run.process.resident)());
     let granted = granted.map_or(u64::MAX, |(limit, now)| now.saturating_add(limit.left));
     let promised = run.ledger.total();
     let limits = [(host + device, promised), (device, run.ledger.on_device()), (host, granted)];
-    let left_out = |why: std::fmt::Arguments<'_>| {
+    let skip = |why: std::fmt::Arguments<'_>| {
         let folder = folder.display();
         observer.say(format_args!(
             "note: geometry is not measured: {why}; `densify eval {folder}` measures it"
@@ -43,18 +43,18 @@ pub(super) fn measure(session: Session<'_>, folder: &Path) -> Result<(), Failure
     };
     if let Some(&(needed, room)) = limits.iter().find(|(needed, room)| needed > room) {
         let (needed, room) = (Bytes(needed), Bytes(room));
-        return left_out(format_args!("that takes {needed}, and there is room for {room}"));
+        return skip(format_args!("that takes {needed}, and there is room for {room}"));
     }
     let model = read_model(&model_path(folder, iteration), observer)?;
     let model = run.dataset.normalisation.model_from_world(model);
-    let backend = measuring.device.backend(&model, &measuring.for_rows(model.len()))?;
+    let backend = measurement.device.backend(&model, &measurement.for_rows(model.len()))?;
     let (dataset, data) = (run.dataset, run.spec.data);
     let mut opened = Opened { sh_degree: model.sh_degree, backend, dataset, data };
     drop(model);
     let measured = match opened.geometry(&run.test, &|| observer.interrupt().is_some()) {
         Ok(None) => return Ok(()),
         Ok(Some(measured)) => measured,
-        Err(_) if observer.interrupt().is_some() => return left_out(format_args!("stopped")),
+        Err(_) if observer.interrupt().is_some() => return skip(format_args!("stopped")),
         Err(failure) => return Err(failure),
     };
     write_geometry(folder, Split::Test, iteration, &measured)?;

@@ -1,5 +1,5 @@
-//! The session of a run: the loop around the trainer with its progress, logs, saved models, measurements and checkpoints.
-//! The file is not split because all of this happens between two steps, and the order matters.
+//! The session of a run: the loop around the trainer with its progress, logs, saved models, measurements and
+//! checkpoints. The file is not split because all of this happens between two steps, and the order matters.
 
 mod first_model;
 mod geometry;
@@ -223,8 +223,8 @@ impl<'a> Session<'a> {
         Err(Failure::with_code(OTHER, TrainingProblem::DrawsNothing { empty, views }))
     }
 
-    /// Saves and measures the model and writes a checkpoint if they are due after `step`; in a resumed run, only those
-    /// that do not exist yet.
+    /// Saves the model, measures it and writes a checkpoint, each if it is due after `step`; in a resumed run, results
+    /// that exist are skipped.
     fn save_and_measure_if_due(&mut self, step: u32, resumed: bool) -> Result<(), Failure> {
         let (output, is_last) = (&self.run.spec.output, step == self.run.last);
         let every = output.checkpoint_every;

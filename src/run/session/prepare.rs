@@ -75,7 +75,7 @@ pub(super) fn prepare(
     let total = Bytes(ledger.total());
     observer.say(format_args!("memory   {total} promised in all"));
     observer.detail(format_args!("{}", case.memory_table(&ledger, observer.spelling())));
-    let measuring = case.measuring(size, case.choices.threads);
+    let geometry_measurement = case.geometry_measurement(size, case.choices.threads);
     let mut backend = case.inputs.device.backend(&model, &case.backend_setup(size, needs))?;
     drop(model);
     if let Some(file) = file.filter(|_| checkpoint.is_none()) {
@@ -110,7 +110,7 @@ pub(super) fn prepare(
         test,
         dataset,
         ledger,
-        measuring,
+        geometry_measurement,
         fingerprint,
         last,
         session,

@@ -1,5 +1,5 @@
-//! The logs of a run and its totals so far. Checkpoints contain both, so that the records of an interrupted run have no
-//! gap.
+//! The logs of a run and its totals so far. Checkpoints contain the totals and the lengths of the logs, so that the
+//! records of an interrupted run have no gap.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
@@ -48,7 +48,7 @@ impl Totals {
         Self { cpu: Some(Duration::ZERO), ..Self::default() }
     }
 
-    /// Adds the time since `wall` and `cpu`.
+    /// Adds the wall time since `wall` and the processor time since `cpu`.
     pub(super) fn time(&mut self, wall: Instant, cpu: Option<ProcessTime>) {
         self.wall = self.wall.saturating_add(wall.elapsed());
         let spent = cpu.and_then(|start| start.try_elapsed().ok());

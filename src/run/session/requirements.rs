@@ -1,4 +1,5 @@
-//! `stats/requirements.json`: the automatic reductions of a run, with their evidence and cost.
+//! `stats/requirements.json`: what the scene did not require and the run therefore left out (its automatic reductions),
+//! with evidence and cost.
 
 use std::path::Path;
 
@@ -14,7 +15,7 @@ use densify_train::trainer::{AutoBudget, MIN_GAIN};
 /// Path within the folder of the run.
 pub(super) const REQUIREMENTS: &str = "stats/requirements.json";
 
-/// The report of a run.
+/// The report on what a run required and what it left out.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Requirements {
     /// Automatic reductions were disabled (`--full`).
@@ -115,7 +116,7 @@ fn degree_left_out(config: &RunConfig) -> Option<LeftOut> {
     if config.resolved.sh_degree_lowered {
         return Some(LeftOut {
             what,
-            // The file has the spelling of the terminal, whoever started the run.
+            // The file names options as on the command line, even if a library started the run.
             evidence: format!(
                 "{} holds fewer rows at this degree than the scene starts with",
                 Spelling::Terminal.option("memory")
@@ -128,12 +129,12 @@ fn degree_left_out(config: &RunConfig) -> Option<LeftOut> {
     Some(LeftOut {
         what,
         evidence: format!(
-            "between their views, a twentieth of {} points differ by {:.2}/255 or more",
+            "the colour of a twentieth of {} points varies by {:.2}/255 or more between the views that see them",
             found.tracks, found.twentieth
         ),
         loss: format!(
-            "the colours of all differ by {:.2}/255 (rms); with equal rows degree 3 still gained 0.5 to \
-             1.4 dB on matt scenes (docs/tradeoffs.md)",
+            "the colours of all these points vary by {:.2}/255 (rms); with as many rows, degree 3 still gained \
+             0.5 to 1.4 dB on matt scenes (docs/tradeoffs.md)",
             found.rms
         ),
     })
@@ -144,7 +145,7 @@ fn exposures_left_out(config: &RunConfig) -> Option<LeftOut> {
     (!config.resolved.has_exposures).then(|| LeftOut {
         what: "an exposure for each photograph".to_owned(),
         evidence: format!(
-            "by the colours of {} points, those of {} views differ by {:.2} stops (rms)",
+            "judged by the colours of {} points, the exposures of {} views differ by {:.2} stops (rms)",
             found.tracks, found.views, found.stops
         ),
         loss: "its loss was not measured".to_owned(),
@@ -172,7 +173,7 @@ fn rows_removed(auto: &AutoBudget) -> Option<LeftOut> {
     (removed > 0).then(|| LeftOut {
         what: format!("{removed} rows of low weight"),
         evidence: format!(
-            "{} times, hiding them cost less than {MIN_GAIN:.2} dB per halving",
+            "in each of {} trials, hiding rows cost less than {MIN_GAIN:.2} dB per halving",
             removals.len()
         ),
         loss: format!("{change:.3} dB in all on training views, measured at removal"),
@@ -250,8 +251,7 @@ mod tests {
             ],
         };
         let text = line(&config, Some(&auto_budget));
-        for words in ["rows beyond 1000", "step 300", "0.04 dB", "100 rows", "1 times", "-0.015 dB"]
-        {
+        for words in ["beyond 1000", "step 300", "0.04 dB", "100 rows", "1 trials", "-0.015 dB"] {
             assert!(text.contains(words), "{words}: {text}");
         }
     }

@@ -24,7 +24,7 @@ pub struct Resumed {
     pub(super) checkpoint: Option<Checkpoint>,
     /// The configuration that was saved.
     pub(super) config: RunConfig,
-    /// The step at which it ends, beyond its original length if it is extended.
+    /// The step at which the run ends, beyond its original length if it is extended.
     pub(super) last: u32,
 }
 
@@ -48,7 +48,7 @@ const FREE_KNOBS: [&str; 2] = ["knob.pairs_per_row", "knob.accumulation"];
 /// checkpoints, and overlays the saved options with `given`. Without either, the run is new.
 ///
 /// # Errors
-/// When a process is training there, or the run in the folder cannot be resumed.
+/// When a process is training in the folder, or the run in the folder cannot be resumed.
 pub fn start(
     given: Partial,
     observer: &dyn Observer,
@@ -165,7 +165,7 @@ fn check_restart(
     Ok(())
 }
 
-/// Fails if the result of this run would differ from that of the saved run, or its dataset does.
+/// Fails if the result of this run would differ from that of the saved run, or if their datasets differ.
 pub(super) fn check(
     now: &RunConfig,
     resumed: &Resumed,
@@ -223,8 +223,8 @@ fn fixed(config: &RunConfig) -> Result<BTreeMap<String, String>, Failure> {
     Ok(found)
 }
 
-/// Restores the trainer, which has as many rows as the checkpoint, and returns the state of the session; `None` without a
-/// checkpoint.
+/// Restores the trainer, which has as many rows as the checkpoint, and returns the state of the session; `None` without
+/// a checkpoint.
 pub(super) fn restore(
     resumed: Resumed,
     trainer: &mut Trainer<DatasetViews>,

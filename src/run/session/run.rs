@@ -9,7 +9,7 @@ use crate::failure::{Failure, TrainingProblem};
 use crate::host::Host;
 use crate::observer::{Interrupt, Observer};
 use crate::process::ProcessMemory;
-use crate::resolved::{Measuring, RunConfig};
+use crate::resolved::{GeometryMeasurement, RunConfig};
 use crate::spec::RunSpec;
 use densify_core::gaussians::Gaussians;
 use densify_core::memory::Ledger;
@@ -33,8 +33,8 @@ pub struct Run {
     pub dataset: Dataset,
     /// Planned bytes per buffer; the run takes no more.
     pub ledger: Ledger,
-    /// The measurement at the end, if the surface is known.
-    pub(super) measuring: Option<Measuring>,
+    /// The measurement against the known surface at the end, if there is such a surface.
+    pub(super) geometry_measurement: Option<GeometryMeasurement>,
     /// Identifies the dataset in checkpoints.
     pub(super) fingerprint: Fingerprint,
     /// The step at which the run ends.
@@ -84,8 +84,8 @@ impl Run {
     /// run.
     ///
     /// # Errors
-    /// When a view cannot be read, or the device, the disk or the policy fails. The error names the files that were written
-    /// until then; they stay.
+    /// When a view cannot be read, or the device, the disk or the policy fails. The error names the files that were
+    /// written until then; these files stay.
     pub fn train(self, if_exists: Occupied, observer: &dyn Observer) -> Result<PathBuf, Failure> {
         train(self, if_exists, observer)
     }

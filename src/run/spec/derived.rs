@@ -1,5 +1,5 @@
-//! Values that follow from the options alone: the dataset's split, the knobs, the learning rates, the policy's parameters,
-//! the output folder.
+//! Values that follow from the options alone: the dataset's split, the knobs, the learning rates, the policy's
+//! parameters, the output folder.
 
 use std::path::{Path, PathBuf};
 
@@ -226,7 +226,7 @@ mod tests {
 
     #[cfg(unix)]
     #[test]
-    fn folders_whose_names_are_not_utf_8_are_named_with_their_option() {
+    fn errors_about_folder_names_that_are_not_utf_8_name_the_option() {
         use std::os::unix::ffi::OsStringExt;
         let folder = || Some(std::ffi::OsString::from_vec(b"caf\xe9".to_vec()).into());
         let [mut scene, mut images, mut output] = [(); 3].map(|()| RunSpec::default());

@@ -98,7 +98,7 @@ macro_rules! run_spec {
         /// A run, completely described: plain data with a default for everything. Fields that are `None` are
         /// decided when the run is prepared.
         ///
-        /// In a file all options are at the top level; the groups are those of the help.
+        /// In a file all options are at the top level; the groups only structure the help.
         #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, Args)]
         pub struct RunSpec {
             $($(#[$doc])* #[command(flatten)] #[serde(flatten)] pub $group: $struct,)*
@@ -125,8 +125,8 @@ run_spec! {
         /// Folder of the photographs, if it is not the dataset's own (relative to the dataset)
         images: Option<PathBuf> = None, Free, value "DIR";
 
-        /// Folder of the COLMAP model, such as sparse/1 (relative to the dataset; default: of several, the one with the
-        /// most images)
+        /// Folder of the COLMAP model, such as sparse/1 (relative to the dataset; default: the one with the most
+        /// images)
         sparse: Option<PathBuf> = None, Fixed, value "DIR";
 
         /// Use only the views that this file names, one per line. A tab and four numbers from 0 to 1 after a name
@@ -134,20 +134,20 @@ run_spec! {
         /// the others are left out
         views: Option<AbsolutePath> = None, Fixed, value "FILE";
 
-        /// Treatment of views whose camera is more than 10 times as far from the others as usual, if they are at most
-        /// one in 20: structure from motion misplaces some
+        /// Treatment of views whose camera is more than 10 times as far from the others as usual, if at most one view
+        /// in 20 is such a view: structure from motion misplaces some cameras
         far_cameras: FarCameras = FarCameras::LeaveOut, Fixed, value "WHAT";
 
-        /// Keep the full field of view of a distorted lens, and mask pixels that it did not see; by default photographs
-        /// are cropped to the largest rectangle without such pixels. Where the distortion folds over, the invertible
-        /// part is kept
+        /// Keep the full field of view of a distorted lens, and mask pixels that the lens did not see; by default
+        /// photographs are cropped to the largest rectangle without such pixels. Where the distortion folds over, the
+        /// invertible part is kept
         keep_fov: bool = false, Fixed, switch Set;
 
         /// Masks are white where photographs are to be ignored; by default black is ignored
         invert_masks: bool = false, Fixed, switch Set;
 
-        /// Meaning of masked pixels. To carve out an object, background needs a background colour that the object does
-        /// not have, or --background random
+        /// Meaning of masked pixels. To carve out an object with the mode background, set --background to a colour that
+        /// the object does not have, or to random
         mask_mode: MaskMode = MaskMode::Ignore, Fixed, value "MODE";
 
         /// Render a built-in scene again, and do not keep it in the user's cache folder
@@ -176,12 +176,12 @@ run_spec! {
         /// Its colours are cut or extended to --sh-degree
         init: Option<InitChoice> = None, Fixed, value "points|random|MODEL";
 
-        /// Learning rates of a run from a model; --lr changes single ones
+        /// Learning rates of a run from a model; --lr changes single rates
         init_rates: InitRates = InitRates::Fine, Fixed, value "WHICH";
 
         /// A model in the dataset's coordinates (a file by any program, or a run's folder) whose Gaussians are rendered
         /// but never change: they are neither trained, moved nor removed. The Gaussians of --init are trained beside
-        /// them; the budget counts both
+        /// them; the budget counts frozen and trained Gaussians
         freeze: Option<AbsolutePath> = None, Fixed, value "MODEL";
 
         /// Number of random points to start from (default: half the budget, at most 100k)
@@ -197,8 +197,8 @@ run_spec! {
         /// Maximum number of Gaussians in the model: 200000, 28k, 1.5M (default: 200k, or as many as --memory holds)
         ///
         /// auto: growth stops where twice as many Gaussians gain less than 0.10 dB on training
-        /// views, and those with the least effect are then pruned. The default stays the limit;
-        /// auto:50k sets another
+        /// views, and Gaussians with the least effect are then pruned. The limit is still the default;
+        /// auto:50k sets another limit
         #[arg(short)]
         budget: Option<Budget> = None, Fixed, value "ROWS";
 
@@ -206,9 +206,9 @@ run_spec! {
         /// the process
         ///
         /// Options that are given are kept: --budget (the smaller of the two limits applies), --sh-degree, --tile-cap,
-        /// --image-cache. The others are chosen: as many Gaussians as fit; degree 3 unless fewer fit than the scene
-        /// starts with, then it is lowered until they do; decoded photographs take at most an eighth, and those beyond
-        /// it are decoded again; tile lists hold 4 pairs per Gaussian, up to 16 where --budget leaves room. `densify
+        /// --image-cache. The others are chosen: as many Gaussians as fit; degree 3, or a lower one if at degree 3
+        /// fewer fit than the scene starts with; decoded photographs take at most an eighth, and those that do not fit
+        /// in it are decoded again; tile lists hold 4 pairs per Gaussian, up to 16 where --budget leaves room. `densify
         /// plan` shows the result
         memory: Option<ByteCount> = None, Fixed, value "BYTES";
 
@@ -217,8 +217,8 @@ run_spec! {
         tile_cap: Option<Rows> = None, Free, value "PAIRS";
 
         /// Memory for decoded photographs, and the same amount on a GPU; others are decoded and uploaded again when
-        /// they are needed. auto: an eighth of the memory of the run, and the rest of --memory; 1GiB if --memory limits
-        /// a GPU (default: 1GiB, or as auto with --memory)
+        /// they are needed. auto: an eighth of the memory of the run, plus what is left of --memory; 1GiB if --memory
+        /// limits a GPU (default: 1GiB, or as auto with --memory)
         image_cache: Option<ImageCache> = None, Free, value "BYTES";
 
         /// Dependence of colours on the viewing direction: 0 none, 3 most; auto: as much as the scene requires
@@ -262,8 +262,8 @@ run_spec! {
         #[serde(with = "as_table")]
         lr: Vec<Assignment> = Vec::new(), Fixed, value "NAME=RATE";
 
-        /// Settings that go together: exact, balanced, fast or tiny-memory. Options that are given override it
-        /// (default: balanced)
+        /// Set several options and knobs at once: exact, balanced, fast or tiny-memory. Options that are given override
+        /// the preset (default: balanced)
         preset: Option<String> = None, Free, value "NAME";
 
         /// Set a knob of the trade-off between speed, memory and accuracy, such as alpha_min=1/128; `densify knobs`

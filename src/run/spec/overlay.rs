@@ -121,7 +121,7 @@ impl Partial {
         lower
     }
 
-    /// The value of an option, if it is there.
+    /// The value of an option, if it is set.
     pub fn get(&self, name: &str) -> Option<&Value> {
         self.0.get(name)
     }

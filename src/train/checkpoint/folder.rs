@@ -45,8 +45,8 @@ pub fn newest(run: &Path) -> (Option<Checkpoint>, Vec<CheckpointError>) {
     (None, rejected)
 }
 
-/// Removes all but the two newest checkpoints up to `step`, whose checkpoint has just been written. Later ones, which may
-/// be damaged, stay until they are overwritten. Errors are ignored.
+/// Removes all but the two newest checkpoints up to `step`, whose checkpoint has just been written. Checkpoints of
+/// later steps, which may be damaged, stay until they are overwritten. Errors are ignored.
 pub fn remove_older(run: &Path, step: u32) {
     let past = list(run).into_iter().filter(|&(saved, _)| saved <= step);
     for (_, path) in past.skip(MAX_CHECKPOINTS) {

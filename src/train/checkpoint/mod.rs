@@ -1,17 +1,17 @@
 //! Saves the complete state of a run in one file, and restores it.
 //!
-//! The result of a run that continues from a checkpoint is bit-identical to that of a run never interrupted.
+//! A run that continues from a checkpoint ends with the same model, bit for bit, as an uninterrupted run.
 //!
 //! ```text
 //! RUN/checkpoints/iteration_N.safetensors     the two newest are kept
 //! ```
 //!
-//! The file is [safetensors](https://github.com/huggingface/safetensors), which many languages read: eight bytes of
-//! length, a JSON header, and arrays. The arrays of the model are `model.means`, `model.log_scales`, `model.quats`,
-//! `model.opacity_logits`, `model.sh` ([`Gaussians`](densify_core::gaussians::Gaussians), in the coordinates of
-//! training); the others are the [backend's](densify_render::Backend::state). The rest is JSON in the metadata of the
-//! header: the version of the format, [`Header`], the arrays with a checksum each (CRC-32C), and a checksum of that
-//! JSON. Every byte is therefore checked before it is used.
+//! The file is [safetensors](https://github.com/huggingface/safetensors), which many languages read: the length of the
+//! header in eight bytes, a JSON header, and arrays. The arrays of the model are `model.means`, `model.log_scales`,
+//! `model.quats`, `model.opacity_logits`, `model.sh` ([`Gaussians`](densify_core::gaussians::Gaussians), in the
+//! coordinates of training); the others are the [backend's](densify_render::Backend::state). The rest is JSON in the
+//! metadata of the header: the version of the format, [`Header`], the arrays with a checksum each (CRC-32C), and a
+//! checksum of that JSON. Every byte is therefore checked before it is used.
 //!
 //! A file appears under its name only when it is complete and synced to disk. Files are untrusted: sizes
 //! are checked against the length of the file before anything is allocated.

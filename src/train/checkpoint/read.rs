@@ -76,7 +76,7 @@ impl Checkpoint {
         &self.header
     }
 
-    /// A model of zeros with the checkpoint's size, for making the backend that is then
+    /// A model of zeros with the checkpoint's size, for creating the backend that is then
     /// [restored](Self::restore).
     ///
     /// # Errors
@@ -116,7 +116,7 @@ impl Checkpoint {
         )))
     }
 
-    /// Restores the model and the state of `backend`, which was made for the
+    /// Restores the model and the state of `backend`, which was created with the
     /// [blank model](Self::blank_model).
     ///
     /// # Errors
@@ -157,7 +157,7 @@ impl Checkpoint {
                 }
                 reader.finish()?;
             } else {
-                // An array by rows with another number of rows is refused here.
+                // This refuses an array with one entry per row if its number of rows is wrong.
                 backend.restore(self.tensor(place)?).map_err(&refused)?;
             }
         }
@@ -179,6 +179,7 @@ impl Checkpoint {
         CheckpointError::invalid(&self.path, problem)
     }
 
+    /// Index of an array in `places`.
     fn place(&self, name: &str) -> Result<usize, CheckpointError> {
         let found = self.places.iter().position(|(_, record)| record.name == name);
         found.ok_or_else(|| self.invalid(format!("there is no tensor `{name}`")))

@@ -118,7 +118,7 @@ fn written_with(rows: usize) -> (tempfile::TempDir, PathBuf) {
 }
 
 #[test]
-fn ages_of_rows_are_read_on_their_own() {
+fn ages_of_rows_are_read_without_a_backend() {
     let (_root, path) = written();
     let ages = Checkpoint::open(&path).unwrap().ages().unwrap();
     let signals = backend(ROWS).take_signals(SignalSet::from([Signal::Age])).unwrap();
@@ -214,7 +214,7 @@ fn every_flipped_bit_is_refused() {
 }
 
 #[test]
-fn headers_that_promise_too_much_are_refused_without_allocation() {
+fn headers_with_excessive_sizes_are_refused_without_allocation() {
     let root = tempfile::tempdir().unwrap();
     let path = root.path().join("c.safetensors");
     let check = |length: u64, header: &str, words: &str| {
@@ -235,7 +235,7 @@ fn headers_that_promise_too_much_are_refused_without_allocation() {
 }
 
 #[test]
-fn a_state_of_another_run_is_refused_by_name() {
+fn arrays_of_another_run_are_refused_with_their_names() {
     let (_root, path) = written();
     let refused = |options: Setup, words: &str| {
         let mut checkpoint = Checkpoint::open(&path).unwrap();

@@ -1,9 +1,9 @@
 //! Exposures of the training views, learned together with the model.
 //!
 //! A brighter model with darker exposures gives the same images, so the mean over the views is held constant and only
-//! differences from it are learned. A weak regularisation towards the identity determines what the photographs leave
-//! open. Each view has its own Adam moments and takes a step when its photograph is trained on. The host computes these
-//! steps in a fixed order, so that runs are reproducible.
+//! differences from it are learned. A weak regularisation towards the identity fixes what the photographs do not
+//! determine. Each view has its own Adam moments and takes a step when its photograph is trained on. The host computes
+//! these steps in a fixed order, so that runs are reproducible.
 
 use serde::{Deserialize, Serialize};
 
@@ -14,7 +14,7 @@ use densify_core::colour::{ColourGradient, ColourTransform};
 const PARAMETERS: usize = 12;
 /// Step size at the start of a run.
 const RATE: f64 = 0.01;
-/// Factor of the step size at the end of a run.
+/// Step size at the end of a run, relative to that at the start.
 const FADE: f64 = 0.1;
 /// Step size of offsets relative to that of the matrix, because their range is smaller: exposures within a stop have
 /// offsets below 0.02.
@@ -46,7 +46,7 @@ pub struct Exposures {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct ViewExposure {
-    /// Difference from the identity, before the correction of the mean: the matrix row by row, then the offset.
+    /// Difference from the identity, before the mean is corrected: the matrix row by row, then the offset.
     /// Shape: `[12]`.
     values: [f32; PARAMETERS],
     /// Adam's first moments. Shape: `[12]`.
@@ -93,7 +93,7 @@ impl Exposures {
         transform
     }
 
-    /// A view's difference from the identity, after the correction of the mean.
+    /// A view's difference from the identity, after the mean is corrected.
     fn difference(&self, view: usize) -> [f32; PARAMETERS] {
         let mean = mean(&self.views);
         let own = &self.views[view].values;

@@ -18,7 +18,7 @@ use serde::{Deserialize, Serialize};
 pub use best_fit::fitted;
 pub use learned::{Exposures, named_transforms};
 
-/// The choice to learn exposures of the photographs.
+/// Whether exposures of the photographs are learned.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 pub enum ExposureChoice {
@@ -32,7 +32,7 @@ pub enum ExposureChoice {
     On,
 }
 
-/// The transforms of colours that an exposure may be.
+/// The form of the colour transform that is learned as an exposure.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 pub enum ExposureModel {

@@ -8,15 +8,15 @@ use densify_data::track_colours::exposures::STOPS;
 
 /// Smallest number of photographs with both EXIF and track colours for a comparison.
 const MIN_COMPARED: usize = 3;
-/// Largest difference between the two, as a share of the larger spread.
+/// Largest difference between EXIF and track colours, as a share of the larger of their spreads.
 const MAX_DIFFERENCE: f64 = 0.5;
-/// A difference that is accepted however small the spread `[stops]`.
+/// A difference that is accepted even if the spreads are small `[stops]`.
 const NEGLIGIBLE_DIFFERENCE: f64 = 0.3;
 
 /// The use made of exposures from EXIF.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum ExifUse {
-    /// None was needed or usable.
+    /// No exposure from EXIF was needed or usable.
     Unused,
     /// Number of views that start with the exposure from EXIF.
     Views(usize),
@@ -116,11 +116,11 @@ mod tests {
         let tracks = [-1.0, 0.0, 1.0, 0.0];
         let mut gains = tracks.map(gain);
         gains[3] = [1.0; 3];
-        // Errors of a tenth of a stop, and another zero point.
+        // EXIF has errors of a tenth of a stop, and another zero point.
         let stops = [Some(4.1), Some(5.0), Some(5.9), Some(6.0)];
         let known = [true, true, true, false];
         assert_eq!(complete_gains(&mut gains, &known, &stops), ExifUse::Views(1));
-        // The fourth lies a stop above the second, and the mean of all four is 1.
+        // By EXIF the fourth gain is a stop above the second, and the mean of all four gains is 1.
         for (found, expected) in gains.into_iter().zip([-1.25, -0.25, 0.75, 0.75].map(gain)) {
             assert!(near(found, expected), "{found:?} {expected:?}");
         }

@@ -50,7 +50,7 @@ pub struct InitReport {
 /// Reason why Gaussians cannot be initialised.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum InitError {
-    /// The budget has no room.
+    /// The budget is 0.
     #[error("a budget of 0 Gaussians leaves no model")]
     NoBudget,
     /// There is no such degree.

@@ -20,9 +20,9 @@ const COLOURS: (u8, u8) = (64, 128);
 /// Random points in view of the cameras, in normalised coordinates, with random colours.
 ///
 /// If the cameras look at one object, the points fill a cube around it. With a `background` (images without alpha) only
-/// every other point does; the rest are spread over the views, uniformly in image position and inverse depth. If the
-/// cameras have no common focus (a room from inside, a street), all points are spread over the views. Equal arguments
-/// give equal points.
+/// every other point lies in the cube; the rest are spread over the views, uniformly in image position and inverse
+/// depth. If the cameras have no common focus (a room from inside, a street), all points are spread over the views.
+/// Equal arguments give equal points.
 pub fn random_points(count: usize, cameras: &[Camera], background: bool, seed: u64) -> PointCloud {
     let focus = focus(cameras);
     let mut draw = UniformRng(ChaCha8Rng::seed_from_u64(seed));
@@ -83,7 +83,7 @@ fn focus(cameras: &[Camera]) -> Option<(DVec3, f64)> {
     distances.sort_unstable_by(f64::total_cmp);
     misses.sort_unstable_by(f64::total_cmp);
     let distance = distances[distances.len() / 2];
-    // Nine in ten cameras must see the focus roughly in the middle third of their images.
+    // The axes of nine in ten cameras must pass the focus within half the median distance, that is, about 30°.
     let miss = misses[misses.len() * 9 / 10];
     (miss < 0.5 * distance).then_some((focus, distance))
 }

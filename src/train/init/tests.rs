@@ -90,7 +90,7 @@ fn one_to_three_points_have_the_expected_scales() {
 }
 
 #[test]
-fn duplicates_are_merged_and_counted_and_break_nothing() {
+fn duplicate_and_non_finite_points_are_dropped_and_counted() {
     let mut points = scattered(50, 2);
     let alone = initialise(&points, 1000, 0, 0).unwrap().0;
     for _ in 0..300 {

@@ -1,8 +1,8 @@
 //! Image metrics (PSNR, SSIM, FLIP, LPIPS) and errors against a known surface ([`geometry`]).
 //!
-//! The image metrics compare a rendered image with a packed target, both in sRGB encoding, and sum
+//! The image metrics compare a rendered image with an 8-bit target, both in sRGB encoding, and sum
 //! in `f64`, so that results do not depend on the size of the image or the number of threads.
-//! Renders are clamped to `[0, 1]` first, as in a viewer. A target with coverage is composited on
+//! Renders are clamped to `[0, 1]` first, as in a viewer. A target with coverage (alpha) is composited on
 //! the background of the render. A mask weights the pixels. It also scales the error of the render
 //! before filtering, so that masked pixels do not affect their neighbours.
 
@@ -27,8 +27,8 @@ use rayon::{ThreadPool, ThreadPoolBuilder};
 
 use densify_core::image::Image8;
 
-/// Rows of pixels filtered together: few enough that their buffers take a few megabytes, and enough
-/// that rows filtered twice are less than half of the work.
+/// Rows of pixels filtered together: few enough that their buffers take a few megabytes, and so many
+/// that the rows around a block, which its neighbours filter as well, are less than half of the work.
 const BLOCK: usize = 32;
 /// Number of blocks filtered in parallel, so that memory does not grow with the number of processor cores. Blocks have
 /// their own threads, because the allocator keeps the buffers of every thread that ever filtered one.
@@ -38,8 +38,8 @@ static THREADS: LazyLock<Option<ThreadPool>> = LazyLock::new(|| {
     ThreadPoolBuilder::new().num_threads(threads).build().ok()
 });
 
-/// Memory for scoring an image of this width with a number of threads `[bytes]`: that of [`flip()`], which needs the
-/// most.
+/// Memory for scoring an image of this width with a number of threads `[bytes]`: that of [`flip()`], the metric that
+/// needs the most.
 pub fn scratch_bytes(width: u32, threads: usize) -> u64 {
     flip::bytes_per_block(u64::from(width)) * threads.min(PARALLEL_BLOCKS) as u64
 }

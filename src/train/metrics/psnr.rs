@@ -62,7 +62,7 @@ mod tests {
     }
 
     #[test]
-    fn renders_are_compared_as_they_are_shown() {
+    fn psnr_between_clamps_the_renders() {
         assert!((psnr_between(&[0.5, 0.1], &[0.4, 0.2]) - 20.0).abs() < 1e-5);
         assert!(psnr_between(&[1.5, 0.1], &[1.0, 0.1]).is_infinite());
     }

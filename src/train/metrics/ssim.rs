@@ -3,7 +3,7 @@
 //! Gaussian window with σ = 1.5 px, zeros beyond the border, each colour channel by itself,
 //! mean over all pixels and channels.
 //!
-//! The textbook formula cancels badly where the images are flat. With e = x − y it is exactly
+//! The textbook formula cancels badly where the images are flat. With e = x − y, an equivalent form is
 //!
 //! > SSIM = (1 − μe² / (μx² + μy² + C₁)) · (1 − Var e / (Var x + Var y + C₂)),
 //!
@@ -239,8 +239,8 @@ mod tests {
     }
 
     #[test]
-    fn flat_images_a_hair_apart_stay_below_one() {
-        // Half an ulp of f32 from 153/255. The textbook formula in f32 reports 1.0000046 here.
+    fn nearly_equal_flat_images_do_not_exceed_one() {
+        // The render, 0.6 in f32, is within half an ulp of 153/255. The textbook formula in f32 reports 1.0000046 here.
         let target = flat(64, 64, 153);
         let rendered = vec![0.6; 64 * 64 * 3];
         let measured = ssim(&rendered, &target, [0.0; 3]).unwrap();
@@ -258,7 +258,7 @@ mod tests {
         }
         assert_eq!(ssim(&rendered, &target, [0.0; 3]), Ok(before));
 
-        // With the ignored pixels equal to the target's, the mask only chooses what is averaged.
+        // If the ignored pixels equal the target's, the mask only selects the pixels that are averaged.
         let (mut x, y) = (clamped(&rendered), unpacked(&target));
         let is_masked = |i: usize| mask[i / 3] == 0;
         (0..1200).filter(|&i| is_masked(i)).for_each(|i| x[i] = y[i]);

@@ -45,7 +45,7 @@ impl FolderLock {
             // The previous holder may have removed the file in the meantime.
             if is_at(&file, &path) {
                 let number = std::process::id().to_string();
-                // The lock works without the id, too.
+                // The lock works even if the id cannot be written.
                 let _ = file.set_len(0).and_then(|()| file.write_all(number.as_bytes()));
                 return Ok(Self { path, file: Some(file) });
             }

@@ -1,4 +1,4 @@
-//! Writes and reads the folder of a run. Files in it are never incomplete.
+//! Writes and reads the folder of a run, whose files are never incomplete.
 //!
 //! ```text
 //! RUN/
@@ -10,7 +10,7 @@
 //!   stats/train.jsonl  events.jsonl  summary.json  requirements.json
 //!   results.json  per_view.json                  test scores in the format of the original trainer
 //!   geometry.json                                errors against a known surface
-//!   events.out.tfevents.*                        the same curves for TensorBoard
+//!   events.out.tfevents.*                        loss, rows and test scores for TensorBoard
 //! ```
 //!
 //! A file appears under its name only when it is complete ([`densify_core::files::write_atomically`]). The two logs and

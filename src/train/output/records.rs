@@ -39,7 +39,7 @@ impl RecordLog {
     }
 
     /// Continues a log, truncated to the length that it had at the checkpoint. Also returns whether the log was still that
-    /// long; missing records stay missing.
+    /// long; records that it had lost are not restored.
     ///
     /// # Errors
     /// [`FileError::Io`].
@@ -61,7 +61,7 @@ impl RecordLog {
             file.seek(SeekFrom::End(0))?;
             Ok(there >= bytes)
         };
-        let whole = cut().map_err(FileError::io("cut", path))?;
+        let whole = cut().map_err(FileError::io("truncate", path))?;
         Ok((Self { file, path: path.to_owned() }, whole))
     }
 
@@ -96,7 +96,7 @@ pub struct StepRecord {
     pub step: u32,
     /// Mean loss 0.8·L1 + 0.2·(1 − SSIM) over the steps since the last record.
     pub loss: f32,
-    /// Mean |I − G| over the same steps.
+    /// Mean absolute difference between rendering and photograph over the same steps.
     pub l1: f32,
     /// Mean structural similarity over the same steps.
     pub ssim: f32,
@@ -115,7 +115,7 @@ pub struct Summary {
     pub densify: String,
     /// The policy's name.
     pub policy: String,
-    /// The run reached its last step.
+    /// True if the run reached its last step.
     pub finished: bool,
     /// Steps done.
     pub iterations: u32,
@@ -137,7 +137,8 @@ pub struct Summary {
     pub ledger: Ledger,
     /// Wall time of all steps `[s]`.
     pub seconds: f64,
-    /// Total wall time of each stage, of the policy's events, of rendering views for them, and of waiting for images `[s]`.
+    /// Total wall time `[s]` of each stage, of the policy's events, of rendering views for these events, and of waiting
+    /// for images.
     pub stage_seconds: BTreeMap<String, f64>,
     /// CPU time of all steps, summed over the threads `[s]`, if known.
     pub cpu_seconds: Option<f64>,

@@ -53,7 +53,7 @@ impl TensorBoard {
         }
         let file = OpenOptions::new().append(true).open(&path);
         let cut = file.and_then(|file| file.set_len(bytes).map(|()| file));
-        Ok(Self { file: cut.map_err(FileError::io("cut", &path))?, path })
+        Ok(Self { file: cut.map_err(FileError::io("truncate", &path))?, path })
     }
 
     /// Syncs the file to disk; returns its name and length `[bytes]`.
@@ -89,7 +89,7 @@ fn wall_time() -> f64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64())
 }
 
-/// A TFRecord: length, its checksum, data, its checksum (little-endian).
+/// A TFRecord: length, checksum of the length, data, checksum of the data (little-endian).
 fn record(data: &[u8]) -> Vec<u8> {
     let length = (data.len() as u64).to_le_bytes();
     let mut out = Vec::with_capacity(data.len() + 16);
@@ -159,7 +159,7 @@ mod tests {
     #[test]
     fn the_first_record_has_the_signature_of_event_files() {
         let first = record(&version_event(1.7e9));
-        // Length 24, its checksum, then the tag of a double: the signature of event files.
+        // Length 24, checksum of the length, then the tag of a double: the signature of event files.
         assert_eq!(&first[..13], b"\x18\0\0\0\0\0\0\0\xa3\x7fK\"\x09");
         assert_eq!(&first[21..36], b"\x1a\x0dbrain.Event:2");
     }

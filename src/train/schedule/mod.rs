@@ -1,9 +1,9 @@
 //! Schedules of a run: step sizes, spherical-harmonic degree, view order, background.
 //!
-//! All are pure functions of their arguments, so that a run can be reproduced, or resumed at any step without replaying
-//! the steps before. Constants are those of Kerbl et al., *3D Gaussian Splatting for Real-Time Radiance Field Rendering*
-//! (SIGGRAPH 2023), section 5 and its published code, for a run of 30,000 steps; they are scaled in proportion to the
-//! length of a run.
+//! Every schedule is a pure function of its arguments, so that a run can be reproduced, or resumed at any step without
+//! replaying the earlier steps. Constants are those of Kerbl et al., *3D Gaussian Splatting for Real-Time Radiance
+//! Field Rendering* (SIGGRAPH 2023), section 5 and its published code, for a run of 30,000 steps; they are scaled in
+//! proportion to the length of a run.
 
 use std::fmt;
 use std::str::FromStr;
@@ -39,7 +39,7 @@ pub struct RateOptions {
     pub sh_dc: f32,
     /// Spherical-harmonic coefficients of bands 1–3, ≥ 0.
     pub sh_rest: f32,
-    /// Log-scales at the end of the run, > 0. For this and the next four, `None` means the same as at the start.
+    /// Log-scales at the end of the run, > 0. For this and the next four fields, `None` means the same as at the start.
     pub log_scale_end: Option<f32>,
     /// Quaternions at the end of the run.
     pub quat_end: Option<f32>,
@@ -102,8 +102,8 @@ impl RateOptions {
         Self { boost, sh_rest: published.sh_rest * boost.min(2.0) as f32, ..published }
     }
 
-    /// The final step sizes for the whole run, for models that are trained already: larger steps would cost them 4 to 6 dB
-    /// at first.
+    /// The final step sizes for the whole run, for models that are trained already: larger steps would cost such models
+    /// 4 to 6 dB at first.
     #[must_use]
     pub fn fine(self) -> Self {
         Self {
@@ -123,7 +123,7 @@ impl RateOptions {
         }
     }
 
-    /// These step sizes, with those that a policy overrides.
+    /// These step sizes, replaced where a policy overrides them.
     #[must_use]
     pub fn with(self, overrides: &RateOverrides) -> Self {
         let mut rates = self;
@@ -256,7 +256,7 @@ impl Background {
         }
     }
 
-    /// The background for evaluation, which is black if training uses random ones.
+    /// The background for evaluation, which is black if training uses random backgrounds.
     pub fn fixed(self) -> [f32; 3] {
         match self {
             Self::Black | Self::Random => [0.0; 3],

@@ -36,12 +36,12 @@ impl<V: ViewSource> Trainer<V> {
         EditPlan::new(rows, budget)
     }
 
-    /// The current limit of rows, including frozen ones.
+    /// The current limit on the number of rows, including frozen ones.
     pub(super) fn row_budget(&self) -> RowBudget {
         RowBudget { total: self.row_limit(), frozen: self.options.frozen }
     }
 
-    /// Number and limit of rows as policies see them, without frozen rows.
+    /// Number of rows and its limit, both as policies see them: without frozen rows.
     pub(super) fn trained_rows_and_budget(&self) -> (usize, usize) {
         let budget = self.row_budget();
         (budget.trained(self.backend.rows()), budget.trainable())
@@ -81,7 +81,7 @@ impl<V: ViewSource> Trainer<V> {
         let reason = if ops.rows_before != rows || ops.budget != budget {
             let RowOps { rows_before, budget: planned, .. } = ops;
             format!(
-                "made for {rows_before} rows of {planned}, but the model has {rows} of {budget}"
+                "made for {rows_before} rows and a budget of {planned}, not for {rows} and {budget}"
             )
         } else if let Err(broken) = ops.check() {
             broken.to_string()

@@ -100,8 +100,8 @@ impl<V: ViewSource> Trainer<V> {
         })
     }
 
-    /// Enables automatic choices, before the first step. For choosing the number of rows the backend must have been made
-    /// with [`growth_signals`], too.
+    /// Enables automatic choices, before the first step. To choose the number of rows, the backend must also have been
+    /// created with [`growth_signals`].
     #[must_use]
     pub fn with_auto_choices(mut self, choices: AutoChoices) -> Self {
         if choices.rows {
@@ -115,7 +115,8 @@ impl<V: ViewSource> Trainer<V> {
         self
     }
 
-    /// Enables learning of exposures from initial ones, before the first step. The backend must have been made for it.
+    /// Enables learning of exposures from initial ones, before the first step. The backend must have been created for
+    /// exposures.
     ///
     /// # Panics
     /// When the number of exposures is not that of views, which is a bug in the caller.
@@ -210,7 +211,7 @@ impl<V: ViewSource> Trainer<V> {
         Err(self.policy_error(step, PolicyError::Other(error)))
     }
 
-    /// The policy's terms of the loss and noise of the means at this step.
+    /// The policy's loss terms, and its noise on the means, at this step.
     fn terms(&self, step: u32) -> Result<(LossTerms, Option<NoiseTerm>), TrainError> {
         let Needs { loss_terms, noise, .. } = self.needs;
         let (terms, noise) = self.ask_policy(step, |policy| {
@@ -221,7 +222,7 @@ impl<V: ViewSource> Trainer<V> {
         Ok((terms, noise))
     }
 
-    /// Asks the policy a question that cannot fail, except by a panic.
+    /// Asks the policy a question that can fail only by a panic.
     fn ask_policy<T>(
         &self,
         step: u32,

@@ -33,7 +33,7 @@ impl<V: ViewSource> Trainer<V> {
                 plan.prune_all(trained);
                 self.execute(step, plan)
             }
-            // Frozen rows never change, so that non-finite values in them mean an error elsewhere.
+            // Frozen rows never change, so non-finite values in them mean an error elsewhere.
             None => Err(TrainError::NonFinite { step, count, rows, first: first.to_string() }),
         }
     }

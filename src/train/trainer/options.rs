@@ -15,7 +15,8 @@ pub struct TrainOptions {
     pub sh_degree: u8,
     /// Number of rows at the front of the model that never change and are hidden from policies.
     pub frozen: usize,
-    /// The degree is used from the first step on, as for models that are trained already; otherwise it rises from 0.
+    /// True if `sh_degree` is used from the first step on, as for models that are trained already; otherwise the degree
+    /// rises from 0.
     pub has_all_bands: bool,
     /// Background colour.
     pub background: Background,

@@ -12,7 +12,7 @@ use densify_core::camera::Camera;
 use densify_core::image::SharedImage;
 use densify_data::views::ViewSource;
 
-/// Smallest side of shrunk images, as nothing could be learned from smaller ones `[px]`.
+/// Smallest side of shrunk images `[px]`, because nothing could be learned from smaller ones.
 const MIN_SIDE: u32 = 16;
 
 impl<V: ViewSource> Trainer<V> {
@@ -53,7 +53,7 @@ mod tests {
         assert_eq!(shrunk((256, 192), 0.3), (76, 57));
         assert_eq!(shrunk((100, 50), 0.7), (70, 35));
         assert_eq!(shrunk((256, 192), 1.0), (256, 192));
-        // 16 / 64 of both.
+        // Both sides times 16 / 64.
         assert_eq!(shrunk((256, 64), 0.1), (64, 16));
         assert_eq!(shrunk((9, 300), 0.1), (9, 300));
     }

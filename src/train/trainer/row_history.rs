@@ -1,5 +1,5 @@
 //! Records when each row was created and last edited, for display only. (The optimiser's step counts per row do not
-//! distinguish creation from edits, and plans may keep them.)
+//! distinguish creation from edits, and plans may leave them unchanged.)
 
 use densify_policies::plan::{ParentFate, RowOps};
 
@@ -14,7 +14,7 @@ impl RowHistory {
     /// Memory per row of the budget `[bytes]`.
     pub const BYTES: u64 = 2 * size_of::<u32>() as u64;
 
-    /// The history of rows whose creation is unknown and taken to be their last edit. It has room for `budget` rows.
+    /// The history of rows whose creation is unknown and assumed to be their last edit. It has room for `budget` rows.
     pub fn from_edits(edited: &[u32], budget: usize) -> Self {
         let with_room = || {
             let mut steps = Vec::with_capacity(budget);

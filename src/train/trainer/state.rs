@@ -23,11 +23,11 @@ pub struct TrainerState {
     pub initial_rows: usize,
     /// Largest number of rows so far, including those during edits.
     pub peak_rows: usize,
-    /// Number of renderings so far in addition to one per step: views measured for the policy or the automatic budget.
+    /// Number of views rendered so far for the policy or the automatic budget, in addition to one per step.
     pub extra_forwards: u64,
     /// Wall time of all policy events so far: signals, plan and execution.
     pub policy_time: Duration,
-    /// The part of it that was spent on rendering views.
+    /// The part of `policy_time` that was spent on rendering views.
     pub views_time: Duration,
     /// All edits so far.
     pub events: Vec<EditEvent>,
@@ -67,7 +67,7 @@ impl<V: ViewSource> Trainer<V> {
         matches.map_err(PolicyError::Other)?;
         self.scene.initial_rows = state.initial_rows;
         state.peak_rows = state.peak_rows.max(self.state.peak_rows);
-        // As after `next_view`: at the end of an epoch only the next order exists, within one both orders do.
+        // As after `next_view`: at the end of an epoch only the next order exists; within an epoch both orders do.
         let count = self.views.count();
         let (epoch, place) = (state.step / count as u32, state.step as usize % count);
         let order = |epoch| schedule::view_order(count, self.options.seed, epoch);

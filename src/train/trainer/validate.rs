@@ -22,7 +22,7 @@ pub(super) fn check_options(
     }
     if options.iterations == 0 || options.iterations != scene.iterations {
         let (here, there) = (options.iterations, scene.iterations);
-        return bad(format!("{here} iterations (scene: {there}); both must be equal, >= 1"));
+        return bad(format!("{here} iterations (scene: {there}); both must be equal and >= 1"));
     }
     if !(scene.extent.is_finite() && scene.extent > 0.0) {
         return bad(format!("the scene's extent is {}; it must be positive", scene.extent));

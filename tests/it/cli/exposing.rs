@@ -106,10 +106,10 @@ fn one_stop_of_jitter_enables_exposures_for_every_seed() {
     };
     for seed in [3, 6, 8] {
         let stdout = decision(seed, "1");
-        assert!(stdout.contains("exposure on (auto): by the colours"), "{seed}: {stdout}");
+        assert!(stdout.contains("exposure on (auto): judged by the colours"), "{seed}: {stdout}");
     }
     let stdout = decision(3, "0");
-    assert!(stdout.contains("exposure off (auto): by the colours"), "{stdout}");
+    assert!(stdout.contains("exposure off (auto): judged by the colours"), "{stdout}");
 }
 
 /// Jitter costs less than half a decibel. Measured: 32.93 dB without jitter, 32.68 dB with `auto`, 28.56 dB with `off`.
@@ -150,7 +150,7 @@ fn undecided_auto_equals_off() {
     assert!(!stdout.contains("exposure"), "{stdout}");
     assert_eq!(config(&off)["exposure"].as_str(), Some("off"));
     let (_auto, auto, stdout) = run("--exposure auto");
-    assert!(stdout.contains("exposure off (auto): fewer than 500 points"), "{stdout}");
+    assert!(stdout.contains("off (auto): undecided, because fewer than 500 points"), "{stdout}");
     assert!(model(&off, ITERATIONS) == model(&auto, ITERATIONS));
     assert!(read(&off.join("results.json")) == read(&auto.join("results.json")));
     // The name of the TensorBoard file contains the start time.
@@ -185,7 +185,7 @@ fn auto_detects_differing_exposures_before_training() {
         assert_eq!(factors.is_object(), jitter == "1", "{factors}");
         let flags = "--exposure auto --eval --backend cpu --budget 2k";
         let outcome = train(&folder, &run, 3, flags).ok();
-        let stdout = format!("exposure {word} (auto): by the colours of");
+        let stdout = format!("exposure {word} (auto): judged by the colours of");
         assert!(outcome.stdout.contains(&stdout), "{}", outcome.stdout);
         let report = json(&run.join("stats/requirements.json"));
         assert_eq!(report["exposures"], word == "on", "{report}");

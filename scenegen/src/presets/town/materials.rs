@@ -1,5 +1,5 @@
 //! Materials of a town. Each image covers some metres and repeats; colours that vary between houses are factors
-//! on it.
+//! on the image.
 
 use glam::{DVec2, Vec3, Vec4, dvec2};
 
@@ -22,7 +22,7 @@ pub(super) struct Walls {
     pub(super) plain: u32,
 }
 
-/// All materials, by their use.
+/// All materials, by their use. Sizes are the area that an image covers.
 #[derive(Debug, Clone)]
 pub(super) struct Materials {
     /// 12 x 12 m.
@@ -192,7 +192,7 @@ fn of_tint(model: &mut Model, images: [TextureRef; 3], tint: [f32; 3]) -> Walls 
     Walls { ground, upper, plain }
 }
 
-/// The colour of a bay of a wall, with a window whose width is a share of the bay's, or a door. `at` is the
+/// The colour of a bay of a wall with a door, or with a window of `width` times the bay's width. `at` is the
 /// position in the image; y of `within` is the position within the floor.
 fn bay(at: DVec2, within: DVec2, pattern: WallPattern, width: f64, with_door: bool) -> Vec3 {
     let (number, floor) = ((at.x * f64::from(BAYS)).floor(), (at.y * f64::from(BAYS)).floor());

@@ -1,4 +1,4 @@
-//! `town`: streets, houses and trees of a given size: `town:4` has 4 x 4 blocks.
+//! `town`: streets, houses and trees. The size is the number of blocks along a side: `town:4` has 4 x 4 blocks.
 //!
 //! The ground is flat at y = 0. Streets 11 m wide, including 2 m of pavement on each side, run along x and z
 //! every 50 m, around every block and around the town; the centre of the town is the origin. Blocks are
@@ -71,7 +71,7 @@ fn build(size: u32, seed: u64) -> Staging {
     town.ground(size);
     for block in 0..size * size {
         let (column, row) = (block % size, block / size);
-        let middle = dvec3(crossing(size, column), 0.0, crossing(size, row));
+        let middle = dvec3(street_at(size, column), 0.0, street_at(size, row));
         let middle = middle + 0.5 * PITCH * (DVec3::X + DVec3::Z);
         let turn = u64::from(block + row / 2) + seed;
         let mut draws = Draws::new(seed, &[0x62_6c6f_636b, u64::from(column), u64::from(row)]);
@@ -84,7 +84,7 @@ fn build(size: u32, seed: u64) -> Staging {
     town.furnish_streets(size, seed);
     town.plant_meadow(size, seed);
     let blocks = size * size;
-    let edge = crossing(size, size) + STREET;
+    let edge = street_at(size, size) + STREET;
     let diagonal = 2.0 * (edge + MEADOW) * 2.0_f64.sqrt();
     let rig = Rig {
         kind: RigKind::Survey,
@@ -108,15 +108,15 @@ fn build(size: u32, seed: u64) -> Staging {
 }
 
 /// Position of the centre line of the `i`-th of `size + 1` parallel streets.
-fn crossing(size: u32, i: u32) -> f64 {
+fn street_at(size: u32, i: u32) -> f64 {
     PITCH * (f64::from(i) - 0.5 * f64::from(size))
 }
 
 /// Both ends of each street's centre line, alternately along x and along z.
 fn streets(size: u32) -> impl Iterator<Item = [DVec3; 2]> {
-    let end = crossing(size, size);
+    let end = street_at(size, size);
     (0..=size).flat_map(move |i| {
-        let at = crossing(size, i);
+        let at = street_at(size, i);
         let ends = |along: DVec3, across: DVec3| [-end, end].map(|way| way * along + at * across);
         [ends(DVec3::X, DVec3::Z), ends(DVec3::Z, DVec3::X)]
     })
@@ -193,7 +193,7 @@ impl Town {
         let Materials { street, street_across, crossing: crossed, grass, .. } = self.materials;
         for column in 0..=size {
             for row in 0..=size {
-                let at = dvec3(crossing(size, column), 0.0, crossing(size, row));
+                let at = dvec3(street_at(size, column), 0.0, street_at(size, row));
                 self.level(at, [STREET; 2], [1.0; 2], crossed);
                 if row < size {
                     let middle = at + 0.5 * PITCH * DVec3::Z;
@@ -205,7 +205,7 @@ impl Town {
                 }
             }
         }
-        let edge = crossing(size, size) + STREET;
+        let edge = street_at(size, size) + STREET;
         let (out, half) = (edge + 0.5 * MEADOW, 0.5 * MEADOW);
         for sign in [-1.0, 1.0] {
             let times = [(2.0 * edge + 2.0 * MEADOW) / 12.0, MEADOW / 12.0];

@@ -3,7 +3,7 @@
 use glam::{DVec3, dvec3};
 
 use super::houses::{between, one_of};
-use super::{BLOCK, LocalFrame, MEADOW, PITCH, STREET, Town, crossing};
+use super::{BLOCK, LocalFrame, MEADOW, PITCH, STREET, Town, street_at};
 use crate::random::Draws;
 
 /// Distance of parked cars from the street's centre line.
@@ -64,7 +64,7 @@ impl Town {
     pub(super) fn furnish_streets(&mut self, size: u32, seed: u64) {
         for column in 0..=size {
             for row in 0..=size {
-                let at = dvec3(crossing(size, column), 0.0, crossing(size, row));
+                let at = dvec3(street_at(size, column), 0.0, street_at(size, row));
                 let parts = [(row < size, DVec3::Z), (column < size, DVec3::X)];
                 for (_, ahead) in parts.into_iter().filter(|(exists, _)| *exists) {
                     let key = [u64::from(column), u64::from(row), u64::from(ahead.x > 0.0)];
@@ -78,7 +78,7 @@ impl Town {
         }
     }
 
-    /// The right side of a street section between two crossings.
+    /// Cars and a lamp on the right side of a street section between two crossings.
     fn furnish(&mut self, street: &LocalFrame, draws: &mut Draws) {
         for slot in 0..5 {
             let ahead = 7.0 * (f64::from(slot) - 2.0) + between(draws, -0.6, 0.6);
@@ -107,7 +107,7 @@ impl Town {
     /// Trees around the town.
     pub(super) fn plant_meadow(&mut self, size: u32, seed: u64) {
         let mut draws = Draws::new(seed, &[0x6d65_6164_6f77]);
-        let edge = crossing(size, size) + STREET;
+        let edge = street_at(size, size) + STREET;
         for front in [DVec3::Z, DVec3::X, DVec3::NEG_Z, DVec3::NEG_X] {
             let side = LocalFrame::facing(DVec3::ZERO, front);
             for tree in 0..3 * size {

@@ -14,7 +14,7 @@ pub(super) use rendered::{load, surface_bytes};
 /// Prefix of the paths of built-in scenes.
 pub(crate) const PREFIX: &str = "scene:";
 
-/// The name of a built-in scene, if the path is one.
+/// The name of the built-in scene that a path stands for; `None` for other paths.
 pub fn name(path: &Path) -> Option<&str> {
     path.to_str()?.strip_prefix(PREFIX)
 }

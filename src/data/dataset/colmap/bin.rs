@@ -120,7 +120,7 @@ impl<'a> Reader<'a> {
         text.map_err(|_| self.fault_with_remedy(RENAME, field, "the name is not UTF-8"))
     }
 
-    fn end(&self, field: &str, count: u64) -> Result<(), LoadError> {
+    fn expect_end(&self, field: &str, count: u64) -> Result<(), LoadError> {
         if self.left == 0 {
             return Ok(());
         }
@@ -146,7 +146,7 @@ pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, Lens>, LoadError> {
             return Err(reader.fault(&field, "the id occurs twice"));
         }
     }
-    reader.end("cameras", count)?;
+    reader.expect_end("cameras", count)?;
     Ok(cameras)
 }
 
@@ -177,7 +177,7 @@ pub(super) fn images(path: &Path) -> Result<Vec<Image>, LoadError> {
         reader.skip(&field, observations, 24)?;
         images.push(Image::checked(path, id, name, camera, q, t)?);
     }
-    reader.end("images", count)?;
+    reader.expect_end("images", count)?;
     Ok(images)
 }
 
@@ -215,6 +215,6 @@ pub(super) fn points(
         points.positions.push(position);
         points.colours.push(colour);
     }
-    reader.end("points", count)?;
+    reader.expect_end("points", count)?;
     Ok(points)
 }

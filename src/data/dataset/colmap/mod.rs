@@ -24,7 +24,7 @@ pub(super) const FORMAT: DatasetFormat = DatasetFormat {
     name: "colmap",
     title: "COLMAP",
     file: "sparse/0/cameras.bin",
-    files: "sparse/0/cameras.bin or .txt, also with another number or none, or below colmap/",
+    files: "sparse/0/cameras.bin or .txt, with any number or none in place of 0, also below colmap/",
     read,
 };
 
@@ -82,7 +82,8 @@ fn is_model(folder: &Path) -> bool {
     files.iter().any(|name| folder.join(name).is_file())
 }
 
-/// The models of a dataset, relative to its folder: COLMAP numbers them, as images may not all be connected.
+/// The folders of a dataset's models, relative to the dataset. COLMAP writes several models, numbered from 0, if not all
+/// images are connected.
 fn models(root: &Path) -> Vec<String> {
     for parent in PARENTS {
         let entries = fs::read_dir(root.join(parent)).into_iter().flatten().flatten();
@@ -100,7 +101,7 @@ fn models(root: &Path) -> Vec<String> {
     Vec::new()
 }
 
-/// The model to read, and those that are not: the user's choice, or the first of those with the most images.
+/// The model to read (the user's choice, or the first of those with the most images) and a note about the other models.
 #[derive(Debug)]
 struct Choice {
     folder: PathBuf,
@@ -123,7 +124,7 @@ fn choose(root: &Root, chosen: Option<&Path>) -> Result<Option<Choice>, LoadErro
         return Ok(Some(Choice { root: Root::new(&folder)?, folder, others: None }));
     }
     let several = models.len() > 1;
-    // A single model is not counted, as it is read anyway.
+    // The images of a single model need not be counted, as there is nothing to choose.
     let count = |model: &String| if several { image_count(root, model) } else { Ok(0) };
     let counts = models.iter().map(count).collect::<Result<Vec<u64>, _>>()?;
     let mut counted: Vec<(String, u64)> = models.into_iter().zip(counts).collect();
@@ -150,10 +151,10 @@ fn image_count(root: &Root, model: &str) -> Result<u64, LoadError> {
     }
 }
 
-/// The path of a model's file, which may not be a link out of `root`: binary, if there is one, else text.
+/// The path of a model's file: the binary file if it exists, otherwise the text file. It may not be a link out of `root`.
 fn file(root: &Root, folder: &Path, name: &str) -> Result<PathBuf, LoadError> {
     let [binary, text] = ["bin", "txt"].map(|ending| folder.join(format!("{name}.{ending}")));
-    // A missing file is one of the kind that the others are.
+    // If neither exists, the kind of the model's other files decides which path is returned.
     let others = ["cameras.bin", "images.bin"].map(|name| folder.join(name));
     let is_binary = binary.is_file() || !text.is_file() && others.iter().any(|file| file.is_file());
     let path = if is_binary { binary } else { text };
@@ -232,7 +233,7 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
     }))
 }
 
-/// The paths and contents of a model's three files. One without points need not have their file.
+/// The paths and contents of a model's three files. The file of the points may be missing.
 fn model(
     Choice { folder, root, .. }: &Choice,
     with_tracks: bool,
@@ -252,8 +253,8 @@ fn model(
     Ok(([cameras, images, points], Model { cameras: lenses, images: posed, points: cloud, tracks }))
 }
 
-/// Adds the tracks of the COLMAP model in a folder to a scene of another format, if the images that both list have the
-/// same poses, as `densify scenegen` writes them. Otherwise the model is ignored, as it may belong to another scene.
+/// Adds the tracks of the COLMAP model in a folder to a scene of another format, if the images listed in both formats have
+/// the same poses, as in datasets that `densify scenegen` writes. Otherwise the model is ignored, as it may belong to another scene.
 pub(super) fn adopt_tracks(root: &Root, scene: &mut Scene) {
     let Ok(Some(choice)) = choose(root, None) else { return };
     let Ok((_, model)) = model(&choice, true) else { return };

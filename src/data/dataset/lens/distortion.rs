@@ -77,8 +77,8 @@ impl Distortion {
         ])
     }
 
-    /// The point of the plane that is distorted to `target`; `None` if no such point lies within `reach` of the centre,
-    /// which is at most the invertible radius.
+    /// The point of the plane that is distorted to `target`; `None` if no such point lies within `reach` of the centre.
+    /// `reach` may not exceed the invertible radius.
     pub(crate) fn inverse(&self, target: DVec2, reach: f64) -> Option<DVec2> {
         let mut p = target.clamp_length_max(reach);
         let mut miss = self.apply(p) - target;

@@ -2,20 +2,20 @@
 //!
 //! A map is injective on a disc if the symmetric part of its Jacobian is positive definite there: on the segment from
 //! one point to another, the image moves strictly in the direction of the segment. On a circle of radius r the radial
-//! part has the eigenvalues q and (r·q)′, where q is its factor; the tangential terms p reduce them by at most 6|p|·r
+//! part has the eigenvalues q and (r·q)′, where q is the radial factor; the tangential terms p reduce them by at most 6|p|·r
 //! and the thin-prism terms b by at most 2|b|·r. The distortion is therefore invertible up to the first radius at which
 //! the smaller eigenvalue no longer exceeds the total reduction t.
 //!
-//! With q = N/M, polynomials in s = r², the condition is that M, N − t·M and (N + 2sN′)·M − 2s·N·M′ − t·M² are
-//! positive. Each is bounded from below on whole intervals, so that no point between samples is missed: with the
+//! With q = N/M, where N and M are polynomials in s = r², the condition is that M, N − t·M and (N + 2sN′)·M − 2s·N·M′ − t·M² are
+//! positive. Each is bounded from below on whole intervals, so that no radius is skipped: with the
 //! variable counted from the start of the interval, a polynomial is at least its constant coefficient plus its negative
 //! terms at the end of the interval.
 
 use super::Distortion;
 
-/// Smallest accepted eigenvalue: a lens that shrinks its image a thousandfold shows nothing there.
+/// Smallest accepted eigenvalue: where a lens shrinks its image a thousandfold, the image shows nothing.
 const MIN_EIGENVALUE: f64 = 1e-3;
-/// Smallest step of the search, as a fraction of its range: a thousandth of a pixel if the image spans the range.
+/// Smallest step of the search, as a fraction of the range of r²: near the end of the range it is far below a pixel.
 const MIN_STEP: f64 = 1e-8;
 
 impl Distortion {
@@ -51,13 +51,13 @@ impl Distortion {
             }
             a
         };
-        // 2s·P′ has the coefficients 2k·c.
-        let twice = |p: &[f64]| -> Vec<f64> {
+        // If P has the coefficients cₖ, 2s·P′ has the coefficients 2k·cₖ.
+        let scaled_slope = |p: &[f64]| -> Vec<f64> {
             (0..).zip(p).map(|(power, c)| 2.0 * f64::from(power) * c).collect()
         };
-        let grows: Vec<f64> = n.iter().zip(twice(&n)).map(|(a, b)| a + b).collect();
+        let grows: Vec<f64> = n.iter().zip(scaled_slope(&n)).map(|(a, b)| a + b).collect();
         let mut slope = product(&grows, &m);
-        for (sum, value) in slope.iter_mut().zip(product(&n, &twice(&m))) {
+        for (sum, value) in slope.iter_mut().zip(product(&n, &scaled_slope(&m))) {
             *sum -= value;
         }
         let factor = minus_reduced(n, &m);
@@ -127,7 +127,7 @@ mod tests {
         // r + k r³ folds over at r² = −1/(3k).
         let fold = radius([-0.2, 0.0, 0.0, 0.0], [0.0; 3]);
         assert!((fold - (1.0 / 0.6_f64).sqrt()).abs() < 2e-3, "{fold}");
-        // r / (1 + k r²) folds over at r² = 1/k; a pole ends it too.
+        // r / (1 + k r²) folds over at r² = 1/k; a pole also ends the radius.
         let fold = radius([0.0; 4], [0.5, 0.0, 0.0]);
         assert!((fold - 2.0_f64.sqrt()).abs() < 5e-3, "{fold}");
         let pole = radius([0.0; 4], [-0.25, 0.0, 0.0]);

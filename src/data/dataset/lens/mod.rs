@@ -48,7 +48,7 @@ pub(crate) struct Lens {
 pub(crate) enum Unseen {
     /// The distortion has no inverse at the pixel.
     Folds,
-    /// The angle from the axis is larger than the supported one.
+    /// The angle from the axis is larger than the largest supported angle.
     TooWide,
 }
 

@@ -58,7 +58,7 @@ pub(crate) const MODELS: [LensModel; 11] = [
     model("THIN_PRISM_FISHEYE", 2, Equidistant, &[A(0), A(1), P(0), P(1), A(2), A(3), S(0), S(1)]),
 ];
 
-/// Models that are not supported, by number from that of the first (COLMAP 4, `sensor/models.h`).
+/// Unsupported models, whose numbers follow those of [`MODELS`] (COLMAP 4, `sensor/models.h`).
 const UNSUPPORTED: [&str; 7] = [
     "RAD_TAN_THIN_PRISM_FISHEYE",
     "SIMPLE_DIVISION",
@@ -85,14 +85,14 @@ pub(crate) const FISHEYE_FIELDS: [(&str, Term); 4] =
     [("k1", A(0)), ("k2", A(1)), ("k3", A(2)), ("k4", A(3))];
 
 impl LensModel {
-    /// The model with a name of COLMAP's text files.
+    /// The model with this name in COLMAP's text files.
     pub(crate) fn named(file: &Path, camera: &str, name: &str) -> Result<&'static Self, LoadError> {
         MODELS.iter().find(|model| model.name == name).ok_or_else(|| {
             LoadError::lens_model(file, camera, name, &MODELS.map(|model| model.name).join(", "))
         })
     }
 
-    /// The model with a number of COLMAP's binary files.
+    /// The model with this number in COLMAP's binary files.
     pub(crate) fn numbered(
         file: &Path,
         camera: &str,

@@ -12,9 +12,9 @@ use crate::dataset::undistort::{Pinhole, Undistortion};
 /// The pinhole cameras that replace a lens.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Pinholes {
-    /// Name and resampling of each; a single one has an empty name.
+    /// Name and resampling of each pinhole camera; a single camera has an empty name.
     pub(crate) faces: Vec<(&'static str, Undistortion)>,
-    /// Share of the photograph that none of them shows.
+    /// Share of the photograph that no pinhole camera shows.
     pub(crate) cropped: f64,
 }
 
@@ -32,13 +32,13 @@ pub(crate) enum PinholeError {
     Nothing,
 }
 
-/// Samples along a side of the photograph. Between samples, a smooth border that bends by 100 px is off by less than
-/// 100 px · (1/64)²/8, or 0.01 px.
+/// Samples along a side of the photograph. Between two samples, a border that bulges by 100 px over the whole side
+/// deviates from a straight line by 100 px · (1/64)², less than 0.03 px.
 const SAMPLES: u32 = 64;
 /// Cells along each side of a face that are tested for visibility.
 const CELLS: usize = 128;
-/// Steepest ray of a single pinhole, x/z: 65 degrees for a fisheye, 80 degrees for a distorted pinhole. At these angles
-/// cube faces are as good in narrow views but cost 4 dB in wide ones (docs/studies/wide-fisheyes.tsv).
+/// Steepest ray of a single pinhole, x/z: 65 degrees for a fisheye, 80 degrees for a distorted pinhole. Up to these
+/// angles, cube faces instead of a single pinhole cost 4 dB in views as wide as the lens's (docs/studies/wide-fisheyes.tsv).
 const STEEPEST: f64 = 2.15;
 const STEEPEST_PERSPECTIVE: f64 = 5.67;
 /// Smallest side of a face that becomes a view, x/z.
@@ -63,7 +63,7 @@ impl Pinholes {
     /// The pinhole cameras that cover the field of view of a lens.
     ///
     /// # Errors
-    /// When the distortion folds over within the image, unless `keep_fov` is set; when nothing is left.
+    /// When the distortion folds over within the image, unless `keep_fov` is set, or when no pinhole camera is left.
     pub(crate) fn covering(lens: &Lens, keep_fov: bool) -> Result<Self, PinholeError> {
         let seen = grid(lens);
         if !keep_fov && seen.iter().any(|(_, ray)| *ray == Err(Unseen::Folds)) {
@@ -107,7 +107,7 @@ impl Pinholes {
     }
 }
 
-/// The faces of a cube as rotations `lens_from_face`; the others share the edges of the front face.
+/// The faces of a cube as rotations `lens_from_face`: the front face and the four that share its edges.
 fn cube() -> [(&'static str, DMat3); 5] {
     let turned = |x, y, z| DMat3::from_cols(x, y, z);
     let (x, y, z) = (DVec3::X, DVec3::Y, DVec3::Z);

@@ -1,4 +1,4 @@
-//! Tests of lenses: projection against COLMAP's, round trips, and the pinholes that replace them.
+//! Tests of lenses: projection compared with COLMAP's, round trips, and the pinholes that replace lenses.
 
 use glam::{DVec2, DVec3};
 
@@ -137,7 +137,7 @@ fn every_lens_model_round_trips_a_grid() {
             let back = lens.project(ray).unwrap_or(DVec2::INFINITY);
             worst = worst.max(back.distance(pixel));
         }
-        // The other way, over the invertible field. 0.01 px is promised; only rounding remains.
+        // The other way, over the invertible field of view: only rounding errors remain.
         let half = 0.5 * lens.usable_field().to_radians();
         for (i, j) in (0..=80).flat_map(|i| (0..48).map(move |j| (i, j))) {
             let angle = half * f64::from(i) / 80.001;
@@ -156,7 +156,7 @@ fn every_lens_model_round_trips_a_grid() {
 #[test]
 fn folding_and_too_wide_lenses_are_not_inverted() {
     let folding = lens("OPENCV", &[210.0, 214.0, 150.0, 92.0, -1.0, 0.0, 0.0, 0.0]);
-    // r − r³ folds over at 0.577, which is 60 degrees both ways.
+    // r − r³ folds over at r = 0.577, 30 degrees from the axis: the usable field of view is 60 degrees.
     assert!((folding.usable_field() - 60.0).abs() < 0.2, "{}", folding.usable_field());
     assert_eq!(folding.unproject(DVec2::ZERO), Err(Unseen::Folds));
     assert_eq!(folding.project(DVec3::new(0.6, 0.0, 1.0)), None);
@@ -169,7 +169,7 @@ fn folding_and_too_wide_lenses_are_not_inverted() {
 }
 
 #[test]
-fn a_pinhole_sees_only_what_the_lens_saw_and_touches_every_side() {
+fn a_pinhole_sees_only_what_the_lens_saw_and_reaches_every_side_of_it() {
     for (name, lens) in lenses() {
         let pinholes = Pinholes::covering(&lens, false).unwrap();
         for (face, undistortion) in &pinholes.faces {
@@ -233,13 +233,14 @@ fn a_distortion_that_folds_over_is_refused_or_used_up_to_the_fold() {
         Pinholes::covering(&nan, false).is_err()
             && Pinholes::covering(&nan, true) == Err(PinholeError::Nothing)
     );
-    // An image whose axis lies outside, as in a crop, is still usable.
+    // An image that does not contain the optical axis, such as a crop, is still usable.
     let aside = lens("OPENCV", &[210.0, 214.0, -40.0, 92.0, 0.058, 0.0, 0.0, 0.0]);
     let pinholes = Pinholes::covering(&aside, false).unwrap();
     assert!(pinholes.faces.len() == 1 && pinholes.cropped < 0.15, "{pinholes:?}");
 }
 
-/// After undistortion, dots that were drawn at the lens's projection of known rays lie at the pinhole's projection.
+/// After undistortion, dots that were drawn at the lens's projections of known rays lie at the pinhole's projections of
+/// these rays.
 #[test]
 fn dots_land_where_pinholes_project_them() {
     for (name, lens) in lenses() {
@@ -269,7 +270,7 @@ fn dots_land_where_pinholes_project_them() {
                 let ray = undistortion.lens_from_pinhole.transpose() * *ray;
                 let pixel = ray.truncate() / ray.z * to.focal + to.principal;
                 let near = pixel.cmpgt(DVec2::splat(9.0)) & pixel.cmplt(size - 9.0);
-                // The stretch of a dot far from the axis moves its centre of mass.
+                // Far from the axis, undistortion stretches a dot, which moves its centre of mass.
                 if ray.z < 0.75 * ray.length() || !near.all() {
                     continue;
                 }

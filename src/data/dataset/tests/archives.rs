@@ -80,8 +80,14 @@ fn renamed(bytes: &[u8], old: &str, new: &str) -> Vec<u8> {
     bytes
 }
 
-/// Changes one byte of each file: at an offset in its own header and at one in the table of contents.
-fn in_headers(bytes: &[u8], own: usize, table: usize, change: impl Fn(&mut u8)) -> Vec<u8> {
+/// Changes one byte at the offset `own` of each file's own header, and one at the offset `table` of its entry in the table
+/// of contents.
+fn with_edited_headers(
+    bytes: &[u8],
+    own: usize,
+    table: usize,
+    change: impl Fn(&mut u8),
+) -> Vec<u8> {
     let mut bytes = bytes.to_vec();
     for at in 0..bytes.len() - 4 {
         if bytes[at..].starts_with(b"PK\x03\x04") {
@@ -238,10 +244,10 @@ fn unsafe_archives_are_refused() {
     refused("a link", &link, "images, symbolic link");
 
     let whole = packed(&Made::colmap_txt());
-    let encrypted = in_headers(&whole, 6, 8, |flags| *flags |= 1);
+    let encrypted = with_edited_headers(&whole, 6, 8, |flags| *flags |= 1);
     refused("encrypted", &encrypted, "images/a.png, encrypted, without a password");
-    let method = in_headers(&whole, 8, 10, |method| *method = 93);
-    refused("of a method that is not read", &method, "images/a.png, pack the folder again");
+    let method = with_edited_headers(&whole, 8, 10, |method| *method = 93);
+    refused("an unsupported method", &method, "images/a.png, pack the folder again");
 }
 
 #[test]
@@ -266,7 +272,7 @@ fn damaged_archives_are_refused() {
     refused("no dataset", &pack(&notes, "", CompressionMethod::Stored), "is not a dataset");
 }
 
-/// 65 MiB of zeros take about 64 KiB; the stated size may be false.
+/// 65 MiB of zeros are compressed to about 64 KiB; the size that the archive states may be false.
 #[test]
 fn bombs_are_refused_before_they_fill_the_disk() {
     let mut all = files(Made::colmap_txt().path());

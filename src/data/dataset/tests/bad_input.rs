@@ -58,15 +58,15 @@ const POINTS: &[Replacement] = &[(" 3 20 30", " 300 20 30", "points3D.txt, line 
 #[test]
 fn options_for_masks_need_masks() {
     let inverts = LoadOptions { invert_masks: true, ..LoadOptions::default() };
-    let carves = LoadOptions { mask_mode: MaskMode::Background, ..LoadOptions::default() };
-    for (options, words) in [(inverts, "inverted: true"), (carves, "inverted: false")] {
+    let background = LoadOptions { mask_mode: MaskMode::Background, ..LoadOptions::default() };
+    for (options, words) in [(inverts, "inverted: true"), (background, "inverted: false")] {
         let words = format!("images.txt, no photograph has a mask, {words}");
         refused("no mask", &Made::colmap_txt(), &options, &words);
     }
 }
 
 #[test]
-fn colmap_text() {
+fn faults_of_colmap_text_files_are_named() {
     for (file, cases) in
         [("cameras.txt", CAMERAS), ("images.txt", IMAGES), ("points3D.txt", POINTS)]
     {
@@ -159,14 +159,14 @@ const COLMAP_BINARY: &[Patch] = &[
     ("points3D", |b| b[51..59].fill(0xff), "points3D.bin, truncated"),
 ];
 
-/// Two parameters, as COLMAP writes them: the size once more.
+/// Makes the camera a panorama, whose two parameters repeat the image size, as COLMAP writes it.
 fn panorama(cameras: &mut Vec<u8>) {
     cameras[12] = 17;
     cameras.truncate(8 + 24 + 16);
 }
 
 #[test]
-fn colmap_binary() {
+fn faults_of_colmap_binary_files_are_named() {
     for (number, (file, edit, words)) in COLMAP_BINARY.iter().enumerate() {
         let made = Made::colmap_bin();
         made.patch(&format!("sparse/0/{file}.bin"), edit);
@@ -259,7 +259,7 @@ fn set(json: &mut Value, pointer: &str, value: &str) {
 }
 
 #[test]
-fn transforms() {
+fn faults_of_transforms_json_are_named() {
     let options = LoadOptions::default();
     for (pointer, value, words) in TRANSFORMS {
         let made = Made::transforms(|json| set(json, pointer, value));
@@ -314,7 +314,7 @@ fn transforms() {
 }
 
 #[test]
-fn folders_and_splits() {
+fn unusable_folders_and_splits_are_refused() {
     let empty = tempfile::tempdir().unwrap();
     for (path, word) in [("", "sparse/0/cameras.bin"), ("", "transforms.json"), ("none", "none")] {
         let loaded = Dataset::load(&empty.path().join(path), &LoadOptions::default());
@@ -336,7 +336,7 @@ fn folders_and_splits() {
 
 #[cfg(unix)]
 #[test]
-fn links_out_of_the_dataset() {
+fn links_out_of_the_dataset_are_refused() {
     let outside = tempfile::tempdir().unwrap();
     for name in densify_fixtures::NAMES {
         image(&outside.path().join(name), densify_fixtures::SIZE, 0);

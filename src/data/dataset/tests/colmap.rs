@@ -1,4 +1,4 @@
-//! Tests of COLMAP's models as they are found: several, without points, or written by other programs.
+//! Tests of unusual COLMAP models: several in one dataset, without points, or written by other programs.
 
 use std::fs;
 
@@ -6,7 +6,7 @@ use super::super::*;
 use super::{assert_noted, load, load_with, names, refused};
 use densify_fixtures::{Made, SIZE, image};
 
-/// Copies a model, with the first `images` of its images.
+/// Copies a model, but only the first `images` of its images.
 fn copy(made: &Made, from: &str, to: &str, images: usize) {
     fs::create_dir_all(made.file(to)).unwrap();
     for entry in fs::read_dir(made.file(from)).unwrap() {
@@ -47,7 +47,7 @@ fn the_largest_of_several_models_is_read() {
         let data = load_with(&made, &chosen);
         assert_eq!((names(&data.train), other_models(&data)), (vec!["a.png", "b.png"], None));
         assert_noted(&data, "sparse/2 has the poses of 2 of 3 images");
-        // Of equal ones the first is read, and no number is needed.
+        // Of models with equally many images the first is read, and no model needs the number 0.
         fs::remove_dir_all(made.file("sparse/0")).unwrap();
         copy(&made, "sparse/10", "sparse/9", 3);
         let others = vec![("sparse/2".to_owned(), 2), ("sparse/10".to_owned(), 3)];
@@ -95,7 +95,7 @@ fn a_model_may_have_no_points() {
     }
 }
 
-/// Programs leave out the lines of observations, or only the empty ones.
+/// Some programs leave out all lines of observations, others only the empty lines.
 #[test]
 fn images_may_have_no_line_of_observations() {
     for name in ["b.png", "b 2.png", "my b 2.png", "1 2 3 b.png"] {
@@ -132,16 +132,16 @@ fn photographs_without_a_pose_are_counted_wherever_they_are() {
     for file in ["Thumbs.db", ".hidden.png", "a.mask.png", "masks/d.png", ".cache/d.png"] {
         made.write(&format!("images/{file}"), "");
     }
-    write_names(&made);
+    respell_name(&made);
     assert_noted(&load(&made), "3 of 5 images, the others are not used");
-    // The dataset itself as the folder of photographs holds copies of them as well.
+    // If the dataset's own folder is chosen as the folder of photographs, its subfolders are not searched.
     let images = Some(".".into());
     for name in ["\u{e4}.png", "b.png", "c.png", "other.png"] {
         image(&made.file(name), SIZE, 0);
     }
     let data = load_with(&made, &LoadOptions { images, ..LoadOptions::default() });
     assert_noted(&data, "3 of 4 images");
-    // Only smaller photographs are there.
+    // Only reduced photographs exist.
     let made = Made::colmap_txt();
     fs::create_dir(made.file("images_2")).unwrap();
     for name in densify_fixtures::NAMES.iter().chain(&["d.png"]) {
@@ -153,8 +153,8 @@ fn photographs_without_a_pose_are_counted_wherever_they_are() {
     assert_noted(&data, "3 of 4 images");
 }
 
-/// Names in another Unicode spelling than that of the files are theirs.
-fn write_names(made: &Made) {
+/// Gives a file a name whose Unicode spelling differs from that in the list.
+fn respell_name(made: &Made) {
     fs::rename(made.file("images/a.png"), made.file("images/\u{e4}.png")).unwrap();
     made.replace("sparse/0/images.txt", "a.png", "a\u{308}.png");
 }

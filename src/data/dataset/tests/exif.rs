@@ -39,7 +39,7 @@ fn write_exif(path: &Path, fields: Vec<(Tag, Value)>) {
     sum.update(&chunk);
     let length = (chunk.len() as u32 - 4).to_be_bytes();
     let mut file = std::fs::read(path).unwrap();
-    // Signature and first chunk.
+    // The chunk is inserted after the signature and the first chunk.
     file.splice(33..33, [length.to_vec(), chunk, sum.sum().to_be_bytes().to_vec()].concat());
     std::fs::write(path, file).unwrap();
 }
@@ -168,7 +168,7 @@ fn write_turned_image(made: &Made, orientation: Option<u16>) {
 }
 
 #[test]
-fn a_photograph_that_lies_on_its_side_for_its_camera_is_turned() {
+fn a_photograph_that_lies_on_its_side_compared_with_its_camera_is_turned() {
     // Orientation 6 is a quarter turn clockwise, so that the upper side comes to the right; 8 is the opposite turn; 5
     // and 7 are also mirrored.
     let (upper, lower) = ([255, 0, 0], [0, 0, 255]);

@@ -46,7 +46,7 @@ fn the_model_may_lie_directly_under_sparse() {
 }
 
 #[test]
-fn splits() {
+fn an_option_or_the_dataset_decides_which_views_are_held_out() {
     let every = |k| LoadOptions {
         split: Split::Every(NonZeroU32::new(k).unwrap()),
         ..LoadOptions::default()
@@ -86,7 +86,7 @@ fn splits() {
     }
 }
 
-/// nerfstudio's lists, as letters of frames, and what is trained on, tested and noted.
+/// Each case has nerfstudio's lists (as letters of frames), the frames trained on and tested on, and words of the note.
 #[test]
 fn frames_are_split_as_their_lists_say() {
     let file = |letter: char| format!("images/{letter}.png");
@@ -123,14 +123,14 @@ fn frames_are_split_as_their_lists_say() {
                 assert_noted(&data, note);
             }
         }
-        // All frames take part in another split.
+        // If every K-th view is held out by option, the lists are ignored.
         let data = load_with(&made, &every);
         assert_eq!(names(&data.train), all("bc"));
         assert_eq!(names(&data.test), all("a"));
     }
 }
 
-/// Lists name frames as paths of any spelling, also those whose photograph is missing.
+/// Lists may spell the paths of frames in any way, also of frames whose photograph is missing.
 #[test]
 fn lists_and_frames_may_spell_paths_differently() {
     let made = Made::transforms(|json| {
@@ -154,7 +154,7 @@ fn lists_and_frames_may_spell_paths_differently() {
 }
 
 #[test]
-fn resolutions() {
+fn images_are_loaded_at_the_requested_resolution() {
     let options =
         |resolution| LoadOptions { resolution: Some(resolution), ..LoadOptions::default() };
     for made in [Made::colmap_txt(), Made::transforms(|_| ())] {
@@ -182,13 +182,13 @@ fn resolutions() {
         assert_eq!(data.train.iter().map(first).collect::<Vec<_>>(), [0, 7, 7]);
         assert!(data.train.iter().all(|view| view.camera.width == 10));
         assert_noted(&data, "images_2");
-        // It is not used for another divisor.
+        // The folder is not used for another divisor.
         assert_eq!(first(&load_with(&made, &options(Resolution::Divisor(4))).train[1]), 40);
     }
 }
 
 #[test]
-fn another_folder_of_images() {
+fn images_are_read_from_the_folder_that_is_named() {
     let elsewhere = tempfile::tempdir().unwrap();
     for made in [Made::colmap_txt(), Made::transforms(|_| ())] {
         for name in NAMES {
@@ -233,8 +233,8 @@ fn masks_are_found() {
         let data = load_with(&made, &inverted);
         let found = data.train[1].source.load().unwrap().mask.unwrap();
         assert_eq!((found[0], found[19]), (255, 0), "{mask}");
-        let carves = LoadOptions { mask_mode: MaskMode::Background, ..LoadOptions::default() };
-        let source = &load_with(&made, &carves).train[1].source;
+        let background = LoadOptions { mask_mode: MaskMode::Background, ..LoadOptions::default() };
+        let source = &load_with(&made, &background).train[1].source;
         let found = source.load().unwrap();
         let alpha = found.alpha.as_ref().unwrap();
         assert_eq!((alpha[0], alpha[19], &found.mask), (0, 255, &None), "{mask}");
@@ -243,7 +243,7 @@ fn masks_are_found() {
 }
 
 #[test]
-fn masks_of_no_photograph_are_named() {
+fn folders_whose_masks_belong_to_no_photograph_are_noted() {
     for file in ["masks/other.png", "images/masks/b.png", "segmentation/other.png"] {
         let made = Made::colmap_txt();
         image(&made.file(file), SIZE, 200);
@@ -271,7 +271,7 @@ fn dynamic_masks_are_found_beside_photographs() {
 /// Masks are in the dataset's `masks/` or beside the photographs, and are never taken for photographs.
 #[test]
 fn masks_are_found_in_the_folder_that_is_named() {
-    // Each is preferred to the following ones, and then removed.
+    // Each mask is preferred to the following ones, and then removed.
     let masks = [
         "masks/b.png.png",
         "masks/b.png",

@@ -32,7 +32,7 @@ fn exported(names: [&str; 3], points: &str, edit: impl Fn(&mut Value)) -> Made {
 }
 
 #[test]
-fn exports_of_apps_are_the_same_scene() {
+fn exports_of_phone_apps_load_as_the_same_scene() {
     let made = Made::transforms(|_| ());
     let plain = load(&made);
     let each = |json: &mut Value, field: &str, value: Value| {
@@ -41,7 +41,7 @@ fn exports_of_apps_are_the_same_scene() {
         }
     };
     let exports = [
-        // Polycam, through nerfstudio: no lens at the top, a confidence in each frame.
+        // Polycam, through nerfstudio: no intrinsics at the top level, a blur score in each frame.
         exported(
             ["./images/frame_00001.png", "./images/frame_00002.png", "./images/frame_00003.png"],
             "sparse_pc.ply",
@@ -53,14 +53,14 @@ fn exports_of_apps_are_the_same_scene() {
                 each(json, "blur_score", 42.5.into());
             },
         ),
-        // Record3D: names without folders, numbers as names, depth beside them.
+        // Record3D: numbers as names of files, depth images beside the photographs.
         exported(["rgb/0.png", "rgb/1.png", "rgb/10.png"], "sparse_pc.ply", |json| {
             each(json, "depth_path", "depth/0.exr".into());
             each(json, "timestamp", 1700000000.25.into());
             json["is_fisheye"] = false.into();
             json["aabb_scale"] = 16.into();
         }),
-        // Spaces and brackets in names, distortion that is there and 0.
+        // Spaces and brackets in names, distortion fields that are all 0.
         exported(
             ["images/IMG 0001 (1).png", "images/IMG 0002 (1).png", "images/IMG 0003 (1).png"],
             "My points.ply",
@@ -71,7 +71,7 @@ fn exports_of_apps_are_the_same_scene() {
                 }
             },
         ),
-        // Names of other scripts, fields that are null.
+        // Names in other scripts, fields that are null.
         exported(
             ["images/厨房 01.png", "images/厨房 02.png", "images/厨房 03 – Süd.png"],
             "点云.ply",
@@ -278,21 +278,23 @@ fn masks_and_points_of_another_machine_are_found_too() {
     let data = load(&found);
     assert_eq!((data.train.len(), data.test.len(), data.points.len()), (2, 1, 200));
     assert!(place(&data).ends_with("masks/hidden.png"));
-    // Otherwise the mask is found by the photograph's name; files elsewhere may be photographs.
+    // Otherwise the mask is found by the photograph's name; a file of the mask's bare name may be a photograph.
     found.remove("masks/hidden.png");
     assert!(place(&load(&found)).ends_with("masks/b.png"));
     found.remove("masks/b.png");
     refused("phones", &found, &options, "frames[1].mask_path, hidden.png, `masks/`");
     // Points that were not copied along are left out.
-    let without = made();
-    image(&without.file("masks/b.png"), (20, 12), 255);
-    without.remove("points.ply");
-    let data = load(&without);
+    let without_points = made();
+    image(&without_points.file("masks/b.png"), (20, 12), 255);
+    without_points.remove("points.ply");
+    let data = load(&without_points);
     assert!(data.points.is_empty());
     assert_noted(&data, "points.ply, left out");
-    // Without the option no path is guessed.
-    std::fs::rename(without.file("moved"), without.file("images")).unwrap();
-    refused("phones", &without, &LoadOptions::default(), "is absolute, OtherImagesFolder");
+    // Without a folder of images in the options, no path is guessed.
+    let [moved, images] = ["moved", "images"].map(|name| without_points.file(name));
+    std::fs::rename(moved, images).unwrap();
+    let words = "is absolute, OtherImagesFolder";
+    refused("phones", &without_points, &LoadOptions::default(), words);
 }
 
 #[test]

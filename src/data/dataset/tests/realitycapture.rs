@@ -9,7 +9,7 @@ use densify_fixtures::{Made, SIZE, image};
 const TABLE: &str = "cameras.csv";
 
 #[test]
-fn cameras_are_those_of_the_same_colmap_scene() {
+fn cameras_agree_with_those_of_the_same_scene_in_colmap_format() {
     let (colmap, table) = (load(&Made::colmap_txt()), load(&Made::realitycapture()));
     assert_eq!(table.points.colours, colmap.points.colours);
     assert_eq!(table.train.len(), 3);
@@ -81,7 +81,7 @@ fn tables_of_realityscan_load_the_same() {
     }
 }
 
-/// The terms are k1, k2, p2 and p1 of COLMAP's OPENCV model.
+/// The table's k1, k2, t1 and t2 are k1, k2, p2 and p1 of COLMAP's OPENCV model.
 #[test]
 fn distortion_agrees_with_other_formats() {
     let made = Made::realitycapture();
@@ -106,7 +106,7 @@ fn distortion_agrees_with_other_formats() {
 }
 
 #[test]
-fn names_may_have_commas_spaces_and_other_scripts_and_lie_in_images() {
+fn names_may_contain_commas_spaces_and_other_scripts_and_omit_the_folder_images() {
     let made = Made::realitycapture();
     let text = std::fs::read_to_string(made.file(TABLE)).unwrap();
     let text = text.replace("images/a.png", "\"Küche, Süd (1).png\"").replace("images/", "");

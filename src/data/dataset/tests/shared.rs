@@ -59,10 +59,10 @@ fn real_datasets_load() {
     }
 }
 
-/// Cases after public reports.
+/// Datasets that reproduce public bug reports.
 #[test]
 #[ignore = "needs shared data"]
-fn shared_cases_load_as_they_say() {
+fn shared_cases_load_or_fail_as_expected() {
     let case = |name: &str| Dataset::load(&shared("../cases").join(name), &LoadOptions::default());
     for (name, train, test) in [("split/both", 10, 3), ("split/subset", 4, 4)] {
         let data = case(name).unwrap_or_else(|e| panic!("{name}: {e}"));

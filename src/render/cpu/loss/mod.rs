@@ -3,16 +3,16 @@
 //!
 //! SSIM is written in terms of the difference e = x − y of rendering x and target y, by an exact identity:
 //! SSIM = (1 − μₑ²/A)·(1 − Var(e)/B), A = μₓ² + μᵧ² + C₁, B = Var(x) + Var(y) + C₂.
-//! Where the images agree it is exactly 1; the usual form is off by up to 4e-7 there, and
+//! Where the images agree, this form is exactly 1; the usual form is off by up to 4e-7 there, and
 //! its gradient is noise. The identity holds for any linear window, also where zero padding takes
 //! part of the window's weight. Var(x) + Var(y) is 2·Cov(x, y) + Var(e), so that four means under the
 //! window are enough: of e, y, e² and x·y.
 //!
 //! Subtracting a constant from y, padding included, leaves the variances unchanged. Computed from y − ½, they lose two
-//! bits less to rounding.
+//! bits fewer to rounding.
 //!
-//! The file is one piece because the passes share their planes and their strips. Each pass runs over
-//! strips of image rows that write nothing that other strips of the pass read. Image rows are
+//! All passes are in one file because they share their planes and their strips. A task of a pass
+//! processes one strip of image rows, and writes nothing that another task of the pass reads. Image rows are
 //! convolved vertically from the planes into a few lines that stay in the cache, and then
 //! horizontally; nothing is computed twice, whatever the division into strips. [`Segments`] documents the
 //! arrangement of a line's pixels.
@@ -43,9 +43,9 @@ const C2: f32 = 0.03 * 0.03;
 pub(crate) const SSIM_WEIGHT: f32 = 0.2;
 /// The constant subtracted from y.
 const MIDDLE: f32 = 0.5;
-/// Rows per strip where tiles are written: a row of tiles.
+/// Image rows per strip of whole tiles.
 const STRIP: usize = TILE;
-/// Rows per strip in the other passes.
+/// Image rows per strip in the other passes.
 const SHORT_STRIP: usize = TOGETHER;
 /// Lines convolved vertically per image row: e, y, e² and x·y.
 const CONVOLVED: usize = 4;
@@ -55,21 +55,23 @@ const MAX_LINES: usize = CONVOLVED * TOGETHER + 2;
 /// The buffers of the loss.
 #[derive(Debug)]
 pub(super) struct LossBuffers {
-    /// e, y − ½, and three derivatives. Shape: `[rows, pitch]` each.
+    /// e, y − ½, and three derivatives. Shape: `[image rows, pitch]` each.
     planes: [Vec<[f32; WIDTH]>; 5],
-    /// Errors per pixel, means over the channels, if requested. Same shape.
+    /// Errors per pixel, means over the channels, each if requested: the errors that select candidates, and those that
+    /// rows accumulate. Same shape.
     errors: [Vec<[f32; WIDTH]>; 2],
     segments: Segments,
     weights: PixelWeights,
 }
 
-/// The optional results of a loss.
+/// The pixel errors requested from a loss.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(super) struct ImageTerms {
-    /// Weights of |e| and 1 − SSIM in the error of each pixel, if that is requested.
-    pub(super) error: Option<[f32; 2]>,
-    /// How pixel errors are weighted in the last plane of the gradient, if they are requested there.
-    pub(super) by_pixel: Option<ErrorScore>,
+pub(super) struct ErrorRequests {
+    /// Weights of |e| and 1 − SSIM in the errors that select candidates, if these are requested.
+    pub(super) for_candidates: Option<[f32; 2]>,
+    /// Weighting of the errors that rows accumulate, if these are requested; they are written to the last plane of the
+    /// gradient.
+    pub(super) for_rows: Option<ErrorScore>,
 }
 
 /// The scalars of a loss.
@@ -91,11 +93,11 @@ impl LossBuffers {
         width: usize,
         height: usize,
         threads: usize,
-        by_pixel: Option<ErrorScore>,
+        for_rows: Option<ErrorScore>,
     ) -> u64 {
         let segments = Segments::new(width);
-        let weights = by_pixel.map_or(0, |score| PixelWeights::bytes(width * height, &score));
-        let planes = (6 + usize::from(by_pixel.is_some())) * segments.pitch() * WIDTH * height;
+        let weights = for_rows.map_or(0, |score| PixelWeights::bytes(width * height, &score));
+        let planes = (6 + usize::from(for_rows.is_some())) * segments.pitch() * WIDTH * height;
         let lines = threads * MAX_LINES * segments.padded() * WIDTH;
         ((planes + lines) * size_of::<f32>()) as u64 + weights
     }
@@ -127,9 +129,9 @@ impl LossBuffers {
         vectors
     }
 
-    /// Computes the loss of `canvas` against `target`, writes dL/dpixel to `gradient`, and computes the error of each
-    /// pixel that `terms` requests: the mean over channels of a weighted sum of |e| and 1 − SSIM.
-    #[expect(clippy::too_many_arguments, reason = "a kernel: each is a buffer of its own")]
+    /// Computes the loss of `canvas` against `target`, writes dL/dpixel to `gradient`, and computes the requested
+    /// errors of each pixel: means over the channels of a weighted sum of |e| and 1 − SSIM.
+    #[expect(clippy::too_many_arguments, reason = "a kernel: each argument is a buffer of its own")]
     pub(super) fn run(
         &mut self,
         threads: &Threads,
@@ -139,20 +141,20 @@ impl LossBuffers {
         target: &Image8,
         background: [f32; 3],
         gradient: &mut [TileGradient],
-        terms: ImageTerms,
+        requests: ErrorRequests,
     ) -> LossValue {
-        let ImageTerms { error: error_weights, by_pixel } = terms;
-        let requested = [error_weights.is_some(), by_pixel.is_some()];
+        let ErrorRequests { for_candidates, for_rows } = requests;
+        let requested = [for_candidates.is_some(), for_rows.is_some()];
         let vectors = self.resize(grid, requested);
         let Self { planes, errors, segments, .. } = self;
         let segments = *segments;
         let [e, y, p1, p2, p3] = planes.each_mut().map(|plane| &mut plane[..vectors]);
-        let [ranking, errors_by_pixel] = errors;
+        let [candidate_errors, row_errors] = errors;
         // Empty unless requested.
-        let ranking = &mut ranking[..if requested[0] { vectors } else { 0 }];
-        let errors_by_pixel = &mut errors_by_pixel[..if requested[1] { vectors } else { 0 }];
-        let by_map = by_pixel.map(|score| score.map.weights());
-        let error_weights = [error_weights, by_map].map(Option::unwrap_or_default);
+        let candidate_errors = &mut candidate_errors[..if requested[0] { vectors } else { 0 }];
+        let row_errors = &mut row_errors[..if requested[1] { vectors } else { 0 }];
+        let row_weights = for_rows.map(|score| score.map.weights());
+        let error_weights = [for_candidates, row_weights].map(Option::unwrap_or_default);
         let short = SHORT_STRIP * segments.pitch();
         let samples = (3 * grid.width * grid.height) as f64;
         let (mut l1, mut ssim) = (0.0_f64, 0.0_f64);
@@ -168,14 +170,14 @@ impl LossBuffers {
                 p1.par_chunks_mut(short),
                 p2.par_chunks_mut(short),
                 p3.par_chunks_mut(short),
-                parts(ranking, short, strips),
-                parts(errors_by_pixel, short, strips),
+                parts(candidate_errors, short, strips),
+                parts(row_errors, short, strips),
             );
             let sums = threads.collect_with(
                 "loss similarity",
                 tasks.into_par_iter().enumerate(),
                 Vec::new,
-                |scratch, (i, (p1, p2, p3, ranking, by_pixel))| {
+                |scratch, (i, (p1, p2, p3, candidate_errors, row_errors))| {
                     arch.dispatch(Similarity {
                         width: grid.width,
                         segments,
@@ -184,7 +186,7 @@ impl LossBuffers {
                         e,
                         y,
                         derivatives: [p1, p2, p3],
-                        errors: [ranking, by_pixel],
+                        errors: [candidate_errors, row_errors],
                         first_channel: channel == 0,
                         error_weights: error_weights.map(|weights| weights.map(|w| w / 3.0)),
                     })
@@ -211,15 +213,15 @@ impl LossBuffers {
                 });
             });
         }
-        if let Some(score) = by_pixel {
+        if let Some(score) = for_rows {
             self.weights.measure(threads, target, background, &score);
-            self.spread_over_tiles(threads, grid, gradient, &score);
+            self.write_row_errors(threads, grid, gradient, &score);
         }
         LossValue { l1: l1 / samples, ssim: ssim / samples }
     }
 
-    /// Writes the second error, weighted by `score`, to the last plane of the gradient.
-    fn spread_over_tiles(
+    /// Writes the errors that rows accumulate, weighted by `score`, to the last plane of the gradient.
+    fn write_row_errors(
         &self,
         threads: &Threads,
         grid: &Grid,
@@ -244,7 +246,7 @@ impl LossBuffers {
         });
     }
 
-    /// The error of a pixel after a run with error weights.
+    /// The error of a pixel, after a run that requested errors for candidates.
     pub(super) fn error_at(&self, x: usize, y: usize) -> f32 {
         let [vector, lane] = self.segments.place(x);
         self.segments.line(&self.errors[0], y)[vector][lane]
@@ -269,8 +271,8 @@ struct Source<'a> {
     channel: usize,
 }
 
-/// Computes the lines of e and y − ½ in one strip of one channel, where e = rendering − target, 0 where masked. The
-/// padding to the right has the values of pixels outside the image.
+/// Computes the lines of e and y − ½ in one strip of one channel; e is (rendering − target)·mask. The padding to the
+/// right has the values of pixels outside the image.
 struct Lines<'a> {
     source: Source<'a>,
     segments: Segments,
@@ -357,7 +359,7 @@ struct Similarity<'a> {
     errors: [&'a mut Line; 2],
     /// Weights of |e| and 1 − SSIM in each error.
     error_weights: [[f32; 2]; 2],
-    /// True if errors are overwritten instead of added to.
+    /// True for the channel that overwrites the errors; the others add to them.
     first_channel: bool,
 }
 
@@ -448,7 +450,7 @@ struct Ssim<S: Simd> {
 }
 
 impl<S: Simd> Ssim<S> {
-    /// Computes them from the means of e, y − ½, e² and (x − ½)·(y − ½).
+    /// Computes SSIM and its derivatives from the means of e, y − ½, e² and (x − ½)·(y − ½).
     #[inline(always)]
     fn new(s: S, [mu_e, middle, mean_ee, mean_xy]: [V<S>; 4]) -> Self {
         let c = |x: f32| V::splat(s, x);

@@ -1,4 +1,4 @@
-//! Tests of the optional results of the loss; the selftest compares values and gradients with the reference.
+//! Tests of the pixel errors requested from the loss; the selftest compares values and gradients with the reference.
 
 use std::ops::Range;
 
@@ -6,14 +6,14 @@ use super::super::tiles::Grid;
 use super::*;
 
 /// The scalars, dL/dpixel and each pixel's part of the loss for two structured images.
-fn run(terms: ImageTerms, mask: bool) -> (LossValue, Vec<f32>, Vec<f32>) {
-    run_in(&mut LossBuffers::new(), [37, 50], terms, mask)
+fn run(requests: ErrorRequests, mask: bool) -> (LossValue, Vec<f32>, Vec<f32>) {
+    run_in(&mut LossBuffers::new(), [37, 50], requests, mask)
 }
 
 fn run_in(
     buffers: &mut LossBuffers,
     [width, height]: [u32; 2],
-    terms: ImageTerms,
+    requests: ErrorRequests,
     mask: bool,
 ) -> (LossValue, Vec<f32>, Vec<f32>) {
     let grid = Grid::new(width, height);
@@ -36,7 +36,7 @@ fn run_in(
     let mut gradient = vec![TileGradient { planes: [DARK; 5] }; grid.tiles()];
     let threads = Threads::new(Some(2)).expect("threads");
     let (arch, gradients) = (Arch::new(), &mut gradient);
-    let value = buffers.run(&threads, arch, &grid, &canvas, &target, [0.0; 3], gradients, terms);
+    let value = buffers.run(&threads, arch, &grid, &canvas, &target, [0.0; 3], gradients, requests);
     let values = |planes: Range<usize>| -> Vec<f32> {
         let planes = gradient.iter().flat_map(|tile| &tile.planes[planes.clone()]);
         planes.flat_map(|plane| plane.as_flattened().iter().copied()).collect()
@@ -44,15 +44,15 @@ fn run_in(
     (value, values(0..3), values(4..5))
 }
 
-/// Optional results change neither the loss nor its gradient.
+/// Requested pixel errors change neither the loss nor its gradient.
 #[test]
-fn pixel_errors_add_up_to_the_loss() {
+fn the_mean_of_the_pixel_errors_is_the_loss() {
     for mask in [false, true] {
-        let (full, gradient, _) = run(ImageTerms::default(), mask);
+        let (full, gradient, _) = run(ErrorRequests::default(), mask);
         assert!(gradient.iter().any(|g| *g != 0.0));
-        for error in [None, Some([1.0, 1.0])] {
-            let (value, same, parts) =
-                run(ImageTerms { error, by_pixel: Some(ErrorScore::default()) }, mask);
+        for for_candidates in [None, Some([1.0, 1.0])] {
+            let for_rows = Some(ErrorScore::default());
+            let (value, same, parts) = run(ErrorRequests { for_candidates, for_rows }, mask);
             assert_eq!((value, &same), (full, &gradient));
             let mean = parts.into_iter().map(f64::from).sum::<f64>() / (37.0 * 50.0);
             assert!((mean - full.loss()).abs() < 1e-6, "{mean} {full:?}");
@@ -60,13 +60,14 @@ fn pixel_errors_add_up_to_the_loss() {
     }
 }
 
-/// Earlier images of other sizes, and earlier runs with other optional results, have no effect.
+/// Earlier images of other sizes, and earlier runs with other requested errors, have no effect.
 #[test]
 fn reused_buffers_give_the_same_results_as_new_ones() {
-    let terms = ImageTerms { error: Some([0.3, 0.7]), by_pixel: Some(ErrorScore::default()) };
+    let requests =
+        ErrorRequests { for_candidates: Some([0.3, 0.7]), for_rows: Some(ErrorScore::default()) };
     let all = |buffers: &mut LossBuffers, size: [u32; 2]| {
         let [width, height] = size.map(|side| side as usize);
-        let found = run_in(buffers, size, terms, false);
+        let found = run_in(buffers, size, requests, false);
         let at = |i| buffers.error_at(i % width, i / width);
         let errors: Vec<f32> = (0..width * height).map(at).collect();
         assert!(errors.iter().any(|error| *error > 0.0));
@@ -75,6 +76,6 @@ fn reused_buffers_give_the_same_results_as_new_ones() {
     let mut buffers = LossBuffers::new();
     for size in [[37, 50], [60, 20], [37, 50], [100, 70]] {
         assert_eq!(all(&mut buffers, size), all(&mut LossBuffers::new(), size), "{size:?}");
-        run_in(&mut buffers, [50, 90], ImageTerms::default(), true);
+        run_in(&mut buffers, [50, 90], ErrorRequests::default(), true);
     }
 }

@@ -26,12 +26,12 @@ const WINDOW: [f32; 2 * REACH + 1] = [
     0.007_598_758,
     0.001_028_380_2,
 ];
-/// Rows, or vectors of a row, that are convolved together. They share most of their neighbours, which are loaded 3.5
-/// times instead of eleven. More would not fit into the registers.
+/// Number of rows, or vectors of a row, that are convolved together. They share most of their neighbours, so that 3.5
+/// loads per result suffice instead of eleven. More would not fit into the registers.
 pub(super) const TOGETHER: usize = 4;
-/// Rows or vectors within reach of [`TOGETHER`] of them.
+/// Number of rows or vectors within reach of [`TOGETHER`] adjacent ones.
 const NEAR: usize = TOGETHER + 2 * REACH;
-/// Pixels per run; a segment consists of whole runs.
+/// Pixels per run, which are transposed together; a segment consists of whole runs.
 const RUN: usize = 4;
 
 /// The arrangement of a line's pixels: lane l of vector i is pixel i of segment l.
@@ -80,7 +80,7 @@ impl Segments {
         std::array::from_fn(|lane| (lane * self.length) as f32)
     }
 
-    /// Arranges consecutive pixels in segments. Both have [`stride`](Self::stride) numbers.
+    /// Arranges consecutive pixels in segments. `pixels` and `line` have [`stride`](Self::stride) numbers each.
     #[inline(always)]
     pub(super) fn arrange(self, pixels: &[f32], line: &mut Line) {
         for lane in (0..WIDTH).step_by(RUN) {
@@ -137,8 +137,8 @@ fn copy_vector(line: &mut [f32], from: usize, to: usize) {
     }
 }
 
-/// Transposes a block, as a matrix, for which there are vector instructions: the compiler turns a plain loop into one
-/// load and store per number.
+/// Transposes a block by means of `Mat4`, which uses vector instructions: the compiler turns a plain loop into one load
+/// and one store per number.
 #[inline(always)]
 fn transposed(rows: [[f32; RUN]; RUN]) -> [[f32; RUN]; RUN] {
     Mat4::from_cols_array_2d(&rows).transpose().to_cols_array_2d()
@@ -149,7 +149,7 @@ pub(super) type Line = [[f32; WIDTH]];
 /// A padded scratch line for each of [`TOGETHER`] rows.
 pub(super) type LinePerRow<'a> = [&'a mut Line; TOGETHER];
 
-/// The lines of a plane within reach of [`TOGETHER`] rows; a constant line outside the image.
+/// The lines of a plane within reach of [`TOGETHER`] rows; for rows outside the image, a constant line.
 pub(super) struct Near<'a>([&'a Line; NEAR]);
 
 impl<'a> Near<'a> {
@@ -177,14 +177,14 @@ macro_rules! near {
 const _: () =
     assert!(NEAR == 14 && TOGETHER == 4, "`near`, `cut` and `convolved` list all indices");
 
-/// Convolves for each of [`TOGETHER`] rows or vectors.
+/// The convolution at each of [`TOGETHER`] rows or vectors.
 #[inline(always)]
 fn convolved<S: Simd>(s: S, x: &[V<S>; NEAR]) -> [V<S>; TOGETHER] {
-    each!(n in 4 => at(s, x, n))
+    each!(n in 4 => convolved_at(s, x, n))
 }
 
 #[inline(always)]
-fn at<S: Simd>(s: S, x: &[V<S>; NEAR], n: usize) -> V<S> {
+fn convolved_at<S: Simd>(s: S, x: &[V<S>; NEAR], n: usize) -> V<S> {
     let mut sum = x[n + REACH] * WINDOW[REACH];
     for k in 0..REACH {
         sum = V::splat(s, WINDOW[k]).mul_add(x[n + k] + x[n + 2 * REACH - k], sum);
@@ -244,7 +244,7 @@ pub(super) fn vertical_with_square<S: Simd>(
     }
 }
 
-/// Convolves a plane p vertically, and p·(p + q) with another plane q.
+/// Convolves p and p·(p + q) vertically, for two planes p and q.
 #[inline(always)]
 pub(super) fn vertical_with_product<S: Simd>(
     s: S,
@@ -281,7 +281,7 @@ pub(super) fn horizontal<S: Simd, const N: usize, const M: usize>(
     let x = near!(d => V::load(s, &around[if d < M { d } else { 0 }][lane..]));
     let mut sums = [V::zero(s); N];
     for (n, sum) in sums.iter_mut().enumerate() {
-        *sum = at(s, &x, n);
+        *sum = convolved_at(s, &x, n);
     }
     sums
 }

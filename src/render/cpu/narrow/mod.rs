@@ -23,7 +23,7 @@ const F16_INFINITE: u32 = 0x7c00;
 const INFINITE: u32 = 0x7f80_0000;
 /// Bits of the significand that [`F8`] lacks: all but one.
 const F8_DROPPED: u32 = 22;
-/// Difference of the upper bits of f32 and the codes of [`F8`], whose smallest number, 2⁻⁹⁶, has the code 1.
+/// Difference between the upper bits of an f32 and its code in [`F8`], whose smallest number, 2⁻⁹⁶, has the code 1.
 const F8_BIAS: u32 = ((127 - 96) << 1) - 1;
 /// 2⁹⁶, the inverse of the smallest positive number of [`F8`].
 const F8_INVERSE_LEAST: f32 = 79_228_162_514_264_337_593_543_950_336.0;
@@ -86,7 +86,7 @@ pub(super) trait Narrow: Copy + Default {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct F16(pub(super) u16);
 
-/// A non-negative number in a byte: 7 bits of exponent and one of significand. Non-finite numbers are NaN.
+/// A non-negative number in a byte: 7 bits of exponent and one of significand. Non-finite numbers become NaN.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct F8(pub(super) u8);
 
@@ -108,13 +108,13 @@ impl Narrow for F16 {
         let bits = x.to_bits();
         let magnitude = bits & 0x7fff_ffff;
         let size = f32::from_bits(magnitude);
-        // Numbers from 2⁻¹⁴ to 2⁻¹³ have the spacing of subnormal ones, and there the same significand.
+        // Numbers from 2⁻¹⁴ to 2⁻¹³ are spaced like subnormal ones: adding 2⁻¹⁴ gives the significand to store.
         let is_small = size < F16_NORMAL;
         let lifted = if is_small { size + F16_NORMAL } else { size };
         let drawn = lifted.to_bits() + (random >> (32 - F16_DROPPED));
         let lowered = if is_small { F16_BIAS + 0x400 } else { F16_BIAS };
         let half = (drawn >> F16_DROPPED).wrapping_sub(lowered).min(F16_MAX);
-        // Infinity, or NaN, which keeps a bit set.
+        // Infinity, or NaN, whose significand must not be 0.
         let digit = u32::from(magnitude > INFINITE);
         let half = if magnitude >= INFINITE { F16_INFINITE | digit } else { half };
         Self((half | (bits >> 16 & 0x8000)) as u16)
@@ -150,8 +150,8 @@ fn unit(random: u32, digits: u32) -> f32 {
     (random >> (32 - digits)) as i32 as f32 * (1.0 / (1_u32 << digits) as f32)
 }
 
-/// Rounds `x`, within ±32,767, to one of its two neighbouring integers, in the lower bits: to the farther one if
-/// `draw` is below the distance to the nearer.
+/// Rounds `x`, within ±32,767, to one of its two neighbouring integers: to the farther one if `draw` is less than the
+/// distance to the nearer one. The integer is in the lower 16 bits of the result; the upper bits have no meaning.
 #[inline(always)]
 fn round_to_integer(x: f32, draw: f32) -> i32 {
     // Adding 1.5·2²³ leaves the nearest integer in the last bits.

@@ -48,7 +48,7 @@ fn all_codes_survive_a_round_trip() {
 
 /// The definition of binary16, IEEE 754-2008, section 3.4.
 #[test]
-fn halves_are_what_the_standard_says() {
+fn f16_numbers_are_those_of_the_standard() {
     for bits in 0..=u16::MAX {
         let [sign, exponent, digits] = [bits >> 15, bits >> 10 & 31, bits & 0x3ff].map(f64::from);
         let size = match bits >> 10 & 31 {
@@ -203,7 +203,7 @@ fn ratios_round_trip_and_are_rounded_fairly() {
 
 /// A second moment of 0 makes the first 0, and one of NaN makes it NaN, so that an audit finds it.
 #[test]
-fn ratios_with_a_zero_or_nonfinite_second_moment() {
+fn a_zero_or_nonfinite_second_moment_makes_the_first_zero_or_nan() {
     let [mut draws, ..] = Draws::of_block(&PolicyRng::new(0, 0), 0);
     for (first, second) in [(1e-30, 0.0), (0.0, 0.0), (f32::NAN, f32::NAN), (3.0, f32::INFINITY)] {
         let mut stored = [1; WIDTH];

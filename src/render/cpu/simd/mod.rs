@@ -2,8 +2,8 @@
 //!
 //! `pulp` dispatches at run time (AVX-512, AVX2, NEON, baseline). Its methods take a token as their first argument
 //! and make formulas hard to read; [`V`] carries the token and overloads the operators. Everything is
-//! inlined into the dispatched kernel, so that the wrapper costs nothing. The file is one piece: a vector and its
-//! functions.
+//! inlined into the dispatched kernel, so that the wrapper costs nothing. The vector and all its functions are in this
+//! file.
 
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
@@ -267,7 +267,7 @@ pub(super) fn sums_of_four<S: Simd>([a, b, c, d]: [V<S>; 4]) -> [f32; 4] {
     }
     let s = a.s;
     let [even, odd]: [S::f32s; 2] = s.deinterleave_shfl_f32s([halves(a, c).v, halves(b, d).v]);
-    // Every four lanes: a, b, c, d.
+    // Each group of four lanes: a part of the sum of a, of b, of c and of d.
     let mut lanes = [0.0; WIDTH];
     V { s, v: s.add_f32s(even, odd) }.store(&mut lanes);
     let mut sums = [0.0; 4];
@@ -281,7 +281,7 @@ pub(super) fn sums_of_four<S: Simd>([a, b, c, d]: [V<S>; 4]) -> [f32; 4] {
     sums
 }
 
-/// Every four lanes: a₀ + a₂, a₁ + a₃, c₀ + c₂, c₁ + c₃.
+/// In each group of four lanes: a₀ + a₂, a₁ + a₃, c₀ + c₂, c₁ + c₃.
 #[inline(always)]
 fn halves<S: Simd>(a: V<S>, c: V<S>) -> V<S> {
     let s = a.s;
@@ -326,7 +326,8 @@ impl<S: Simd> Mask<S> {
     /// set or clear, and without vectors a lane is one byte.
     #[inline(always)]
     pub(super) fn bits(self) -> u32 {
-        // AVX2 has an instruction for this, which must be called explicitly; the generic code takes two dozen.
+        // AVX2 has an instruction for this, which must be called explicitly; the generic code takes two dozen
+        // instructions.
         #[cfg(target_arch = "x86_64")]
         if let Some(v3) = (&self.s as &dyn std::any::Any).downcast_ref::<pulp::x86::V3>() {
             return v3.avx._mm256_movemask_ps(pulp::bytemuck::cast(self.m)) as u32;

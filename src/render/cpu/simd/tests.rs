@@ -6,7 +6,8 @@ use pulp::{Arch, WithSimd};
 use super::super::InstructionSet;
 use super::*;
 
-struct Each<'a>(&'a [f32], fn(f32) -> f64, Function, f64);
+/// Measures the largest relative error of a function: inputs, true function, function, smallest divisor.
+struct WorstError<'a>(&'a [f32], fn(f32) -> f64, Function, f64);
 #[derive(Clone, Copy)]
 enum Function {
     Exp2,
@@ -14,11 +15,11 @@ enum Function {
     Log2,
 }
 
-impl WithSimd for Each<'_> {
+impl WithSimd for WorstError<'_> {
     type Output = f64;
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) -> f64 {
-        let Each(inputs, truth, function, floor) = self;
+        let WorstError(inputs, truth, function, floor) = self;
         let mut worst = 0.0_f64;
         for chunk in inputs.chunks_exact(WIDTH) {
             let mut out = [0.0_f32; WIDTH];
@@ -48,11 +49,11 @@ fn grid(from: f32, to: f32) -> Vec<f32> {
 #[test]
 fn elementary_functions_are_accurate() {
     let arch = Arch::new();
-    let exp2 = Each(&grid(-30.0, 0.0), |x| f64::from(x).exp2(), Function::Exp2, 0.0);
+    let exp2 = WorstError(&grid(-30.0, 0.0), |x| f64::from(x).exp2(), Function::Exp2, 0.0);
     assert!(arch.dispatch(exp2) < 2e-7);
-    let exp = Each(&grid(-80.0, 80.0), |x| f64::from(x).exp(), Function::Exp, 0.0);
+    let exp = WorstError(&grid(-80.0, 80.0), |x| f64::from(x).exp(), Function::Exp, 0.0);
     assert!(arch.dispatch(exp) < 2e-7);
-    let log2 = Each(&grid(1.0, 2.0), |x| f64::from(x).log2(), Function::Log2, 1.0);
+    let log2 = WorstError(&grid(1.0, 2.0), |x| f64::from(x).log2(), Function::Log2, 1.0);
     assert!(arch.dispatch(log2) < 3e-7);
 }
 
@@ -71,7 +72,7 @@ impl WithSimd for SumsOfFour {
 }
 
 #[test]
-fn sums_of_four_are_four_sums() {
+fn sums_of_four_are_the_sums_of_each_vector() {
     for set in InstructionSet::available() {
         let (sums, lanes) = set.arch().dispatch(SumsOfFour);
         let squares: usize = (0..lanes).map(|i| i * i).sum();

@@ -134,7 +134,7 @@ fn every_kernel_is_dispatched_by_its_name() {
             "`rebound` has buffers for `{kernel}`, which is no kernel"
         );
     }
-    // Bound to each array of rows.
+    // These are bound to each array of rows, not dispatched by name.
     let mut dispatched = BTreeSet::from(["copy_rows", "swap_rows", "audit"].map(str::to_owned));
     let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/gpu");
     for entry in std::fs::read_dir(folder).expect("the sources") {
@@ -187,7 +187,7 @@ macro_rules! layout {
 }
 
 #[test]
-fn layouts_are_those_of_the_shaders() {
+fn struct_layouts_are_those_of_the_shaders() {
     let project = &STAGES[0];
     let text = project.text(Accumulation::Slots).expect("every device projects");
     let module = parse(project, &text);

@@ -35,14 +35,14 @@ pub(super) struct SizeRequest {
     pub(crate) sh_degree: RangeInclusive<u8>,
     /// Maximum number of (row, tile) pairs; `None`: chosen by the solver.
     pub(crate) tile_cap: Option<usize>,
-    /// (Row, tile) pairs per row to choose from, in ascending order; those above the first are chosen only if memory is
-    /// left.
+    /// (Row, tile) pairs per row to choose from, in ascending order; numbers above the first are chosen only if
+    /// memory is left.
     pub(crate) pairs: [usize; 3],
     /// Maximum number of (row, tile) pairs that the device supports.
     pub(crate) max_pairs: usize,
     /// Bytes of decoded images; `None`: chosen by the solver.
     pub(crate) image_cache: Option<u64>,
-    /// Maximum bytes of decoded images that may reduce the number of rows.
+    /// Maximum bytes of decoded images that are kept at the expense of rows.
     pub(crate) max_images: u64,
     /// Bytes of all images when decoded.
     pub(crate) all_images: u64,
@@ -79,8 +79,8 @@ impl SizeRequest {
 }
 
 /// Finds the largest size; `None` if not even the fewest rows fit. `bytes` returns the memory of a size. Once above the
-/// limit, it must stay above it as rows, pairs or images grow, and images must take at most the size of their cache
-/// plus a constant.
+/// limit, this memory must stay above it as rows, pairs or images grow, and images must take at most the size of their
+/// cache plus a constant.
 ///
 /// The degree is the highest at which enough rows fit, or else the lowest. As many rows as possible are chosen; if all
 /// wanted rows fit, the remaining memory goes to the tile lists and then to the images.

@@ -73,8 +73,8 @@ fn requests() -> impl Strategy<Value = (Model, SizeRequest)> {
     (models(), sizes).prop_map(|(model, sizes)| {
         let (memory, max_rows, tile_cap, image_cache, lowest, pairs) = sizes;
         let sh_degree = lowest..=3;
-        let open = request(&model, memory);
-        let request = SizeRequest { max_rows, tile_cap, image_cache, sh_degree, pairs, ..open };
+        let base = request(&model, memory);
+        let request = SizeRequest { max_rows, tile_cap, image_cache, sh_degree, pairs, ..base };
         (model, request)
     })
 }

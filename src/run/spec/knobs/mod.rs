@@ -2,7 +2,7 @@
 //! cost.
 //!
 //! A knob is set with `--knob NAME=VALUE`, or in the table `[knob]` of a file. [`Knobs`] holds the knobs of a run;
-//! [`Preset`]s are knobs and options that go together.
+//! [`Preset`]s are knobs and options that are set together.
 
 mod presets;
 mod settings;
@@ -91,7 +91,7 @@ pub enum KnobError {
         nearest: String,
     },
     /// No preset has this name.
-    #[error("no preset is called `{name}`; there are {}", presets::names())]
+    #[error("no preset is called `{name}`; the presets are {}", presets::names())]
     UnknownPreset {
         /// The name given.
         name: String,
@@ -137,7 +137,7 @@ impl Knob {
         }
     }
 
-    /// A number as the default or a level spells it, else as a decimal.
+    /// A number as the default or a level spells it, else in the shorter of the decimal and the scientific notation.
     fn spell(&self, value: f64) -> String {
         let known = self.levels.iter().copied().chain([self.default]);
         let same =

@@ -1,11 +1,11 @@
-//! Presets: knobs and options that go together, named by what they promise. Each preset quotes the measurements by
-//! `densify trade` that its levels follow from.
+//! Presets: knobs and options that are set together, named after what they promise. Each preset quotes the measurements
+//! by `densify trade` that its levels follow from.
 
 use std::fmt;
 
 use super::KnobError;
 
-/// Knobs and options that go together.
+/// Knobs and options that are set together.
 #[derive(Debug)]
 pub struct Preset {
     /// Such as `fast`.
@@ -42,7 +42,7 @@ const STUDY: &str = "two built-in scenes, an object and photographs, 2,000 itera
 const COMMAND: &str = "densify trade scene:spheres scene:room data/chair data/cup --knobs preset:tiny-memory --seeds 4 \
                        -i 2000 -b 20k -- --threads 1 --backend cpu";
 
-/// The runs behind the figures of shorter presets, at full length.
+/// The runs behind the figures of `balanced` and `fast`; the reference runs have the full 30,000 iterations.
 const LONG_STUDY: &str = "two built-in scenes, an object and photographs at half their size, 30,000 iterations in \
                           exact, 5,000 rows, 5 seeds";
 
@@ -61,7 +61,7 @@ pub const DEFAULT_PRESET: &str = "balanced";
 pub static PRESETS: &[Preset] = &[
     Preset {
         name: EXACT,
-        promise: "no shortcut that a knob can take",
+        promise: "no accuracy traded for time or memory",
         levels: &[
             ("alpha_min", "1/255"),
             ("transmittance_stop", "1e-4"),
@@ -70,7 +70,7 @@ pub static PRESETS: &[Preset] = &[
         ],
         measured: None,
     },
-    // In runs of this length, every other level loses more quality for the time that it saves: docs/tradeoffs.md.
+    // Fewer iterations cost less quality than knobs that save as much time: docs/tradeoffs.md.
     Preset {
         name: "balanced",
         promise: "four fifths of the iterations; the rest make no visible difference",

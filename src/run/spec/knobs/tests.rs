@@ -16,7 +16,7 @@ fn the_table_is_consistent() {
     let mut names = BTreeSet::new();
     for knob in KNOBS {
         let name = knob.name;
-        assert!(names.insert(name), "{name} is there twice");
+        assert!(names.insert(name), "{name} is listed twice");
         assert!(RunOption::find(name).is_none(), "{name} is an option of its own");
         assert_eq!(knob.canonical(knob.default).as_deref(), Ok(knob.default), "{name}");
         for level in knob.levels {
@@ -27,7 +27,7 @@ fn the_table_is_consistent() {
 }
 
 #[test]
-fn equal_values_are_equal_texts() {
+fn equal_values_have_equal_texts() {
     for (setting, value) in [
         ("alpha_min=1/255", "1/255"),
         ("alpha_min= 0.0078125", "1/128"),

@@ -1,7 +1,7 @@
 //! LDR-FLIP: the visible difference when alternating between two images (Andersson, Nilsson,
 //! Akenine-Möller, Oskarsson, Åström and Fairchild, *FLIP: A Difference Evaluator for Alternating
-//! Images*, Proc. ACM Comput. Graph. Interact. Tech. 3(2), 2020; the source of section and equation
-//! numbers here). A colour pipeline filters both images by the contrast sensitivity of the eye and
+//! Images*, Proc. ACM Comput. Graph. Interact. Tech. 3(2), 2020; section and equation numbers here
+//! are those of this paper). A colour pipeline filters both images by the contrast sensitivity of the eye and
 //! measures a perceptual distance. A feature pipeline compares edges and points, and amplifies the
 //! distance where they differ.
 
@@ -21,7 +21,7 @@ const SENSITIVITY: [[(f64, f64); 2]; 3] =
 const WIDEST: f64 = 0.04;
 /// Exponent of colour distances, q_c.
 const COLOUR_EXPONENT: f64 = 0.7;
-/// Distances up to this fraction of the largest count as small, p_c.
+/// Distances up to this fraction of the largest distance are small, p_c.
 const SMALL_SHARE: f64 = 0.4;
 /// Fraction of the range of errors that small distances fill, p_t.
 const SMALL_RANGE: f64 = 0.95;
@@ -148,7 +148,7 @@ fn product(matrix: &[[f64; 3]; 3], v: [f64; 3]) -> [f64; 3] {
     matrix.map(|row| row[0] * v[0] + row[1] * v[1] + row[2] * v[2])
 }
 
-/// XYZ relative to white, which is the sum of the matrix's rows.
+/// XYZ relative to that of white, whose components are the sums of the matrix's rows.
 fn relative_xyz(rgb: [f64; 3]) -> [f64; 3] {
     let xyz = product(&XYZ_OF_RGB, rgb);
     [0, 1, 2].map(|i| xyz[i] / XYZ_OF_RGB[i].iter().sum::<f64>())
@@ -183,7 +183,7 @@ fn linear(encoded: f64) -> f64 {
 
 /// The kernels of both pipelines along one axis. Every filter is a sum of separable ones.
 struct Filters {
-    /// Kernels of the terms of each opponent channel; both passes together have the weight of the term.
+    /// Kernels of the terms of each opponent channel; applied along both axes, they have the weight of the term.
     sensitivity: [Vec<Vec<f64>>; 3],
     /// A Gaussian as wide as features, with sum 1, and its first and second derivatives, whose positive taps sum to 1 and
     /// negative taps to −1.

@@ -21,7 +21,7 @@ pub struct Geometry {
     /// Median angle between the surface's normal and the shortest axis of the Gaussian at a pixel
     /// `[degrees]`, in 0..=90. The Gaussian is the densest at the surface point among the eight of
     /// opacity above 0.1 with the nearest centres; it approximates the one with the largest blend
-    /// weight. Over the pixels of [`DepthErrors`], on a regular grid of about 2,000 per view.
+    /// weight. Over every nth pixel of [`DepthErrors`], so that there are up to 2,000 per view.
     #[serde(deserialize_with = "or_nan")]
     pub normal_error: f64,
     /// Distances between centres and surface.
@@ -58,8 +58,8 @@ pub struct CentreErrors {
     /// 95th percentile of the distance, weighted by w `[diagonals]`.
     #[serde(deserialize_with = "or_nan")]
     pub accuracy_p95: f64,
-    /// Mean distance from the mesh to the nearest centre of opacity above 0.1 `[diagonals]`, over those of 20,000 uniform
-    /// samples of the mesh that at least two training views see.
+    /// Mean distance from the mesh to the nearest centre of opacity above 0.1 `[diagonals]`, over 20,000 uniform
+    /// samples of the mesh, except those that fewer than two training views see.
     #[serde(deserialize_with = "or_nan")]
     pub completeness: f64,
     /// Accuracy + completeness `[diagonals]`.
@@ -75,7 +75,7 @@ pub struct CentreErrors {
 }
 
 /// Rows of opacity above 0.05 whose distance from the mesh exceeds 1 % of the diagonal and twice their largest standard
-/// deviation, at a position that at least two training views see through: they show a farther surface there, or none.
+/// deviation, at a position that at least two training views see through: these show a farther surface there, or none.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Floaters {
     /// Number of floaters.

@@ -8,7 +8,7 @@ use super::EPSILON;
 use super::convolution::Convolution;
 use crate::metrics::THREADS;
 
-/// Rows of features in memory at a time, because a whole stage with many channels would be too large.
+/// Number of rows of features in memory at a time, because a whole stage with many channels would be too large.
 const STRIP: usize = 64;
 
 /// A network whose features are compared.
@@ -20,7 +20,7 @@ pub enum Network {
     Alex,
 }
 
-/// A convolution: its number in the published network, input and output channels, side, step and padding `[px]`.
+/// A convolution: its number in the published network, input and output channels, side, stride and padding `[px]`.
 pub(super) type Layer = (usize, [usize; 2], usize, usize, usize);
 
 const VGG: [&[Layer]; 5] = [
@@ -121,14 +121,14 @@ impl Stage {
             [(); 2].map(|()| Activation::zeros(channels, 0..pooled(height), pooled(width)));
         let mut sum = 0.0;
         for first in (0..height).step_by(STRIP) {
-            let own = first..(first + STRIP).min(height);
+            let strip = first..(first + STRIP).min(height);
             // Windows larger than the stride extend into the next strip.
             let beyond = self.pooling.map_or(0, |window| window - 2);
-            let rows = first..(own.end + beyond).min(height);
+            let rows = first..(strip.end + beyond).min(height);
             let features = images.each_ref().map(|image| self.features(image, rows.clone()));
-            sum += self.distance(&features, own.clone());
+            sum += self.distance(&features, strip.clone());
             for (features, next) in features.iter().zip(&mut next) {
-                self.pool(features, own.clone(), next);
+                self.pool(features, strip.clone(), next);
             }
         }
         (sum / (width * height) as f64, next)
@@ -188,18 +188,18 @@ impl Stage {
     }
 
     /// Pools some rows of the features into the input of the next stage.
-    fn pool(&self, features: &Activation, own: Range<usize>, next: &mut Activation) {
+    fn pool(&self, features: &Activation, strip: Range<usize>, next: &mut Activation) {
         let (width, height) = (next.width, next.rows.len());
         for channel in 0..features.channels {
             let to = &mut next.values[channel * height * width..][..height * width];
             let Some(window) = self.pooling else {
-                for row in own.clone() {
+                for row in strip.clone() {
                     to[row * width..][..width].copy_from_slice(features.row(channel, row));
                 }
                 continue;
             };
             for (row, to) in to.chunks_exact_mut(width).enumerate() {
-                if !own.contains(&(2 * row)) {
+                if !strip.contains(&(2 * row)) {
                     continue;
                 }
                 to.fill(f32::NEG_INFINITY);

@@ -21,7 +21,7 @@ fn unit(seed: u64, count: usize) -> impl Iterator<Item = f64> {
 /// Shapes and bytes of arrays by name.
 type Arrays = HashMap<String, (Vec<usize>, Vec<u8>)>;
 
-/// Random weights that keep the magnitude of features.
+/// Random weights with which features keep their magnitude from layer to layer.
 fn random(network: Network) -> Arrays {
     let mut arrays = Arrays::new();
     let mut seed = 0;
@@ -66,7 +66,7 @@ fn pair(width: u32, height: u32) -> (Vec<f32>, Image8) {
 
 #[test]
 fn values_agree_with_another_implementation() {
-    // The largest sizes take several strips of rows.
+    // The largest images are processed in several strips of rows.
     let vgg = [
         (40, 37, 0.095_950_650_516_9),
         (16, 16, 0.104_173_281_230_0),

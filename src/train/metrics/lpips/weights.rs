@@ -83,13 +83,13 @@ impl Lpips {
 fn convolution(
     file: &SafeTensors<'_>,
     stage: usize,
-    &(number, channels, side, step, padding): &Layer,
+    &(number, channels, side, stride, padding): &Layer,
 ) -> Result<Convolution, String> {
     let name = format!("net.slice{}.{number}", stage + 1);
     let shape = [channels[1], channels[0], side, side];
     let weights = array(file, &format!("{name}.weight"), &shape)?;
     let bias = array(file, &format!("{name}.bias"), &channels[1..])?;
-    Ok(Convolution::new(channels, (side, step, padding), &weights, bias))
+    Ok(Convolution::new(channels, (side, stride, padding), &weights, bias))
 }
 
 /// Reads an array.

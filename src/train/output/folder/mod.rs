@@ -69,7 +69,7 @@ pub fn is_in_use(run: &Path) -> bool {
 #[derive(Debug)]
 pub struct RunFolder {
     target: PathBuf,
-    /// This run created the folder.
+    /// True if this run created the folder.
     is_new: bool,
     /// Suffix of the hidden folder of a run that replaces another.
     staged: Option<String>,
@@ -131,8 +131,8 @@ impl RunFolder {
         Ok(folder)
     }
 
-    /// Opens the folder of a run that continues, or that starts again (`restart`) because it has no checkpoint; then its
-    /// files are removed. Incomplete files of a killed process are removed in any case.
+    /// Opens the folder of a run that continues, or that starts again because it has no checkpoint. With `restart` the
+    /// files of the run are removed; incomplete files of a killed process are removed in any case.
     ///
     /// # Errors
     /// [`FolderError`] if a process is training there, and if a restart would remove models, checkpoints, or files that do
@@ -188,7 +188,7 @@ impl RunFolder {
         Guard(Rc::clone(&self.lock))
     }
 
-    /// Hidden folders in `target` of interrupted runs that would have replaced the one there.
+    /// Hidden folders in `target` of interrupted runs that would have replaced the run there.
     pub fn staged(target: &Path) -> Vec<PathBuf> {
         let mut staged = hidden(target, NEW);
         staged.retain(|path| FolderLock::check(path).is_ok());

@@ -13,13 +13,13 @@ pub(super) const NEW: &str = ".densify-new-";
 /// Prefix of the hidden folder to which the old run is moved, with the same suffix. While it exists, the old run is the
 /// valid one.
 pub(super) const OLD: &str = ".densify-old-";
-/// New prefix of [`OLD`] when all of the old run has been moved; from then on the new run is the valid one.
+/// Replaces the prefix [`OLD`] when all of the old run has been moved; from then on the new run is the valid one.
 pub(super) const REPLACED: &str = ".densify-replaced-";
 
 /// Reason why a run could not replace another.
 pub(super) struct ReplaceError {
     pub(super) source: FolderError,
-    /// Folder of (a part of) the old run, if it could not be moved back either.
+    /// Folder with the old run or a part of it, if that could not be moved back either.
     pub(super) aside: Option<PathBuf>,
 }
 

@@ -83,11 +83,13 @@ fn a_failed_replacement_leaves_the_old_run_unchanged() {
     }
 }
 
-/// If moving fails, and moving back too, the message names the folders of all files, and the next run recovers them.
+/// If moving fails, and moving back too, the message names the folders of all files, and the next run recovers the
+/// files.
 #[test]
 fn a_stuck_replacement_is_reported_and_recovered() {
-    // The operation that fails after a number of successes, the prefix of the old run's folder, and the valid run.
-    for (operation, file, spared, aside, counts) in [
+    // The operation that fails, the file, the number of successes before, the prefix of the old run's folder, and the
+    // valid run.
+    for (operation, file, spared, aside, valid) in [
         (Operation::Create, "", 0, None, "old"),
         (Operation::Rename, "", 1, Some(OLD), "old"),
         (Operation::Rename, "", 2, Some(OLD), "old"),
@@ -105,15 +107,15 @@ fn a_stuck_replacement_is_reported_and_recovered() {
         let fault = Fault { operation, file, spared, kind: std::io::ErrorKind::Other };
         let error = with_fault(Some(fault), || run.finish()).0.unwrap_err().to_string();
         let what = format!("{operation:?} {spared}: {error}");
-        let lies = tree(root.path())
+        let aside_folder = tree(root.path())
             .into_iter()
             .find(|name| aside.is_some_and(|aside| name.starts_with(aside)));
-        assert_eq!(lies.is_some(), aside.is_some(), "{what}");
+        assert_eq!(aside_folder.is_some(), aside.is_some(), "{what}");
         assert_eq!(error.contains("is unchanged"), aside.is_none(), "{what}");
-        assert!(lies.is_none_or(|name| error.contains(&name)), "{what}");
+        assert!(aside_folder.is_none_or(|name| error.contains(&name)), "{what}");
         RunFolder::settle(root.path()).unwrap();
-        assert_eq!(fs::read_to_string(root.path().join("config.toml")).unwrap(), counts, "{what}");
-        assert_eq!(root.path().join("cameras.json").exists(), counts == "old", "{what}");
+        assert_eq!(fs::read_to_string(root.path().join("config.toml")).unwrap(), valid, "{what}");
+        assert_eq!(root.path().join("cameras.json").exists(), valid == "old", "{what}");
     }
 }
 
@@ -196,7 +198,7 @@ fn a_folder_in_use_is_neither_replaced_nor_resumed() {
     let replacing = RunFolder::create(root.path(), true).unwrap();
     write(&replacing.path().join("config.toml"), "b");
     assert!(RunFolder::check(root.path(), true).is_err());
-    // The lock is tested again at the end.
+    // The lock is checked again at the end.
     fs::remove_file(root.path().join(LOCK)).unwrap();
     assert!(matches!(replacing.finish(), Err(FolderError::NotReplaced { .. })));
     assert_eq!(fs::read(root.path().join("config.toml")).unwrap(), b"a");

@@ -63,8 +63,8 @@ impl<V: ViewSource> Trainer<V> {
         Ok(event)
     }
 
-    /// The rows to remove, and the change of the probe views' PSNR without them, relative to `psnr` with all rows `[dB]`; if
-    /// none can be removed, the change without a tenth of them.
+    /// The rows to remove, and the change of the probe views' PSNR without them, relative to `psnr` with all rows
+    /// `[dB]`; if no row can be removed, the change without a tenth of the rows.
     fn least_important(&mut self, step: u32, psnr: f64) -> Result<(Vec<u32>, f64), TrainError> {
         let signals = self.backend.take_signals(growth_signals()).at(step)?;
         let weights = signals.get(Signal::WeightMax).unwrap_or_default();
@@ -80,7 +80,7 @@ impl<V: ViewSource> Trainer<V> {
     }
 
     /// Hides the rows in the given order, a tenth at a time, until the PSNR falls too much. Returns the number of rows
-    /// that can be removed, and the change of the PSNR without them.
+    /// that can be removed, and the change of the PSNR without them (without a tenth, if none can be removed).
     fn hide_tenths(
         &mut self,
         step: u32,

@@ -1,21 +1,21 @@
 //! The automatic budget: a limit on the number of rows that rises while more rows improve the images, and falls while rows
 //! can be removed without loss.
 //!
-//! The run is divided into intervals. At the end of each, before the policy's edit, the PSNR of a few training views (the
-//! probe views) is measured. In the first half of the run the limit then rises by half a doubling, up to the budget.
-//! Policies receive the limit as their budget, and plans enforce it, so policies need not know about it. The gain of a
-//! doubling is the slope of the PSNR over log2(rows), fitted to the last three intervals. It includes the improvement by
-//! training alone, so growth stops too late rather than too early: after the gain has been below [`MIN_GAIN`] twice in a
-//! row.
+//! The run is divided into intervals. At the end of each, before the policy's edit, the PSNR of a few training views
+//! (the probe views) is measured. In the first half of the run the limit then rises by half a doubling, up to the
+//! budget. Policies receive the limit as their budget, and plans enforce it, so policies need not know about it. The
+//! gain of a doubling is the slope of the PSNR over log2(rows), fitted to the last three intervals. Growth stops when
+//! the gain has been below [`MIN_GAIN`] twice in a row. The gain includes the improvement by training alone, so growth
+//! stops too late rather than too early.
 //!
-//! Some edits reduce the PSNR for a while, such as inserting rows or resetting opacities. If it is more than [`MAX_DROP`]
-//! below the best of the last [`RECENT`] intervals, the interval is not evaluated: the limit stays the same, and no row is
-//! removed.
+//! Some edits reduce the PSNR for a while, such as inserting rows or resetting opacities. If the PSNR is more than
+//! [`MAX_DROP`] below the best of the last [`RECENT`] intervals, the interval is not evaluated: the limit stays the
+//! same, and no row is removed.
 //!
 //! After growth, rows with low weights are pruned. At the end of each later interval the rows are sorted by their largest
 //! blend weight in any view. Tenths of them are hidden one after another and removed as long as the PSNR falls by less
-//! than [`MIN_GAIN`] per halving. The comparison uses the same model at the same step, so it has no noise; it
-//! overestimates the loss, because the other rows will adapt.
+//! than [`MIN_GAIN`] per halving. The comparison uses the same model at the same step, so it has no noise. It
+//! overestimates the loss, because the remaining rows will adapt.
 //!
 //! Measuring does not change the model or any other state: rows are hidden only by their opacity logits, which are
 //! restored.
@@ -37,9 +37,9 @@ const MAX_DROP: f64 = 0.5;
 /// Number of intervals after which a loss counts as permanent. The insertions of `diet` take a sixth of a run, which is
 /// four intervals.
 const RECENT: usize = 6;
-/// Steps of an interval in a run of 30,000. That gives ten intervals, or five doublings, until most policies stop growing.
+/// Steps of an interval in a run of 30,000. Most policies then stop growing after ten intervals, or five doublings.
 const INTERVAL: u32 = 1_500;
-/// Intervals are multiples of this number of steps, because policies are due every 100 steps at most.
+/// Intervals are multiples of this number of steps, because policies are due at most every 100 steps.
 const INTERVAL_UNIT: u32 = 100;
 /// Growth of the limit per interval.
 const GROWTH_FACTOR: f64 = std::f64::consts::SQRT_2;
@@ -59,7 +59,7 @@ pub fn growth_signals() -> SignalSet {
     SignalSet::from([Signal::WeightMax])
 }
 
-/// The row limit and the measurements it follows from.
+/// The row limit, and the measurements that determine it.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct AutoBudget {
@@ -85,10 +85,10 @@ pub struct Interval {
     pub rows: usize,
     /// Mean PSNR of the probe views `[dB]`.
     pub psnr: f64,
-    /// The PSNR is near its recent best; otherwise the interval is not evaluated.
+    /// True if the PSNR is near its recent best; otherwise the interval is not evaluated.
     pub settled: bool,
-    /// Gain over this settled interval and the two before, including the effect of training `[dB per doubling]`; `None` if
-    /// there are fewer, if rows did not increase, or after growth.
+    /// Gain over this settled interval and the two before it, including the effect of training `[dB per doubling]`;
+    /// `None` if there are fewer, if rows did not increase, or after growth.
     pub gain: Option<f64>,
 }
 
@@ -100,9 +100,9 @@ pub struct Removal {
     pub step: u32,
     /// Rows before.
     pub before: usize,
-    /// Rows after; the same as before if removing a tenth would cost too much.
+    /// Rows after; as many as before if removing a tenth would cost too much.
     pub after: usize,
-    /// Immediate change of the probe views' PSNR `[dB]`; if none was removed, the change for a tenth.
+    /// Immediate change of the probe views' PSNR `[dB]`; if no row was removed, the change without a tenth of the rows.
     pub change: f64,
 }
 
@@ -154,7 +154,7 @@ fn slope(intervals: &[Interval]) -> Option<f64> {
     let y = intervals.iter().map(|interval| interval.psnr).sum::<f64>() / count;
     let variance: f64 = intervals.iter().map(|i| (doublings(i) - x).powi(2)).sum();
     let covariance: f64 = intervals.iter().map(|i| (doublings(i) - x) * (i.psnr - y)).sum();
-    // The variance must be at least that of a quarter of a doubling from first to last.
+    // The spread must exceed that of three equally spaced points that span a quarter of a doubling.
     let is_enough = intervals.len() == FITTED && variance > 2.0 * 0.125_f64.powi(2);
     is_enough.then(|| covariance / variance)
 }

@@ -11,7 +11,7 @@ const ONE_IN: usize = 20;
 const MIN_PROBES: usize = 4;
 /// Largest number of probe views.
 const MAX_PROBES: usize = 16;
-/// Smallest number of training views for probe views.
+/// Smallest number of training views from which probe views are chosen.
 const MIN_VIEWS: usize = 2 * MIN_PROBES;
 /// Upper bound of a measured PSNR, which would be infinite for equal images `[dB]`.
 const MAX_PSNR: f64 = 99.0;
@@ -21,7 +21,7 @@ pub(in crate::trainer) fn probe_views(views: usize, seed: u64) -> Vec<usize> {
     if views < MIN_VIEWS {
         return Vec::new();
     }
-    // No policy samples views at step 0.
+    // The sample of step 0 is not one of a policy's, as policies sample views only at later steps.
     let mut chosen =
         schedule::fresh_views(views, views.div_ceil(ONE_IN).clamp(MIN_PROBES, MAX_PROBES), seed, 0);
     chosen.sort_unstable();

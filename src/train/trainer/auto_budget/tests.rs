@@ -29,26 +29,27 @@ fn grow(first: usize, training: f64) -> AutoBudget {
 fn growth_stops_when_the_gain_is_too_low_twice_in_a_row() {
     let auto = grow(1_000, 0.0);
     let gains: Vec<Option<f64>> = auto.intervals.iter().map(|interval| interval.gain).collect();
-    assert_eq!(gains[..2], [None, None], "two points are no slope");
+    assert_eq!(gains[..2], [None, None], "two points give no slope");
     let gains: Vec<f64> = gains.into_iter().flatten().collect();
     // For three equally spaced points the slope is the difference of the outer two, which are a doubling apart.
     let [first, .., third] = [0, 1, 2].map(|i| auto.intervals[i].psnr);
     assert!((gains[0] - (third - first)).abs() < 1e-2, "{} for {}", gains[0], third - first);
-    let (paid, idle) = gains.split_at(gains.len() - 2);
-    assert!(paid.len() > 5 && paid.iter().all(|gain| *gain >= MIN_GAIN), "{gains:?}");
-    assert!(idle.iter().all(|gain| *gain < MIN_GAIN), "it stops at the second: {gains:?}");
-    assert_eq!(auto.limit, auto.intervals.last().unwrap().rows, "no row more");
+    let (sufficient, low) = gains.split_at(gains.len() - 2);
+    let all_sufficient = sufficient.iter().all(|gain| *gain >= MIN_GAIN);
+    assert!(sufficient.len() > 5 && all_sufficient, "{gains:?}");
+    assert!(low.iter().all(|gain| *gain < MIN_GAIN), "stopped too late: {gains:?}");
+    assert_eq!(auto.limit, auto.intervals.last().unwrap().rows, "the model grows no further");
 }
 
 #[test]
-fn gains_by_training_prolong_growth() {
-    let (still, training) = (grow(1_000, 0.0), grow(1_000, 0.03));
-    assert!(still.stopped.is_some() && training.stopped > still.stopped, "{training:?}");
+fn gains_by_training_alone_prolong_growth() {
+    let (without, with) = (grow(1_000, 0.0), grow(1_000, 0.03));
+    assert!(without.stopped.is_some() && with.stopped > without.stopped, "{with:?}");
     assert_eq!(grow(1_000, 0.06).stopped, None, "0.12 dB per doubling by training alone");
 }
 
 #[test]
-fn a_limit_that_is_not_reached_rises_to_the_budget_at_most() {
+fn a_limit_that_is_not_reached_rises_at_most_to_the_budget() {
     let mut auto = AutoBudget::new(100_000, BUDGET);
     for end in 1..=6 {
         auto.record(end * LENGTH, 20_000, 30.0);
@@ -56,7 +57,7 @@ fn a_limit_that_is_not_reached_rises_to_the_budget_at_most() {
     }
     assert_eq!((auto.limit, auto.stopped), (BUDGET, None));
     assert!(auto.intervals.iter().all(|interval| interval.gain.is_none()), "{:?}", auto.intervals);
-    // The limit also rises if rows increase far below it.
+    // The limit also rises if the number of rows increases but stays far below it.
     for end in 7..=12 {
         auto.record(end * LENGTH, 1_000 << (end - 7), 30.0);
         auto.update_limit(BUDGET);
@@ -94,15 +95,15 @@ fn intervals_count_only_after_the_psnr_has_recovered() {
 #[test]
 fn rows_are_removed_after_growth_and_not_at_the_end() {
     let mut auto = AutoBudget::new(10_000, BUDGET);
-    assert!(!auto.may_remove(500, 1_000), "it grows");
+    assert!(!auto.may_remove(500, 1_000), "the model still grows");
     assert!(auto.may_remove(600, 1_000), "policies have stopped");
     auto.stopped = Some(300);
     assert!(auto.may_remove(400, 1_000));
-    assert!(!auto.may_remove(900, 1_000), "those that stay must settle");
+    assert!(!auto.may_remove(900, 1_000), "the remaining rows must adapt");
 }
 
 #[test]
-fn intervals_are_multiples_of_the_policies_intervals() {
+fn intervals_are_multiples_of_100_steps() {
     for (iterations, steps) in [(30_000, 1_500), (2_000, 100), (5_000, 300), (100, 100)] {
         assert_eq!(interval_steps(iterations), steps);
     }

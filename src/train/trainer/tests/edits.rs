@@ -6,9 +6,9 @@ use super::*;
 fn edits_are_reported_and_the_budget_holds() {
     let (mut trainer, ..) = trainer(&CASE);
     let events: Vec<EditEvent> = (0..9).flat_map(|_| trainer.step().unwrap().events).collect();
-    let short: Vec<_> =
+    let counts: Vec<_> =
         events.iter().map(|e| (e.step, e.before, e.added, e.denied, e.after)).collect();
-    assert_eq!(short, [(2, 3, 3, 0, 6), (4, 6, 4, 2, 10), (6, 10, 0, 10, 10), (8, 10, 0, 10, 10)]);
+    assert_eq!(counts, [(2, 3, 3, 0, 6), (4, 6, 4, 2, 10), (6, 10, 0, 10, 10), (8, 10, 0, 10, 10)]);
     assert_eq!((events[0].updated, events[0].removed, &*events[0].cause), (3, 0, "scripted"));
     assert_eq!(trainer.state.events, events);
     assert_eq!((trainer.progress().peak_rows, trainer.rows(), trainer.steps_done()), (10, 10, 9));
@@ -23,9 +23,9 @@ fn frozen_rows_count_for_the_budget_and_are_hidden_from_policies() {
     assert!(matches!(refused, Err(TrainError::BadOption(why)) if why.contains("3 frozen")));
     let (mut trainer, log, _) = build(&case, 3, info, options).unwrap();
     let events: Vec<EditEvent> = (0..9).flat_map(|_| trainer.step().unwrap().events).collect();
-    let short: Vec<_> =
+    let counts: Vec<_> =
         events.iter().map(|e| (e.step, e.before, e.added, e.denied, e.after)).collect();
-    assert_eq!(short, [(2, 5, 2, 0, 7), (4, 7, 3, 1, 10), (6, 10, 0, 7, 10), (8, 10, 0, 7, 10)]);
+    assert_eq!(counts, [(2, 5, 2, 0, 7), (4, 7, 3, 1, 10), (6, 10, 0, 7, 10), (8, 10, 0, 7, 10)]);
     assert!(log.lock().unwrap().iter().any(|call| call.starts_with("observe")));
     // A frozen row with non-finite values ends the run.
     let case = Case { unsound: 1, behaviour: Behaviour::Nothing, ..case };
@@ -54,7 +54,7 @@ fn the_peak_is_kept_after_pruning() {
 }
 
 #[test]
-fn a_policy_error_stops_before_the_edit() {
+fn a_policy_error_ends_the_run_before_the_edit() {
     let (message, rows, calls) = failure(&Case { behaviour: Behaviour::Fail, ..CASE });
     assert_eq!(message, "step 2: policy `scripted`: out of ideas");
     assert_eq!(rows, 3);

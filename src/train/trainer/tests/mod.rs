@@ -28,7 +28,7 @@ mod nonfinite;
 mod policy_views;
 mod steps;
 
-/// All calls to a fake, in order.
+/// All calls to a fake object, in order.
 type CallLog = Arc<Mutex<Vec<String>>>;
 
 fn note(log: &CallLog, call: String) {

@@ -8,8 +8,8 @@ fn nonfinite_rows_are_removed_before_the_policy_plans() {
     let (mut trainer, log, _) = trainer(&case);
     assert!(trainer.step().unwrap().events.is_empty());
     let events = trainer.step().unwrap().events;
-    let short: Vec<_> = events.iter().map(|e| (&*e.cause, e.before, e.removed)).collect();
-    assert_eq!(short, [("not finite", 2000, 2), ("scripted", 1998, 999)]);
+    let counts: Vec<_> = events.iter().map(|e| (&*e.cause, e.before, e.removed)).collect();
+    assert_eq!(counts, [("not finite", 2000, 2), ("scripted", 1998, 999)]);
     assert_eq!(log.lock().unwrap().iter().filter(|d| *d == "apply 2").count(), 2);
     assert_eq!(trainer.state.events, events);
 }
@@ -23,7 +23,7 @@ fn nonfinite_rows_are_removed_at_the_end() {
 
 #[test]
 fn many_nonfinite_rows_end_the_run() {
-    // One in a thousand rows may be removed, and one always.
+    // One in a thousand rows may be removed, and a single row always, unless it is the only one.
     for (rows, unsound, ends) in
         [(3, 1, false), (3, 2, true), (3000, 3, false), (3000, 4, true), (1, 1, true)]
     {

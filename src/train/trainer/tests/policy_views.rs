@@ -3,7 +3,7 @@
 use super::*;
 
 #[test]
-fn the_first_of_near_duplicates_is_kept() {
+fn the_first_of_several_near_duplicates_is_kept() {
     let camera = |x: f64, degrees: f64, fx: f64| {
         let rotation = DMat3::from_rotation_y(degrees.to_radians());
         Camera::centred((64, 48), (fx, 50.0), rotation, DVec3::new(x, 0.0, 0.0))
@@ -37,7 +37,7 @@ fn near_duplicates_are_not_scored() {
     let observed = |view| log.iter().any(|d| d.starts_with(&format!("observe {view},")));
     assert_eq!([0, 1, 2].map(observed), [true, false, true], "{log:?}");
     assert_eq!(trainer.unscored_views(), 1);
-    // All are trained on.
+    // All views are trained on.
     assert!((0..3).all(|view| log.iter().any(|d| d.contains(&format!("view {view}")))), "{log:?}");
 }
 

@@ -17,13 +17,13 @@ fn every_epoch_shows_every_view_once_and_prefetches() {
     let steps: Vec<String> =
         shown.iter().enumerate().map(|(i, view)| format!("step {} view {view}", i + 1)).collect();
     assert_eq!(log.iter().filter(|d| *d != "epoch").cloned().collect::<Vec<_>>(), steps);
-    // The next views are announced, but none beyond the end of the run.
+    // The next two views are prefetched, but none beyond the end of the run.
     for (i, said) in prefetched.lock().unwrap().iter().enumerate() {
         assert_eq!(*said, format!("{:?}", &shown[i + 1..(i + 3).min(9)]));
     }
 }
 
-/// Each view has its own exposure, which its own steps change and which checkpoints contain.
+/// Each view has its own exposure, which is changed by steps with this view and is saved in checkpoints.
 #[test]
 fn exposures_belong_to_views() {
     let gains = [[1.0, 0.5, 1.0], [1.0; 3], [1.0, 1.5, 1.0]];
@@ -41,7 +41,7 @@ fn exposures_belong_to_views() {
     for (gain, view) in noted.iter().zip(&shown) {
         assert!((gain - gains[*view][1]).abs() < 0.05, "view {view}: {gain}");
     }
-    // A step reduces the view's factor; the mean is constant, so that the others increase.
+    // A step reduces the view's factor; the mean is constant, so the factors of the other views increase.
     assert!(noted[1..3].iter().zip(&shown[1..]).all(|(gain, view)| *gain > gains[*view][1]));
     let state = new.state().unwrap();
     assert_eq!(state.exposures, new.progress().exposures);

@@ -89,7 +89,7 @@ impl Entry {
         let metadata = HashMap::from([(CHECKSUM.to_owned(), checksum_of(tensors.clone()))]);
         let bytes = safetensors::serialize(tensors, Some(metadata))?;
         write_atomically(&self.path, |out| out.write_all(&bytes))?;
-        self.path.parent().map_or(Ok(()), |folder| bound(folder, MAX_BYTES))?;
+        self.path.parent().map_or(Ok(()), |folder| evict(folder, MAX_BYTES))?;
         Ok(())
     }
 }
@@ -158,12 +158,12 @@ fn fingerprint(path: &Path) -> io::Result<u32> {
 }
 
 /// Removes the least recently used entries until all together have at most `most` bytes.
-fn bound(folder: &Path, most: u64) -> io::Result<()> {
+fn evict(folder: &Path, most: u64) -> io::Result<()> {
     let mut entries = Vec::new();
     for entry in fs::read_dir(folder)? {
         let entry = entry?;
         let known = entry.metadata()?;
-        // Incomplete files of killed processes count as unused entries.
+        // Incomplete files that killed processes left behind are counted and removed like entries.
         let is_entry = entry.path().extension().is_some_and(|ending| ending == ENDING);
         if is_entry || entry.file_name().as_encoded_bytes().starts_with(b".densify-") {
             entries.push((known.modified()?, known.len(), entry.path()));
@@ -215,7 +215,7 @@ mod tests {
         path.file_name().is_some_and(|name| name.to_string_lossy().contains(':'))
     }
 
-    fn same(read: Option<Rendered>) -> bool {
+    fn is_sample(read: Option<Rendered>) -> bool {
         read.is_some_and(|read| read == sample())
     }
 
@@ -226,14 +226,14 @@ mod tests {
         let default = entry(&Options::default());
         assert!(default.read().is_none());
         default.write(&sample());
-        assert!(same(default.read()));
-        // Other parameters are another scene.
+        assert!(is_sample(default.read()));
+        // Other parameters make another entry.
         assert!(entry(&Options { seed: 9, ..Options::default() }).read().is_none());
-        // So is another size.
+        // Another size makes another entry, too.
         let sized = |name| Entry::new(folder.path(), name, &Options::default()).unwrap();
         let [town, larger] = ["town", "town:4"].map(sized);
         town.write(&sample());
-        assert!(same(town.read()) && larger.read().is_none() && !has_colon(&larger.path));
+        assert!(is_sample(town.read()) && larger.read().is_none() && !has_colon(&larger.path));
         // A damaged entry counts as missing.
         let whole = fs::read(&default.path).unwrap();
         for at in (0..whole.len()).step_by(7) {
@@ -241,7 +241,7 @@ mod tests {
             damaged[at] ^= 16;
             fs::write(&default.path, &damaged).unwrap();
             let read = default.read();
-            assert!(read.is_none() || same(read), "byte {at}");
+            assert!(read.is_none() || is_sample(read), "byte {at}");
         }
         fs::write(&default.path, &whole[..whole.len() - 1]).unwrap();
         assert!(default.read().is_none());
@@ -257,7 +257,7 @@ mod tests {
             File::options().write(true).open(&path).unwrap().set_modified(then).unwrap();
         }
         fs::write(folder.path().join("other.txt"), [0; 900]).unwrap();
-        bound(folder.path(), 200).unwrap();
+        evict(folder.path(), 200).unwrap();
         let there = |name: &str| folder.path().join(name).with_extension(ENDING).exists();
         assert_eq!(["a", "b", "c"].map(there), [false, true, true]);
         assert!(folder.path().join("other.txt").exists());

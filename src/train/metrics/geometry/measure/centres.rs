@@ -44,7 +44,7 @@ pub(super) fn errors(
     })
 }
 
-/// The weighted percentile of (value, weight) pairs; NaN without weight.
+/// The weighted percentile of (value, weight) pairs; NaN without pairs.
 fn percentile(mut values: Vec<(f64, f64)>, fraction: f64) -> f64 {
     values.sort_by(|a, b| a.0.total_cmp(&b.0));
     let goal = fraction * values.iter().map(|&(_, weight)| weight).sum::<f64>();

@@ -18,8 +18,8 @@ use pixels::Pixels;
 use rows::Rows;
 use visibility::Visibility;
 
-/// Measures the model in `backend`, which was made for [`needs`]: weights and visibility in the training views; depth,
-/// normals and thin structures in `views`.
+/// Measures the model in `backend`, which was created with [`needs`]: weights and visibility in the training views;
+/// depth, normals and thin structures in `views`.
 ///
 /// # Errors
 /// When a view cannot be read or rendered, and when the caller stops.
@@ -68,7 +68,7 @@ impl KnownScene<'_> {
         (world, caster)
     }
 
-    /// Depth and normals of the surface in a view. Called once per view, and stops if the caller asks for it.
+    /// Depth and normals of the surface in a view. Called once per view; returns an error if the caller asks to stop.
     fn g_buffer(
         &self,
         name: &str,

@@ -14,7 +14,7 @@ use densify_render::{Backend, Rendering};
 
 /// Alpha above which a pixel is covered.
 const COVERED: f32 = 0.5;
-/// Approximate number of pixels of a view whose normals are compared.
+/// Maximum number of pixels of a view whose normals are compared.
 const NORMALS: usize = 2000;
 /// Largest depth error of a thin structure, in addition to its thickness `[fraction of the depth]`.
 const DEPTH_SLACK: f64 = 0.01;

@@ -159,7 +159,7 @@ fn rows_on_the_surface_have_no_error() {
     let mean = 0.05 * (2f64.sqrt() + 1f64.asinh()) / 6.0 / DIAGONAL;
     close(g.centres.completeness, mean, 0.01 * mean);
     close(g.centres.chamfer, g.centres.completeness, 1e-6);
-    // In every cell, a disc lies within 0.5 % of the diagonal from the centre.
+    // Recall: of every cell, the disc within 0.5 % of the diagonal from the centre.
     let recall = std::f64::consts::PI * (0.005 * DIAGONAL / 0.05).powi(2);
     close(g.centres.f_score_half_percent, 2.0 * recall / (1.0 + recall), 0.01);
     assert_eq!((g.floaters.count, g.floaters.of_weight), (0, 0.0));
@@ -175,9 +175,9 @@ fn an_offset_of_all_rows_is_measured() {
     close(g.centres.accuracy, 0.1 / DIAGONAL, 1e-6);
     close(g.centres.accuracy_p95, 0.1 / DIAGONAL, 1e-6);
     assert_eq!(g.centres.f_score_one_percent, 0.0);
-    // Behind the surface no view sees them.
+    // No view sees the rows, because they are behind the surface.
     assert_eq!(g.floaters.count, 0);
-    // At the same distance in front of the surface all are in empty space: 0.1 > 0.01 · 2.83 and > 2 · 0.03.
+    // At the same distance in front of the surface, all rows are in empty space: 0.1 > 0.01 · 2.83 and > 2 · 0.03.
     let g = measured(&truth, &carpet(-0.1));
     assert_eq!((g.floaters.count, g.floaters.of_rows), (1600, 1.0));
     close(g.floaters.of_weight, 1.0, 1e-12);
@@ -186,7 +186,7 @@ fn an_offset_of_all_rows_is_measured() {
 
 #[test]
 fn invisible_rows_and_surfaces_do_not_count() {
-    // Rows behind the carpet weigh next to nothing.
+    // Rows behind the carpet have almost no weight.
     let (mut model, hidden) = (carpet(0.0), carpet(0.5));
     for row in 0..hidden.len() {
         let place = DVec3::from(hidden.means[row].map(f64::from));
@@ -225,7 +225,7 @@ fn only_floaters_are_counted() {
     // rows cover the square, 2 · (64 · 2 / 3)² px.
     assert!((5e-4..3e-3).contains(&floater.of_weight), "{}", floater.of_weight);
     let cases = [
-        ("within the wall", DVec3::new(0.0, 0.0, 1.0), small, 0.9),
+        ("behind the square", DVec3::new(0.0, 0.0, 1.0), small, 0.9),
         ("faint", DVec3::new(0.0, 0.0, -1.0), small, 0.04),
         ("large", DVec3::new(0.0, 0.0, -1.0), DVec3::new(0.02, 0.6, 0.02), 0.9),
         ("near", DVec3::new(0.0, 0.0, -0.027), DVec3::splat(0.001), 0.9),
@@ -235,7 +235,7 @@ fn only_floaters_are_counted() {
     for (what, place, scale, opacity) in cases {
         assert_eq!(with(place, scale, opacity).count, 0, "{what}");
     }
-    // Beside the square the views see the background, so space is empty there too.
+    // Beside the square the views see the background, so the space there is empty, too.
     assert_eq!(with(DVec3::new(0.0, 1.2, 0.0), small, 0.9).count, 1);
 }
 
@@ -246,7 +246,7 @@ fn blended_and_negligible_rows_are_counted() {
     push(&mut model, DVec3::ZERO, DVec3::new(50.0, 50.0, 0.01), 0.9);
     let g = measured(&truth, &model).redundancy;
     assert_eq!((g.blended_per_pixel, g.below_one_percent), (1.0, 0.0));
-    // In the shadow of the first: 0.08 · (1 − 0.9) is less than 0.01.
+    // The second row is behind the first: 0.08 · (1 − 0.9) is less than 0.01.
     push(&mut model, DVec3::Z, DVec3::new(50.0, 50.0, 0.01), 0.08);
     let g = measured(&truth, &model).redundancy;
     assert_eq!((g.blended_per_pixel, g.below_one_percent), (2.0, 0.5));

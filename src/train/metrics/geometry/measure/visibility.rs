@@ -24,7 +24,7 @@ const MIN_OPACITY: f32 = 0.05;
 const MIN_DISTANCE: f64 = 0.01;
 /// Blend weight below which a row has a negligible effect.
 const NEGLIGIBLE: f32 = 0.01;
-/// Number of views that must agree.
+/// Number of views that must see through a floater's position, or see a sample of the mesh.
 const MIN_VIEWS: u32 = 2;
 
 /// Sums over the training views.
@@ -33,7 +33,7 @@ pub(super) struct Visibility {
     pub(super) weights: Vec<f64>,
     /// Largest α·T of each row.
     peaks: Vec<f32>,
-    /// Number of views in which each row's position is empty.
+    /// Number of views that see through each row's position.
     empty: Vec<u32>,
     /// Numbers of blended (row, pixel) pairs and of pixels.
     blended: (f64, f64),
@@ -70,8 +70,8 @@ impl Visibility {
                 *empty += u32::from(sees_through(&world, &g_buffer, place));
             });
             let surface = ground.truth.surface();
-            let open = samples.par_iter_mut().filter(|(_, views)| *views < MIN_VIEWS);
-            open.for_each(|(at, views)| {
+            let unseen = samples.par_iter_mut().filter(|(_, views)| *views < MIN_VIEWS);
+            unseen.for_each(|(at, views)| {
                 let (pixel, depth) = ray_camera.project(*at);
                 let is_shown = depth > 0.0 && ray_camera.contains(pixel);
                 *views += u32::from(is_shown && !surface.blocked(ray_camera.centre, *at));
@@ -143,10 +143,10 @@ impl Visibility {
     }
 
     pub(super) fn redundancy(&self) -> Redundancy {
-        let idle = self.peaks.iter().filter(|&&peak| peak < NEGLIGIBLE).count();
+        let negligible = self.peaks.iter().filter(|&&peak| peak < NEGLIGIBLE).count();
         Redundancy {
             blended_per_pixel: ratio(self.blended.0, self.blended.1),
-            below_one_percent: ratio(idle as f64, self.peaks.len() as f64),
+            below_one_percent: ratio(negligible as f64, self.peaks.len() as f64),
         }
     }
 }
@@ -193,7 +193,7 @@ mod tests {
 
     #[test]
     fn samples_lie_on_the_triangles_with_uniform_density() {
-        // A triangle of area 3 in z = 0 and one of area 1 in z = 1, with one of area 0 between.
+        // A triangle of area 3 in z = 0, one of area 0, and one of area 1 in z = 1.
         let first = [DVec3::ZERO, 3.0 * DVec3::X, 2.0 * DVec3::Y];
         let line = [DVec3::ZERO, DVec3::X, 2.0 * DVec3::X];
         let second = [DVec3::Z, DVec3::Z + DVec3::X, DVec3::Z + 2.0 * DVec3::Y];

@@ -7,10 +7,10 @@ use densify_train::metrics::geometry;
 
 /// A measurement of a model in a scene whose surface is known.
 #[derive(Debug, Clone)]
-pub(crate) struct Measuring {
+pub(crate) struct GeometryMeasurement {
     pub(crate) device: Device,
     /// Setup of the backend, for any number of rows.
-    pub(crate) options: Setup,
+    pub(crate) setup: Setup,
     /// Threads that measure.
     pub(crate) threads: usize,
     /// Memory of the known surface `[bytes]`.
@@ -19,7 +19,7 @@ pub(crate) struct Measuring {
     pub(crate) views: usize,
 }
 
-impl Measuring {
+impl GeometryMeasurement {
     /// The ledger of training, with the memory for measuring a model of this many rows afterwards.
     pub(super) fn added_to(&self, training: &Ledger, rows: usize, sh_degree: u8) -> Ledger {
         let mut counted = training.clone();
@@ -32,24 +32,24 @@ impl Measuring {
 
     /// Memory for measuring in addition to the process, on the host and on the device `[bytes]`.
     pub(crate) fn bytes(&self, rows: usize, sh_degree: u8) -> [u64; 2] {
-        let options = self.for_rows(rows);
-        let plan = self.device.memory_plan(sh_degree, &options, self.threads);
-        let geometry = geometry::bytes(rows, sh_degree, options.largest_image, self.views);
+        let setup = self.for_rows(rows);
+        let plan = self.device.memory_plan(sh_degree, &setup, self.threads);
+        let geometry = geometry::bytes(rows, sh_degree, setup.largest_image, self.views);
         [plan.on_host() + geometry + self.surface, plan.on_device()]
     }
 
     /// The backend for a model of this many rows.
     pub(crate) fn for_rows(&self, rows: usize) -> Setup {
         let rows = rows.max(1);
-        // Few views have more pairs; these are rendered in bands, with the same result.
-        let pairs = rows.saturating_mul(3).min(self.device.most_pairs(&self.options.needs));
-        let cap = self.options.tile_cap.map_or(pairs, |cap| cap.min(pairs));
+        // Few views have more than three pairs per row; these are rendered in bands, with the same result.
+        let pairs = rows.saturating_mul(3).min(self.device.most_pairs(&self.setup.needs));
+        let cap = self.setup.tile_cap.map_or(pairs, |cap| cap.min(pairs));
         Setup {
-            budget: RowBudget { total: rows, ..self.options.budget },
+            budget: RowBudget { total: rows, ..self.setup.budget },
             tile_cap: Some(cap.max(rows)),
             // No gradient is computed.
             record_cap: rows,
-            ..self.options.clone()
+            ..self.setup.clone()
         }
     }
 }
