@@ -27,8 +27,8 @@ pub(super) struct Observation {
 /// Peak memory for reading and measuring the colours of tracks, in addition to an image `[bytes]`.
 pub fn bytes(tracks: &Tracks) -> u64 {
     let colours: usize = tracks.views.iter().map(Vec::len).sum();
-    // The observations, and one channel of them, which is sorted for a median.
-    (colours * (size_of::<Observation>() + 2 * size_of::<f32>())) as u64
+    // The observations, and two differences per channel of each, of which medians are taken.
+    (colours * (size_of::<Observation>() + 6 * size_of::<f32>())) as u64
 }
 
 /// The observed colours of all tracks, and the gains and track colours fitted to them.

@@ -63,7 +63,11 @@ impl ExposureSpread {
                 std::array::from_fn(|channel| (f64::from(gains[channel]) / factor[channel]) as f32)
             })
             .collect();
-        let (mut alike, mut with_gains, mut own) = (Vec::new(), Vec::new(), Vec::new());
+        // Reserved at once, so that they take no more than [`bytes`](super::bytes) counts.
+        let differences = 3 * colours.by_track().map(<[_]>::len).sum::<usize>();
+        let mut alike = Vec::with_capacity(differences);
+        let mut with_gains = Vec::with_capacity(differences);
+        let mut own = Vec::new();
         let mut tracks = 0;
         for (place, seen) in colours.by_track().enumerate() {
             tracks += 1;

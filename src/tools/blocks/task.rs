@@ -11,7 +11,7 @@ use super::{
 };
 use densify_core::camera::Camera;
 use densify_core::files::{FileError, write_atomically};
-use densify_core::numbers::grouped;
+use densify_core::numbers::gaussians;
 use densify_data::dataset::Dataset;
 use densify_data::models::PLY;
 use densify_launch::utf8;
@@ -50,7 +50,7 @@ pub fn run(
         Task::Merge => {
             let output = folder.join(MERGED_FILE);
             let merged = merge(folder, plan, &output, PLY, false, observer)?;
-            observer.say(format_args!("{}: {} Gaussians", output.display(), grouped(merged.rows)));
+            observer.say(format_args!("{}: {}", output.display(), gaussians(merged.rows)));
             return Ok(());
         }
     };

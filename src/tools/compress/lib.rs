@@ -17,7 +17,7 @@ use tempfile::TempPath;
 
 use densify_core::files::{FileError, folder_of, write_atomically};
 use densify_core::gaussians::Gaussians;
-use densify_core::numbers::grouped;
+use densify_core::numbers::{gaussians, grouped};
 use densify_data::models::{Format, PLY};
 use densify_run::failure::Failure;
 use densify_run::finished::read_model;
@@ -199,8 +199,8 @@ impl Search<'_> {
         };
         let attempt = self.evaluate_file(&small, format, bytes)?;
         observer.say(format_args!(
-            "tried    {} Gaussians of degree {degree} as {}: {} bytes, {:.2} dB",
-            grouped(attempt.rows),
+            "tried    {} of degree {degree} as {}: {} bytes, {:.2} dB",
+            gaussians(attempt.rows),
             format.name,
             grouped(usize::try_from(bytes).unwrap_or(usize::MAX)),
             attempt.train_psnr

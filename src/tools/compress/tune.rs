@@ -6,6 +6,7 @@ use super::colour::reduce;
 use super::{Options, Target, fit};
 use densify_core::files::write_atomically;
 use densify_core::gaussians::Gaussians;
+use densify_core::numbers::gaussians;
 use densify_data::models::{Format, PLY};
 use densify_run::failure::Failure;
 use densify_run::finished::read_model;
@@ -45,7 +46,8 @@ pub(super) fn tune(
             budget = fit::rows_that_fit(options.to, format, &model)?.unwrap_or(1);
         }
         observer.say(format_args!(
-            "training {budget} Gaussians of degree {} for {iterations} iterations ({} of {})",
+            "training {} of degree {} for {iterations} iterations ({} of {})",
+            gaussians(budget),
             model.sh_degree,
             stage + 1,
             stages.len()
