@@ -9,7 +9,8 @@ use crate::ply::{Element, Ply, Scalar};
 
 /// Colour of points that have none.
 const GREY: u8 = 128;
-/// Largest real colour of a cloud whose full value is 1; in one of 0 to 255 all would be black.
+/// Fractional colours up to this value are read on a scale of 0 to 1, even if some exceed 1: on a scale of 0 to 255,
+/// all would be almost black.
 const BRIGHTEST: f64 = 16.0;
 
 /// A coloured point cloud in structure of arrays.
@@ -86,11 +87,11 @@ pub fn read_points(path: &Path) -> Result<PointCloud, LoadError> {
     Ok(points)
 }
 
-/// The value of a full colour channel: of bytes their largest, else the smallest usual one that no colour exceeds, as
-/// programs write colours of 0 to 255 as any type.
+/// The value of a full colour channel: for bytes their largest value, otherwise the smallest usual value that no colour
+/// exceeds, because programs write colours of 0 to 255 in any type.
 ///
 /// # Errors
-/// When real colours exceed all usual values.
+/// When floating-point colours exceed all usual values.
 fn full_scale(path: &Path, vertices: &Element, channels: [usize; 3]) -> Result<f64, LoadError> {
     let kinds = channels.map(|column| vertices.properties[column].kind);
     if matches!(kinds, [Scalar::U8, Scalar::U8, Scalar::U8] | [Scalar::I8, Scalar::I8, Scalar::I8])

@@ -1,7 +1,8 @@
 //! Datasets in ZIP archives, unpacked into a temporary folder that is removed with the dataset's last view.
 //!
 //! The readers of all formats then see a folder, from which photographs are decoded as fast as from any other. Archives
-//! are untrusted: no name leads out of the folder, no links are created, and the unpacked size is bounded before and during unpacking.
+//! are untrusted: no name leads out of the folder, no links are created, and the unpacked size is bounded before and
+//! during unpacking.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufReader, Read};
@@ -146,8 +147,8 @@ impl Unpacked {
 
     /// Replaces the temporary folder with the archive's name in a path.
     pub(super) fn shown(&self, path: &Path) -> PathBuf {
-        let rest =
-            path.strip_prefix(&self.folder).or_else(|_| path.strip_prefix(self.temporary.path()));
+        let rest = path.strip_prefix(&self.folder);
+        let rest = rest.or_else(|_| path.strip_prefix(self.temporary.path()));
         rest.map_or_else(|_| path.to_owned(), |rest| self.archive.join(rest))
     }
 }

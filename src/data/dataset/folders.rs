@@ -190,7 +190,7 @@ impl Folders {
     }
 }
 
-/// Adds the names of the photographs in a folder and, if `is_deep`, in its subfolders. Masks and hidden files are left out.
+/// Adds the names of the photographs in a folder and, if `is_deep`, in its subfolders, without masks and hidden files.
 fn add_photographs(folder: &Path, inside: &str, is_deep: bool, names: &mut Vec<String>) {
     for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
         let file = entry.file_name();

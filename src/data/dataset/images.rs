@@ -132,7 +132,7 @@ impl ImageSource {
 
     /// Whether loaded images may have transparent pixels.
     pub(crate) fn may_be_transparent(&self) -> bool {
-        self.header.has_alpha || self.masks_become_transparent()
+        self.header.has_alpha || self.mask_becomes_transparency()
     }
 
     /// Whether loaded images have a mask: from a file, or of the field of view of the lens.
@@ -143,7 +143,7 @@ impl ImageSource {
     }
 
     /// Returns true if the mask becomes transparency.
-    fn masks_become_transparent(&self) -> bool {
+    fn mask_becomes_transparency(&self) -> bool {
         self.mask.as_ref().is_some_and(|mask| mask.mode == MaskMode::Background)
     }
 

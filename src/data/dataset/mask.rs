@@ -129,7 +129,7 @@ mod tests {
 
     /// Masked pixels and transparent pixels of the photograph are both transparent.
     #[test]
-    fn masks_of_background_become_transparency() {
+    fn in_background_mode_masked_pixels_are_transparent() {
         let folder = tempfile::tempdir().unwrap();
         let [path, plain, mask] = ["a.png", "b.png", "m.png"].map(|name| folder.path().join(name));
         let alpha = |x, _| image::Rgba([10_u8, 20, 30, if x == 0 { 102 } else { 255 }]);

@@ -304,8 +304,8 @@ impl<'a> Fields<'a> {
                 root.existing_on_any_system(named)?.ok_or_else(missing)?,
             ));
         }
-        // The path is from another machine: its suffixes are looked for in the dataset's folder, then the mask is looked
-        // for in the usual places. The bare file name does not count, as a photograph may have the same name.
+        // The path is from another machine: its suffixes are looked for in the dataset's folder, then the usual places
+        // of masks are searched. The bare file name does not count, as a photograph may have the same name.
         for value in named.suffixes()?.filter(|end| end.contains('/')) {
             if let Some(found) = root.existing(DataPath { value: &value, ..named })? {
                 return Ok(MaskFile::black_hides(found));

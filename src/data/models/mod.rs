@@ -57,7 +57,7 @@ pub struct Format {
 
 inventory::collect!(Format);
 
-/// A name or an extension of no format that densify writes.
+/// The error for a name or an extension that belongs to no format that densify writes.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0}; choose one of: {names}", names = names(&export_formats()))]
 pub struct FormatError(String);
@@ -89,7 +89,7 @@ pub fn compress_formats() -> Vec<&'static Format> {
 /// The format with this name, to write.
 ///
 /// # Errors
-/// When there is none; the message names the nearest.
+/// When there is none; the message suggests the format with the nearest name.
 pub fn find(name: &str) -> Result<&'static Format, FormatError> {
     let formats = export_formats();
     formats.iter().find(|format| format.name == name).copied().ok_or_else(|| {

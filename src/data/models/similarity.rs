@@ -176,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn other_matrices_are_refused() {
+    fn matrices_that_are_not_similarities_are_refused() {
         let uneven = DMat4::from_scale(DVec3::new(1.0, 1.0, 1.1));
         let mirrored = DMat4::from_scale(DVec3::new(1.0, 1.0, -1.0));
         for matrix in [uneven, mirrored, DMat4::ZERO, DMat4::from_scale(DVec3::NAN)] {

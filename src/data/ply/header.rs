@@ -8,7 +8,7 @@ use crate::error::LoadError;
 
 /// Longest header accepted `[bytes]`.
 const MAX_HEADER: u64 = 1 << 20;
-/// Number of rows from which on an element is refused.
+/// An element with this number of rows or more is refused.
 const MAX_ROWS: u64 = 1 << 32;
 
 /// Encoding of the data.
@@ -105,7 +105,7 @@ impl Element {
         })
     }
 
-    /// Index of a property that the purpose needs.
+    /// Index of a required property.
     ///
     /// # Errors
     /// When it is missing; the message ends with `remedy`.
@@ -228,7 +228,7 @@ impl<R: BufRead> Lines<'_, R> {
         if line.last() != Some(&b'\n') && line.trim_ascii() != b"end_header" {
             return Err(self.fault("the header ends without `end_header`, or is longer than 1 MiB"));
         }
-        // Comments may hold any encoding.
+        // Comments may be in any character encoding.
         Ok(String::from_utf8_lossy(&line).into_owned())
     }
 

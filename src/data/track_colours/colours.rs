@@ -19,8 +19,9 @@ pub(super) struct Observation {
     pub(super) view: u32,
     /// Colour at the point.
     pub(super) centre: [u8; 3],
-    /// Smallest and largest values within a pixel.
+    /// Smallest values of the pixel at the point and of its neighbours.
     lowest: [u8; 3],
+    /// Largest values of these pixels.
     highest: [u8; 3],
 }
 
@@ -105,7 +106,7 @@ impl TrackColours {
         self.fits[0].gains.len()
     }
 
-    /// The fitted colour of a track, by its index among those with enough views.
+    /// The fitted colour of a track, by its index among the tracks with enough views.
     pub(super) fn reference(&self, place: usize) -> [f32; 3] {
         self.fits.each_ref().map(|fit| fit.references[place])
     }

@@ -1,4 +1,4 @@
-//! Runs a task. A task that was killed resumes from its last checkpoint, and its result is byte-identical.
+//! Runs a task. A task that was killed resumes from its last checkpoint, and gives the same result, byte for byte.
 
 use std::fs;
 use std::path::Path;
@@ -105,7 +105,7 @@ fn prepare_block(
     let trained = plan.rows_in_cell(&cell, &model);
     if trained.is_empty() {
         return Err(Failure::input(format!(
-            "{}: the coarse model has no Gaussian there; plan with fewer --blocks or more --coarse-rows",
+            "{}: the coarse model has no Gaussian in its cell; plan with fewer --blocks or more --coarse-rows",
             block.name
         )));
     }

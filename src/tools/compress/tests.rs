@@ -1,4 +1,4 @@
-//! Tests of the attempts and of the training between them.
+//! Tests of the formats and sizes that are tried, and of training on a decoded file.
 
 use std::collections::HashSet;
 
@@ -76,9 +76,9 @@ fn formats_that_do_not_hold_the_model_are_not_tried() {
         fit::fitting(&options, &model, &scratch, &Silent)
     };
     let names = |formats: Vec<&Format>| formats.iter().map(|format| format.name).collect();
-    let found: Vec<&str> = fitting(&[spz, sog(), PLY]).map(names).expect("two hold it");
+    let found: Vec<&str> = fitting(&[spz, sog(), PLY]).map(names).expect("two formats");
     assert_eq!(found, ["sog", "ply"]);
-    let refused = fitting(&[spz]).expect_err("it does not").to_string();
+    let refused = fitting(&[spz]).expect_err("spz cannot hold it").to_string();
     assert!(refused.contains("spz does not hold") && refused.contains("such as"), "{refused}");
 }
 
@@ -113,8 +113,8 @@ fn only_variants_that_hold_enough_rows_are_tried() {
     assert_eq!(few.rows, 500);
 }
 
-/// The last iterations train the decoded model and keep its view-dependent colour, of which many rows share a palette
-/// entry.
+/// The last iterations train the decoded model and keep its view-dependent colours, each of which is a palette entry
+/// shared by many rows.
 #[test]
 fn colours_stay_as_decoded_from_the_file() {
     let made = Made::colmap_txt();

@@ -69,7 +69,7 @@ pub(super) fn list(run: &RunRecord) -> Result<Markup, Failure> {
     })
 }
 
-/// Lists the common options that differ between runs; `None` if there are none.
+/// Lists the options that all runs have and that differ between them; `None` if there are none.
 pub(super) fn list_differences(runs: &[RunRecord]) -> Result<Option<Markup>, Failure> {
     let options = runs.iter().map(|run| Ok(flatten(&published(&run.config.spec)?)));
     let options: Vec<BTreeMap<String, String>> = options.collect::<Result<_, Failure>>()?;
@@ -104,7 +104,7 @@ mod tests {
     use super::*;
     use densify_run::AbsolutePath;
 
-    /// Options whose value is a file or a folder are paths.
+    /// An option is a path if its value is called a file, folder, model or scene in `--help`.
     #[test]
     fn every_path_option_is_known() {
         let command = RunSpec::augment_args(clap::Command::new("train"));

@@ -30,7 +30,7 @@ use trial::Trial;
 /// A set of checks that every backend must pass.
 #[derive(Debug, Clone, Copy)]
 pub struct Case {
-    /// Number, as the user chooses it.
+    /// Number by which the user selects the case.
     pub number: u8,
     /// The numerical difficulty, in a few words.
     pub title: &'static str,

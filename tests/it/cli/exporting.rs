@@ -119,9 +119,9 @@ fn a_model_beyond_the_range_of_a_format_is_refused() {
     std::fs::write(&to, "old").unwrap();
     let export = |to: &Path| call(&format!("export {} -o {} --overwrite", text(&model), text(to)));
     let refused = export(&to);
-    refused.refused("spz", &["tiny.spz", "the scales of", "% of what shows", "such as"]);
+    refused.refused("spz", &["tiny.spz", "the scales of", "% of the visible area", "such as"]);
     assert_eq!(read(&to), b"old");
     let other = refused.stderr.trim().rsplit(' ').next().unwrap();
     let outcome = export(&root.path().join(format!("tiny.{}", other.replace('-', ".")))).ok();
-    assert!(!outcome.stdout.contains("what shows"), "{outcome:?}");
+    assert!(!outcome.stdout.contains("visible area"), "{outcome:?}");
 }

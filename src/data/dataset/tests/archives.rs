@@ -80,8 +80,8 @@ fn renamed(bytes: &[u8], old: &str, new: &str) -> Vec<u8> {
     bytes
 }
 
-/// Changes one byte at the offset `own` of each file's own header, and one at the offset `table` of its entry in the table
-/// of contents.
+/// Changes one byte at the offset `own` of each file's own header, and one at the offset `table` of its entry in the
+/// table of contents.
 fn with_edited_headers(
     bytes: &[u8],
     own: usize,

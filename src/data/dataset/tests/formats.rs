@@ -173,7 +173,7 @@ fn images_are_loaded_at_the_requested_resolution() {
                 assert!((view.camera.fx / f64::from(size.0) - 15.0 / 20.0).abs() < 1e-12);
             }
         }
-        // The folder of reduced images is used if there is one. One image is missing in it.
+        // The folder of reduced images is used if it exists; here, one image is missing in the folder.
         for name in &NAMES[1..] {
             image(&made.file("images_2").join(name), (10, 6), 7);
         }

@@ -33,7 +33,7 @@ const FORMAT: Format = Format {
 const VERSION_4: Format = Format {
     name: "spz-v4",
     extension: "v4.spz",
-    summary: "SPZ version 4: the same in zstd frames, which some readers do not take",
+    summary: "SPZ version 4: the same values in zstd frames, which some readers do not support",
     // The reader of `spz` reads all versions.
     reader: None,
     writer: Some(|| Box::new(SpzWriter::in_frames())),

@@ -221,7 +221,7 @@ pub fn leeway(
     view: View<'_>,
     counted: &[bool],
 ) -> Vec<(f64, f64, u32)> {
-    // Without thresholds nothing is skipped; an alpha 10 % below the minimum is never blended.
+    // These rules skip no row that a backend may blend: an alpha 10 % below the minimum is never blended.
     let rules = Rules { alpha_min: 0.9 / 255.0, ..Rules::SMOOTH };
     let mut bounds = vec![(0.0, 0.0, 0); splats.len()];
     for (at, _) in pixels(view).zip(counted).filter(|(_, counted)| !**counted) {

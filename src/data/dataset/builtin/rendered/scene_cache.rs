@@ -162,11 +162,11 @@ fn evict(folder: &Path, most: u64) -> io::Result<()> {
     let mut entries = Vec::new();
     for entry in fs::read_dir(folder)? {
         let entry = entry?;
-        let known = entry.metadata()?;
+        let metadata = entry.metadata()?;
         // Incomplete files that killed processes left behind are counted and removed like entries.
         let is_entry = entry.path().extension().is_some_and(|ending| ending == ENDING);
         if is_entry || entry.file_name().as_encoded_bytes().starts_with(b".densify-") {
-            entries.push((known.modified()?, known.len(), entry.path()));
+            entries.push((metadata.modified()?, metadata.len(), entry.path()));
         }
     }
     entries.sort();
