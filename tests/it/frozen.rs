@@ -1,4 +1,4 @@
-//! Frozen rows: steps and plans never change a bit of them, and they need no memory for training.
+//! Frozen rows: steps and plans never change a bit of their parameters, and they need no memory for training.
 
 use densify::core::budget::RowBudget;
 use densify::core::camera::Camera;
@@ -21,7 +21,7 @@ fn view() -> Camera {
     scenes::camera(41, 33, 81)
 }
 
-/// Includes quaternions of any length, and sizes and opacities beyond the range to which steps confine them.
+/// Includes quaternions of any length, and sizes and opacities outside the range to which training steps clamp them.
 fn model() -> Gaussians {
     let mut model = scenes::cloud(ROWS, 1, &view(), 82);
     for row in [3, 18] {
@@ -149,8 +149,8 @@ fn other_rows_train_as_usual() {
             // Arrays of missing SH bands are empty.
             if free.shape[0] == ROWS && !free_rows.is_empty() {
                 assert!(free_rows[FROZEN..] == frozen_rows[FROZEN..], "{}", free.name);
-                let rests = |row: &Vec<u32>| row.iter().all(|value| *value == 0);
-                assert!(frozen_rows[..FROZEN].iter().all(rests), "{}", free.name);
+                let is_zero = |row: &Vec<u32>| row.iter().all(|value| *value == 0);
+                assert!(frozen_rows[..FROZEN].iter().all(is_zero), "{}", free.name);
             }
         }
     });

@@ -14,7 +14,7 @@ use densify_render::cpu::ModelGradient;
 pub struct Limits {
     /// Largest difference of a value where no threshold is close.
     pub interior: f64,
-    /// Largest difference of a value where a threshold is close.
+    /// Largest step of a value at a threshold: its difference where a threshold is close.
     pub step: f64,
     /// Largest share of pixels that may differ by more than `interior`; one pixel always may.
     pub flipped: f64,

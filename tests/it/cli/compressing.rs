@@ -38,7 +38,7 @@ fn compressed_files_stay_within_the_requested_size() {
     let (outcome, few) = compress(&third.to_string(), "few.ply", "");
     assert!(outcome.ok().stdout.contains(&format!("training {third} Gaussians")));
     assert_eq!(gaussians(&few).len(), third);
-    // Already small enough: nothing is trained and nothing is lost.
+    // A model that is already small enough is neither trained nor reduced.
     let (outcome, same) = compress("1MiB", "same.ply", "");
     assert!(!outcome.ok().stdout.contains("training"));
     assert_eq!(read(&same).len(), whole);

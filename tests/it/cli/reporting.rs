@@ -259,7 +259,7 @@ fn reports_average_seeds_compare_policies_and_separate_scenes() {
     let file = at("moved.html");
     let refused =
         report(&[&runs[0], &at("garden-run")], &file, &format!("--scene {}", text(scene.path())));
-    refused.refused("two scenes at one place", &["--scene", "garden"]);
+    refused.refused("two scenes, one folder", &["--scene", "garden"]);
     assert!(!file.exists());
 }
 
@@ -331,7 +331,7 @@ fn a_run_in_progress_is_reported_as_last_saved() {
     run_of(scene.path(), &run, "--save-iterations 20 --test-iterations 20");
     let so_far = root.path().join("so-far");
     super::copy_unfinished(&run, &so_far, 40);
-    // An incomplete last line, as of a log in progress.
+    // The last line is incomplete, as in a log that is being written.
     let log = so_far.join("stats/train.jsonl");
     std::fs::write(&log, [&read(&log)[..], b"{\"step\": 50, \"lo"].concat()).expect("a log");
     let lock = std::fs::File::create(so_far.join("densify.lock")).expect("a file");

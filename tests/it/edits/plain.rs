@@ -21,9 +21,9 @@ pub(super) struct Row {
     pub(super) signals: [f32; SIGNALS.len()],
     /// The row of the twin that has the same moments; `None` if they are zero.
     pub(super) moments: Option<usize>,
-    /// True if the moments of the opacity are zero, regardless of the others.
+    /// True if the moments of the opacity are zero, regardless of the other moments.
     pub(super) opacity_rests: bool,
-    /// The first SH coefficient from which on moments are zero, regardless of the others.
+    /// The first of the SH coefficients whose moments are zero, regardless of the other moments.
     pub(super) sh_rests_from: usize,
     /// True if the opacity has decayed.
     pub(super) has_decayed: bool,
@@ -161,7 +161,7 @@ fn empty(signal: Signal) -> f32 {
     if signal.kind() == SignalKind::Minimum { f32::INFINITY } else { 0.0 }
 }
 
-/// Applies the accepted calls of a step to the plain vector.
+/// Applies the accepted calls of one event to the plain vector.
 pub(super) fn execute(
     model: Vec<Row>,
     calls: &[Call],
@@ -212,9 +212,9 @@ pub(super) fn execute(
             }
         }
     }
-    let families = slots.into_iter().zip(children);
+    let rows_with_children = slots.into_iter().zip(children);
     let mut model: Vec<Row> =
-        families.flat_map(|(row, children)| row.into_iter().chain(children)).collect();
+        rows_with_children.flat_map(|(row, children)| row.into_iter().chain(children)).collect();
     model.extend(seeds);
     assert!(model.len() <= budget, "{} rows, budget {budget}", model.len());
     for row in &mut model {

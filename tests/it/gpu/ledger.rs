@@ -15,7 +15,7 @@ fn device_allocations_match_the_ledger() {
     };
     let mask = MaskTerm { start: 1.0, rate: 0.01, weight: 5e-4, threshold: 0.01 };
     let columns = vec![AuxColumn::PixelCount, AuxColumn::MapSum];
-    // One number per pair for the error, another for the weight of scores, none for attributes.
+    // The numbers per gradient record: nine, one more for the error, and another for the weight of scores.
     let asked = [
         (needs(&[]), 9),
         (needs(&[Signal::WeightedError]), 10),

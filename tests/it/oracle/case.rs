@@ -18,7 +18,7 @@ pub(super) struct Case {
     pub(super) model: Gaussians,
     pub(super) cameras: Vec<Camera>,
     pub(super) background: [f32; 3],
-    /// Relative error of the same computation in `f32`, by quantity.
+    /// Relative error of each quantity if it is computed in `f32`.
     floors: BTreeMap<String, f64>,
     arrays: BTreeMap<String, Vec<f64>>,
 }

@@ -1,6 +1,7 @@
 //! Compares the float64 renderer and every backend with stored float64 renders and gradients of small scenes.
-//! Tolerances: 1e-9 for the renderer; 2e-5 (1e-4 on a GPU) for images of backends away from thresholds; ten (twenty) times the error
-//! of float32 arithmetic for their gradients and statistics.
+//! Tolerances: 1e-9 for the renderer; 2e-5 (1e-4 on a GPU) for images of backends, except in pixels near a threshold;
+//! ten times the error of float32 arithmetic (twenty times on a GPU or without SIMD) for gradients and statistics of
+//! backends.
 
 mod case;
 
@@ -14,7 +15,7 @@ use densify::selftest::{Subject, scenes};
 use crate::subject::{all, class, make, wide};
 use case::{Case, Part, cases};
 
-/// For float64 computations in a different order, including needles of 1000:1.
+/// Tolerance of float64 computations in a different order, for scenes that include needles of 1000:1.
 const EXACT: f64 = 1e-9;
 
 /// Images of one camera and gradients of part of the loss.

@@ -6,7 +6,7 @@ use std::path::Path;
 use image::AnimationDecoder;
 use image::codecs::webp::WebPDecoder;
 
-use super::looking::{ITERATIONS, run_of};
+use super::inspecting::{ITERATIONS, run_of};
 use super::{Outcome, WITHOUT_GPU, call, files, json, outcome_of, scratch, text};
 use crate::photographs::Photographs;
 

@@ -38,7 +38,7 @@ fn eval_reproduces_the_scores_of_training() {
     let trained = paths.clone().map(|path| json(&path));
     paths.iter().for_each(|path| std::fs::remove_file(path).expect("an existing file"));
     let outcome = call(&format!("eval {}", text(&run))).ok();
-    // The model file rounds, because it stores the model in the dataset's coordinates.
+    // Values are rounded when the model file stores them in the dataset's coordinates.
     for (path, trained) in paths.iter().zip(&trained) {
         assert_close(&json(path), trained, 2e-3);
     }
@@ -137,7 +137,7 @@ fn render_writes_images_of_the_views() {
     let depth = json(&pictures.join("depth.json"));
     let largest = depth["largest"]["view_00.depth.png"].as_f64().expect("a number");
     assert!((3.0..6.0).contains(&largest), "{largest}");
-    // The pair is the photograph beside the rendering.
+    // The pair shows the photograph on the left and the rendering on the right.
     let pair = open("view_00.pair.png").into_rgb8();
     let (photograph, rendering) = (
         image::open(scene.file("images/view_00.png")).unwrap().into_rgb8(),
