@@ -104,7 +104,10 @@ fn every_level_matches_its_exactness_class() {
     let explicit = root.path().join("explicit");
     for flags in [&*defaults, "--preset exact"] {
         short(scene.path(), &explicit, &format!("{flags} --overwrite")).ok();
-        assert!(expected == model(&explicit, ITERATIONS), "{flags} does not give the default model");
+        assert!(
+            expected == model(&explicit, ITERATIONS),
+            "{flags} does not give the default model"
+        );
     }
     let mut changed = 0;
     // `accumulation.rs` tests the knobs of a GPU.
