@@ -15,7 +15,7 @@ use densify::selftest::{Differentiable, Setup, Subject, scenes};
 /// Steps before saving. With accumulation, no update is due at this step, so all classes have pending gradients.
 const BEFORE: u32 = 7;
 
-/// All signals and gradients accumulated over several steps.
+/// All signals except `Mask`, and gradients that are summed over several steps.
 fn with_accumulation() -> Needs {
     let signals = Signal::ALL.into_iter().filter(|signal| *signal != Signal::Mask).collect();
     Needs {

@@ -135,8 +135,8 @@ impl Materials {
             if shown == 0.0 {
                 let name = shortened(name);
                 self.model.notes.push(format!(
-                    "material {name}: Tr {tr} would hide it, but is what some programs write for opaque materials; it is \
-                     shown (d 0 hides a material)"
+                    "material {name} is shown: Tr {tr} means invisible, but some programs write it for opaque \
+                     materials; write `d 0` to hide the material"
                 ));
             }
             opacity = Some(Vec3::splat(if shown == 0.0 { 1.0 } else { shown }));

@@ -39,7 +39,7 @@ pub(super) fn describe(run: &RunRecord) -> Option<Markup> {
                 Some(peak) => {
                     "The process took " strong { (Bytes(peak)) } " at its peak; " (Bytes(promise)) " were promised"
                     @if peak <= promise { ", and the promise was kept." }
-                    @else { ": " strong { "more than promised." } }
+                    @else { ". " strong { "The promise was exceeded." } }
                 }
                 None => { "The process promised to take at most " (Bytes(promise)) "; this system does not report its peak." }
             }

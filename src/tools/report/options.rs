@@ -49,7 +49,8 @@ fn published(spec: &RunSpec) -> Result<Table, Failure> {
 pub(super) fn list(run: &RunRecord) -> Result<Markup, Failure> {
     let (all, defaults) = (published(&run.config.spec)?, published(&RunSpec::default())?);
     let (own, defaults) = (flatten(&all), flatten(&defaults));
-    // Tables are left out: they hold all parameters of the policy, without marking the defaults.
+    // Entries of TOML tables are left out: they include every parameter of the policy, whether or not it has its
+    // default value.
     let is_changed = |name: &str| {
         all.get(name).is_some_and(|value| !value.is_table()) && own.get(name) != defaults.get(name)
     };

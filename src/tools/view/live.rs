@@ -29,7 +29,7 @@ use densify_train::trainer::{EditEvent, RowHistory};
 
 /// Maximum number of waiting requests.
 const MAX_WAITING: usize = 8;
-/// Maximum number of pictures in progress; their memory is part of the plan.
+/// Maximum number of pictures in progress; their memory is in the ledger.
 const MAX_ACTIVE: usize = 1;
 /// Memory of a connection: the used part of its thread's stack, its buffers and its request `[bytes]`.
 const CONNECTION_BYTES: u64 = 80 << 10;

@@ -62,7 +62,7 @@ fn compressed_files_stay_within_the_requested_size() {
         ("1MiB", "same.ply", "", &["exists", "--overwrite"]),
         ("1MiB", "any", "--format any", &["any.", "exists", "--overwrite"]),
         ("1MiB", "tiny.ply", "--format all", &["`all`", "any"]),
-        ("1MiB", "tiny.ply", "--near 0.1", &["--near", "leave it out"]),
+        ("1MiB", "tiny.ply", "--near 0.1", &["--near", "leave the option out"]),
     ] {
         let (outcome, _) = compress(to, name, flags);
         outcome.refused(name, words);

@@ -218,7 +218,7 @@ fn unsuitable_models_are_refused_or_reported() {
     std::fs::create_dir(root.path().join("early")).unwrap();
     std::fs::write(root.path().join("early/config.toml"), "").unwrap();
     let early = root.path().join("early");
-    assert_refused(&start(&early, ""), root.path(), &["--init", "early", "has no model"]);
+    assert_refused(&start(&early, ""), root.path(), &["--init", "early", "no saved model"]);
     assert_refused(&start(&file, "--init-points 9"), root.path(), &["--init-points 9", "random"]);
     let cut = root.path().join("cut.ply");
     std::fs::write(&cut, &read(&file)[..2_000]).unwrap();

@@ -104,7 +104,7 @@ impl Case {
     }
 
     /// True for pixels that are not near a threshold of the renderer. Shape: [height, width].
-    pub(super) fn decided(&self, camera: usize) -> Vec<bool> {
+    pub(super) fn away_from_thresholds(&self, camera: usize) -> Vec<bool> {
         self.split(self.array("pixel_ok"), camera).iter().map(|&ok| ok > 0.0).collect()
     }
 
@@ -122,8 +122,8 @@ impl Case {
         }
     }
 
-    /// Ten times the `f32` error of this quantity. If it was not measured, the largest error of the same parameter class
-    /// in another loss is used, or else of any gradient.
+    /// Ten times the `f32` error of this quantity. If it was not measured, the largest error of the same parameter
+    /// class in another loss is used, or else of any gradient.
     pub(super) fn tolerance(&self, key: &str) -> f64 {
         let class = key.rsplit('.').next().unwrap_or(key);
         let largest = |of: &dyn Fn(&str) -> bool| {
