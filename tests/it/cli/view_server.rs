@@ -372,7 +372,7 @@ fn invalid_calls_are_refused_with_a_remedy() {
     let model = densify::train::output::model_path(&run, 40);
     let model = text(&model);
     for (words, expected) in [
-        (format!("{run_text} --port {port}"), vec!["--port", "another program", "name none"]),
+        (format!("{run_text} --port {port}"), vec!["--port", "another program", "give none"]),
         (format!("{run_text} --port 70000"), vec!["--port"]),
         (format!("{run_text} --host nowhere"), vec!["--host"]),
         (format!("{run_text} --host 192.0.2.1"), vec!["--host 192.0.2.1", "this machine"]),
