@@ -14,7 +14,7 @@ use densify_run::{Partial, RunSpec};
 /// Maximum number of rows of the table of differences; more would not be readable.
 const MAX_DIFFERENCES: usize = 60;
 /// Options that are paths on the machine that trained; only their last component is published.
-const PATHS: [&str; 5] = ["scene", "images", "views", "init", "freeze"];
+const PATHS: [&str; 6] = ["scene", "images", "sparse", "views", "init", "freeze"];
 
 /// All options with their full names, such as `knob.alpha_min`, and their values as text.
 pub(super) fn flatten(options: &Table) -> BTreeMap<String, String> {
