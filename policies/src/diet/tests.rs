@@ -53,7 +53,8 @@ fn the_gradient_mixes_screen_and_colour() {
 
 #[test]
 fn at_the_budget_the_least_important_are_replaced() {
-    // 9.4 / 94 is a tenth of the budget of 20: two rows, the least important of those that are not candidates.
+    // `rho` 9.4 over 94 events is a tenth of the budget per event: two of 20 rows, the least important of those that
+    // are not candidates.
     let event =
         event(600, 20, 20).with(Signal::ScreenGradient, &gradient_sums(20, &[0, 2, 9, 12, 19]));
     let done = run(&event, "rho = 9.4");
@@ -114,12 +115,12 @@ fn huge_rows_are_kept_unless_a_size_limit_is_set() {
     let kept = run(&late, "");
     assert_eq!((kept.pruned, kept.split), (vec![], vec![2, 3]));
     // With a limit they are pruned after step 3000, at growth steps only.
-    let named = "max_scale = 0.1";
-    let early = run(&event, named);
+    let limited = "max_scale = 0.1";
+    let early = run(&event, limited);
     assert_eq!((early.pruned, early.split), (vec![], vec![2, 3]));
-    let late = run(&late, named);
+    let late = run(&late, limited);
     assert_eq!((late.pruned, late.split), (vec![1, 3], vec![2]));
-    assert!(run(&Event { step: 3150, ..event }, named).ops.is_empty());
+    assert!(run(&Event { step: 3150, ..event }, limited).ops.is_empty());
 }
 
 #[test]
@@ -229,9 +230,9 @@ fn large_rows_split_and_small_ones_are_cloned() {
         .with(Signal::ScreenGradient, &[2.0, 1.0])
         .with(Signal::ScaleMax, &[0.101, 0.1]);
     let offspring = |set: &str| -> Vec<Offspring> { run(&event, set).offspring() };
-    let [original, clone] = offspring("split = \"random\"")[..] else { panic!("two families") };
-    assert_eq!((original, clone), (split_by(1.6), clone_at([0.0; 3])));
-    assert_eq!(original.scale, ScaleRule::Uniform(0.625));
+    let [random_split, clone] = offspring("split = \"random\"")[..] else { panic!("two families") };
+    assert_eq!((random_split, clone), (split_by(1.6), clone_at([0.0; 3])));
+    assert_eq!(random_split.scale, ScaleRule::Uniform(0.625));
     let [halves, clone] = offspring("")[..] else { panic!("two families") };
     assert_eq!((halves, clone), (split_long_axis(0.45, 0.6), clone_at([0.0; 3])));
     let other = offspring("split_share = 0.3\nchild_opacity = 0.8")[0];
@@ -315,7 +316,7 @@ fn no_row_is_evicted_for_a_pixel_without_a_point() {
 }
 
 #[test]
-fn newborn_size_code_is_the_squared_geometric_mean_of_the_scales() {
+fn with_newborn_size_code_the_size_is_the_squared_geometric_mean_of_the_scales() {
     let mut event = event(10_500, 3, 40).with(Signal::ScaleMax, &[0.1, 0.4, f32::NAN]);
     event.candidates = vec![candidate(0.1, 7.0)];
     let scale = |set| run(&event, &format!("rho_c = 1\n{set}")).ops.seeds[0].1.scales[0];

@@ -86,7 +86,7 @@ pub fn compress_formats() -> Vec<&'static Format> {
     formats
 }
 
-/// The format with this name, to write.
+/// The writable format with this name.
 ///
 /// # Errors
 /// When there is none; the message suggests the format with the nearest name.
@@ -99,7 +99,7 @@ pub fn find(name: &str) -> Result<&'static Format, FormatError> {
     })
 }
 
-/// The format with the extension of `path`, to write; the longest extension wins (`a.b` over `b`).
+/// The writable format with the extension of `path`; the longest extension wins (`a.b` over `b`).
 ///
 /// # Errors
 /// When there is none.

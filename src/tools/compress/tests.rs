@@ -9,7 +9,7 @@ use densify_render::BackendChoice;
 use densify_run::Silent;
 
 #[test]
-fn degrees_are_tried_from_the_models_own_down() {
+fn degrees_are_tried_downwards_from_that_of_the_model() {
     assert_eq!(degrees(3, Target::Bytes(1)), [3, 2, 1, 0]);
     assert_eq!(degrees(1, Target::Bytes(1)), [1, 0]);
     assert_eq!(degrees(0, Target::Bytes(1)), [0]);
@@ -82,8 +82,9 @@ fn formats_that_do_not_hold_the_model_are_not_tried() {
     assert!(refused.contains("spz cannot hold") && refused.contains("such as"), "{refused}");
 }
 
-/// Less accurate variants are smaller, so that more rows fit. Variants that hold fewer than four fifths of the most rows
-/// are not tried. If all rows fit with the default accuracy, the most accurate variant that holds them is tried.
+/// Less accurate variants are smaller, so that more rows fit. Variants that hold fewer than four fifths of the maximum
+/// number of rows are not tried. If all rows fit with the default accuracy, the most accurate variant that holds them
+/// is tried.
 #[test]
 fn only_variants_that_hold_enough_rows_are_tried() {
     let model = colourful(2_000);

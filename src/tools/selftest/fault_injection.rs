@@ -1,7 +1,7 @@
 //! Fault injection: shows that the selftest can fail.
 //!
 //! In tests, a [`FaultyBackend`] stands in for the native backend and spoils one kind of output. Every kind
-//! of figure of every case must exceed its tolerance under at least one fault.
+//! of measurement of every case must exceed its tolerance under at least one fault.
 
 use std::cell::Cell;
 use std::collections::BTreeSet;

@@ -76,7 +76,7 @@ fn every_format_is_written_compared_and_read_back() {
     for ending in ["glb", "spz", "sog", "compressed.ply"] {
         call(&format!("export {} -o {} --overwrite", text(&at(ending)), text(&again))).ok();
         assert_eq!(read(&again).len(), saved.len(), "{ending}");
-        // A truncated file is refused by name, and nothing is written.
+        // A truncated file is refused with a message that names it, and nothing is written.
         let whole = read(&at(ending));
         let (cut, lost) = (root.path().join("cut"), root.path().join("lost.ply"));
         std::fs::write(&cut, &whole[..whole.len() / 2]).unwrap();

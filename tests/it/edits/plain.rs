@@ -90,7 +90,7 @@ impl Row {
         self.rescale(ScaleRule::Uniform(1.0 - how.scale));
     }
 
-    /// Resets moments and signals, of which the age is one.
+    /// Resets moments and signals (the age is a signal).
     fn newborn(mut self) -> Self {
         self.moments = None;
         self.signals = SIGNALS.map(empty);
