@@ -40,7 +40,7 @@
 //!
 //! ## Differences from the published code
 //!
-//! - **`sum_scaling`.** The published values of `sum` and `sum_more`, 5 and 20, give 1,500 + 375 optimiser steps
+//! - **`sums`.** The published values of `sum` and `sum_more`, 5 and 20, give 1,500 + 375 optimiser steps
 //!   in the second half of 30,000 iterations, but 350 + 88 in a run of 7,000. By default (`"scaled"`) both are
 //!   multiplied by iterations / 30,000 and rounded, at least 1, so that a short run has about as many optimiser
 //!   steps as a full one if it has enough iterations; a run of 7,000 uses 1 and 5. `"fixed"` uses the same values
@@ -83,14 +83,14 @@
 //! | sum | 5 | 1 to 1000 | steps | iterations per optimiser step after `sum_from` |
 //! | sum_more_from | 22500 | >= 0 | step | start of summing them over `sum_more` iterations (exclusive) |
 //! | sum_more | 20 | 1 to 1000 | steps | iterations per optimiser step after `sum_more_from` |
-//! | sum_scaling | "scaled" | scaled, fixed | | whether `sum` and `sum_more` scale with the run |
+//! | sums | "scaled" | scaled, fixed | | whether `sum` and `sum_more` scale with the run |
 //! | mean_start | 0.00004 | > 0 | extent / step | learning rate of the means at the start |
 //! | mean_end | 0.000002 | > 0 | extent / step | learning rate of the means at the end |
 //! | sh_rest | 0.00025 | > 0 | | learning rate of SH bands 1–3 |
 //!
 //! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
 //! (`…_every`) do not shrink below 100 steps. `recover` does not scale; `sum` and `sum_more` scale even if
-//! they are set, unless `sum_scaling` is `"fixed"`.
+//! they are set, unless `sums` is `"fixed"`.
 
 use crate::adc::{OpacityResets, PruneLimits, Window, mean_over_views, spare_one, split_long_axis};
 use crate::parameters::StepParameter::{self, Interval, Step};

@@ -39,7 +39,7 @@ pub struct IgsParams {
     pub sum: u32,
     pub sum_more_from: u32,
     pub sum_more: u32,
-    pub sum_scaling: SumScaling,
+    pub sums: SumScaling,
     pub mean_start: f64,
     pub mean_end: f64,
     pub sh_rest: f64,
@@ -82,7 +82,7 @@ impl Default for IgsParams {
             sum: 5,
             sum_more_from: 22_500,
             sum_more: 20,
-            sum_scaling: SumScaling::Scaled,
+            sums: SumScaling::Scaled,
             mean_start: 4e-5,
             mean_end: 2e-6,
             sh_rest: 2.5e-4,
@@ -93,7 +93,7 @@ impl Default for IgsParams {
 impl IgsParams {
     /// `sum` and `sum_more` for a run of `iterations`.
     pub(super) fn scaled_sums(&self, iterations: u32) -> [u32; 2] {
-        [self.sum, self.sum_more].map(|sum| match self.sum_scaling {
+        [self.sum, self.sum_more].map(|sum| match self.sums {
             SumScaling::Fixed => sum,
             SumScaling::Scaled => {
                 let exact =

@@ -303,7 +303,7 @@ fn the_number_of_optimiser_steps_is_kept_in_short_runs() {
     assert_eq!(optimiser_steps("", 2000), [500, 500]);
     assert_eq!(optimiser_steps("", 4), [1, 1]);
     // As published: 1,750/5, and the multiples of 20 from 5,260 to 7,000.
-    let fixed = "sum_scaling = \"fixed\"";
+    let fixed = "sums = \"fixed\"";
     assert_eq!(optimiser_steps(fixed, 30_000), [1500, 375]);
     assert_eq!(optimiser_steps(fixed, 7000), [350, 88]);
     // Values set by the user scale too.
