@@ -246,6 +246,7 @@ const MODULES: [(&str, &[&str]); 5] = [
             "host",
             "spec",
             "near_plane",
+            "position_rates",
             "resolved",
             "finished",
             "session",
