@@ -258,7 +258,7 @@ fn folders_whose_masks_belong_to_no_photograph_are_noted() {
 fn dynamic_masks_are_found_beside_photographs() {
     for made in [Made::colmap_txt(), Made::transforms(|_| ())] {
         write_mask(&made.file("images/dynamic_mask_b.png"), |x| u8::from(x >= 10));
-        for (invert_masks, expected) in [(false, (255, 0)), (true, (0, 1))] {
+        for (invert_masks, expected) in [(false, (255, 0)), (true, (0, 255))] {
             let options = LoadOptions { invert_masks, ..LoadOptions::default() };
             let data = load_with(&made, &options);
             assert_eq!(data.train[0].source.load().unwrap().mask, None);
