@@ -105,6 +105,14 @@ impl Element {
         })
     }
 
+    /// As [`find`](Self::find), whatever the case of the letters in the file.
+    pub(crate) fn find_in_any_case(&self, names: &[&str]) -> Option<usize> {
+        let is_named = |p: &Property, name: &str| p.name.eq_ignore_ascii_case(name);
+        names.iter().find_map(|name| {
+            self.properties.iter().position(|p| p.list.is_none() && is_named(p, name))
+        })
+    }
+
     /// Index of a required property.
     ///
     /// # Errors
