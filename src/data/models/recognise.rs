@@ -114,7 +114,16 @@ pub fn read_model(path: &Path) -> Result<SplatFile, LoadError> {
             Match::None => {}
         }
     }
-    weak.map_or_else(|| Err(unrecognised(path)), |reader| (reader.read)(file))
+    match weak {
+        Some(reader) => (reader.read)(file),
+        None if file.json()?.is_some_and(|text| text.contains("\"lodLevels\"")) => {
+            Err(LoadError::Data(format!(
+                "{} is a list of models in several levels of detail; name one of the meta.json files that it lists",
+                path.display()
+            )))
+        }
+        None => Err(unrecognised(path)),
+    }
 }
 
 /// The main file of a folder that is a model; `None` if the folder is not one.

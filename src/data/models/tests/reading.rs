@@ -87,6 +87,30 @@ fn every_format_holds_the_same_model() {
     assert!(grey.iter().zip(limits).all(|(f, l)| *f <= l), "{grey:?}");
 }
 
+/// A ZIP archive of these files.
+fn archive(files: &[(&str, &[u8])]) -> Vec<u8> {
+    let mut archive = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+    for (name, contents) in files {
+        archive.start_file(*name, zip::write::SimpleFileOptions::default()).unwrap();
+        std::io::Write::write_all(&mut archive, contents).unwrap();
+    }
+    archive.finish().unwrap().into_inner()
+}
+
+#[test]
+fn an_archive_may_hold_the_folder_of_a_model() {
+    let folder = sog_folder();
+    let mut files = vec![("__MACOSX/scene/._meta.json".to_owned(), Vec::new())];
+    for entry in std::fs::read_dir(folder.path()).unwrap() {
+        let path = entry.unwrap().path();
+        let name = path.file_name().unwrap().to_str().unwrap();
+        files.push((format!("scene/{name}"), std::fs::read(&path).unwrap()));
+    }
+    let files: Vec<_> = files.iter().map(|(name, bytes)| (&**name, &**bytes)).collect();
+    let (_folder, path) = saved("model.sog", archive(&files));
+    assert_eq!(read(&path), read(folder.path()));
+}
+
 #[test]
 fn file_names_do_not_matter() {
     for (name, format) in [("model.ply", "spz/v4.spz"), ("model.spz", "sog/stored.sog")] {
@@ -188,6 +212,14 @@ fn dishonest_files_are_refused_with_the_reason() {
         ("a picture", b"\x89PNG\r\n\x1a\n0123".to_vec(), &["convert"]),
         ("a pointer", b"version https://git-lfs.github.com/spec/v1\n".to_vec(), &["git lfs pull"]),
         ("version 5", spz(4, 5), &["header", "2 and 3, in gzip, and 4, not 5"]),
+        ("other JSON", b"{\"frames\":[]}".to_vec(), &["not a model", "convert"]),
+        ("levels", b"{\"lodLevels\":1}".to_vec(), &["levels of detail", "meta.json files"]),
+        ("a ZIP", archive(&[("a.ply", b"ply")]), &["ZIP archive, but no SOG", "unpack it"]),
+        (
+            "a model among others",
+            archive(&[("a/meta.json", b"{}"), ("b/meta.json", b"{}")]),
+            &["ZIP archive, but no SOG"],
+        ),
         ("a damaged frame", spz(96, 0xff), &["compressed data is damaged"]),
         ("degree 4", spz(12, 4), &["degree 4"]),
         ("too many rows", spz(11, 255), &["header", "too many for a file of 497"]),
