@@ -120,6 +120,15 @@ fn file_names_do_not_matter() {
 }
 
 #[test]
+fn a_byte_order_mark_is_skipped() {
+    for format in ["ply/twelve.ply", "compressed-ply/twelve.ply"] {
+        let plain = std::fs::read(corpus(format)).unwrap();
+        let (_folder, path) = saved("model.ply", ["\u{feff}".as_bytes(), &plain].concat());
+        assert_eq!(read(&path), read(&corpus(format)), "{format}");
+    }
+}
+
+#[test]
 fn nodes_place_their_splats() {
     let placed = read(&corpus("gltf/placed.gltf"));
     let plain = read(&corpus("glb/twelve.glb"));
@@ -203,6 +212,14 @@ fn dishonest_files_are_refused_with_the_reason() {
             &["compressed-ply, glb, gltf, ply, sog, splat, spz", "convert"][..],
         ),
         ("zeros", vec![0; 320], &["convert"]),
+        ("other JSON", b"{\"frames\":[]}".to_vec(), &["not a model", "convert"]),
+        ("levels", b"{\"lodLevels\":1}".to_vec(), &["levels of detail", "meta.json files"]),
+        ("a ZIP", archive(&[("a.ply", b"ply")]), &["ZIP archive, but no SOG", "unpack it"]),
+        (
+            "a model among others",
+            archive(&[("a/meta.json", b"{}"), ("b/meta.json", b"{}")]),
+            &["ZIP archive, but no SOG"],
+        ),
         // The head of a .ksplat: its version, then the number of its sections.
         (
             "a ksplat",
@@ -212,14 +229,6 @@ fn dishonest_files_are_refused_with_the_reason() {
         ("a picture", b"\x89PNG\r\n\x1a\n0123".to_vec(), &["convert"]),
         ("a pointer", b"version https://git-lfs.github.com/spec/v1\n".to_vec(), &["git lfs pull"]),
         ("version 5", spz(4, 5), &["header", "2 and 3, in gzip, and 4, not 5"]),
-        ("other JSON", b"{\"frames\":[]}".to_vec(), &["not a model", "convert"]),
-        ("levels", b"{\"lodLevels\":1}".to_vec(), &["levels of detail", "meta.json files"]),
-        ("a ZIP", archive(&[("a.ply", b"ply")]), &["ZIP archive, but no SOG", "unpack it"]),
-        (
-            "a model among others",
-            archive(&[("a/meta.json", b"{}"), ("b/meta.json", b"{}")]),
-            &["ZIP archive, but no SOG"],
-        ),
         ("a damaged frame", spz(96, 0xff), &["compressed data is damaged"]),
         ("degree 4", spz(12, 4), &["degree 4"]),
         ("too many rows", spz(11, 255), &["header", "too many for a file of 497"]),
