@@ -55,8 +55,7 @@ mod tests {
         let z = depth * EXTENT;
         let camera = Camera::centred((64, 64), (32.0, 32.0), DMat3::IDENTITY, DVec3::ZERO);
         let at = |i: usize| z * (2.0 * (i as f64 + 0.5) / 32.0 - 1.0);
-        let points: Vec<DVec3> =
-            (0..1024).map(|i| DVec3::new(at(i % 32), at(i / 32), z)).collect();
+        let points: Vec<DVec3> = (0..1024).map(|i| DVec3::new(at(i % 32), at(i / 32), z)).collect();
         SeenDepths::measure(&points, &[camera])
     }
 

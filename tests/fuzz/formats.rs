@@ -109,7 +109,7 @@ fn accepts_model(folder: &Path, file: &Path) -> bool {
 }
 
 fn accepts_points(path: &Path) -> bool {
-    read_points(path).is_ok_and(|points| {
+    read_points(path).is_ok_and(|(points, _)| {
         assert_eq!(points.colours.len(), points.positions.len());
         true
     })

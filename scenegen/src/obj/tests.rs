@@ -273,3 +273,33 @@ fn indices_outside_the_file_are_refused_with_their_line() {
     }
     assert!(loaded(&format!("{head}f -3/-1/-1 -2/1/1 3/1/1/7 # fine\n"), &[]).is_ok());
 }
+
+/// Metashape writes quotes around names with spaces.
+#[test]
+fn quotes_around_names_are_removed() {
+    let mut png = Cursor::new(Vec::new());
+    let red = image::RgbImage::from_pixel(1, 1, [255, 0, 0].into());
+    red.write_to(&mut png, image::ImageFormat::Png).expect("png");
+    let png = png.into_inner();
+    let obj = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl m\nf 1/1 2/1 3/1\n";
+    for (library, texture) in
+        [("\"my scene.mtl\"", "my tex.png"), ("\"my scene.mtl\"", "\"my tex.png\"")]
+    {
+        let material = format!("newmtl m\nmap_Kd -s 1 1 1 {texture}\n");
+        let files = [("my scene.mtl", material.as_bytes()), ("my tex.png", &png[..])];
+        let model = loaded(&format!("mtllib {library}\n{obj}"), &files).expect("a triangle");
+        assert_eq!((model.notes.len(), model.textures.len()), (0, 1), "{:?}", model.notes);
+    }
+    let model = loaded(&format!("mtllib \"none.mtl\"\n{obj}"), &[]).expect("a triangle");
+    assert!(model.notes[0].contains("none.mtl"), "{:?}", model.notes);
+}
+
+/// A file whose own name has quotes takes precedence. Windows has no such names.
+#[cfg(unix)]
+#[test]
+fn names_may_have_quotes() {
+    let files = [("\"a.mtl\"", &b"newmtl quoted\n"[..]), ("a.mtl", &b"newmtl plain\n"[..])];
+    let obj = "mtllib \"a.mtl\"\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl quoted\nf 1 2 3\n";
+    let model = loaded(obj, &files).expect("a triangle");
+    assert_eq!(model.notes, Vec::<String>::new());
+}

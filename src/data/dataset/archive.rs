@@ -16,6 +16,7 @@ use zip::result::ZipError;
 use super::LoadError;
 use super::paths::{lexical_fault, relative};
 use super::{Dataset, LoadOptions, Note, View};
+use crate::models::folder_in_archive;
 use densify_core::files;
 use densify_core::memory::Bytes;
 
@@ -39,7 +40,11 @@ pub(super) struct Unpacked {
 
 /// Returns true if a file's contents are a complete ZIP archive other than a SOG model.
 pub fn is_archive(path: &Path) -> bool {
-    is_zip(path) && open(path).is_ok_and(|archive| archive.index_for_name("meta.json").is_none())
+    let is_model = |archive: &ZipArchive<BufReader<File>>| {
+        let names: Vec<&str> = archive.file_names().collect();
+        folder_in_archive(names.iter().copied()).is_some()
+    };
+    is_zip(path) && open(path).is_ok_and(|archive| !is_model(&archive))
 }
 
 /// Returns true if a file begins like a ZIP archive; the archive may still be damaged.

@@ -257,6 +257,10 @@ fn header_of(path: &Path, file: &mut File) -> Result<ImageHeader, LoadError> {
         header => header,
     }
     .map_err(|problem| LoadError::image(path, problem))?;
+    if let Some(name) = transfer::high_range(Cursor::new(&start)) {
+        let problem = format!("its values are {name}, of high dynamic range");
+        return Err(LoadError::malformed(path, "cICP", problem, "convert the image to sRGB"));
+    }
     let pixels = u64::from(header.width) * u64::from(header.height);
     if pixels == 0 {
         return Err(LoadError::image(path, "it has no pixels"));

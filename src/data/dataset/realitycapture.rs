@@ -156,7 +156,9 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
     }
     let points_file = usual_points(root, path, &mut notes)?;
     let points = points_file.as_deref().map(crate::points::read_points).transpose()?;
-    let (points, listing) = (points.unwrap_or_default(), path.to_owned());
+    let (points, note) = points.unwrap_or_default();
+    notes.extend(note);
+    let listing = path.to_owned();
     let (notes, rest) = (texts(notes), Scene::default());
     Ok(Some(Scene { listing, frames, first_missing, points, points_file, notes, ..rest }))
 }

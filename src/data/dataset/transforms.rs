@@ -22,7 +22,7 @@ use super::mask_files::MaskFile;
 use super::paths::{DataPath, Root, relative};
 use super::pose::{check_lens, checked_pose};
 use super::prepare::texts;
-use super::{Frame, LoadError, LoadOptions, Scene, Split, colmap};
+use super::{Frame, LoadError, LoadOptions, Note, Scene, Split, colmap};
 
 /// The pair of files that defines its own test split.
 pub(super) const SPLIT_FORMAT: DatasetFormat = DatasetFormat {
@@ -191,7 +191,9 @@ fn read(
     if declared != DeclaredSplit::Test
         && let Some(file) = &scene.points_file
     {
-        scene.points = crate::points::read_points(file)?;
+        let (points, note) = crate::points::read_points(file)?;
+        scene.points = points;
+        scene.notes.extend(note.map(Note::Text));
     }
     Ok(scene)
 }

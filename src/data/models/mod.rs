@@ -32,6 +32,7 @@ pub use inventory;
 pub use changes::Changes;
 pub use recognise::{Match, ModelFile, Reader, main_file, read_model};
 pub use rows::SplatFile;
+pub(crate) use sog::folder_in_archive;
 pub use write::{ModelWriter, Shape, fitting_format, is_unfit};
 
 /// The format that training writes.

@@ -105,6 +105,14 @@ impl Element {
         })
     }
 
+    /// As [`find`](Self::find), whatever the case of the letters in the file.
+    pub(crate) fn find_in_any_case(&self, names: &[&str]) -> Option<usize> {
+        let is_named = |p: &Property, name: &str| p.name.eq_ignore_ascii_case(name);
+        names.iter().find_map(|name| {
+            self.properties.iter().position(|p| p.list.is_none() && is_named(p, name))
+        })
+    }
+
     /// Index of a required property.
     ///
     /// # Errors
@@ -136,7 +144,8 @@ impl Header {
     /// Reads the header and leaves `input` at the first byte of data.
     pub(super) fn read(path: &Path, input: &mut impl BufRead) -> Result<Self, LoadError> {
         let mut lines = Lines { path, input, number: 0, read: 0 };
-        if lines.next()?.trim_end() != "ply" {
+        // A byte-order mark may come first.
+        if lines.next()?.trim_start_matches('\u{feff}').trim_end() != "ply" {
             return Err(lines.fault("it is not a PLY file: the first line is not `ply`"));
         }
         let mut encoding = None;

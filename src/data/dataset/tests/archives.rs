@@ -193,6 +193,8 @@ fn masks_and_points_are_read_from_the_archive() {
 fn models_are_not_datasets() {
     let model = [("meta.json".to_owned(), b"{}".to_vec())];
     assert!(!is_archive(&Packed::of(&pack(&model, "", CompressionMethod::Stored)).path()));
+    let inside = pack(&model, "scene/", CompressionMethod::Stored);
+    assert!(!is_archive(&Packed::of(&inside).path()), "in a folder");
     let archive = Packed::of(&packed(&Made::colmap_txt()));
     assert!(is_archive(&archive.path()) && !is_archive(archive.folder.path()));
     refused("a model", &pack(&model, "", CompressionMethod::Stored), "is not a dataset");

@@ -185,7 +185,11 @@ fn splats(
     if let Some(view) = extension.pointer(&format!("/extensions/{SPZ}/bufferView")) {
         let view = view.as_u64().and_then(|view| usize::try_from(view).ok());
         let bytes = buffers.view(view.unwrap_or(usize::MAX))?;
-        return spz::read::read(path, bytes, bytes.len() as u64);
+        let (mut file, axes) = spz::read::read_as_stored(path, bytes, bytes.len() as u64)?;
+        let ignored =
+            axes.map(|axes| format!("its SPZ states the axes {axes}; those of glTF count"));
+        file.notes.extend(ignored);
+        return Ok(file);
     }
     let stated = |key: &str| extension.get(key).and_then(Value::as_str).unwrap_or_default();
     if !matches!(stated("kernel"), "ellipse" | "") || stated("colorSpace") == "lin_rec709_display" {
@@ -268,4 +272,8 @@ fn join(whole: &mut SplatFile, part: SplatFile) {
     whole.gaussians.append(more);
     whole.dropped += part.dropped;
     whole.repaired += part.repaired;
+    // Many parts may have the same note.
+    let is_new = |note: &String| !whole.notes.contains(note);
+    let notes: Vec<String> = part.notes.into_iter().filter(is_new).collect();
+    whole.notes.extend(notes);
 }

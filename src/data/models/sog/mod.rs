@@ -12,6 +12,7 @@ mod read;
 mod write;
 
 use super::{Format, Match, Reader};
+pub(crate) use read::folder_in_archive;
 use write::SogWriter;
 
 const FORMAT: Format = Format {

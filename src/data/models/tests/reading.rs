@@ -87,11 +87,44 @@ fn every_format_holds_the_same_model() {
     assert!(grey.iter().zip(limits).all(|(f, l)| *f <= l), "{grey:?}");
 }
 
+/// A ZIP archive of these files.
+fn archive(files: &[(&str, &[u8])]) -> Vec<u8> {
+    let mut archive = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+    for (name, contents) in files {
+        archive.start_file(*name, zip::write::SimpleFileOptions::default()).unwrap();
+        std::io::Write::write_all(&mut archive, contents).unwrap();
+    }
+    archive.finish().unwrap().into_inner()
+}
+
+#[test]
+fn an_archive_may_hold_the_folder_of_a_model() {
+    let folder = sog_folder();
+    let mut files = vec![("__MACOSX/scene/._meta.json".to_owned(), Vec::new())];
+    for entry in std::fs::read_dir(folder.path()).unwrap() {
+        let path = entry.unwrap().path();
+        let name = path.file_name().unwrap().to_str().unwrap();
+        files.push((format!("scene/{name}"), std::fs::read(&path).unwrap()));
+    }
+    let files: Vec<_> = files.iter().map(|(name, bytes)| (&**name, &**bytes)).collect();
+    let (_folder, path) = saved("model.sog", archive(&files));
+    assert_eq!(read(&path), read(folder.path()));
+}
+
 #[test]
 fn file_names_do_not_matter() {
     for (name, format) in [("model.ply", "spz/v4.spz"), ("model.spz", "sog/stored.sog")] {
         let (_folder, path) = saved(name, std::fs::read(corpus(format)).unwrap());
         assert_eq!(read(&path).len(), 12, "{format} as {name}");
+    }
+}
+
+#[test]
+fn a_byte_order_mark_is_skipped() {
+    for format in ["ply/twelve.ply", "compressed-ply/twelve.ply"] {
+        let plain = std::fs::read(corpus(format)).unwrap();
+        let (_folder, path) = saved("model.ply", ["\u{feff}".as_bytes(), &plain].concat());
+        assert_eq!(read(&path), read(&corpus(format)), "{format}");
     }
 }
 
@@ -179,6 +212,14 @@ fn dishonest_files_are_refused_with_the_reason() {
             &["compressed-ply, glb, gltf, ply, sog, splat, spz", "convert"][..],
         ),
         ("zeros", vec![0; 320], &["convert"]),
+        ("other JSON", b"{\"frames\":[]}".to_vec(), &["not a model", "convert"]),
+        ("levels", b"{\"lodLevels\":1}".to_vec(), &["levels of detail", "meta.json files"]),
+        ("a ZIP", archive(&[("a.ply", b"ply")]), &["ZIP archive, but no SOG", "unpack it"]),
+        (
+            "a model among others",
+            archive(&[("a/meta.json", b"{}"), ("b/meta.json", b"{}")]),
+            &["ZIP archive, but no SOG"],
+        ),
         // The head of a .ksplat: its version, then the number of its sections.
         (
             "a ksplat",
