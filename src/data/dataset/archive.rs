@@ -41,8 +41,8 @@ pub(super) struct Unpacked {
 /// Returns true if a file's contents are a complete ZIP archive other than a SOG model.
 pub fn is_archive(path: &Path) -> bool {
     let is_model = |archive: &ZipArchive<BufReader<File>>| {
-        let names: Vec<&str> = archive.file_names().collect();
-        folder_in_archive(names.iter().copied()).is_some()
+        let names: Vec<_> = archive.file_names().flatten().collect();
+        folder_in_archive(&names).is_some()
     };
     is_zip(path) && open(path).is_ok_and(|archive| !is_model(&archive))
 }

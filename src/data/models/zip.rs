@@ -1,5 +1,6 @@
 //! ZIP archives (PKWARE APPNOTE 6.3) that hold a model: a bounded reader, and a writer that stores files uncompressed.
 
+use std::borrow::Cow;
 use std::io::{self, BufReader, Read, Seek, Write};
 use std::path::Path;
 
@@ -32,9 +33,9 @@ impl<'a, R: Read + Seek> ZipReader<'a, R> {
         Ok(Self { path, length, files })
     }
 
-    /// The names of all files.
-    pub(super) fn names(&self) -> impl Iterator<Item = &str> + Clone {
-        self.files.file_names().collect::<Vec<_>>().into_iter()
+    /// The names of all files; names that are no text are left out.
+    pub(super) fn names(&self) -> Vec<Cow<'_, str>> {
+        self.files.file_names().flatten().collect()
     }
 
     /// The contents of a file, with its checksum checked.

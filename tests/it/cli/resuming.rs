@@ -74,6 +74,13 @@ fn compare(scene: &Path, flags: &str, case: &str) -> (TempDir, PathBuf) {
     (root, whole)
 }
 
+/// The first edit of a run, which depends only on the rounding of a few steps: step, cause, and numbers of Gaussians.
+fn first_edit(run: &Path) -> (u64, String, [u64; 3]) {
+    let event = &records(&run.join("stats/events.jsonl"))[0];
+    let cause = event["cause"].as_str().expect("a cause").to_owned();
+    (count(event, "step"), cause, ["before", "removed", "after"].map(|key| count(event, key)))
+}
+
 /// Test PSNR and number of Gaussians at the end of a run.
 fn quality(run: &Path) -> (f64, u64) {
     let scores = &json(&run.join("results.json"))[format!("ours_{ITERATIONS}")];
@@ -121,11 +128,19 @@ fn every_policy_resumes_exactly_on_a_gpu() {
         let (_whole_root, whole) = compare(scene.path(), &on_device, policy);
         let (_root, run) = scratch();
         train(scene.path(), &run, ITERATIONS, &format!("{flags} --backend cpu")).ok();
+        let [(step, cause, rows), native] = [&whole, &run].map(|run| first_edit(run));
+        assert_eq!((step, &*cause), (native.0, &*native.1), "{policy} on {name}");
+        let differ = rows.iter().zip(native.2).any(|(&rows, native)| rows.abs_diff(native) > 1);
+        assert!(
+            !differ,
+            "{policy} on {name}: the first edit has {rows:?}, natively {:?}",
+            native.2
+        );
         let [found, expected] = [whole, run].map(|run| quality(&run));
         let message = format!("{policy} on {name}: {found:?}, natively {expected:?}");
-        // A difference in the last bit can change which Gaussian is replaced: up to 0.11 dB in such a short run.
-        // `mini-splatting` resamples all Gaussians by weight.
-        let tolerance = if policy == "mini-splatting" { 2.0 } else { 0.3 };
+        // From then on, a difference in the last bit can change which Gaussian is replaced, as another seed would: seeds
+        // lie up to 1 dB apart. `mini-splatting` resamples all Gaussians by weight.
+        let tolerance = if policy == "mini-splatting" { 2.0 } else { 1.0 };
         assert!((found.0 - expected.0).abs() < tolerance, "{message}");
         assert!(found.1.abs_diff(expected.1) * 50 <= expected.1, "{message}");
     }

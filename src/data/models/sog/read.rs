@@ -77,7 +77,7 @@ pub(super) fn read(file: ModelFile<'_>) -> Result<SplatFile, LoadError> {
         });
     }
     let mut archive = ZipReader::open(path, file.input, file.length)?;
-    let Some(folder) = folder_in_archive(archive.names()).map(str::to_owned) else {
+    let Some(folder) = folder_in_archive(&archive.names()).map(str::to_owned) else {
         return Err(LoadError::Data(format!(
             "{} is a ZIP archive, but no SOG model, which has one {META}; unpack it, and name a file of Gaussian splats",
             path.display()
@@ -90,16 +90,14 @@ pub(super) fn read(file: ModelFile<'_>) -> Result<SplatFile, LoadError> {
 
 /// The folder of a model in an archive with these files, ending in `/`, or nothing if the model is in no folder; `None`
 /// if the archive holds no model. A model in a folder has all other files of the archive beside it.
-pub(crate) fn folder_in_archive<'a>(
-    names: impl Iterator<Item = &'a str> + Clone,
-) -> Option<&'a str> {
+pub(crate) fn folder_in_archive<'a, N: AsRef<str>>(names: &'a [N]) -> Option<&'a str> {
+    let names = names.iter().map(AsRef::as_ref);
     if names.clone().any(|name| name == META) {
         return Some("");
     }
     let mut files = names.filter(|name| !name.ends_with('/') && !name.starts_with("__MACOSX/"));
-    let is_meta = |name: &str| name.strip_suffix(META).is_some_and(|folder| folder.ends_with('/'));
-    let main = files.clone().find(|name| is_meta(name))?;
-    let folder = &main[..main.len() - META.len()];
+    let folder_of = |name: &'a str| name.strip_suffix(META).filter(|folder| folder.ends_with('/'));
+    let folder = files.clone().find_map(folder_of)?;
     let is_beside = |name: &str| name.strip_prefix(folder).is_some_and(|name| !name.contains('/'));
     files.all(is_beside).then_some(folder)
 }
