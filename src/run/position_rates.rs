@@ -73,7 +73,7 @@ mod tests {
         let (percent, line) = rates("", &wall(USUAL_DEPTH / 4.0));
         assert_eq!(percent, 25.0);
         assert!(line.expect("a line").contains("times 0.25"));
-        let given = "[schedule]\nlr = { mean_start = 1e-4 }";
+        let given = "lr = { mean_start = 1e-4 }";
         assert_eq!(rates(given, &wall(0.01)), (100.0, None), "the user decides");
     }
 }

@@ -293,7 +293,7 @@ fn masks_are_found_in_the_folder_that_is_named() {
         std::fs::rename(made.file("images"), made.file("moved")).unwrap();
         masks.iter().for_each(|mask| image(&made.file(mask), SIZE, 200));
         // In this mask, every value but black hides a pixel.
-        write_mask(&made.file(masks[9]), |_| 0);
+        write_mask(&made.file(masks[10]), |_| 0);
         let options = LoadOptions { images: Some("moved".into()), ..LoadOptions::default() };
         for mask in masks {
             let data = load_with(&made, &options);

@@ -60,8 +60,8 @@ fn logarithms_and_logits_are_refused_with_the_reason() {
         std::fs::write(folder.path().join("data.bin"), &data).unwrap();
         let primitive = json!({"attributes": attributes, "extensions": {SPLATS: {}}});
         let document = json!({
-            "buffers": [{"uri": "data.bin", "byteLength": data.len()}], "bufferViews": views,
-            "accessors": accessors, "nodes": [{"mesh": 0}], "meshes": [{"primitives": [primitive]}],
+            "asset": {"version": "2.0"}, "buffers": [{"uri": "data.bin", "byteLength": data.len()}],
+            "bufferViews": views, "accessors": accessors, "nodes": [{"mesh": 0}], "meshes": [{"primitives": [primitive]}],
         });
         std::fs::write(&path, document.to_string()).unwrap();
         read_model(&path).map(|file| file.gaussians).map_err(|error| error.to_string())
