@@ -64,16 +64,16 @@ mod tests {
         let rates = |spec: &str, seen: &SeenDepths| {
             let spec = toml::from_str(spec).expect("a description");
             let rates = PositionRates::choose(&spec, seen);
-            ((100.0 * rates.factor).round(), rates.line())
+            ((100.0 * rates.factor).round() as u32, rates.line())
         };
         for depth in [USUAL_DEPTH * 1.001, 1.0, 50.0] {
-            assert_eq!(rates("", &wall(depth)), (100.0, None), "{depth}");
+            assert_eq!(rates("", &wall(depth)), (100, None), "{depth}");
         }
-        assert_eq!(rates("", &SeenDepths::default()), (100.0, None), "nothing is known");
+        assert_eq!(rates("", &SeenDepths::default()), (100, None), "nothing is known");
         let (percent, line) = rates("", &wall(USUAL_DEPTH / 4.0));
-        assert_eq!(percent, 25.0);
+        assert_eq!(percent, 25);
         assert!(line.expect("a line").contains("times 0.25"));
         let given = "lr = { mean_start = 1e-4 }";
-        assert_eq!(rates(given, &wall(0.01)), (100.0, None), "the user decides");
+        assert_eq!(rates(given, &wall(0.01)), (100, None), "the user decides");
     }
 }

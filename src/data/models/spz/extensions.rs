@@ -140,7 +140,8 @@ mod tests {
     fn models_are_converted_from_the_axes_that_are_stated() {
         for version in [3, 4] {
             let plain = read_model(&corpus(&format!("spz/v{version}.spz"))).unwrap();
-            let cases: [(u32, fn([f32; 3]) -> [f32; 3]); 5] = [
+            type Turn = fn([f32; 3]) -> [f32; 3];
+            let cases: [(u32, Turn); 5] = [
                 (6, |mean| mean),
                 (4, |[x, y, z]| [x, -y, -z]),
                 (8, |[x, y, z]| [x, -y, z]),
