@@ -109,7 +109,7 @@ impl Folder {
 
     /// The error for a reference that is not a relative path within the folder.
     fn refused(&self, element: &str, uri: &str, problem: &str) -> Error {
-        let uri: String = uri.chars().take(80).collect();
+        let uri = shortened(uri);
         let remedy = "keep all files in the mesh's own folder";
         Error::malformed(&self.file, element, format!("the URI {uri:?} {problem}"), remedy)
     }
@@ -122,7 +122,7 @@ impl Folder {
             return read(&literal);
         }
         let decoded = percent_decoded(uri).ok_or_else(|| {
-            let uri: String = uri.chars().take(80).collect();
+            let uri = shortened(uri);
             let problem =
                 format!("the URI {uri:?} has a % without two hexadecimal digits of UTF-8 after it");
             let remedy = "give the file a name in UTF-8, and write a % in it as %25";
@@ -165,6 +165,11 @@ pub(crate) fn add_texture(
         return Err(Error::malformed(file, element, problem, "store smaller textures"));
     }
     Ok(model.textures.len() as u32 - 1)
+}
+
+/// Shortens text of a file for a message.
+pub(crate) fn shortened(text: &str) -> String {
+    text.chars().take(80).collect()
 }
 
 fn percent_decoded(text: &str) -> Option<String> {

@@ -55,13 +55,18 @@ impl Camera {
     /// The depth of a world point in front of the camera whose projection is in the image; `None` for other points.
     /// The image is extended on every side by `margin`, a fraction of that side.
     pub fn depth_in_image(&self, world: DVec3, margin: f64) -> Option<f64> {
+        self.place_in_image(world, margin).map(|(_, depth)| depth)
+    }
+
+    /// As [`depth_in_image`](Self::depth_in_image), with the pixel.
+    pub fn place_in_image(&self, world: DVec3, margin: f64) -> Option<(DVec2, f64)> {
         let (pixel, depth) = self.project(world);
         let within = |x: f64, size: u32| {
             let (size, margin) = (f64::from(size), margin * f64::from(size));
             (-margin..size + margin).contains(&x)
         };
         (depth > 0.0 && within(pixel.x, self.width) && within(pixel.y, self.height))
-            .then_some(depth)
+            .then_some((pixel, depth))
     }
 
     /// The same view with an image of another size; intrinsics scale per axis.

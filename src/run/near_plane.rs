@@ -57,7 +57,12 @@ impl NearPlane {
 
     /// The distance from the camera `[scene units]`.
     pub fn distance(&self) -> f32 {
-        (self.fraction.0 * EXTENT) as f32
+        Self::distance_of(self.fraction)
+    }
+
+    /// The distance of a plane at this fraction of the extent `[scene units]`.
+    pub fn distance_of(fraction: Fraction) -> f32 {
+        (fraction.0 * EXTENT) as f32
     }
 
     /// A line for the user if the chosen plane is nearer than usual, or the plane hides points.
@@ -84,14 +89,14 @@ fn two_digits(number: f64) -> f64 {
 
 #[cfg(test)]
 #[allow(clippy::float_cmp, reason = "results are exact")]
-mod tests {
+pub(crate) mod tests {
     use densify_core::camera::Camera;
     use glam::{DMat3, DVec3};
 
     use super::*;
 
     /// The depths seen by cameras that each see only one wall, at one of these depths.
-    fn walls(depths: &[f64]) -> SeenDepths {
+    pub(crate) fn walls(depths: &[f64]) -> SeenDepths {
         let at = |z: f64, i: usize| z * (2.0 * (i as f64 + 0.5) / 32.0 - 1.0);
         let mut points = Vec::new();
         let mut cameras = Vec::new();

@@ -45,19 +45,8 @@ impl PositionRates {
 
 #[cfg(test)]
 mod tests {
-    use densify_core::camera::Camera;
-    use glam::{DMat3, DVec3};
-
     use super::*;
-
-    /// What a camera sees of a wall at this depth `[fraction of the extent]`.
-    fn wall(depth: f64) -> SeenDepths {
-        let z = depth * EXTENT;
-        let camera = Camera::centred((64, 64), (32.0, 32.0), DMat3::IDENTITY, DVec3::ZERO);
-        let at = |i: usize| z * (2.0 * (i as f64 + 0.5) / 32.0 - 1.0);
-        let points: Vec<DVec3> = (0..1024).map(|i| DVec3::new(at(i % 32), at(i / 32), z)).collect();
-        SeenDepths::measure(&points, &[camera])
-    }
+    use crate::near_plane::tests::walls;
 
     #[test]
     fn rates_are_reduced_where_the_views_see_nearer_surfaces_than_usual() {
@@ -67,13 +56,13 @@ mod tests {
             ((100.0 * rates.factor).round() as u32, rates.line())
         };
         for depth in [USUAL_DEPTH * 1.001, 1.0, 50.0] {
-            assert_eq!(rates("", &wall(depth)), (100, None), "{depth}");
+            assert_eq!(rates("", &walls(&[depth * EXTENT])), (100, None), "{depth}");
         }
         assert_eq!(rates("", &SeenDepths::default()), (100, None), "nothing is known");
-        let (percent, line) = rates("", &wall(USUAL_DEPTH / 4.0));
+        let (percent, line) = rates("", &walls(&[USUAL_DEPTH / 4.0 * EXTENT]));
         assert_eq!(percent, 25);
         assert!(line.expect("a line").contains("times 0.25"));
         let given = "lr = { mean_start = 1e-4 }";
-        assert_eq!(rates(given, &wall(0.01)), (100, None), "the user decides");
+        assert_eq!(rates(given, &walls(&[0.01 * EXTENT])), (100, None), "the user decides");
     }
 }

@@ -221,7 +221,7 @@ fn refuse_unsupported(path: &Path, text: &[u8]) -> Result<(), Error> {
     let unknown = head.extensions_required.iter().find(|name| !known(name));
     let mut used = head.extensions_used.iter();
     if let Some(name) = unknown.or_else(|| used.find(|name| GEOMETRY.contains(&name.as_str()))) {
-        let shown: String = name.chars().take(80).collect();
+        let shown = resource::shortened(name);
         let feature =
             format!("the extension {shown}, which the file requires or places surfaces with,");
         return Err(Error::unsupported(path, &feature, remedy(name)));

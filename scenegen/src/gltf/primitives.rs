@@ -10,6 +10,7 @@ use super::nodes::Places;
 use super::{DRACO, Reader, fault, remedy};
 use crate::error::Error;
 use crate::mesh::pad;
+use crate::resource::shortened;
 
 /// Maximum number of triangles of a scene, including instances.
 const MAX_TRIANGLES: usize = 1 << 26;
@@ -145,7 +146,7 @@ impl Reader<'_> {
             }
             _ => return Ok(()),
         };
-        let shown: String = name.chars().take(80).collect();
+        let shown = shortened(name);
         let feature = format!("{element}: geometry that only the extension {shown} defines");
         Err(Error::unsupported(self.path, &feature, remedy(name)))
     }

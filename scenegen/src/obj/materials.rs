@@ -5,10 +5,10 @@ use std::path::{Path, PathBuf};
 
 use glam::{Vec2, Vec3};
 
-use super::statements::{self, Statement, shortened, split_word};
+use super::statements::{self, Statement, split_word};
 use crate::error::Error;
 use crate::mesh::{AlphaMode, Material, Model, Reflection};
-use crate::resource::{self, Folder};
+use crate::resource::{self, Folder, shortened};
 use crate::texture::{TextureRef, Wrap};
 
 /// Linear base colour of materials without a colour, and of faces without a material.
@@ -132,8 +132,8 @@ impl Materials {
             |map: Option<&Map>, srgb| map.map(|map| self.texture(path, map, srgb)).transpose();
         let (base_map, alpha_map) = (map("map_kd"), map("map_d"));
         // An image that is the map of both colour and opacity holds the opacity in its alpha channel.
-        let file = |map: &Option<Map>| map.as_ref().map(|map| map.file.clone());
-        let shares_alpha = alpha_map.is_some() && file(&alpha_map) == file(&base_map);
+        let maps = alpha_map.as_ref().zip(base_map.as_ref());
+        let shares_alpha = maps.is_some_and(|(alpha, base)| alpha.file == base.file);
         let base_texture = texture(base_map.as_ref(), true)?;
         let alpha_texture = texture(alpha_map.as_ref().filter(|_| !shares_alpha), false)?;
         let emissive_texture = texture(map("map_ke").as_ref(), true)?;

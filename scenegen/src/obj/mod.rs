@@ -31,10 +31,11 @@ use tobj::Mesh;
 
 use crate::error::Error;
 use crate::mesh::{Material, Model, pad};
+use crate::resource::shortened;
 use crate::texture::linear_from_srgb;
 use block::Block;
 use materials::{GREY, Materials};
-use statements::{Statement, shortened};
+use statements::Statement;
 
 /// Maximum number of triangles of a file.
 const MAX_TRIANGLES: usize = 1 << 26;

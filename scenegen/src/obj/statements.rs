@@ -35,7 +35,8 @@ impl<'a> Statement<'a> {
     /// The first words, at most `most`, as numbers.
     pub(super) fn numbers(&self, most: usize) -> Result<Vec<f64>, Error> {
         let parse = |word: &str| {
-            word.parse().map_err(|_| self.fault(format!("{:?} is not a number", shortened(word))))
+            word.parse()
+                .map_err(|_| self.fault(format!("{:?} is not a number", resource::shortened(word))))
         };
         self.words().take(most).map(parse).collect()
     }
@@ -104,11 +105,6 @@ fn fault(path: &Path, line: usize, problem: impl Display) -> Error {
 pub(super) fn split_word(text: &str) -> (&str, &str) {
     let (word, rest) = text.split_once(char::is_whitespace).unwrap_or((text, ""));
     (word, rest.trim_start())
-}
-
-/// Shortens text of the file for a message.
-pub(super) fn shortened(text: &str) -> String {
-    text.chars().take(80).collect()
 }
 
 #[cfg(test)]

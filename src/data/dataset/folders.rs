@@ -158,13 +158,15 @@ impl Folders {
     /// Number of photographs in the folder of images that belong to no frame.
     pub(super) fn count_others(&self, frames: &[Frame]) -> usize {
         let images = self.root.path().join("images");
-        let reduced = self.reduced.as_ref().map(|(folder, _)| folder.path().to_owned());
-        let own = if images.is_dir() { images } else { reduced.unwrap_or(images) };
-        let folder = self.chosen.as_ref().map_or(own, |folder| folder.path().to_owned());
+        let folder = match (&self.chosen, &self.reduced) {
+            (Some(chosen), _) => chosen.path(),
+            (None, Some((reduced, _))) if !images.is_dir() => reduced.path(),
+            _ => &images,
+        };
         let mut names = Vec::new();
         // If the dataset lies in the chosen folder, its subfolders are not searched: they hold no further photographs.
         let is_deep = !self.chosen.as_ref().is_some_and(|folder| folder.contains(&self.root));
-        add_photographs(&folder, "", is_deep, &mut names);
+        add_photographs(folder, "", is_deep, &mut names);
         // Names may have several Unicode spellings.
         let spelled = |name: &str| name.nfc().collect::<String>();
         let used: HashSet<String> = frames.iter().map(|frame| spelled(&frame.name)).collect();

@@ -83,9 +83,14 @@ impl FrameLists {
         self.lists[list].as_ref().is_some_and(|names| !names.is_empty())
     }
 
+    /// The first list that defines which frames are tested on; only a list for training may be empty.
+    fn decisive(&self) -> Option<usize> {
+        (0..3).find(|&list| self.names_any(list) || list == 0 && self.lists[0].is_some())
+    }
+
     /// Whether the lists define which frames are tested on.
     pub(super) fn define_the_split(&self) -> bool {
-        self.lists[0].is_some() || self.names_any(1) || self.names_any(2)
+        self.decisive().is_some()
     }
 
     /// The field that is wrong and its problem: a name that no frame has, or no frame to train on.
@@ -102,10 +107,8 @@ impl FrameLists {
             }
         }
         let leaves_none = self.trained == 0 && self.frames > 0;
-        let decisive =
-            (0..3).find(|&list| self.lists[list].is_some() && (list == 0 || self.names_any(list)));
         let problem = || "it leaves no frame to train on".to_owned();
-        decisive.filter(|_| leaves_none).map(|list| (FIELDS[list], problem()))
+        self.decisive().filter(|_| leaves_none).map(|list| (FIELDS[list], problem()))
     }
 
     /// Notes for the user about frames that would be used differently without lists.

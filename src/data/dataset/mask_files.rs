@@ -44,7 +44,12 @@ pub(super) fn is_mask(name: &OsStr) -> bool {
 
 /// Returns true if masks are in folders of this name.
 pub(super) fn is_mask_folder(name: &str) -> bool {
-    FOLDERS.iter().any(|known| known.eq_ignore_ascii_case(name))
+    precedence(name).is_some()
+}
+
+/// The place of a folder's name among those that hold masks.
+fn precedence(name: &str) -> Option<usize> {
+    FOLDERS.iter().position(|known| known.eq_ignore_ascii_case(name))
 }
 
 /// The names of a dataset's folders of masks, in order of precedence.
@@ -54,10 +59,7 @@ pub(super) fn folders(dataset: &Path) -> Vec<String> {
     let mut found: Vec<String> =
         names.filter(|name| is_mask_folder(name) && dataset.join(name).is_dir()).collect();
     // Names in lower case first.
-    found.sort_by_cached_key(|name| {
-        let rank = FOLDERS.iter().position(|known| known.eq_ignore_ascii_case(name));
-        (rank, std::cmp::Reverse(name.clone()))
-    });
+    found.sort_by_cached_key(|name| (precedence(name), std::cmp::Reverse(name.clone())));
     found
 }
 

@@ -3,7 +3,7 @@
 //! Each picture is cut into cells, and each cell shows its nearest point: points behind it are hidden, and a wall counts
 //! by its area in the picture, not by its number of points. This needs no tracks, so that it is the same for every format.
 
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
 use densify_core::camera::Camera;
@@ -30,8 +30,8 @@ impl SeenDepths {
             .flat_map_iter(|camera| {
                 let mut nearest = [f32::INFINITY; CELLS * CELLS];
                 for &point in points.iter().step_by(stride) {
-                    if let Some(depth) = camera.depth_in_image(point, 0.0) {
-                        let cell = &mut nearest[cell(camera, point)];
+                    if let Some((pixel, depth)) = camera.place_in_image(point, 0.0) {
+                        let cell = &mut nearest[cell(camera, pixel)];
                         *cell = cell.min(depth as f32);
                     }
                 }
@@ -60,9 +60,8 @@ fn stride(values: usize, most: usize) -> usize {
     values.div_ceil(most.max(1)).max(1)
 }
 
-/// The cell of the picture that shows a point.
-fn cell(camera: &Camera, point: DVec3) -> usize {
-    let (pixel, _) = camera.project(point);
+/// The cell of the picture that contains a pixel.
+fn cell(camera: &Camera, pixel: DVec2) -> usize {
     let along =
         |pixel: f64, size: u32| ((pixel / f64::from(size) * CELLS as f64) as usize).min(CELLS - 1);
     along(pixel.y, camera.height) * CELLS + along(pixel.x, camera.width)

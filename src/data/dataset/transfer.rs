@@ -4,6 +4,7 @@
 
 use std::io::{BufRead, Read, Seek};
 
+use densify_scenegen::texture::srgb_from_linear;
 use image::{DynamicImage, ImageBuffer, Pixel};
 
 const SIGNATURE: [u8; 8] = *b"\x89PNG\r\n\x1a\n";
@@ -78,10 +79,7 @@ fn stated(mut input: impl BufRead + Seek) -> Option<Transfer> {
 /// Converts values that are light to the power of `exponent` to sRGB.
 pub(super) fn to_srgb(image: &mut DynamicImage, exponent: f64) {
     use DynamicImage::*;
-    let srgb = |value: f64| {
-        let light = value.powf(1.0 / exponent);
-        if light <= 0.003_130_8 { 12.92 * light } else { 1.055 * light.powf(1.0 / 2.4) - 0.055 }
-    };
+    let srgb = |value: f64| srgb_from_linear(value.powf(1.0 / exponent));
     let eight: Vec<u8> =
         (0..=255).map(|v| (255.0 * srgb(f64::from(v) / 255.0)).round() as u8).collect();
     let deep = || -> Vec<u16> {

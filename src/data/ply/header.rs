@@ -100,16 +100,17 @@ impl Scalar {
 impl Element {
     /// Index of the scalar property with the first of these names that exists.
     pub(crate) fn find(&self, names: &[&str]) -> Option<usize> {
-        names.iter().find_map(|name| {
-            self.properties.iter().position(|p| p.list.is_none() && p.name == *name)
-        })
+        self.find_by(names, |own, name| own == name)
     }
 
     /// As [`find`](Self::find), whatever the case of the letters in the file.
     pub(crate) fn find_in_any_case(&self, names: &[&str]) -> Option<usize> {
-        let is_named = |p: &Property, name: &str| p.name.eq_ignore_ascii_case(name);
+        self.find_by(names, str::eq_ignore_ascii_case)
+    }
+
+    fn find_by(&self, names: &[&str], is_same: impl Fn(&str, &str) -> bool) -> Option<usize> {
         names.iter().find_map(|name| {
-            self.properties.iter().position(|p| p.list.is_none() && is_named(p, name))
+            self.properties.iter().position(|p| p.list.is_none() && is_same(&p.name, name))
         })
     }
 

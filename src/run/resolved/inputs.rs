@@ -86,17 +86,11 @@ impl Inputs {
             Some(InitChoice::Model(path)) => Some(path),
             Some(InitChoice::Points | InitChoice::Random) | None => None,
         };
-        let (files, [init_model, frozen_model]) = match reading.models {
-            Some(models) => ([init, freeze.as_ref()].map(Option::<&_>::cloned), models),
-            None => {
-                let init = start_model("init", init, observer)?;
-                let freeze = start_model("freeze", freeze.as_ref(), observer)?;
-                let (init_file, init_model) = init.unzip();
-                let (frozen_file, frozen_model) = freeze.unzip();
-                ([init_file, frozen_file], [init_model, frozen_model])
-            }
-        };
-        let [init_file, frozen_file] = files;
+        let [known_init, known_frozen] =
+            reading.models.map_or([None; 2], |models| models.map(Some));
+        let (init_file, init_model) = start_model("init", init, known_init, observer)?;
+        let (frozen_file, frozen_model) =
+            start_model("freeze", freeze.as_ref(), known_frozen, observer)?;
         // Tracks have a separate line in the ledger, and are freed before training.
         let uncounted = dataset.tracks.bytes() + reading.tolerance;
         let resident = (host.process.resident)().map(|now| now.saturating_sub(uncounted));
@@ -139,16 +133,22 @@ fn image_demand(dataset: &Dataset) -> [ImageDemand; 2] {
     [demand(&dataset.train), demand(&dataset.test)]
 }
 
-/// The file of the model that an option names, and its size.
+/// The file of the model that an option names, and its size, which is read from the file unless it is known.
 fn start_model(
     option: &'static str,
     named: Option<&AbsolutePath>,
+    known: Option<Option<ModelSize>>,
     observer: &dyn Observer,
-) -> Result<Option<(AbsolutePath, ModelSize)>, Failure> {
-    let Some(named) = named else { return Ok(None) };
-    let file = file_of(option, named, observer)?;
-    let size = size_of_model(option, &file.0, observer)?;
-    Ok(Some((file, size)))
+) -> Result<(Option<AbsolutePath>, Option<ModelSize>), Failure> {
+    match (named, known) {
+        (_, Some(size)) => Ok((named.cloned(), size)),
+        (None, None) => Ok((None, None)),
+        (Some(named), None) => {
+            let file = file_of(option, named, observer)?;
+            let size = size_of_model(option, &file.0, observer)?;
+            Ok((Some(file), Some(size)))
+        }
+    }
 }
 
 /// Opens the device, checks that it supports the knobs that are set, and sets the knob `accumulation` to the method in

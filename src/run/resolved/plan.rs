@@ -44,9 +44,11 @@ pub fn plan(spec: &RunSpec, host: Host<'_>) -> Result<Plan, Failure> {
     let ledger = case.ledger_of(&size)?;
     reasons.push(case.memory_table(&ledger, host.observer.spelling()));
     let limited = case.inputs.device.limited_bytes(&ledger);
-    let needed = size::needed_bytes(&case, &size)?;
-    if case.memory().is_none() && needed + MIB < limited {
-        reasons.push(notes::for_speed(host.observer.spelling(), needed, limited - needed));
+    if case.memory().is_none() {
+        let needed = size::needed_bytes(&case, &size)?;
+        if needed + MIB < limited {
+            reasons.push(notes::for_speed(host.observer.spelling(), needed, limited - needed));
+        }
     }
     let memory = case.memory().unwrap_or(limited.next_multiple_of(MIB));
     let alternatives = alternatives(&case, memory, size.rows)?;

@@ -37,6 +37,7 @@ pub fn submit(
     let batch = Batch {
         command: ["blocks", "run", utf8(&folder)?].map(str::to_owned).into(),
         stages: stages.into_iter().filter(|stage| !stage.jobs.is_empty()).collect(),
+        inputs: Vec::new(),
         status: "`densify blocks status`".to_owned(),
         folder,
     };

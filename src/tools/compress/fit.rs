@@ -81,7 +81,7 @@ pub(super) fn fitting(
             Ok(()) => fitting.push(format),
             Err(failure) if failure.code == INPUT && options.formats.len() > 1 => {
                 observer.say(format_args!("note: not tried: {failure}"));
-                unfit = Some(failure);
+                unfit = unfit.or(Some(failure));
             }
             Err(failure) => return Err(failure),
         }

@@ -96,6 +96,8 @@ pub struct Batch {
     pub command: Vec<String>,
     /// The stages; none is empty.
     pub stages: Vec<Stage>,
+    /// Paths and texts of the files that the tasks read. They are written before the tasks start.
+    pub inputs: Vec<(PathBuf, String)>,
     /// How the user can see the progress, for messages.
     pub status: String,
 }
@@ -174,7 +176,12 @@ pub fn submit(
 ) -> Result<(), Failure> {
     let files = match submission.engine {
         Engine::Local if submission.dry_run => return local::show(batch, observer),
-        Engine::Local => return local::run(batch, observer),
+        Engine::Local => {
+            for (path, text) in &batch.inputs {
+                write_atomically(path, |out| out.write_all(text.as_bytes()))?;
+            }
+            return local::run(batch, observer);
+        }
         Engine::Slurm => slurm::files(batch)?,
         Engine::Hq => vec![hq::file(batch, submission.with_memory)?],
     };
@@ -194,18 +201,23 @@ pub fn submit(
     }
     let logs = batch.logs();
     fs::create_dir_all(&logs).map_err(FileError::io("create the folder", &logs))?;
-    let mut written = vec![logs.clone()];
-    for EngineFile { path, text, .. } in &files {
-        if !path.exists() {
-            written.push(path.clone());
+    let (mut written, mut jobs) = (vec![logs.clone()], Vec::new());
+    let mut write_and_submit = || -> Result<(), Failure> {
+        let inputs = batch.inputs.iter().map(|(path, text)| (path, text));
+        for (path, text) in inputs.chain(files.iter().map(|file| (&file.path, &file.text))) {
+            if !path.exists() {
+                written.push(path.clone());
+            }
+            write_atomically(path, |out| out.write_all(text.as_bytes()))?;
         }
-        write_atomically(path, |out| out.write_all(text.as_bytes()))?;
-    }
-    let mut jobs = Vec::new();
-    let submitted = match submission.engine {
-        Engine::Hq => files.iter().try_for_each(|file| hq::submit(file).map(|job| jobs.push(job))),
-        _ => slurm::submit(&files, &mut jobs),
+        match submission.engine {
+            Engine::Hq => {
+                files.iter().try_for_each(|file| hq::submit(file).map(|job| jobs.push(job)))
+            }
+            _ => slurm::submit(&files, &mut jobs),
+        }
     };
+    let submitted = write_and_submit();
     if submitted.is_err() && jobs.is_empty() {
         remove_written(&written, &batch.folder);
     }
@@ -218,7 +230,7 @@ pub fn submit(
 }
 
 /// Removes files and empty folders, and the folders above them up to `root` that are then empty.
-pub fn remove_written(paths: &[PathBuf], root: &Path) {
+fn remove_written(paths: &[PathBuf], root: &Path) {
     for path in paths {
         // A folder that is not empty stays, as does what cannot be removed.
         let _ = if path.is_dir() { fs::remove_dir(path) } else { fs::remove_file(path) };

@@ -96,7 +96,9 @@ pub(super) fn render(
         observer.say(format_args!("pictures {}", run.name));
         let model = read_model(&model_path(&run.folder, run.iteration), observer)?;
         let degree = model.sh_degree;
-        let near = NearPlane::choose(run.config.spec.start.near, &dataset).distance();
+        let own = run.config.spec.start.near;
+        let near = own
+            .map_or_else(|| NearPlane::choose(None, &dataset).distance(), NearPlane::distance_of);
         let backend = machine.backend(&dataset, model, near)?;
         let mut renderer = Renderer { backend, background, degree };
         // The first run's ranking selects the views; the photograph comes first in each comparison.

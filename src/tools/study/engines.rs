@@ -77,13 +77,15 @@ pub(super) fn submit(
     }
     let mut known_memory: Vec<(Partial, u64)> = Vec::new();
     let mut jobs: Vec<Job> = Vec::new();
-    let mut submitted: Vec<&PlannedRun> = Vec::new();
+    let mut submitted: Vec<&Partial> = Vec::new();
+    let mut inputs = Vec::new();
     for (index, run) in runs.iter().enumerate() {
         // Runs with the same description are trained once.
-        if is_done(run) || submitted.iter().any(|other| other.spec == run.spec) {
+        if is_done(run) || submitted.contains(&&run.spec) {
             continue;
         }
-        submitted.push(run);
+        submitted.push(&run.spec);
+        inputs.push(run.task_file(&folder)?);
         let spec = run.spec.clone().describe()?;
         let all_threads = || rayon::current_num_threads().try_into().unwrap_or(1);
         jobs.push(Job {
@@ -97,38 +99,13 @@ pub(super) fn submit(
     let batch = Batch {
         command: ["study-run", utf8(&folder)?].map(str::to_owned).into(),
         stages: vec![Stage { name: "runs", is_array: true, jobs }],
+        inputs,
         status: "the output of that process".to_owned(),
         folder,
     };
-    let mut written = Vec::new();
-    let outcome = if submission.dry_run {
-        Ok(())
-    } else {
-        write_all(&submitted, &batch.folder, &mut written)
-    };
-    let outcome = outcome.and_then(|()| launch::submit(&batch, submission, observer));
-    if is_scheduled && outcome.is_err() {
-        launch::remove_written(&written, &batch.folder);
-    }
-    outcome?;
+    launch::submit(&batch, submission, observer)?;
     if is_scheduled {
         observer.say(format_args!("run the same command again to collect the results"));
-    }
-    Ok(())
-}
-
-/// Writes the descriptions of the runs for an engine, and lists those that did not exist.
-fn write_all(
-    runs: &[&PlannedRun],
-    folder: &Path,
-    written: &mut Vec<PathBuf>,
-) -> Result<(), Failure> {
-    for run in runs {
-        let path = run.task_file(folder);
-        if !path.exists() {
-            written.push(path.clone());
-        }
-        run.write(&path)?;
     }
     Ok(())
 }

@@ -97,15 +97,10 @@ impl PlannedRun {
         Ok(())
     }
 
-    /// The file that describes the run to an engine.
-    pub(super) fn task_file(&self, output: &Path) -> PathBuf {
-        task_file(output, &self.name())
-    }
-
-    /// Writes the file that describes the run to an engine.
-    pub(super) fn write(&self, path: &Path) -> Result<(), Failure> {
+    /// The file that describes the run to an engine, and its text.
+    pub(super) fn task_file(&self, output: &Path) -> Result<(PathBuf, String), Failure> {
         let text = toml::to_string(self).map_err(Failure::input)?;
-        Ok(write_atomically(path, |out| out.write_all(text.as_bytes()))?)
+        Ok((task_file(output, &self.name()), text))
     }
 
     /// Reads the run of this name from its file.

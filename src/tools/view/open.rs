@@ -8,7 +8,7 @@ use super::picture_kind::PictureKind::{RowAge, RowEdit, RowGradient, RowWeight};
 use super::scene::{LoadedScene, ModelInfo, NO_MODEL, Scene};
 use densify_core::camera_path::Keyframe;
 use densify_core::gaussians::{Gaussians, logit};
-use densify_data::dataset::normalise::{EXTENT, Normalisation};
+use densify_data::dataset::normalise::Normalisation;
 use densify_data::dataset::{Dataset, PointCloud, SeenDepths, builtin};
 use densify_run::failure::Failure;
 use densify_run::finished::{
@@ -283,7 +283,7 @@ impl LoadedScene {
     ) -> Result<(), Failure> {
         let checkpoint = Some(checkpoint_path(run, iteration)).filter(|path| path.is_file());
         let own = config.spec.start.near;
-        let near = own.map_or(near, |near| (near.0 * EXTENT) as f32);
+        let near = own.map_or(near, NearPlane::distance_of);
         self.add_model(name, model, near, checkpoint)
     }
 

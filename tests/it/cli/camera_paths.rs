@@ -6,14 +6,9 @@ use std::path::Path;
 use image::AnimationDecoder;
 use image::codecs::webp::WebPDecoder;
 
-use super::inspecting::{ITERATIONS, train_run};
+use super::inspecting::{ITERATIONS, size, train_run};
 use super::{Outcome, WITHOUT_GPU, call, files, json, outcome_of, scratch, text};
 use crate::photographs::Photographs;
-
-fn size(folder: &Path, name: &str) -> (u32, u32) {
-    let path = folder.join(name);
-    image::image_dimensions(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
-}
 
 #[test]
 fn a_camera_path_is_rendered_as_frames_and_video() {

@@ -204,6 +204,12 @@ fn scheduler_runs_match_local_ones_and_are_collected_by_repeating_the_call() {
         let script = shown_in_parts.split(&header).nth(1).expect("a script");
         assert!(script.split("names=").next().unwrap().contains(&format!("--array={tasks}\n")));
     }
+    // Jobs that were submitted before the scheduler refused one find the descriptions of their runs.
+    write_program(&bin, "sbatch", "[ ! -e \"$0.ran\" ] || exit 1; touch \"$0.ran\"; echo 6");
+    submit("", &path).refused("one array submitted", &["already submitted: 6", "scancel"]);
+    let described = files(&output).into_keys().filter(|name| name.ends_with(".task.toml"));
+    assert_eq!(described.count(), 8);
+    std::fs::remove_dir_all(&output).expect("an existing folder");
     std::fs::remove_file(bin.join("scontrol")).expect("an existing file");
     write_program(&bin, "sbatch", "echo 7");
     let stdout = submit("", &path).ok().stdout;

@@ -106,7 +106,7 @@ fn eval_measures_lpips_with_the_users_weights() {
 }
 
 /// The size of an image [px].
-fn size(folder: &Path, name: &str) -> (u32, u32) {
+pub(super) fn size(folder: &Path, name: &str) -> (u32, u32) {
     let path = folder.join(name);
     image::image_dimensions(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
 }

@@ -205,7 +205,7 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
     let mut notes: Vec<Note> = choice.others.iter().cloned().collect();
     let (posed, others) = (frames.len(), folders.count_others(&frames));
     if others > 0 {
-        let is_one_of_several = !notes.is_empty() || options.sparse.is_some();
+        let is_one_of_several = choice.others.is_some() || options.sparse.is_some();
         let folder = choice.folder.strip_prefix(root.path()).unwrap_or(&choice.folder);
         let model = match is_one_of_several {
             true => format!("{} has", folder.display()),

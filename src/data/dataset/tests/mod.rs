@@ -6,6 +6,7 @@ mod colmap;
 mod exif;
 mod formats;
 mod lenses;
+mod masks;
 mod phones;
 mod realitycapture;
 mod shared;

@@ -41,8 +41,9 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
         LoadError::damaged(path, "f_rest_*", problem)
     })?;
     let rest = 3 * (sh_coefficients(sh_degree) - 1);
+    let remedy = remedy(&vertices);
     let columns = properties(sh_degree)
-        .map(|name| vertices.column(path, &name, remedy(&vertices)))
+        .map(|name| vertices.column(path, &name, remedy))
         .collect::<Result<Vec<_>, _>>()?;
 
     let mut rows = Rows::new(sh_degree);

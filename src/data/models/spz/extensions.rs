@@ -79,16 +79,16 @@ pub(super) fn parse(path: &Path, mut records: &[u8]) -> Result<Extensions, LoadE
             continue;
         }
         let number = content.first_chunk().map(|&bytes| u32::from_le_bytes(bytes));
-        found.axes = match number.map(|number| (number, number.checked_sub(1))) {
-            Some((_, None)) => {
+        found.axes = match number {
+            Some(0) => {
                 found.notes.push("the axes are stated to be unspecified".into());
                 None
             }
-            Some((number, Some(index))) if index < SYSTEMS.len() as u32 => {
+            Some(number) if number as usize <= SYSTEMS.len() => {
                 Some(Axes(SYSTEMS[number as usize - 1]))
             }
             other => {
-                let number = other.map_or("no number".into(), |(number, _)| number.to_string());
+                let number = other.map_or("no number".into(), |number| number.to_string());
                 let problem = format!("the axes are {number}, but 1 to {} exist", SYSTEMS.len());
                 return Err(LoadError::damaged(path, "SPZ_ADOBE_coordinate_system", problem));
             }

@@ -1,0 +1,120 @@
+//! Tests of where masks are found, and what they hide.
+
+use super::super::*;
+use super::{assert_noted, load, load_with, write_mask};
+use densify_fixtures::{Made, NAMES, SIZE, image};
+
+#[test]
+fn masks_are_found() {
+    for (made, mask) in [
+        (Made::colmap_txt(), "masks/b.png.png"),
+        (Made::colmap_txt(), "masks/b.png"),
+        (Made::transforms(|_| ()), "masks/b.png"),
+        (Made::colmap_txt(), "masks/b.mask.png"),
+        (Made::colmap_txt(), "mask/b.png"),
+        (Made::transforms(|_| ()), "segmentation/b.png.png"),
+        (Made::colmap_txt(), "dynamic_masks/b.png"),
+        (Made::realitycapture(), "masks/b.png.mask.png"),
+        (Made::realitycapture(), "images/b.png.mask.png"),
+        (Made::colmap_txt(), "images/b.mask.png"),
+        (Made::colmap_txt(), "images/b_mask.png"),
+        (Made::transforms(|_| ()), "images/b_mask.png"),
+        (Made::colmap_txt(), "Masks/b.png"),
+        (Made::transforms(|_| ()), "MASK/b.png"),
+        (Made::transforms(|_| ()), "images/.mask/b.png"),
+        (
+            Made::transforms(|json| json["frames"][1]["mask_path"] = "elsewhere/m.png".into()),
+            "elsewhere/m.png",
+        ),
+    ] {
+        write_mask(&made.file(mask), |x| if x < 10 { 0 } else { 255 });
+        let data = load(&made);
+        assert_noted(&data, "1 of 3 photographs have a mask");
+        assert_eq!(data.train[0].source.load().unwrap().mask, None, "{mask}");
+        let found = data.train[1].source.load().unwrap().mask.unwrap();
+        assert_eq!((found[0], found[19]), (0, 255), "{mask}");
+        let inverted = LoadOptions { invert_masks: true, ..LoadOptions::default() };
+        let data = load_with(&made, &inverted);
+        let found = data.train[1].source.load().unwrap().mask.unwrap();
+        assert_eq!((found[0], found[19]), (255, 0), "{mask}");
+        let background = LoadOptions { mask_mode: MaskMode::Background, ..LoadOptions::default() };
+        let source = &load_with(&made, &background).train[1].source;
+        let found = source.load().unwrap();
+        let alpha = found.alpha.as_ref().unwrap();
+        assert_eq!((alpha[0], alpha[19], &found.mask), (0, 255, &None), "{mask}");
+        assert_eq!(found.bytes(), source.loaded_bytes());
+    }
+}
+
+#[test]
+fn folders_whose_masks_belong_to_no_photograph_are_noted() {
+    for file in ["masks/other.png", "images/masks/b.png", "Segmentation/other.png"] {
+        let made = Made::colmap_txt();
+        image(&made.file(file), SIZE, 200);
+        let folder = file.rsplit_once('/').unwrap().0;
+        assert_noted(&load(&made), &format!("{folder}, the mask of no photograph"));
+    }
+    assert!(!load(&Made::colmap_txt()).notes.iter().any(|note| note.contains("mask")));
+}
+
+/// In masks of instant-ngp every value but black hides pixels.
+#[test]
+fn dynamic_masks_are_found_beside_photographs() {
+    for made in [Made::colmap_txt(), Made::transforms(|_| ())] {
+        write_mask(&made.file("images/dynamic_mask_b.png"), |x| u8::from(x >= 10));
+        for (invert_masks, expected) in [(false, (255, 0)), (true, (0, 255))] {
+            let options = LoadOptions { invert_masks, ..LoadOptions::default() };
+            let data = load_with(&made, &options);
+            assert_eq!(data.train[0].source.load().unwrap().mask, None);
+            let found = data.train[1].source.load().unwrap().mask.unwrap();
+            assert_eq!((found[0], found[19]), expected, "{invert_masks}");
+        }
+    }
+}
+
+/// Masks are in the dataset's `masks/` or beside the photographs, and are never taken for photographs.
+#[test]
+fn masks_are_found_in_the_folder_that_is_named() {
+    // Each mask is preferred to the following ones, and then removed.
+    let masks = [
+        "masks/b.png.png",
+        "masks/b.png",
+        "masks/b.jpg",
+        "masks/b.jpeg",
+        "masks/b.png.mask.png",
+        "masks/b.mask.png",
+        "moved/b.png.mask.png",
+        "moved/b.mask.png",
+        "moved/b_mask.png",
+        "moved/.mask/b.png",
+        "moved/dynamic_mask_b.png",
+    ];
+    for made in [Made::colmap_txt(), Made::transforms(|_| ()), Made::realitycapture()] {
+        std::fs::rename(made.file("images"), made.file("moved")).unwrap();
+        masks.iter().for_each(|mask| image(&made.file(mask), SIZE, 200));
+        // In this mask, every value but black hides a pixel.
+        write_mask(&made.file("moved/dynamic_mask_b.png"), |_| 0);
+        let options = LoadOptions { images: Some("moved".into()), ..LoadOptions::default() };
+        for mask in masks {
+            let data = load_with(&made, &options);
+            let found = data.train[1].source.mask.clone().expect(mask);
+            assert!(found.file.path.ends_with(mask), "{mask}: {}", found.file.path.display());
+            let dynamic = found.hides == images::Hides::AllButBlack;
+            assert_eq!(dynamic, mask.contains("dynamic"), "{mask}");
+            assert!(data.train[0].source.mask.is_none() && data.train.len() == 3);
+            assert!(!data.notes.iter().any(|note| note.contains("poses")), "{:?}", data.notes);
+            made.remove(mask);
+        }
+    }
+    // Masks beside the reduced photographs, or beside the full-size ones.
+    let made = Made::colmap_txt();
+    for name in NAMES {
+        image(&made.file("images_2").join(name), (10, 6), 7);
+    }
+    let half = LoadOptions { resolution: Some(Resolution::Divisor(2)), ..LoadOptions::default() };
+    for mask in ["images/b.png.mask.png", "images_2/b.png.mask.png"] {
+        image(&made.file(mask), (10, 6), 200);
+        let found = load_with(&made, &half).train[1].source.mask.clone().expect(mask);
+        assert!(found.file.path.ends_with(mask), "{mask}");
+    }
+}
