@@ -21,6 +21,7 @@ mod knobs;
 mod looking;
 mod memory;
 mod photographing;
+mod remote;
 mod reporting;
 mod requiring;
 mod resuming;
