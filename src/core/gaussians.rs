@@ -115,10 +115,15 @@ impl Gaussians {
         })
     }
 
+    /// True if means are measured from this point.
+    pub fn has_origin(&self, origin: [f64; 3]) -> bool {
+        self.origin.map(f64::to_bits) == origin.map(f64::to_bits)
+    }
+
     /// The same positions, measured from another point. They are rounded to f32 unless the point is the same.
     #[must_use]
     pub fn with_origin(mut self, origin: [f64; 3]) -> Self {
-        if origin != self.origin {
+        if !self.has_origin(origin) {
             for row in 0..self.len() {
                 let position = self.position(row);
                 self.means[row] =

@@ -134,7 +134,7 @@ fn placed<'a>(
     observer: &dyn Observer,
 ) -> Result<(Cow<'a, Gaussians>, Frame), Failure> {
     let within = |frame: Frame| {
-        let is_there = model.origin == frame.origin;
+        let is_there = model.has_origin(frame.origin);
         let moved = || Cow::Owned(model.clone().with_origin(frame.origin));
         Ok((if is_there { Cow::Borrowed(model) } else { moved() }, frame))
     };

@@ -54,7 +54,9 @@ impl<'a> Ply<'a> {
             let numbers = numbers.filter(|n| count == 3 && n.iter().all(|value| value.is_finite()));
             let numbers =
                 numbers.ok_or_else(|| wrong(format!("{:?} is not three numbers", text.trim())))?;
-            if found.is_some_and(|found| found != numbers) {
+            if found
+                .is_some_and(|found: [f64; 3]| found.map(f64::to_bits) != numbers.map(f64::to_bits))
+            {
                 return Err(wrong(format!("{numbers:?} contradicts the {found:?} before it")));
             }
             found = Some(numbers);

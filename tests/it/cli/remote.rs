@@ -1,5 +1,7 @@
 //! Scenes in coordinates that f32 cannot hold, as in UTM: what is saved is what was trained, or the user is told.
 
+#![allow(clippy::float_cmp, reason = "results are exact")]
+
 use std::path::Path;
 
 use densify::data::models::{find, sidecar_path};
