@@ -125,8 +125,8 @@ pub fn read_model(path: &Path, observer: &dyn Observer) -> Result<Gaussians, Fai
     Ok(file.gaussians)
 }
 
-/// A model in the coordinates of its file. Automatic coordinates are local if f32 is too coarse for world coordinates,
-/// unless the model already has only those and the format keeps them.
+/// The model in the coordinates of its file, and their frame. Automatic coordinates are local if f32 is too coarse for
+/// world coordinates, unless the model itself has only world coordinates in f32, and the format keeps these exactly.
 fn placed<'a>(
     model: &'a Gaussians,
     coordinates: Coordinates,

@@ -17,8 +17,8 @@ pub const EXTENT: f64 = 1.1;
 /// Cameras count as being at one place if their radius is below this fraction of their distance from the origin:
 /// the precision of f64 is 2.2e-16, and poses of other programs have a few digits less.
 const SAME_PLACE: f64 = 1e-12;
-/// Distance from the origin, in radii of the cameras, below which f32 world coordinates are fine enough for all Gaussians:
-/// at 50 their step is at most 4e-6 radii, a fiftieth of the smallest Gaussian made from a point.
+/// Distance from the origin, in radii of the cameras, below which f32 world coordinates are fine enough for all
+/// Gaussians: at 50 their step is at most 4e-6 radii, a fiftieth of the smallest Gaussian made from a point.
 const F32_DISTANCE: f64 = 50.0;
 
 /// A camera is an outlier if its distance from the median position exceeds this many times the median of all these

@@ -53,14 +53,15 @@ pub fn offset_text(offset: [f64; 3]) -> String {
     offset.map(|value| value.to_string()).join(" ")
 }
 
-/// Error of a rounded position from which on it counts, as a fraction of the Gaussian's size (root mean square). A tenth
+/// Error of a rounded position above which the position counts as coarse (root mean square) `[Gaussian's size]`. A tenth
 /// changes a pixel by less than a twentieth of the Gaussian's contrast.
 const COARSE: f64 = 0.1;
-/// As [`COARSE`], for a position that is lost. Half as in [`super::Changes`].
+/// Error above which a position counts as lost: a half, as in [`super::Changes`].
 const LOST: f64 = 0.5;
-/// Share of what shows from which on coarse coordinates are said, and avoided.
+/// Share of the visible area, estimated as in [`Coarseness::add`], from which on coarse coordinates are avoided, or the user
+/// is told.
 const NOTED: f64 = 0.01;
-/// Share of what shows from which on lost positions make a file unfit.
+/// Share of the visible area from which on lost positions make a file unfit.
 const UNFIT: f64 = 0.25;
 
 /// Distance of a model from the origin, in medians of its Gaussians' distances from its middle, from which on f32 may be
@@ -72,7 +73,8 @@ const REMOTE: f64 = 50.0;
 pub struct Coarseness {
     /// Number of Gaussians whose positions are coarse.
     rows: usize,
-    /// Estimates of what shows: of all, of those that are coarse, and of those whose positions are lost.
+    /// Estimates of the visible area: of all Gaussians, of those whose positions are coarse, and of those whose positions
+    /// are lost.
     total: f64,
     coarse: f64,
     lost: f64,
@@ -120,7 +122,7 @@ impl Coarseness {
         }
     }
 
-    /// True if so much of what shows is coarse that it must be said.
+    /// True if so much of the visible area is coarse that the user must be told.
     pub fn is_noted(&self) -> bool {
         self.coarse >= NOTED * self.total.max(f64::MIN_POSITIVE)
     }
@@ -135,8 +137,8 @@ impl std::fmt::Display for Coarseness {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(
             f,
-            "so far from the origin, f32 has steps of up to {}, and shifts {} ({:.1} % of what shows) by more than {:.0} % of \
-             their size",
+            "so far from the origin, f32 has steps of up to {}, and shifts {} ({:.1} % of the visible area) by more than \
+             {:.0} % of their size",
             shortest(self.step),
             gaussians(self.rows),
             100.0 * self.coarse / self.total.max(f64::MIN_POSITIVE),
@@ -220,9 +222,9 @@ mod tests {
         }
     }
 
-    /// What counts is the size of the Gaussians that show, not the extent.
+    /// What counts is the size of the visible Gaussians, not the extent.
     #[test]
-    fn only_gaussians_that_show_make_coordinates_coarse() {
+    fn only_visible_gaussians_make_coordinates_coarse() {
         let mut model = Gaussians::zeros(100, 0);
         model.origin = [0.0, 5e6, 0.0];
         model.log_scales.fill([2f32.ln(); 3]);
@@ -231,7 +233,7 @@ mod tests {
             *mean = [row as f32, (row % 7) as f32, 0.0];
         }
         assert!(!Coarseness::measure(&model).is_noted());
-        // A few small ones show nothing.
+        // A few small Gaussians are hardly visible.
         model.log_scales[..10].fill([0.01f32.ln(); 3]);
         assert!(!Coarseness::measure(&model).is_noted());
         model.log_scales[..10].fill([1.2f32.ln(); 3]);

@@ -33,9 +33,11 @@ pub use inventory;
 
 pub use changes::Changes;
 pub use coordinates::{Coarseness, Coordinates, Frame, local_origin, offset_text, round_origin};
+pub(crate) use ply::layout::OFFSET as PLY_OFFSET;
 pub use recognise::{Match, ModelFile, Reader, main_file, read_model};
 pub use rows::SplatFile;
 pub use sidecar::{remove_sidecar, sidecar_path, write_sidecar};
+pub(crate) use sog::folder_in_archive;
 pub use write::{ModelWriter, Shape, fitting_format, is_unfit};
 
 /// The format that training writes.
@@ -61,7 +63,7 @@ pub struct Format {
 
 inventory::collect!(Format);
 
-/// A name or an extension of no format that densify writes.
+/// The error for a name or an extension that belongs to no format that densify writes.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0}; choose one of: {names}", names = names(&export_formats()))]
 pub struct FormatError(String);
@@ -90,10 +92,10 @@ pub fn compress_formats() -> Vec<&'static Format> {
     formats
 }
 
-/// The format with this name, to write.
+/// The writable format with this name.
 ///
 /// # Errors
-/// When there is none; the message names the nearest.
+/// When there is none; the message suggests the format with the nearest name.
 pub fn find(name: &str) -> Result<&'static Format, FormatError> {
     let formats = export_formats();
     formats.iter().find(|format| format.name == name).copied().ok_or_else(|| {
@@ -103,7 +105,7 @@ pub fn find(name: &str) -> Result<&'static Format, FormatError> {
     })
 }
 
-/// The format with the extension of `path`, to write; the longest extension wins (`a.b` over `b`).
+/// The writable format with the extension of `path`; the longest extension wins (`a.b` over `b`).
 ///
 /// # Errors
 /// When there is none.

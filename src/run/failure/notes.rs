@@ -112,7 +112,7 @@ pub(crate) fn other_coordinates(
 /// World coordinates are too coarse in f32.
 pub(crate) fn coarse(s: Spelling, coarseness: &Coarseness) -> String {
     format!(
-        "{coarseness}; {} or {} keeps them exact",
+        "{coarseness}; {} or {} keeps positions exact",
         s.text("coordinates", "local"),
         s.text("coordinates", "double")
     )
@@ -121,7 +121,7 @@ pub(crate) fn coarse(s: Spelling, coarseness: &Coarseness) -> String {
 /// A file is in local coordinates because those of the world are too coarse.
 pub(crate) fn saved_in_local(s: Spelling, coarseness: &Coarseness, offset: [f64; 3]) -> String {
     format!(
-        "note: saved in local coordinates, with the offset {} beside them: {coarseness} ({} or {} saves others)",
+        "note: saved in local coordinates, relative to the offset {}: {coarseness} ({} or {} saves others)",
         offset_text(offset),
         s.text("coordinates", "world"),
         s.text("coordinates", "double")

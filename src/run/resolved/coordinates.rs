@@ -11,7 +11,7 @@ use densify_train::init;
 
 /// Size of a trained Gaussian relative to one of as many that are evenly spread over the same points.
 const TRAINED_SIZE: f64 = 0.5;
-/// Largest number of points that are looked at: their spacing varies little with more.
+/// Largest number of points that are used: with more, their spacing varies little.
 const MOST_POINTS: usize = 200_000;
 
 /// Random points for a run without any, seen by its training views.

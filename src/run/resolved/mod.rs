@@ -98,9 +98,9 @@ impl<'a> ResolvedRun<'a> {
     fn new(case: Case<'a>, size: &Size, degree_lowered: bool, host: Host<'_>) -> Self {
         let spelling = host.observer.spelling();
         let scene = case.choices.lines(spelling);
-        let init = case.first_rows(size.setting.rows);
-        let coordinates = coordinates::line(&case, size.setting.rows, &init, spelling);
+        let init = case.first_rows(size.run_size.rows);
+        let coordinates = coordinates::line(&case, size.run_size.rows, &init, spelling);
         let reasons = scene.chain(size.lines(&case, spelling)).chain(coordinates).collect();
-        Self { init, size: size.setting, degree_lowered, reasons, case }
+        Self { init, size: size.run_size, degree_lowered, reasons, case }
     }
 }

@@ -7,8 +7,8 @@ use densify_core::pieces::pieces;
 use densify_data::models::{Coarseness, Coordinates, Frame};
 
 impl Session<'_> {
-    /// The coordinates of the model that is saved now, and how coarse they are if the file will be worse than the model. Tells
-    /// the user once if they are not what is usual.
+    /// The coordinates of the model that is saved now, and how coarse they are if the file will be worse than the model.
+    /// Tells the user once if world coordinates are too coarse.
     pub(super) fn choose_frame(&mut self) -> Result<(Frame, Option<Coarseness>), Failure> {
         let to_world = self.run.dataset.normalisation;
         let local = Frame::from_origin(to_world.local_origin());

@@ -20,7 +20,7 @@ const PACKED: usize = 14;
 #[derive(Default)]
 pub(super) struct CompressedPlyWriter {
     frame: Frame,
-    /// Gaussians of a chunk that is not full.
+    /// Gaussians of the current chunk, which is not full.
     open: Vec<[f32; PACKED]>,
     chunks: Vec<[f32; BOUNDS.len()]>,
     words: Vec<[u32; WORDS.len()]>,

@@ -10,7 +10,7 @@ use crate::models::write::{NO_DOUBLE, unfit};
 use crate::models::{Frame, ModelWriter, Shape};
 use densify_core::gaussians::{Gaussians, sh_coefficients, sigmoid};
 
-/// Attributes before those of colour, each with its numbers per Gaussian.
+/// Attributes before those of colour, each with its number of components.
 const ATTRIBUTES: [(&str, usize); 6] = [
     ("POSITION", 3),
     ("ROTATION", 4),

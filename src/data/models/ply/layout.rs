@@ -7,8 +7,8 @@ use densify_core::gaussians::{MAX_SH_DEGREE, sh_coefficients};
 /// First bytes of every PLY file.
 pub(in crate::models) const START: &[u8] = b"ply";
 
-/// Names of the properties that are read, in the order of the original. Before index [`NORMALS_AT`] the original has
-/// three normals, which are 0.
+/// Names of the properties that are read, in the order of the original trainer, which also writes three normals, all 0,
+/// before index [`NORMALS_AT`].
 pub(super) fn properties(sh_degree: u8) -> impl Iterator<Item = String> {
     let rest = 3 * (sh_coefficients(sh_degree) - 1);
     let named = |names: &[&str]| names.iter().map(|&name| name.to_owned()).collect::<Vec<_>>();
@@ -28,7 +28,7 @@ pub(super) fn properties(sh_degree: u8) -> impl Iterator<Item = String> {
 
 /// Begins the comment that names the offset of local coordinates, before three numbers: a position in the dataset's
 /// coordinates is (x, y, z) plus the offset.
-pub(in crate::models) const OFFSET: &str = "densify offset";
+pub(crate) const OFFSET: &str = "densify offset";
 /// Begins the comment that names a point near the model, if x, y and z are `double`. Measured from there, positions are
 /// exact in f32.
 pub(super) const NEAR: &str = "densify near";

@@ -5,6 +5,10 @@
 
 /// First word of the data, `NGSP` in little endian.
 pub(super) const MAGIC: u32 = 0x5053_474e;
+/// The bit of the header's flags, byte 14, that says that there are extensions.
+pub(super) const HAS_EXTENSIONS: u8 = 2;
+/// Type of the extension that states the axes (Adobe).
+pub(super) const COORDINATE_SYSTEM: u32 = 0xadbe_0003;
 /// First bytes of a gzip stream.
 pub(super) const GZIP: [u8; 2] = [0x1f, 0x8b];
 /// A colour's byte is 255·(½ + `COLOUR`·coefficient).
