@@ -55,7 +55,10 @@ impl ModelArray {
 pub struct Gaussians {
     /// Spherical-harmonic degree, 0..=3; decides the length of `sh`.
     pub sh_degree: u8,
-    /// Means `[scene units]`. Shape: `[rows]`.
+    /// The point from which means are measured `[scene units]`: a position is a mean plus this. Other than 0 only outside
+    /// training, where coordinates would be too coarse in f32.
+    pub origin: [f64; 3],
+    /// Means, relative to `origin` `[scene units]`. Shape: `[rows]`.
     pub means: Vec<[f32; 3]>,
     /// Natural logarithm of the standard deviations `[ln scene units]`. Shape: `[rows]`.
     pub log_scales: Vec<[f32; 3]>,
@@ -78,6 +81,7 @@ impl Gaussians {
     ) -> Result<Self, E> {
         Ok(Self {
             sh_degree,
+            origin: [0.0; 3],
             means: in_rows(array(ModelArray::Means)?),
             log_scales: in_rows(array(ModelArray::LogScales)?),
             quats: in_rows(array(ModelArray::Quats)?),
@@ -90,12 +94,44 @@ impl Gaussians {
     pub fn zeros(rows: usize, sh_degree: u8) -> Self {
         Self {
             sh_degree,
+            origin: [0.0; 3],
             means: vec![[0.0; 3]; rows],
             log_scales: vec![[0.0; 3]; rows],
             quats: vec![[0.0; 4]; rows],
             opacity_logits: vec![0.0; rows],
             sh: vec![0.0; rows * 3 * sh_coefficients(sh_degree)],
         }
+    }
+
+    /// The position of a row.
+    ///
+    /// # Panics
+    /// When the row does not exist.
+    pub fn position(&self, row: usize) -> [f64; 3] {
+        std::array::from_fn(|axis| {
+            let mean = f64::from(self.means[row][axis]);
+            // Adding 0 would change the sign of −0.
+            if self.origin[axis] == 0.0 { mean } else { mean + self.origin[axis] }
+        })
+    }
+
+    /// True if means are measured from this point.
+    pub fn has_origin(&self, origin: [f64; 3]) -> bool {
+        self.origin.map(f64::to_bits) == origin.map(f64::to_bits)
+    }
+
+    /// The same positions, measured from another point. They are rounded to f32 unless the point is the same.
+    #[must_use]
+    pub fn with_origin(mut self, origin: [f64; 3]) -> Self {
+        if !self.has_origin(origin) {
+            for row in 0..self.len() {
+                let position = self.position(row);
+                self.means[row] =
+                    std::array::from_fn(|axis| (position[axis] - origin[axis]) as f32);
+            }
+            self.origin = origin;
+        }
+        self
     }
 
     /// Changes the degree: higher bands are dropped, new ones are zero.
@@ -112,12 +148,16 @@ impl Gaussians {
         self
     }
 
-    /// Appends the rows of another model of the same degree.
+    /// Appends the rows of another model of the same degree. A model without rows takes the other's origin.
     ///
     /// # Panics
     /// When the degrees differ.
     pub fn append(&mut self, mut other: Self) {
         assert_eq!(self.sh_degree, other.sh_degree, "models of different degrees cannot be joined");
+        if self.is_empty() {
+            self.origin = other.origin;
+        }
+        other = other.with_origin(self.origin);
         self.means.append(&mut other.means);
         self.log_scales.append(&mut other.log_scales);
         self.quats.append(&mut other.quats);
@@ -132,6 +172,7 @@ impl Gaussians {
     pub fn gather(&self, rows: &[usize]) -> Self {
         Self {
             sh_degree: self.sh_degree,
+            origin: self.origin,
             means: rows.iter().map(|&row| self.means[row]).collect(),
             log_scales: rows.iter().map(|&row| self.log_scales[row]).collect(),
             quats: rows.iter().map(|&row| self.quats[row]).collect(),

@@ -5,6 +5,7 @@ use std::path::Path;
 use glam::DVec3;
 
 use crate::error::LoadError;
+use crate::models::PLY_OFFSET;
 use crate::ply::{Element, Ply, Scalar};
 use densify_core::files::one_line;
 use densify_core::sh;
@@ -55,7 +56,8 @@ impl PointCloud {
 }
 
 /// Reads the vertices of a PLY file as points, and a note if they have no colours; other elements are skipped. Positions
-/// may be of any type, and non-finite. A model of Gaussian splats gives the colours of its Gaussians.
+/// may be of any type, and non-finite. A model of Gaussian splats gives the colours of its Gaussians, and their world
+/// positions even if the file has local coordinates.
 ///
 /// # Errors
 /// When the file is unreadable, contradicts itself, or its vertices have no x, y, z.
@@ -82,9 +84,11 @@ pub fn read_points(path: &Path) -> Result<(PointCloud, Option<String>), LoadErro
         (offset, factor) = (0.5, f64::from(sh::C0));
         columns.extend([r, g, b]);
     }
+    let origin = ply.comment_numbers(PLY_OFFSET)?.map(DVec3::from);
     let mut points = PointCloud::default();
     ply.each_row(&vertices, &columns, |row| {
-        points.positions.push(DVec3::new(row[0], row[1], row[2]));
+        let position = DVec3::new(row[0], row[1], row[2]);
+        points.positions.push(origin.map_or(position, |origin| position + origin));
         points.colours.push(match row[3..] {
             // The cast turns NaN into 0 and saturates.
             [r, g, b] => [r, g, b].map(|v| (255.0 * (offset + factor * (v / full)) + 0.5) as u8),
@@ -206,6 +210,18 @@ mod tests {
             let is_noted = note.is_some_and(|note| note.contains("file.ply: the points have no"));
             assert_eq!(is_noted, expected.is_none(), "{names:?}");
         }
+    }
+
+    /// Models in local coordinates have one.
+    #[test]
+    fn an_offset_in_the_header_is_added_to_positions() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("file.ply");
+        let text = "ply\nformat ascii 1.0\ncomment densify offset 500000.5 -4 1e6\nelement vertex 1\n\
+                    property float x\nproperty float y\nproperty float z\nend_header\n1 2 3\n";
+        std::fs::write(&path, text).unwrap();
+        let (points, _) = read_points(&path).unwrap();
+        assert_eq!(points.positions, [DVec3::new(500_001.5, -2.0, 1_000_003.0)]);
     }
 
     #[test]

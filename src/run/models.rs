@@ -1,14 +1,17 @@
 //! Files of models: single files, and those saved by a run.
 
+use std::borrow::Cow;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-use crate::failure::{Failure, ModelProblem};
+use crate::failure::{Failure, ModelProblem, notes};
 use crate::observer::Observer;
 use densify_core::files::{self, WriteError};
 use densify_core::gaussians::Gaussians;
 use densify_data::dataset::is_archive;
-use densify_data::models::{self, Format, fitting_format, is_unfit};
+use densify_data::models::{
+    self, Coarseness, Coordinates, Format, Frame, fitting_format, is_unfit, local_origin,
+};
 use densify_train::checkpoint::newest_step;
 use densify_train::output::{is_in_use, model_path, saved_iterations};
 
@@ -122,19 +125,63 @@ pub fn read_model(path: &Path, observer: &dyn Observer) -> Result<Gaussians, Fai
     Ok(file.gaussians)
 }
 
-/// Writes a model in another format, and tells the observer what the format changes. An error leaves an existing file
-/// as it is.
+/// The model in the coordinates of its file, and their frame. Automatic coordinates are local if f32 is too coarse for
+/// world coordinates, unless the model itself has only world coordinates in f32, and the format keeps these exactly.
+fn placed<'a>(
+    model: &'a Gaussians,
+    coordinates: Coordinates,
+    format: &Format,
+    observer: &dyn Observer,
+) -> Result<(Cow<'a, Gaussians>, Frame), Failure> {
+    let within = |frame: Frame| {
+        let is_there = model.has_origin(frame.origin);
+        let moved = || Cow::Owned(model.clone().with_origin(frame.origin));
+        Ok((if is_there { Cow::Borrowed(model) } else { moved() }, frame))
+    };
+    let (local, spelling) = (Frame::from_origin(local_origin(model)), observer.spelling());
+    match coordinates {
+        Coordinates::Local => return within(local),
+        Coordinates::Double => return within(Frame { is_double: true, ..local }),
+        Coordinates::Auto | Coordinates::World => {}
+    }
+    let coarseness = Coarseness::measure(model);
+    let has_more = model.origin != [0.0; 3];
+    if !coarseness.is_noted() {
+        return within(Frame::WORLD);
+    }
+    if coordinates == Coordinates::Auto && (has_more || format.is_lossy()) {
+        observer
+            .say(format_args!("{}", notes::saved_in_local(spelling, &coarseness, local.origin)));
+        return within(local);
+    }
+    if has_more && coarseness.is_unfit() {
+        return Err(Failure::input(notes::coarse(spelling, &coarseness)));
+    }
+    let note = if has_more {
+        notes::coarse(spelling, &coarseness)
+    } else {
+        format!("its coordinates are only f32: {coarseness}; export it from the run that made it")
+    };
+    observer.say(format_args!("note: {note}"));
+    within(Frame::WORLD)
+}
+
+/// Writes a model in another format, and tells the observer what the format and the coordinates change. An error leaves
+/// an existing file as it is.
 ///
 /// # Errors
-/// When the format cannot hold the model, or the disk fails.
+/// When the format cannot hold the model or its coordinates, or the disk fails.
 pub fn write_model(
     format: &Format,
     path: &Path,
     model: &Gaussians,
+    coordinates: Coordinates,
     observer: &dyn Observer,
 ) -> Result<(), Failure> {
+    let (model, frame) = placed(model, coordinates, format, observer)?;
+    let model = model.as_ref();
     let write = |out: &mut dyn Write| {
-        format.write(model, out).map_err(|error| match error {
+        format.write_in(frame, model, out).map_err(|error| match error {
             // The format cannot hold the model; the disk is not at fault.
             error if is_unfit(&error) => WriteError::Source(Failure::input(error)),
             error => WriteError::Io(error),
@@ -152,8 +199,9 @@ pub fn write_model(
         if changes.is_noted() {
             observer.say(format_args!("note: {name}: {changes}; ply and glb hold all values"));
         }
-        Ok(())
-    })
+        Ok::<_, Failure>(format.write_sidecar(frame, path, written)?)
+    })?;
+    Ok(format.remove_old_sidecar(frame, path)?)
 }
 
 #[cfg(test)]

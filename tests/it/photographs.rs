@@ -127,19 +127,26 @@ impl Photographs {
 
     /// A COLMAP text model.
     pub(crate) fn colmap_text() -> Self {
+        Self::colmap_text_at(DVec3::ZERO)
+    }
+
+    /// The same with its origin at a place in the world.
+    pub(crate) fn colmap_text_at(place: DVec3) -> Self {
         let made = Self::with_images();
         let (width, height) = SIZE;
         let camera = format!("1 PINHOLE {width} {height} {FOCAL} {FOCAL} 24 20\n");
         made.write("sparse/0/cameras.txt", camera);
         let mut images = String::new();
         for (view, Shot { camera, .. }) in shots().iter().enumerate() {
-            let (q, t) = (DQuat::from_mat3(&camera.rotation), camera.translation);
+            let q = DQuat::from_mat3(&camera.rotation);
+            let t = camera.translation - camera.rotation * place;
             let pose = [q.w, q.x, q.y, q.z, t.x, t.y, t.z].map(|number| number.to_string());
             images += &format!("{} {} 1 {}\n\n", view + 1, pose.join(" "), name(view));
         }
         made.write("sparse/0/images.txt", images);
         let mut lines = String::new();
         for (id, ([x, y, z], [r, g, b])) in points().into_iter().enumerate() {
+            let [x, y, z] = (DVec3::new(x, y, z) + place).to_array();
             lines += &format!("{} {x} {y} {z} {r} {g} {b} 0.5\n", id + 1);
         }
         made.write("sparse/0/points3D.txt", lines);

@@ -13,7 +13,7 @@ use super::threads::open_machine;
 use densify_core::files::FileError;
 use densify_core::gaussians::Gaussians;
 use densify_core::numbers::gaussians;
-use densify_data::models::{Format, export_formats, find, find_by_extension};
+use densify_data::models::{Coordinates, Format, export_formats, find, find_by_extension};
 use densify_inspect::Reference;
 use densify_run::RunConfig;
 use densify_run::failure::{Failure, INPUT};
@@ -43,6 +43,10 @@ pub(super) struct ExportArgs {
     /// Saved iteration of the run `[default: the last]`
     #[arg(long, value_name = "N")]
     iteration: Option<u32>,
+    /// Coordinates of the file: local ones are relative to an offset, which stands in the file or, for SPZ and SOG, in
+    /// FILE.offset.json. auto: world, or local if f32 is too coarse for world coordinates, as in UTM
+    #[arg(long, value_name = "KIND", default_value = "auto")]
+    coordinates: Coordinates,
     /// Replace files that exist
     #[arg(long)]
     overwrite: bool,
@@ -92,7 +96,7 @@ pub(super) fn run(
     let mut unfit = None;
     for (format, path) in &files {
         let shown = path.display().to_string();
-        let result = write_model(format, path, &model, console);
+        let result = write_model(format, path, &model, args.coordinates, console);
         match result.map_err(|error| if error.code == INPUT { error.within(&shown) } else { error })
         {
             Ok(()) => {}

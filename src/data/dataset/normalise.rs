@@ -7,6 +7,7 @@
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
+use crate::models::round_origin;
 use densify_core::camera::Camera;
 use densify_core::gaussians::Gaussians;
 
@@ -16,9 +17,9 @@ pub const EXTENT: f64 = 1.1;
 /// Cameras count as being at one place if their radius is below this fraction of their distance from the origin:
 /// the precision of f64 is 2.2e-16, and poses of other programs have a few digits less.
 const SAME_PLACE: f64 = 1e-12;
-/// Distance from the origin, in extents, beyond which f32 world coordinates are too coarse. At 1e4 they are rounded by
-/// up to 5e-4 extents: half a pixel, for a focal length of 1,500 px and a point 1.5 extents away.
-const F32_OFFSET: f64 = 1e4;
+/// Distance from the origin, in radii of the cameras, below which f32 world coordinates are fine enough for all
+/// Gaussians: at 50 their step is at most 4e-6 radii, a fiftieth of the smallest Gaussian made from a point.
+const F32_DISTANCE: f64 = 50.0;
 
 /// A camera is an outlier if its distance from the median position exceeds this many times the median of all these
 /// distances. Drone flights and walks around an object stay below 5.
@@ -76,11 +77,11 @@ impl Normalisation {
     pub fn fit_model(model: &Gaussians) -> Self {
         let middle = |axis: usize| {
             let along = model.means.iter().map(|mean| f64::from(mean[axis]));
-            median(along.collect()).unwrap_or_default()
+            median(along.collect()).unwrap_or_default() + model.origin[axis]
         };
         let centre = DVec3::new(middle(0), middle(1), middle(2));
-        let away = |mean: &[f32; 3]| DVec3::from(mean.map(f64::from)).distance(centre);
-        let mut away: Vec<f64> = model.means.iter().map(away).collect();
+        let away = |row| DVec3::from(model.position(row)).distance(centre);
+        let mut away: Vec<f64> = (0..model.len()).map(away).collect();
         away.sort_unstable_by(f64::total_cmp);
         // The last fifth is mostly background, which may be very far away.
         let most =
@@ -128,45 +129,49 @@ impl Normalisation {
         Camera { translation, ..*scene }
     }
 
-    /// Transforms a model from scene to world coordinates, computing in f64.
-    pub fn world_from_model(&self, scene: Gaussians) -> Gaussians {
-        self.mapped(scene, -self.scale.ln(), |mean| self.world_from_scene(mean))
+    /// Transforms a model from scene to world coordinates, computing in f64. The means are measured from `origin`, a
+    /// world point.
+    pub fn world_from_model(&self, scene: Gaussians, origin: [f64; 3]) -> Gaussians {
+        let from_scene = |scene| self.world_from_scene(scene);
+        self.mapped(scene, origin, -self.scale.ln(), from_scene)
     }
 
     /// Transforms a model from world to scene coordinates, computing in f64.
     pub fn model_from_world(&self, world: Gaussians) -> Gaussians {
-        self.mapped(world, self.scale.ln(), |mean| self.scene_from_world(mean))
+        self.mapped(world, [0.0; 3], self.scale.ln(), |world| self.scene_from_world(world))
     }
 
     /// Transforms a model in place, as it may take most of the memory.
     fn mapped(
         &self,
         mut model: Gaussians,
+        origin: [f64; 3],
         ln_scale: f64,
         point: impl Fn(DVec3) -> DVec3,
     ) -> Gaussians {
-        if *self != Self::IDENTITY {
-            for mean in &mut model.means {
-                *mean = point(DVec3::from(mean.map(f64::from))).as_vec3().to_array();
-            }
-            for value in model.log_scales.as_flattened_mut() {
-                *value = (f64::from(*value) + ln_scale) as f32;
-            }
+        if *self == Self::IDENTITY {
+            return model.with_origin(origin);
+        }
+        for row in 0..model.len() {
+            let place = point(DVec3::from(model.position(row)));
+            model.means[row] = (place - DVec3::from(origin)).as_vec3().to_array();
+        }
+        model.origin = origin;
+        for value in model.log_scales.as_flattened_mut() {
+            *value = (f64::from(*value) + ln_scale) as f32;
         }
         model
     }
 
-    /// A warning if world coordinates in f32 are too coarse for this scene.
-    pub fn f32_warning(&self) -> Option<String> {
-        let offset = self.centre.length() * self.scale / EXTENT;
-        (offset > F32_OFFSET).then(|| {
-            format!(
-                "the scene is {offset:.1e} times its extent from the origin: f32 coordinates in the exported \
-                 model are only precise to {:.1e} of the extent; move the reconstruction near the \
-                 origin before training",
-                offset * f64::from(f32::EPSILON)
-            )
-        })
+    /// True if the scene is so far from the origin that world coordinates in f32 may be too coarse for it.
+    pub fn is_remote(&self) -> bool {
+        self.centre.length() * self.scale > F32_DISTANCE
+    }
+
+    /// A round world point in the middle of the scene, from which local coordinates are measured: near its centre, to
+    /// a power of ten below the radius of the cameras.
+    pub fn local_origin(&self) -> [f64; 3] {
+        round_origin(self.centre.to_array(), 1.0 / self.scale)
     }
 }
 
@@ -211,8 +216,8 @@ mod tests {
         let scene = centres.map(|c| n.scene_from_world_camera(&camera(c)).centre());
         assert!((mean_and_radius(&scene).1 - 1.0).abs() < 1e-8);
         assert!((scene.iter().sum::<DVec3>()).length() < 1e-8);
-        assert!(n.f32_warning().is_some());
-        assert!(Normalisation::fit(&[DVec3::X, DVec3::Y], &[]).f32_warning().is_none());
+        assert!(n.is_remote() && !Normalisation::fit(&[DVec3::X, DVec3::Y], &[]).is_remote());
+        assert_eq!(n.local_origin(), [4e6 + 1.0, -5e6 + 2.0, 299.0]);
     }
 
     #[test]
@@ -265,16 +270,19 @@ mod tests {
             quats: vec![[1.0, 0.0, 0.0, 0.0]],
             opacity_logits: vec![0.3],
             sh: vec![0.1, 0.2, 0.3],
-            sh_degree: 0,
+            ..Gaussians::default()
         };
         let n = Normalisation { centre: DVec3::new(100.0, 200.0, 300.0), scale: 0.125 };
-        let world = n.world_from_model(model.clone());
+        let world = n.world_from_model(model.clone(), [0.0; 3]);
         assert_eq!(world.means, [[104.0, 198.0, 308.0]]);
         assert!((world.log_scales[0][0] - (-3.0 + 8f32.ln())).abs() < 1e-6);
+        let local = n.world_from_model(model.clone(), [100.0, 200.0, 300.0]);
+        assert_eq!((local.means[0], local.position(0)), ([4.0, -2.0, 8.0], [104.0, 198.0, 308.0]));
+        assert_eq!(n.model_from_world(local).means, model.means);
         let back = n.model_from_world(world);
-        assert_eq!(back.means, model.means);
+        assert_eq!((&back.means, back.origin), (&model.means, [0.0; 3]));
         assert!((back.log_scales[0][2] - 0.5).abs() < 1e-6);
         assert_eq!((back.quats, back.sh), (model.quats.clone(), model.sh.clone()));
-        assert_eq!(Normalisation::IDENTITY.world_from_model(model.clone()), model);
+        assert_eq!(Normalisation::IDENTITY.world_from_model(model.clone(), [0.0; 3]), model);
     }
 }

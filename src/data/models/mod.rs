@@ -13,10 +13,12 @@ mod splat;
 mod spz;
 
 mod changes;
+mod coordinates;
 mod quantise;
 mod recognise;
 mod rows;
 mod siblings;
+mod sidecar;
 mod similarity;
 mod spatial_order;
 mod unpack;
@@ -30,8 +32,11 @@ use densify_policies::parameters::nearest;
 pub use inventory;
 
 pub use changes::Changes;
+pub use coordinates::{Coarseness, Coordinates, Frame, local_origin, offset_text, round_origin};
+pub(crate) use ply::layout::OFFSET as PLY_OFFSET;
 pub use recognise::{Match, ModelFile, Reader, main_file, read_model};
 pub use rows::SplatFile;
+pub use sidecar::{remove_sidecar, sidecar_path, write_sidecar};
 pub(crate) use sog::folder_in_archive;
 pub use write::{ModelWriter, Shape, fitting_format, is_unfit};
 

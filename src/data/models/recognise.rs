@@ -8,7 +8,7 @@ use std::fs::File;
 use std::io::{BufReader, Read, Seek};
 use std::path::{Path, PathBuf};
 
-use super::{Format, SplatFile, formats, names};
+use super::{Format, SplatFile, formats, names, sidecar};
 use crate::error::LoadError;
 use densify_core::files;
 
@@ -99,7 +99,8 @@ impl<'a> ModelFile<'a> {
 }
 
 /// Reads a model in any registered format: a file, or a folder that is a model (SOG). The model is in the coordinates
-/// of its dataset; formats with a frame of their own (glTF) are converted.
+/// of its dataset, measured from an offset if the file or its sidecar names one; formats with a frame of their own
+/// (glTF) are converted.
 ///
 /// # Errors
 /// When the file is unreadable, of no known format, contradicts its format, or more than 1 % of its Gaussians are
@@ -110,24 +111,29 @@ pub fn read_model(path: &Path) -> Result<SplatFile, LoadError> {
         return read_model(&main);
     }
     let file = ModelFile::open(path)?;
-    let mut weak = None;
+    let mut best = None;
     for (_, reader) in readers() {
         match (reader.recognise)(&file)? {
-            Match::Strong => return (reader.read)(file),
-            Match::Weak => weak = weak.or(Some(reader)),
+            Match::Strong => {
+                best = Some(reader);
+                break;
+            }
+            Match::Weak => best = best.or(Some(reader)),
             Match::None => {}
         }
     }
-    match weak {
-        Some(reader) => (reader.read)(file),
+    let mut found = match best {
+        Some(reader) => (reader.read)(file)?,
         None if file.json()?.is_some_and(|text| text.contains("\"lodLevels\"")) => {
-            Err(LoadError::Data(format!(
+            return Err(LoadError::Data(format!(
                 "{} is a list of models in several levels of detail; name one of the meta.json files that it lists",
                 path.display()
-            )))
+            )));
         }
-        None => Err(unrecognised(path)),
-    }
+        None => return Err(unrecognised(path)),
+    };
+    sidecar::apply(path, &mut found)?;
+    Ok(found)
 }
 
 /// The main file of a folder that is a model; `None` if the folder is not one.

@@ -39,19 +39,19 @@ impl Similarity {
         })
     }
 
-    /// Transforms a model; the identity changes no bit.
+    /// Transforms a model; the identity changes no bit. A translation alone moves the model's origin, so that no position
+    /// is rounded.
     pub(super) fn apply(&self, model: &mut Gaussians) {
         let Self { rotation, scale, translation } = *self;
-        if rotation.abs_diff_eq(DQuat::IDENTITY, 0.0)
-            && scale.to_bits() == 1f64.to_bits()
-            && translation == DVec3::ZERO
-        {
+        if rotation.abs_diff_eq(DQuat::IDENTITY, 0.0) && scale.to_bits() == 1f64.to_bits() {
+            model.origin = (DVec3::from(model.origin) + translation).to_array();
             return;
         }
-        for mean in &mut model.means {
-            let turned = rotation * DVec3::from(mean.map(f64::from));
-            *mean = (scale * turned + translation).as_vec3().to_array();
+        for row in 0..model.len() {
+            let turned = rotation * DVec3::from(model.position(row));
+            model.means[row] = (scale * turned + translation).as_vec3().to_array();
         }
+        model.origin = [0.0; 3];
         for log in model.log_scales.as_flattened_mut() {
             *log = (f64::from(*log) + scale.ln()) as f32;
         }
@@ -85,6 +85,8 @@ impl Similarity {
 
 /// Mirrors a model in the plane x = 0.
 pub(super) fn mirror_x(model: &mut Gaussians) {
+    // Subtracting keeps 0 positive.
+    model.origin[0] = 0.0 - model.origin[0];
     model.means.iter_mut().for_each(|[x, ..]| *x = -*x);
     for [_, _, y, z] in &mut model.quats {
         (*y, *z) = (-*y, -*z);

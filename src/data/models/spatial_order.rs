@@ -5,21 +5,21 @@ use densify_core::gaussians::Gaussians;
 
 /// The centre and the spread of a model along each axis: medians, so that outliers have no effect.
 pub(super) fn frame(model: &Gaussians) -> [(f64, f64); 3] {
-    let middle = model.len() / 2;
-    let mut frame = [(0.0, 1.0); 3];
-    let mut values = Vec::with_capacity(model.len());
-    for (axis, (centre, spread)) in frame.iter_mut().enumerate() {
-        values.clear();
-        values.extend(model.means.iter().map(|mean| f64::from(mean[axis])));
-        if values.is_empty() {
-            break;
-        }
-        *centre = *values.select_nth_unstable_by(middle, f64::total_cmp).1;
-        values.iter_mut().for_each(|value| *value = (*value - *centre).abs());
-        // The median is 0 if half of all rows are equal in this coordinate.
-        *spread = values.select_nth_unstable_by(middle, f64::total_cmp).1.max(f64::MIN_POSITIVE);
+    [0, 1, 2].map(|axis| {
+        middle_and_spread(model.means.iter().map(|mean| f64::from(mean[axis])).collect())
+    })
+}
+
+/// The median of values, and the median of their distances from it.
+pub(super) fn middle_and_spread(mut values: Vec<f64>) -> (f64, f64) {
+    let middle = values.len() / 2;
+    if values.is_empty() {
+        return (0.0, 1.0);
     }
-    frame
+    let centre = *values.select_nth_unstable_by(middle, f64::total_cmp).1;
+    values.iter_mut().for_each(|value| *value = (*value - centre).abs());
+    // The median is 0 if half of all values are equal.
+    (centre, values.select_nth_unstable_by(middle, f64::total_cmp).1.max(f64::MIN_POSITIVE))
 }
 
 /// The rows of a model in the order of the curve, whose scale is that of the [`frame`].

@@ -5,9 +5,11 @@ use std::ops::Range;
 use std::path::Path;
 
 use super::spatial_order::spatial_order;
-use super::{Changes, Format, PLY, compress_formats, read_model};
+use super::{
+    Changes, Format, Frame, PLY, compress_formats, read_model, remove_sidecar, write_sidecar,
+};
 use crate::error::LoadError;
-use densify_core::files::{FileError, WriteError, write_atomically, write_atomically_from};
+use densify_core::files::{FileError, WriteError, write_atomically, write_checked};
 use densify_core::gaussians::Gaussians;
 use densify_core::pieces::pieces;
 
@@ -43,13 +45,26 @@ pub trait ModelWriter {
         &[]
     }
 
+    /// Takes note of what coordinates are measured from, before [`begin`](Self::begin). Returns true if the file will
+    /// say so itself; else a [sidecar](super::sidecar_path) must. World coordinates need neither.
+    ///
+    /// # Errors
+    /// [`io::ErrorKind::InvalidInput`] for coordinates in f64, unless the format has them.
+    fn set_frame(&mut self, frame: Frame) -> io::Result<bool> {
+        if frame.is_double {
+            return Err(unfit(NO_DOUBLE));
+        }
+        Ok(false)
+    }
+
     /// Writes what precedes the Gaussians.
     ///
     /// # Errors
     /// Those of `out`, and [`io::ErrorKind::InvalidInput`] where the format cannot hold the model.
     fn begin(&mut self, shape: Shape, out: &mut dyn Write) -> io::Result<()>;
 
-    /// Takes the next Gaussians, some thousand at a time, in the dataset's own coordinates.
+    /// Takes the next Gaussians, some thousand at a time, in the dataset's own coordinates, measured from the origin of
+    /// the [frame](Self::set_frame).
     ///
     /// # Errors
     /// As [`begin`](Self::begin).
@@ -61,6 +76,10 @@ pub trait ModelWriter {
     /// As [`begin`](Self::begin).
     fn finish(&mut self, out: &mut dyn Write) -> io::Result<()>;
 }
+
+/// The problem of a format without coordinates in f64.
+pub(super) const NO_DOUBLE: &str =
+    "only ply holds coordinates in f64; choose that format, or local coordinates";
 
 /// True if a writer failed because its format cannot hold the model, and not because of the disk.
 pub fn is_unfit(error: &io::Error) -> bool {
@@ -106,12 +125,22 @@ impl Format {
         self.writer.map_or(&[], |make| make().variants())
     }
 
-    /// Writes a model that is in memory as a whole, in the order that suits the format.
+    /// Writes a model that is in memory as a whole, in the order that suits the format. The model's origin is lost unless
+    /// the format [has a place](Self::states_offset) for it.
     ///
     /// # Errors
     /// Those of [`ModelWriter`].
     pub fn write(&self, model: &Gaussians, out: &mut dyn Write) -> io::Result<()> {
+        self.write_in(Frame::from_origin(model.origin), model, out)
+    }
+
+    /// As [`write`](Self::write), for a frame with the origin of the model.
+    ///
+    /// # Errors
+    /// Those of [`ModelWriter`].
+    pub fn write_in(&self, frame: Frame, model: &Gaussians, out: &mut dyn Write) -> io::Result<()> {
         let mut writer = self.open_writer()?;
+        writer.set_frame(frame)?;
         writer.begin(Shape { rows: model.len(), sh_degree: model.sh_degree }, out)?;
         if writer.wants_spatial_order() {
             let order = spatial_order(model);
@@ -140,24 +169,74 @@ impl Format {
         Ok(Changes::measure(model, &order, &read_model(file)?.gaussians))
     }
 
-    /// Writes a model to a file that appears only when it is complete. `rows` is asked for one
-    /// piece after the other, as a second copy of the model may not fit into memory.
+    /// True if files of this format name the origin of their coordinates.
+    pub fn states_offset(&self) -> bool {
+        self.writer.is_some_and(|make| make().set_frame(Frame::default()).unwrap_or(false))
+    }
+
+    /// Writes the sidecar that a file with this frame needs, before the file at `written` gets its name `path`. Afterwards,
+    /// [`remove_old_sidecar`](Self::remove_old_sidecar) completes the pair.
     ///
     /// # Errors
-    /// Those of `rows`, [`ModelWriter`] and [`write_atomically_from`].
+    /// When it cannot be written.
+    pub fn write_sidecar(
+        &self,
+        frame: Frame,
+        path: &Path,
+        written: &Path,
+    ) -> Result<(), FileError> {
+        match frame.offset().filter(|_| !self.states_offset()) {
+            Some(offset) => write_sidecar(path, offset, written),
+            None => Ok(()),
+        }
+    }
+
+    /// Removes a sidecar that the file which had this name before has left, if the new one needs none.
+    ///
+    /// # Errors
+    /// When it cannot be removed.
+    pub fn remove_old_sidecar(&self, frame: Frame, path: &Path) -> Result<(), FileError> {
+        match frame.offset().filter(|_| !self.states_offset()) {
+            Some(_) => Ok(()),
+            None => remove_sidecar(path),
+        }
+    }
+
+    /// Writes a model that is in memory as a whole to a file that appears only when it is complete, with its sidecar if
+    /// it needs one.
+    ///
+    /// # Errors
+    /// Those of [`ModelWriter`] and [`write_atomically`].
+    pub fn save(&self, model: &Gaussians, path: &Path) -> Result<(), FileError> {
+        let frame = Frame::from_origin(model.origin);
+        let write = |out: &mut dyn Write| Ok::<_, WriteError<FileError>>(self.write(model, out)?);
+        write_checked(path, write, |written| self.write_sidecar(frame, path, written))?;
+        self.remove_old_sidecar(frame, path)
+    }
+
+    /// Writes a model to a file that appears only when it is complete, with its sidecar if it needs one. `rows` is asked
+    /// for one piece after the other, as a second copy of the model may not fit into memory; each has the origin of the
+    /// frame.
+    ///
+    /// # Errors
+    /// Those of `rows`, [`ModelWriter`] and [`write_checked`].
     pub fn write_file<E: From<FileError>>(
         &self,
         path: &Path,
         shape: Shape,
+        frame: Frame,
         mut rows: impl FnMut(Range<usize>) -> Result<Gaussians, E>,
     ) -> Result<(), E> {
-        write_atomically_from(path, |out| {
+        let write = |out: &mut dyn Write| {
             let mut writer = self.open_writer()?;
+            writer.set_frame(frame)?;
             writer.begin(shape, out)?;
             for piece in pieces(shape.rows) {
                 writer.rows(&rows(piece).map_err(WriteError::Source)?, out)?;
             }
             Ok(writer.finish(out)?)
-        })
+        };
+        write_checked(path, write, |written| Ok(self.write_sidecar(frame, path, written)?))?;
+        Ok(self.remove_old_sidecar(frame, path)?)
     }
 }

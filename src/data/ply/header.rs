@@ -8,6 +8,8 @@ use crate::error::LoadError;
 
 /// Longest header accepted `[bytes]`.
 const MAX_HEADER: u64 = 1 << 20;
+/// Longest comment that is kept `[bytes]`.
+const MAX_COMMENT: usize = 256;
 /// An element with this number of rows or more is refused.
 const MAX_ROWS: u64 = 1 << 32;
 
@@ -54,6 +56,8 @@ pub(crate) struct Element {
 pub(super) struct Header {
     pub(super) encoding: Encoding,
     pub(super) elements: Vec<Element>,
+    /// The comments that are not long, in order.
+    pub(super) comments: Vec<String>,
     /// Size of the header `[bytes]`.
     pub(super) length: u64,
 }
@@ -151,11 +155,17 @@ impl Header {
         }
         let mut encoding = None;
         let mut elements: Vec<Element> = Vec::new();
+        let mut comments = Vec::new();
         loop {
             let line = lines.next()?;
             let words: Vec<&str> = line.split_whitespace().collect();
             match words[..] {
-                [] | ["comment" | "obj_info", ..] => {}
+                ["comment", ..] => {
+                    let text = line.trim().strip_prefix("comment").unwrap_or_default().trim();
+                    // Other comments of a writer may be long.
+                    comments.extend((text.len() <= MAX_COMMENT).then(|| text.to_owned()));
+                }
+                [] | ["obj_info", ..] => {}
                 ["format", kind, "1.0"] if encoding.is_none() && elements.is_empty() => {
                     encoding = Some(match kind {
                         "ascii" => Encoding::Ascii,
@@ -210,7 +220,7 @@ impl Header {
             }
         }
         let encoding = encoding.ok_or_else(|| lines.fault("there is no `format` line"))?;
-        Ok(Self { encoding, elements, length: lines.read })
+        Ok(Self { encoding, elements, comments, length: lines.read })
     }
 }
 

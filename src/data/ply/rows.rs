@@ -39,6 +39,31 @@ impl<'a> Ply<'a> {
         &self.header.elements
     }
 
+    /// The three numbers after a word in a comment, if there is one. Several must agree.
+    pub(crate) fn comment_numbers(&self, word: &str) -> Result<Option<[f64; 3]>, LoadError> {
+        let mut found = None;
+        let texts = self.header.comments.iter().filter_map(|comment| comment.strip_prefix(word));
+        for text in texts.filter(|text| text.starts_with(' ')) {
+            let wrong = |problem: String| {
+                let field = format!("header comment {word:?}");
+                LoadError::damaged(self.path, field, problem)
+            };
+            let numbers: Vec<f64> = text.split_whitespace().map_while(|n| n.parse().ok()).collect();
+            let count = text.split_whitespace().count();
+            let numbers = <[f64; 3]>::try_from(numbers).ok();
+            let numbers = numbers.filter(|n| count == 3 && n.iter().all(|value| value.is_finite()));
+            let numbers =
+                numbers.ok_or_else(|| wrong(format!("{:?} is not three numbers", text.trim())))?;
+            if found
+                .is_some_and(|found: [f64; 3]| found.map(f64::to_bits) != numbers.map(f64::to_bits))
+            {
+                return Err(wrong(format!("{numbers:?} contradicts the {found:?} before it")));
+            }
+            found = Some(numbers);
+        }
+        Ok(found)
+    }
+
     /// The element with this name.
     pub(crate) fn element(&self, name: &str) -> Result<Element, LoadError> {
         let found = self.header.elements.iter().find(|element| element.name == name).cloned();

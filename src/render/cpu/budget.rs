@@ -173,6 +173,7 @@ mod tests {
     fn renderings_are_the_same_without_memory_for_training() {
         let model = Gaussians {
             sh_degree: 0,
+            origin: [0.0; 3],
             means: vec![[0.0, 0.1, 2.0], [0.3, 0.0, 3.0]],
             log_scales: vec![[-1.5; 3]; 2],
             quats: vec![[1.0, 0.0, 0.0, 0.0]; 2],

@@ -29,6 +29,7 @@ fn scene() -> (Gaussians, Camera, Image8) {
     let per_row = 3 * sh_coefficients(1) as u32;
     let model = Gaussians {
         sh_degree: 1,
+        origin: [0.0; 3],
         means: (0..ROWS).map(|row| draw(row, 0)).map(|[x, y, z]| [0.6 * x, 0.6 * y, z]).collect(),
         log_scales: (0..ROWS).map(|row| draw(row, 1).map(|s| 0.5 * s - 2.0)).collect(),
         quats: (0..ROWS)

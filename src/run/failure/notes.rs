@@ -7,6 +7,7 @@ use densify_core::memory::Bytes;
 use densify_core::numbers::grouped;
 use densify_core::spelling::Spelling;
 use densify_data::dataset::Note;
+use densify_data::models::{Coarseness, offset_text};
 use densify_render::{Accumulation, AdapterKind, BackendKind, Device};
 
 /// The device, with a hint where another choice may be better.
@@ -106,6 +107,43 @@ pub(crate) fn other_coordinates(
         "note: {model}: it shows little of the photographs (their correlation is {correlation:.2}); its coordinates \
          may not be those of the dataset (axes, scale, or origin)"
     )
+}
+
+/// World coordinates are too coarse in f32.
+pub(crate) fn coarse(s: Spelling, coarseness: &Coarseness) -> String {
+    format!(
+        "{coarseness}; {} or {} keeps positions exact",
+        s.text("coordinates", "local"),
+        s.text("coordinates", "double")
+    )
+}
+
+/// A file is in local coordinates because those of the world are too coarse.
+pub(crate) fn saved_in_local(s: Spelling, coarseness: &Coarseness, offset: [f64; 3]) -> String {
+    format!(
+        "note: saved in local coordinates, relative to the offset {}: {coarseness} ({} or {} saves others)",
+        offset_text(offset),
+        s.text("coordinates", "world"),
+        s.text("coordinates", "double")
+    )
+}
+
+/// World coordinates will be too coarse for the Gaussians that training is expected to make.
+pub(crate) fn expected_coarse(
+    s: Spelling,
+    coarseness: &Coarseness,
+    offset: [f64; 3],
+    is_automatic: bool,
+) -> String {
+    if is_automatic {
+        return format!(
+            "coords   local, from the offset {}: {coarseness} ({} or {} saves others)",
+            offset_text(offset),
+            s.text("coordinates", "world"),
+            s.text("coordinates", "double")
+        );
+    }
+    format!("note: the saved model will be worse than the trained one: {}", coarse(s, coarseness))
 }
 
 /// The hint on how to learn exposures if the tracks do not show whether they differ.

@@ -15,7 +15,7 @@ use densify_core::memory::{Ledger, Section};
 use densify_core::pieces::ROWS_AT_A_TIME;
 use densify_data::dataset::images::ImageDemand;
 use densify_data::dataset::{Dataset, View};
-use densify_data::models::{PLY, Shape};
+use densify_data::models::{Coordinates, PLY, Shape};
 use densify_render::{KeptPhotographs, MomentStorage, Setup, Shortcuts, Storage};
 use densify_train::exposure::Exposures;
 use densify_train::metrics::{geometry, scratch_bytes};
@@ -159,7 +159,12 @@ impl Case<'_> {
             // opacities, then a plan.
             let row = float + (2 * float).max(bytes_per_row(&Needs::default()) as u64);
             let removal = if self.choices.automatic.rows { budget * row } else { 0 };
-            pass("measuring a view", rendering + image + scratch_bytes(width, threads) + removal);
+            // Means as they were, while those of the saved file are measured.
+            let rounds = self.spec.output.coordinates == Coordinates::World
+                && self.inputs.dataset.normalisation.is_remote();
+            let means = if rounds { 3 * float * budget } else { 0 };
+            let other = scratch_bytes(width, threads) + removal + means;
+            pass("measuring a view", rendering + image + other);
         }
         let process = self.process_bytes();
         if let Some(beyond) = self.inputs.peak.and_then(|peak| peak.checked_sub(process)) {

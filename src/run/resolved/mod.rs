@@ -4,6 +4,7 @@
 
 mod case;
 mod config;
+mod coordinates;
 mod degree;
 mod estimate;
 mod exposure;
@@ -23,6 +24,7 @@ pub(crate) use case::{Case, DECODERS, Init, TEST_DECODERS};
 #[cfg(test)]
 pub(crate) use config::tests::sample;
 pub use config::{DegreeSource, ExposureSource, Findings, ModelSize, RunConfig};
+pub(crate) use coordinates::random_points;
 pub use estimate::{estimate, host_bytes};
 pub(crate) use fit::RunSize;
 pub(crate) use geometry_measurement::GeometryMeasurement;
@@ -96,8 +98,9 @@ impl<'a> ResolvedRun<'a> {
     fn new(case: Case<'a>, size: &Size, degree_lowered: bool, host: Host<'_>) -> Self {
         let spelling = host.observer.spelling();
         let scene = case.choices.lines(spelling);
-        let reasons = scene.chain(size.lines(&case, spelling)).collect();
         let init = case.first_rows(size.run_size.rows);
+        let coordinates = coordinates::line(&case, size.run_size.rows, &init, spelling);
+        let reasons = scene.chain(size.lines(&case, spelling)).chain(coordinates).collect();
         Self { init, size: size.run_size, degree_lowered, reasons, case }
     }
 }

@@ -9,7 +9,7 @@ use crate::coordinate_check::CoordinateCheck;
 use crate::failure::{Failure, ModelProblem, OptionProblem, notes};
 use crate::finished::views_of;
 use crate::observer::{Observer, Silent};
-use crate::resolved::{Init, ResolvedRun, importance_setup, read};
+use crate::resolved::{Init, ResolvedRun, importance_setup, random_points, read};
 use crate::spec::AbsolutePath;
 use densify_core::gaussians::Gaussians;
 use densify_core::numbers::{gaussians, grouped};
@@ -18,7 +18,7 @@ use densify_data::dataset::normalise::EXTENT;
 use densify_render::Backend;
 use densify_train::evaluate::Split;
 use densify_train::importance::{importance, largest};
-use densify_train::init::{initialise, random_points};
+use densify_train::init::initialise;
 
 /// Minimum share of Gaussians in the training views; a model with less counts as being in other coordinates.
 const LEAST_IN_VIEW: f64 = 0.1;
@@ -46,9 +46,7 @@ pub(super) fn first_model(
         Init::Model(file) => return load(&file.0, run, observer),
         Init::Points => (&dataset.points, "points of the scene"),
         Init::Random(count) => {
-            let cameras: Vec<_> = dataset.train.iter().map(|view| view.camera).collect();
-            let opaque = !dataset.train.iter().any(|view| view.source.header.has_alpha);
-            random = random_points(*count, &cameras, opaque, seed);
+            random = random_points(case, *count);
             (&random, "random points")
         }
     };

@@ -1,6 +1,7 @@
 //! The session of a run: the loop around the trainer with its progress, logs, saved models, measurements and
 //! checkpoints. The file is not split because all of this happens between two steps, and the order matters.
 
+mod coordinates;
 mod first_model;
 mod geometry;
 mod prepare;
@@ -55,6 +56,8 @@ struct Session<'a> {
     guard: Guard,
     /// Step of the last checkpoint that this process has written or resumed from.
     checkpoint: Option<u32>,
+    /// The user was told about the coordinates of saved models.
+    has_told_coordinates: bool,
 }
 
 /// Treatment of a run that already exists in the output folder.
@@ -140,9 +143,6 @@ impl<'a> Session<'a> {
         run.config.write(folder)?;
         let config = run.config.table()?;
         let to_world = &run.dataset.normalisation;
-        if let Some(warning) = to_world.f32_warning() {
-            observer.say(format_args!("note: {warning}"));
-        }
         let views = run.dataset.test.iter().chain(&run.dataset.train);
         let cameras =
             views.map(|view| (&*view.name, to_world.world_from_scene_camera(&view.camera)));
@@ -162,7 +162,18 @@ impl<'a> Session<'a> {
             }
         };
         let folder = folder.to_owned();
-        Ok(Self { run, config, observer, folder, logs, totals, guard, checkpoint })
+        let has_told_coordinates = false;
+        Ok(Self {
+            run,
+            config,
+            observer,
+            folder,
+            logs,
+            totals,
+            guard,
+            checkpoint,
+            has_told_coordinates,
+        })
     }
 
     /// Does all remaining steps.
@@ -342,10 +353,11 @@ impl<'a> Session<'a> {
     fn save(&mut self, step: u32) -> Result<PathBuf, Failure> {
         self.guard.check()?;
         let path = model_path(&self.folder, step);
+        let frame = self.choose_frame()?.0;
         let (backend, to_world) = (self.run.trainer.backend(), &self.run.dataset.normalisation);
         let shape = Shape { rows: backend.rows(), sh_degree: backend.sh_degree() };
-        PLY.write_file(&path, shape, |piece| {
-            Ok::<_, Failure>(to_world.world_from_model(backend.download_rows(piece)?))
+        PLY.write_file(&path, shape, frame, |piece| {
+            Ok::<_, Failure>(to_world.world_from_model(backend.download_rows(piece)?, frame.origin))
         })?;
         if let Some(exposures) = &self.run.trainer.progress().exposures {
             let names = self.run.dataset.train.iter().map(|view| &*view.name);
@@ -357,10 +369,11 @@ impl<'a> Session<'a> {
 
     /// Measures the test views, if there are any.
     fn test(&mut self, step: u32, is_last: bool) -> Result<(), Failure> {
-        let Run { spec, trainer, test, config, .. } = &mut self.run;
-        if test.count() == 0 {
+        if self.run.test.count() == 0 {
             return Ok(());
         }
+        let exact = self.round_means_as_saved()?;
+        let Run { spec, trainer, test, config, .. } = &mut self.run;
         let (background, degree) = (spec.data.background.fixed(), config.sh_degree);
         let observer = self.observer;
         let fits_exposure = config.resolved.has_exposures;
@@ -368,6 +381,7 @@ impl<'a> Session<'a> {
         let scores = evaluate(trainer.backend(), test, background, degree, comparison, |_| {
             observer.interrupt().map_or(ControlFlow::Continue(()), |_| ControlFlow::Break(()))
         });
+        self.restore_means(exact)?;
         let scores = match (scores, self.observer.interrupt()) {
             (Err(EvaluateError::Stopped), Some(interrupt)) => {
                 return Err(self.stopped_by(interrupt));

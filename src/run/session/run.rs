@@ -14,6 +14,7 @@ use crate::spec::RunSpec;
 use densify_core::gaussians::Gaussians;
 use densify_core::memory::Ledger;
 use densify_data::dataset::Dataset;
+use densify_data::models::Coordinates;
 use densify_data::views::DatasetViews;
 use densify_train::checkpoint::Fingerprint;
 use densify_train::trainer::Trainer;
@@ -65,7 +66,8 @@ impl Run {
         prepare::prepare(spec, resumed, host)
     }
 
-    /// Trains to the end, writes nothing, and returns the model in the dataset's own coordinates.
+    /// Trains to the end, writes nothing, and returns the model in the dataset's own coordinates, measured from its origin or,
+    /// unless the description asks for world coordinates, from a point in a remote scene.
     ///
     /// # Errors
     /// When a view cannot be read, the device fails, or the observer asks to stop.
@@ -77,7 +79,10 @@ impl Run {
             }
             self.trainer.step()?;
         }
-        Ok(self.dataset.normalisation.world_from_model(self.trainer.model()?))
+        let to_world = self.dataset.normalisation;
+        let is_world = self.spec.output.coordinates == Coordinates::World || !to_world.is_remote();
+        let origin = if is_world { [0.0; 3] } else { to_world.local_origin() };
+        Ok(to_world.world_from_model(self.trainer.model()?, origin))
     }
 
     /// Trains to the end, writes all files of the run, and returns its folder; `if_exists` decides about an existing

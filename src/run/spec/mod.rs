@@ -26,6 +26,7 @@ use serde::{Deserialize, Serialize};
 
 use densify_core::spelling::Spelling;
 use densify_data::dataset::{FarCameras, MaskMode, Resolution};
+use densify_data::models::Coordinates;
 use densify_render::BackendChoice;
 use densify_train::exposure::{ExposureChoice, ExposureModel};
 use densify_train::schedule::{Background, InitRates, REFERENCE_ITERATIONS};
@@ -306,6 +307,10 @@ run_spec! {
         /// Folder to write to (default: output/SCENE-POLICY)
         #[arg(short)]
         output: Option<PathBuf> = None, Free, value "DIR";
+
+        /// Coordinates of the saved model: local ones are relative to an offset in the file's header. auto: world, or
+        /// local if f32 is too coarse for world coordinates, as in UTM
+        coordinates: Coordinates = Coordinates::Auto, Free, value "KIND";
 
         /// Iterations after which to save the model, besides the last
         #[arg(num_args = 1.., value_delimiter = ',')]

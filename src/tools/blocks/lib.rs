@@ -184,13 +184,14 @@ impl BlockPlan {
     }
 
     /// True if the centre of a Gaussian lies in a cell.
-    fn is_in_cell(&self, cell: &Cell, mean: [f32; 3]) -> bool {
-        cell.contains(self.ground.project(DVec3::from(mean.map(f64::from))))
+    fn is_in_cell(&self, cell: &Cell, centre: DVec3) -> bool {
+        cell.contains(self.ground.project(centre))
     }
 
     /// The rows of a model whose centres lie in a cell.
     fn rows_in_cell(&self, cell: &Cell, model: &Gaussians) -> Vec<usize> {
-        (0..model.len()).filter(|&row| self.is_in_cell(cell, model.means[row])).collect()
+        let is_inside = |row: &usize| self.is_in_cell(cell, DVec3::from(model.position(*row)));
+        (0..model.len()).filter(is_inside).collect()
     }
 }
 

@@ -1,14 +1,15 @@
 //! Merges the blocks: streams the Gaussians in each block's cell into one file.
 
 use std::fs::File;
+use std::io::Write;
 use std::path::Path;
 
 use super::status::is_complete;
 use super::{Block, BlockPlan, Task, run_folder};
-use densify_core::files::{WriteError, write_atomically_from};
+use densify_core::files::{WriteError, write_checked};
 use densify_core::gaussians::{Gaussians, sh_coefficients};
 use densify_core::pieces::ROWS_AT_A_TIME;
-use densify_data::models::{Format, Shape};
+use densify_data::models::{Format, Frame, Shape};
 use densify_run::failure::{Failure, OTHER};
 use densify_run::finished::{iteration, read_model};
 use densify_run::{Observer, RunConfig, Silent};
@@ -65,26 +66,38 @@ pub fn merge(
     }
     // The header holds the number of rows, so each block is read twice.
     let mut rows = 0;
+    let mut frame = Frame::WORLD;
     for &index in &complete {
-        rows += read_part(folder, plan, index, observer)?.len();
+        let part = read_part(folder, plan, index, observer)?;
+        rows += part.len();
+        // Blocks in local coordinates have offsets of their own; the model gets the first.
+        if frame.offset().is_none() {
+            frame = Frame::from_origin(part.origin);
+        }
     }
     if rows > plan.rows {
         let message = format!("{rows} rows, but the plan allows only {}; this is a bug", plan.rows);
         return Err(Failure::new(OTHER, message));
     }
     let shape = Shape { rows, sh_degree: plan.sh_degree };
-    write_atomically_from::<Failure>(output, |out| {
+    let write = |out: &mut dyn Write| {
         let mut writer = format.open_writer()?;
+        writer.set_frame(frame)?;
         writer.begin(shape, out)?;
         for &index in &complete {
             let part = read_part(folder, plan, index, &Silent).map_err(WriteError::Source)?;
+            let part = part.with_origin(frame.origin);
             let rows: Vec<usize> = (0..part.len()).collect();
             for piece in rows.chunks(ROWS_AT_A_TIME) {
                 writer.rows(&part.gather(piece), out)?;
             }
         }
         Ok(writer.finish(out)?)
+    };
+    write_checked(output, write, |written| {
+        Ok::<_, Failure>(format.write_sidecar(frame, output, written)?)
     })?;
+    format.remove_old_sidecar(frame, output)?;
     let bytes = File::open(output).and_then(|file| file.metadata());
     let bytes = bytes.map_err(|error| Failure::input(format!("{}: {error}", output.display())))?;
     Ok(Merged { rows, bytes: bytes.len(), missing })

@@ -111,10 +111,9 @@ fn prepare_block(
     }
     let cameras = world_cameras(plan, views.clone().over(given.clone()))?;
     let is_frozen = |row: &usize| {
-        let mean = model.means[*row];
-        let centre = DVec3::from(mean.map(f64::from));
+        let centre = DVec3::from(model.position(*row));
         let is_visible = |camera: &Camera| camera.depth_in_image(centre, IMAGE_MARGIN).is_some();
-        !plan.is_in_cell(&cell, mean) && cameras.iter().any(is_visible)
+        !plan.is_in_cell(&cell, centre) && cameras.iter().any(is_visible)
     };
     let frozen: Vec<usize> = (0..model.len()).filter(is_frozen).collect();
     let write = |option: &str, file: &str, rows: &[usize]| {

@@ -6,7 +6,7 @@ use std::path::Path;
 use super::{Options, Target};
 use densify_core::gaussians::Gaussians;
 use densify_core::numbers::grouped;
-use densify_data::models::{Format, is_unfit};
+use densify_data::models::{Coordinates, Format, is_unfit, remove_sidecar};
 use densify_run::Observer;
 use densify_run::failure::{Failure, INPUT, OTHER};
 use densify_run::finished::write_model;
@@ -64,6 +64,19 @@ pub(super) fn check(options: &Options<'_>, model: &Gaussians) -> Result<(), Fail
     }
 }
 
+/// Writes the model as it is to a temporary file, without the sidecar that a result would have.
+fn write_scratch(
+    format: &Format,
+    scratch: &Path,
+    model: &Gaussians,
+    observer: &dyn Observer,
+) -> Result<(), Failure> {
+    let is_local = model.origin != [0.0; 3];
+    let coordinates = if is_local { Coordinates::Local } else { Coordinates::World };
+    write_model(format, scratch, model, coordinates, observer)?;
+    Ok(remove_sidecar(scratch)?)
+}
+
 /// Tries each format in the file `scratch`, and returns those that can hold the model. Tells the observer what they
 /// change, and which formats cannot hold it.
 ///
@@ -77,7 +90,7 @@ pub(super) fn fitting(
 ) -> Result<Vec<&'static Format>, Failure> {
     let (mut fitting, mut unfit) = (Vec::new(), None);
     for &format in options.formats {
-        match write_model(format, scratch, model, observer) {
+        match write_scratch(format, scratch, model, observer) {
             Ok(()) => fitting.push(format),
             Err(failure) if failure.code == INPUT && options.formats.len() > 1 => {
                 observer.say(format_args!("note: not tried: {failure}"));

@@ -18,7 +18,7 @@ use tempfile::TempPath;
 use densify_core::files::{FileError, folder_of, write_atomically};
 use densify_core::gaussians::Gaussians;
 use densify_core::numbers::{gaussians, grouped};
-use densify_data::models::{Format, PLY};
+use densify_data::models::{Coarseness, Format, PLY, local_origin};
 use densify_run::failure::Failure;
 use densify_run::finished::read_model;
 use densify_run::{DataSpec, DeviceSpec, Fraction, Observer};
@@ -115,7 +115,7 @@ pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compre
             "exposure learned again, as in the run; PSNR is measured with the best exposure of each photograph"
         ));
     }
-    let model = read_model(options.model, observer)?;
+    let model = in_fine_coordinates(read_model(options.model, observer)?);
     fit::check(options, &model)?;
     let bytes = fit::file_size(PLY, &model)?;
     let whole = evaluator.evaluate_original(model.clone(), options.model, bytes, observer)?;
@@ -149,7 +149,7 @@ pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compre
         return Err(fit::too_small(options, &search.model));
     };
     let file = file(options.output, allowed_formats, format);
-    write_atomically(&file, |out| format.write(&small, out))?;
+    format.save(&small, &file)?;
     Ok(Compressed { whole, stages: best_stages, attempts, best, file })
 }
 
@@ -216,8 +216,17 @@ impl Search<'_> {
         bytes: u64,
     ) -> Result<Attempt, Failure> {
         write_atomically(&self.scratch, |out| format.write(model, out))?;
-        self.evaluator.evaluate(read_model(&self.scratch, self.observer)?, format, bytes)
+        // The temporary file has no sidecar.
+        let found = Gaussians { origin: model.origin, ..read_model(&self.scratch, self.observer)? };
+        self.evaluator.evaluate(found, format, bytes)
     }
+}
+
+/// The model in local coordinates if world coordinates are too coarse in f32, else in world coordinates.
+fn in_fine_coordinates(model: Gaussians) -> Gaussians {
+    let is_coarse = Coarseness::measure(&model).is_noted();
+    let origin = if is_coarse { local_origin(&model) } else { [0.0; 3] };
+    model.with_origin(origin)
 }
 
 /// Creates a temporary file in the folder of the result.

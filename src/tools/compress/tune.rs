@@ -7,7 +7,7 @@ use super::{Options, Target, fit};
 use densify_core::files::write_atomically;
 use densify_core::gaussians::Gaussians;
 use densify_core::numbers::gaussians;
-use densify_data::models::{Format, PLY};
+use densify_data::models::{Coordinates, Format, PLY};
 use densify_run::failure::Failure;
 use densify_run::finished::read_model;
 use densify_run::{
@@ -59,7 +59,9 @@ pub(super) fn tune(
         if adaptation_steps > 0 {
             model = reduce(model, u8::MAX);
             write_atomically(scratch, |out| format.write(&model, out))?;
-            model = read_model(scratch, observer)?;
+            let origin = model.origin;
+            // The temporary file has no sidecar.
+            model = Gaussians { origin, ..read_model(scratch, observer)? };
             let setting = (model.len(), adaptation_steps);
             model = train(model, setting, true, options, scratch, observer)?;
         }
@@ -82,8 +84,12 @@ fn train(
         // Rates must be positive; with a rate this small, every step is lost to rounding.
         spec.schedule.lr = vec![assignment("sh_rest=1e-30")?];
     }
+    let origin = model.origin;
+    let is_local = origin != [0.0; 3];
+    spec.output.coordinates = if is_local { Coordinates::Local } else { Coordinates::World };
     drop(model);
-    Run::prepare(&spec)?.model_after_training(observer)
+    let tuned = Run::prepare(&spec)?.model_after_training(observer)?;
+    Ok(tuned.with_origin(origin))
 }
 
 fn assignment(text: &str) -> Result<Assignment, Failure> {

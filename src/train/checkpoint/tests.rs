@@ -29,6 +29,7 @@ fn gaussians(rows: usize) -> Gaussians {
     let by = |n: usize, seed| numbers(n * rows, seed);
     Gaussians {
         sh_degree: 1,
+        origin: [0.0; 3],
         means: by(3, 1.0).as_chunks().0.to_vec(),
         log_scales: by(3, 2.0).as_chunks().0.to_vec(),
         quats: by(4, 3.0).as_chunks().0.to_vec(),

@@ -111,6 +111,7 @@ pub fn initialise(
     }
     let gaussians = Gaussians {
         sh_degree,
+        origin: [0.0; 3],
         means: positions.iter().map(|p| p.map(|v| v as f32)).collect(),
         log_scales: log_scales.into_iter().map(|log| [log; 3]).collect(),
         quats: vec![[1.0, 0.0, 0.0, 0.0]; rows],

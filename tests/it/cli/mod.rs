@@ -26,6 +26,7 @@ mod memory;
 mod model_formats;
 mod neutral_options;
 mod photographing;
+mod remote;
 mod reporting;
 mod resuming;
 mod trading;

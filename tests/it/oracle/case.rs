@@ -159,6 +159,7 @@ fn model(arrays: &BTreeMap<String, Vec<f64>>, sh_degree: u8) -> Gaussians {
     }
     Gaussians {
         sh_degree,
+        origin: [0.0; 3],
         means: rows(&values("in.means")),
         log_scales: rows(&values("in.log_scales")),
         quats: rows(&values("in.quats")),

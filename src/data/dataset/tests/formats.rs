@@ -303,5 +303,5 @@ fn a_far_off_scene_keeps_its_precision() {
     for (a, b) in data.train.iter().zip(&far.train) {
         assert!((a.camera.translation - b.camera.translation).length() < 1e-8);
     }
-    assert!(far.normalisation.f32_warning().is_some());
+    assert!(far.normalisation.is_remote() && !data.normalisation.is_remote());
 }

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::layout::{BOUNDS, CHUNK, WORDS};
 use crate::error::LoadError;
-use crate::models::ply::layout::sh_degree;
+use crate::models::ply::layout::{OFFSET, sh_degree};
 use crate::models::quantise::{from_smallest_three, quantised_logit};
 use crate::models::rows::{Row, Rows, SplatFile};
 use crate::ply::{Element, Ply};
@@ -88,7 +88,9 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
         }
         rows.push(row(*words, bounds, &mut colours));
     }
-    rows.finish(path)
+    let mut file = rows.finish(path)?;
+    file.gaussians.origin = ply.comment_numbers(OFFSET)?.unwrap_or_default();
+    Ok(file)
 }
 
 /// Decodes the four words of a Gaussian. `sh` already holds the coefficients above band 0.

@@ -6,8 +6,11 @@
 use std::io::{self, Write};
 
 use super::layout::{BOUNDS, CHUNK, WORDS};
+use crate::models::coordinates::offset_text;
+use crate::models::ply::layout::OFFSET;
 use crate::models::quantise::{MAX_LOG_SCALE, smallest_three};
-use crate::models::{ModelWriter, Shape};
+use crate::models::write::{NO_DOUBLE, unfit};
+use crate::models::{Frame, ModelWriter, Shape};
 use densify_core::gaussians::{Gaussians, dc_to_rgb, sh_coefficients, sigmoid};
 
 /// Number of values per Gaussian that are packed chunk by chunk: position, log-scale, colour, opacity and quaternion.
@@ -16,6 +19,7 @@ const PACKED: usize = 14;
 /// Holds the packed values of all Gaussians, because all chunks precede them in the file.
 #[derive(Default)]
 pub(super) struct CompressedPlyWriter {
+    frame: Frame,
     /// Gaussians of the current chunk, which is not full.
     open: Vec<[f32; PACKED]>,
     chunks: Vec<[f32; BOUNDS.len()]>,
@@ -37,15 +41,26 @@ impl ModelWriter for CompressedPlyWriter {
         true
     }
 
+    fn set_frame(&mut self, frame: Frame) -> io::Result<bool> {
+        if frame.is_double {
+            return Err(unfit(NO_DOUBLE));
+        }
+        self.frame = frame;
+        Ok(true)
+    }
+
     fn begin(&mut self, Shape { rows, sh_degree }: Shape, out: &mut dyn Write) -> io::Result<()> {
         let rest = 3 * (sh_coefficients(sh_degree) - 1);
         self.open.reserve_exact(CHUNK);
         self.chunks.reserve_exact(rows.div_ceil(CHUNK));
         self.words.reserve_exact(rows);
         self.bands.reserve_exact(rows * rest);
+        let comment = |offset| format!("comment {OFFSET} {}\n", offset_text(offset));
+        let offset = self.frame.offset().map(comment).unwrap_or_default();
         let mut header = format!(
-            "ply\nformat binary_little_endian 1.0\ncomment densify {}\nelement chunk {}\n",
+            "ply\nformat binary_little_endian 1.0\ncomment densify {}\n{}element chunk {}\n",
             env!("CARGO_PKG_VERSION"),
+            offset,
             rows.div_ceil(CHUNK)
         );
         header.extend(BOUNDS.iter().map(|name| format!("property float {name}\n")));

@@ -6,8 +6,8 @@ use std::io::{self, Write};
 use serde_json::{Value, json};
 
 use super::layout::{HALF_TURN, LOG_SCALE, MAGIC, OPACITY_LOGIT, SHAPES, SPLATS, coefficient};
-use crate::models::write::unfit;
-use crate::models::{ModelWriter, Shape};
+use crate::models::write::{NO_DOUBLE, unfit};
+use crate::models::{Frame, ModelWriter, Shape};
 use densify_core::gaussians::{Gaussians, sh_coefficients, sigmoid};
 
 /// Attributes before those of colour, each with its number of components.
@@ -24,6 +24,7 @@ const ATTRIBUTES: [(&str, usize); 6] = [
 #[derive(Default)]
 pub(super) struct GlbWriter {
     sh_degree: u8,
+    frame: Frame,
     columns: Vec<Vec<f32>>,
 }
 
@@ -35,6 +36,14 @@ impl ModelWriter for GlbWriter {
 
     fn is_lossy(&self) -> bool {
         false
+    }
+
+    fn set_frame(&mut self, frame: Frame) -> io::Result<bool> {
+        if frame.is_double {
+            return Err(unfit(NO_DOUBLE));
+        }
+        self.frame = frame;
+        Ok(true)
     }
 
     fn begin(&mut self, Shape { rows, sh_degree }: Shape, _out: &mut dyn Write) -> io::Result<()> {
@@ -119,6 +128,11 @@ impl GlbWriter {
             accessors[0]["min"] = json!(bound(f32::INFINITY, f32::min));
             accessors[0]["max"] = json!(bound(f32::NEG_INFINITY, f32::max));
         }
+        let mut node = json!({"mesh": 0, "rotation": HALF_TURN});
+        if let Some([x, y, z]) = self.frame.offset() {
+            // In glTF's frame.
+            node["translation"] = json!([-x, -y, z]);
+        }
         json!({
             "asset": {
                 "version": "2.0", "generator": format!("densify {}", env!("CARGO_PKG_VERSION")),
@@ -126,7 +140,7 @@ impl GlbWriter {
             "extensionsUsed": [SPLATS],
             "scene": 0,
             "scenes": [{"nodes": [0]}],
-            "nodes": [{"mesh": 0, "rotation": HALF_TURN}],
+            "nodes": [node],
             "buffers": [{"byteLength": offset}],
             "bufferViews": views,
             "accessors": accessors,

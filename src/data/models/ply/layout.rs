@@ -1,5 +1,5 @@
 //! Properties of a Gaussian: x y z, f_dc_0..2, f_rest_* channel by channel, opacity (logit), scale_0..2 (logarithms),
-//! rot_0..3 (w x y z); all f32.
+//! rot_0..3 (w x y z); all f32, or x y z in f64.
 
 use crate::ply::Element;
 use densify_core::gaussians::{MAX_SH_DEGREE, sh_coefficients};
@@ -25,6 +25,13 @@ pub(super) fn properties(sh_degree: u8) -> impl Iterator<Item = String> {
     .into_iter()
     .flatten()
 }
+
+/// Begins the comment that names the offset of local coordinates, before three numbers: a position in the dataset's
+/// coordinates is (x, y, z) plus the offset.
+pub(crate) const OFFSET: &str = "densify offset";
+/// Begins the comment that names a point near the model, if x, y and z are `double`. Measured from there, positions are
+/// exact in f32.
+pub(super) const NEAR: &str = "densify near";
 
 /// Where the normals stand among the [`properties`].
 pub(super) const NORMALS_AT: usize = 3;

@@ -19,7 +19,7 @@ pub(super) const FORMAT: Format = Format {
         read: |file| read::read(file.path),
         main_file: None,
     }),
-    writer: Some(|| Box::new(PlyWriter)),
+    writer: Some(|| Box::new(PlyWriter::default())),
     compress_rank: Some(0),
 };
 

@@ -3,10 +3,11 @@
 use std::path::Path;
 
 use super::activation;
-use super::layout::{properties, sh_degree};
+use super::layout::{NEAR, NORMALS_AT, OFFSET, properties, sh_degree};
 use crate::error::LoadError;
+use crate::models::coordinates::remote_origin;
 use crate::models::rows::{Row, Rows, SplatFile};
-use crate::ply::{Element, Ply};
+use crate::ply::{Element, Ply, Scalar};
 use densify_core::gaussians::sh_coefficients;
 
 /// The remedy if a property is missing, which depends on the program that left it out.
@@ -46,6 +47,16 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
         .map(|name| vertices.column(path, &name, remedy))
         .collect::<Result<Vec<_>, _>>()?;
 
+    let offset = ply.comment_numbers(OFFSET)?;
+    let is_double = |column: &usize| vertices.properties[*column].kind == Scalar::F64;
+    let origin = if columns[..NORMALS_AT].iter().any(is_double) && offset.is_none() {
+        match ply.comment_numbers(NEAR)? {
+            Some(near) => near,
+            None => origin_of(path, &vertices, &columns[..NORMALS_AT])?,
+        }
+    } else {
+        [0.0; 3]
+    };
     let mut rows = Rows::new(sh_degree);
     let mut values = vec![0f32; columns.len()];
     let mut sh = Vec::with_capacity(3 + rest);
@@ -53,11 +64,27 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
         for (value, &wide) in values.iter_mut().zip(row) {
             *value = wide as f32;
         }
+        for (value, (wide, origin)) in values.iter_mut().zip(row.iter().zip(origin)) {
+            // Subtracting 0 keeps the sign of −0.
+            *value = (wide - origin) as f32;
+        }
         push(&mut rows, &values, &mut sh, rest);
     })?;
     let mut file = rows.finish(path)?;
+    file.gaussians.origin = offset.unwrap_or(origin);
     file.notes = activation::undo(&mut file.gaussians);
     Ok(file)
+}
+
+/// The point from which positions in f64 are measured, so that f32 holds them: 0 unless they are far from it.
+fn origin_of(path: &Path, vertices: &Element, columns: &[usize]) -> Result<[f64; 3], LoadError> {
+    let mut axes = [const { Vec::new() }; 3];
+    Ply::open(path)?.each_row(vertices, columns, |row| {
+        for (axis, &value) in axes.iter_mut().zip(row) {
+            axis.extend(Some(value).filter(|value| value.is_finite()));
+        }
+    })?;
+    Ok(remote_origin(axes))
 }
 
 /// Adds a Gaussian with these [`properties`]. `sh` is scratch.

@@ -2,50 +2,74 @@
 
 use std::io::{self, Write};
 
-use super::layout::{NORMALS_AT, properties};
-use crate::models::{ModelWriter, Shape};
+use super::layout::{NEAR, NORMALS_AT, OFFSET, properties};
+use crate::models::coordinates::offset_text;
+use crate::models::{Frame, ModelWriter, Shape};
 use densify_core::gaussians::{Gaussians, sh_coefficients};
 
 /// Gaussians per write.
 const CHUNK: usize = 256;
 
 /// Holds one chunk at a time.
-pub(super) struct PlyWriter;
+#[derive(Default)]
+pub(super) struct PlyWriter {
+    frame: Frame,
+}
 
-/// Size of a Gaussian: position, normal, opacity, scales, rotation and colours `[bytes]`.
-const fn row_bytes(sh_degree: u8) -> usize {
-    size_of::<f32>() * (14 + 3 * sh_coefficients(sh_degree))
+impl PlyWriter {
+    /// Size of a Gaussian: position, normal, opacity, scales, rotation and colours `[bytes]`.
+    fn row_bytes(&self, sh_degree: u8) -> usize {
+        let wider =
+            if self.frame.is_double { 3 * (size_of::<f64>() - size_of::<f32>()) } else { 0 };
+        size_of::<f32>() * (14 + 3 * sh_coefficients(sh_degree)) + wider
+    }
 }
 
 impl ModelWriter for PlyWriter {
     fn held_bytes(&self, Shape { rows, sh_degree }: Shape) -> u64 {
-        (rows.min(CHUNK) * row_bytes(sh_degree)) as u64
+        (rows.min(CHUNK) * self.row_bytes(sh_degree)) as u64
     }
 
     fn is_lossy(&self) -> bool {
         false
     }
 
+    fn set_frame(&mut self, frame: Frame) -> io::Result<bool> {
+        self.frame = frame;
+        Ok(true)
+    }
+
     fn begin(&mut self, Shape { rows, sh_degree }: Shape, out: &mut dyn Write) -> io::Result<()> {
-        let mut header = format!("ply\nformat binary_little_endian 1.0\nelement vertex {rows}\n");
+        let mut header = "ply\nformat binary_little_endian 1.0\n".to_owned();
+        if let Some(offset) = self.frame.offset() {
+            header += &format!("comment {OFFSET} {}\n", offset_text(offset));
+        } else if self.frame.is_double {
+            header += &format!("comment {NEAR} {}\n", offset_text(self.frame.origin));
+        }
+        header += &format!("element vertex {rows}\n");
         for (index, name) in properties(sh_degree).enumerate() {
             if index == NORMALS_AT {
                 for normal in ["nx", "ny", "nz"] {
                     header += &format!("property float {normal}\n");
                 }
             }
-            header += &format!("property float {name}\n");
+            let is_wide = self.frame.is_double && index < NORMALS_AT;
+            header += &format!("property {} {name}\n", if is_wide { "double" } else { "float" });
         }
         header += "end_header\n";
         out.write_all(header.as_bytes())
     }
 
     fn rows(&mut self, rows: &Gaussians, out: &mut dyn Write) -> io::Result<()> {
-        let mut chunk = Vec::with_capacity(rows.len().min(CHUNK) * row_bytes(rows.sh_degree));
+        let mut chunk = Vec::with_capacity(rows.len().min(CHUNK) * self.row_bytes(rows.sh_degree));
         for row in 0..rows.len() {
+            if self.frame.is_double {
+                chunk.extend(rows.position(row).into_iter().flat_map(f64::to_le_bytes));
+            } else {
+                chunk.extend(rows.means[row].into_iter().flat_map(f32::to_le_bytes));
+            }
             let mut put = |value: f32| chunk.extend_from_slice(&value.to_le_bytes());
             let sh = rows.sh_of(row);
-            rows.means[row].into_iter().for_each(&mut put);
             [0.0; 3].into_iter().for_each(&mut put);
             sh[..3].iter().copied().for_each(&mut put);
             for channel in 0..3 {

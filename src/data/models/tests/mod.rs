@@ -4,6 +4,7 @@
 #![allow(clippy::float_cmp, reason = "results are exact")]
 
 mod changes;
+mod coordinates;
 mod reading;
 mod round_trips;
 
@@ -93,7 +94,9 @@ fn a_registered_format_is_found_and_given_every_row_once() {
     let (folder, whole) = (tempfile::tempdir().unwrap(), model(rows, 1));
     let path = folder.path().join("new/model.log.txt");
     let shape = Shape { rows, sh_degree: 1 };
-    format.write_file(&path, shape, |rows| Ok::<_, FileError>(piece(&whole, rows))).unwrap();
+    format
+        .write_file(&path, shape, Frame::WORLD, |rows| Ok::<_, FileError>(piece(&whole, rows)))
+        .unwrap();
     let expected = format!("begin {rows} 1;{ROWS_AT_A_TIME};{ROWS_AT_A_TIME};4;finish");
     assert_eq!(std::fs::read_to_string(&path).unwrap(), expected);
 }
@@ -126,7 +129,7 @@ fn a_failed_source_leaves_the_old_file() {
     std::fs::write(&path, "old").unwrap();
     let shape = Shape { rows: ROWS_AT_A_TIME + 1, sh_degree: 0 };
     let lost = || FileError::malformed(Path::new("lost"), "it is gone");
-    let written = PLY.write_file(&path, shape, |rows| match rows.start {
+    let written = PLY.write_file(&path, shape, Frame::WORLD, |rows| match rows.start {
         0 => Ok(model(rows.len(), 0)),
         _ => Err(lost()),
     });

@@ -1,0 +1,251 @@
+//! Coordinates in the files of models. In f32, a place 5,000 km from the origin (the northing of UTM) has a step of half a
+//! metre, which is more than most Gaussians. Files may therefore hold coordinates relative to an offset, which stands in a
+//! comment (PLY), in a node (glTF) or in a [sidecar](super::sidecar), or coordinates in f64 (PLY).
+
+use serde::{Deserialize, Serialize};
+
+use super::spatial_order::{frame, middle_and_spread};
+use densify_core::gaussians::{Gaussians, sigmoid};
+use densify_core::numbers::gaussians;
+
+/// `--coordinates`: what coordinates in the file of a model are measured from.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub enum Coordinates {
+    /// As world; as local where world coordinates are too coarse in f32
+    #[default]
+    Auto,
+    /// From the dataset's origin, in f32
+    World,
+    /// From an offset near the model, which is stored with it
+    Local,
+    /// From the dataset's origin, in f64; only PLY
+    Double,
+}
+
+/// What the coordinates of a file are measured from, and their type.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Frame {
+    /// The offset: a position is a coordinate plus this `[world units]`. For coordinates in f64, the point from which
+    /// rows are measured in memory.
+    pub origin: [f64; 3],
+    /// True for world coordinates in f64.
+    pub is_double: bool,
+}
+
+impl Frame {
+    /// World coordinates in f32.
+    pub const WORLD: Self = Self { origin: [0.0; 3], is_double: false };
+
+    /// Coordinates in f32 from this origin.
+    pub fn from_origin(origin: [f64; 3]) -> Self {
+        Self { origin, is_double: false }
+    }
+
+    /// The offset that must be stored with the file, if there is one.
+    pub fn offset(&self) -> Option<[f64; 3]> {
+        (self.origin != [0.0; 3] && !self.is_double).then_some(self.origin)
+    }
+}
+
+/// An offset as text: three numbers that are read back exactly.
+pub fn offset_text(offset: [f64; 3]) -> String {
+    offset.map(|value| value.to_string()).join(" ")
+}
+
+/// Error of a rounded position above which the position counts as coarse (root mean square) `[Gaussian's size]`. A tenth
+/// changes a pixel by less than a twentieth of the Gaussian's contrast.
+const COARSE: f64 = 0.1;
+/// Error above which a position counts as lost: a half, as in [`super::Changes`].
+const LOST: f64 = 0.5;
+/// Share of the visible area, estimated as in [`Coarseness::add`], from which on coarse coordinates are avoided, or the user
+/// is told.
+const NOTED: f64 = 0.01;
+/// Share of the visible area from which on lost positions make a file unfit.
+const UNFIT: f64 = 0.25;
+
+/// Distance of a model from the origin, in medians of its Gaussians' distances from its middle, from which on f32 may be
+/// too coarse.
+const REMOTE: f64 = 50.0;
+
+/// A comparison of the step of f32 at the world coordinates of Gaussians with the sizes of these Gaussians.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Coarseness {
+    /// Number of Gaussians whose positions are coarse.
+    rows: usize,
+    /// Estimates of the visible area: of all Gaussians, of those whose positions are coarse, and of those whose positions
+    /// are lost.
+    total: f64,
+    coarse: f64,
+    lost: f64,
+    /// The largest step `[world units]`.
+    step: f64,
+}
+
+impl Coarseness {
+    /// Measures a whole model.
+    pub fn measure(model: &Gaussians) -> Self {
+        let frame = frame(model);
+        let middle = std::array::from_fn(|axis| frame[axis].0 + model.origin[axis]);
+        let spread = frame.iter().map(|(_, spread)| *spread).fold(0.0, f64::max);
+        let mut found = Self::default();
+        found.add(model, middle, spread);
+        found
+    }
+
+    /// Adds rows of a scene with this middle and extent `[world units]`: cameras are about as far away from a Gaussian as
+    /// it is from the middle, or as the extent if that is more.
+    pub fn add(&mut self, rows: &Gaussians, middle: [f64; 3], extent: f64) {
+        for row in 0..rows.len() {
+            let position = rows.position(row);
+            let mut sizes = rows.log_scales[row].map(|log| f64::from(log).exp());
+            sizes.sort_by(f64::total_cmp);
+            let [_, size, largest] = sizes;
+            let away = (0..3).map(|i| (position[i] - middle[i]).powi(2)).sum::<f64>();
+            let covered = (size * largest / (away + extent.powi(2))).min(1.0);
+            let weight = covered * f64::from(sigmoid(rows.opacity_logits[row]));
+            if !weight.is_finite() {
+                continue;
+            }
+            let steps = position.map(step_of_f32);
+            // An error that is equally likely from −½ to ½ step has a variance of 1/12 of the step's square.
+            let error = (steps.iter().map(|step| step * step).sum::<f64>() / 12.0).sqrt() / size;
+            self.total += weight;
+            self.step = steps.into_iter().fold(self.step, f64::max);
+            if error > COARSE {
+                self.rows += 1;
+                self.coarse += weight;
+            }
+            if error > LOST {
+                self.lost += weight;
+            }
+        }
+    }
+
+    /// True if so much of the visible area is coarse that the user must be told.
+    pub fn is_noted(&self) -> bool {
+        self.coarse >= NOTED * self.total.max(f64::MIN_POSITIVE)
+    }
+
+    /// True if so many positions are lost that other coordinates must be chosen.
+    pub fn is_unfit(&self) -> bool {
+        self.lost >= UNFIT * self.total.max(f64::MIN_POSITIVE)
+    }
+}
+
+impl std::fmt::Display for Coarseness {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(
+            f,
+            "so far from the origin, f32 has steps of up to {}, and shifts {} ({:.1} % of the visible area) by more than \
+             {:.0} % of their size",
+            shortest(self.step),
+            gaussians(self.rows),
+            100.0 * self.coarse / self.total.max(f64::MIN_POSITIVE),
+            100.0 * COARSE
+        )
+    }
+}
+
+/// A step in two digits: 0.5, 0.031, 9.5e-7.
+fn shortest(step: f64) -> String {
+    let rounded: f64 = format!("{step:.1e}").parse().unwrap_or(step);
+    if rounded >= 1e-3 || rounded == 0.0 { format!("{rounded}") } else { format!("{rounded:e}") }
+}
+
+/// The distance from the f32 at this value to the next larger one.
+fn step_of_f32(value: f64) -> f64 {
+    let near = value.abs() as f32;
+    f64::from(near.next_up()) - f64::from(near)
+}
+
+/// A point near the middle of a model, for its local coordinates; the model's own origin if it has one.
+pub fn local_origin(model: &Gaussians) -> [f64; 3] {
+    if model.origin != [0.0; 3] {
+        return model.origin;
+    }
+    let frame = frame(model);
+    let spread = frame.iter().map(|(_, spread)| *spread).fold(0.0, f64::max);
+    round_origin(frame.map(|(middle, _)| middle), spread)
+}
+
+/// A point near the middle of these coordinates, by axis, if they are so far from 0 that f32 may be too coarse; else 0.
+pub(super) fn remote_origin(axes: [Vec<f64>; 3]) -> [f64; 3] {
+    let is_exact = |value: &f64| f64::from(*value as f32).to_bits() == value.to_bits();
+    if axes.iter().flatten().all(is_exact) {
+        return [0.0; 3];
+    }
+    let frame = axes.map(middle_and_spread);
+    let spread = frame.iter().map(|(_, spread)| *spread).fold(0.0, f64::max);
+    let middle = frame.map(|(middle, _)| middle);
+    let distance = middle.iter().map(|value| value * value).sum::<f64>().sqrt();
+    if distance > REMOTE * spread { round_origin(middle, spread) } else { [0.0; 3] }
+}
+
+/// A point rounded to the power of ten below `unit`, at most 1e15; a number that is not finite becomes 0.
+pub fn round_origin(point: [f64; 3], unit: f64) -> [f64; 3] {
+    let exponent = unit.log10().floor().clamp(-15.0, 15.0) as i32;
+    let step = 10f64.powi(exponent.abs());
+    point.map(|value| {
+        let rounded = if exponent < 0 {
+            (value * step).round() / step
+        } else {
+            (value / step).round() * step
+        };
+        // Adding 0 turns −0 into 0.
+        if rounded.is_finite() { rounded + 0.0 } else { 0.0 }
+    })
+}
+
+#[cfg(test)]
+#[allow(clippy::float_cmp, reason = "results are exact")]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn steps_are_those_of_f32() {
+        for (value, step) in [(5e6, 0.5), (-5e5, 0.031_25), (1.0, f64::from(f32::EPSILON))] {
+            assert_eq!(step_of_f32(value), step);
+        }
+        assert_eq!([0.5, 0.031_25, 9.53e-7].map(shortest), ["0.5", "0.031", "9.5e-7"]);
+    }
+
+    #[test]
+    fn origins_are_round_and_near_the_middle() {
+        assert_eq!(round_origin([123.456, -0.001, f64::NAN], 0.2), [123.5, 0.0, 0.0]);
+        assert_eq!(
+            round_origin([512_345.6, 5_400_123.4, 80.0], 37.0),
+            [512_350.0, 5_400_120.0, 80.0]
+        );
+        for unit in [0.0, f64::MIN_POSITIVE, f64::INFINITY, f64::NAN] {
+            assert!(round_origin([1e300, 5.0, -5.0], unit).iter().all(|value| value.is_finite()));
+        }
+    }
+
+    /// What counts is the size of the visible Gaussians, not the extent.
+    #[test]
+    fn only_visible_gaussians_make_coordinates_coarse() {
+        let mut model = Gaussians::zeros(100, 0);
+        model.origin = [0.0, 5e6, 0.0];
+        model.log_scales.fill([2f32.ln(); 3]);
+        model.opacity_logits.fill(3.0);
+        for (row, mean) in model.means.iter_mut().enumerate() {
+            *mean = [row as f32, (row % 7) as f32, 0.0];
+        }
+        assert!(!Coarseness::measure(&model).is_noted());
+        // A few small Gaussians are hardly visible.
+        model.log_scales[..10].fill([0.01f32.ln(); 3]);
+        assert!(!Coarseness::measure(&model).is_noted());
+        model.log_scales[..10].fill([1.2f32.ln(); 3]);
+        let some = Coarseness::measure(&model);
+        assert!(some.is_noted() && !some.is_unfit(), "{some:?}");
+        assert!(
+            some.to_string().contains("10 Gaussians") && some.to_string().contains("0.5"),
+            "{some}"
+        );
+        model.log_scales.fill([0.1f32.ln(); 3]);
+        assert!(Coarseness::measure(&model).is_unfit());
+        assert!(!Coarseness::measure(&Gaussians { origin: [0.0; 3], ..model }).is_noted());
+        assert!(!Coarseness::measure(&Gaussians::default()).is_noted());
+    }
+}
