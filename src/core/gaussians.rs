@@ -4,6 +4,8 @@
 //! quaternion (w, x, y, z; not necessarily normalised), opacity as a logit, and spherical-harmonic
 //! coefficients of its colour: colour = max(0, ½ + Σ Y_k(direction)·sh_k).
 
+use crate::antialiasing::Antialiasing;
+
 /// Number of spherical-harmonic coefficients per channel at `degree`: (degree + 1)².
 pub const fn sh_coefficients(degree: u8) -> usize {
     (degree as usize + 1) * (degree as usize + 1)
@@ -55,6 +57,8 @@ impl ModelArray {
 pub struct Gaussians {
     /// Spherical-harmonic degree, 0..=3; decides the length of `sh`.
     pub sh_degree: u8,
+    /// How the model is rendered where its Gaussians are smaller than a pixel.
+    pub antialiasing: Antialiasing,
     /// Means `[scene units]`. Shape: `[rows]`.
     pub means: Vec<[f32; 3]>,
     /// Natural logarithm of the standard deviations `[ln scene units]`. Shape: `[rows]`.
@@ -68,7 +72,7 @@ pub struct Gaussians {
 }
 
 impl Gaussians {
-    /// Builds a model from its arrays, each row-major.
+    /// Builds a model without antialiasing from its arrays, each row-major.
     ///
     /// # Errors
     /// The first error of `array`.
@@ -78,6 +82,7 @@ impl Gaussians {
     ) -> Result<Self, E> {
         Ok(Self {
             sh_degree,
+            antialiasing: Antialiasing::None,
             means: in_rows(array(ModelArray::Means)?),
             log_scales: in_rows(array(ModelArray::LogScales)?),
             quats: in_rows(array(ModelArray::Quats)?),
@@ -90,6 +95,7 @@ impl Gaussians {
     pub fn zeros(rows: usize, sh_degree: u8) -> Self {
         Self {
             sh_degree,
+            antialiasing: Antialiasing::None,
             means: vec![[0.0; 3]; rows],
             log_scales: vec![[0.0; 3]; rows],
             quats: vec![[0.0; 4]; rows],
@@ -112,12 +118,13 @@ impl Gaussians {
         self
     }
 
-    /// Appends the rows of another model of the same degree.
+    /// Appends the rows of another model of the same degree and antialiasing.
     ///
     /// # Panics
-    /// When the degrees differ.
+    /// When they differ.
     pub fn append(&mut self, mut other: Self) {
         assert_eq!(self.sh_degree, other.sh_degree, "models of different degrees cannot be joined");
+        assert_eq!(self.antialiasing, other.antialiasing, "models are rendered in different ways");
         self.means.append(&mut other.means);
         self.log_scales.append(&mut other.log_scales);
         self.quats.append(&mut other.quats);
@@ -132,6 +139,7 @@ impl Gaussians {
     pub fn gather(&self, rows: &[usize]) -> Self {
         Self {
             sh_degree: self.sh_degree,
+            antialiasing: self.antialiasing,
             means: rows.iter().map(|&row| self.means[row]).collect(),
             log_scales: rows.iter().map(|&row| self.log_scales[row]).collect(),
             quats: rows.iter().map(|&row| self.quats[row]).collect(),
