@@ -58,7 +58,9 @@ impl Display for Antialiasing {
 
 /// A text that names no antialiasing.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("`{0}` is not an antialiasing kernel; choose 0.3, 0.1 (Mip-Splatting, Brush, LichtFeld) or none")]
+#[error(
+    "`{0}` is not an antialiasing kernel; choose 0.3, 0.1 (Mip-Splatting, Brush, LichtFeld) or none"
+)]
 pub struct AntialiasingError(String);
 
 impl FromStr for Antialiasing {

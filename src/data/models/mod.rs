@@ -19,6 +19,7 @@ mod rows;
 mod siblings;
 mod similarity;
 mod spatial_order;
+mod statement;
 mod unpack;
 mod write;
 mod zip;

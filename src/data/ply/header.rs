@@ -54,6 +54,8 @@ pub(crate) struct Element {
 pub(super) struct Header {
     pub(super) encoding: Encoding,
     pub(super) elements: Vec<Element>,
+    /// Texts of the `comment` and `obj_info` lines.
+    pub(super) comments: Vec<String>,
     /// Size of the header `[bytes]`.
     pub(super) length: u64,
 }
@@ -141,11 +143,13 @@ impl Header {
         }
         let mut encoding = None;
         let mut elements: Vec<Element> = Vec::new();
+        let mut comments = Vec::new();
         loop {
             let line = lines.next()?;
             let words: Vec<&str> = line.split_whitespace().collect();
             match words[..] {
-                [] | ["comment" | "obj_info", ..] => {}
+                [] => {}
+                ["comment" | "obj_info", ..] => comments.push(words[1..].join(" ")),
                 ["format", kind, "1.0"] if encoding.is_none() && elements.is_empty() => {
                     encoding = Some(match kind {
                         "ascii" => Encoding::Ascii,
@@ -200,7 +204,7 @@ impl Header {
             }
         }
         let encoding = encoding.ok_or_else(|| lines.fault("there is no `format` line"))?;
-        Ok(Self { encoding, elements, length: lines.read })
+        Ok(Self { encoding, elements, comments, length: lines.read })
     }
 }
 

@@ -39,6 +39,11 @@ impl<'a> Ply<'a> {
         &self.header.elements
     }
 
+    /// Texts of the comments in the header, their words one blank apart.
+    pub(crate) fn comments(&self) -> &[String] {
+        &self.header.comments
+    }
+
     /// The element with this name.
     pub(crate) fn element(&self, name: &str) -> Result<Element, LoadError> {
         let found = self.header.elements.iter().find(|element| element.name == name).cloned();

@@ -148,8 +148,7 @@ impl BlockGradient {
         let mn0 = each!(k in 3 => muu * n0[k] + muz * n1[k]);
         let mn1 = each!(k in 3 => muz * n0[k] + mzz * n1[k]);
         let scale2 = each!(k in 3 => g.scale[k] * g.scale[k]);
-        let mut by_log_scale =
-            each!(k in 3 => (n0[k] * mn0[k] + n1[k] * mn1[k]) * scale2[k]);
+        let mut by_log_scale = each!(k in 3 => (n0[k] * mn0[k] + n1[k] * mn1[k]) * scale2[k]);
         let mut turn = each!(i in 3 => {
             let (j, k) = ((i + 1) % 3, (i + 2) % 3);
             (n0[j] * mn0[k] + n1[j] * mn1[k]) * (scale2[j] - scale2[k])

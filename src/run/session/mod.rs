@@ -343,7 +343,11 @@ impl<'a> Session<'a> {
         self.guard.check()?;
         let path = model_path(&self.folder, step);
         let (backend, to_world) = (self.run.trainer.backend(), &self.run.dataset.normalisation);
-        let shape = Shape { rows: backend.rows(), sh_degree: backend.sh_degree() };
+        let shape = Shape {
+            rows: backend.rows(),
+            sh_degree: backend.sh_degree(),
+            antialiasing: backend.antialiasing(),
+        };
         PLY.write_file(&path, shape, |piece| {
             Ok::<_, Failure>(to_world.world_from_model(backend.download_rows(piece)?))
         })?;

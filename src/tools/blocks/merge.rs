@@ -65,14 +65,24 @@ pub fn merge(
     }
     // The header holds the number of rows, so each block is read twice.
     let mut rows = 0;
+    let mut stated = None;
     for &index in &complete {
-        rows += read_part(folder, plan, index, observer)?.len();
+        let part = read_part(folder, plan, index, observer)?;
+        rows += part.len();
+        let antialiasing = *stated.get_or_insert(part.antialiasing);
+        if part.antialiasing != antialiasing {
+            return Err(Failure::input(format!(
+                "{}: its antialiasing is {}, that of the blocks before it {antialiasing}; train it again",
+                plan.block[index].name, part.antialiasing
+            )));
+        }
     }
     if rows > plan.rows {
         let message = format!("{rows} rows, but the plan allows only {}; this is a bug", plan.rows);
         return Err(Failure::new(OTHER, message));
     }
-    let shape = Shape { rows, sh_degree: plan.sh_degree };
+    let antialiasing = stated.unwrap_or_default();
+    let shape = Shape { rows, sh_degree: plan.sh_degree, antialiasing };
     write_atomically_from::<Failure>(output, |out| {
         let mut writer = format.open_writer()?;
         writer.begin(shape, out)?;

@@ -7,6 +7,7 @@ use crate::error::LoadError;
 use crate::models::ply::layout::sh_degree;
 use crate::models::quantise::{from_smallest_three, quantised_logit};
 use crate::models::rows::{Row, Rows, SplatFile};
+use crate::models::statement::of_comments;
 use crate::ply::{Element, Ply};
 use densify_core::gaussians::{rgb_to_dc, sh_coefficients};
 
@@ -77,6 +78,7 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
         }
     }
 
+    let (antialiasing, note) = of_comments(path, ply.comments())?;
     let mut rows = Rows::new(sh_degree);
     let mut colours = vec![0.0; 3 + rest];
     for (index, words) in vertices.iter().enumerate() {
@@ -88,7 +90,10 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
         }
         rows.push(row(*words, bounds, &mut colours));
     }
-    rows.finish(path)
+    let mut file = rows.finish(path)?;
+    file.gaussians.antialiasing = antialiasing;
+    file.notes.extend(note);
+    Ok(file)
 }
 
 /// Decodes the four words of a Gaussian. `sh` already holds the coefficients above band 0.

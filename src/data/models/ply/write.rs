@@ -3,6 +3,7 @@
 use std::io::{self, Write};
 
 use super::layout::{NORMALS_AT, properties};
+use crate::models::statement::comments;
 use crate::models::{ModelWriter, Shape};
 use densify_core::gaussians::{Gaussians, sh_coefficients};
 
@@ -18,7 +19,7 @@ const fn row_bytes(sh_degree: u8) -> usize {
 }
 
 impl ModelWriter for PlyWriter {
-    fn held_bytes(&self, Shape { rows, sh_degree }: Shape) -> u64 {
+    fn held_bytes(&self, Shape { rows, sh_degree, .. }: Shape) -> u64 {
         (rows.min(CHUNK) * row_bytes(sh_degree)) as u64
     }
 
@@ -26,8 +27,11 @@ impl ModelWriter for PlyWriter {
         false
     }
 
-    fn begin(&mut self, Shape { rows, sh_degree }: Shape, out: &mut dyn Write) -> io::Result<()> {
-        let mut header = format!("ply\nformat binary_little_endian 1.0\nelement vertex {rows}\n");
+    fn begin(&mut self, shape: Shape, out: &mut dyn Write) -> io::Result<()> {
+        let Shape { rows, sh_degree, antialiasing } = shape;
+        let stated = comments(antialiasing);
+        let mut header =
+            format!("ply\nformat binary_little_endian 1.0\n{stated}element vertex {rows}\n");
         for (index, name) in properties(sh_degree).enumerate() {
             if index == NORMALS_AT {
                 for normal in ["nx", "ny", "nz"] {

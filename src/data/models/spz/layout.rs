@@ -5,6 +5,8 @@
 
 /// First word of the data, `NGSP` in little endian.
 pub(super) const MAGIC: u32 = 0x5053_474e;
+/// Flag of a model with antialiasing (`load-spz.cc`).
+pub(super) const ANTIALIASED: u8 = 1;
 /// First bytes of a gzip stream.
 pub(super) const GZIP: [u8; 2] = [0x1f, 0x8b];
 /// A colour's byte is 255·(½ + `COLOUR`·coefficient).

@@ -6,11 +6,13 @@ use std::path::Path;
 use flate2::bufread::GzDecoder;
 use ruzstd::decoding::StreamingDecoder;
 
-use super::layout::{COLOUR, GZIP, HEADER_OF_VERSION_4, MAGIC};
+use super::layout::{ANTIALIASED, COLOUR, GZIP, HEADER_OF_VERSION_4, MAGIC};
 use crate::error::LoadError;
 use crate::models::quantise::{from_smallest_three, quantised_logit};
 use crate::models::rows::{Row, Rows, SplatFile};
+use crate::models::statement::note;
 use crate::models::unpack::{DAMAGED, read_error, read_exactly, read_to_end};
+use densify_core::antialiasing::Antialiasing;
 use densify_core::files::most_unpacked;
 use densify_core::gaussians::{MAX_SH_DEGREE, sh_coefficients};
 
@@ -23,6 +25,7 @@ struct Header {
     version: u32,
     sh_degree: u8,
     fractional_bits: u8,
+    is_antialiased: bool,
     /// The arrays in the order of the file: name and bytes per Gaussian.
     arrays: [(&'static str, u64); 6],
 }
@@ -63,6 +66,7 @@ fn read_header(
     let words: Vec<u32> = bytes.as_chunks().0.iter().map(|&w| u32::from_le_bytes(w)).collect();
     let (version, rows) = (words[1], u64::from(words[2]));
     let (sh_degree, fractional_bits) = (bytes[12], bytes[13]);
+    let is_antialiased = bytes[14] & ANTIALIASED != 0;
     if words[0] != MAGIC {
         return wrong("it does not begin with `NGSP`".into());
     }
@@ -90,7 +94,7 @@ fn read_header(
             "{rows} Gaussians take {bytes} bytes, too many for a file of {length}"
         ));
     }
-    Ok(Header { rows, version, sh_degree, fractional_bits, arrays })
+    Ok(Header { rows, version, sh_degree, fractional_bits, is_antialiased, arrays })
 }
 
 /// Reads arrays that follow each other.
@@ -171,7 +175,12 @@ fn decode(path: &Path, header: &Header, arrays: &[Vec<u8>]) -> Result<SplatFile,
             sh: &sh,
         });
     }
-    rows.finish(path)
+    let mut file = rows.finish(path)?;
+    if header.is_antialiased {
+        file.gaussians.antialiasing = Antialiasing::Wide;
+        file.notes.push(note(Antialiasing::Wide, "a flag of SPZ"));
+    }
+    Ok(file)
 }
 
 /// Version 2 has x, y, z in a byte each. Later versions have the largest component's index in the order (x, y, z, w),

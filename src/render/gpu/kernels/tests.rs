@@ -18,8 +18,8 @@ use super::super::sizes::Sizes;
 use super::*;
 use crate::KeptPhotographs;
 use crate::Shortcuts;
-use densify_core::antialiasing::Antialiasing;
 use crate::signals::RecordLayout;
+use densify_core::antialiasing::Antialiasing;
 use densify_shaders::{Accumulation, STAGES};
 
 /// Capabilities that naga must allow in addition to those of every WebGPU device.

@@ -133,8 +133,7 @@ pub fn backward(
             continue;
         }
         let (splat, upstream) = (&splats[row], &screen[row]);
-        gradient.opacity_logits[row] =
-            upstream.opacity * splat.opacity * (1.0 - splat.own_opacity);
+        gradient.opacity_logits[row] = upstream.opacity * splat.opacity * (1.0 - splat.own_opacity);
         let d_mean = geometry_backward(model, row, view, splat, upstream, &mut gradient)
             + colour_backward(model, row, view, splat, upstream, &mut gradient);
         gradient.means[row] = d_mean.to_array();
