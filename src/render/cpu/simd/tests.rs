@@ -58,8 +58,7 @@ fn elementary_functions_are_accurate() {
     let log2 = WorstError(&grid(1.0, 2.0), |x| f64::from(x).log2(), Function::Log2, 1.0);
     assert!(arch.dispatch(log2) < 3e-7);
     for (from, to) in [(1e-6, 1.0), (0.999, 1.001), (1e-30, 1e-29), (1.0, 1e9)] {
-        let log2 =
-            WorstError(&grid(from, to), |x| f64::from(x).log2(), Function::Log2OfAny, 1.0);
+        let log2 = WorstError(&grid(from, to), |x| f64::from(x).log2(), Function::Log2OfAny, 1.0);
         assert!(arch.dispatch(log2) < 4e-7, "{from} to {to}");
     }
 }
