@@ -121,7 +121,8 @@ fn print_regions(step: &Step) {
         }
     }
     println!(
-        "  region               times  tasks       ms  share %  largest task %  busy % of {CORES:?}"
+        "  region                runs  tasks       ms  share %  largest task %  \
+         busy % on {CORES:?} cores"
     );
     for name in names {
         let regions = || step.regions.iter().filter(|region| region.0 == name);

@@ -246,8 +246,9 @@ mod tests {
         // x = 1: 84,100·(2/29 − 1/841) = 84,100·57/841 = 5,700.
         assert_eq!([at(500), at(1000), at(1500)], [1000, 6700, 12_200]);
         assert_eq!([at(14_500), at(15_000), at(90_000)], [85_000, 85_100, 85_100]);
-        let big = Window { every: 100, ..window };
-        assert_eq!(concave_curve(big, 14_900, 0, 145 * 145), 145 * 145 - 1);
+        // M = 145: after the 144th and last event, 1/145² of the growth is still missing.
+        let frequent = Window { every: 100, ..window };
+        assert_eq!(concave_curve(frequent, 14_900, 0, 145 * 145), 145 * 145 - 1);
         assert_eq!(concave_curve(Window { every: 0, ..window }, 900, 7, 9), 7);
         // Nothing grows where the end is below the start.
         assert!(concave_curve(window, 1000, 100, 50) < 100);

@@ -17,8 +17,8 @@ pub struct Offspring {
     pub placement: Placement,
     /// Scales of the children (and of a rewritten parent), relative to the parent's.
     pub scale: ScaleRule,
-    /// Rotation of the scaled children (and of a rewritten parent) about the parent's own axes, new =
-    /// old · turn: a quaternion (w, x, y, z) of any length but 0, or [`NO_ROTATION`].
+    /// Rotation of the children (and of a rewritten parent), applied after scaling, about the parent's own axes,
+    /// new = old · turn: a quaternion (w, x, y, z) of any length but 0, or [`NO_ROTATION`].
     pub turn: [f32; 4],
     /// Opacities of the children (and of a rewritten parent), relative to the parent's.
     pub opacity: OpacityRule,
@@ -192,8 +192,8 @@ impl Offspring {
         ])
     }
 
-    /// True if the children are rotated, or their scales are set or change by axis. Such edits must be
-    /// declared by [`Needs::detailed_edits`](crate::policy::Needs).
+    /// True if the children are rotated, or their scales are set or change separately for each axis. Such edits
+    /// must be declared by [`Needs::detailed_edits`](crate::policy::Needs).
     pub fn is_detailed(&self) -> bool {
         matches!(self.scale, ScaleRule::Axes(_) | ScaleRule::Set(_))
             || self.turn.map(f32::to_bits) != NO_ROTATION.map(f32::to_bits)

@@ -1,4 +1,5 @@
-//! Pruning by a measure over all training views, or of the same number of rows at random.
+//! Prunes the rows with the lowest values of a measure over all training views or, as a control, equally many
+//! rows at random.
 //!
 //! Methods that prune a grown model differ in their measure and share this code: the measure is accumulated
 //! over the auxiliary views of one event, and the rows with the lowest values are pruned. A control prunes the

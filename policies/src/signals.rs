@@ -233,8 +233,8 @@ impl<const N: usize> From<[Signal; N]> for SignalSet {
 #[derive(Debug, Clone, Default)]
 pub struct Signals {
     rows: usize,
-    present: SignalSet,
-    /// Columns, one after another in declaration order. Shape: `[present, rows, width]`.
+    set: SignalSet,
+    /// Columns, one after another in declaration order. Shape: `[set, rows, width]`.
     values: Vec<f32>,
 }
 
@@ -248,7 +248,7 @@ impl Signals {
     pub fn zeros_in(mut values: Vec<f32>, rows: usize, set: SignalSet) -> Self {
         values.clear();
         values.resize(rows * set.width(), 0.0);
-        Self { rows, present: set, values }
+        Self { rows, set, values }
     }
 
     /// The allocation of all columns, for reuse.
@@ -261,12 +261,12 @@ impl Signals {
         self.rows
     }
 
-    /// The column of `signal`, if present. Shape: `[rows, width]`.
+    /// The column of `signal`, if the set contains it. Shape: `[rows, width]`.
     pub fn get(&self, signal: Signal) -> Option<&[f32]> {
         self.range(signal).map(|range| &self.values[range])
     }
 
-    /// The column of `signal` for writing, if present. Shape: `[rows, width]`.
+    /// The column of `signal` for writing, if the set contains it. Shape: `[rows, width]`.
     pub fn get_mut(&mut self, signal: Signal) -> Option<&mut [f32]> {
         self.range(signal).map(|range| &mut self.values[range])
     }
@@ -283,7 +283,7 @@ impl Signals {
         }
         let left = self.rows - rows;
         let (mut from, mut to) = (0, 0);
-        for width in self.present.iter().map(Signal::width) {
+        for width in self.set.iter().map(Signal::width) {
             self.values.copy_within(from + width * rows..from + width * self.rows, to);
             from += width * self.rows;
             to += width * left;
@@ -295,9 +295,9 @@ impl Signals {
 
     fn range(&self, signal: Signal) -> Option<Range<usize>> {
         let mut start = 0;
-        for present in self.present.iter() {
-            let end = start + present.width() * self.rows;
-            if present == signal {
+        for column in self.set.iter() {
+            let end = start + column.width() * self.rows;
+            if column == signal {
                 return Some(start..end);
             }
             start = end;

@@ -38,8 +38,8 @@ impl Surface {
         };
         let mut best = (0_u32, DVec3::ZERO, f64::INFINITY);
         let mut open = vec![(0.0_f64, 0_u32)];
-        while let Some((least, index)) = open.pop() {
-            if least > best.2 {
+        while let Some((least_squared, index)) = open.pop() {
+            if least_squared > best.2 {
                 continue;
             }
             let node = &nodes[index as usize];
@@ -53,10 +53,10 @@ impl Surface {
             for slot in node.first_index..node.first_index + node.prim_count {
                 let corners = self.triangles[slot as usize].map(Vec3::as_dvec3);
                 let point = nearest_on_triangle(p, corners);
-                let distance = point.distance_squared(p);
+                let squared = point.distance_squared(p);
                 let earlier = || self.triangle_of(slot) < self.triangle_of(best.0);
-                if distance < best.2 || (distance == best.2 && earlier()) {
-                    best = (slot, point, distance);
+                if squared < best.2 || (squared == best.2 && earlier()) {
+                    best = (slot, point, squared);
                 }
             }
         }

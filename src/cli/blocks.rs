@@ -15,7 +15,7 @@ use densify_blocks::{
     Block, BlockPlan, Grid, PlanOptions, Size, Task, TaskState, merge, plan, status, submit,
 };
 use densify_core::memory::Bytes;
-use densify_core::numbers::grouped;
+use densify_core::numbers::{gaussians, grouped};
 use densify_launch::{Engine, SubmissionArgs};
 use densify_run::failure::Failure;
 use densify_run::{ByteCount, Fraction, Rows, Threads, Whole};
@@ -257,10 +257,10 @@ fn run_merge(args: &MergeArgs, console: &Console) -> Result<(), Failure> {
         console.say(format_args!("note: incomplete, left out: {}", merged.missing.join(", ")));
     }
     console.result(format_args!(
-        "{} ({}): {} Gaussians, {}",
+        "{} ({}): {}, {}",
         args.output.display(),
         format.name,
-        grouped(merged.rows),
+        gaussians(merged.rows),
         Bytes(merged.bytes)
     ));
     Ok(())

@@ -71,7 +71,7 @@ pub(super) struct RenderingArgs {
     /// LichtFeld, Mip-Splatting), or none. The PLY of the original trainer does not state it
     #[arg(
         long, value_name = "KERNEL", num_args = 0..=1, require_equals = true, default_missing_value = "0.3",
-        help_heading = "Scene"
+        help_heading = "Rendering"
     )]
     pub(super) antialias: Option<Antialiasing>,
     #[command(flatten)]

@@ -9,7 +9,7 @@ use super::console::Console;
 use super::interrupt::Interrupts;
 use super::render::{RenderingArgs, refuse_scene_options};
 use super::threads::open_machine;
-use densify_core::numbers::grouped;
+use densify_core::numbers::gaussians;
 use densify_run::failure::Failure;
 use densify_view as view;
 use densify_view::{FIRST_PORT, ListenAddress, Server, ViewOptions};
@@ -80,7 +80,7 @@ pub(super) fn run(args: &ViewArgs, matches: &ArgMatches, console: &Console) -> R
     };
     let scene = view::open(options, machine, console)?;
     for (name, rows) in scene.models() {
-        console.say(format_args!("model    {name}: {} Gaussians", grouped(rows)));
+        console.say(format_args!("model    {name}: {}", gaussians(rows)));
     }
     // From here on, a signal ends the page cleanly instead of killing the process.
     let interrupts = Interrupts::listen();

@@ -28,12 +28,12 @@ pub enum LoadError {
         /// The line and the fault.
         problem: String,
     },
-    /// Masks are to be inverted or carved away, but the dataset has none.
+    /// Masks are to be inverted, or masked pixels to become background, but the dataset has no masks.
     #[error("{}: no photograph has a mask", listing.display())]
     NoMasks {
         /// The file that lists the photographs.
         listing: PathBuf,
-        /// True if masks are to be inverted, false if they are to carve the background away.
+        /// True if masks are to be inverted, false if masked pixels are only to become background.
         inverted: bool,
     },
 }
@@ -47,9 +47,9 @@ pub enum LoadRemedy {
     AddOrImagesFolder,
     /// Name a folder of images instead of paths that lead out of the dataset.
     OtherImagesFolder,
-    /// Name the folder that holds both images at their original paths, as the suffixes of their paths are the same.
+    /// Name a folder that holds both images in their original subfolders: in the given folder, both match one file.
     ImagesFolderOfBoth,
-    /// Change whether masks that hide everything are inverted.
+    /// Invert masks that hide everything (true), or stop inverting them (false).
     InvertMasks(bool),
     /// Hold out fewer views.
     LargerTestEvery,

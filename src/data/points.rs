@@ -6,10 +6,13 @@ use glam::DVec3;
 
 use crate::error::LoadError;
 use crate::ply::{Element, Ply, Scalar};
+use densify_core::files::one_line;
+use densify_core::sh;
 
 /// Colour of points that have none.
 const GREY: u8 = 128;
-/// Largest real colour of a cloud whose full value is 1; in one of 0 to 255 all would be black.
+/// Fractional colours up to this value are read on a scale of 0 to 1, even if some exceed 1: on a scale of 0 to 255,
+/// all would be almost black.
 const BRIGHTEST: f64 = 16.0;
 
 /// A coloured point cloud in structure of arrays.
@@ -51,12 +54,12 @@ impl PointCloud {
     }
 }
 
-/// Reads the vertices of a PLY file as points; other elements are skipped. Positions may be of any
-/// type, and non-finite.
+/// Reads the vertices of a PLY file as points, and a note if they have no colours; other elements are skipped. Positions
+/// may be of any type, and non-finite. A model of Gaussian splats gives the colours of its Gaussians.
 ///
 /// # Errors
 /// When the file is unreadable, contradicts itself, or its vertices have no x, y, z.
-pub fn read_points(path: &Path) -> Result<PointCloud, LoadError> {
+pub fn read_points(path: &Path) -> Result<(PointCloud, Option<String>), LoadError> {
     let mut ply = Ply::open(path)?;
     let vertices = ply.element("vertex")?;
     let mut columns = Vec::new();
@@ -68,10 +71,15 @@ pub fn read_points(path: &Path) -> Result<PointCloud, LoadError> {
         ["green", "diffuse_green", "g"],
         ["blue", "diffuse_blue", "b"],
     ]
-    .map(|names| vertices.find(&names));
-    let mut full = 1.0;
+    .map(|names| vertices.find_in_any_case(&names));
+    let coefficients = ["f_dc_0", "f_dc_1", "f_dc_2"].map(|name| vertices.find(&[name]));
+    // The share of a full colour is `offset + factor · value / full`.
+    let (mut offset, mut factor, mut full) = (0.0, 1.0, 1.0);
     if let [Some(r), Some(g), Some(b)] = channels {
         full = full_scale(path, &vertices, [r, g, b])?;
+        columns.extend([r, g, b]);
+    } else if let [Some(r), Some(g), Some(b)] = coefficients {
+        (offset, factor) = (0.5, f64::from(sh::C0));
         columns.extend([r, g, b]);
     }
     let mut points = PointCloud::default();
@@ -79,18 +87,22 @@ pub fn read_points(path: &Path) -> Result<PointCloud, LoadError> {
         points.positions.push(DVec3::new(row[0], row[1], row[2]));
         points.colours.push(match row[3..] {
             // The cast turns NaN into 0 and saturates.
-            [r, g, b] => [r, g, b].map(|v| (255.0 * (v / full) + 0.5) as u8),
+            [r, g, b] => [r, g, b].map(|v| (255.0 * (offset + factor * (v / full)) + 0.5) as u8),
             _ => [GREY; 3],
         });
     })?;
-    Ok(points)
+    let file = path.file_name().unwrap_or_default().to_string_lossy();
+    let is_grey = columns.len() == 3 && !points.is_empty();
+    let note =
+        is_grey.then(|| one_line(&format!("{file}: the points have no colours; they start grey")));
+    Ok((points, note))
 }
 
-/// The value of a full colour channel: of bytes their largest, else the smallest usual one that no colour exceeds, as
-/// programs write colours of 0 to 255 as any type.
+/// The value of a full colour channel: for bytes their largest value, otherwise the smallest usual value that no colour
+/// exceeds, because programs write colours of 0 to 255 in any type.
 ///
 /// # Errors
-/// When real colours exceed all usual values.
+/// When floating-point colours exceed all usual values.
 fn full_scale(path: &Path, vertices: &Element, channels: [usize; 3]) -> Result<f64, LoadError> {
     let kinds = channels.map(|column| vertices.properties[column].kind);
     if matches!(kinds, [Scalar::U8, Scalar::U8, Scalar::U8] | [Scalar::I8, Scalar::I8, Scalar::I8])
@@ -150,7 +162,8 @@ mod tests {
                  property short x\nproperty double y\nproperty float z\nend_header\n{colour} 1 2 3\n"
             );
             std::fs::write(&path, text).unwrap();
-            let points = read_points(&path).unwrap();
+            let (points, note) = read_points(&path).unwrap();
+            assert_eq!(note, None, "{kind}");
             assert_eq!(points.positions, [DVec3::new(1.0, 2.0, 3.0)], "{kind}");
             assert_eq!(points.colours, [expected], "{kind}");
         }
@@ -161,7 +174,7 @@ mod tests {
             )
         };
         std::fs::write(&path, text("inf")).unwrap();
-        assert_eq!(read_points(&path).unwrap().colours, [[0, 128, 255]]);
+        assert_eq!(read_points(&path).unwrap().0.colours, [[0, 128, 255]]);
         std::fs::write(&path, text("1e6")).unwrap();
         let message = read_points(&path).unwrap_err().to_string();
         assert!(message.contains("file.ply: colours") && message.contains("1000000"), "{message}");
@@ -171,10 +184,35 @@ mod tests {
         assert!(message.contains("property z"), "{message}");
     }
 
+    /// Models of Gaussian splats have coefficients, of which 0 is grey.
+    #[test]
+    fn colours_of_other_names_are_read_and_none_are_noted() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("file.ply");
+        for (names, colour, expected) in [
+            (["Red", "Green", "Blue"], "0 0.5 1", Some([0, 128, 255])),
+            (["DIFFUSE_RED", "DIFFUSE_GREEN", "DIFFUSE_BLUE"], "1 0 0", Some([255, 0, 0])),
+            (["f_dc_0", "f_dc_1", "f_dc_2"], "0 -1.7724539 9", Some([128, 0, 255])),
+            (["nx", "ny", "nz"], "0 0 1", None),
+        ] {
+            let columns = names.map(|name| format!("property float {name}\n")).concat();
+            let text = format!(
+                "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n\
+                 {columns}end_header\n1 2 3 {colour}\n"
+            );
+            std::fs::write(&path, text).unwrap();
+            let (points, note) = read_points(&path).unwrap();
+            assert_eq!(points.colours, [expected.unwrap_or([GREY; 3])], "{names:?}");
+            let is_noted = note.is_some_and(|note| note.contains("file.ply: the points have no"));
+            assert_eq!(is_noted, expected.is_none(), "{names:?}");
+        }
+    }
+
     #[test]
     #[ignore = "needs shared data"]
     fn shared_colours_of_type_int_are_read() {
-        let points = read_points(&densify_fixtures::shared("../cases/ply/int255.ply")).unwrap();
+        let (points, _) =
+            read_points(&densify_fixtures::shared("../cases/ply/int255.ply")).unwrap();
         assert_eq!(points.colours, [[200, 100, 50]; 4]);
     }
 
@@ -182,7 +220,7 @@ mod tests {
     #[ignore = "needs files of other programs: set DENSIFY_SHARED"]
     fn shared_clouds_of_other_programs_load() {
         for path in densify_fixtures::shared_files("points", "ply") {
-            let points = read_points(&path).unwrap_or_else(|e| panic!("{e}"));
+            let (points, _) = read_points(&path).unwrap_or_else(|e| panic!("{e}"));
             assert!([8, 24].contains(&points.len()), "{}: {}", path.display(), points.len());
             let reach = points.positions.iter().map(|p| p.abs().max_element()).fold(0.0, f64::max);
             assert!((0.4..200.0).contains(&reach), "{}: {reach}", path.display());

@@ -56,8 +56,8 @@ impl DatasetViews {
         Self { views, cache }
     }
 
-    /// Checks that a view shows anything. Images without transparent pixels are not decoded for it, of others those up to
-    /// the first with a visible pixel.
+    /// Checks that at least one view shows something. For this, images that cannot be transparent are not decoded,
+    /// and the others only up to the first one with a visible pixel.
     ///
     /// # Errors
     /// When every pixel of every view of the dataset `root` is transparent.
@@ -132,7 +132,7 @@ mod tests {
         assert!(message.contains("scenes/empty") && message.contains("all 2 views"), "{message}");
         check(vec![view(Some(0)), view(Some(1))]).unwrap();
         check(vec![view(Some(0)), view(None)]).unwrap();
-        // An image that cannot be loaded is none that shows nothing.
+        // An image that cannot be loaded does not count as empty.
         let mut lost = view(Some(0));
         lost.source.rendered = None;
         lost.source.file.path = PathBuf::from("missing.png");

@@ -15,6 +15,7 @@ mod host;
 mod models;
 mod near_plane;
 mod observer;
+mod position_rates;
 mod process;
 mod resolved;
 mod session;

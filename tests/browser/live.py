@@ -41,13 +41,13 @@ def check(browser: Browser, url: str, run: Path, folder: Path | None) -> None:
     hide = "Object.defineProperty(document, 'hidden', { configurable: true, value: true });"
     seen = "document.dispatchEvent(new Event('visibilitychange'));"
     browser.run(hide + seen)
-    browser.wait_for("underway === 0", "a picture does not come")
+    browser.wait_for("underway === 0", "a requested picture does not arrive")
     before = browser.run("requestPicture(); return requests")
     time.sleep(0.5)
     after = browser.run("return requests")
-    assert after == before, f"in the background it asks for {after - before} pictures"
+    assert after == before, f"a hidden page requests {after - before} pictures"
     browser.run("delete document.hidden;" + seen)
-    browser.wait_for(f"requests > {before}", "seen again, it does not look")
+    browser.wait_for(f"requests > {before}", "a page that is shown again requests no picture")
 
     click("pause")
     browser.wait_for(f"{STATE}.state === 'paused'", "the run is not paused")
@@ -59,13 +59,13 @@ def check(browser: Browser, url: str, run: Path, folder: Path | None) -> None:
     browser.wait_for(f"Number({STATE}.step) === {paused + 1}", "the run does not proceed by one step")
     click("checkpoint")
     browser.wait_for("document.getElementById('training-numbers').textContent.includes('Checkpoint of step')", "no checkpoint is shown")
-    assert (run / f"checkpoints/iteration_{paused + 1}.safetensors").is_file(), "no checkpoint is there"
+    assert (run / f"checkpoints/iteration_{paused + 1}.safetensors").is_file(), "the checkpoint was not written"
     browser.wait_until_sharp()
     # The heading shows the run's number of Gaussians, whatever it showed before.
     browser.run("scene.models[0].rows = 1; showModels()")
     counts = "document.getElementById('models').textContent.split(': ')[1].replace('Gaussians', 'of at most')"
     browser.wait_for(f"document.getElementById('training-numbers').textContent.includes({counts})", "the heading's count is not updated")
-    # Displays that exist only during training.
+    # Kinds of picture that exist only during training.
     colours = {}
     for kind in browser.run("return scene.kinds.map(({ kind }) => kind)"):
         if kind.startswith("row_"):

@@ -2,8 +2,8 @@
 
     python view.py DENSIFY RUN OTHER [FOLDER FOR SCREENSHOTS]          needs chromium and chromium-driver
 
-RUN and OTHER are of one scene, and RUN must have test views. WebDriver is JSON over HTTP, for which Python's
-standard library suffices.
+RUN and OTHER are runs on the same scene, and RUN must have test views. WebDriver is JSON over HTTP, for which
+Python's standard library suffices.
 """
 
 import base64
@@ -116,15 +116,15 @@ const turn = (now) => {
 };
 requestAnimationFrame(turn);
 """
-# The size that the page chooses for coarse pictures, relative to full size, after one of size 0.5 and 1000 bytes, each
-# of which takes a microsecond. Arguments: the time to render it, the time until it arrived, and the network's latency.
+# The size that the page chooses for coarse pictures, relative to full size, after a picture of size 0.5 with 1000
+# bytes, at a microsecond per byte. Arguments: the times to render it and until it arrived, and the latency [ms].
 COARSE_SIZE = """
 const [milliseconds, took, alone] = arguments;
 [latency, perByte] = [alone, 1e-3];
 pace([{ bitmap: { width: 1, height: 1 }, bytes: 1000, milliseconds, held: milliseconds, took }], performance.now() - took, true, 0.5);
 return coarse;
 """
-# Delays every reply by a number of milliseconds, like a network; also counts the requests under way at the same time.
+# Delays every reply by a number of milliseconds, like a slow network; also records the most requests under way at once.
 DELAY = """
 const undelayed = window.fetch;
 window.fetch = async (...request) => {
@@ -237,7 +237,7 @@ class Browser:
 
 
 def check_moves(browser: Browser) -> None:
-    """Checks that all other ways to move the camera move it in the right direction only."""
+    """Checks that keys, mouse buttons and sliders move the camera in the right direction only."""
     browser.run("document.getElementById('marks').focus()")
     state = "return [camera.at, camera.right, camera.up, camera.back, camera.away, camera.fov]"
     dot = lambda a, b: sum(x * y for x, y in zip(a, b))
@@ -400,7 +400,7 @@ def check(browser: Browser, url: str, densify: str, run: str, rendered: Path, fo
     browser.mouse(place, {"type": "pointerDown", "button": 0}, {"type": "pointerUp", "button": 0})
     assert found and browser.run("return view") == found, f"a click does not go to {found}"
     browser.wait_until_sharp()
-    # The wheel moves closer; while moving, pictures are smaller than at rest.
+    # The wheel moves the camera closer; pictures are smaller while it moves than at rest.
     watch = "window.sizes = []; const note = () => sizes.push(Number(stage.dataset.size.split('x')[0]));"
     browser.run(watch + "coarse = 0.4; new MutationObserver(note).observe(stage, { attributeFilter: ['data-size'] });")
     before = browser.run("return camera.away")
@@ -422,7 +422,7 @@ def check(browser: Browser, url: str, densify: str, run: str, rendered: Path, fo
     assert browser.run("return dot(add(camera.at, arguments[0], -1), camera.back)", before) > 0, "S does not fly back"
     rate, rested = browser.run(pace)
     print(f"{rate} pictures per second moving; sharp {rested} ms after the last change")
-    # Spreading two fingers moves closer.
+    # Spreading two fingers moves the camera closer.
     before = browser.run("return camera.away")
     browser.pinch((400, 300), (480, 300), (300, 300), (580, 300))
     after = browser.run("return camera.away")

@@ -2,8 +2,8 @@
 
     python3 tests/engines/hq_blocks.py PROGRAM
 
-Needs the package hyperqueue. It has no command `hq`, so the tasks of the job file, with their dependencies and
-resources, are submitted through its API, to a server and two workers started here.
+Needs the package hyperqueue. The package has no command `hq`, so the tasks of the job file, with their dependencies
+and resources, are submitted through its API to a server and two workers that this script starts.
 """
 
 import subprocess

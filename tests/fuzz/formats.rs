@@ -1,8 +1,8 @@
 //! Reads arbitrary bytes as a file of each format that comes from other programs. Whatever the bytes are, a reader
 //! accepts or refuses them: it never panics, hangs, or allocates more than the size of the file justifies.
 //!
-//! Formats of models and datasets come from their registries. `cargo fuzz` runs without end (see CONTRIBUTING.md),
-//! `tests/it/fuzz.rs` briefly in every test run; both use the same corpora.
+//! Formats of models and datasets are those of their registries. `cargo fuzz` runs without end (see CONTRIBUTING.md),
+//! `tests/it/fuzz.rs` runs briefly in every test run. Both use the same corpora.
 
 use std::path::Path;
 
@@ -18,11 +18,11 @@ use densify_scenegen::{Options, PointOptions, Scene, Source};
 
 /// A target of the fuzzer.
 pub struct Target {
-    /// Name, also of the folder with its corpus.
+    /// Name of the target and of the folder with its corpus.
     pub name: &'static str,
-    /// Name of an input that is one file.
+    /// File name of an input that consists of one file.
     file: String,
-    /// Names under which the input finds a photograph.
+    /// File names under which a photograph is put beside the input.
     photographs: &'static [&'static str],
     /// Returns true if the files in a folder are accepted. The second argument is the path of `file`.
     accepts: fn(&Path, &Path) -> bool,
@@ -95,7 +95,7 @@ impl Target {
     }
 }
 
-/// A folder that is a model has no file with the target's name.
+/// Reads a model. If the input has no file with the target's name, the model is the folder.
 fn accepts_model(folder: &Path, file: &Path) -> bool {
     let path = if file.is_file() { file } else { folder };
     read_model(path).is_ok_and(|file| {
@@ -109,13 +109,13 @@ fn accepts_model(folder: &Path, file: &Path) -> bool {
 }
 
 fn accepts_points(path: &Path) -> bool {
-    read_points(path).is_ok_and(|points| {
+    read_points(path).is_ok_and(|(points, _)| {
         assert_eq!(points.colours.len(), points.positions.len());
         true
     })
 }
 
-/// A folder or an archive: its cameras first, then its images.
+/// Reads the cameras of a folder or an archive, then the images.
 fn accepts_dataset(path: &Path) -> bool {
     let options = LoadOptions { tracks: true, ..LoadOptions::default() };
     let Ok(dataset) = Dataset::load(path, &options) else {
@@ -129,7 +129,7 @@ fn accepts_dataset(path: &Path) -> bool {
     })
 }
 
-/// A photograph, twice: its header when the dataset is loaded, its pixels after that.
+/// Reads a dataset with the photograph in two views: its header when the dataset is loaded, its pixels afterwards.
 fn accepts_images(folder: &Path) -> bool {
     let listing = br#"{"camera_angle_x": 0.8, "frames": [
         {"file_path": "images/0.png", "transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,4],[0,0,0,1]]},
@@ -139,7 +139,7 @@ fn accepts_images(folder: &Path) -> bool {
     copied.is_ok() && accepts_dataset(folder)
 }
 
-/// A checkpoint: its header, its model, and the backend's arrays.
+/// Reads a checkpoint: its header, its model, and the backend's arrays.
 fn accepts_checkpoint(path: &Path) -> bool {
     let Ok(mut checkpoint) = Checkpoint::open(path) else {
         return false;
@@ -157,7 +157,7 @@ fn accepts_checkpoint(path: &Path) -> bool {
     true
 }
 
-/// `config.toml` of a run.
+/// Reads `config.toml` of a run.
 fn accepts_config(folder: &Path) -> bool {
     RunConfig::read(folder).is_ok_and(|config| !config.scene_path().as_os_str().is_empty())
 }

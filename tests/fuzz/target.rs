@@ -1,4 +1,4 @@
-//! The fuzz target: reads inputs as the format that the variable `FORMAT` names. See `formats.rs`.
+//! The fuzz target: reads inputs in the format that the environment variable `FORMAT` names. See `formats.rs`.
 #![no_main]
 
 use std::sync::LazyLock;

@@ -13,7 +13,7 @@ class Case:
     name: str
     # Without the program's name; split into words as a shell does.
     commands: tuple[str, ...]
-    # Case whose output by the reference program is copied into the folder before either program runs.
+    # Name of a case whose output by the reference program is copied into the folder before either program runs.
     start: str | None = None
     # Files and folders to delete from that copy.
     without: tuple[str, ...] = ()
@@ -109,7 +109,7 @@ def extras():
                               run("full", f"--init {MODEL} --init-rates full --sh-degree 1", budget="500")))
     yield Case("extra/freeze", (small(), run("model"), run("run", f"--freeze {MODEL}", budget="2k"),
                                 run("both", f"--freeze {MODEL} --init {MODEL} --policy mcmc", budget="3k")))
-    # With --memory alone the budget would depend on measured memory.
+    # Without an explicit budget, --memory would make the budget depend on measured memory.
     yield Case("extra/memory", (small(points=5000), run("run", "--preset tiny-memory --memory 64MiB", budget="4k"),
                                 run("knobs", "--knob param_storage=f16 --knob alpha_min=1/64 --image-cache 0")))
     yield Case("extra/presets", (small(), run("exact", "--preset exact"), run("fast", "--preset fast")))

@@ -14,7 +14,7 @@ from cases import INTENDED
 
 # Written, but not compared. TensorBoard's file repeats stats/train.jsonl with times.
 IGNORED = ("*events.out.tfevents.*", "*densify.lock", "*local.lock", "case.json")
-# Must exist, but is not compared: it is full of times and measured memory.
+# Must exist and not be empty; the contents, full of times and measured memory, are not compared.
 PRESENT = ("report.html", "compare/*.html", "trade/*.html", "compare/growth-*.svg", "trade/pareto-*.svg")
 # Text for people: its figures must be the same, in any order; changed words are only reported.
 WORDS = ("*.out", "*.err", "*.log", "*requirements.json", "*.md")
@@ -112,7 +112,7 @@ def words_difference(left: str, right: str):
             return f"a figure of memory is {one}, now {other}"
     alike = [[FIGURE.sub("#", line) if LOOSE_LINES.search(line) else line for line in side.splitlines()]
              for side in (left, right)]
-    # Columns are as wide as their figures.
+    # The width of a column depends on its figures, so spaces are ignored.
     squeezed = [[" ".join(line.split()) for line in side] for side in alike]
     return None if squeezed[0] == squeezed[1] else ""
 
@@ -166,7 +166,7 @@ def value_difference(left, right, path: str = ""):
         if list(left) != list(right):
             return f"{path}: keys {list(left)}, now {list(right)}"
         pairs = [(key, left[key], right[key]) for key in left if key not in VARYING_KEYS]
-        # Of the times of the stages, only the names of the stages are compared.
+        # The times of the stages are not compared, only the names of the stages.
         pairs = [(key, *((list(it) for it in both) if key == "stage_seconds" else both)) for key, *both in pairs]
     elif isinstance(left, list) and isinstance(right, list):
         if len(left) != len(right):

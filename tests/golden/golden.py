@@ -178,7 +178,7 @@ def build_revision(revision: str, store: Path) -> Path:
 
 
 def record(reference: Program, chosen: list[Case], by_name: dict[str, Case], jobs: int) -> None:
-    """Runs the reference, and checks that no command fails unexpectedly. Cases that others start from come first."""
+    """Runs the reference, and checks that no command fails unexpectedly. Cases that others start from are run first."""
     # Renders the scene in advance, as rendering it within a case would raise the measured memory.
     reference.printed("plan scene:spheres --backend cpu")
     starts = {by_name[case.start] for case in chosen if case.start}
@@ -251,10 +251,10 @@ def prove(reference: Program, chosen: list[Case]) -> int:
         for changed_content in corrupted(content):
             changed.write_bytes(changed_content)
             found = difference(str(name), folder / name, changed, folders, [])
-            # "" means changed words: a file without figures.
+            # An empty description means that only words differ, as in a file without figures. This is noticed, too.
             if found is not None:
                 break
-        # Some contain only progress, which varies.
+        # Some files contain only progress messages, which vary.
         compared = not is_text(content) or bool(fixed_text(str(name), content.decode(), folders, []))
         missed += found is None and compared
         print(f"{'noticed' if found is not None else 'MISSED' if compared else 'varies':9}{kind:36}{found or ''}"[:160])

@@ -1,4 +1,4 @@
-"""Reads every format that densify writes with other programs, and reads their files with densify.
+"""Has other programs read every format that densify writes, and densify read the files of those programs.
 
     python models.py DENSIFY NODE_MODULES MODEL.ply...
 

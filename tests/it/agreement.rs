@@ -1,5 +1,5 @@
 //! Compares every backend with the native one: losses, and training step by step. Unlike `extremes`, this includes
-//! backends that add gradients in any order; `oracle` checks images and gradients.
+//! backends that add gradients in an arbitrary order. `oracle` checks images and gradients.
 
 use densify::core::camera::Camera;
 use densify::core::gaussians::Gaussians;
@@ -81,7 +81,7 @@ fn step(
 
 fn columns(backend: &mut dyn Backend, needs: &Needs) -> Vec<(Signal, Vec<f32>)> {
     let signals = backend.take_signals(needs.signals).expect("signals");
-    // Minima are compared as inverses, because those of unseen Gaussians are infinite.
+    // Minima are compared as reciprocals, because the minima of unseen Gaussians are infinite.
     let comparable = |s: Signal, x: f32| if s.kind() == SignalKind::Minimum { 1.0 / x } else { x };
     let column = |s: Signal| -> Vec<f32> {
         signals.get(s).expect("a requested signal").iter().map(|&x| comparable(s, x)).collect()

@@ -47,7 +47,7 @@ fn request(map: PixelMap) -> AuxRequest {
     AuxRequest { map, columns: AuxColumn::ALL.to_vec(), points: 0 }
 }
 
-/// `cap` limits the tile lists; records are limited to half of it.
+/// `cap` limits the entries of the tile lists; gradient records are limited to half of `cap`.
 fn backend(
     subject: &Subject,
     scene: &Scene,
@@ -221,7 +221,7 @@ fn observing_does_not_affect_training() {
                 ..step_input(step, &scene.camera, &scene.target, 2)
             };
             let output = backend.train_step(&input).expect("a small image is rendered");
-            // The observed loss is the one that the next step starts from.
+            // A step reports the loss before its update, so the loss observed after a step is that of the next one.
             assert!(observed.is_none_or(|loss: f32| (loss - output.loss).abs() < 1e-6));
             observed = with_views.then(|| observe(&mut *backend, &scene, &request, 0).loss);
         }

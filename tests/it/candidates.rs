@@ -1,4 +1,4 @@
-//! Candidates: where each error mode finds them on a plane, where none may appear, and that all backends agree.
+//! Candidates: the places where each error mode finds them, places without candidates, and agreement of all backends.
 
 use densify::core::camera::Camera;
 use densify::core::gaussians::{Gaussians, logit, rgb_to_dc};
@@ -128,7 +128,7 @@ fn gradient_mode_ignores_a_constant_colour_offset() {
         let found = candidates(subject, &model, &target, request(mode, 0.5));
         assert!(found.len() >= 20, "{mode:?}: {} candidates", found.len());
         let [left, top, right, bottom] = PATCH;
-        // Well inside, because the patch's border is structure too.
+        // Only the interior counts, because the patch's border is itself fine structure.
         let within = |c: &&Candidate| {
             let p = pixel(c);
             (left + WINDOW..right - WINDOW).contains(&p.x)
@@ -261,8 +261,8 @@ fn candidates_match_the_native_backend() {
     }
 }
 
-/// The device lists the pixels that the host finds in the full error map. Only the larger budget leaves room for the
-/// device list.
+/// With the larger budget, the device has room to list candidate pixels; otherwise the host searches the whole error
+/// map. The same pixels are selected.
 #[test]
 fn device_and_host_select_the_same_pixels() {
     let (model, camera) = cloud();

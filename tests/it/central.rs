@@ -16,8 +16,8 @@ use densify::selftest::scenes;
 
 /// Step of the central difference, to either side.
 const STEP: f64 = 1e-6;
-/// Relative to the largest gradient of the class. The rounding error is eps·|L| / STEP ≈ 1e-16·10 / 1e-6 and the
-/// truncation error STEP²; both are smaller for losses and gradients around 1.
+/// Tolerance relative to the largest gradient of the class. The rounding error is eps·|L| / STEP ≈ 1e-16·10 / 1e-6 and
+/// the truncation error STEP²; for losses and gradients around 1, both errors are smaller than the tolerance.
 const TOLERANCE: f64 = 1e-6;
 
 /// Compares every gradient of Σ image · upstream with its central difference; reports the worst per class.
@@ -52,7 +52,7 @@ fn view(camera: &Camera, sh_degree: u8) -> View<'_> {
 }
 
 #[test]
-fn gradients_of_every_class_at_every_degree() {
+fn gradients_of_every_class_match_at_every_degree() {
     let mut table = Table::new("reference against central differences");
     for degree in 0..=3 {
         let camera = scenes::camera(13, 11, 40 + u64::from(degree));
@@ -69,7 +69,7 @@ fn gradients_of_every_class_at_every_degree() {
 }
 
 #[test]
-fn gradients_with_antialiasing() {
+fn gradients_match_with_antialiasing() {
     let mut table = Table::new("reference with antialiasing");
     for kind in [Antialiasing::Wide, Antialiasing::Narrow] {
         for size in [1.0_f32, 0.2] {
@@ -86,7 +86,7 @@ fn gradients_with_antialiasing() {
 }
 
 #[test]
-fn gradients_where_the_jacobian_is_clamped() {
+fn gradients_match_where_the_jacobian_is_clamped() {
     // Large Gaussians whose centres are far outside the image: the slope is clamped in x, in y, or in both.
     let camera = Camera { cx: 2.0, cy: 9.5, fx: 9.0, fy: 14.0, ..scenes::camera(12, 10, 5) };
     let mut table = Table::new("reference beyond the frustum");
@@ -105,7 +105,7 @@ fn gradients_where_the_jacobian_is_clamped() {
 }
 
 #[test]
-fn gradient_of_the_loss() {
+fn the_gradient_of_the_loss_matches() {
     let mut table = Table::new("reference loss against central differences");
     let mut rng = ChaCha8Rng::seed_from_u64(8);
     for (width, height) in [(1, 1), (1, 17), (17, 1), (7, 5), (14, 12)] {

@@ -91,7 +91,7 @@ fn noise_has_the_declared_covariance() {
         let opacity = 1.0 / (1.0 + 4.0_f64.exp());
         let share = 1.0 / (1.0 + (100.0 * (opacity - 0.005)).exp());
         let factor = 7.0 * f64::from(RATES.noise) * share;
-        // The standard deviation is Σ·factor. Rotated Gaussians have x and y swapped.
+        // The noise has the standard deviation Σ·factor. Rotated Gaussians have x and y swapped.
         for (parity, variances) in [(0, [0.01, 0.04, 0.16]), (1, [0.04, 0.01, 0.16])] {
             let of_parity = moved.means.iter().skip(parity).step_by(2);
             let deltas: Vec<[f64; 3]> =
@@ -102,7 +102,7 @@ fn noise_has_the_declared_covariance() {
                     let deviation = |k: usize| factor * variances[k];
                     let found = deltas.iter().map(|d| d[i] * d[j]).sum::<f64>() / n;
                     let expected = if i == j { deviation(i).powi(2) } else { 0.0 };
-                    // Five standard errors.
+                    // The bound is five standard errors.
                     let error = if i == j { 2.0_f64 } else { 1.0 };
                     let bound = 5.0 * (error / n).sqrt() * deviation(i) * deviation(j);
                     assert!(
@@ -214,7 +214,7 @@ fn steps_use_the_gradients_accumulated_since_the_last_step() {
     on_each(repeatable(), |subject| {
         for (all, sh_rest, loss_terms) in cases {
             let longest = Cadence { all, sh_rest };
-            // One case changes its cadence and stays below the declared one.
+            // In one case the cadence changes, with intervals below the declared ones.
             let cadence_at = |step: u32| match all {
                 20 if step < 5 => Cadence { all: 1, sh_rest: 2 },
                 20 => Cadence { all: 2, sh_rest: 3 },
@@ -295,7 +295,7 @@ fn masks_follow_their_gradient_and_hide_gaussians() {
                 let first_hat = *first / (1.0 - 0.9_f64.powi(age));
                 let second_hat = *second / (1.0 - 0.999_f64.powi(age));
                 *m -= 0.02 * first_hat / second_hat.sqrt();
-                // A hundredth of a step.
+                // The tolerance is a hundredth of a step.
                 let off = (found[row] - sigmoid(*m)).abs();
                 assert!(off < 0.01 * 0.02, "step {number}, row {row}: {} {m}", found[row]);
                 let is_transparent = after.opacity_logits[row] < -9.0;

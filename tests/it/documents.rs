@@ -9,7 +9,7 @@ const FOLDERS: [&str; 10] = [
     ".cargo", ".ci", ".github", "benches", "docs", "policies", "scenegen", "shaders", "src",
     "tests",
 ];
-/// Generated from the options of a run: neither counted nor searched.
+/// Generated from the options of a run, so neither counted nor searched.
 const GENERATED: &str = "docs/options.md";
 /// Documents about the code, in which a name that ends in a slash must be a folder.
 const ABOUT_CODE: [&str; 3] = ["ARCHITECTURE.md", "CONTRIBUTING.md", "docs/numerics.md"];
@@ -17,7 +17,7 @@ const ABOUT_CODE: [&str; 3] = ["ARCHITECTURE.md", "CONTRIBUTING.md", "docs/numer
 const CODE: [&str; 4] = [".rs", ".wgsl", ".py", ".sh"];
 /// Files whose words count as existing names.
 const WORDS_FROM: [&str; 6] = [".rs", ".wgsl", ".py", ".sh", ".js", ".toml"];
-/// This file, whose examples do not exist.
+/// This file, which must not count as a source of names: its examples name things that do not exist.
 const THIS: &str = "tests/it/documents.rs";
 /// Parts that mark a name as a placeholder.
 const PLACEHOLDERS: [&str; 4] = ["NAME", "FORMAT", "*", "…"];
@@ -290,7 +290,7 @@ fn missing_names_are_detected() {
     }
 }
 
-/// A study is a table below its question, its conclusion and its command. Some document must link it.
+/// A study is a table below its question, its conclusion and its command. At least one document must link it.
 #[test]
 fn studies_are_complete_and_linked() {
     let tree = Tree::of_project();

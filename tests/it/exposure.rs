@@ -28,7 +28,7 @@ struct Scene {
     target: Image8,
 }
 
-/// Gaussians that leave much of the background visible, optionally with a transparent photograph.
+/// Gaussians that leave much of the background visible. The photograph may be partly transparent.
 fn scene(with_alpha: bool) -> Scene {
     let camera = scenes::camera(37, 29, 61);
     let model = normalised(scenes::cloud(14, 1, &camera, 62));

@@ -2,8 +2,8 @@
 //! of each extreme.
 //!
 //! Backends are compared with the float64 reference, which `central.rs` checks by central differences.
-//! `docs/studies/selftest.tsv` lists all tolerances. Pixels near a threshold of the renderer are compared differently
-//! (see `compare.rs`). `properties.rs` tests properties of arbitrary scenes.
+//! `docs/studies/selftest.tsv` lists all tolerances. Pixels near a threshold of the renderer get a wider tolerance (see
+//! `compare.rs`). `properties.rs` tests properties of arbitrary scenes.
 //!
 //! | extreme | tested in |
 //! |---|---|
@@ -69,7 +69,7 @@ fn every_case_passes_on_the_native_backend() {
 /// accumulation by atomics.
 #[test]
 #[ignore = "takes minutes: run by .ci/run"]
-fn every_case_passes_with_other_instructions_and_on_every_device() {
+fn every_case_passes_with_other_instruction_sets_and_on_every_device() {
     for subject in others().iter().filter(|subject| subject.is_deterministic()) {
         check(subject, &SLOW);
     }

@@ -1,4 +1,4 @@
-//! Frozen rows: steps and plans never change a bit of them, and they need no memory for training.
+//! Frozen rows: steps and plans never change a bit of their parameters, and they need no memory for training.
 
 use densify::core::budget::RowBudget;
 use densify::core::camera::Camera;
@@ -21,7 +21,7 @@ fn view() -> Camera {
     scenes::camera(41, 33, 81)
 }
 
-/// Includes quaternions of any length, and sizes and opacities beyond the range to which steps confine them.
+/// Includes quaternions of any length, and sizes and opacities outside the range to which training steps clamp them.
 fn model() -> Gaussians {
     let mut model = scenes::cloud(ROWS, 1, &view(), 82);
     for row in [3, 18] {
@@ -113,11 +113,11 @@ fn frozen_rows_never_change() {
     });
 }
 
-/// Other rows, their moments, ages, masks and signals change as if no row were frozen. The moments, ages, masks and
-/// signals of frozen rows stay 0.
+/// Other rows, their moments, ages and signals change as if no row were frozen. The moments, ages and signals of frozen
+/// rows stay 0.
 #[test]
 fn other_rows_train_as_usual() {
-    // Loss terms are averaged over the rows that train.
+    // Loss terms and masks are off: they are averaged over the rows that train, so freezing rows changes them.
     let needs = Needs { loss_terms: LossTerms::default(), noise: None, mask: None, ..all_needs() };
     // Some rows are invisible and do not decay.
     let mut model = model();
@@ -149,8 +149,8 @@ fn other_rows_train_as_usual() {
             // Arrays of missing SH bands are empty.
             if free.shape[0] == ROWS && !free_rows.is_empty() {
                 assert!(free_rows[FROZEN..] == frozen_rows[FROZEN..], "{}", free.name);
-                let rests = |row: &Vec<u32>| row.iter().all(|value| *value == 0);
-                assert!(frozen_rows[..FROZEN].iter().all(rests), "{}", free.name);
+                let is_zero = |row: &Vec<u32>| row.iter().all(|value| *value == 0);
+                assert!(frozen_rows[..FROZEN].iter().all(is_zero), "{}", free.name);
             }
         }
     });
@@ -175,15 +175,16 @@ fn frozen_rows_have_no_memory_for_training() {
             .ledger()
             .total()
     };
-    // Degree 1 has 23 parameters, each with two moments and an accumulated gradient. In addition: two ages, two signal
-    // sums, and a mask with two moments.
+    // f32 numbers per row: two moments and a summed gradient for each of the 23 parameters of degree 1, two signal
+    // sums, and a mask with two moments. The two ages are added below: two bytes each, or one word on a GPU.
     let numbers = 3 * 23 + 2 + 3;
     let native = |frozen: usize| total(&Subject::NATIVE, frozen);
     assert_eq!(native(0) - native(TASK), (TASK * (4 * numbers + 2 * 2)) as u64);
     assert_eq!(native(TASK), native(FROZEN), "memory is saved for whole tasks only");
     on_each(all(), |subject| {
         let Subject::Gpu(_) = subject else { return };
-        // Three times the padding of the geometry, and the gradient of a row in the current view.
+        // In addition: three times the padding of the geometry, the word of ages, and the gradient of a row in the
+        // current view.
         let bytes = 4 * (numbers + 3 + 1 + 20);
         let padding = 16 * 16;
         let saved = total(subject, 0) - total(subject, FROZEN);

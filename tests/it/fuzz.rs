@@ -137,7 +137,7 @@ fn damaged_files_never_cause_a_panic() {
     assert!(failures.is_empty(), "these cause a panic: {failures:#?}");
 }
 
-/// A new format fails here until it has a corpus.
+/// This test fails for a new format until there is a corpus for it.
 #[test]
 fn formats_and_corpora_correspond() {
     let names: Vec<&str> = targets().iter().map(|target| target.name).collect();

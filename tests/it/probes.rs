@@ -17,7 +17,7 @@ use crate::photographs::Photographs;
 use crate::subject::{devices, make_with, saved, storages};
 
 const ROWS: usize = 60;
-/// Probes are measured at step 100, and at step 200 also without the rows of lowest weight.
+/// The PSNR is measured at steps 100 and 200, at step 200 also with the rows of lowest weight hidden.
 const ITERATIONS: u32 = 250;
 const MEASURED_AT: u32 = 200;
 
@@ -63,7 +63,7 @@ fn bits(backend: Box<dyn Backend>, dataset: &Dataset, measures: bool) -> (Gaussi
     };
     let views = DatasetViews::new(dataset.train.clone(), 1 << 20, 1);
     let trainer = Trainer::new(views, backend, ("idle", Box::new(Idle)), scene, options);
-    let mut trainer = trainer.expect("they agree");
+    let mut trainer = trainer.expect("consistent options");
     trainer = trainer.with_auto_choices(AutoChoices { rows: measures, ..AutoChoices::default() });
     for _ in 0..MEASURED_AT {
         trainer.step().expect("a small image is rendered");
@@ -77,7 +77,7 @@ fn bits(backend: Box<dyn Backend>, dataset: &Dataset, measures: bool) -> (Gaussi
 }
 
 #[test]
-fn measuring_changes_no_bit() {
+fn measuring_does_not_change_the_run() {
     let photographs = Photographs::colmap_text();
     let dataset = Dataset::load(photographs.path(), &LoadOptions::default()).expect("a dataset");
     let (model, _) = initialise(&dataset.points, ROWS, 1, 7).expect("points to start from");

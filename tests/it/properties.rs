@@ -57,7 +57,7 @@ fn render(
     backend.render(camera, background, model.sh_degree).expect("a small image is rendered")
 }
 
-/// Depths as backends compute them. Rows of equal depth are blended in row order.
+/// The sorted depths. Rows of equal depth are blended in row order.
 fn depths(model: &Gaussians, camera: &Camera) -> Vec<f64> {
     let depth = |mean: &[f32; 3]| camera.project(mean.map(f64::from).into()).1;
     let mut depths: Vec<f64> = model.means.iter().map(depth).collect();

@@ -12,7 +12,7 @@ use crate::subject::{make, make_with, on_each, repeatable, step_input, storages}
 /// The row to poison in tests of a single row.
 const POISONED: usize = 11;
 
-/// The kind of the number in slot `slot` of a row that is not finite.
+/// The expected finding for a row whose parameter number `slot` is not finite.
 fn unsound(row: usize, slot: usize) -> NonFinite {
     let array = match slot {
         0..3 => ModelArray::Means,
@@ -34,7 +34,7 @@ fn every_non_finite_parameter_is_found(subject: &Subject, storage: Storage) {
     assert!(audit(&model).is_empty());
     for value in POISON {
         let mut poisoned = model.clone();
-        // Too large for f16, but finite, so not a reason for removal.
+        // Too large for f16, but finite, so it must not be reported.
         *slot_mut(&mut poisoned, SLOTS + 1, 20) = -1e30;
         (0..SLOTS).for_each(|slot| *slot_mut(&mut poisoned, slot, slot) = value);
         let expected: Vec<NonFinite> = (0..SLOTS).map(|slot| unsound(slot, slot)).collect();

@@ -12,10 +12,10 @@ use densify::core::camera::Camera;
 use densify::core::gaussians::Gaussians;
 use densify::selftest::{Differentiable, Setup, Subject, scenes};
 
-/// Steps before saving. With accumulation, no update is due and all classes have pending gradients.
+/// Steps before saving. With accumulation, no update is due at this step, so all classes have pending gradients.
 const BEFORE: u32 = 7;
 
-/// All signals and gradients accumulated over several steps.
+/// All signals except `Mask`, and gradients that are summed over several steps.
 fn with_accumulation() -> Needs {
     let signals = Signal::ALL.into_iter().filter(|signal| *signal != Signal::Mask).collect();
     Needs {
@@ -97,7 +97,7 @@ fn a_restored_backend_continues_identically() {
     let model = scenes::cloud(200, 3, &camera, 52);
     let with_accumulation: fn() -> Needs = with_accumulation;
     let stored = storages().map(|storage| (Subject::NATIVE, (storage, 0, with_accumulation)));
-    // Frozen rows: one task of the native backend and part of another.
+    // 141 frozen rows are one task of the native backend and part of another.
     let all = repeatable().into_iter().flat_map(|subject| {
         let setups = [(0, with_accumulation), (141, with_masks)];
         setups.map(|(frozen, needs)| (subject.clone(), (Storage::default(), frozen, needs)))

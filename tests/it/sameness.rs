@@ -1,5 +1,5 @@
-//! Bit-exactness of deterministic backends: results do not depend on threads, the room for tile lists and records, or
-//! earlier runs. `properties` covers row order and hidden rows. Accumulation by atomics stays close to these results.
+//! Bit-exactness of deterministic backends: results do not depend on threads, on the room for tile lists and gradient
+//! records, or on earlier runs. `properties` covers row order and hidden rows. Atomic accumulation gives close results.
 
 use densify::core::camera::Camera;
 use densify::core::gaussians::Gaussians;
@@ -102,7 +102,7 @@ fn bands_change_nothing() {
     }
 }
 
-/// Records that do not fit are processed in parts: within a band and within a tile.
+/// If there is room for fewer gradient records than entries, a band or even a tile is processed in parts.
 #[test]
 fn room_for_records_changes_nothing() {
     let camera = scenes::camera(140, 120, 32);
@@ -141,7 +141,7 @@ fn running_twice_changes_nothing() {
     }
 }
 
-/// With room for few records, the records of removed rows must not be mistaken for those of remaining rows.
+/// With room for few gradient records, those of removed rows must not be mistaken for those of remaining rows.
 #[test]
 fn removed_rows_leave_no_records() {
     let camera = scenes::camera(64, 48, 11);
@@ -160,7 +160,7 @@ fn removed_rows_leave_no_records() {
     assert!(with(200) == with(1 << 20));
 }
 
-/// Sums start at 0 with every pass, continue over bands, and restart if a pass is repeated with more bands.
+/// Gradient sums start at 0 in each pass, continue over its bands, and restart if a pass is repeated with more bands.
 #[test]
 fn atomic_accumulation_matches_slots_at_any_cap() {
     let camera = scenes::camera(70, 90, 32);

@@ -1,5 +1,5 @@
-//! Blending limits: backends with non-default limits are compared with the reference under the same limits, forward and
-//! backward.
+//! Blending thresholds (`Shortcuts`): backends with non-default thresholds are compared with the reference under
+//! the same thresholds, in the forward and the backward pass.
 
 use densify::core::camera::Camera;
 use densify::core::gaussians::Gaussians;
@@ -13,7 +13,7 @@ use densify::selftest::{Setup, scenes};
 /// Tolerance of gradients relative to the largest of their class.
 const GRADIENT: f64 = 1e-4;
 
-/// Overlapping translucent Gaussians, at which many pixels stop blending early.
+/// Overlapping translucent Gaussians, so that blending stops early in many pixels.
 fn scene() -> (Gaussians, Camera) {
     let camera = scenes::camera(52, 41, 5);
     let mut model = scenes::cloud(160, 1, &camera, 8);
@@ -40,9 +40,9 @@ fn truth(
 }
 
 #[test]
-fn blending_limits_apply_to_both_passes() {
+fn blending_thresholds_apply_to_the_forward_and_backward_pass() {
     let (model, camera) = scene();
-    let mut table = Table::new("limits of blending");
+    let mut table = Table::new("blending thresholds");
     let standard = truth(&model, &camera, &Rules::STANDARD).0;
     for (alpha_min, transmittance_min) in
         [(1.0 / 255.0, 1e-4), (1.0 / 1024.0, 1e-5), (1.0 / 32.0, 1e-4), (1.0 / 255.0, 1e-2)]
@@ -55,7 +55,7 @@ fn blending_limits_apply_to_both_passes() {
         };
         let (image, gradient, upstream) = truth(&model, &camera, &rules);
         let is_standard = shortcuts == Shortcuts::default();
-        assert_eq!(image.rgb == standard.rgb, is_standard, "the limits have no effect");
+        assert_eq!(image.rgb == standard.rgb, is_standard, "the thresholds have no effect");
         let upstream = scenes::narrowed(&upstream);
         for subject in all() {
             let mut backend = make_with(&subject, &model, Setup { shortcuts, ..Setup::default() });
@@ -63,11 +63,11 @@ fn blending_limits_apply_to_both_passes() {
             let (rendering, measured) = outcome.expect("a small image is rendered");
             let name = subject.name();
             let case = format!("{name}, {alpha_min:.4}, {transmittance_min:e}");
-            // A threshold decided differently may change the result by the faintest splat.
+            // One renderer only may blend a splat close to a threshold, which changes the pixel by about its alpha.
             let step = 1.5 * f64::from(alpha_min.max(transmittance_min).max(1.0 / 255.0));
-            let limits = Limits { step, ..Limits::CPU };
-            let outcome = compare_images(&rendering.rgb, &image.rgb, &image.boundary, limits);
-            table.image(&case, "rgb", outcome, limits);
+            let tolerances = Limits { step, ..Limits::CPU };
+            let outcome = compare_images(&rendering.rgb, &image.rgb, &image.boundary, tolerances);
+            table.image(&case, "rgb", outcome, tolerances);
             for name in CLASSES {
                 let error = relative_error(class(&measured, name), gradient.class(name));
                 table.check(&case, name, error, GRADIENT);

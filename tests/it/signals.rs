@@ -98,7 +98,7 @@ fn norm(values: impl IntoIterator<Item = f64>) -> f64 {
     values.into_iter().map(|v| v * v).sum::<f64>().sqrt()
 }
 
-/// Contribution of one view to a signal. From `full_depth` on, views have full weight. Shape: [rows].
+/// Contribution of one view to a signal. Rows at least `full_depth` away count fully, nearer ones less. Shape: [rows].
 fn contribution(
     signal: Signal,
     (gradient, errors, dominated): &(Gradient, Vec<f64>, Vec<f64>),
@@ -125,11 +125,11 @@ fn contribution(
                 Signal::WeightMax => s.max_weight,
                 Signal::WeightSum => s.sum_weight,
                 Signal::PixelCount => f64::from(s.pixels),
-                // The default score is the same.
+                // The default error score is the weighted error.
                 Signal::WeightedError | Signal::ErrorScore => error,
                 Signal::WeightMaxRoot => s.max_weight.sqrt(),
                 Signal::Support => f64::from(u8::from(s.max_weight >= f64::from(SUPPORT_WEIGHT))),
-                // Minima are compared as inverses.
+                // Minima are compared as reciprocals.
                 Signal::DepthMin => seen / depth,
                 Signal::PixelSizeMin => seen * focal / depth,
                 Signal::DominantPixels => dominated,
@@ -191,8 +191,8 @@ fn every_signal_matches_in_any_combination() {
     let mut of_first = depths(&views.cameras[0]);
     of_first.sort_by(f64::total_cmp);
     let middle = of_first[of_first.len() / 2] as f32;
-    // Each signal alone, with the free ones, and with all others, because backends store only requested signals. Also
-    // with reduced weights of near views, for screen and colour gradients only.
+    // Each signal is requested alone, with those that need no pixel sums, and with all others, because backends store
+    // only requested signals. All are also requested with a reduced weight of near rows.
     let mut requests =
         vec![(base.clone(), 0.0), (everything.clone(), 0.0), (everything.clone(), middle)];
     for &signal in &everything {
@@ -308,7 +308,7 @@ fn error_scores_match_their_definition() {
             }
             let error = relative_error(&columns[0], &expected);
             let case = format!("{score:?}");
-            // The exponent multiplies the relative inaccuracy of the error.
+            // Raising the error to a power multiplies its relative error by the exponent.
             let tolerance = tolerance(&subject) * f64::from(score.power);
             table.check(&case, "ErrorScore", error, tolerance);
         }
@@ -335,7 +335,7 @@ fn the_largest_weight_covers_the_previous_epoch() {
     }
 }
 
-/// Bit for bit, for all kinds of storage and for rows moved by an edit.
+/// They agree bit for bit, for all kinds of storage and also for rows that an edit has moved.
 #[test]
 fn attribute_signals_equal_the_parameters() {
     let views = views();
@@ -375,7 +375,7 @@ fn attribute_signals_equal_the_parameters() {
 /// Signals are returned in the buffer of gradient sums. Neither the return of the buffer nor the number of columns may
 /// affect later steps or images.
 #[test]
-fn lending_buffers_for_signals_changes_nothing() {
+fn reading_signals_does_not_affect_later_steps_or_images() {
     let views = views();
     let declared = SignalSet::from([Signal::ScreenGradient, Signal::WeightMax]);
     let present = declared.with(Signal::Age).with(Signal::ScaleMax);

@@ -31,9 +31,11 @@ use crate::subject::{make_with, normalised, on_each, repeatable};
 const STEP: u32 = 3;
 /// Displacement of rows outside the box.
 const SHIFT: f32 = 0.25;
-/// A quarter turn about the first axis and two offspring along the second axis.
+/// Offspring half a standard deviation to either side along the second axis.
 const HALVES: Placement = Placement::Axes([0.0, 0.5, 0.0]);
+/// Offspring half as long along the second axis.
 const HALVED: ScaleRule = ScaleRule::Axes([1.0, 0.5, 1.0]);
+/// A quarter turn about the first axis.
 const QUARTER: [f32; 4] = [1.0, 1.0, 0.0, 0.0];
 
 /// Rows in the box x > `left` are split in two; the others move along x and are tinted by their mean error.
@@ -98,7 +100,7 @@ fn policy_conforms() {
     check_policy(&entry).unwrap_or_else(|report| panic!("{report}"));
 }
 
-/// One view.
+/// A dataset of one view.
 struct One(Camera, SharedImage);
 
 impl ViewSource for One {

@@ -1,5 +1,5 @@
-//! Training quality with parameters and moments in fewer bits. Related tests: `sameness` for reproducibility, `resuming`
-//! for checkpoints, `quarantine` for non-finite values, and `cli/memory.rs` for memory.
+//! Training quality if parameters and moments are stored in fewer bits. Related tests: `sameness` for reproducibility,
+//! `resuming` for checkpoints, `quarantine` for non-finite values, and `cli/memory.rs` for memory.
 
 use densify::render::Storage;
 use densify::selftest::{Setup, Subject, scenes};

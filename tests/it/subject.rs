@@ -135,8 +135,8 @@ pub(crate) fn make_with(
     subject.backend_with(model, setup).expect("a small model fits")
 }
 
-/// The proptest configuration of a backend: `PROPTEST_CASES` or `default` cases; an eighth on devices, because software
-/// drivers take forty times as long.
+/// The proptest configuration of a backend: `PROPTEST_CASES` or `default` cases, and an eighth of that on devices,
+/// because software drivers take forty times as long.
 pub(crate) fn cases_on(subject: &Subject, default: u32) -> ProptestConfig {
     let base = ProptestConfig { failure_persistence: None, ..ProptestConfig::default() };
     let is_set = std::env::var_os("PROPTEST_CASES").is_some();
@@ -177,7 +177,7 @@ pub(crate) fn normalised(mut model: Gaussians) -> Gaussians {
     model
 }
 
-/// A distant camera facing away, which sees nothing of the view of `camera`.
+/// A distant camera that faces away from the scene of `camera` and sees none of its Gaussians.
 pub(crate) fn turned_away(camera: &Camera) -> Camera {
     let turn = DMat3::from_diagonal(DVec3::new(-1.0, 1.0, -1.0));
     let translation = turn * camera.translation - DVec3::new(0.0, 0.0, 1000.0);

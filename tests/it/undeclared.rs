@@ -27,7 +27,7 @@ fn undeclared_features_need_no_memory() {
         needs(&[Signal::DominantPixels]),
         needs(&[Signal::ErrorScore]),
     ];
-    // Edges need sums in addition to those of errors.
+    // Weighting by edges needs additional sums.
     let with_edges = Needs { error_score: edges, ..needs(&[Signal::ErrorScore]) };
     let promise = |device: Option<&GpuDevice>, needs: &Needs| {
         let needs = needs.clone();

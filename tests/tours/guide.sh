@@ -1,4 +1,4 @@
-# Functions shared by the tours, which run the commands of a document's section as they are written.
+# Functions shared by the tours. A tour runs the commands in a section of a document as they are written.
 
 fail() { printf 'error: %s\n' "$*" >&2; exit 1; }
 

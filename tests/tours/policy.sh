@@ -11,9 +11,9 @@ CARGO_TARGET_DIR="$(realpath -m "${CARGO_TARGET_DIR:-$root/target}")/tours"
 export CARGO_TARGET_DIR
 
 cd "$folder"
-# The recipe is changed in two ways: paths lead to this checkout, and its Cargo.lock is copied, since other versions are
-# not available without a network. The lock is copied again for the trainer, which is added later: `cargo test` removes
-# unused dependencies from it.
+# The recipe is changed in two ways: paths lead to this checkout, and this checkout's Cargo.lock is copied, since other
+# versions are not available without a network. It is copied again before each `cargo add`, because `cargo test` removes
+# unused dependencies from the lock file.
 lock="cp '$root/Cargo.lock' ."
 recipe "$root/CONTRIBUTING.md" 'A policy' |
     sed "s|\.\./densify|$root|g; s|^cd my_policy\$|&; $lock|; s|^cargo add |$lock; &|" >recipe.sh

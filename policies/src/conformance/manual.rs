@@ -23,7 +23,9 @@ pub fn check_manual(entry: &PolicyEntry) -> Result<(), Report> {
     for (name, default) in &entry.parameters() {
         match rows.iter().find(|row| row[0] == name) {
             None => wrong.push(format!("`{name}` is missing")),
-            Some(row) if row.len() != 5 => wrong.push(format!("`{name}` has {} cells", row.len())),
+            Some(row) if row.len() != 5 => {
+                wrong.push(format!("the row of `{name}` has {} cells instead of 5", row.len()));
+            }
             Some(row) => {
                 if !equals(&parse_value(row[1]), default) {
                     wrong.push(format!("`{name}` has the default {default}, not {}", row[1]));
@@ -50,8 +52,8 @@ fn equals(documented: &Value, default: &Value) -> bool {
     }
 }
 
-/// Builds the policy with values at the ends of the documented range and beyond them. Reports the first
-/// value that is not accepted or refused as documented.
+/// Builds the policy with values at the ends of the documented range and beyond them. Reports the first value that is
+/// refused although the range includes it, or accepted although it does not.
 fn check_range(entry: &PolicyEntry, name: &str, default: &Value, range: &str) -> Option<String> {
     let Some((inside, outside)) = boundary_values(range, default) else {
         return Some(format!("`{name}` has the range `{range}`, which is not in a known form"));

@@ -53,7 +53,8 @@ pub enum Check {
     ReadsOnlyDeclared,
     /// It requests auxiliary views only if its needs say what to measure there.
     RequestsConsistently,
-    /// It rewrites, turns or scales by axis only if its needs declare detailed edits.
+    /// It rewrites rows, rotates children, or sets their scales or changes them separately for each axis, only if
+    /// its needs declare [detailed edits](crate::policy::Needs::detailed_edits).
     DeclaresEdits,
     /// Every number in its needs is in its range, and at no step is its cadence longer or its resolution
     /// lower than declared.
@@ -82,7 +83,9 @@ impl fmt::Display for Check {
         f.write_str(match self {
             Self::Builds => "can be built from its defaults",
             Self::ReadsOnlyDeclared => "reads only what it declares",
-            Self::RequestsConsistently => "requests views together with what is measured in them",
+            Self::RequestsConsistently => {
+                "requests auxiliary views only if it declares what to measure in them"
+            }
             Self::DeclaresEdits => "declares detailed edits",
             Self::DeclaresValidNumbers => "declares valid numbers",
             Self::NeverFails => "plans without error for any input",
@@ -110,7 +113,7 @@ impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "policy {} does not conform:", self.policy)?;
         for (check, how) in &self.failures {
-            write!(f, "\n- failed: it {check}; {how}")?;
+            write!(f, "\n- fails the check \"{check}\": {how}")?;
         }
         Ok(())
     }
@@ -161,7 +164,7 @@ pub fn check_policy_with(entry: &PolicyEntry, set: &Table) -> Result<(), Report>
         }
         if !edits && report.failures.is_empty() {
             let how = "no plan of any run changed a row, although models had up to 5,000 rows and room \
-                       to grow; set parameters by which it acts, with check_policy_with";
+                       to grow; use check_policy_with to set parameters with which the policy acts";
             report.add(Check::Edits, how.to_owned());
         }
     }

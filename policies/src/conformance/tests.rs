@@ -319,10 +319,9 @@ fn every_fault_is_found() {
 #[test]
 fn a_report_names_the_policy_and_the_step() {
     let report = report(Fault::ReadsUndeclared).unwrap_err().to_string();
-    assert!(
-        report
-            .starts_with("policy `faulty` (tests.rs:1) does not conform:\n- failed: it reads only")
-    );
+    assert!(report.starts_with(
+        "policy `faulty` (tests.rs:1) does not conform:\n- fails the check \"reads only"
+    ));
     assert!(report.contains("an empty model") && report.contains("step 5"), "{report}");
     assert!(report.contains("ScreenGradientAbs"), "{report}");
 }
@@ -388,7 +387,7 @@ fn manuals_are_checked() {
     let message = "`threshold` has the default 0.0, not 0.1, `ghost` is not a parameter";
     assert_eq!(wrong, Err(message.to_owned()));
     let short = manual(with("//! | threshold | 0 | meaning |\n"));
-    assert_eq!(short, Err("`threshold` has 3 cells".to_owned()));
+    assert_eq!(short, Err("the row of `threshold` has 3 cells instead of 5".to_owned()));
     let range = |range| manual(with(&format!("//! | threshold | 0 | {range} | | meaning |\n")));
     assert_eq!([range("0 to 1"), range(">= 0"), range("")], [Ok(()), Ok(()), Ok(())]);
     for (wrong, value) in [

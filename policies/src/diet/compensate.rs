@@ -14,7 +14,8 @@ impl Diet {
         if every == 0 || from >= until {
             return None;
         }
-        // The number of pixels that one interval collects if the model is at the budget, but at most the budget.
+        // The number of pixels collected in one interval by a model that fills the budget; never more than the budget's
+        // number of rows.
         let steps = every.min(until - from) as usize;
         let per_step = (scene.budget / self.params.rows_per_candidate as usize).max(1);
         let capacity = steps.saturating_mul(per_step).min(scene.budget).max(1);

@@ -88,8 +88,9 @@
 //! - `nms`: non-maximum suppression; only pixels with the largest error of their 3 × 3 neighbourhood count.
 //! - `newborn_size`: the standard deviation of an inserted Gaussian.
 //!   - `pixel`: `size_pixels` times the width of the pixel at that depth.
-//!   - `code`: (geometric mean of the largest standard deviations of all Gaussians)². The code squares the
-//!     mean of each axis; only the largest is available here. Depends on the unit of length.
+//!   - `code`: the square of the geometric mean, over all Gaussians, of each one's largest standard
+//!     deviation. The code does this for each axis; only the longest axis is available here. The result
+//!     depends on the unit of length.
 //!
 //! ## Parameters
 //!

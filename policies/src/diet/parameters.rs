@@ -56,9 +56,10 @@ pub struct DietParams {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Growth {
-    /// As many as have room, plus this event's part of `rho` · budget, for which other rows are evicted.
+    /// As many as there are free rows in the budget, plus this event's share of `rho` · budget, for which other
+    /// rows are evicted.
     Turnover,
-    /// As many as have room, plus one for each row that can be evicted.
+    /// As many as there are free rows in the budget, plus one for each row that can be evicted.
     All,
 }
 
@@ -112,7 +113,7 @@ pub enum Importance {
 pub enum NewbornSize {
     /// `size_pixels` pixels at the row's depth.
     Pixel,
-    /// The square of the geometric mean of all sizes.
+    /// As in the published code: the squared geometric mean of the largest scales of all rows.
     Code,
 }
 

@@ -30,8 +30,8 @@ fn gradient_sums(rows: usize, listed: &[usize]) -> Vec<f32> {
     sums
 }
 
-// `rho` and `rho_c` apply to the whole run: growth at step 600 is the first of 94 growth steps, and the
-// insertion at step 10,500 the first of 9.
+// `rho` and `rho_c` are totals for the whole run, divided equally among its events: step 600 is the first of 94
+// growth steps, and step 10,500 the first of 9 insertions.
 
 fn candidate(error: f32, pixel_size: f32) -> Candidate {
     Candidate { position: [error, 0.0, 0.0], colour: [error, 0.5, 1.0], pixel_size, error }
@@ -47,13 +47,14 @@ fn the_gradient_mixes_screen_and_colour() {
     assert_eq!(done.cloned, [3, 1, 0]);
     assert!(!done.ops.reset_signals.is_empty() && !done.ops.reset_candidates);
     assert_eq!(done.ops.cause, "grow");
-    // Without colour: twice 4e-4, 2e-4, 2e-4, 0, 1.9e-4.
+    // Without colour, the screen gradient counts twice: 8.005e-4, 4.005e-4, 4.005e-4, 0, 3.8e-4.
     assert_eq!(run(&event, "tau = 4e-4\nmixed_gradient = false").cloned, [0, 1, 2]);
 }
 
 #[test]
 fn at_the_budget_the_least_important_are_replaced() {
-    // 9.4 / 94 is a tenth of the budget of 20: two rows, the least important of those that are not candidates.
+    // `rho` 9.4 over 94 events is a tenth of the budget per event: two of 20 rows, the least important of those that
+    // are not candidates.
     let event =
         event(600, 20, 20).with(Signal::ScreenGradient, &gradient_sums(20, &[0, 2, 9, 12, 19]));
     let done = run(&event, "rho = 9.4");
@@ -114,17 +115,18 @@ fn huge_rows_are_kept_unless_a_size_limit_is_set() {
     let kept = run(&late, "");
     assert_eq!((kept.pruned, kept.split), (vec![], vec![2, 3]));
     // With a limit they are pruned after step 3000, at growth steps only.
-    let named = "max_scale = 0.1";
-    let early = run(&event, named);
+    let limited = "max_scale = 0.1";
+    let early = run(&event, limited);
     assert_eq!((early.pruned, early.split), (vec![], vec![2, 3]));
-    let late = run(&late, named);
+    let late = run(&late, limited);
     assert_eq!((late.pruned, late.split), (vec![1, 3], vec![2]));
-    assert!(run(&Event { step: 3150, ..event }, named).ops.is_empty());
+    assert!(run(&Event { step: 3150, ..event }, limited).ops.is_empty());
 }
 
 #[test]
 fn importance_may_be_measured_in_fresh_views() {
-    // With `epochs`, rows 0 and 1 are least important; in the fresh views row 4, a candidate, then 6 and 2.
+    // By default (`importance = "epochs"`), rows 0 and 1 are least important; in the fresh views row 4, a candidate,
+    // then 6 and 2.
     let fresh = [0.3, 0.4, 0.02, 0.5, 0.0, 0.6, 0.01, 0.7];
     let mut event = event(600, 8, 8).with(Signal::ScreenGradient, &gradient_sums(8, &[4, 7]));
     // Each row is in one of two views.
@@ -177,7 +179,7 @@ fn new_rows_are_protected_for_an_epoch() {
 }
 
 #[test]
-fn if_all_rows_are_new_the_oldest_are_evicted() {
+fn if_too_few_rows_are_old_the_oldest_new_ones_are_evicted() {
     // One row is old and three must go: the old one first, then the two of age 60 by importance.
     let event = event(600, 6, 6)
         .with(Signal::ScreenGradient, &gradient_sums(6, &[5]))
@@ -228,9 +230,9 @@ fn large_rows_split_and_small_ones_are_cloned() {
         .with(Signal::ScreenGradient, &[2.0, 1.0])
         .with(Signal::ScaleMax, &[0.101, 0.1]);
     let offspring = |set: &str| -> Vec<Offspring> { run(&event, set).offspring() };
-    let [original, clone] = offspring("split = \"random\"")[..] else { panic!("two families") };
-    assert_eq!((original, clone), (split_by(1.6), clone_at([0.0; 3])));
-    assert_eq!(original.scale, ScaleRule::Uniform(0.625));
+    let [random_split, clone] = offspring("split = \"random\"")[..] else { panic!("two families") };
+    assert_eq!((random_split, clone), (split_by(1.6), clone_at([0.0; 3])));
+    assert_eq!(random_split.scale, ScaleRule::Uniform(0.625));
     let [halves, clone] = offspring("")[..] else { panic!("two families") };
     assert_eq!((halves, clone), (split_long_axis(0.45, 0.6), clone_at([0.0; 3])));
     let other = offspring("split_share = 0.3\nchild_opacity = 0.8")[0];
@@ -314,7 +316,7 @@ fn no_row_is_evicted_for_a_pixel_without_a_point() {
 }
 
 #[test]
-fn code_size_is_the_squared_geometric_mean() {
+fn with_newborn_size_code_the_size_is_the_squared_geometric_mean_of_the_scales() {
     let mut event = event(10_500, 3, 40).with(Signal::ScaleMax, &[0.1, 0.4, f32::NAN]);
     event.candidates = vec![candidate(0.1, 7.0)];
     let scale = |set| run(&event, &format!("rho_c = 1\n{set}")).ops.seeds[0].1.scales[0];

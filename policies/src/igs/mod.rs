@@ -40,11 +40,11 @@
 //!
 //! ## Differences from the published code
 //!
-//! - **`sums`.** The published values of `sum` and `sum_more`, 5 and 20, give 1,500 + 375 optimiser steps in the second
-//!   half of 30,000 iterations, but 350 + 88 in a run of 7,000. By default (`"scaled"`) both are multiplied by
-//!   iterations / 30,000 and rounded, at least 1, so that a short run has about as many optimiser steps as a
-//!   full one if it has enough iterations; a run of 7,000 uses 1 and 5. `"fixed"` uses the same values in a
-//!   run of any length.
+//! - **`sums`.** The published values of `sum` and `sum_more`, 5 and 20, give 1,500 + 375 optimiser steps
+//!   in the second half of 30,000 iterations, but 350 + 88 in a run of 7,000. By default (`"scaled"`) both are
+//!   multiplied by iterations / 30,000 and rounded, at least 1, so that a short run has about as many optimiser
+//!   steps as a full one if it has enough iterations; a run of 7,000 uses 1 and 5. `"fixed"` uses the same values
+//!   in a run of any length.
 //! - The published code splits, then prunes. A plan has one edit per Gaussian: if a Gaussian is drawn and
 //!   its children would be pruned in the same event, it is pruned itself. The result is the same.
 //! - `recover` counts optimiser steps and does not scale with the length of the run, but is at most half
@@ -105,7 +105,7 @@ use crate::sample::weighted;
 
 mod parameters;
 
-pub use parameters::{IgsParams, Sums};
+pub use parameters::{IgsParams, SumScaling};
 
 crate::register_policy!(
     "igs",

@@ -39,7 +39,7 @@ pub struct IgsParams {
     pub sum: u32,
     pub sum_more_from: u32,
     pub sum_more: u32,
-    pub sums: Sums,
+    pub sums: SumScaling,
     pub mean_start: f64,
     pub mean_end: f64,
     pub sh_rest: f64,
@@ -48,7 +48,7 @@ pub struct IgsParams {
 /// The effect of the run's length on `sum` and `sum_more`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Sums {
+pub enum SumScaling {
     /// Scaled with the run's length, so that the number of optimiser steps stays the same.
     Scaled,
     /// Used as given in a run of any length.
@@ -82,7 +82,7 @@ impl Default for IgsParams {
             sum: 5,
             sum_more_from: 22_500,
             sum_more: 20,
-            sums: Sums::Scaled,
+            sums: SumScaling::Scaled,
             mean_start: 4e-5,
             mean_end: 2e-6,
             sh_rest: 2.5e-4,
@@ -94,8 +94,8 @@ impl IgsParams {
     /// `sum` and `sum_more` for a run of `iterations`.
     pub(super) fn scaled_sums(&self, iterations: u32) -> [u32; 2] {
         [self.sum, self.sum_more].map(|sum| match self.sums {
-            Sums::Fixed => sum,
-            Sums::Scaled => {
+            SumScaling::Fixed => sum,
+            SumScaling::Scaled => {
                 let exact =
                     f64::from(sum) * f64::from(iterations) / f64::from(REFERENCE_ITERATIONS);
                 exact.round().clamp(1.0, f64::from(MAX_SUM)) as u32

@@ -171,7 +171,7 @@ fn opaque_rows_are_drawn_more_often() {
 }
 
 #[test]
-fn opacity_and_scale_formulas_cap_the_number_of_copies() {
+fn the_number_of_copies_is_capped_within_the_formulas_only() {
     let mut opacity = [0.001; 80];
     opacity[7] = 0.5;
     let family = run(&event(&opacity, 80), "").offspring()[0];

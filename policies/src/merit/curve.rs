@@ -6,17 +6,19 @@ use crate::policy::{PolicyResult, Signal, Snapshot};
 use crate::quota::event_quota;
 
 impl Merit {
-    /// Number of rows that the curve allows in addition to those not pruned.
-    pub(super) fn missing(&self, step: u32, start: usize, plan: &EditPlan) -> usize {
+    /// Number of rows by which the model, after this plan's pruning, falls short of the curve, which starts at
+    /// `initial_rows`.
+    pub(super) fn shortfall(&self, step: u32, initial_rows: usize, plan: &EditPlan) -> usize {
         let MeritParams { grow_from: from, curve_until: until, .. } = self.params;
         let length = f64::from(until.saturating_sub(from).max(1));
         let passed = (f64::from(step.saturating_sub(from)) / length).min(1.0);
-        let room = plan.budget().saturating_sub(start) as f64;
-        let allowed = start.min(plan.budget()) + (room * passed.sqrt()).floor() as usize;
+        let room = plan.budget().saturating_sub(initial_rows) as f64;
+        let allowed = initial_rows.min(plan.budget()) + (room * passed.sqrt()).floor() as usize;
         allowed.saturating_sub(plan.rows() - plan.pruned())
     }
 
-    /// Number of rows that this event replaces.
+    /// Number of rows that this event replaces: those less important than `replaceable` times the median importance,
+    /// within the limits of `rho` and `most_rho`.
     pub(super) fn turnover(&self, now: &Snapshot<'_>, plan: &EditPlan) -> PolicyResult<usize> {
         let MeritParams { rho, most_rho, replaceable, .. } = self.params;
         let part = |share| event_quota(share, self.events, now.step, plan.budget());

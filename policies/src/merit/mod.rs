@@ -154,7 +154,7 @@ impl DensityPolicy for Merit {
         plan.prune_all(dead);
 
         let births =
-            self.missing(now.step, now.scene.initial_rows, plan) + self.turnover(now, plan)?;
+            self.shortfall(now.step, now.scene.initial_rows, plan) + self.turnover(now, plan)?;
         let parents = self.parents(now, plan, births)?;
         let without_room = parents.len().saturating_sub(plan.room());
         self.prune_least(now, plan, &parents, without_room)?;

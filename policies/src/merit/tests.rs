@@ -30,7 +30,7 @@ fn the_curve_fills_the_budget_without_a_threshold() {
     assert_eq!((done.ops.rows_after, done.pruned.len()), (100, 0));
     assert_eq!(done.cloned[..3], [59, 58, 57]);
     assert_eq!((done.ops.cause.as_str(), done.ops.reset_signals.is_empty()), ("grow", false));
-    // After its end the curve allows the whole budget, but each row has at most one child in an event.
+    // After the curve has ended, it allows the whole budget, but each row has at most one child per event.
     let late = Event { step: 8600, ..event.clone() };
     assert_eq!(run(&late, "curve_until = 8500").ops.rows_after, 120);
     let low = Event { budget: 99, ..late };
@@ -107,7 +107,7 @@ fn the_least_important_rows_that_are_not_parents_are_pruned() {
 
 #[test]
 fn parents_are_ranked_by_mean_screen_and_colour_gradients() {
-    // g: 4/4 + 30·0; 1/2 + 30·0.04/2; 8/2; 0.
+    // g: 4/4 + 30·0; 1.5/3 + 30·0.06/3; 8/2; 0.
     let event = event(8600, 4, 5)
         .with(Signal::VisibleCount, &[4.0, 3.0, 2.0, 9.0])
         .with(Signal::ScreenGradientAbs, &[4.0, 1.5, 8.0, 0.0])

@@ -15,17 +15,17 @@
 //! the largest share first while there is room.
 //!
 //! **Re-initialisation** at the steps `first_reinit_at` and `second_reinit_at`: the whole model is replaced by
-//! surface points, at most `reinit_share` of the budget, drawn in all training views in proportion to their
-//! opacity. The size of a new Gaussian is the root mean square distance to its three nearest neighbours, its
-//! opacity `restart_opacity`. Nothing else grows at these steps.
+//! surface points, at most `reinit_share` of the budget, drawn from the pixels of all training views in
+//! proportion to accumulated alpha. The size of a new Gaussian is the root mean square distance to its three
+//! nearest neighbours, its opacity `restart_opacity`. Nothing else grows at these steps.
 //!
-//! **Sampling** at step `sample_at`. A Gaussian's importance is the sum of its blend weights α·T over all
-//! pixels of all training views, or 0 if it dominates no pixel. (`importance` = "density" divides the sum of
-//! each view by the number of pixels, as published for outdoor scenes.) Of the Gaussians with an importance
-//! above 0, the share `sample_share` is drawn without replacement, in proportion to importance, and all others
-//! are pruned. The remaining ones restart: round, sized by the distance to their three nearest neighbours, with
-//! opacity `restart_opacity`, without view-dependent colour and without optimiser moments. (Published shares:
-//! 0.5, and 0.3 for Tanks & Temples and Deep Blending.)
+//! **Sampling** at step `sample_at`. A Gaussian's importance is the sum of its blend weights α·T over all pixels
+//! of all training views, or 0 if it dominates no pixel. (`importance` = "density" divides each view's sum by the
+//! number of pixels that the Gaussian is blended into there, as published for outdoor scenes.) Of the Gaussians
+//! with an importance above 0, the share `sample_share` is drawn without replacement, in proportion to
+//! importance, and all others are pruned. The remaining ones restart: round, sized by the distance to their three
+//! nearest neighbours, with opacity `restart_opacity`, without view-dependent colour and without optimiser
+//! moments. (Published shares: 0.5, and 0.3 for Tanks & Temples and Deep Blending.)
 //!
 //! **Cut** at step `cut_at`: the most important Gaussians, which together have the share `cut_mass` of the
 //! total importance, are kept and the others pruned.
@@ -77,7 +77,7 @@
 //! | reinit_share | 0.8 | 0 to 1, 0 excluded | budget | maximum number of Gaussians after a re-initialisation |
 //! | sample_at | 15000 | >= 0 | step | sampling; 0: none |
 //! | sample_share | 0.5 | 0 to 1 | Gaussians | share of the Gaussians with an importance above 0 that is kept |
-//! | importance | "sum" | sum, density | | sum of blend weights, or the sum per pixel of each view |
+//! | importance | "sum" | sum, density | | sum of blend weights in a view, or their mean over the Gaussian's pixels |
 //! | restart_opacity | 0.1 | 0 to 1, both excluded | | opacity of new and restarted Gaussians |
 //! | cut_at | 20000 | >= 0 | step | the cut; 0: none |
 //! | cut_mass | 0.99 | 0 to 1 | importance | share of the importance that is kept |
@@ -176,8 +176,9 @@ impl DensityPolicy for MiniSplatting {
     }
 
     fn aux_views(&self, step: u32, _rows: usize, _budget: usize) -> u32 {
-        let samples = is_at(self.params.sample_at, step) || is_at(self.params.cut_at, step);
-        if self.is_reinit(step) || samples { u32::MAX } else { 0 }
+        let measures_importance =
+            is_at(self.params.sample_at, step) || is_at(self.params.cut_at, step);
+        if self.is_reinit(step) || measures_importance { u32::MAX } else { 0 }
     }
 
     fn observe(&mut self, view: &AuxView<'_>) -> PolicyResult {

@@ -36,7 +36,7 @@ pub struct MiniSplattingParams {
 pub enum Importance {
     /// Sum of the blend weights.
     Sum,
-    /// Sum of the blend weights, divided by the number of pixels.
+    /// Mean of the blend weights over the row's pixels.
     Density,
 }
 

@@ -54,7 +54,7 @@ pub struct Needs {
     pub start: StartRule,
     /// True if plans hold edits that take more memory: rows rewritten in place
     /// ([`EditPlan::update`](crate::plan::EditPlan::update)), and children that are rotated or whose scales
-    /// are set or change by axis ([`ScaleRule::Axes`](crate::plan::ScaleRule::Axes)).
+    /// are set or change separately for each axis ([`ScaleRule::Axes`](crate::plan::ScaleRule::Axes)).
     pub detailed_edits: bool,
 }
 

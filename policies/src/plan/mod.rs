@@ -32,8 +32,8 @@ pub enum Refused {
     /// The edit needs [`Needs::detailed_edits`], or it is a decay of seen rows only and needs
     /// [`Signal::VisibleCount`].
     #[error(
-        "not declared: updates, scales by axis and rotations need `detailed_edits` in the policy's needs, \
-         and a decay of seen rows needs the signal `visible_count`"
+        "not declared: updates, rotations, and scales that are set or change separately for each axis need \
+         `detailed_edits` in the policy's needs, and a decay of seen rows needs the signal `visible_count`"
     )]
     Undeclared,
 }

@@ -3,7 +3,7 @@
 //! A policy decides which Gaussians are cloned, split, pruned or added. It declares the statistics
 //! it needs ([`Needs`]), and the backend accumulates only these. At the steps at which it
 //! [`is_due`](DensityPolicy::is_due) it reads a [`Snapshot`] and writes its edits into an
-//! [`EditPlan`]. It accesses neither parameters nor devices, so every policy runs unchanged on every
+//! [`EditPlan`]. It accesses neither the model's parameters nor devices, so every policy runs unchanged on every
 //! backend and can be tested without a renderer.
 
 use serde::{Deserialize, Serialize};
@@ -79,8 +79,8 @@ pub trait DensityPolicy: Send {
     /// [`PolicyError`] stops the run with the policy's name and the step; the plan is dropped.
     fn plan(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult;
 
-    /// The state that future decisions depend on, apart from the parameters. The default is for policies
-    /// without state.
+    /// The state that future decisions depend on, apart from the policy's own parameters. The default is for
+    /// policies without state.
     fn save(&self) -> PolicyState {
         PolicyState::Null
     }
@@ -106,7 +106,8 @@ pub type PolicyState = serde_json::Value;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SceneInfo {
     /// Size of the scene `[scene units]`, > 0: 1.1 times the largest distance of a training camera from the mean
-    /// of all cameras, or the substitute described at [`Signal::Position`]. Size thresholds are fractions of it.
+    /// of all cameras or, if all cameras coincide, the median distance of the points (see [`Signal::Position`]).
+    /// Size thresholds are fractions of it.
     pub extent: f32,
     /// Number of training views, >= 1; also the length of an epoch in steps.
     pub train_views: u32,
@@ -205,7 +206,7 @@ pub struct AuxView<'a> {
     pub loss: f32,
     /// The requested columns. Shape of each: `[rows]`.
     pub columns: &'a [(AuxColumn, Vec<f32>)],
-    /// Surface points, in the order in which their pixels were drawn. Their `error` is the
+    /// Surface points, in the order in which their pixels were sampled. Their `error` is the
     /// accumulated alpha of the pixel.
     pub points: &'a [Candidate],
 }

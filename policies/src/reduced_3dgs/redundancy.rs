@@ -31,9 +31,10 @@ pub(super) struct Ellipsoids<'a> {
 }
 
 impl Ellipsoids<'_> {
-    /// The redundancy of each row: the smallest count of the spheres that it intersects, its own included. The
-    /// count of a row's sphere is 1 plus the number of those of the row's `neighbours` nearest neighbours whose
-    /// ellipsoids intersect the sphere. 1 for a row that intersects none or is not finite. Shape: `[rows]`.
+    /// The redundancy of each row. A row with a pixel size has a sphere, whose count is 1 plus the number of those
+    /// of its `neighbours` nearest neighbours whose ellipsoids intersect the sphere. The redundancy of a row is the
+    /// smallest count among its own sphere and the spheres that its ellipsoid intersects; 1 if there is no such
+    /// sphere, or if the row is not finite. Shape: `[rows]`.
     pub(super) fn redundancy(&self, neighbours: usize) -> Vec<f32> {
         let half_axes: Vec<[f64; 3]> = self.log_scales.iter().map(|s| self.half_axes(*s)).collect();
         let is_valid = |&row: &u32| {
@@ -232,7 +233,8 @@ mod tests {
     #[test]
     fn redundancy_is_the_smallest_count_of_the_intersected_spheres() {
         // Balls of radius 1 at 0, 2, 4 and 20, with spheres of radius 1.1: the surface of the next ball is 1 away
-        // from each mean. Counts: 2, 3, 2, 1. The second row is in the sphere of the first.
+        // from each mean. Counts: 2, 3, 2, 1. The second row also
+        // intersects the first row's sphere, so its redundancy is 2.
         let pixel = 1.1 / 0.866_025_4;
         let xs = [0.0, 2.0, 4.0, 20.0];
         assert_eq!(redundancy(&xs, &[[1.0; 3]; 4], &[pixel; 4], 30), [2.0, 2.0, 2.0, 1.0]);

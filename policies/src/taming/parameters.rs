@@ -45,7 +45,8 @@ pub struct TamingParams {
 pub enum PruneDraw {
     /// Dead rows, by their own scores.
     Candidates,
-    /// All rows, by scores that belong to other rows; dead rows among those drawn are pruned.
+    /// All rows, as in the published code, which misaligns the scores: after splits, a row is drawn by the score of
+    /// another row. Of the rows drawn, only dead ones are pruned.
     Published,
 }
 

@@ -1,7 +1,7 @@
 //! The score of `taming`: the importance of a row in badly rendered views.
 //!
-//! The terms of the row itself (gradient, opacity, size) are the same in all views, so only their
-//! common factor is summed over views: Σ 50·L over those in which the row is visible.
+//! The terms of the row itself (gradient, opacity, size) are the same in all views, so only the factor
+//! they share, 50 times the loss L of a view, is summed over the views in which the row is visible: Σ 50·L.
 
 use super::TamingParams;
 use crate::policy::{AuxColumn, AuxView, PolicyResult, Signal, Snapshot};

@@ -165,7 +165,8 @@ impl DensityPolicy for Vanilla {
         if self.grow.is_due(now.step) {
             plan.cause("densify");
             self.densify(now, plan)?;
-            // Only the signals of growth: a policy that grows like this one may reset others at its own intervals.
+            // Only the signals of growth: a policy that reuses this growth may reset other signals at its own
+            // intervals.
             plan.reset(Reset::Only([Signal::VisibleCount, Signal::ScreenGradient].into()));
         }
         self.resets.plan(now.step, plan);

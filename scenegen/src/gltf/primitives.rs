@@ -68,7 +68,8 @@ impl Reader<'_> {
             None => (0..u32::try_from(count).unwrap_or(u32::MAX)).collect(),
         };
         if let Some(&index) = indices.iter().find(|&&i| i as usize >= count) {
-            return Err(self.fault(element, format!("index {index} of {count} vertices")));
+            let problem = format!("index {index} is out of range: there are {count} vertices");
+            return Err(self.fault(element, problem));
         }
         let triangles = triangles(mode, &indices);
         // All matrices, and how many make one pose: one for all vertices, or one for each vertex.
@@ -222,7 +223,8 @@ impl Reader<'_> {
                 for (number, weight) in weighted.filter(|(_, weight)| *weight != 0.0) {
                     let joint = joints.get(number as usize).filter(|_| number.fract() == 0.0);
                     let Some(joint) = joint else {
-                        let problem = format!("joint {number} of {}", joints.len());
+                        let count = joints.len();
+                        let problem = format!("there is no joint {number}: the skin has {count}");
                         return Err(self.fault(source.element, problem));
                     };
                     let weight = f64::from(weight);

@@ -350,7 +350,7 @@ fn skins_that_cannot_be_applied_are_refused() {
     };
     check("/nodes/0/skin", json!(1), "there is no skin 1");
     check("/skins/0/joints", json!([2, 3, 3]), "3 joints have 2 inverse bind matrices");
-    check("/skins/0/joints", json!([2]), "joint 1 of 1");
+    check("/skins/0/joints", json!([2]), "there is no joint 1: the skin has 1");
     check("/skins/0/joints", json!([2, 9]), "node 9, is not in the scene");
     check("/nodes/1/children", json!([]), "node 2, is not in the scene");
     check("/skins/0/inverseBindMatrices", json!(0), "accessor 0");

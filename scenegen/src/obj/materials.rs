@@ -53,12 +53,12 @@ impl Materials {
     pub(super) fn read_libraries(&mut self, s: Statement<'_>) -> Result<(), Error> {
         let element = format!("line {}: mtllib", s.line);
         // The statement may be one name with spaces, or several names.
-        let names: Vec<&str> = match self.folder.resolve(&element, &with_slashes(s.text)) {
+        let names: Vec<&str> = match self.resolve(&element, s.text) {
             Ok(path) if path.is_file() => vec![s.text],
             _ => s.words().collect(),
         };
         for name in names {
-            let path = self.folder.resolve(&element, &with_slashes(name))?;
+            let path = self.resolve(&element, name)?;
             if path.is_file() {
                 self.read(&path)?;
             } else {
@@ -67,6 +67,18 @@ impl Materials {
             }
         }
         Ok(())
+    }
+
+    /// The path of a file. Quotes around its name, which Metashape writes, are removed if no file has the quoted name.
+    fn resolve(&self, element: &str, name: &str) -> Result<PathBuf, Error> {
+        let name = with_slashes(name);
+        let path = self.folder.resolve(element, &name)?;
+        match name.strip_prefix('"').and_then(|name| name.strip_suffix('"')) {
+            Some(plain) if !plain.is_empty() && !path.is_file() => {
+                self.folder.resolve(element, plain)
+            }
+            _ => Ok(path),
+        }
     }
 
     /// Reads a library.
@@ -135,8 +147,8 @@ impl Materials {
             if shown == 0.0 {
                 let name = shortened(name);
                 self.model.notes.push(format!(
-                    "material {name}: Tr {tr} would hide it, but is what some programs write for opaque materials; it is \
-                     shown (d 0 hides a material)"
+                    "material {name} is shown: Tr {tr} means invisible, but some programs write it for opaque \
+                     materials; write `d 0` to hide the material"
                 ));
             }
             opacity = Some(Vec3::splat(if shown == 0.0 { 1.0 } else { shown }));
@@ -177,7 +189,7 @@ impl Materials {
     fn texture(&mut self, path: &Path, map: &Map, srgb: bool) -> Result<TextureRef, Error> {
         let library = path.file_name().unwrap_or_default().to_string_lossy();
         let element = format!("{library} line {}: texture", map.line);
-        let file = self.folder.resolve(&element, &map.file)?;
+        let file = self.resolve(&element, &map.file)?;
         let key = (file.clone(), srgb);
         let number = match self.textures.get(&key) {
             Some(&number) => number,

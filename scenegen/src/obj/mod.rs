@@ -206,7 +206,10 @@ impl Reader {
             *number = u32::try_from(found)
                 .ok()
                 .filter(|&found| (1..=count).contains(&(found as usize)))
-                .ok_or_else(|| statement.fault(format!("{what} index {value} of {count}")))?;
+                .ok_or_else(|| {
+                    let problem = format!("is out of range: the file has {count} so far");
+                    statement.fault(format!("{what} index {value} {problem}"))
+                })?;
         }
         if numbers[0] == 0 {
             return Err(statement.fault("a corner has no vertex index"));

@@ -124,7 +124,8 @@ fn corners_without_coordinates_get_placeholders() {
 }
 
 #[test]
-fn vertices_before_the_first_colour_are_white() {
+fn vertices_without_a_valid_colour_are_white() {
+    // The second vertex has a colour that is not finite; the colour of the third follows a weight.
     let text = "v 0 0 0\nv 1 0 0 0.5 -1 nan\nv 0 1 0 1 0.25 -1 0\nf 3 2 1\n";
     let model = loaded(text, &[]).expect("a triangle");
     let colours: Vec<_> = model.triangles[0].map(|i| model.colours[i as usize]).to_vec();
@@ -256,13 +257,13 @@ fn byte_order_marks_are_skipped() {
 fn indices_outside_the_file_are_refused_with_their_line() {
     let head = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvn 0 0 1\n";
     for (face, problem) in [
-        ("0 1 2", "vertex index 0 of 3"),
-        ("1 2 4", "vertex index 4 of 3"),
-        ("-4 1 2", "vertex index -4 of 3"),
-        ("1/0 2/1 3/1", "texture index 0 of 1"),
-        ("1/1 2/-2 3/1", "texture index -2 of 1"),
-        ("1//9223372036854775807 2//1 3//1", "normal index 9223372036854775807 of 1"),
-        ("1//-9223372036854775808 2//1 3//1", "normal index -9223372036854775808 of 1"),
+        ("0 1 2", "vertex index 0 is out of range"),
+        ("1 2 4", "vertex index 4 is out of range"),
+        ("-4 1 2", "vertex index -4 is out of range"),
+        ("1/0 2/1 3/1", "texture index 0 is out of range"),
+        ("1/1 2/-2 3/1", "texture index -2 is out of range"),
+        ("1//9223372036854775807 2//1 3//1", "normal index 9223372036854775807 is out of range"),
+        ("1//-9223372036854775808 2//1 3//1", "normal index -9223372036854775808 is out of range"),
         ("1 2 x", "\"x\" is not a vertex index"),
         ("/1 2 3", "a corner has no vertex index"),
     ] {
@@ -271,4 +272,34 @@ fn indices_outside_the_file_are_refused_with_their_line() {
         assert!(error.contains("line 6") && error.contains(problem), "{error}");
     }
     assert!(loaded(&format!("{head}f -3/-1/-1 -2/1/1 3/1/1/7 # fine\n"), &[]).is_ok());
+}
+
+/// Metashape writes quotes around names with spaces.
+#[test]
+fn quotes_around_names_are_removed() {
+    let mut png = Cursor::new(Vec::new());
+    let red = image::RgbImage::from_pixel(1, 1, [255, 0, 0].into());
+    red.write_to(&mut png, image::ImageFormat::Png).expect("png");
+    let png = png.into_inner();
+    let obj = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl m\nf 1/1 2/1 3/1\n";
+    for (library, texture) in
+        [("\"my scene.mtl\"", "my tex.png"), ("\"my scene.mtl\"", "\"my tex.png\"")]
+    {
+        let material = format!("newmtl m\nmap_Kd -s 1 1 1 {texture}\n");
+        let files = [("my scene.mtl", material.as_bytes()), ("my tex.png", &png[..])];
+        let model = loaded(&format!("mtllib {library}\n{obj}"), &files).expect("a triangle");
+        assert_eq!((model.notes.len(), model.textures.len()), (0, 1), "{:?}", model.notes);
+    }
+    let model = loaded(&format!("mtllib \"none.mtl\"\n{obj}"), &[]).expect("a triangle");
+    assert!(model.notes[0].contains("none.mtl"), "{:?}", model.notes);
+}
+
+/// A file whose own name has quotes takes precedence. Windows has no such names.
+#[cfg(unix)]
+#[test]
+fn names_may_have_quotes() {
+    let files = [("\"a.mtl\"", &b"newmtl quoted\n"[..]), ("a.mtl", &b"newmtl plain\n"[..])];
+    let obj = "mtllib \"a.mtl\"\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl quoted\nf 1 2 3\n";
+    let model = loaded(obj, &files).expect("a triangle");
+    assert_eq!(model.notes, Vec::<String>::new());
 }

@@ -50,10 +50,10 @@ pub struct InitPoints {
     pub positions: Vec<DVec3>,
     /// sRGB colours. Shape: `[points]`.
     pub colours: Vec<[u8; 3]>,
-    /// True surface points in world coordinates: `positions` before noise, and for outliers the points that
-    /// their features show. Shape: `[points]`.
+    /// The surface points that `positions` were before noise or, for outliers, before their displacement, in world
+    /// coordinates. Image features are projections of these. Shape: `[points]`.
     pub found_at: Vec<DVec3>,
-    /// Indices of the training views that see each true surface point and have the noisy point in front of their
+    /// Indices of the training views that see each point of `found_at` and have that of `positions` in front of their
     /// camera, ascending. Shape: `[points]`.
     pub seen_by: Vec<Vec<u32>>,
     /// Number of outliers.

@@ -43,14 +43,14 @@ impl Rig {
         let up = mean(&|camera| -camera.rotation.row(1)).normalize_or(-cameras[0].rotation.row(1));
         // Least squares: Σ (I − ffᵀ) (x − c) = 0. A small weight on the mean position keeps the system
         // solvable when all cameras look the same way.
-        let (mut matrix, mut right) = (DMat3::IDENTITY * 1e-9, centre * 1e-9);
+        let (mut matrix, mut rhs) = (DMat3::IDENTITY * 1e-9, centre * 1e-9);
         for camera in cameras {
             let f = camera.forward();
             let across = DMat3::IDENTITY - outer(f);
             matrix += across;
-            right += across * camera.centre();
+            rhs += across * camera.centre();
         }
-        let focus = matrix.inverse() * right;
+        let focus = matrix.inverse() * rhs;
         let ahead = |camera: &&Camera| (focus - camera.centre()).dot(camera.forward()) > 0.0;
         let looks_inward = 2 * cameras.iter().filter(ahead).count() > cameras.len();
         // In upright photographs the x axis is level; with the camera on its side, the y axis is.

@@ -1,7 +1,8 @@
 //! Datasets in ZIP archives, unpacked into a temporary folder that is removed with the dataset's last view.
 //!
 //! The readers of all formats then see a folder, from which photographs are decoded as fast as from any other. Archives
-//! are untrusted: no name leads out of the folder, no links are created, and the unpacked size is bounded before and during unpacking.
+//! are untrusted: no name leads out of the folder, no links are created, and the unpacked size is bounded before and
+//! during unpacking.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufReader, Read};
@@ -15,6 +16,7 @@ use zip::result::ZipError;
 use super::LoadError;
 use super::paths::{lexical_fault, relative};
 use super::{Dataset, LoadOptions, Note, View};
+use crate::models::folder_in_archive;
 use densify_core::files;
 use densify_core::memory::Bytes;
 
@@ -38,7 +40,11 @@ pub(super) struct Unpacked {
 
 /// Returns true if a file's contents are a complete ZIP archive other than a SOG model.
 pub fn is_archive(path: &Path) -> bool {
-    is_zip(path) && open(path).is_ok_and(|archive| archive.index_for_name("meta.json").is_none())
+    let is_model = |archive: &ZipArchive<BufReader<File>>| {
+        let names: Vec<&str> = archive.file_names().collect();
+        folder_in_archive(names.iter().copied()).is_some()
+    };
+    is_zip(path) && open(path).is_ok_and(|archive| !is_model(&archive))
 }
 
 /// Returns true if a file begins like a ZIP archive; the archive may still be damaged.
@@ -146,8 +152,8 @@ impl Unpacked {
 
     /// Replaces the temporary folder with the archive's name in a path.
     pub(super) fn shown(&self, path: &Path) -> PathBuf {
-        let rest =
-            path.strip_prefix(&self.folder).or_else(|_| path.strip_prefix(self.temporary.path()));
+        let rest = path.strip_prefix(&self.folder);
+        let rest = rest.or_else(|_| path.strip_prefix(self.temporary.path()));
         rest.map_or_else(|_| path.to_owned(), |rest| self.archive.join(rest))
     }
 }

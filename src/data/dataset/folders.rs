@@ -23,6 +23,8 @@ pub(super) struct Folders {
     pub(super) root: Root,
     /// The folder given by `--images`.
     pub(super) chosen: Option<Root>,
+    /// The names of the folders of masks, in order of precedence.
+    pub(super) mask_folders: Vec<String>,
     /// The folder `images_K` and K, if requested by `-r K` and present.
     reduced: Option<(Root, u32)>,
     /// True if names are relative to `images/`, as in COLMAP models, rather than to the dataset's folder.
@@ -60,7 +62,8 @@ impl Folders {
             }
             _ => None,
         };
-        Ok(Self { root: root.clone(), chosen, reduced, within_images })
+        let mask_folders = mask_files::folders(root.path());
+        Ok(Self { root: root.clone(), chosen, mask_folders, reduced, within_images })
     }
 
     /// The file of an image, if there is one.
@@ -190,7 +193,7 @@ impl Folders {
     }
 }
 
-/// Adds the names of the photographs in a folder and, if `is_deep`, in its subfolders. Masks and hidden files are left out.
+/// Adds the names of the photographs in a folder and, if `is_deep`, in its subfolders, without masks and hidden files.
 fn add_photographs(folder: &Path, inside: &str, is_deep: bool, names: &mut Vec<String>) {
     for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
         let file = entry.file_name();
@@ -204,7 +207,7 @@ fn add_photographs(folder: &Path, inside: &str, is_deep: bool, names: &mut Vec<S
             PHOTOGRAPHS.iter().any(|known| ending == *known)
         };
         if entry.file_type().is_ok_and(|kind| kind.is_dir()) {
-            if is_deep && !mask_files::FOLDERS.contains(&&*name) {
+            if is_deep && !mask_files::is_mask_folder(&name) {
                 add_photographs(&entry.path(), &format!("{path}/"), true, names);
             }
         } else if is_photograph() {

@@ -1,8 +1,8 @@
 //! nerfstudio's lists of the frames to train on, to validate with and to test on.
 //!
-//! Only the frames listed for training are trained on; without a list for training, all frames that no other list names.
-//! Test views are the frames listed for tests or, if there are none, those listed for validation. A frame listed for
-//! validation is trained on only if it is listed for training, too.
+//! Only the frames listed for training are trained on; without a list for training, all frames that no other list
+//! names. Test views are the frames listed for tests or, if there are none, those listed for validation. A frame listed
+//! for validation is trained on only if it is listed for training, too.
 
 use std::collections::HashMap;
 use std::path::PathBuf;
@@ -25,7 +25,7 @@ pub(super) struct FrameLists {
     unlisted: Vec<String>,
     /// Frames that are not used, because only the list for validation names them.
     validation: Vec<String>,
-    /// Frames that are both trained on and tested.
+    /// Frames that are both trained on and tested on.
     both: Vec<String>,
     /// Number of frames whose image exists.
     frames: usize,

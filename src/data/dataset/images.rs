@@ -132,7 +132,7 @@ impl ImageSource {
 
     /// Whether loaded images may have transparent pixels.
     pub(crate) fn may_be_transparent(&self) -> bool {
-        self.header.has_alpha || self.masks_become_transparent()
+        self.header.has_alpha || self.mask_becomes_transparency()
     }
 
     /// Whether loaded images have a mask: from a file, or of the field of view of the lens.
@@ -143,7 +143,7 @@ impl ImageSource {
     }
 
     /// Returns true if the mask becomes transparency.
-    fn masks_become_transparent(&self) -> bool {
+    fn mask_becomes_transparency(&self) -> bool {
         self.mask.as_ref().is_some_and(|mask| mask.mode == MaskMode::Background)
     }
 
@@ -257,6 +257,10 @@ fn header_of(path: &Path, file: &mut File) -> Result<ImageHeader, LoadError> {
         header => header,
     }
     .map_err(|problem| LoadError::image(path, problem))?;
+    if let Some(name) = transfer::high_range(Cursor::new(&start)) {
+        let problem = format!("its values are {name}, of high dynamic range");
+        return Err(LoadError::malformed(path, "cICP", problem, "convert the image to sRGB"));
+    }
     let pixels = u64::from(header.width) * u64::from(header.height);
     if pixels == 0 {
         return Err(LoadError::image(path, "it has no pixels"));

@@ -75,8 +75,24 @@ impl Mask {
     }
 }
 
-/// The values of a mask: its brightness, or its alpha channel if only that varies.
+/// The values of a mask. If none exceeds 1, the mask is one of 0 and 1, as arrays of truth values are often saved: 1 then
+/// counts as 255.
 fn values(mask: DynamicImage) -> GrayImage {
+    let mut values = match mask {
+        // Conversion to eight bits would turn 1 into 0.
+        DynamicImage::ImageLuma16(deep) if deep.iter().all(|&value| value <= 1) => {
+            GrayImage::from_fn(deep.width(), deep.height(), |x, y| [deep[(x, y)].0[0] as u8].into())
+        }
+        mask => brightness_or_alpha(mask),
+    };
+    if values.iter().all(|&value| value <= 1) {
+        values.iter_mut().for_each(|value| *value *= 255);
+    }
+    values
+}
+
+/// The brightness of a mask, or its alpha channel if only that varies.
+fn brightness_or_alpha(mask: DynamicImage) -> GrayImage {
     if !mask.color().has_alpha() {
         return mask.into_luma8();
     }
@@ -129,7 +145,7 @@ mod tests {
 
     /// Masked pixels and transparent pixels of the photograph are both transparent.
     #[test]
-    fn masks_of_background_become_transparency() {
+    fn in_background_mode_masked_pixels_are_transparent() {
         let folder = tempfile::tempdir().unwrap();
         let [path, plain, mask] = ["a.png", "b.png", "m.png"].map(|name| folder.path().join(name));
         let alpha = |x, _| image::Rgba([10_u8, 20, 30, if x == 0 { 102 } else { 255 }]);
@@ -162,6 +178,26 @@ mod tests {
         assert_eq!(read([[0, 0], [255, 255]]), [0, 255]);
         assert_eq!(read([[0, 255], [255, 0]]), [0, 255], "brightness");
         assert_eq!(read([[7, 255], [7, 255]]), [7, 7]);
+    }
+
+    /// 1 is full only if no value exceeds it.
+    #[test]
+    fn a_mask_may_consist_of_0_and_1() {
+        let read = |pixels: [u8; 3]| {
+            let image = GrayImage::from_fn(3, 1, |x, _| [pixels[x as usize]].into());
+            values(image.into()).into_raw()
+        };
+        assert_eq!(read([0, 1, 1]), [0, 255, 255]);
+        assert_eq!(read([1, 1, 1]), [255; 3]);
+        assert_eq!(read([0, 1, 2]), [0, 1, 2]);
+        assert_eq!(read([0, 0, 0]), [0; 3]);
+        let deep = |most: u16| {
+            let image = ImageBuffer::from_fn(2, 1, |x, _| image::Luma([x as u16 * most]));
+            values(image.into()).into_raw()
+        };
+        assert_eq!(deep(1), [0, 255]);
+        assert_eq!(deep(65_535), [0, 255]);
+        assert_eq!(deep(257), [0, 255], "1 in eight bits");
     }
 
     #[test]

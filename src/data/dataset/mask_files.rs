@@ -1,7 +1,7 @@
 //! Finds mask files by the names that programs give them.
 //!
-//! COLMAP's and nerfstudio's masks are in `masks/` and folders with similar names; RealityCapture's mask layers and
-//! instant-ngp's dynamic masks are beside the photographs.
+//! COLMAP's and nerfstudio's masks are in `masks/` and folders with similar names; RealityCapture's mask layers, 3DGRUT's
+//! masks and instant-ngp's dynamic masks are beside the photographs.
 
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
@@ -12,11 +12,13 @@ use super::paths::{DataPath, Root};
 
 /// Suffix of RealityCapture's mask layers.
 const LAYER: &str = ".mask.png";
+/// Suffix of 3DGRUT's masks.
+const BESIDE: &str = "_mask.png";
 /// Prefix of instant-ngp's dynamic masks.
 const DYNAMIC: &str = "dynamic_mask_";
 
-/// Folders of masks in the dataset, in order of precedence.
-pub(super) const FOLDERS: [&str; 4] = ["masks", "mask", "segmentation", "dynamic_masks"];
+/// Folders of masks in the dataset, in any case of letters, in order of precedence.
+const FOLDERS: [&str; 4] = ["masks", "mask", "segmentation", "dynamic_masks"];
 
 /// The file of a mask.
 #[derive(Debug, Clone)]
@@ -35,7 +37,28 @@ impl MaskFile {
 
 /// Returns true if a file beside photographs is the mask of a photograph.
 pub(super) fn is_mask(name: &OsStr) -> bool {
-    name.to_str().is_some_and(|name| name.ends_with(LAYER) || name.starts_with(DYNAMIC))
+    name.to_str().is_some_and(|name| {
+        [LAYER, BESIDE].iter().any(|suffix| name.ends_with(suffix)) || name.starts_with(DYNAMIC)
+    })
+}
+
+/// Returns true if masks are in folders of this name.
+pub(super) fn is_mask_folder(name: &str) -> bool {
+    FOLDERS.iter().any(|known| known.eq_ignore_ascii_case(name))
+}
+
+/// The names of a dataset's folders of masks, in order of precedence.
+pub(super) fn folders(dataset: &Path) -> Vec<String> {
+    let entries = dataset.read_dir().into_iter().flatten().flatten();
+    let names = entries.filter_map(|entry| entry.file_name().into_string().ok());
+    let mut found: Vec<String> =
+        names.filter(|name| is_mask_folder(name) && dataset.join(name).is_dir()).collect();
+    // Names in lower case first.
+    found.sort_by_cached_key(|name| {
+        let rank = FOLDERS.iter().position(|known| known.eq_ignore_ascii_case(name));
+        (rank, std::cmp::Reverse(name.clone()))
+    });
+    found
 }
 
 /// Note about a folder of masks, for datasets in which no photograph has a mask.
@@ -43,8 +66,8 @@ pub(super) fn unused_masks_note(dataset: &Path) -> Option<String> {
     let holds_files = |folder: &PathBuf| {
         folder.read_dir().is_ok_and(|mut entries| entries.any(|entry| entry.is_ok()))
     };
-    let all = FOLDERS.map(|name| dataset.join(name));
-    let folder = all.into_iter().chain([dataset.join("images/masks")]).find(holds_files)?;
+    let all = folders(dataset).into_iter().map(|name| dataset.join(name));
+    let folder = all.chain([dataset.join("images/masks")]).find(holds_files)?;
     Some(format!(
         "{} contains the mask of no photograph: masks belong in the dataset's folder `masks/`, in the same subfolders as \
          the photographs and named after them as NAME.EXT.png or NAME.png",
@@ -74,7 +97,7 @@ impl Folders {
             format!("{inside}{LAYER}"),
             renamed(LAYER),
         ];
-        for folder in FOLDERS.iter().filter(|folder| self.root.path().join(folder).is_dir()) {
+        for folder in &self.mask_folders {
             for name in &names {
                 if let Some(path) = at(&self.root, format!("{folder}/{name}"))? {
                     return Ok(Some(MaskFile::black_hides(path)));
@@ -86,6 +109,7 @@ impl Folders {
             for value in [
                 format!("{file}{LAYER}"),
                 format!("{stem}{LAYER}"),
+                format!("{stem}{BESIDE}"),
                 format!(".mask/{stem}.png"),
                 format!("{DYNAMIC}{stem}.png"),
             ] {

@@ -16,8 +16,8 @@ pub const EXTENT: f64 = 1.1;
 /// Cameras count as being at one place if their radius is below this fraction of their distance from the origin:
 /// the precision of f64 is 2.2e-16, and poses of other programs have a few digits less.
 const SAME_PLACE: f64 = 1e-12;
-/// Distance from the origin, in extents, beyond which f32 world coordinates are too coarse. At 1e4 they are rounded by up
-/// to 5e-4 extents: half a pixel, for a focal length of 1,500 px and a point 1.5 extents away.
+/// Distance from the origin, in extents, beyond which f32 world coordinates are too coarse. At 1e4 they are rounded by
+/// up to 5e-4 extents: half a pixel, for a focal length of 1,500 px and a point 1.5 extents away.
 const F32_OFFSET: f64 = 1e4;
 
 /// A camera is an outlier if its distance from the median position exceeds this many times the median of all these

@@ -44,8 +44,8 @@ pub enum Resolution {
     Width(u32),
 }
 
-/// Treatment of views whose camera is far from all others, mostly by an error of structure from motion. Such views never
-/// count for the extent of the scene.
+/// Treatment of views whose camera is far from all others, mostly by an error of structure from motion. Such views
+/// never count for the extent of the scene.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 pub enum FarCameras {

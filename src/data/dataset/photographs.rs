@@ -39,8 +39,9 @@ pub(super) fn photographs(
     options: &LoadOptions,
     notes: &mut Vec<Note>,
 ) -> Result<Vec<Photograph>, LoadError> {
-    let is_background = options.mask_mode == MaskMode::Background;
-    if (options.invert_masks || is_background) && frames.iter().all(|frame| frame.mask.is_none()) {
+    let masks_become_background = options.mask_mode == MaskMode::Background;
+    let needs_masks = options.invert_masks || masks_become_background;
+    if needs_masks && frames.iter().all(|frame| frame.mask.is_none()) {
         let listing = listing.to_owned();
         return Err(LoadError::NoMasks { listing, inverted: options.invert_masks });
     }
@@ -298,7 +299,8 @@ fn check_mask(mask: &Mask, found: ImageHeader, image: ImageHeader) -> Result<(),
 
 /// Returns true if a mask hides all of a view; `several` is true if its photograph has more than one view.
 fn is_hidden(view: &View, several: bool, mask: &GrayImage, lens: &Lens) -> bool {
-    /// Number of pixels along the longer side of a mask, up to a factor of 2, that are tested against each of several views.
+    /// Number of pixels along the longer side of a mask that are tested against each of several views; at most twice as
+    /// many are.
     const SAMPLED_SIDE: u32 = 512;
     let (width, height) = mask.dimensions();
     let stride = if several { (width.max(height) / SAMPLED_SIDE).max(1) } else { 1 } as usize;

@@ -69,7 +69,7 @@ pub(super) fn assemble(
     // Centres of the training cameras that are not outliers.
     let mut near = Vec::new();
     for (index, photograph) in photographs.into_iter().enumerate() {
-        // Photographs that are left out still count for the split, so that the others are split as if none were left out.
+        // Photographs that are left out count for the split, so that the others are split as if none were missing.
         if is_far[index] && options.far_cameras == FarCameras::LeaveOut {
             continue;
         }
@@ -93,7 +93,8 @@ pub(super) fn assemble(
     if train.is_empty() && test.is_empty() && !hidden_names.is_empty() {
         let ignored = if options.invert_masks { "white" } else { "black" };
         let problem = format!(
-            "no view is left to train on: masks hide every pixel of all {} views ({ignored} is ignored)",
+            "no view is left to train on: masks hide every pixel of all {} views ({ignored} is \
+             ignored)",
             hidden_names.len()
         );
         let remedy = LoadRemedy::InvertMasks(!options.invert_masks);
@@ -145,7 +146,8 @@ fn far_note(names: &[&str], treatment: FarCameras) -> Option<Note> {
     Some(match treatment {
         FarCameras::LeaveOut => Note::FarCamerasLeftOut { count, names: shown },
         FarCameras::Keep => Note::Text(format!(
-            "{count} cameras far from all others are kept, but do not count for the extent of the scene: {shown}"
+            "{count} cameras far from all others are kept, but do not count for the extent of the \
+             scene: {shown}"
         )),
     })
 }

@@ -5,8 +5,8 @@
 //! down and the top of its image is north (+y); heading turns it clockwise about the vertical, pitch raises its view
 //! towards the horizon, roll tilts it (Capturing Reality, *Registration export and camera orientations*). `f` is the
 //! focal length for an image whose longer side is 36 mm; `px` and `py` are the offset of the principal point from the
-//! centre, in units of the longer side. The distortion is Brown's: k1 to k4 of r² to r⁸; t1 and t2 are OpenCV's p2 and p1, the order
-//! in which RealityCapture's own OpenCV export writes them.
+//! centre, in units of the longer side. The distortion is Brown's: k1 to k4 of r² to r⁸; t1 and t2 are OpenCV's p2 and
+//! p1, the order in which RealityCapture's own OpenCV export writes them.
 //!
 //! The table is parsed here rather than by a CSV crate: the export writes plain commas and decimal points whatever the
 //! system's language, and names without quotes. Quotes are accepted nevertheless.
@@ -156,7 +156,9 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
     }
     let points_file = usual_points(root, path, &mut notes)?;
     let points = points_file.as_deref().map(crate::points::read_points).transpose()?;
-    let (points, listing) = (points.unwrap_or_default(), path.to_owned());
+    let (points, note) = points.unwrap_or_default();
+    notes.extend(note);
+    let listing = path.to_owned();
     let (notes, rest) = (texts(notes), Scene::default());
     Ok(Some(Scene { listing, frames, first_missing, points, points_file, notes, ..rest }))
 }

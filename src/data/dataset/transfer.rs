@@ -9,13 +9,40 @@ use image::{DynamicImage, ImageBuffer, Pixel};
 const SIGNATURE: [u8; 8] = *b"\x89PNG\r\n\x1a\n";
 /// Code of linear values in `cICP` (ITU-T H.273, table 3).
 const LINEAR: u8 = 8;
+/// Codes and names of the values of high dynamic range.
+const HIGH_RANGE: [(u8, &str); 2] = [(16, "PQ"), (18, "HLG")];
 /// The exponent in `gAMA` that programs write for sRGB.
 const SRGB: f64 = 1.0 / 2.2;
 /// Relative tolerance of this exponent, because programs round it.
 const TOLERANCE: f64 = 0.05;
 
+/// The transfer function of a PNG's values.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Transfer {
+    /// The values are light to the power of this exponent.
+    Exponent(f64),
+    /// High dynamic range with this name.
+    HighRange(&'static str),
+}
+
 /// The exponent of a PNG's values, which are light to the power of the exponent; `None` if they are sRGB or in doubt.
-pub(super) fn exponent(mut input: impl BufRead + Seek) -> Option<f64> {
+pub(super) fn exponent(input: impl BufRead + Seek) -> Option<f64> {
+    match stated(input)? {
+        Transfer::Exponent(exponent) => Some(exponent),
+        Transfer::HighRange(_) => None,
+    }
+}
+
+/// The name of the transfer function if the values have a high dynamic range, which no factor converts to sRGB.
+pub(super) fn high_range(input: impl BufRead + Seek) -> Option<&'static str> {
+    match stated(input)? {
+        Transfer::HighRange(name) => Some(name),
+        Transfer::Exponent(_) => None,
+    }
+}
+
+/// The transfer function that a PNG states, unless it is that of sRGB or in doubt.
+fn stated(mut input: impl BufRead + Seek) -> Option<Transfer> {
     let bytes = |input: &mut dyn Read| {
         let mut bytes = [0; 8];
         input.read_exact(&mut bytes).ok().map(|()| bytes)
@@ -23,7 +50,7 @@ pub(super) fn exponent(mut input: impl BufRead + Seek) -> Option<f64> {
     if bytes(&mut input)? != SIGNATURE {
         return None;
     }
-    let (mut stated, mut is_known) = (None, false);
+    let (mut gamma, mut is_known) = (None, false);
     loop {
         let [a, b, c, d, kind @ ..] = bytes(&mut input)?;
         let mut rest = i64::from(u32::from_be_bytes([a, b, c, d])) + 4;
@@ -31,9 +58,11 @@ pub(super) fn exponent(mut input: impl BufRead + Seek) -> Option<f64> {
             b"cICP" | b"gAMA" if rest == 8 => {
                 let [a, b, c, d, ..] = bytes(&mut input)?;
                 if &kind == b"cICP" {
-                    return (b == LINEAR).then_some(1.0);
+                    let high = HIGH_RANGE.iter().find(|(code, _)| *code == b);
+                    let linear = (b == LINEAR).then_some(Transfer::Exponent(1.0));
+                    return high.map(|&(_, name)| Transfer::HighRange(name)).or(linear);
                 }
-                stated = Some(f64::from(u32::from_be_bytes([a, b, c, d])) / 1e5);
+                gamma = Some(f64::from(u32::from_be_bytes([a, b, c, d])) / 1e5);
                 rest = 0;
             }
             b"iCCP" | b"sRGB" => is_known = true,
@@ -43,7 +72,7 @@ pub(super) fn exponent(mut input: impl BufRead + Seek) -> Option<f64> {
         input.seek_relative(rest).ok()?;
     }
     let is_other = |exponent: &f64| *exponent > 0.0 && (exponent / SRGB - 1.0).abs() > TOLERANCE;
-    stated.filter(|exponent| !is_known && is_other(exponent))
+    gamma.filter(|exponent| !is_known && is_other(exponent)).map(Transfer::Exponent)
 }
 
 /// Converts values that are light to the power of `exponent` to sRGB.
@@ -88,7 +117,7 @@ mod tests {
 
     use image::{ImageFormat, Luma, Rgb, Rgba};
 
-    use super::super::images::ImageSource;
+    use super::super::images::{ImageSource, read_header};
     use super::*;
 
     type Chunk<'a> = (&'a [u8; 4], &'a [u8]);
@@ -144,6 +173,18 @@ mod tests {
             std::fs::write(&path, png(&image, &[(b"gAMA", &linear)])).unwrap();
             let loaded = ImageSource::whole(path.clone()).load().unwrap();
             assert_eq!((&loaded.rgb[..3], loaded.alpha), (&[137; 3][..], alpha));
+        }
+    }
+
+    #[test]
+    fn values_of_high_dynamic_range_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.png");
+        let rgb = ImageBuffer::from_pixel(2, 2, Rgb([64_u8, 0, 255])).into();
+        for (code, name) in [(16, "PQ"), (18, "HLG")] {
+            std::fs::write(&path, png(&rgb, &[(b"cICP", &[9, code, 0, 1])])).unwrap();
+            let message = read_header(&path).unwrap_err().to_string();
+            assert!(message.contains(&format!("a.png: cICP: its values are {name}")), "{message}");
         }
     }
 

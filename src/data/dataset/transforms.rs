@@ -22,7 +22,7 @@ use super::mask_files::MaskFile;
 use super::paths::{DataPath, Root, relative};
 use super::pose::{check_lens, checked_pose};
 use super::prepare::texts;
-use super::{Frame, LoadError, LoadOptions, Scene, Split, colmap};
+use super::{Frame, LoadError, LoadOptions, Note, Scene, Split, colmap};
 
 /// The pair of files that defines its own test split.
 pub(super) const SPLIT_FORMAT: DatasetFormat = DatasetFormat {
@@ -191,7 +191,9 @@ fn read(
     if declared != DeclaredSplit::Test
         && let Some(file) = &scene.points_file
     {
-        scene.points = crate::points::read_points(file)?;
+        let (points, note) = crate::points::read_points(file)?;
+        scene.points = points;
+        scene.notes.extend(note.map(Note::Text));
     }
     Ok(scene)
 }
@@ -304,8 +306,8 @@ impl<'a> Fields<'a> {
                 root.existing_on_any_system(named)?.ok_or_else(missing)?,
             ));
         }
-        // The path is from another machine: its suffixes are looked for in the dataset's folder, then the mask is looked
-        // for in the usual places. The bare file name does not count, as a photograph may have the same name.
+        // The path is from another machine: its suffixes are looked for in the dataset's folder, then the usual places
+        // of masks are searched. The bare file name does not count, as a photograph may have the same name.
         for value in named.suffixes()?.filter(|end| end.contains('/')) {
             if let Some(found) = root.existing(DataPath { value: &value, ..named })? {
                 return Ok(MaskFile::black_hides(found));

@@ -7,7 +7,7 @@ use super::View;
 use densify_core::camera::Camera;
 use densify_core::image::Window;
 
-/// Smallest side of a window `[px]`: with a smaller one, most rendered pixels would lie outside.
+/// Smallest side of a window `[px]`: around a smaller window, most pixels of the rendered tiles would lie outside.
 const MIN_SIDE: u32 = 32;
 
 /// A rectangular part of an image. Coordinates are fractions of its width and height, in `[0, 1]`.

@@ -1,5 +1,5 @@
-//! Measures what a file in a quantised format changes of a model. A range that ends, a step that is too coarse, a codebook
-//! that an outlier spoils: whatever the reason, it shows in the file as it is read back.
+//! Measures how much a quantised format changes a model, by reading the file back. This finds changes of every cause: a
+//! limited range, a step that is too coarse, a codebook that an outlier spoils.
 
 use std::fmt;
 
@@ -8,36 +8,36 @@ use densify_core::gaussians::{Gaussians, sigmoid};
 use densify_core::numbers::gaussians;
 use densify_core::sh;
 
-/// The quantities of a Gaussian, and from where on a change counts. Rounding stays below: half a step of SPZ's scales, the
-/// coarsest, is 3 %.
+/// The quantities of a Gaussian, and the limits above which changes count. Rounding stays below these limits: half a
+/// step of SPZ's scales, the coarsest quantity, is 3 %.
 const QUANTITIES: [(&str, &str, f64); 4] = [
     ("positions", "by more than half the Gaussian's size", 0.5),
     ("scales", "by more than 10 %", 0.1),
     ("opacities", "by more than 10 %", 0.1),
     ("colours", "by more than 10 % of white", 0.1),
 ];
-/// Share of what shows from which on changes are noted.
+/// Share of the visible area, estimated by [`weight`], from which on changes are noted.
 const NOTED: f64 = 0.01;
-/// Share of what shows from which on a format does not fit.
+/// Share of the visible area from which on a format is unfit for the model.
 const UNFIT: f64 = 0.25;
 /// Directions in which colours are compared; a band has at most seven coefficients.
 const DIRECTIONS: usize = 8;
 
-/// What a file changes of a model.
+/// The changes to a model in a file.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Changes {
-    /// Number of Gaussians with a changed quantity, and their share of what shows, by [`QUANTITIES`].
+    /// Number of Gaussians with a changed quantity, and their share of the visible area, by [`QUANTITIES`].
     by_quantity: [(usize, f64); 4],
-    /// Share of what shows that is changed in any quantity, 0..=1.
+    /// Share of the visible area that is changed in any quantity, 0..=1.
     share: f64,
 }
 
 impl Changes {
-    /// Compares the model with the file that was made of it, which has its rows in this order.
+    /// Compares the model with what was read back from its file, which has the model's rows in this order.
     pub(super) fn measure(model: &Gaussians, order: &[usize], found: &Gaussians) -> Self {
         let mut changes = Self::default();
         if found.len() < model.len() {
-            // The rest was not finite when read back.
+            // The missing Gaussians were not finite when read back.
             (changes.by_quantity[0], changes.share) = ((model.len() - found.len(), 1.0), 1.0);
             return changes;
         }
@@ -49,7 +49,7 @@ impl Changes {
             let mut is_changed = false;
             let row_changes = row_changes(model, row, found, place, &bases);
             for (at, (change, (.., limit))) in row_changes.into_iter().zip(QUANTITIES).enumerate() {
-                // Not a number if both are infinite.
+                // The change is NaN if both values are infinite.
                 if change > limit || change.is_nan() {
                     is_changed = true;
                     changes.by_quantity[at].0 += 1;
@@ -68,7 +68,7 @@ impl Changes {
         self.share >= UNFIT
     }
 
-    /// True if so much changes that it should be said.
+    /// True if so much changes that the user should be told.
     pub fn is_noted(&self) -> bool {
         self.share >= NOTED
     }
@@ -81,7 +81,7 @@ impl fmt::Display for Changes {
         let words: Vec<String> = parts
             .map(|((rows, share), (name, limit, _))| {
                 let (rows, percent) = (gaussians(*rows), 100.0 * share);
-                format!("the {name} of {rows} ({percent:.1} % of what shows) change {limit}")
+                format!("the {name} of {rows} ({percent:.1} % of the visible area) change {limit}")
             })
             .collect();
         f.write_str(&words.join(", "))
@@ -97,7 +97,7 @@ fn row_changes(
     bases: &[[f32; 16]],
 ) -> [f64; 4] {
     let [old, new] = [&model.log_scales[row], &found.log_scales[place]].map(|logs| logs.map(size));
-    // Only from its edge does the thinnest axis of a flat Gaussian show.
+    // The thinnest axis of a flat Gaussian is visible only from its edge, so the middle axis sets the scale.
     let middle = sorted(old)[1];
     let shift = (0..3).map(|axis| {
         let [a, b] = [&model.means[row], &found.means[place]].map(|mean| f64::from(mean[axis]));
@@ -118,8 +118,8 @@ fn row_changes(
     ]
 }
 
-/// An estimate of the share of an image that a Gaussian covers, times its opacity: cameras are about as far away as the
-/// model's centre, or its extent if that is more.
+/// An estimate of the share of an image that a Gaussian covers, times its opacity. Its distance from the model's
+/// centre, or the model's spread if that is larger, stands for its distance from the cameras.
 fn weight(model: &Gaussians, row: usize, frame: &[(f64, f64); 3]) -> f64 {
     let [_, middle, largest] = sorted(model.log_scales[row].map(size));
     let squares = model.means[row]
@@ -130,7 +130,7 @@ fn weight(model: &Gaussians, row: usize, frame: &[(f64, f64); 3]) -> f64 {
     covered * f64::from(sigmoid(model.opacity_logits[row]))
 }
 
-/// Standard deviation of a logarithm.
+/// Standard deviation, from its logarithm.
 fn size(log: f32) -> f64 {
     f64::from(log).exp()
 }

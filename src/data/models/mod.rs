@@ -33,6 +33,7 @@ pub use inventory;
 pub use changes::Changes;
 pub use recognise::{Match, ModelFile, Reader, main_file, read_model};
 pub use rows::SplatFile;
+pub(crate) use sog::folder_in_archive;
 pub use write::{ModelWriter, Shape, fitting_format, is_unfit};
 
 /// The format that training writes.
@@ -58,7 +59,7 @@ pub struct Format {
 
 inventory::collect!(Format);
 
-/// A name or an extension of no format that densify writes.
+/// The error for a name or an extension that belongs to no format that densify writes.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0}; choose one of: {names}", names = names(&export_formats()))]
 pub struct FormatError(String);
@@ -87,10 +88,10 @@ pub fn compress_formats() -> Vec<&'static Format> {
     formats
 }
 
-/// The format with this name, to write.
+/// The writable format with this name.
 ///
 /// # Errors
-/// When there is none; the message names the nearest.
+/// When there is none; the message suggests the format with the nearest name.
 pub fn find(name: &str) -> Result<&'static Format, FormatError> {
     let formats = export_formats();
     formats.iter().find(|format| format.name == name).copied().ok_or_else(|| {
@@ -100,7 +101,7 @@ pub fn find(name: &str) -> Result<&'static Format, FormatError> {
     })
 }
 
-/// The format with the extension of `path`, to write; the longest extension wins (`a.b` over `b`).
+/// The writable format with the extension of `path`; the longest extension wins (`a.b` over `b`).
 ///
 /// # Errors
 /// When there is none.

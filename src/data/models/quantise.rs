@@ -3,9 +3,10 @@
 
 use densify_core::gaussians::logit;
 
-/// Log-scale of a flat Gaussian, finite in place of −∞; compressed PLY uses the same.
+/// Log-scale of a flat Gaussian, finite in place of −∞; compressed PLY uses the same value.
 pub(super) const FLAT: f32 = -20.0;
-/// Largest magnitude of a log-scale in quantised formats: an infinite one would leave no resolution for the others.
+/// Largest magnitude of a log-scale in quantised formats: an infinite log-scale would leave no resolution for the
+/// others.
 pub(super) const MAX_LOG_SCALE: f32 = 20.0;
 /// Opacities stay this far from 0 and 1, whose logits are infinite; other readers use the same margin.
 const MARGIN: f32 = 1e-6;

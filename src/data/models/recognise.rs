@@ -76,10 +76,14 @@ impl<'a> ModelFile<'a> {
         Ok(Self { path, start, length, input, json: OnceCell::new() })
     }
 
+    /// The first bytes, without a byte-order mark.
+    pub(super) fn unmarked_start(&self) -> &[u8] {
+        self.start.strip_prefix("\u{feff}".as_bytes()).unwrap_or(&self.start)
+    }
+
     /// The text of a file that begins like a JSON object, without a byte-order mark; read once.
     pub(super) fn json(&self) -> Result<Option<&str>, LoadError> {
-        let unmarked = self.start.strip_prefix("\u{feff}".as_bytes()).unwrap_or(&self.start);
-        if !unmarked.trim_ascii_start().starts_with(b"{") {
+        if !self.unmarked_start().trim_ascii_start().starts_with(b"{") {
             return Ok(None);
         }
         let text = match self.json.get() {
@@ -114,7 +118,16 @@ pub fn read_model(path: &Path) -> Result<SplatFile, LoadError> {
             Match::None => {}
         }
     }
-    weak.map_or_else(|| Err(unrecognised(path)), |reader| (reader.read)(file))
+    match weak {
+        Some(reader) => (reader.read)(file),
+        None if file.json()?.is_some_and(|text| text.contains("\"lodLevels\"")) => {
+            Err(LoadError::Data(format!(
+                "{} is a list of models in several levels of detail; name one of the meta.json files that it lists",
+                path.display()
+            )))
+        }
+        None => Err(unrecognised(path)),
+    }
 }
 
 /// The main file of a folder that is a model; `None` if the folder is not one.

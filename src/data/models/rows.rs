@@ -20,7 +20,7 @@ pub struct SplatFile {
     pub dropped: usize,
     /// Gaussians whose zero quaternion was replaced with the identity.
     pub repaired: usize,
-    /// What was read otherwise than the format says, or may have to be, each in a sentence.
+    /// Notes, one sentence each, on values that were read otherwise than the format says, or may have to be.
     pub notes: Vec<String>,
 }
 

@@ -83,6 +83,23 @@ impl Similarity {
     }
 }
 
+/// Mirrors a model in the plane x = 0.
+pub(super) fn mirror_x(model: &mut Gaussians) {
+    model.means.iter_mut().for_each(|[x, ..]| *x = -*x);
+    for [_, _, y, z] in &mut model.quats {
+        (*y, *z) = (-*y, -*z);
+    }
+    // The coefficients of functions that are odd in x.
+    let odd = [3, 4, 7, 10, 13, 15];
+    for row in model.sh.chunks_exact_mut(3 * sh_coefficients(model.sh_degree)) {
+        for (at, colour) in row.as_chunks_mut::<3>().0.iter_mut().enumerate() {
+            if odd.contains(&at) {
+                colour.iter_mut().for_each(|value| *value = -*value);
+            }
+        }
+    }
+}
+
 /// The matrix that rotates the coefficients of a band, by least squares over directions on a spiral: in the rotated
 /// direction, the new coefficients give the colour that the old ones give in the original direction.
 /// Shape: `[2·band + 1, 2·band + 1]`.
@@ -176,7 +193,28 @@ mod tests {
     }
 
     #[test]
-    fn other_matrices_are_refused() {
+    fn a_mirrored_model_shows_mirrored_colours() {
+        let before = model(3, 3);
+        let mut after = before.clone();
+        mirror_x(&mut after);
+        let mirror = DVec3::new(-1.0, 1.0, 1.0);
+        for row in 0..3 {
+            let d = DVec3::new(0.36, -0.8, 0.48);
+            let (old, new) = (shown(&before, row, d), shown(&after, row, mirror * d));
+            assert!((0..3).all(|c| (old[c] - new[c]).abs() < 1e-6), "{old:?} and {new:?}");
+            let [old, new] = [&before, &after].map(|model| {
+                let [w, x, y, z] = model.quats[row].map(f64::from);
+                (model.means[row], DQuat::from_xyzw(x, y, z, w).normalize())
+            });
+            assert_eq!(new.0, [-old.0[0], old.0[1], old.0[2]]);
+            // A mirrored ellipsoid has the mirrored axes, in either direction.
+            let axis = (new.1 * DVec3::Y).dot(mirror * (old.1 * DVec3::Y));
+            assert!((axis.abs() - 1.0).abs() < 1e-6, "{axis}");
+        }
+    }
+
+    #[test]
+    fn matrices_that_are_not_similarities_are_refused() {
         let uneven = DMat4::from_scale(DVec3::new(1.0, 1.0, 1.1));
         let mirrored = DMat4::from_scale(DVec3::new(1.0, 1.0, -1.0));
         for matrix in [uneven, mirrored, DMat4::ZERO, DMat4::from_scale(DVec3::NAN)] {

@@ -16,7 +16,7 @@ pub(super) fn frame(model: &Gaussians) -> [(f64, f64); 3] {
         }
         *centre = *values.select_nth_unstable_by(middle, f64::total_cmp).1;
         values.iter_mut().for_each(|value| *value = (*value - *centre).abs());
-        // 0 if half of all rows are equal in this coordinate.
+        // The median is 0 if half of all rows are equal in this coordinate.
         *spread = values.select_nth_unstable_by(middle, f64::total_cmp).1.max(f64::MIN_POSITIVE);
     }
     frame
@@ -42,7 +42,7 @@ mod tests {
     fn neighbours_follow_each_other_whatever_the_unit() {
         for unit in [1e-6, 1.0, 1e6] {
             let mut model = Gaussians::zeros(64, 0);
-            // Two clusters, their rows in turn.
+            // Two clusters, whose rows alternate.
             for (row, mean) in model.means.iter_mut().enumerate() {
                 let x = if row % 2 == 0 { -1.0 } else { 1.0 };
                 *mean = [unit * (x + 0.001 * row as f32), 0.0, 0.0];

@@ -15,7 +15,7 @@ pub(super) const DAMAGED: &str = "the compressed data is damaged";
 /// Reads `bytes` bytes for `field`.
 ///
 /// # Errors
-/// When there are fewer, the compressed data is damaged, or the file cannot be read.
+/// When there are fewer bytes, the compressed data is damaged, or the file cannot be read.
 pub(super) fn read_exactly(
     path: &Path,
     field: &str,

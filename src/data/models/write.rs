@@ -34,11 +34,11 @@ impl From<&Gaussians> for Shape {
 /// in order, then [`finish`](Self::finish).
 pub trait ModelWriter {
     /// Upper bound on the memory that the writer takes beside the piece it is given `[bytes]`. It is part
-    /// of a run's memory promise, so it must hold for every model of this shape.
+    /// of a run's memory ledger, so it must hold for every model of this shape.
     fn held_bytes(&self, shape: Shape) -> u64;
 
     /// True if the format packs consecutive Gaussians together, so that they should be neighbours in space. The file
-    /// then has them in that order.
+    /// then has all Gaussians in spatial order.
     fn wants_spatial_order(&self) -> bool {
         false
     }
@@ -48,7 +48,7 @@ pub trait ModelWriter {
         true
     }
 
-    /// True if files can state this antialiasing. Readers of files that cannot take another kernel.
+    /// True if files can state this antialiasing; if not, readers use another kernel.
     fn states(&self, _antialiasing: Antialiasing) -> bool {
         true
     }
@@ -82,7 +82,7 @@ pub fn is_unfit(error: &io::Error) -> bool {
     error.raw_os_error().is_none() && error.kind() == io::ErrorKind::InvalidInput
 }
 
-/// The smallest format that holds a model; each is tried in the file `scratch`.
+/// The smallest format that holds a model; each format is tried in the file `scratch`.
 pub fn fitting_format(model: &Gaussians, scratch: &Path) -> &'static Format {
     let fits = |format: &&Format| {
         write_atomically(scratch, |out| format.write(model, out)).is_ok()
@@ -144,7 +144,7 @@ impl Format {
         writer.finish(out)
     }
 
-    /// What a file that [`write`](Self::write) has made of `model` changes of it; nothing if the format is exact.
+    /// The changes to `model` in the file that [`write`](Self::write) has made of it; none if the format is exact.
     ///
     /// # Errors
     /// When the file cannot be read.

@@ -32,6 +32,11 @@ impl<'a, R: Read + Seek> ZipReader<'a, R> {
         Ok(Self { path, length, files })
     }
 
+    /// The names of all files.
+    pub(super) fn names(&self) -> impl Iterator<Item = &str> + Clone {
+        self.files.file_names().collect::<Vec<_>>().into_iter()
+    }
+
     /// The contents of a file, with its checksum checked.
     pub(super) fn read(&mut self, name: &str) -> Result<Vec<u8>, LoadError> {
         let Self { path, length, files } = self;

@@ -8,7 +8,7 @@ use crate::error::LoadError;
 
 /// Longest header accepted `[bytes]`.
 const MAX_HEADER: u64 = 1 << 20;
-/// Number of rows from which on an element is refused.
+/// An element with this number of rows or more is refused.
 const MAX_ROWS: u64 = 1 << 32;
 
 /// Encoding of the data.
@@ -107,7 +107,15 @@ impl Element {
         })
     }
 
-    /// Index of a property that the purpose needs.
+    /// As [`find`](Self::find), whatever the case of the letters in the file.
+    pub(crate) fn find_in_any_case(&self, names: &[&str]) -> Option<usize> {
+        let is_named = |p: &Property, name: &str| p.name.eq_ignore_ascii_case(name);
+        names.iter().find_map(|name| {
+            self.properties.iter().position(|p| p.list.is_none() && is_named(p, name))
+        })
+    }
+
+    /// Index of a required property.
     ///
     /// # Errors
     /// When it is missing; the message ends with `remedy`.
@@ -138,7 +146,8 @@ impl Header {
     /// Reads the header and leaves `input` at the first byte of data.
     pub(super) fn read(path: &Path, input: &mut impl BufRead) -> Result<Self, LoadError> {
         let mut lines = Lines { path, input, number: 0, read: 0 };
-        if lines.next()?.trim_end() != "ply" {
+        // A byte-order mark may come first.
+        if lines.next()?.trim_start_matches('\u{feff}').trim_end() != "ply" {
             return Err(lines.fault("it is not a PLY file: the first line is not `ply`"));
         }
         let mut encoding = None;
@@ -232,7 +241,7 @@ impl<R: BufRead> Lines<'_, R> {
         if line.last() != Some(&b'\n') && line.trim_ascii() != b"end_header" {
             return Err(self.fault("the header ends without `end_header`, or is longer than 1 MiB"));
         }
-        // Comments may hold any encoding.
+        // Comments may be in any character encoding.
         Ok(String::from_utf8_lossy(&line).into_owned())
     }
 

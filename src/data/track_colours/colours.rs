@@ -19,16 +19,17 @@ pub(super) struct Observation {
     pub(super) view: u32,
     /// Colour at the point.
     pub(super) centre: [u8; 3],
-    /// Smallest and largest values within a pixel.
+    /// Smallest values of the pixel at the point and of its neighbours.
     lowest: [u8; 3],
+    /// Largest values of these pixels.
     highest: [u8; 3],
 }
 
 /// Peak memory for reading and measuring the colours of tracks, in addition to an image `[bytes]`.
 pub fn bytes(tracks: &Tracks) -> u64 {
     let colours: usize = tracks.views.iter().map(Vec::len).sum();
-    // The observations, and one channel of them, which is sorted for a median.
-    (colours * (size_of::<Observation>() + 2 * size_of::<f32>())) as u64
+    // The observations, and two differences per channel of each, of which medians are taken.
+    (colours * (size_of::<Observation>() + 6 * size_of::<f32>())) as u64
 }
 
 /// The observed colours of all tracks, and the gains and track colours fitted to them.
@@ -105,7 +106,7 @@ impl TrackColours {
         self.fits[0].gains.len()
     }
 
-    /// The fitted colour of a track, by its index among those with enough views.
+    /// The fitted colour of a track, by its index among the tracks with enough views.
     pub(super) fn reference(&self, place: usize) -> [f32; 3] {
         self.fits.each_ref().map(|fit| fit.references[place])
     }

@@ -13,7 +13,7 @@ use super::{MIN_TRACKS, TrackColours, median};
 pub const MIN_STOPS: f64 = 0.3;
 /// Largest share of the colour differences that the gains may leave unexplained. With random exposures 0.34 or less is
 /// left. In photographs of one exposure whose colours change with the view, 0.6 or more is left, at a spread of
-/// 0.4 stops; learning exposures there made test views worse. Both were measured for docs/studies/exposure-auto.tsv.
+/// 0.4 stops, and learning exposures made test views worse. Both were measured for docs/studies/exposure-auto.tsv.
 const MAX_UNEXPLAINED: f64 = 0.45;
 /// Stops per doubling of an sRGB-encoded value, as the sRGB curve is nearly the power 1/2.4.
 pub const STOPS: f64 = 2.4;
@@ -63,7 +63,11 @@ impl ExposureSpread {
                 std::array::from_fn(|channel| (f64::from(gains[channel]) / factor[channel]) as f32)
             })
             .collect();
-        let (mut alike, mut with_gains, mut own) = (Vec::new(), Vec::new(), Vec::new());
+        // Reserved at once, so that they take no more than [`bytes`](super::bytes) counts.
+        let differences = 3 * colours.by_track().map(<[_]>::len).sum::<usize>();
+        let mut alike = Vec::with_capacity(differences);
+        let mut with_gains = Vec::with_capacity(differences);
+        let mut own = Vec::new();
         let mut tracks = 0;
         for (place, seen) in colours.by_track().enumerate() {
             tracks += 1;

@@ -27,7 +27,7 @@ fn scene(shade: impl Fn(usize, usize, f32) -> f32) -> (Tracks, Vec<View>) {
     let colour =
         |square: usize| [square * 37, square * 59, square * 83].map(|v| (40 + v % 120) as f32);
     let mut tracks = Tracks::default();
-    // Squares at the border are left out, because their pixels lack neighbours.
+    // The first and the last row of squares are left out.
     for square in (0..squares * squares).filter(|s| s / squares > 0 && s / squares < squares - 1) {
         let (x, y) = (3 * (square % squares) + 1, 3 * (square / squares) + 1);
         tracks.positions.push(DVec3::new(x as f64 + 0.5, y as f64 + 0.5, 1.0));

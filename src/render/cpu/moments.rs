@@ -2,8 +2,8 @@
 //!
 //! The first moment is at most 7.3 times the root of the second, whatever the gradients were. A step uses only
 //! this ratio, and [`MomentStorage::Both8`] stores it in place of the first moment, in steps of 0.057.
-//! Pure noise gives ratios of about 0.23, whose variance the rounding increases by a twentieth. Numbers share no
-//! scale, so that an outlier cannot spoil its neighbours.
+//! If gradients are pure noise, the ratio is about 0.23, and rounding increases its variance by 5 %. Numbers share
+//! no scale, so that an outlier cannot spoil its neighbours.
 
 use std::ops::Range;
 
@@ -219,7 +219,7 @@ impl MomentTask<'_> {
     }
 
     /// Converts the opened planes back to the stored format, if this is not f32. First moments become multiples of the
-    /// roots of the second moments as stored.
+    /// roots of the rounded second moments.
     #[inline(always)]
     pub(super) fn close(
         &mut self,

@@ -130,7 +130,7 @@ impl CpuBackend {
                 }
                 let mut fresh = band.start == 0;
                 for part in parts(threads, lists, band.len(), records.len() / STRIDE) {
-                    threads.each("replay", part.tiles.clone(), |i| {
+                    threads.each_with("replay", part.tiles.clone(), Batch::new, |batch, i| {
                         let tile = band.start + i;
                         arch.dispatch(Replay {
                             splats,
@@ -139,6 +139,7 @@ impl CpuBackend {
                             blending,
                             map: &gradient[tile].planes[MAP],
                             records: part.records(lists, i, records, STRIDE),
+                            batch,
                         });
                     });
                     let to = Sums { sums, stride: STRIDE, fresh, visible };
@@ -183,6 +184,8 @@ struct Replay<'a> {
     map: &'a Plane,
     /// The records of this tile's entries; entries outside the current part have none.
     records: TileRecords<'a>,
+    /// Scratch.
+    batch: &'a mut Batch,
 }
 
 impl WithSimd for Replay<'_> {
@@ -190,13 +193,12 @@ impl WithSimd for Replay<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        let Self { splats, list, place, blending, map, records } = self;
+        let Self { splats, list, place, blending, map, records, batch } = self;
         let c = |x: f32| V::splat(s, x);
         let least_light = c(blending.transmittance_min);
         let zero = V::zero(s);
         // Transmittance of unfinished pixels; 0 for finished ones and outside the image.
         let (mut light, mut alive) = place.inside();
-        let mut batch = Batch::new();
         for (n, chunk) in list.chunks(BATCH).enumerate() {
             batch.set(s, splats, chunk, &place);
             for (i, entry) in chunk.iter().enumerate() {

@@ -70,7 +70,8 @@ pub(super) struct Audit<L> {
     pub(super) first_row: u32,
     /// Numbers per row.
     pub(super) numbers: u32,
-    /// What marks the row if its first number is not finite: the parameter's index, plus [`MOMENTS`] for a moment.
+    /// A row whose number i is the first that is not finite is marked with `mark` + i + 1. `mark` is the index of the
+    /// array's first parameter, plus [`MOMENTS`] for moments.
     pub(super) mark: u32,
 }
 
@@ -200,7 +201,7 @@ pub(super) fn rebound() -> HashMap<&'static str, Vec<Vec<Rebinding>>> {
         ("expose_bwd", vec![vec![("gradient", "pixel gradient")]]),
         ("adam_band", (0..4).map(|band| adam(1 + band)).collect()),
         ("adam_geometry", vec![adam(0)]),
-        // Borrows the sums of the sorts, which are unused then and long enough.
+        // Borrows the buffer of prefix sums, which is long enough and unused between two steps.
         ("present", vec![vec![("signals", "sums")]]),
         // Borrows the gradients of the rows, which are unused between two steps.
         ("surface", two(&|i| vec![list(i), ("pixels", "ops"), ("points", "gradient")])),
@@ -231,7 +232,7 @@ fn row_launches<L>(kernel: &str, bind: Bind<'_, L>, sizes: &Sizes) -> Vec<RowLau
     edited.map(launch).collect()
 }
 
-/// The launches of `audit`. The marks borrow the sums of the sorts, which are unused between two steps.
+/// The launches of `audit`. The marks borrow the buffer of prefix sums, which is unused between two steps.
 fn audits<L>(bind: Bind<'_, L>, sizes: &Sizes) -> Vec<Audit<L>> {
     let arrays = sizes.row_arrays();
     let audit = |array: &RowArray| {

@@ -95,6 +95,7 @@ impl GpuBackend {
     ) -> Result<Vec<(usize, usize, f32)>, BackendError> {
         let [width, height, ..] = rendered.frame.image.map(|n| n as usize);
         let pixels = width * height;
+        // Per pixel: its final transmittance and its last entry.
         let finish = self.read("finish", 0, 8 * pixels as u64)?;
         let error: Vec<f32> = match request.error {
             ErrorMode::Gradient => {
@@ -126,7 +127,8 @@ impl GpuBackend {
         let focal = 0.5 * (frame.lens[0] + frame.lens[1]);
         let is_median = u32::from(mode == DepthMode::Median);
         let mut found = Vec::new();
-        // Limited by the upload, and by the buffer of the points, of four numbers each.
+        // A chunk must fit into the upload (one number per pixel), and its points into the buffer of the rows'
+        // gradients (four numbers per point).
         let room = (OPS_BYTES as usize / 4).min(GRADIENT / 4 * self.sizes.trained() as usize);
         for chunk in pixels.chunks(room) {
             let numbers: Vec<u32> =

@@ -211,7 +211,8 @@ impl Passes<'_> {
         to.run(l.get("total_exposure"), [0; 4], 1);
     }
 
-    /// Stage 4. The weights are those of |e| and 1 − SSIM in the errors per pixel, for candidates and for signals.
+    /// Stage 4. `error_weights`: the weights of |e| and of 1 − SSIM in the error of a pixel, first for candidates, then
+    /// for signals.
     pub(super) fn loss(&self, to: &mut Recorder<'_>, error_weights: [[f32; 2]; 2]) {
         let l = self.launches;
         let [[a, b], [c, d]] = error_weights.map(|weights| weights.map(f32::to_bits));
@@ -248,8 +249,8 @@ impl Passes<'_> {
         to.run(self.launches.get("project_bwd"), [0; 4], self.shape.rows.div_ceil(256));
     }
 
-    /// Stages 6 to 8. Colours step before the geometry, as their gradient depends on it. The weight of `mask` is per
-    /// row.
+    /// Stages 6 to 8. Colours step before the geometry, as their gradient depends on it. The weight in `mask` is
+    /// already divided by the number of rows in training.
     pub(super) fn optimise(
         &self,
         to: &mut Recorder<'_>,

@@ -14,8 +14,8 @@ use crate::signals::Field;
 use crate::{BackendError, StepInput, StepOutput, assert_same_size};
 
 impl GpuBackend {
-    /// The parameter groups that step and those that have waited, as bits of the frame; then the groups that wait after
-    /// the step.
+    /// Returns the bits of the frame ([`due`]) that tell which parameter groups this step updates and which have
+    /// gradients waiting from earlier steps, and then the groups whose gradients wait after this step.
     fn cadence_bits(&self, input: &StepInput<'_>) -> (u32, Waiting) {
         let (step, cadence) = (input.step, input.cadence);
         assert!(cadence.is_within(self.cadence), "step {step}: {cadence:?} was not declared");

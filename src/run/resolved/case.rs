@@ -15,6 +15,7 @@ use super::size::MIN_ROWS;
 use crate::failure::{Failure, ModelProblem, OptionProblem, SizeProblem};
 use crate::host::Host;
 use crate::near_plane::NearPlane;
+use crate::position_rates::PositionRates;
 use crate::spec::knobs::Knobs;
 use crate::spec::{AbsolutePath, Budget, InitChoice, RunSpec, ShDegree};
 use densify_core::antialiasing::Antialiasing;
@@ -53,6 +54,7 @@ pub(crate) struct Choices {
     pub(crate) degree: Degree,
     pub(crate) exposure: Exposure,
     pub(crate) near: NearPlane,
+    pub(crate) position_rates: PositionRates,
     /// Choices that the run makes while it trains.
     pub(crate) automatic: AutoChoices,
     /// Threads that train and measure.
@@ -73,8 +75,8 @@ pub(crate) enum Init {
 impl Choices {
     /// Messages about the choices that depend on the scene.
     pub(super) fn lines(&self, spelling: Spelling) -> impl Iterator<Item = String> {
-        let near = self.near.line(spelling).into_iter();
-        near.chain(self.degree.line()).chain(self.exposure.line(spelling))
+        let of_depths = self.near.line(spelling).into_iter().chain(self.position_rates.line());
+        of_depths.chain(self.degree.line()).chain(self.exposure.line(spelling))
     }
 }
 
@@ -158,9 +160,18 @@ impl<'a> Case<'a> {
         };
         let threads = spec.device.threads.map(|threads| threads.0 as usize);
         let threads = threads.unwrap_or_else(rayon::current_num_threads);
-        let near = NearPlane::choose(spec.start.near, &inputs.dataset);
-        let choices =
-            Choices { entry, parameters, knobs, degree, exposure, near, automatic, threads };
+        let seen = inputs.dataset.seen_depths();
+        let choices = Choices {
+            entry,
+            parameters,
+            knobs,
+            degree,
+            exposure,
+            near: NearPlane::from_depths(spec.start.near, &seen),
+            position_rates: PositionRates::choose(spec, &seen),
+            automatic,
+            threads,
+        };
         let mut case = Self { spec, inputs: Cow::Owned(inputs), choices };
         let driver = case.driver_bytes(host)?;
         let inputs = case.inputs.to_mut();

@@ -15,6 +15,7 @@ use crate::spec::{
 };
 use densify_core::antialiasing::Antialiasing;
 use densify_core::files::{FileError, write_atomically};
+use densify_data::dataset::is_archive;
 use densify_data::track_colours::Spread;
 use densify_data::track_colours::exposures::ExposureSpread;
 use densify_train::output::{CONFIG_FILE, FolderError};
@@ -224,7 +225,14 @@ impl RunConfig {
         let path = run.join(CONFIG_FILE);
         let text = densify_core::files::read_text(&path, densify_core::files::MAX_OPTIONS)
             .map_err(|error| match error.kind() {
-                std::io::ErrorKind::NotFound => FolderError::no_run(run, CONFIG_FILE).into(),
+                _ if is_archive(run) => Failure::input(format!(
+                    "{} is a ZIP archive, but no SOG model; unpack it, and name a file of Gaussian splats, or the folder of \
+                     a run, in it",
+                    run.display()
+                )),
+                std::io::ErrorKind::NotFound | std::io::ErrorKind::NotADirectory => {
+                    FolderError::no_run(run, CONFIG_FILE).into()
+                }
                 _ => Failure::input(format!("cannot read {}: {error}", path.display())),
             })?;
         let malformed = |problem: String| Failure::from(FileError::malformed(&path, problem));
@@ -264,6 +272,18 @@ pub(crate) mod tests {
     use super::*;
     use crate::spec::ByteCount;
     use densify_train::schedule::Background;
+
+    #[test]
+    fn a_file_is_no_run() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let message = RunConfig::read(file.path()).unwrap_err().to_string();
+        assert!(message.contains("is neither a model nor a run; name a file"), "{message}");
+        // The end of an empty archive.
+        let empty = [&b"PK\x05\x06"[..], &[0; 18]].concat();
+        std::fs::write(file.path(), empty).unwrap();
+        let message = RunConfig::read(file.path()).unwrap_err().to_string();
+        assert!(message.contains("is a ZIP archive, but no SOG model; unpack"), "{message}");
+    }
 
     pub(crate) fn sample() -> RunConfig {
         let mut spec = RunSpec::default();

@@ -31,7 +31,8 @@ pub(crate) struct Inputs {
     pub(crate) frozen_model: Option<ModelSize>,
     /// Number of Gaussians of a run that starts from all points of the dataset.
     pub(super) usable_points: usize,
-    /// Bytes for reading the colours of tracks, in addition to an image; 0 if no choice depends on them.
+    /// Bytes of the tracks and their colours while these are read, not counting the images; 0 if no automatic choice
+    /// uses the tracks.
     pub(super) track_bytes: u64,
     /// Resident memory with the dataset and the device's driver, if it is known `[bytes]`.
     pub(super) resident: Option<u64>,

@@ -236,7 +236,7 @@ impl Case<'_> {
     }
 
     /// Bytes of all training images when decoded.
-    pub(super) fn all_images(&self) -> u64 {
+    pub(super) fn all_image_bytes(&self) -> u64 {
         self.inputs.images[0].all
     }
 }

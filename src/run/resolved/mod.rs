@@ -97,7 +97,7 @@ impl<'a> ResolvedRun<'a> {
         let spelling = host.observer.spelling();
         let scene = case.choices.lines(spelling);
         let reasons = scene.chain(size.lines(&case, spelling)).collect();
-        let init = case.first_rows(size.setting.rows);
-        Self { init, size: size.setting, degree_lowered, reasons, case }
+        let init = case.first_rows(size.run_size.rows);
+        Self { init, size: size.run_size, degree_lowered, reasons, case }
     }
 }

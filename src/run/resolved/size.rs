@@ -33,7 +33,7 @@ pub(super) const RESOLUTIONS: [Resolution; 3] =
 
 /// The size of a run.
 pub(super) struct Size {
-    pub(super) setting: RunSize,
+    pub(super) run_size: RunSize,
     /// The memory limit and the solution for it, if there is a limit.
     solved: Option<(u64, Fit)>,
 }
@@ -45,25 +45,27 @@ impl Size {
         let most = max_pairs(case, rows)?;
         let per_row = case.choices.knobs.pairs_per_row.unwrap_or(PAIRS_PER_ROW);
         let pairs = rows.saturating_mul(per_row).min(most);
-        let mut setting = RunSize {
+        let mut run_size = RunSize {
             rows,
             sh_degree: case.choices.degree.highest(),
             tile_cap: case.tile_cap().unwrap_or(pairs).max(rows),
             image_cache: 0,
             images_on_gpu: 0,
         };
-        setting.image_cache = match case.spec.size.image_cache {
+        run_size.image_cache = match case.spec.size.image_cache {
             None => DEFAULT_IMAGE_CACHE,
             Some(ImageCache::Bytes(bytes)) => bytes,
             // An eighth of the total, that is, a seventh of the rest.
             Some(ImageCache::Auto) => {
-                let rest = case.ledger_of(&setting)?.on_host();
-                (rest / (IMAGE_SHARE_DIVISOR - 1)).min(DEFAULT_IMAGE_CACHE).min(case.all_images())
+                let rest = case.ledger_of(&run_size)?.on_host();
+                (rest / (IMAGE_SHARE_DIVISOR - 1))
+                    .min(DEFAULT_IMAGE_CACHE)
+                    .min(case.all_image_bytes())
             }
         };
         let share = case.memory().map_or(u64::MAX, |memory| memory / IMAGE_SHARE_DIVISOR);
-        setting.images_on_gpu = case.image_cache().unwrap_or(DEFAULT_IMAGE_CACHE).min(share);
-        Ok(Self { setting, solved: None })
+        run_size.images_on_gpu = case.image_cache().unwrap_or(DEFAULT_IMAGE_CACHE).min(share);
+        Ok(Self { run_size, solved: None })
     }
 
     /// Takes the size from the options, or the largest that `--memory` allows.
@@ -74,7 +76,7 @@ impl Size {
         let Some(size) = solve(case)? else {
             return Err(no_size_error(case, &request(case, case.memory().unwrap_or(0))?)?);
         };
-        let budget = case.budget(size.setting.rows);
+        let budget = case.budget(size.run_size.rows);
         if budget.trainable() == 0 {
             let RowBudget { total, frozen } = budget;
             return Err(SizeProblem::FreezeFillsBudget { frozen, budget: total }.into());
@@ -84,12 +86,12 @@ impl Size {
 
     /// True if memory made the degree lower than requested.
     pub(super) fn is_lowered(&self, case: &Case<'_>) -> bool {
-        self.setting.sh_degree < case.choices.degree.highest()
+        self.run_size.sh_degree < case.choices.degree.highest()
     }
 
     /// The size and the reason for it, for the user.
     pub(super) fn lines(&self, case: &Case<'_>, spelling: Spelling) -> Vec<String> {
-        let RunSize { rows, sh_degree, tile_cap, image_cache, .. } = self.setting;
+        let RunSize { rows, sh_degree, tile_cap, image_cache, .. } = self.run_size;
         let solved = self.solved.as_ref();
         let limit = solved.map(|(memory, fit)| (*memory, fit.by_memory));
         let given = case.spec.size.budget;
@@ -101,7 +103,7 @@ impl Size {
         lines.push(format!(
             "memory   {memory} given: degree {sh_degree}, {} (Gaussian, tile) pairs, images {}",
             grouped(tile_cap),
-            match case.all_images() {
+            match case.all_image_bytes() {
                 all if image_cache >= all => format!("all kept decoded ({})", Bytes(all)),
                 all => format!(
                     "{} of {} kept decoded, the rest decoded when needed",
@@ -171,7 +173,7 @@ impl ResolvedRun<'_> {
         let pairs = largest_where(size.rows, size.tile_cap, fits)?.unwrap_or(size.rows);
         let changes = [Remedy::NoImages, Remedy::TileCap(pairs)];
         let remedies = remedies(case, case.spec, &changes, |case| {
-            Ok(bytes(case, &Size::as_given(case)?.setting)? <= memory)
+            Ok(bytes(case, &Size::as_given(case)?.run_size)? <= memory)
         });
         Err(SizeProblem::OverMemory { memory, needed, remedies }.into())
     }
@@ -195,8 +197,8 @@ impl ResolvedRun<'_> {
         // Leave a 64th unused: the memory that the system grants varies from call to call.
         let most = (now + left) / 64 * 63;
         let on_host = |case: &Case<'_>| {
-            let Some(Size { setting, .. }) = solve(case)? else { return Ok(false) };
-            Ok::<_, Failure>(case.ledger_of(&setting)?.on_host() <= most)
+            let Some(Size { run_size, .. }) = solve(case)? else { return Ok(false) };
+            Ok::<_, Failure>(case.ledger_of(&run_size)?.on_host() <= most)
         };
         let mut base = case.spec.clone();
         // `--memory` is no remedy on a GPU: there it limits the device's memory.
@@ -233,8 +235,8 @@ pub(super) fn solve(case: &Case<'_>) -> Result<Option<Size>, Failure> {
     let Some(memory) = case.memory() else {
         return Size::as_given(case).map(Some);
     };
-    let fit = fit(&request(case, memory)?, |setting| bytes(case, setting))?;
-    Ok(fit.map(|fit| Size { setting: fit.setting, solved: Some((memory, fit)) }))
+    let fit = fit(&request(case, memory)?, |size| bytes(case, size))?;
+    Ok(fit.map(|fit| Size { run_size: fit.size, solved: Some((memory, fit)) }))
 }
 
 /// The number of rows that fit in `memory` at this degree, ignoring the budget; at least the smaller of [`MIN_ROWS`]
@@ -251,8 +253,8 @@ pub(super) fn rows_at(
         max_rows: case.inputs.device.largest_budget(sh_degree),
         ..request(case, memory)?
     };
-    let fit = fit(&request, |setting| bytes(case, setting))?;
-    Ok(fit.map(|fit| fit.setting.rows))
+    let fit = fit(&request, |size| bytes(case, size))?;
+    Ok(fit.map(|fit| fit.size.rows))
 }
 
 /// Bytes in which a run of these rows and this degree fits, with the shortest tile lists and without decoded images
@@ -260,12 +262,12 @@ pub(super) fn rows_at(
 pub(super) fn needed_bytes(case: &Case<'_>, size: &RunSize) -> Result<u64, Failure> {
     let request = request(case, u64::MAX)?;
     let request = SizeRequest { image_cache: Some(case.image_cache().unwrap_or(0)), ..request };
-    bytes(case, &request.setting(size.rows, size.sh_degree, request.pairs[0]))
+    bytes(case, &request.size(size.rows, size.sh_degree, request.pairs[0]))
 }
 
 /// Bytes of a run of this size that count towards `--memory`.
-fn bytes(case: &Case<'_>, setting: &RunSize) -> Result<u64, Failure> {
-    Ok(case.inputs.device.limited_bytes(&case.ledger_of(setting)?))
+fn bytes(case: &Case<'_>, size: &RunSize) -> Result<u64, Failure> {
+    Ok(case.inputs.device.limited_bytes(&case.ledger_of(size)?))
 }
 
 fn request(case: &Case<'_>, memory: u64) -> Result<SizeRequest, Failure> {
@@ -285,8 +287,8 @@ fn request(case: &Case<'_>, memory: u64) -> Result<SizeRequest, Failure> {
             BackendKind::Gpu => Some(case.image_cache().unwrap_or(DEFAULT_IMAGE_CACHE)),
             BackendKind::Cpu => case.image_cache(),
         },
-        max_images: DEFAULT_IMAGE_CACHE,
-        all_images: case.all_images(),
+        max_image_bytes: DEFAULT_IMAGE_CACHE,
+        all_image_bytes: case.all_image_bytes(),
     })
 }
 
@@ -301,13 +303,13 @@ fn no_size_error(case: &Case<'_>, request: &SizeRequest) -> Result<Failure, Fail
     let rows = case.min_rows().min(request.max_rows);
     let degree = *request.sh_degree.start();
     let memory = request.memory;
-    let Some(least) = min_memory(request, MIB, |setting| bytes(case, setting))? else {
+    let Some(least) = min_memory(request, MIB, |size| bytes(case, size))? else {
         return Ok(SizeProblem::NoSize { memory }.into());
     };
     let mut remedies = remedies(case, case.spec, &Remedy::NEW, |case| Ok(solve(case)?.is_some()));
     let fewer = SizeRequest { min_rows: case.rows_for(1), ..request.clone() };
-    if let Some(fewer) = fit(&fewer, |setting| bytes(case, setting))? {
-        remedies.push(vec![Remedy::Budget(fewer.setting.rows)]);
+    if let Some(fewer) = fit(&fewer, |size| bytes(case, size))? {
+        remedies.push(vec![Remedy::Budget(fewer.size.rows)]);
     }
     let needed = least / MIB;
     remedies.push(vec![Remedy::Memory(needed)]);

@@ -26,9 +26,9 @@ fn described(options: &[(&str, toml::Value)]) -> RunSpec {
 
 /// Rows of a run, and its bytes that `--memory` limits.
 fn sized(case: &Case<'_>) -> (usize, u64) {
-    let setting = size::solve(case).expect("it is solved").expect("it fits").setting;
-    let ledger = case.ledger_of(&setting).expect("a ledger");
-    (setting.rows, case.inputs.device.limited_bytes(&ledger))
+    let run_size = size::solve(case).expect("it is solved").expect("it fits").run_size;
+    let ledger = case.ledger_of(&run_size).expect("a ledger");
+    (run_size.rows, case.inputs.device.limited_bytes(&ledger))
 }
 
 fn check(case: &Case<'_>, rows: usize) -> Result<(), TestCaseError> {
@@ -61,14 +61,14 @@ fn detailed_edits_are_counted_if_they_are_declared() {
     let scene = made.path().to_str().expect("UTF-8");
     let spec = described(&[("scene", scene.into()), ("backend", "cpu".into())]);
     let case = Case::for_new_run(&spec, Host::default()).expect("a scene");
-    let setting = size::solve(&case).expect("it is solved").expect("it fits").setting;
+    let run_size = size::solve(&case).expect("it is solved").expect("it fits").run_size;
     let declared = [false, true].map(|detailed_edits| {
-        let needs = case.needs(setting.rows).expect("needs");
+        let needs = case.needs(run_size.rows).expect("needs");
         let needs = Needs { detailed_edits, ..needs };
-        let ledger = case.ledger(&setting, &needs);
+        let ledger = case.ledger(&run_size, &needs);
         let event = ledger.lines.iter().find(|line| line.what == "a policy's event");
         let event = event.expect("a line").bytes;
-        (event, bytes_per_row(&needs) as u64 * setting.rows as u64)
+        (event, bytes_per_row(&needs) as u64 * run_size.rows as u64)
     });
     let [(plain, plain_plan), (detailed, detailed_plan)] = declared;
     assert!(plain_plan < detailed_plan);
@@ -91,8 +91,8 @@ fn plain_ledger(made: &Made, exposure: &str) -> (Vec<(Section, String, u64)>, u6
     ]);
     let host = Host { process: ProcessMemory::UNKNOWN, ..Host::default() };
     let case = Case::for_new_run(&spec, host).expect("a scene");
-    let setting = size::solve(&case).expect("it is solved").expect("it fits").setting;
-    let ledger = case.ledger_of(&setting).expect("a ledger");
+    let run_size = size::solve(&case).expect("it is solved").expect("it fits").run_size;
+    let ledger = case.ledger_of(&run_size).expect("a ledger");
     let total = ledger.total();
     (ledger.lines.into_iter().map(|line| (line.section, line.what, line.bytes)).collect(), total)
 }

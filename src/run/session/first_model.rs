@@ -13,7 +13,7 @@ use crate::observer::{Observer, Silent};
 use crate::resolved::{Init, ResolvedRun, importance_setup, read};
 use crate::spec::AbsolutePath;
 use densify_core::gaussians::Gaussians;
-use densify_core::numbers::grouped;
+use densify_core::numbers::{gaussians, grouped};
 use densify_data::dataset::Dataset;
 use densify_data::dataset::normalise::EXTENT;
 use densify_render::Backend;
@@ -64,8 +64,8 @@ pub(super) fn first_model(
         }
     }
     observer.say(format_args!(
-        "start    {} Gaussians from {} {source}",
-        grouped(model.len()),
+        "start    {} from {} {source}",
+        gaussians(model.len()),
         grouped(report.points)
     ));
     Ok(model)
@@ -97,11 +97,11 @@ fn load(file: &Path, run: &ResolvedRun<'_>, observer: &dyn Observer) -> Result<G
         drop(backend);
         model = model.gather(&largest(&importance, room));
     }
-    observer.say(format_args!("start    {} Gaussians of {}", grouped(whole), file.display()));
+    observer.say(format_args!("start    {} of {}", gaussians(whole), file.display()));
     if whole > room {
         observer.say(format_args!(
-            "note: {} Gaussians beyond the budget left out: those with the least blend weight in the training views",
-            grouped(whole - room)
+            "note: {} beyond the budget left out: those with the least blend weight in the training views",
+            gaussians(whole - room)
         ));
     }
     Ok(with_degree(model, size.sh_degree, observer))
@@ -155,7 +155,7 @@ pub(super) fn append_to_frozen(
     if in_view(&model, &case.inputs.dataset) == 0 {
         return Err(ModelProblem::FreezeOutOfView { file: file.clone(), rows }.into());
     }
-    observer.say(format_args!("frozen   {} Gaussians of {}", grouped(rows), file.display()));
+    observer.say(format_args!("frozen   {} of {}", gaussians(rows), file.display()));
     model = with_degree(model, size.sh_degree, observer);
     model.append(others);
     Ok(model)

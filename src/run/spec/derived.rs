@@ -94,15 +94,21 @@ impl RunSpec {
         Knobs::from_table(&table).map_err(|error| OptionProblem::value("knob", error).into())
     }
 
-    /// The learning rates: the defaults for a run of this length, overlaid with those of the policy, reduced if the run
-    /// starts from a model, and overlaid with `--lr`.
+    /// The learning rates: the defaults for a run of this length, overlaid with those of the policy, reduced in a long
+    /// capture by `position_factor` and if the run starts from a model, and overlaid with `--lr`.
     ///
     /// # Errors
     /// When there is no such rate, or its value is not allowed.
-    pub fn learning_rates(&self, of_policy: &RateOverrides) -> Result<RateOptions, Failure> {
+    pub(crate) fn learning_rates(
+        &self,
+        of_policy: &RateOverrides,
+        position_factor: f64,
+    ) -> Result<RateOptions, Failure> {
         let fail = |problem: &str| Failure::from(OptionProblem::value("lr", problem.trim()));
         let iterations = self.schedule.iterations.0;
         let mut defaults = RateOptions::for_run(iterations).with(of_policy);
+        defaults.mean_start *= position_factor;
+        defaults.mean_end *= position_factor;
         let is_model = matches!(self.start.init, Some(InitChoice::Model(_)));
         if is_model && self.start.init_rates == InitRates::Fine {
             defaults = defaults.fine();
@@ -168,7 +174,7 @@ mod tests {
         let rates = |lr: &str, of_policy: &RateOverrides| {
             let mut spec = spec("lr", lr).unwrap();
             spec.schedule.iterations.0 = 30_000;
-            spec.learning_rates(of_policy).unwrap()
+            spec.learning_rates(of_policy, 1.0).unwrap()
         };
         let given = rates("{ opacity = 0.05, mean_end = 1e-5 }", &RateOverrides::default());
         let expected = RateOptions { opacity: 0.05, mean_end: 1e-5, ..RateOptions::default() };

@@ -1,4 +1,4 @@
-//! Divides the ground into cells of equal work: strips along the first axis, each cut along the second.
+//! Divides the ground into cells of equal work: strips along the first axis, each cut along the second axis.
 
 use serde::{Deserialize, Serialize};
 
@@ -28,7 +28,7 @@ impl Cell {
     }
 }
 
-/// Divides points of the ground with their work into `strips` × `across` cells, strip by strip.
+/// Divides the ground into `strips` × `across` cells that share the points' work evenly, strip by strip.
 pub(super) fn divide(points: &[[f64; 2]], work: &[f64], [strips, across]: [usize; 2]) -> Vec<Cell> {
     let strips = cut(Cell::ALL, 0, points, work, strips).into_iter();
     strips.flat_map(|strip| cut(strip, 1, points, work, across)).collect()

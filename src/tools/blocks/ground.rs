@@ -1,4 +1,5 @@
-//! The ground plane of a scene, estimated from its cameras, which stay at about the same height on foot or in flight.
+//! The ground plane of a scene, estimated from its cameras: whether carried or flown, they stay at about the same
+//! height.
 
 use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
@@ -24,7 +25,8 @@ pub struct Ground {
 }
 
 impl Ground {
-    /// Fits the plane to the camera centres by least squares. If they are on a line, the plane is as level as the images.
+    /// Fits the plane to the camera centres by least squares. If they are on a line, the plane contains this line and
+    /// is level in the images.
     pub fn fit(cameras: &[Camera]) -> Self {
         let count = cameras.len().max(1) as f64;
         let origin = cameras.iter().map(Camera::centre).sum::<DVec3>() / count;
@@ -98,7 +100,7 @@ mod tests {
     }
 
     #[test]
-    fn cameras_of_a_flight_find_the_ground_whichever_way_they_look() {
+    fn flying_cameras_determine_the_ground_whichever_way_they_look() {
         let turn = DMat3::from_rotation_x(0.7);
         let cameras: Vec<Camera> = (0..30)
             .map(|i| {
@@ -118,8 +120,8 @@ mod tests {
     }
 
     #[test]
-    fn on_a_line_the_ground_is_level() {
-        // Looking forward along z, y down.
+    fn cameras_on_a_line_give_a_level_ground() {
+        // The cameras look along z, and y points down.
         let cameras: Vec<Camera> =
             (0..9).map(|i| camera(DVec3::new(0.0, 0.0, f64::from(i)), DMat3::IDENTITY)).collect();
         let ground = Ground::fit(&cameras);

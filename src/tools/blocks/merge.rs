@@ -15,7 +15,7 @@ use densify_run::{Observer, RunConfig, Silent};
 use densify_train::importance::{footprints, largest};
 use densify_train::output::model_path;
 
-/// Memory of the program beside models `[bytes]`.
+/// Memory of the program apart from models `[bytes]`.
 const PROGRAM_MEMORY: u64 = 32 << 20;
 
 /// A merged model.
@@ -29,8 +29,8 @@ pub struct Merged {
     pub missing: Vec<String>,
 }
 
-/// Upper bound of the memory of a merge `[bytes]`, with `largest` the largest number of rows of a block, frozen ones
-/// included: the model while it is read into growing arrays, and its part in the cell.
+/// Upper bound of the memory of a merge `[bytes]`, if no block has more than `largest` rows, frozen rows included. It
+/// covers a block's model while it is read into growing arrays, and the part of this model in the cell.
 pub(super) fn memory(largest: usize, sh_degree: u8) -> u64 {
     let row = size_of::<f32>() * (11 + 3 * sh_coefficients(sh_degree));
     PROGRAM_MEMORY + 4 * (largest * row) as u64

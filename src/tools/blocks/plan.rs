@@ -34,7 +34,7 @@ const MIN_ROWS: usize = 100;
 const COARSE_SHARE: [usize; 2] = [2, 5];
 /// Smallest default budget of the coarse run.
 const MIN_COARSE_ROWS: usize = 1_000;
-/// The length of a single run over the whole scene is divided by this for the coarse run.
+/// The coarse run has the iterations of a single run over the whole scene, divided by this number.
 const COARSE_SHORTENING: u32 = 2;
 /// Maximum width of the images of the coarse run `[px]`.
 const COARSE_WIDTH: u32 = 400;
@@ -341,7 +341,7 @@ impl<'a> Planner<'a> {
         if rows < wanted {
             let memory = Bytes(self.options.memory.unwrap_or_default());
             return Err(Failure::input(format!(
-                "{TOO_LARGE} of --memory {memory}: {name} has {} Gaussians, of which {} fit; give more --blocks, \
+                "{TOO_LARGE} for --memory {memory}: {name} has {} Gaussians, of which {} fit; give more --blocks, \
                  more --memory, or fewer --rows",
                 grouped(wanted),
                 grouped(rows)

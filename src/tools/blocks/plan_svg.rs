@@ -20,7 +20,7 @@ pub(super) fn draw(plan: &BlockPlan, points: &[[f64; 2]], dataset: &Dataset) -> 
         .map(|centre| plan.ground.project(centre))
         .collect();
     let range = |axis: usize| {
-        // Outliers would shrink the drawing.
+        // Outlying points do not count, as they would shrink the rest of the drawing.
         let mut values: Vec<f64> = points.iter().map(|at| at[axis]).collect();
         values.sort_by(f64::total_cmp);
         let cut = values.len() / 100;

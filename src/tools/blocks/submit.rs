@@ -18,15 +18,15 @@ pub fn submit(
     submission: Submission,
     observer: &dyn Observer,
 ) -> Result<(), Failure> {
-    let open = |(task, state)| (state != TaskState::Complete).then_some(task);
-    let open: Vec<Task> = status(folder, plan).into_iter().filter_map(open).collect();
-    if open.is_empty() {
+    let incomplete = |(task, state)| (state != TaskState::Complete).then_some(task);
+    let incomplete: Vec<Task> = status(folder, plan).into_iter().filter_map(incomplete).collect();
+    if incomplete.is_empty() {
         observer.say(format_args!("every task is complete"));
         return Ok(());
     }
     let folder = std::path::absolute(folder).map_err(Failure::input)?;
     let stage = |name, is_array, includes: fn(Task) -> bool| {
-        let tasks = open.iter().copied().filter(|task| includes(*task));
+        let tasks = incomplete.iter().copied().filter(|task| includes(*task));
         Stage { name, is_array, jobs: tasks.map(|task| job(plan, task)).collect() }
     };
     let stages = [

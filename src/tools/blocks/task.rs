@@ -1,4 +1,4 @@
-//! Runs a task. A task that was killed resumes from its last checkpoint, and its result is byte-identical.
+//! Runs a task. A task that was killed resumes from its last checkpoint, and gives the same result, byte for byte.
 
 use std::fs;
 use std::path::Path;
@@ -11,7 +11,7 @@ use super::{
 };
 use densify_core::camera::Camera;
 use densify_core::files::{FileError, write_atomically};
-use densify_core::numbers::grouped;
+use densify_core::numbers::gaussians;
 use densify_data::dataset::Dataset;
 use densify_data::models::PLY;
 use densify_launch::utf8;
@@ -50,7 +50,7 @@ pub fn run(
         Task::Merge => {
             let output = folder.join(MERGED_FILE);
             let merged = merge(folder, plan, &output, PLY, false, observer)?;
-            observer.say(format_args!("{}: {} Gaussians", output.display(), grouped(merged.rows)));
+            observer.say(format_args!("{}: {}", output.display(), gaussians(merged.rows)));
             return Ok(());
         }
     };
@@ -105,7 +105,7 @@ fn prepare_block(
     let trained = plan.rows_in_cell(&cell, &model);
     if trained.is_empty() {
         return Err(Failure::input(format!(
-            "{}: the coarse model has no Gaussian there; plan with fewer --blocks or more --coarse-rows",
+            "{}: the coarse model has no Gaussian in its cell; plan with fewer --blocks or more --coarse-rows",
             block.name
         )));
     }

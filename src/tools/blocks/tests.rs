@@ -36,7 +36,7 @@ fn cells_cover_the_ground_once_and_have_equal_work() {
 }
 
 #[test]
-fn points_at_one_place_are_not_divided() {
+fn points_at_one_place_stay_in_one_cell() {
     let cells = divide(&[[1.0, 2.0]; 9], &[1.0; 9], [2, 2]);
     assert_eq!(cells.iter().filter(|cell| cell.contains([1.0, 2.0])).count(), 1);
 }
@@ -52,7 +52,7 @@ fn a_margin_widens_a_cell_on_both_sides() {
 }
 
 #[test]
-fn divisions_parse() {
+fn grids_of_blocks_are_parsed() {
     assert_eq!("4".parse(), Ok(Grid::Fixed([4, 1])));
     assert_eq!("3x2".parse(), Ok(Grid::Fixed([3, 2])));
     assert_eq!("auto".parse(), Ok(Grid::Auto));

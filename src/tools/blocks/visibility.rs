@@ -13,11 +13,11 @@ use densify_run::failure::Failure;
 const MIN_TRACKS: usize = 500;
 /// A view belongs to a block if at least this fraction of the points that it sees lie in the block.
 const MIN_FRACTION: f64 = 0.05;
-/// Margin around a block's points in the part of a view that is trained, as a fraction of the image's size.
+/// Margin around a block's points in the part of an image that the block trains on, as a fraction of the image's size.
 const PART_MARGIN: f64 = 0.04;
 /// Maximum number of points that are projected into the training views, evenly sampled.
 const MAX_POINTS: usize = 20_000;
-/// The same for the test views.
+/// Maximum number of points that are projected into the test views, evenly sampled.
 const MAX_TEST_POINTS: usize = 2_000;
 
 /// The points of a scene, their positions on the ground, and the training views that see each.
@@ -103,7 +103,7 @@ impl Visibility {
         let train = train
             .filter(|(_, coverage)| is_enough(coverage.inside, coverage.all))
             .map(|(view, coverage)| (&*view.name, coverage.part));
-        // Tracks exist in training views only.
+        // Tracks exist in training views only, so the dataset's points are projected into the test views.
         let points = &dataset.points.positions;
         let points = points.iter().step_by(points.len().div_ceil(MAX_TEST_POINTS).max(1));
         let is_inside = |&point: &DVec3| {
@@ -159,7 +159,7 @@ impl Visibility {
     }
 }
 
-/// The points that a view sees.
+/// How many points a view sees, and where those inside a cell lie in its image.
 #[derive(Debug, Clone, Copy, Default)]
 struct Coverage {
     /// Number of visible points that are inside.

@@ -23,7 +23,7 @@ pub(super) struct Evaluator {
     /// Near plane `[scene units]`.
     near: f32,
     background: [f32; 3],
-    /// Each render is compared with its best-fitting exposure.
+    /// The exposure of each render is fitted to the photograph before they are compared.
     fits_exposure: bool,
 }
 

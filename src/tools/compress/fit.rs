@@ -64,10 +64,11 @@ pub(super) fn check(options: &Options<'_>, model: &Gaussians) -> Result<(), Fail
     }
 }
 
-/// The formats that hold the model, each tried in the file `scratch`; says what they change, and which ones do not hold it.
+/// Tries each format in the file `scratch`, and returns those that can hold the model. Tells the observer what they
+/// change, and which formats cannot hold it.
 ///
 /// # Errors
-/// When none holds it, or the disk fails.
+/// When no format can hold the model, or the disk fails.
 pub(super) fn fitting(
     options: &Options<'_>,
     model: &Gaussians,
@@ -88,7 +89,7 @@ pub(super) fn fitting(
     unfit.filter(|_| fitting.is_empty()).map_or(Ok(fitting), Err)
 }
 
-/// A format, and the number of rows of the untrained model that reach the target in it.
+/// A format, and the number of rows of the untrained model with which its file meets the target.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Packing {
     pub(super) format: &'static Format,
@@ -97,9 +98,10 @@ pub(super) struct Packing {
     pub(super) is_whole: bool,
 }
 
-/// Chooses the packings to try, in the format that holds the most rows, the first of equals. If it has several variants
-/// and all rows fit with the default accuracy, this is the most accurate variant that still holds all rows; otherwise
-/// it is every variant that holds at least four fifths of the maximum number of rows. Empty if not even one row fits.
+/// Chooses the packings to try, all in the format that holds the most rows; of formats that hold equally many, the
+/// first. If the format has several variants and all rows fit with the default accuracy, the only packing is the most
+/// accurate variant that still holds all rows. Otherwise there is a packing for every variant that holds at least four
+/// fifths of the maximum number of rows. Empty if not even one row fits.
 ///
 /// # Errors
 /// If writing fails.
@@ -137,7 +139,7 @@ pub(super) fn packings(options: &Options<'_>, model: &Gaussians) -> Result<Vec<P
     Ok(packings)
 }
 
-/// Number of rows of this model that reach the target; `None` if not even one fits.
+/// Number of rows of this model with which the file meets the target; `None` if not even one row fits.
 pub(super) fn rows_that_fit(
     to: Target,
     format: &Format,

@@ -18,7 +18,7 @@ use tempfile::TempPath;
 use densify_core::antialiasing::Antialiasing;
 use densify_core::files::{FileError, folder_of, write_atomically};
 use densify_core::gaussians::Gaussians;
-use densify_core::numbers::grouped;
+use densify_core::numbers::{gaussians, grouped};
 use densify_data::models::{Format, PLY};
 use densify_run::failure::Failure;
 use densify_run::finished::{read_model, read_model_as};
@@ -47,7 +47,7 @@ pub struct Options<'a> {
     pub data: DataSpec,
     /// Exposure model, if the model was trained with an exposure per photograph.
     pub exposure: Option<ExposureModel>,
-    /// Near plane, as a fraction of the scene's extent; `None`: the usual one of the dataset.
+    /// Near plane, as a fraction of the scene's extent; `None`: the usual near plane of the dataset.
     pub near: Option<Fraction>,
     /// Antialiasing of the model; `None`: as its file states.
     pub antialias: Option<Antialiasing>,
@@ -59,7 +59,7 @@ pub struct Options<'a> {
     pub iterations: u32,
     /// Random seed of the training.
     pub seed: u64,
-    /// Allowed formats of the file, at least one. Of those that hold equally many Gaussians, the first is used.
+    /// Allowed formats of the file, at least one. Of formats that hold equally many Gaussians, the first is used.
     pub formats: &'a [&'static Format],
     /// File to write, named by [`file()`].
     pub output: &'a Path,
@@ -96,7 +96,7 @@ pub struct Attempt {
 pub struct Compressed {
     /// The original model as PLY.
     pub whole: Attempt,
-    /// The best attempt after each stage of its training but the last.
+    /// Measurements of the best attempt after each stage of its training but the last.
     pub stages: Vec<Attempt>,
     /// All attempts in order.
     pub attempts: Vec<Attempt>,
@@ -115,7 +115,7 @@ pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compre
     let evaluator = Evaluator::open(options, observer)?;
     if options.exposure.is_some() {
         observer.say(format_args!(
-            "exposure learned again, as in the run; PSNR is with the best exposure of each photograph"
+            "exposure learned again, as in the run; PSNR is measured with the best exposure of each photograph"
         ));
     }
     let model = read_model_as(options.model, options.antialias, observer)?;
@@ -123,7 +123,7 @@ pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compre
     let bytes = fit::file_size(PLY, &model)?;
     let whole = evaluator.evaluate_original(model.clone(), options.model, bytes, observer)?;
     let scratch = create_scratch_file(options.output)?;
-    let named = options.formats;
+    let allowed_formats = options.formats;
     let formats = fit::fitting(options, &model, &scratch, observer)?;
     let options = &Options { formats: &formats, ..options.clone() };
     let search = Search { options, observer, evaluator, scratch, model };
@@ -144,14 +144,14 @@ pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compre
                 best_stages = stages;
             }
         }
-        if packings.first().is_some_and(|packing| search.is_lossless(packing, degree)) {
+        if packings.first().is_some_and(|packing| search.keeps_everything(packing, degree)) {
             break;
         }
     }
     let Some((best, format, small)) = best else {
         return Err(fit::too_small(options, &search.model));
     };
-    let file = file(options.output, named, format);
+    let file = file(options.output, allowed_formats, format);
     write_atomically(&file, |out| format.write(&small, out))?;
     Ok(Compressed { whole, stages: best_stages, attempts, best, file })
 }
@@ -167,13 +167,13 @@ struct Search<'a> {
 }
 
 impl Search<'_> {
-    /// The original model with at most this degree. Each attempt makes its own copy, so none takes memory in training.
+    /// The original model with at most this degree. Each attempt makes its own copy and drops it before it trains.
     fn start(&self, degree: u8) -> Gaussians {
         colour::reduce(self.model.clone(), degree)
     }
 
-    /// True if the packing holds the model without loss, so that training cannot improve it.
-    fn is_lossless(&self, packing: &Packing, degree: u8) -> bool {
+    /// True if the packing keeps all rows and bands of the model, so that no training is needed.
+    fn keeps_everything(&self, packing: &Packing, degree: u8) -> bool {
         packing.is_whole && degree == self.model.sh_degree
     }
 
@@ -188,7 +188,7 @@ impl Search<'_> {
         let Self { options, observer, scratch, .. } = self;
         let start = self.start(degree);
         let Packing { format, rows, .. } = *packing;
-        let tuned = if self.is_lossless(packing, degree) {
+        let tuned = if self.keeps_everything(packing, degree) {
             start
         } else {
             let after_stage = &mut |model: &Gaussians| {
@@ -202,8 +202,8 @@ impl Search<'_> {
         };
         let attempt = self.evaluate_file(&small, format, bytes)?;
         observer.say(format_args!(
-            "tried    {} Gaussians of degree {degree} as {}: {} bytes, {:.2} dB",
-            grouped(attempt.rows),
+            "tried    {} of degree {degree} as {}: {} bytes, {:.2} dB",
+            gaussians(attempt.rows),
             format.name,
             grouped(usize::try_from(bytes).unwrap_or(usize::MAX)),
             attempt.train_psnr
@@ -211,7 +211,7 @@ impl Search<'_> {
         Ok(Some((attempt, small)))
     }
 
-    /// Evaluates the file of a model as it is read back, with the losses of its format.
+    /// Writes a model in a format, reads it back and evaluates it, so that the losses of the format count.
     fn evaluate_file(
         &self,
         model: &Gaussians,

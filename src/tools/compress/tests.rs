@@ -1,4 +1,4 @@
-//! Tests of the attempts and of the training between them.
+//! Tests of the formats and sizes that are tried, and of training on a decoded file.
 
 use std::collections::HashSet;
 
@@ -9,7 +9,7 @@ use densify_render::BackendChoice;
 use densify_run::Silent;
 
 #[test]
-fn degrees_are_tried_from_the_models_own_down() {
+fn degrees_are_tried_downwards_from_that_of_the_model() {
     assert_eq!(degrees(3, Target::Bytes(1)), [3, 2, 1, 0]);
     assert_eq!(degrees(1, Target::Bytes(1)), [1, 0]);
     assert_eq!(degrees(0, Target::Bytes(1)), [0]);
@@ -77,14 +77,15 @@ fn formats_that_do_not_hold_the_model_are_not_tried() {
         fit::fitting(&options, &model, &scratch, &Silent)
     };
     let names = |formats: Vec<&Format>| formats.iter().map(|format| format.name).collect();
-    let found: Vec<&str> = fitting(&[spz, sog(), PLY]).map(names).expect("two hold it");
+    let found: Vec<&str> = fitting(&[spz, sog(), PLY]).map(names).expect("two formats");
     assert_eq!(found, ["sog", "ply"]);
-    let refused = fitting(&[spz]).expect_err("it does not").to_string();
-    assert!(refused.contains("spz does not hold") && refused.contains("such as"), "{refused}");
+    let refused = fitting(&[spz]).expect_err("spz cannot hold it").to_string();
+    assert!(refused.contains("spz cannot hold") && refused.contains("such as"), "{refused}");
 }
 
-/// Less accurate variants are smaller, so that more rows fit. Variants that hold fewer than four fifths of the most rows
-/// are not tried. If all rows fit with the default accuracy, the most accurate variant that holds them is tried.
+/// Less accurate variants are smaller, so that more rows fit. Variants that hold fewer than four fifths of the maximum
+/// number of rows are not tried. If all rows fit with the default accuracy, the most accurate variant that holds them
+/// is tried.
 #[test]
 fn only_variants_that_hold_enough_rows_are_tried() {
     let model = colourful(2_000);
@@ -114,8 +115,8 @@ fn only_variants_that_hold_enough_rows_are_tried() {
     assert_eq!(few.rows, 500);
 }
 
-/// The last iterations train the decoded model and keep its view-dependent colour, of which many rows share a palette
-/// entry.
+/// The last iterations train the decoded model and keep its view-dependent colours, each of which is a palette entry
+/// shared by many rows.
 #[test]
 fn colours_stay_as_decoded_from_the_file() {
     let made = Made::colmap_txt();

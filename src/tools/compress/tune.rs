@@ -6,6 +6,7 @@ use super::colour::reduce;
 use super::{Options, Target, fit};
 use densify_core::files::write_atomically;
 use densify_core::gaussians::Gaussians;
+use densify_core::numbers::gaussians;
 use densify_data::models::{Format, PLY};
 use densify_run::failure::Failure;
 use densify_run::finished::read_model;
@@ -14,12 +15,12 @@ use densify_run::{
 };
 use densify_train::exposure::ExposureChoice;
 
-/// A policy that neither adds nor prunes with the settings below.
+/// With the settings below, this policy neither adds nor prunes rows.
 const POLICY: &str = "vanilla";
 const POLICY_SETTINGS: [&str; 3] =
     ["vanilla.grow_every=0", "vanilla.reset_every=0", "vanilla.white_reset_at=0"];
 
-/// Prunes the model to about this many rows, the most important, and trains them. Training changes the compression ratio,
+/// Prunes the model to about its `rows` most important rows, and trains them. Training changes the compression ratio,
 /// so the number of rows that fit is estimated again before the last stage. If the format is lossy, the second half of
 /// the last stage starts from the decoded file and freezes the view-dependent colour, which is quantised most, so that
 /// the other parameters compensate its errors. `after_stage` receives the model after each stage but the last.
@@ -45,20 +46,21 @@ pub(super) fn tune(
             budget = fit::rows_that_fit(options.to, format, &model)?.unwrap_or(1);
         }
         observer.say(format_args!(
-            "training {budget} Gaussians of degree {} for {iterations} iterations ({} of {})",
+            "training {} of degree {} for {iterations} iterations ({} of {})",
+            gaussians(budget),
             model.sh_degree,
             stage + 1,
             stages.len()
         ));
         let is_last = stage + 1 == stages.len();
-        let adapting = if format.is_lossy() && is_last { iterations / 2 } else { 0 };
-        let setting = (budget, iterations - adapting);
+        let adaptation_steps = if format.is_lossy() && is_last { iterations / 2 } else { 0 };
+        let setting = (budget, iterations - adaptation_steps);
         model = train(model, setting, false, options, scratch, observer)?;
-        if adapting > 0 {
+        if adaptation_steps > 0 {
             model = reduce(model, u8::MAX);
             write_atomically(scratch, |out| format.write(&model, out))?;
             model = read_model(scratch, observer)?;
-            let setting = (model.len(), adapting);
+            let setting = (model.len(), adaptation_steps);
             model = train(model, setting, true, options, scratch, observer)?;
         }
     }
@@ -77,7 +79,7 @@ fn train(
     write_atomically(scratch, |out| PLY.write(&model, out))?;
     let mut spec = describe_run(&model, setting, options, scratch)?;
     if freezes_sh {
-        // Rates must be positive; with one so small all steps are lost to rounding.
+        // Rates must be positive; with a rate this small, every step is lost to rounding.
         spec.schedule.lr = vec![assignment("sh_rest=1e-30")?];
     }
     drop(model);

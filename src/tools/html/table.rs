@@ -53,7 +53,7 @@ impl Table {
         self.rows.is_empty()
     }
 
-    /// The table as HTML. A table wider than the page scrolls by itself.
+    /// The table as HTML. A table wider than the page has its own scroll bar.
     pub fn to_html(&self) -> Markup {
         html! {
             div.wide tabindex="0" role="group" aria-label="table" {

@@ -65,7 +65,7 @@ impl Animation {
             }
             head.extend(b"ANIM");
             head.extend(6_u32.to_le_bytes());
-            // A black background, repeated for ever.
+            // A black background; the animation repeats for ever.
             head.extend([0, 0, 0, 255, 0, 0]);
             let length = u32::try_from(head.len() as u64 + frames).map_err(|_| {
                 io::Error::other(

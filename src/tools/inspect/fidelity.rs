@@ -25,8 +25,8 @@ pub struct Reference {
 }
 
 impl Reference {
-    /// Loads the dataset at `scene` and renders `model`, which was read from `file`. Without `near`, the near plane is
-    /// the usual one of the dataset. Unless the dataset or `data` selects test views, every 8th photograph is held out.
+    /// Loads the dataset at `scene` and renders `model`, which was read from `file`. Without `near`, the usual near
+    /// plane of the dataset is used. Unless the dataset or `data` selects test views, every 8th photograph is held out.
     ///
     /// # Errors
     /// When the dataset cannot be loaded or the model cannot be rendered.

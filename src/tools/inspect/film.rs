@@ -69,7 +69,7 @@ pub struct FilmSource {
     pub background: [f32; 3],
     /// From the dataset's coordinates to the renderer's.
     pub normalisation: Normalisation,
-    /// The dataset's cameras, in the renderer's coordinates; none where there is only a model.
+    /// The dataset's cameras, in the renderer's coordinates; empty if there is only a model.
     pub cameras: Vec<Camera>,
 }
 
@@ -85,14 +85,14 @@ impl From<Opened> for FilmSource {
     }
 }
 
-/// An error of making a film.
+/// An error in making a film.
 #[derive(Debug, thiserror::Error)]
 pub enum FilmError {
     /// The file of the camera path is invalid.
     #[error("{0}")]
     Path(#[from] CameraPathError),
     /// Neither the file nor a dataset states the size of a frame.
-    #[error("the file does not say how large a frame is")]
+    #[error("the file does not give the size of a frame")]
     NoSize,
     /// A frame of this size does not fit into memory.
     #[error("a frame of {width}x{height} px takes {}, which cannot be allocated", Bytes(*bytes))]
@@ -112,7 +112,7 @@ pub enum FilmError {
     },
     /// MP4 needs ffmpeg.
     #[error(
-        "{path}: the program ffmpeg is needed for it and was not found; install it, or name a .webp"
+        "{path}: this needs the program ffmpeg, which was not found; install it, or name a .webp"
     )]
     NoFfmpeg {
         /// The video.
@@ -269,7 +269,8 @@ fn encode(pictures: &Path, path: &Path, frames: u32, fps: u32) -> Result<(), Fil
     let (rate, count) = (fps.to_string(), frames.to_string());
     // Named relative to their folder: a % in its path would be part of the pattern.
     let input = ["-framerate", &rate, "-start_number", "0", "-i", "frame_%05d.png"];
-    // The folder may hold more pictures of a longer film. Colours are halved each way, so sides must be even.
+    // The folder may also hold pictures of an earlier, longer film. yuv420p halves the resolution of colour each way,
+    // so sides must be even.
     let even = "pad=ceil(iw/2)*2:ceil(ih/2)*2";
     let output =
         ["-frames:v", &count, "-vf", even, "-pix_fmt", "yuv420p", "-movflags", "+faststart"];

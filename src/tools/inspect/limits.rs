@@ -114,10 +114,10 @@ impl Limits<'_> {
         let mean = Mean { psnr: 0.0, ssim: 0.0, flip: 0.0, lpips, fitted: None };
         let known = measured_values(&mean, has_geometry.then_some(&example));
         for (bound, Limit { key, .. }) in self.each() {
-            // The number of thin structures is known only after measuring.
-            let first = |part| if str::parse::<u32>(part).is_ok() { "0" } else { part };
-            let like = key.split('.').map(first).collect::<Vec<_>>().join(".");
-            if !known.contains_key(&like) {
+            // The number of thin structures is known only after measuring, so any index is accepted.
+            let zero_if_index = |part| if str::parse::<u32>(part).is_ok() { "0" } else { part };
+            let with_index_0 = key.split('.').map(zero_if_index).collect::<Vec<_>>().join(".");
+            if !known.contains_key(&with_index_0) {
                 return Err(LimitError::unknown(bound, key, &known));
             }
         }
@@ -160,7 +160,7 @@ impl LimitError {
                 let geometry = if *has_geometry {
                     ""
                 } else {
-                    "; geometry is known of built-in scenes, and of those that `densify scenegen` wrote"
+                    "; geometry is known only for built-in scenes and those that `densify scenegen` wrote"
                 };
                 let lpips =
                     if key == "lpips" { "; LPIPS is measured with --lpips FILE" } else { "" };

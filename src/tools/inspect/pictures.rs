@@ -95,8 +95,8 @@ impl PictureFolder {
     }
 }
 
-/// A file name without extension for each view. Names come from data files: no part of one may lead out of the
-/// output folder, and no two are the same.
+/// A file name without extension for each view. The views' names come from data files; the file names stay within the
+/// output folder and are distinct.
 pub fn file_names(views: &[&str]) -> Vec<String> {
     let plain = |name: &str| {
         let parts = name.split(['/', '\\']).filter(|part| !matches!(*part, "" | "." | ".."));

@@ -105,7 +105,7 @@ pub struct Batch {
 pub struct Stage {
     /// Name of the stage.
     pub name: &'static str,
-    /// Submitted as an array job, even if only one task is left.
+    /// True if the stage is submitted as an array job, even if only one task is left.
     pub is_array: bool,
     /// Tasks of the stage.
     pub jobs: Vec<Job>,

@@ -44,7 +44,7 @@ pub(super) fn show(batch: &Batch, observer: &dyn Observer) -> Result<(), Failure
     Ok(())
 }
 
-/// Runs all tasks to completion. After a failure no task is started, and those that are running finish.
+/// Runs all tasks to completion. After a failure, no further task is started, and the running tasks finish.
 ///
 /// # Errors
 /// The first failure of a task.

@@ -17,7 +17,7 @@ const MAX_LINES: usize = 400;
 /// Totals over edits.
 #[derive(Default)]
 struct Totals {
-    /// Edits, and Gaussians pruned, added, rewritten and denied, as in the table.
+    /// Number of edits, and of Gaussians pruned, added, rewritten and denied, in the order of the table's columns.
     counts: [usize; 5],
     /// Iteration of the first edit.
     first: u32,
@@ -81,7 +81,7 @@ pub(super) fn tabulate(run: &RunRecord) -> Markup {
     }
 }
 
-/// Totals by cause, the most frequent first, then those of all edits.
+/// Totals by cause, the most frequent first, then the totals of all edits.
 fn totals_by_cause(events: &[EditEvent]) -> Vec<(String, Totals)> {
     let mut by_cause: BTreeMap<&str, Totals> = BTreeMap::new();
     let mut all = Totals::default();

@@ -44,7 +44,7 @@ pub(super) fn scene_name(path: &Path) -> String {
 
 /// Groups all runs by scene and settings.
 pub(super) fn group(runs: &[RunRecord]) -> Result<Vec<Scene>, Failure> {
-    // Each with the canonical path of its dataset, and the settings of its groups.
+    // Each scene with the canonical path of its dataset, and the settings of its groups.
     let mut scenes: Vec<(Scene, PathBuf, Vec<Table>)> = Vec::new();
     for (number, run) in runs.iter().enumerate() {
         let path = run.config.scene_path();
@@ -99,7 +99,7 @@ fn settings(run: &RunRecord) -> Result<Table, Failure> {
     Ok(all)
 }
 
-/// Labels for groups: the policy, and those common options that differ between groups.
+/// Labels for groups: the policy, and those options that all groups have and that differ between them.
 fn labels(known: &[Table]) -> Vec<String> {
     const MAX_OPTIONS: usize = 3;
     let all: Vec<_> = known.iter().map(flatten).collect();

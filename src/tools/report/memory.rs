@@ -6,7 +6,8 @@ use super::runs::RunRecord;
 use densify_core::memory::{Bytes, LedgerLine};
 use densify_html::{Column, Table};
 
-/// The host memory that a run promised not to exceed `[bytes]`. Measurements of the system do not include device memory.
+/// The host memory that a run promised not to exceed `[bytes]`. Device memory is left out, as the system's measurements
+/// do not include it.
 pub(super) fn promised_host_bytes(run: &RunRecord) -> Option<u64> {
     let summary = run.summary.as_ref()?;
     Some(match summary.ledger.on_device() {
@@ -38,7 +39,7 @@ pub(super) fn describe(run: &RunRecord) -> Option<Markup> {
                 Some(peak) => {
                     "The process took " strong { (Bytes(peak)) } " at its peak; " (Bytes(promise)) " were promised"
                     @if peak <= promise { ", and the promise was kept." }
-                    @else { ": " strong { "more than promised." } }
+                    @else { ". " strong { "The promise was exceeded." } }
                 }
                 None => { "The process promised to take at most " (Bytes(promise)) "; this system does not report its peak." }
             }
@@ -48,7 +49,7 @@ pub(super) fn describe(run: &RunRecord) -> Option<Markup> {
         details {
             summary { "The ledger: every buffer" }
             (ledger.to_html())
-            p.note { "Not all of them exist at the same time." }
+            p.note { "Not all buffers exist at the same time." }
         }
     })
 }

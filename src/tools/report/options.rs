@@ -14,7 +14,7 @@ use densify_run::{Partial, RunSpec};
 /// Maximum number of rows of the table of differences; more would not be readable.
 const MAX_DIFFERENCES: usize = 60;
 /// Options that are paths on the machine that trained; only their last component is published.
-const PATHS: [&str; 5] = ["scene", "images", "views", "init", "freeze"];
+const PATHS: [&str; 6] = ["scene", "images", "sparse", "views", "init", "freeze"];
 
 /// All options with their full names, such as `knob.alpha_min`, and their values as text.
 pub(super) fn flatten(options: &Table) -> BTreeMap<String, String> {
@@ -49,7 +49,8 @@ fn published(spec: &RunSpec) -> Result<Table, Failure> {
 pub(super) fn list(run: &RunRecord) -> Result<Markup, Failure> {
     let (all, defaults) = (published(&run.config.spec)?, published(&RunSpec::default())?);
     let (own, defaults) = (flatten(&all), flatten(&defaults));
-    // Tables are left out: they hold all parameters of the policy, without marking the defaults.
+    // Entries of TOML tables are left out: they include every parameter of the policy, whether or not it has its
+    // default value.
     let is_changed = |name: &str| {
         all.get(name).is_some_and(|value| !value.is_table()) && own.get(name) != defaults.get(name)
     };
@@ -69,7 +70,7 @@ pub(super) fn list(run: &RunRecord) -> Result<Markup, Failure> {
     })
 }
 
-/// Lists the common options that differ between runs; `None` if there are none.
+/// Lists the options that all runs have and that differ between them; `None` if there are none.
 pub(super) fn list_differences(runs: &[RunRecord]) -> Result<Option<Markup>, Failure> {
     let options = runs.iter().map(|run| Ok(flatten(&published(&run.config.spec)?)));
     let options: Vec<BTreeMap<String, String>> = options.collect::<Result<_, Failure>>()?;
@@ -104,7 +105,7 @@ mod tests {
     use super::*;
     use densify_run::AbsolutePath;
 
-    /// Options whose value is a file or a folder are paths.
+    /// An option is a path if its value is called a file, folder, model or scene in `--help`.
     #[test]
     fn every_path_option_is_known() {
         let command = RunSpec::augment_args(clap::Command::new("train"));

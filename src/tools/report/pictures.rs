@@ -99,7 +99,7 @@ pub(super) fn render(
         let near = NearPlane::choose(run.config.spec.start.near, &dataset).distance();
         let backend = machine.backend(&dataset, model, near)?;
         let mut renderer = Renderer { backend, background, degree };
-        // The first run chooses the views; their photographs come first.
+        // The first run's ranking selects the views; the photograph comes first in each comparison.
         let pictures = match &mut pictures {
             Some(pictures) => pictures,
             None => {
@@ -243,7 +243,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_worst_views_come_first_and_each_once() {
+    fn the_worst_views_come_first_and_none_is_repeated() {
         let places = |count: usize| -> Vec<&str> {
             choose_ends(&(0..count).collect::<Vec<_>>())
                 .into_iter()

@@ -24,7 +24,7 @@ pub(super) struct RunRecord {
     pub(super) iteration: u32,
     /// True while the run is in training.
     pub(super) is_training: bool,
-    /// The summary at the end; `None` during training, when the file may be from an earlier stop.
+    /// The summary written at the end; `None` during training, when the file may be left from an earlier stop.
     pub(super) summary: Option<Summary>,
     pub(super) steps: Vec<StepRecord>,
     pub(super) events: Vec<EditEvent>,

@@ -128,7 +128,7 @@ pub(super) fn tabulate_means(runs: &[RunRecord], scenes: &[Scene]) -> Option<Mar
             (tabulate_scene(scene, runs))
         }
         p.note {
-            "Brackets are 95 % intervals of the mean by Student's t, given from three seeds on."
+            "Brackets are 95 % intervals of the mean by Student's t, given for three seeds or more."
             @if scenes.iter().any(|scene| scene.groups.len() > 1) {
                 " Differences are between runs of the same seed."
             }
@@ -147,7 +147,7 @@ fn tabulate_scene(scene: &Scene, runs: &[RunRecord]) -> Markup {
     let row = |group: &Group| {
         let mut row = vec![group.label.clone(), group.runs.len().to_string()];
         for (_, value, digits) in SCORES {
-            let values = pairs(group, runs, |run| run.score().map(|mean| value(&mean)));
+            let values = values_by_seed(group, runs, |run| run.score().map(|mean| value(&mean)));
             row.push(mean_of(&values, digits));
         }
         if scene.groups.len() > 1 {
@@ -161,8 +161,8 @@ fn tabulate_scene(scene: &Scene, runs: &[RunRecord]) -> Markup {
     table.to_html()
 }
 
-/// A value of each run of a group, with its seed.
-fn pairs(
+/// A value of each run of a group, with its seed: [`Pair::difference`] is the value itself.
+fn values_by_seed(
     group: &Group,
     runs: &[RunRecord],
     value: impl Fn(&RunRecord) -> Option<f64>,
@@ -183,13 +183,13 @@ fn mean_of(values: &[Pair<'_>], digits: usize) -> String {
 
 fn against_first(group: &Group, first: &Group, runs: &[RunRecord]) -> String {
     let psnr = |run: &RunRecord| run.score().map(|mean| mean.psnr);
-    let base = pairs(first, runs, psnr);
+    let base = values_by_seed(first, runs, psnr);
     let pair = |pair: Pair<'static>| {
         let other = base.iter().find(|other| other.seed == pair.seed)?;
         Some(Pair { difference: pair.difference - other.difference, ..pair })
     };
     let differences: Vec<Pair<'_>> =
-        pairs(group, runs, psnr).into_iter().filter_map(pair).collect();
+        values_by_seed(group, runs, psnr).into_iter().filter_map(pair).collect();
     Difference::new(&differences).map_or_else(|| DASH.to_owned(), |found| found.format(2))
 }
 
@@ -205,7 +205,7 @@ pub(super) fn tabulate_geometry(runs: &[RunRecord]) -> Option<Markup> {
             percent(geometry.floaters.of_rows),
         ])
     };
-    let numbers = ["depth RMSE", "Chamfer distance", "F-score at 1 %", "floaters, of all"];
+    let numbers = ["depth RMSE", "Chamfer distance", "F-score at 1 %", "floaters, of Gaussians"];
     let mut table =
         Table::new(std::iter::once(Column::text("run")).chain(numbers.map(Column::number)));
     runs.iter().filter_map(row).for_each(|row| table.row(row));

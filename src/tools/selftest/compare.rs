@@ -1,9 +1,9 @@
 //! Compares a backend's arrays with the reference's.
 //!
-//! A renderer has thresholds: alpha below 1/255, transmittance used up, depth order. Close to a threshold `f32`
-//! and `f64` may decide differently, and the images then differ by more than rounding. So the comparison is tight
-//! where no threshold is close. Elsewhere a pixel may flip, but rarely, by a bounded amount, and not always in
-//! the same direction: a bias would be a bug. (After gsplat's `assert_close_with_boundary_band`.)
+//! A renderer has thresholds: the smallest alpha, 1/255, the smallest transmittance, and the order of depths. Close to
+//! a threshold `f32` and `f64` may decide differently, and the images then differ by more than rounding. So the
+//! comparison is tight where no threshold is close. Elsewhere a pixel may flip, but rarely, by a bounded amount, and
+//! not always in the same direction: a bias would be a bug. (After gsplat's `assert_close_with_boundary_band`.)
 
 use std::fmt::Write as _;
 
@@ -14,11 +14,11 @@ use densify_render::cpu::ModelGradient;
 pub struct Limits {
     /// Largest difference of a value where no threshold is close.
     pub interior: f64,
-    /// Largest difference of a value where one is close.
+    /// Largest step of a value at a threshold: its difference where a threshold is close.
     pub step: f64,
     /// Largest share of pixels that may differ by more than `interior`; one pixel always may.
     pub flipped: f64,
-    /// Largest absolute mean of the signs of these differences.
+    /// Largest absolute mean of the signs of these pixels' differences.
     pub bias: f64,
 }
 
@@ -36,9 +36,9 @@ impl Limits {
 /// Minimum number of flipped pixels to test their bias: a bias of ½ is then not due to chance (p < 0.01).
 const MIN_FLIPS_FOR_BIAS: usize = 30;
 
-/// Compares two images; returns the largest difference away from boundaries.
+/// Compares two images; returns the largest difference of the pixels that did not flip.
 ///
-/// Shapes: `measured` and `expected` `[pixels, channels]`, `boundary` `[pixels]`.
+/// Shapes: `measured` and `expected` `[pixels, channels]`, `boundary` `[pixels]`, true where a threshold is close.
 ///
 /// # Errors
 /// The first pixel that differs by more than its tolerance, or too many flipped pixels.
@@ -272,7 +272,7 @@ mod tests {
     }
 
     #[test]
-    fn relative_error_is_against_the_largest() {
+    fn errors_are_relative_to_the_largest_expected_value() {
         assert!((relative_error(&[1.0_f32, 10.0], &[1.1, 10.0]) - 0.01).abs() < 1e-7);
         assert!(relative_error(&[0.0_f32; 4], &[0.0; 4]) == 0.0);
         assert!(relative_error(&[1e-20_f32], &[0.0]).is_infinite());

@@ -1,7 +1,7 @@
 //! Fault injection: shows that the selftest can fail.
 //!
 //! In tests, a [`FaultyBackend`] stands in for the native backend and spoils one kind of output. Every kind
-//! of figure of every case must leave its tolerance under at least one fault.
+//! of measurement of every case must exceed its tolerance under at least one fault.
 
 use std::cell::Cell;
 use std::collections::BTreeSet;
@@ -24,7 +24,7 @@ use densify_render::{
 
 use super::{Subject, cases};
 
-/// The kind of output that is spoilt.
+/// The kind of output that is made wrong.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Fault {
     /// Images too bright, each by more than the one before; SSIM too low.
@@ -33,9 +33,9 @@ enum Fault {
     Gradients,
     /// NaN in images and losses.
     NotANumber,
-    /// Losses and counts that steps report.
+    /// Wrong losses and counts reported by training steps.
     Steps,
-    /// The downloaded model.
+    /// A downloaded model with wrong values.
     Model,
     /// One row too many in the audit.
     Audit,
@@ -258,7 +258,8 @@ impl Differentiable for FaultyBackend {
     }
 }
 
-/// Case number and kind of the findings on the native backend, with a fault or without, that pass or fail.
+/// Case number and kind of the native backend's findings that pass (or fail, if `passing` is false), with `fault`
+/// injected.
 fn finding_kinds(fault: Option<Fault>, passing: bool) -> BTreeSet<(u8, String)> {
     FAULT.set(fault);
     let findings = cases().iter().flat_map(|case| case.run(&Subject::NATIVE, false));
@@ -276,7 +277,7 @@ fn every_figure_can_fail() {
     let faults = [Images, Gradients, NotANumber, Steps, Model, Audit];
     let mut failed: BTreeSet<_> =
         faults.into_iter().flat_map(|fault| finding_kinds(Some(fault), false)).collect();
-    // A backend over its budget does not get this far: the trainer stops before.
+    // No fault makes this figure fail: the trainer stops a backend that exceeds its budget before it is counted.
     failed.insert((30, "steps over the budget".into()));
     let never: Vec<_> = all.difference(&failed).collect();
     assert!(never.is_empty(), "these never fail: {never:?}");

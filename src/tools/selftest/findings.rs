@@ -1,14 +1,14 @@
-//! Results of the cases on a backend: the worst figure of each kind in each case.
+//! Results of the cases on a backend: for each case, the worst measurement of each kind.
 
 use super::Case;
 use super::compare::Table;
 
-/// The worst figure of one kind in a case.
+/// The worst measurement of one kind in a case.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Finding {
     /// Number of the case.
     pub case: u8,
-    /// Kind of figure: image, gradient, or the name of a quantity.
+    /// Kind of measurement: image, gradient, or the name of a quantity.
     pub kind: String,
     /// Scene and array in which it was measured.
     pub place: String,

@@ -30,7 +30,7 @@ use trial::Trial;
 /// A set of checks that every backend must pass.
 #[derive(Debug, Clone, Copy)]
 pub struct Case {
-    /// Number, as the user chooses it.
+    /// Number by which the user selects the case.
     pub number: u8,
     /// The numerical difficulty, in a few words.
     pub title: &'static str,
@@ -38,8 +38,8 @@ pub struct Case {
 }
 
 impl Case {
-    /// Runs the case and returns the worst finding of each kind of figure. `long` includes checks that take
-    /// minutes.
+    /// Runs the case and returns the worst finding for each kind of measurement (image, gradient, …). `long`
+    /// includes checks that take minutes.
     pub fn run(&self, subject: &Subject, long: bool) -> Vec<Finding> {
         let mut trial = Trial::new(subject, long);
         // A panic is a bug; the figures of the other cases are still needed.

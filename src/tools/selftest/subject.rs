@@ -86,7 +86,7 @@ impl Subject {
         }
     }
 
-    /// Tolerance of a gradient against the reference, relative to the largest of its class. Single
+    /// Tolerance of a gradient against the reference, relative to the largest of its parameter class. Single
     /// precision loses about 1e-6 in a sum over pixels; a hundred times that allows for cancellation, but
     /// not for a wrong term.
     pub fn gradient_tolerance(&self) -> f64 {

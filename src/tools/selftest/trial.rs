@@ -17,7 +17,7 @@ use densify_render::{BackendError, Differentiable, Rendering, StepInput, StepOut
 
 /// Training steps after each comparison of a scene.
 const STEPS: u32 = 5;
-/// Quantity that counts the numbers broken by these steps.
+/// Name of the figure that counts non-finite numbers after these steps.
 const BROKEN_BY_STEPS: &str = "NaN or infinity in 5 steps and an edit";
 
 /// A running case.
@@ -28,7 +28,7 @@ pub(super) struct Trial<'a> {
     pub(super) table: Table,
     /// Tolerances of images.
     pub(super) limits: Limits,
-    /// Tolerance of gradients, relative to the largest of their class.
+    /// Tolerance of gradients, relative to the largest of their parameter class.
     pub(super) gradient_tolerance: f64,
 }
 
@@ -184,7 +184,7 @@ impl<'a> Trial<'a> {
         let rows = backend.rows();
         let mut plan = EditPlan::new(rows, backend.budget());
         if rows > 1 {
-            // Refusals do not matter: a budget of two rows has room for a child of one.
+            // The pruned row makes room for the child of the split, so neither edit is refused.
             let _ = plan.prune(0);
             let _ = plan.grow(rows as u32 - 1, adc::split_by(1.6));
         }

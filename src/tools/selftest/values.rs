@@ -41,11 +41,11 @@ pub const SIZES: [(u32, u32); 11] = [
     (1, 16_384),
 ];
 
-/// Image sizes `[px]` of 65,536 and 66,049 tiles: more than 65,535, the workgroups along one axis that every
+/// Image sizes `[px]` of 65,536 and 66,049 tiles: more than 65,535, the number of workgroups along one axis that every
 /// WebGPU device supports.
 pub(crate) const LARGE_SIZES: [(u32, u32); 2] = [(4096, 4096), (4097, 4097)];
 
-/// Parameters of a row of degree 3.
+/// Number of parameters of a row of degree 3.
 pub const SLOTS: usize = 59;
 
 /// Parameter `slot` of a row of degree 3, in the order mean, log-scale, quaternion, opacity logit, coefficients.

@@ -14,7 +14,7 @@ const MIN_VALUES: usize = 3;
 /// Explanation of the intervals of [`Difference`], for reports.
 pub(super) const INTERVALS: &str = "Brackets are 95 % intervals of the mean: over seeds by Student's t; over several scenes by \
      resampling scenes and then their seeds, with the standard error multiplied by Student's t, as \
-     scenes are few. There are none below three seeds, or three scenes";
+     scenes are few. No interval is given for fewer than three seeds, or three scenes";
 
 /// Mean of some numbers; `None` if there are none.
 pub(super) fn mean(values: impl IntoIterator<Item = f64>) -> Option<f64> {
@@ -139,7 +139,7 @@ mod tests {
 
     use super::*;
 
-    /// The difference of values by scene and seed.
+    /// The statistics of these differences, by scene and seed.
     fn difference(scenes: &[&[f64]]) -> Option<Difference> {
         let names: Vec<String> = (0..scenes.len()).map(|i| i.to_string()).collect();
         let pairs = names.iter().zip(scenes).flat_map(|(scene, seeds)| {
@@ -151,7 +151,7 @@ mod tests {
 
     /// Quantiles of Student's t at 97.5 %, as printed in any table.
     #[test]
-    fn intervals_over_seeds_are_students() {
+    fn intervals_over_seeds_follow_students_t() {
         let root = f64::sqrt;
         // Standard errors √(1/3), √(2.5/5), √(9.1667/10).
         let ten: Vec<f64> = (1..=10).map(f64::from).collect();
@@ -172,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn few_runs_or_scenes_have_no_interval_and_say_so() {
+    fn too_few_runs_or_scenes_give_a_reason_instead_of_an_interval() {
         for (scenes, said) in [
             (&[&[0.5][..]][..], "+0.50, one run"),
             (&[&[0.0, 1.0]], "+0.50, two runs"),
@@ -187,8 +187,8 @@ mod tests {
         assert_eq!((found.format(1).as_str(), found.pairs), ("+2.0, one seed", 3));
     }
 
-    /// The variance of a resample is (variance of the scenes' means + mean over scenes of the seeds' variance divided by
-    /// their number) / number of scenes.
+    /// The variance of a resampled mean is (variance of the scenes' means + mean over scenes of the seeds' variance
+    /// divided by their number) / number of scenes.
     #[test]
     fn resampled_errors_match_the_closed_form() {
         let scenes: [&[f64]; 4] = [&[0.0, 1.0, 2.0], &[2.0, 4.0], &[-1.0, 0.0, 4.0], &[5.0]];
@@ -206,16 +206,16 @@ mod tests {
     }
 
     /// In simulated studies of three scenes and three seeds, 19 of 20 intervals must contain the true mean, whether
-    /// scenes differ or not. Of percentile intervals only 15 to 17 would contain it.
+    /// scenes differ or not. Only 15 to 17 of 20 percentile intervals would contain it.
     #[test]
     fn intervals_over_scenes_contain_the_true_mean_as_often_as_claimed() {
         let normal = Normal::new(0.0, 1.0).unwrap();
         let mut rng = ChaCha8Rng::seed_from_u64(3);
-        for of_scenes in [0.0, 1.0, 5.0] {
+        for scene_deviation in [0.0, 1.0, 5.0] {
             let mut draw = || normal.inverse_cdf(rng.random_range(1e-9..1.0));
             let holds = |_: &usize| {
                 let scenes = [(); 3].map(|()| {
-                    let scene = of_scenes * draw();
+                    let scene = scene_deviation * draw();
                     [(); 3].map(|()| scene + draw())
                 });
                 let [low, high] =
@@ -224,7 +224,7 @@ mod tests {
             };
             let count = (0..200).filter(holds).count();
             // At least 190 are expected; the first percentile is 182.
-            assert!(count >= 182, "{count} of 200 where scenes differ by {of_scenes}");
+            assert!(count >= 182, "{count} of 200 where scenes differ by {scene_deviation}");
         }
     }
 }

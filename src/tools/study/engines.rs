@@ -69,7 +69,7 @@ pub(super) fn submit(
         && let Some(jobs) = launch::submitted_jobs(&folder)
     {
         observer.say(format_args!(
-            "already submitted as job {jobs}: run this command again when that has ended, with \
+            "already submitted as job {jobs}: run this command again when the job has ended, with \
             --again if it has failed (logs in {})",
             folder.join("logs").display()
         ));

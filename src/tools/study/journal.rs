@@ -1,4 +1,4 @@
-//! The journal of a study: a file with a line per finished run, so that none is repeated.
+//! The journal of a study: a file with a line per finished run, so that no run is repeated.
 
 use std::fs;
 use std::path::{Path, PathBuf};

@@ -61,17 +61,18 @@ impl<'a> Study<'a> {
         Ok(Self { output, observer, journal })
     }
 
-    /// Trains the runs that are not done yet, one after another or with an engine, and returns all outcomes; `None` while
-    /// a scheduler still has runs. Runs with the same description are trained once, as training is reproducible.
+    /// Trains the runs that are not done yet, one after another or with an engine, and returns all outcomes; `None`
+    /// while a scheduler still has unfinished runs. Runs with the same description are trained once, as training is
+    /// reproducible.
     fn run(
         &mut self,
         runs: &[PlannedRun],
         engine: &EngineArgs,
     ) -> Result<Option<Vec<Outcome>>, Failure> {
         let submission = engine.submission()?;
-        let has_open = self.collect(runs)?;
+        let has_unfinished = self.collect(runs)?;
         if let Some(submission) = submission
-            && has_open
+            && has_unfinished
         {
             let is_done = |run: &PlannedRun| self.journal.outcome(&run.spec).is_some();
             engines::submit(self.output, runs, is_done, submission, self.observer)?;
@@ -100,18 +101,18 @@ impl<'a> Study<'a> {
         Ok(Some(outcomes))
     }
 
-    /// Adds the outcomes of runs that an engine has finished to the journal. Returns true if runs are still open.
+    /// Adds the outcomes of runs that an engine has finished to the journal. Returns true if some runs are unfinished.
     fn collect(&mut self, runs: &[PlannedRun]) -> Result<bool, Failure> {
-        let mut has_open = false;
+        let mut has_unfinished = false;
         for run in runs {
             if self.journal.outcome(&run.spec).is_none() {
                 match run.recorded(self.output) {
                     Some(outcome) => self.journal.add(outcome)?,
-                    None => has_open = true,
+                    None => has_unfinished = true,
                 }
             }
         }
-        Ok(has_open)
+        Ok(has_unfinished)
     }
 
     /// Writes the report as `name`.md and as `name`.html with embedded pictures.

@@ -32,7 +32,7 @@ pub(super) struct Outcome {
     pub(super) ssim: f64,
     /// Mean FLIP of the test views.
     pub(super) flip: f64,
-    /// Gaussians at the end.
+    /// Number of Gaussians at the end.
     pub(super) rows: usize,
     /// Largest number of Gaussians at any instant.
     pub(super) peak_rows: usize,
@@ -44,7 +44,7 @@ pub(super) struct Outcome {
     pub(super) seconds: f64,
     /// Processor time of training `[s]`, if known.
     pub(super) cpu_seconds: Option<f64>,
-    /// Views rendered for the policy's decisions.
+    /// Number of views rendered for the policy's decisions.
     pub(super) extra_forwards: u64,
     /// Iterations and PSNR of the test views during training.
     pub(super) curve: Vec<(u32, f64)>,

@@ -48,9 +48,9 @@ pub struct Panel {
     pub x: &'static str,
     /// Name of the y axis.
     pub y: &'static str,
-    /// The points hold the logarithm of the quantity on the x axis.
+    /// True if the x values of the points are logarithms of the quantity on the x axis.
     pub log_x: bool,
-    /// The curves are named in the panel.
+    /// True if a legend in the panel names the curves.
     pub has_legend: bool,
     /// The curves, drawn in order.
     pub curves: Vec<Curve>,
@@ -128,7 +128,7 @@ fn draw_panel(
             let line = chart.draw_series(LineSeries::new(xy, style))?;
             line.label(name).legend(move |at| PathElement::new(ends(at), style));
         }
-        // Few points are separate measurements, which a line alone would hide.
+        // A curve of few points consists of separate measurements, which a line alone would hide.
         if points.len() <= MAX_MARKED_POINTS && !is_dashed {
             let dot = |&point: &(f64, f64)| Circle::new(point, 3, colour.filled());
             chart.draw_series(points.iter().map(dot))?;
@@ -203,7 +203,7 @@ mod tests {
     const SIZE: (u32, u32) = (720, 300);
 
     #[test]
-    fn a_plot_shows_every_curve_and_may_have_none() {
+    fn a_plot_shows_every_curve_and_may_be_empty() {
         let curve =
             |name: &str, points| Curve { name: name.into(), points, colour: 0, is_dashed: false };
         let panel = |log_x| Panel {
@@ -230,7 +230,7 @@ mod tests {
         }
         assert_eq!(even_ticks(0.0, 300.0), [0.0, 50.0, 100.0, 150.0, 200.0, 250.0, 300.0]);
         assert_eq!(even_ticks(0.0, 7000.0).len(), 8);
-        // From 29 to 33 dB with margins, in steps of 0.5 dB, with one decimal.
+        // Ticks go from 29 to 33 dB with margins, in steps of 0.5 dB, with one decimal.
         let text = svg(&[panel(false)], SIZE).unwrap();
         for (label, is_there) in [("30.5", true), ("30.0", true), ("30.000", false)] {
             let lines = text.lines().filter(|line| line.trim() == label);
@@ -244,7 +244,7 @@ mod tests {
             let panel = Panel { curves: vec![line(is_dashed)], has_legend, ..panel(false) };
             svg(&[panel], SIZE).unwrap().matches("stroke-width=\"2\"").count()
         };
-        // A solid curve is one stroke, and one in the legend; a dashed one is many.
+        // A solid curve is one stroke in the panel and one in the legend; a dashed curve is many strokes.
         assert_eq!((strokes(false, true), strokes(false, false)), (2, 1));
         assert!(strokes(true, true) > 20, "{}", strokes(true, true));
         let empty = Panel { curves: Vec::new(), ..panel(false) };

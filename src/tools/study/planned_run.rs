@@ -32,8 +32,8 @@ pub(super) struct PlannedRun {
     pub(super) title: String,
     /// Factor and level for the name of the folder.
     pub(super) folder: String,
-    /// Scores are measured by `densify eval`, which renders without shortcuts, as any viewer does; otherwise they are those
-    /// that the run measured itself.
+    /// If true, scores are measured by `densify eval`, which renders without shortcuts, as other viewers do; otherwise
+    /// the run's own measurements are used.
     pub(super) scores_without_shortcuts: bool,
     /// Description of the run.
     pub(super) spec: Partial,
@@ -148,7 +148,7 @@ impl PlannedRun {
         };
         let Some(scores) = scores else {
             let scene = self.scene.display();
-            return Err(Failure::input(format!("{scene}: no view is held out to measure")));
+            return Err(Failure::input(format!("{scene}: no view is held out to be scored")));
         };
         let path = model_path(folder, iterations);
         let model =

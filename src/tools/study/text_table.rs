@@ -55,7 +55,7 @@ pub(super) fn number_or_dash(value: Option<f64>, digits: usize) -> String {
     or_dash(value.map(|value| format!("{value:.digits$}")))
 }
 
-/// A text, or a dash without it.
+/// The text, or a dash if there is none.
 pub(super) fn or_dash(text: Option<String>) -> String {
     text.unwrap_or_else(|| "–".to_owned())
 }

@@ -1,9 +1,9 @@
-//! Chooses a crop of a picture for comparison by a rule: the window with the most edges, of a quarter of the picture's
-//! sides and at most 160 px.
+//! Chooses a crop of a picture for comparison by a fixed rule: the window with the most edges. Its sides are a quarter
+//! of the picture's, at most 160 px.
 
 use image::{RgbImage, imageops};
 
-/// Longest side of a window `[px]`. Larger windows would not show details enlarged.
+/// Longest side of a window `[px]`. Larger windows could not be shown enlarged.
 const MAX_SIDE: u32 = 160;
 
 /// A window of a picture.
@@ -16,8 +16,8 @@ pub struct Window {
 }
 
 impl Window {
-    /// The window with the largest sum of |∂G/∂x| + |∂G/∂y| of the green channel, and that sum. Of equal windows the first
-    /// in row-major order.
+    /// The window with the largest sum of |∂G/∂x| + |∂G/∂y| of the green channel, and that sum. Of windows with equal
+    /// sums, the first in row-major order.
     pub fn with_most_edges(picture: &RgbImage) -> (u64, Self) {
         let (width, height) = picture.dimensions();
         let side = |length: u32| (length / 4).clamp(1, MAX_SIDE);

@@ -125,7 +125,7 @@ mod tests {
     use densify_core::camera_path::Keyframe;
 
     #[test]
-    fn points_take_no_more_than_their_share_of_memory() {
+    fn points_take_no_more_memory_than_planned() {
         let (_folder, mut scene) = scene_of_one_view();
         let lacks_points = |json: &[u8]| String::from_utf8_lossy(json).contains(NO_POINTS);
         let described = describe(&mut scene);

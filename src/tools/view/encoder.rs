@@ -25,7 +25,7 @@ use densify_train::evaluate::Split;
 use densify_train::metrics::flip_map;
 use densify_train::pictures::{photograph, picture, to_u8};
 
-/// Stack of the encoder thread `[bytes]`. Image decoders use most of it, less than a quarter.
+/// Stack of the encoder thread `[bytes]`. Image decoders use more of it than anything else, but less than a quarter.
 pub(super) const STACK: usize = 512 << 10;
 /// JPEG quality at rest: its PSNR against the rendering is at least 38 dB, usually 45 dB.
 const STILL_QUALITY: u8 = 95;
@@ -41,7 +41,7 @@ const MIN_ALPHA: f32 = 0.02;
 pub(super) struct EncodedPicture {
     pub(super) jpeg: Vec<u8>,
     pub(super) size: (u32, u32),
-    /// The values at both ends of the colour map, if it represents numbers.
+    /// The values at both ends of the colour map, if the colours represent numbers.
     pub(super) range: Option<Range<f64>>,
     /// The mean of the shown numbers, where it is meaningful.
     pub(super) mean: Option<f64>,
@@ -273,8 +273,9 @@ mod tests {
 
     #[test]
     fn large_photographs_need_less_than_a_quarter_of_the_stack() {
-        // Photographs of a current camera. Differences are tested on smaller ones, as they would take a minute; besides
-        // reading the photograph, their stack does not depend on its size.
+        // The first photographs are as large as those of a current camera. Differences are tested on smaller
+        // photographs, as large ones would take a minute; except for reading the photograph, the stack needed does not
+        // depend on its size.
         let scenes = [(4096, 3072), (512, 384)].map(|size| {
             let folder = tempfile::tempdir().expect("a folder");
             photographs(folder.path(), size);
@@ -312,7 +313,7 @@ mod tests {
     fn numbers_are_drawn_from_dark_to_light() {
         let (_folder, scene) = scene_of_one_view();
         let units = 1.0 / scene.normalisation.scale;
-        // Near; three times as far and translucent; empty.
+        // A near pixel, a translucent one three times as far away, and an empty one.
         let rendering = Rendering {
             width: 3,
             height: 1,

@@ -1,9 +1,9 @@
 //! `densify view`: a web page with pictures of a model, rendered on this machine by the training backend.
 //!
 //! One thread owns the models; for a run in training (`live`) it is the training thread. HTTP connections put picture
-//! requests into the `render_queue`, which keeps only the newest request of each page. The model thread renders them
-//! (`render`); a second thread turns the renderings into JPEGs (`encoder`). Every request is validated first
-//! (`listener`, `picture_request`), and no file is ever served from the disk. Prints nothing.
+//! requests into the `render_queue`, which keeps only the newest request of each pane of a page. The model thread
+//! renders them (`render`); a second thread turns the renderings into JPEGs (`encoder`). Every request is validated
+//! first (`listener`, `picture_request`), and no file is ever served from the disk. Prints nothing.
 
 mod colour_map;
 mod description;

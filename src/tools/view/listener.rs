@@ -47,11 +47,11 @@ impl Server {
             let socket = TcpListener::bind((host, port))?;
             Ok((socket.local_addr()?, socket))
         };
-        // The option of `train`, and that of `view`.
+        // `needs_token` is set for `train --view=PORT`; `view` has the option `--port`.
         let flag = if needs_token { "--view=" } else { "--port " };
         let refused = |port: u16, error: std::io::Error| match error.kind() {
             std::io::ErrorKind::AddrInUse => Failure::input(format!(
-                "{flag}{port}: another program uses this port; choose another, or name none to use a free one"
+                "{flag}{port}: another program uses this port; choose another, or give none to use a free one"
             )),
             std::io::ErrorKind::PermissionDenied => Failure::input(format!(
                 "{flag}{port}: the system reserves this port ({error}); choose one from 1024 on"

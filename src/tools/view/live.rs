@@ -1,6 +1,6 @@
 //! `train --view`: the page of a run in training. The training thread renders its own model between two steps, so no
-//! second copy is needed, and training waits for nothing else. Without requests, a step costs one check of an empty
-//! queue.
+//! second copy is needed, and training waits only for this rendering. Without requests, a step costs one check of an
+//! empty queue.
 
 use std::cell::Cell;
 use std::fmt;
@@ -29,7 +29,7 @@ use densify_train::trainer::{EditEvent, RowHistory};
 
 /// Maximum number of waiting requests.
 const MAX_WAITING: usize = 8;
-/// Maximum number of pictures in progress; their memory is part of the plan.
+/// Maximum number of pictures in progress; their memory is in the ledger.
 const MAX_ACTIVE: usize = 1;
 /// Memory of a connection: the used part of its thread's stack, its buffers and its request `[bytes]`.
 const CONNECTION_BYTES: u64 = 80 << 10;
@@ -50,9 +50,9 @@ const COLOURING_NUMBERS: u64 = 5;
 const COLOURING_NUMBERS_ON_GPU: usize = 12;
 
 /// Memory of the page during the whole run `[bytes]`: connections, responses, run status, history of the Gaussians, and
-/// the encoder, which may be active at any time. A picture needs the rendering, the photograph (as decoded, flattened,
-/// half resized and resized), their difference with the buffers of the metric, and the encoded picture.
-fn lasting_bytes(
+/// the encoder, which may be active at any time. A picture needs the rendering, the photograph (decoded, flattened,
+/// resized in one direction, and resized), their difference with the buffers of the metric, and the encoded picture.
+fn page_bytes(
     largest_image: (u32, u32),
     photograph: u64,
     views: usize,
@@ -76,7 +76,7 @@ fn lasting_bytes(
 }
 
 /// Memory for colouring this many Gaussians between two steps `[bytes]`.
-fn passing_bytes(rows: u64, device: &Device) -> u64 {
+fn colouring_bytes(rows: u64, device: &Device) -> u64 {
     let numbers = COLOURING_NUMBERS + device.columns_on_host(COLOURING_NUMBERS_ON_GPU) as u64;
     rows * numbers * size_of::<f32>() as u64
 }
@@ -89,8 +89,8 @@ pub const COMPANION: Companion = Companion { reserve, points: MAX_POINTS };
 
 fn reserve(size: &CompanionSize<'_>, ledger: &mut Ledger) {
     let CompanionSize { budget, device, largest_image, photograph, views, threads } = *size;
-    ledger.add_to(Section::Passing, "a picture for the page", passing_bytes(budget, device));
-    let bytes = lasting_bytes(largest_image, photograph, views, budget, threads);
+    ledger.add_to(Section::Passing, "a picture for the page", colouring_bytes(budget, device));
+    let bytes = page_bytes(largest_image, photograph, views, budget, threads);
     ledger.add_to(Section::Renderer, "the page", bytes);
 }
 
@@ -144,7 +144,7 @@ impl Server {
             let live = LiveObserver { observer, queue, run_status, scene, rows, signals, step };
             let trained = train(run, &live);
             queue.close();
-            // A failed encoder has logged its error, and does not concern training.
+            // A failed encoder has logged its error, and must not make training fail.
             let _ = encoder.join();
             trained
         })

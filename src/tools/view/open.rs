@@ -42,8 +42,8 @@ pub struct ViewOptions<'a> {
     pub dataset: Option<PathBuf>,
     /// Iteration of the run's saved model; by default the last one.
     pub iteration: Option<u32>,
-    /// Near plane for a model file or a dataset, as a fraction of the scene's extent; `None`: the usual one of the
-    /// dataset.
+    /// Near plane for a model file or a dataset, as a fraction of the scene's extent; `None`: the usual near plane of
+    /// the dataset.
     pub near: Option<Fraction>,
     /// Antialiasing of all models; `None`: as their files state.
     pub antialias: Option<Antialiasing>,
@@ -77,7 +77,7 @@ pub fn open(
         return Err(Failure::input("--iteration is for a run's folder; leave it out"));
     }
     let mut first_config = None;
-    // Of models that do not state their own.
+    // The near plane of models that do not state their own.
     let near;
     let mut loaded = if is_model(path) {
         let model = read_model_as(path, antialias, observer)?;
@@ -279,7 +279,7 @@ impl LoadedScene {
         self.add_model_in_scene(name, &model, near, checkpoint)
     }
 
-    /// Adds the model of a run, which states its near plane unless somebody has edited its file.
+    /// Adds the model of a run, whose description states the near plane unless the file was edited by hand.
     fn add_model_of_run(
         &mut self,
         name: String,

@@ -1,5 +1,5 @@
-//! Renders picture requests. This is the only part that needs the models, so their thread, which may be training, does
-//! nothing else.
+//! Renders picture requests. Only this part needs the models, so the thread that owns them, which may be training, does
+//! no other work for the page.
 
 use std::ops::Range;
 use std::time::{Duration, Instant};
@@ -24,7 +24,7 @@ const MEASURING_TIME: Duration = Duration::from_millis(150);
 pub(super) struct RenderedPicture {
     /// Empty if the request is for a photograph.
     pub(super) rendering: Rendering,
-    /// The values at both ends of the colour map, if it represents numbers.
+    /// The values at both ends of the colour map, if the colours represent numbers.
     pub(super) range: Option<Range<f64>>,
     /// Number of training views in which the Gaussians were measured, and number of all training views.
     pub(super) measured_views: Option<[usize; 2]>,
@@ -98,7 +98,7 @@ fn read_edits(model: &ModelInfo) -> Result<Option<(RowHistory, u32)>, Checkpoint
     if edited.len() == model.rows {
         return Ok(Some((RowHistory::from_edits(&edited, model.rows), step)));
     }
-    let problem = format!("it has {} Gaussians, and the model {}", edited.len(), model.rows);
+    let problem = format!("it has {} Gaussians, but the model has {}", edited.len(), model.rows);
     Err(CheckpointError::Invalid { path: path.clone(), problem })
 }
 

@@ -183,14 +183,14 @@ impl RenderQueue {
     }
 }
 
-/// Closes the queue when dropped, also by a panic.
+/// Closes the queue when dropped, even if its thread panics.
 pub(super) struct CloseOnDrop<'a>(pub(super) &'a RenderQueue);
 
 impl Drop for CloseOnDrop<'_> {
     fn drop(&mut self) {
         if thread::panicking() {
             tracing::error!(
-                "a thread of the page failed, so it shows no more pictures; this is a bug"
+                "a thread of the page failed, so the page shows no more pictures; this is a bug"
             );
         }
         self.0.close();
@@ -220,7 +220,7 @@ mod tests {
             let first = scope.spawn(|| queue.submit(picture_request("a", 0)));
             wait_until(&queue, |jobs| !jobs.waiting.is_empty());
             assert_eq!(queue.submit(picture_request("b", 0)).unwrap_err(), RenderError::QueueFull);
-            // A newer request of the waiting pane takes its place.
+            // A newer request of the waiting pane replaces the older one.
             let second = scope.spawn(|| queue.submit(picture_request("a", 1)));
             assert_eq!(first.join().unwrap().unwrap_err(), RenderError::Superseded);
             let job = queue.next_within(Duration::ZERO).unwrap();

@@ -23,7 +23,7 @@ const GRADIENTS: [Signal; 2] = [Signal::ScreenGradient, Signal::ScreenGradientAb
 pub(super) struct RowColours {
     /// Shape: `[rows]`.
     pub(super) rows: Vec<[f32; 3]>,
-    /// The values at both ends of the colour map, if it represents numbers.
+    /// The values at both ends of the colour map, if the colours represent numbers.
     pub(super) range: Option<Range<f64>>,
 }
 
@@ -224,7 +224,7 @@ mod tests {
         model
     }
 
-    /// Edits at steps 9, 6 and 0.
+    /// The last edits of the rows were at steps 9, 6 and 0.
     fn history() -> RowHistory {
         let mut history = RowHistory::from_edits(&[0; 3], 3);
         let ops = |rows: std::ops::RangeInclusive<u32>| -> RowOps {

@@ -146,7 +146,7 @@ mod tests {
         std::fs::write(folder.path().join("transforms.json"), transforms.to_string())
             .expect("a file");
         let scene = scene_of(folder.path());
-        // A Gaussian in front of each.
+        // A Gaussian in front of each camera.
         let mut model = Gaussians::zeros(2, 0);
         for row in 0..2 {
             let camera = scene.view(Split::Train, row).camera;

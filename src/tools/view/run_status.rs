@@ -9,7 +9,7 @@ use densify_train::evaluate::Mean;
 use densify_train::output::StepRecord;
 use densify_train::trainer::EditEvent;
 
-/// Maximum number of points of a curve; when exceeded, every second one is dropped.
+/// Maximum number of points of a curve; when exceeded, every second point is dropped.
 const MAX_POINTS: usize = 512;
 /// Number of newest edits that are kept.
 const MAX_EDITS: usize = 100;
@@ -163,7 +163,8 @@ impl RunStatus {
         (progress.step, progress.rows) = (step, rows);
     }
 
-    /// Adds a point to the curves. When there are too many, drops every second one, so that the whole run stays visible.
+    /// Adds a point to the curves. When there are too many points, drops every second one, so that the curves still
+    /// cover the whole run.
     pub(super) fn record(&self, record: &StepRecord) {
         let mut progress = locked(&self.progress);
         progress.seconds = record.seconds;
@@ -242,7 +243,7 @@ mod tests {
     }
 
     #[test]
-    fn a_long_run_stays_visible_and_within_its_memory() {
+    fn curves_cover_a_long_run_within_the_planned_memory() {
         let run_status = RunStatus::default();
         run_status.begin(0, 1_000_000, 9, 9);
         for step in 1..=100_000 {

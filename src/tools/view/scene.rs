@@ -203,7 +203,7 @@ impl Scene {
     }
 }
 
-/// True if the backend can count the Gaussians behind each pixel.
+/// True if the backend can count the Gaussians blended into each pixel.
 fn counts_rows(backend: &mut dyn Backend) -> bool {
     backend.inspect().is_ok_and(|inspect| inspect.counts_rows())
 }

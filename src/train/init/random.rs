@@ -7,8 +7,8 @@ use rand_chacha::rand_core::{Rng, SeedableRng};
 use densify_core::camera::Camera;
 use densify_data::dataset::PointCloud;
 
-/// Half the side of the cube around the focus, as a fraction of the cameras' distance. As in the original code, it is 1.3
-/// in NeRF-synthetic scenes, whose cameras are 4.03 away.
+/// Half the side of the cube around the focus, as a fraction of the cameras' distance. In NeRF-synthetic scenes, whose
+/// cameras are 4.03 away, half the side is then 1.3, as in the original code.
 const HALF_CUBE: f64 = 1.0 / 3.0;
 /// Depths of background points, as fractions of the cameras' distance from the focus.
 const BACKGROUND_DEPTHS: (f64, f64) = (2.0 / 3.0, 4.0);
@@ -48,24 +48,24 @@ pub fn random_points(count: usize, cameras: &[Camera], background: bool, seed: u
     points
 }
 
-/// The point closest to all optical axes by least squares, and the median distance of the cameras from it; `None` if the
-/// axes are parallel or do not meet in front of the cameras.
+/// The point closest to all optical axes by least squares, and the median distance of the cameras from it; `None` if
+/// the axes are parallel or do not meet in front of the cameras.
 fn focus(cameras: &[Camera]) -> Option<(DVec3, f64)> {
-    let (mut normal, mut right) = (DMat3::ZERO, DVec3::ZERO);
+    let (mut matrix, mut rhs) = (DMat3::ZERO, DVec3::ZERO);
     for camera in cameras {
         let axis = camera.forward();
         let across =
             DMat3::IDENTITY - DMat3::from_cols(axis * axis.x, axis * axis.y, axis * axis.z);
-        normal += across;
-        right += across * camera.centre();
+        matrix += across;
+        rhs += across * camera.centre();
     }
     let count = cameras.len() as f64;
-    // The smallest eigenvalue divided by `count` is the mean square spread of the axes [rad²]; a spread of a milliradian
-    // is noise.
-    if (normal * (1.0 / count)).determinant() < 1e-6 || cameras.is_empty() {
+    // The smallest eigenvalue of the matrix divided by `count` is the mean square spread of the axes [rad²]; a spread
+    // of a milliradian is noise.
+    if (matrix * (1.0 / count)).determinant() < 1e-6 || cameras.is_empty() {
         return None;
     }
-    let focus = normal.inverse() * right;
+    let focus = matrix.inverse() * rhs;
     let (mut distances, mut misses): (Vec<f64>, Vec<f64>) = cameras
         .iter()
         .map(|camera| {

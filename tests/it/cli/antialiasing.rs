@@ -1,15 +1,14 @@
 //! `train --antialias`: the models it makes state their antialiasing, and every command keeps it or says so.
 
 use densify::core::antialiasing::Antialiasing::{self, Narrow, None, Wide};
-use densify::data::models::read_model;
 use densify::train::output::model_path;
 use std::path::Path;
 
-use super::{call, read, read_text, resume, scratch, text, train};
+use super::{call, gaussians, read, read_text, resume, scratch, text, train};
 use crate::photographs::Photographs;
 
 fn stated(file: &Path) -> Antialiasing {
-    read_model(file).expect("a model").gaussians.antialiasing
+    gaussians(file).antialiasing
 }
 
 #[test]

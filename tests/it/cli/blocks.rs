@@ -77,7 +77,7 @@ fn blocks_are_trained_and_merged_into_one_model() {
     let stdout = blocks("submit", &folder).ok().stdout;
     assert!(stdout.contains("every task is complete"), "{stdout}");
 
-    // A block that is killed before its end and resumed is byte-identical.
+    // A block whose training is killed and resumed gives the same model, byte for byte.
     let run = folder.join("blocks/block-1-0/run");
     let iterations = number(&listed[1], "iterations");
     std::fs::remove_dir_all(run.join(format!("point_cloud/iteration_{iterations}"))).unwrap();
@@ -90,7 +90,7 @@ fn blocks_are_trained_and_merged_into_one_model() {
         status(&folder)
     );
     let part = merge("--partial").ok().stdout;
-    assert!(part.contains("not complete: block-1-0"), "{part}");
+    assert!(part.contains("incomplete, left out: block-1-0"), "{part}");
     let part = gaussians(&merged).len();
     assert!((1..rows).contains(&part), "{part} of {rows}");
     blocks("submit", &folder).ok();
@@ -196,7 +196,7 @@ fn impossible_plans_are_refused_and_write_nothing() {
     let left: Vec<_> = std::fs::read_dir(root.path()).unwrap().collect();
     assert!(left.is_empty(), "{left:?}");
 
-    // `plan` chooses the number of blocks that fits the memory; the coarse model leaves room for their Gaussians.
+    // `plan` chooses enough blocks to fit each into the memory, together with the Gaussians of the coarse model.
     let most = 96 << 20;
     let bounded = read_plan(
         scene.path(),
@@ -253,7 +253,7 @@ fn a_run_uses_only_the_listed_views() {
     assert_eq!((count(&summary, "train_views"), count(&summary, "test_views")), (2, 1));
     train("view_01.png\nno.png\n").refused("an unknown view", &["line 2", "no.png", "views.txt"]);
     train("view_08.png\n").refused("nothing to train on", &["--views", "trained on"]);
-    // Only part of a view of 48x40 px.
+    // A crop of a view of 48x40 px.
     let stdout = train("view_01.png\t0.2 0 0.9 1\n").ok().stdout;
     assert!(stdout.contains("up to 35x40 px"), "{stdout}");
     for wrong in ["0 0 1", "0.5 0 0.5 1", "0 0 1 1.1", "0 0 a 1"] {

@@ -75,12 +75,12 @@ fn every_run_appears_once_in_the_log_and_the_table() {
     assert_eq!(stdout.matches("done before").count(), 8, "{stdout}");
     assert!(before == files(&output), "a complete comparison was changed");
 
-    // A lost or truncated record: only its run is repeated, with the same result.
+    // If a record is lost or truncated, only its run is repeated, with the same result.
     let log = output.join("compare.jsonl");
     let lines = read_text(&log);
     let kept: Vec<&str> = lines.lines().take(7).collect();
     std::fs::write(&log, kept.join("\n") + "\n{\"densify\":").expect("written");
-    // A run with damaged records has no curves, which is said.
+    // A run with damaged records has no curves, and the output says so.
     let run = all[0]["run"].as_str().expect("a name");
     std::fs::write(output.join("runs").join(run).join("stats/train.jsonl"), "{\n")
         .expect("written");

@@ -38,7 +38,7 @@ fn compressed_files_stay_within_the_requested_size() {
     let (outcome, few) = compress(&third.to_string(), "few.ply", "");
     assert!(outcome.ok().stdout.contains(&format!("training {third} Gaussians")));
     assert_eq!(gaussians(&few).len(), third);
-    // Already small enough: nothing is trained and nothing is lost.
+    // A model that is already small enough is neither trained nor reduced.
     let (outcome, same) = compress("1MiB", "same.ply", "");
     assert!(!outcome.ok().stdout.contains("training"));
     assert_eq!(read(&same).len(), whole);
@@ -62,7 +62,7 @@ fn compressed_files_stay_within_the_requested_size() {
         ("1MiB", "same.ply", "", &["exists", "--overwrite"]),
         ("1MiB", "any", "--format any", &["any.", "exists", "--overwrite"]),
         ("1MiB", "tiny.ply", "--format all", &["`all`", "any"]),
-        ("1MiB", "tiny.ply", "--near 0.1", &["--near", "leave it out"]),
+        ("1MiB", "tiny.ply", "--near 0.1", &["--near", "leave the option out"]),
     ] {
         let (outcome, _) = compress(to, name, flags);
         outcome.refused(name, words);

@@ -66,6 +66,7 @@ fn config_toml_contains_every_option_of_a_run() {
         "init_points",
         "memory",
         "preset",
+        "sparse",
         "views",
         "freeze",
     ];

@@ -62,7 +62,7 @@ fn every_format_is_written_compared_and_read_back() {
         found.unwrap_or_else(|| panic!("no line for {name}: {outcome:?}")).to_owned()
     };
     assert!(line("ply").ends_with("same") && line("glb").ends_with("same"), "{outcome:?}");
-    // The minimum for trained scenes; this one has hardly been trained.
+    // The lowest accepted PSNR [dB] for trained scenes; this one has hardly been trained.
     for (name, least) in [("compressed-ply", 45.0), ("spz", 45.0), ("spz-v4", 45.0), ("sog", 42.0)]
     {
         let psnr: f64 = line(name).split_whitespace().last().unwrap().parse().unwrap();
@@ -76,7 +76,7 @@ fn every_format_is_written_compared_and_read_back() {
     for ending in ["glb", "spz", "sog", "compressed.ply"] {
         call(&format!("export {} -o {} --overwrite", text(&at(ending)), text(&again))).ok();
         assert_eq!(read(&again).len(), saved.len(), "{ending}");
-        // A truncated file is refused by name, and nothing is written.
+        // A truncated file is refused with a message that names it, and nothing is written.
         let whole = read(&at(ending));
         let (cut, lost) = (root.path().join("cut"), root.path().join("lost.ply"));
         std::fs::write(&cut, &whole[..whole.len() / 2]).unwrap();
@@ -95,7 +95,7 @@ fn every_format_is_written_compared_and_read_back() {
     let names: Vec<_> = files(&others).into_keys().collect();
     let expected = ["glb", "ply", "sog"].map(|extension| format!("re.mote.{extension}"));
     assert!(expected.iter().all(|name| names.contains(name)), "{names:?}");
-    // The others of its chunk would lie in one plane.
+    // SPZ has no room for the position. In the compressed PLY, the others of its chunk would collapse to a plane.
     let unfit = |name: &String| name.ends_with("spz") || name.contains("compressed");
     assert!(!names.iter().any(unfit), "{names:?}");
     let refused =
@@ -105,7 +105,8 @@ fn every_format_is_written_compared_and_read_back() {
     call(&near).refused("near", &["--near", "a run brings its own"]);
 }
 
-/// SPZ clamps scales: of a model in thousandths of its unit, nothing is written, and the format named instead holds it.
+/// SPZ clamps scales. A model scaled down to a ten-thousandth is therefore not written as SPZ, and the format that the
+/// message proposes instead can represent it.
 #[test]
 fn a_model_beyond_the_range_of_a_format_is_refused() {
     let scene = Photographs::colmap_text();
@@ -119,9 +120,9 @@ fn a_model_beyond_the_range_of_a_format_is_refused() {
     std::fs::write(&to, "old").unwrap();
     let export = |to: &Path| call(&format!("export {} -o {} --overwrite", text(&model), text(to)));
     let refused = export(&to);
-    refused.refused("spz", &["tiny.spz", "the scales of", "% of what shows", "such as"]);
+    refused.refused("spz", &["tiny.spz", "the scales of", "% of the visible area", "such as"]);
     assert_eq!(read(&to), b"old");
     let other = refused.stderr.trim().rsplit(' ').next().unwrap();
     let outcome = export(&root.path().join(format!("tiny.{}", other.replace('-', ".")))).ok();
-    assert!(!outcome.stdout.contains("what shows"), "{outcome:?}");
+    assert!(!outcome.stdout.contains("visible area"), "{outcome:?}");
 }

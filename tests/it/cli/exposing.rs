@@ -42,7 +42,7 @@ fn exposures_survive_resuming_and_do_not_depend_on_threads() {
     }
     let refused = resume(scene.path(), &whole, "--exposure off");
     refused.refused("another exposure", &["--exposure", "contradicts"]);
-    // Evaluating such a run fits exposures, too.
+    // `eval` also fits exposures for a run that learned them.
     let evaluated = call(&format!("eval {} --backend cpu", text(&whole))).ok();
     assert!(evaluated.stdout.contains("fitted"), "{}", evaluated.stdout);
 }
@@ -69,7 +69,8 @@ fn a_run_killed_before_its_first_checkpoint_restarts_from_the_same_exposures() {
     }
 }
 
-/// A run's model was learned with exposures, so compressing it learns them again; a model file does not record them.
+/// A run's model was trained with learned exposures, so compressing the run learns exposures again. A model file does
+/// not record whether it was trained with exposures, so compressing it learns none.
 #[test]
 fn a_compressed_run_keeps_its_exposures() {
     let (root, run) = scratch();

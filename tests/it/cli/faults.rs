@@ -70,7 +70,7 @@ fn a_truncated_photograph_ends_the_run() {
     let scene = Photographs::colmap_text();
     scene.truncate("images/view_03.png", 600);
     refused(&scene, "--quiet", &["images/view_03.png", "cannot decode"]);
-    // Files saved before are kept, and the message says where.
+    // Files that were saved before the failure are kept, and the message says where.
     let (_root, run) = scratch();
     let flags = "--budget 400 --quiet --save-iterations 1 --seed 4";
     let outcome = train(scene.path(), &run, 20, flags);
@@ -116,7 +116,7 @@ impl Observer for TruncateAfter<'_> {
 }
 
 #[test]
-fn a_photograph_damaged_during_a_run_costs_no_step() {
+fn a_photograph_damaged_during_a_run_loses_no_completed_step() {
     let scene = Photographs::colmap_text();
     let intact_photograph = std::fs::read(scene.file("images/view_03.png")).expect("a view");
     let (root, whole) = scratch();
@@ -132,7 +132,7 @@ fn a_photograph_damaged_during_a_run_costs_no_step() {
         run.train(Occupied::Refuse, &TruncateAfter(&scene, cut_after))
     };
     train(&whole, 0).expect("the whole run");
-    // Only the next few of the fourteen views are decoded ahead.
+    // Only a few of the fourteen views are decoded in advance, so the damaged one is still read from disk.
     for cut_after in [16, 28] {
         let part = root.path().join(format!("part{cut_after}"));
         let failure = train(&part, cut_after).expect_err("a truncated photograph");

@@ -42,7 +42,7 @@ fn written_scenes_match_the_built_in_ones_in_all_formats() {
     assert_same(&built_in, &nerfstudio, "transforms.json");
     assert_eq!((nerfstudio.test.len(), nerfstudio.points.len()), (10, built_in.points.len()));
     assert_eq!((colmap.train.len(), colmap.points.len()), (40, built_in.points.len()));
-    // COLMAP poses are normalised by all forty cameras, hence the comparison in world coordinates.
+    // The COLMAP scene is normalised with all forty cameras, so positions are compared in world coordinates.
     let find = |name: &str| colmap.train.iter().find(|v| v.name.ends_with(name)).expect(name);
     let world = |set: &Dataset, view: &densify::data::dataset::View| {
         set.normalisation.world_from_scene_camera(&view.camera).centre()
@@ -74,16 +74,12 @@ fn near_walls_of_the_shared_corridor_are_not_hidden() {
 #[test]
 fn built_in_scenes_are_trained_and_measured_by_name() {
     let (_root, run) = scratch();
-    let stdout = train(Path::new("scene:spheres"), &run, 4, "--budget 6k").ok();
-    assert!(stdout.stdout.contains("30 views"), "{}", stdout.stdout);
-    let stdout = call(&format!("eval {}", text(&run))).ok();
-    assert!(
-        stdout.stdout.contains("PSNR") && stdout.stdout.contains("Chamfer"),
-        "{}",
-        stdout.stdout
-    );
+    let stdout = train(Path::new("scene:spheres"), &run, 4, "--budget 6k").ok().stdout;
+    assert!(stdout.contains("30 views"), "{stdout}");
+    let stdout = call(&format!("eval {}", text(&run))).ok().stdout;
+    assert!(stdout.contains("PSNR") && stdout.contains("Chamfer"), "{stdout}");
     assert!(json(&run.join("geometry.json"))["ours_4"]["depth"]["rmse"].is_f64());
-    // The message about a truncated model must not mention the scene.
+    // The message about a truncated model must be a single line about the model, not about the scene.
     let model = run.join("point_cloud/iteration_4/point_cloud.ply");
     let whole = std::fs::read(&model).expect("the model");
     std::fs::write(&model, &whole[..5000]).expect("write");
@@ -129,7 +125,7 @@ fn written_scenes_are_measured_against_their_files() {
     train(&folder, &run, 6, "--budget 400 --eval --overwrite").ok();
     let measured = json(&run.join("geometry.json"));
     assert!(measured["ours_1"].is_null() && measured["ours_6"].is_object(), "{measured}");
-    // At half size the depth files do not apply, but the mesh does.
+    // At half size the stored depth maps do not fit, so geometry is measured against the mesh.
     train(&folder, &run, 6, "--budget 400 --eval --overwrite -r 2").ok();
     call(&format!("eval {} --split train", text(&run))).ok();
     let half = json(&run.join("geometry_train.json"))["ours_6"].clone();
@@ -158,9 +154,9 @@ fn limits_on_unknown_metrics_are_refused_before_evaluation() {
     let folder = root.path().join("wires");
     write_thin_scene(&folder);
     train(&folder, &run, 2, "--budget 400").ok();
-    let stdout = call(&format!("eval {} --split train --fail-above depth.rsme=1", text(&run)));
-    stdout.refused("a typo", &["--fail-above", "depth.rsme", "depth.rmse", "thin.0.recall"]);
-    assert!(!stdout.stdout.contains("PSNR"), "{}", stdout.stdout);
+    let outcome = call(&format!("eval {} --split train --fail-above depth.rsme=1", text(&run)));
+    outcome.refused("a typo", &["--fail-above", "depth.rsme", "depth.rmse", "thin.0.recall"]);
+    assert!(!outcome.stdout.contains("PSNR"), "{}", outcome.stdout);
     assert!(!run.join("results_train.json").exists());
 }
 

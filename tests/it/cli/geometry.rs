@@ -91,8 +91,8 @@ impl WrittenScene {
 
 #[test]
 #[ignore = "takes minutes: run by .ci/run"]
-fn spheres() {
-    // The less accurate policies end with a fifth to half of the budget.
+fn every_policy_is_accurate_on_spheres() {
+    // The less accurate policies end with only a fifth to half of the budget.
     let depth = |policy: &str| match policy {
         "mini-splatting" => 0.042,
         "reduced-3dgs" => 0.039,
@@ -104,7 +104,7 @@ fn spheres() {
 
 #[test]
 #[ignore = "takes minutes: run by .ci/run"]
-fn clutter() {
+fn every_policy_is_accurate_on_the_table() {
     let depth = |policy: &str| match policy {
         "mcmc" | "igs" => 0.05,
         "diet" => 0.056,
@@ -120,13 +120,13 @@ fn clutter() {
 
 #[test]
 #[ignore = "takes minutes: run by .ci/run"]
-fn wires() {
+fn every_policy_is_accurate_on_thin_wires() {
     let recall = |outcome: &Outcome, width: f64| {
         let thin = outcome.geometry.thin.iter().find(|t| (t.width - width).abs() < 1e-9);
         thin.map_or(0.0, |t| t.recall)
     };
     let is_found = |policy: &str, outcome: &Outcome| {
-        // These end with a third or a fifth of the Gaussians and miss more of the wires.
+        // These two policies end with a third or a fifth of the Gaussians and miss more of the wires.
         let least = match policy {
             "lightgaussian" => [0.16, 0.25],
             "mini-splatting" => [0.07, 0.08],

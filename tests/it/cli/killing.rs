@@ -37,7 +37,7 @@ impl Moment {
         }
     }
 
-    /// Polls until the moment has come. Returns false if the child ends before.
+    /// Polls until the moment has come. Returns false if the child ends first.
     fn wait(self, child: &mut Child, run: &Path) -> bool {
         let mut seen = 0;
         while child.try_wait().expect("a child").is_none() {
@@ -132,7 +132,7 @@ fn a_run_killed_anywhere_resumes_to_the_same_bytes() {
     assert!(within_a_write > 0, "no kill hit the writing of a checkpoint");
 }
 
-/// Sends signals to a started run and waits for its end. Returns exit code and message.
+/// Starts a run, sends signals to it and waits for its end. Returns its exit code and message.
 #[cfg(unix)]
 fn signalled(scene: &Photographs, run: &Path, signals: &[&str]) -> (Option<i32>, String) {
     let mut child = spawn(&arguments(scene, run, LONG, "--budget 360 --checkpoint-every 0"));
@@ -209,7 +209,7 @@ fn a_run_in_progress_is_neither_resumed_nor_replaced() {
     }
     child.kill().expect("it can be killed");
     child.wait().expect("the program ends");
-    // The next complete run removes what a process leaves that is killed while replacing a run.
+    // A process killed while it replaces a run leaves files behind; the next complete run removes them.
     let mut child = spawn(&arguments(&scene, &run, 100_000, "--budget 360 --overwrite"));
     let is_staged = || {
         let staged = densify::train::output::RunFolder::staged(&run);

@@ -87,7 +87,7 @@ fn presets_set_the_number_of_iterations_unless_it_is_given() {
         call(&format!("train {scene} -o {output} --save-iterations 30001 {flags}"))
             .refused(flags, &["--save-iterations 30001", &format!("iterations 1 to {last}")]);
     }
-    // The measured cost of `balanced` does not apply to a run of another length.
+    // The printed cost of `balanced` was measured at its own number of iterations, so it is not printed for others.
     let stdout = short(scene.path(), &output, "").ok().stdout;
     let line = format!("preset   none: --iterations {ITERATIONS} is given, and balanced is 24000");
     assert!(stdout.contains(&line), "{stdout}");
@@ -104,7 +104,10 @@ fn every_level_matches_its_exactness_class() {
     let explicit = root.path().join("explicit");
     for flags in [&*defaults, "--preset exact"] {
         short(scene.path(), &explicit, &format!("{flags} --overwrite")).ok();
-        assert!(expected == model(&explicit, ITERATIONS), "{flags} is not the default");
+        assert!(
+            expected == model(&explicit, ITERATIONS),
+            "{flags} does not give the default model"
+        );
     }
     let mut changed = 0;
     // `accumulation.rs` tests the knobs of a GPU.

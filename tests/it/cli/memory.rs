@@ -109,7 +109,7 @@ fn a_run_stays_within_its_memory_limit() {
         (256, "diet", "tiny-memory", "245k"),
     ] {
         let (_root, run) = scratch();
-        // Starting with a full budget and editing often needs all of the promised memory.
+        // A run that starts with a nearly full budget and edits often needs all of the promised memory.
         let often = frequent_edits(find(policy).expect("it is registered"));
         let flags = format!("--policy {policy} {often} --preset {preset} --init-points {points}");
         let flags = format!("{flags} --memory {memory}MiB --eval --iterations 12");
@@ -181,7 +181,7 @@ fn on_a_gpu_the_limit_applies_to_device_memory() {
         // `gpu::ledger` checks that the backend allocates exactly what the ledger says.
         assert!(bytes <= 48 * MIB && bytes > 47 * MIB, "{name}: {bytes}");
         assert!(planned.stdout.contains("on the device"), "{name}: {}", planned.stdout);
-        // Accumulation without records leaves room for more Gaussians.
+        // Accumulation by atomics needs no gradient records, which leaves room for more Gaussians.
         let most = count(&summary, "budget");
         let in_slots = rows.iter().find(|(other, _)| other == name).map(|(_, rows)| *rows);
         let is_in_slots = device.accumulation().is_deterministic();
@@ -229,7 +229,7 @@ fn apply_remedy(flags: &str, remedy: &str) -> String {
 }
 
 #[test]
-fn too_little_memory_is_refused_with_remedies_and_the_cheapest_comes_first() {
+fn too_little_memory_is_refused_with_remedies_in_order_of_cost() {
     let scene = Photographs::colmap_text();
     let plan = |flags: &str| plan(scene.path(), flags);
     // Dropping the image cache comes first, because it costs only decoding time.
@@ -248,7 +248,7 @@ fn too_little_memory_is_refused_with_remedies_and_the_cheapest_comes_first() {
         plan(&apply_remedy(flags, least)).ok();
         let mib = least.trim_start_matches("--memory ").trim_end_matches("MiB");
         let mib: u64 = mib.parse().unwrap_or_else(|e| panic!("{least}: {e}"));
-        // Bisects for the largest limit that is too small, in KiB, where every remedy saves enough.
+        // Bisects for the largest limit [KiB] that is too small: there, every remedy saves enough.
         let (mut too_small, mut enough) = ((mib - 1) << 10, mib << 10);
         while enough - too_small > 1 {
             let middle = (too_small + enough) / 2;
@@ -363,7 +363,7 @@ fn train_with_limit(limit: usize, flags: &str) -> (Option<i32>, String, bool) {
     (outcome.status.code(), stderr, !files(root.path()).is_empty())
 }
 
-/// From far too little to plenty, each limit of the address space ends in a message or in a model.
+/// At every limit of the address space, from far too little to plenty, the run ends with an error message or a model.
 #[test]
 #[cfg(target_os = "linux")]
 fn a_failed_allocation_is_reported_with_remedies_and_writes_nothing() {

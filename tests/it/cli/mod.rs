@@ -2,9 +2,11 @@
 
 mod accumulation;
 mod antialiasing;
+mod automatic_sizes;
 mod blocks;
 #[cfg(unix)]
 mod caching;
+mod camera_paths;
 mod comparing;
 mod compressing;
 mod configuring;
@@ -12,26 +14,24 @@ mod exporting;
 mod exposing;
 mod faults;
 #[cfg(unix)]
-mod filling;
-mod flying;
+mod full_disk;
 mod generated;
 mod geometry;
 mod hostile;
+mod init_and_freeze;
+mod inspecting;
 mod killing;
 mod knobs;
-mod looking;
+mod live_page;
 mod memory;
+mod model_formats;
+mod neutral_options;
 mod photographing;
 mod reporting;
-mod requiring;
 mod resuming;
-mod same;
-mod starting;
 mod trading;
 mod training;
-mod travelling;
-mod view;
-mod watching;
+mod view_server;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

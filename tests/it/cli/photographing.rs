@@ -67,7 +67,7 @@ fn an_archive_is_equivalent_to_its_folder() {
     assert!(!none.exists());
 }
 
-/// Writes `spheres` with these options, trains briefly and returns the test PSNR.
+/// Writes the scene `spheres` with these options, trains on it briefly and returns the test PSNR [dB].
 fn score(root: &Path, name: &str, options: &str, seed: u32) -> f64 {
     let [folder, run] = ["scene", "run"].map(|folder| root.join(format!("{folder}-{name}-{seed}")));
     let words =

@@ -67,7 +67,7 @@ fn report(runs: &[&Path], file: &Path, more: &str) -> Outcome {
     densify(&words)
 }
 
-fn run_of(scene: &Path, run: &Path, more: &str) {
+fn train_run(scene: &Path, run: &Path, more: &str) {
     train(scene, run, 40, &format!("--budget 320 --eval --quiet {more}")).ok();
 }
 
@@ -90,7 +90,7 @@ fn copy_scene(scene: &Photographs, to: PathBuf, renamed: &str) -> PathBuf {
 fn a_report_shows_the_results_and_is_self_contained() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
-    run_of(scene.path(), &run, "--test-iterations 10,20,30");
+    train_run(scene.path(), &run, "--test-iterations 10,20,30");
     let file = root.path().join("new/report.html");
     let stdout = report(&[&run], &file, "").ok().stdout;
     assert!(stdout.contains("report   ") && stdout.contains("KiB"), "{stdout}");
@@ -215,7 +215,7 @@ fn reports_average_seeds_compare_policies_and_separate_scenes() {
     for policy in ["diet", "vanilla"] {
         for seed in 0..3 {
             let run = at(&format!("{policy}{seed}"));
-            run_of(scene.path(), &run, &format!("--policy {policy} --seed {seed}"));
+            train_run(scene.path(), &run, &format!("--policy {policy} --seed {seed}"));
             runs.push(run);
         }
     }
@@ -245,7 +245,7 @@ fn reports_average_seeds_compare_policies_and_separate_scenes() {
 
     // Other photographs, and other splits of the same ones, count as separate scenes.
     let elsewhere = copy_scene(&scene, at("garden"), "view_00.png");
-    run_of(&elsewhere, &at("garden-run"), "");
+    train_run(&elsewhere, &at("garden-run"), "");
     train(&elsewhere, &at("garden-all"), 40, "--budget 320 --quiet --test-every 4").ok();
     let file = at("scenes.html");
     report(&[&runs[0], &at("garden-run"), &at("garden-all")], &file, "").ok();
@@ -259,7 +259,7 @@ fn reports_average_seeds_compare_policies_and_separate_scenes() {
     let file = at("moved.html");
     let refused =
         report(&[&runs[0], &at("garden-run")], &file, &format!("--scene {}", text(scene.path())));
-    refused.refused("two scenes at one place", &["--scene", "garden"]);
+    refused.refused("two scenes, one folder", &["--scene", "garden"]);
     assert!(!file.exists());
 }
 
@@ -288,7 +288,7 @@ fn runs_without_test_views_show_training_views() {
 fn invalid_reports_are_refused_with_a_remedy() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
-    run_of(scene.path(), &run, "");
+    train_run(scene.path(), &run, "");
     let file = root.path().join("report.html");
     let at = |name: &str| root.path().join(name);
     std::fs::create_dir(at("empty")).expect("a folder");
@@ -328,10 +328,10 @@ fn invalid_reports_are_refused_with_a_remedy() {
 fn a_run_in_progress_is_reported_as_last_saved() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
-    run_of(scene.path(), &run, "--save-iterations 20 --test-iterations 20");
+    train_run(scene.path(), &run, "--save-iterations 20 --test-iterations 20");
     let so_far = root.path().join("so-far");
     super::copy_unfinished(&run, &so_far, 40);
-    // An incomplete last line, as of a log in progress.
+    // The last line is incomplete, as in a log that is being written.
     let log = so_far.join("stats/train.jsonl");
     std::fs::write(&log, [&read(&log)[..], b"{\"step\": 50, \"lo"].concat()).expect("a log");
     let lock = std::fs::File::create(so_far.join("densify.lock")).expect("a file");

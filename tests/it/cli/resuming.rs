@@ -33,7 +33,7 @@ fn reproducible_fields(mut value: Value) -> Value {
     value
 }
 
-/// Checks that two runs have left the same files, apart from times.
+/// Checks that two runs have written the same files, apart from times and measured memory.
 fn assert_same(a: &Path, b: &Path, case: &str) {
     let log = |run: &Path| -> Vec<Value> {
         records(&run.join("stats/train.jsonl")).into_iter().map(reproducible_fields).collect()
@@ -53,8 +53,8 @@ fn assert_same(a: &Path, b: &Path, case: &str) {
     }
 }
 
-/// Trains to the end; then resumes from the checkpoint at half in a copy of the folder whose logs contain the later
-/// records, too. Returns the uninterrupted run and the folder that contains it.
+/// Trains to the end. Then copies the run without its last files, though with complete logs, and resumes the copy from
+/// the checkpoint at [`HALF`]. Returns the temporary folder and, in it, the uninterrupted run.
 fn compare(scene: &Path, flags: &str, case: &str) -> (TempDir, PathBuf) {
     let (root, whole) = scratch();
     let flags = format!("--checkpoint-every {HALF} {flags}");
@@ -132,7 +132,7 @@ fn every_policy_resumes_exactly_on_a_gpu() {
 }
 
 #[test]
-fn checkpoints_keep_all_state_between_steps() {
+fn checkpoints_contain_all_state_that_lasts_between_steps() {
     let scene = Photographs::colmap_text();
     // Gradients accumulated between steps, several bands, random backgrounds, and a rising SH degree.
     for flags in [

@@ -185,7 +185,7 @@ fn overwriting_needs_a_flag_and_replaces_the_whole_run() {
 }
 
 #[test]
-fn the_policy_sets_the_cadence_of_view_dependent_colour() {
+fn the_policy_sets_how_often_view_dependent_colour_is_updated() {
     let scene = Photographs::colmap_text();
     let trained = |flags: &str| {
         let (_root, run) = scratch();

@@ -1,8 +1,8 @@
 //! Applies random plans in sequence to a backend and to a plain vector of Gaussians that implements the documented
 //! semantics. Parameters, moments, ages, signals and the history of rows must agree, and the budget must hold.
 //!
-//! Moments cannot be read directly. They show in a step without visible Gaussians, where a row moves only by its moments
-//! and age. An unedited twin provides the expected movement.
+//! Moments cannot be read directly, but in a step without visible Gaussians a row moves only because of its moments and
+//! age. An unedited twin backend provides the expected movement.
 
 #![expect(clippy::float_cmp, reason = "rows must match bit for bit")]
 
@@ -36,7 +36,7 @@ const SIGNALS: [Signal; 6] = [
     Signal::DepthMin,
     Signal::WeightSum,
 ];
-/// The number of views in which a row was visible.
+/// Index in [`SIGNALS`] of the number of views in which a row was visible.
 const SEEN: usize = 3;
 const SAME: Update = Update { keep_moments: false, ..Update::NONE };
 
@@ -99,7 +99,7 @@ fn twin(subject: &Subject) -> [Vec<Row>; 2] {
     [before, rows(&mut *backend)]
 }
 
-/// The logit after a step, which confines opacities to the safe range.
+/// The logit after a step, which clamps opacities to the safe range.
 fn confined(logit: f32) -> f32 {
     logit.clamp(-9.2, 9.2)
 }

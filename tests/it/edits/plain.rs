@@ -19,11 +19,11 @@ pub(super) struct Row {
     pub(super) logit: f32,
     pub(super) sh: Vec<f32>,
     pub(super) signals: [f32; SIGNALS.len()],
-    /// The row of the twin that has the same moments; `None` if they are zero.
+    /// The row of the unedited twin (see `mod.rs`) that has the moments of this row; `None` if they are zero.
     pub(super) moments: Option<usize>,
-    /// True if the moments of the opacity are zero, regardless of the others.
+    /// True if the moments of the opacity are zero, regardless of the other moments.
     pub(super) opacity_rests: bool,
-    /// The first SH coefficient from which on moments are zero, regardless of the others.
+    /// The first of the SH coefficients whose moments are zero, regardless of the other moments.
     pub(super) sh_rests_from: usize,
     /// True if the opacity has decayed.
     pub(super) has_decayed: bool,
@@ -70,7 +70,7 @@ impl Row {
         }
     }
 
-    fn cover(&mut self, rule: OpacityRule, siblings: u32) {
+    fn apply_opacity_rule(&mut self, rule: OpacityRule, siblings: u32) {
         let opacity = sigmoid(self.logit);
         self.logit = match rule {
             OpacityRule::Same => return,
@@ -90,7 +90,7 @@ impl Row {
         self.rescale(ScaleRule::Uniform(1.0 - how.scale));
     }
 
-    /// Resets moments, age and history.
+    /// Resets moments and signals (the age is a signal).
     fn newborn(mut self) -> Self {
         self.moments = None;
         self.signals = SIGNALS.map(empty);
@@ -125,7 +125,7 @@ impl Row {
         child.mean = [0, 1, 2].map(|i| (f64::from(self.mean[i]) + offset[i]) as f32);
         child.rescale(how.scale);
         child.quat = from_dquat(to_dquat(self.quat) * to_dquat(how.turn).normalize());
-        child.cover(how.opacity, how.siblings());
+        child.apply_opacity_rule(how.opacity, how.siblings());
         child
     }
 
@@ -161,7 +161,7 @@ fn empty(signal: Signal) -> f32 {
     if signal.kind() == SignalKind::Minimum { f32::INFINITY } else { 0.0 }
 }
 
-/// Applies the accepted calls of a step to the plain vector.
+/// Applies the accepted calls of one event to the plain vector.
 pub(super) fn execute(
     model: Vec<Row>,
     calls: &[Call],
@@ -191,7 +191,7 @@ pub(super) fn execute(
                 let mut updated = before[*row as usize].clone();
                 updated.steps[1] = step;
                 updated.rescale(how.scale);
-                updated.cover(how.opacity, 1);
+                updated.apply_opacity_rule(how.opacity, 1);
                 if let Some(degree) = how.sh_degree {
                     let kept = 3 * (usize::from(degree) + 1).pow(2);
                     updated.sh.iter_mut().skip(kept).for_each(|coefficient| *coefficient = 0.0);
@@ -212,9 +212,9 @@ pub(super) fn execute(
             }
         }
     }
-    let families = slots.into_iter().zip(children);
+    let rows_with_children = slots.into_iter().zip(children);
     let mut model: Vec<Row> =
-        families.flat_map(|(row, children)| row.into_iter().chain(children)).collect();
+        rows_with_children.flat_map(|(row, children)| row.into_iter().chain(children)).collect();
     model.extend(seeds);
     assert!(model.len() <= budget, "{} rows, budget {budget}", model.len());
     for row in &mut model {

@@ -15,7 +15,7 @@ fn device_allocations_match_the_ledger() {
     };
     let mask = MaskTerm { start: 1.0, rate: 0.01, weight: 5e-4, threshold: 0.01 };
     let columns = vec![AuxColumn::PixelCount, AuxColumn::MapSum];
-    // One number per pair for the error, another for the weight of scores, none for attributes.
+    // The numbers per gradient record: nine, one more for the error, and another for the weight of scores.
     let asked = [
         (needs(&[]), 9),
         (needs(&[Signal::WeightedError]), 10),
@@ -57,11 +57,11 @@ fn device_allocations_match_the_ledger() {
         gpu.render(&camera, GREY, 1).expect("a rendering");
         assert_eq!(gpu.allocated_bytes(), promised);
         // Only accumulation in slots needs records.
-        let pair_lines = gpu.ledger().lines.iter().filter(|line| line.what.contains("per entry"));
-        let records: u64 = pair_lines.map(|line| line.bytes).sum();
+        let record_lines = gpu.ledger().lines.iter().filter(|line| line.what.contains("per entry"));
+        let record_bytes: u64 = record_lines.map(|line| line.bytes).sum();
         let is_in_slots = device.accumulation().is_deterministic();
         assert_eq!(
-            records,
+            record_bytes,
             if is_in_slots { 4 * numbers * 700 } else { 0 },
             "{:?}, {needs:?}",
             device.accumulation()

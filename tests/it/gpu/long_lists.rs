@@ -38,7 +38,7 @@ fn backend(model: &Gaussians, device: &GpuDevice) -> Box<dyn Differentiable> {
     faint(&Subject::Gpu(device.clone()), model)
 }
 
-/// Returns true if the driver ended its loops early. Checks that this is reported, and that llvmpipe does it.
+/// Returns true if the driver ended its loops early. Checks that this is reported, and that llvmpipe ends them early.
 fn ended_early<T>(result: &Result<T, Failure>, device: &GpuDevice, more: bool) -> bool {
     let Err(error) = result else {
         let breaks_off = device.adapter().name.contains("llvmpipe");

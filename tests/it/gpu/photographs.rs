@@ -29,7 +29,7 @@ fn step(backend: &mut GpuBackend, step: u32, view: usize, (camera, target): &(Ca
 }
 
 #[test]
-fn cached_photographs_change_only_memory() {
+fn caching_photographs_changes_only_the_memory() {
     let mut views = [view((41, 27), 1), view((30, 30), 2), view((41, 30), 3), view((17, 5), 4)];
     let plane =
         |seed, size| scenes::noisy(size, 0.0, seed).1.rgb[..(size.0 * size.1) as usize].to_vec();

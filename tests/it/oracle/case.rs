@@ -19,7 +19,7 @@ pub(super) struct Case {
     pub(super) model: Gaussians,
     pub(super) cameras: Vec<Camera>,
     pub(super) background: [f32; 3],
-    /// Relative error of the same computation in `f32`, by quantity.
+    /// Relative error of each quantity if it is computed in `f32`.
     floors: BTreeMap<String, f64>,
     arrays: BTreeMap<String, Vec<f64>>,
 }
@@ -105,7 +105,7 @@ impl Case {
     }
 
     /// True for pixels that are not near a threshold of the renderer. Shape: [height, width].
-    pub(super) fn decided(&self, camera: usize) -> Vec<bool> {
+    pub(super) fn away_from_thresholds(&self, camera: usize) -> Vec<bool> {
         self.split(self.array("pixel_ok"), camera).iter().map(|&ok| ok > 0.0).collect()
     }
 
@@ -123,8 +123,8 @@ impl Case {
         }
     }
 
-    /// Ten times the `f32` error of this quantity. If it was not measured, the largest error of the same parameter class
-    /// in another loss is used, or else of any gradient.
+    /// Ten times the `f32` error of this quantity. If it was not measured, the largest error of the same parameter
+    /// class in another loss is used, or else of any gradient.
     pub(super) fn tolerance(&self, key: &str) -> f64 {
         let class = key.rsplit('.').next().unwrap_or(key);
         let largest = |of: &dyn Fn(&str) -> bool| {

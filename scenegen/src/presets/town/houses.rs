@@ -74,7 +74,7 @@ impl Town {
         }
     }
 
-    /// Two slabs of flats on either side of a paved yard with a row of trees.
+    /// Two slabs of flats, one on each side of a paved yard with a row of trees.
     pub(super) fn flats(&mut self, middle: DVec3, draws: &mut Draws) {
         let paving = self.materials.paving;
         self.level(middle, [BLOCK; 2], [6.5; 2], paving);

@@ -45,7 +45,7 @@ pub(super) struct Materials {
     pub(super) crowns: Vec<u32>,
     pub(super) bark: u32,
     pub(super) concrete: u32,
-    pub(super) paint: Vec<u32>,
+    pub(super) car_paint: Vec<u32>,
     pub(super) glass: u32,
     pub(super) rubber: u32,
     pub(super) pole: u32,
@@ -89,7 +89,7 @@ impl Materials {
             [0.12, 0.12, 0.13],
             [0.4, 0.45, 0.42],
         ];
-        let paint = coats.map(|coat| model.material(Material::lambert("paint", coat))).to_vec();
+        let car_paint = coats.map(|coat| model.material(Material::lambert("paint", coat))).to_vec();
         let mut plain =
             |name: &str, colour: [f32; 3]| model.material(Material::lambert(name, colour));
         let bark = plain("bark", [0.22, 0.15, 0.09]);
@@ -113,7 +113,7 @@ impl Materials {
             crowns,
             bark,
             concrete,
-            paint,
+            car_paint,
             glass,
             rubber,
             pole,
@@ -192,8 +192,9 @@ fn of_tint(model: &mut Model, images: [TextureRef; 3], tint: [f32; 3]) -> Walls 
     Walls { ground, upper, plain }
 }
 
-/// The colour of a bay of a wall with a door, or with a window of `width` times the bay's width. `at` is the
-/// position in the image; y of `within` is the position within the floor.
+/// The colour of a bay of a wall with a door, or with a window of `width` times the bay's width. `at`, the
+/// position in the image, selects the bay by x and the floor by y (0 in the image of a ground floor). Only y of
+/// `within` is used: the position within the floor.
 fn bay(at: DVec2, within: DVec2, pattern: WallPattern, width: f64, with_door: bool) -> Vec3 {
     let (number, floor) = ((at.x * f64::from(BAYS)).floor(), (at.y * f64::from(BAYS)).floor());
     let within = dvec2((at.x * f64::from(BAYS)).fract(), within.y);

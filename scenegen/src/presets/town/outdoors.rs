@@ -93,7 +93,7 @@ impl Town {
     }
 
     fn car(&mut self, place: &LocalFrame, draws: &mut Draws) {
-        let (coat, glass) = (one_of(draws, &self.materials.paint), self.materials.glass);
+        let (coat, glass) = (one_of(draws, &self.materials.car_paint), self.materials.glass);
         let rubber = self.materials.rubber;
         self.block(place, place.at(0.0, 0.65, 0.0), dvec3(0.85, 0.35, 2.1), coat);
         self.block(place, place.at(0.0, 1.2, -0.25), dvec3(0.72, 0.2, 1.15), glass);

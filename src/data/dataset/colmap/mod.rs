@@ -24,7 +24,7 @@ pub(super) const FORMAT: DatasetFormat = DatasetFormat {
     name: "colmap",
     title: "COLMAP",
     file: "sparse/0/cameras.bin",
-    files: "sparse/0/cameras.bin or .txt, with any number or none in place of 0, also below colmap/",
+    files: "sparse/0/cameras.bin or .txt, with any number or none for 0, also below colmap/",
     read,
 };
 
@@ -82,8 +82,8 @@ fn is_model(folder: &Path) -> bool {
     files.iter().any(|name| folder.join(name).is_file())
 }
 
-/// The folders of a dataset's models, relative to the dataset. COLMAP writes several models, numbered from 0, if not all
-/// images are connected.
+/// The folders of a dataset's models, relative to the dataset. COLMAP writes several models, numbered from 0, if not
+/// all images are connected.
 fn models(root: &Path) -> Vec<String> {
     for parent in PARENTS {
         let entries = fs::read_dir(root.join(parent)).into_iter().flatten().flatten();
@@ -151,7 +151,7 @@ fn image_count(root: &Root, model: &str) -> Result<u64, LoadError> {
     }
 }
 
-/// The path of a model's file: the binary file if it exists, otherwise the text file. It may not be a link out of `root`.
+/// The path of a model's file: the binary file if it exists, otherwise the text file. It may not link out of `root`.
 fn file(root: &Root, folder: &Path, name: &str) -> Result<PathBuf, LoadError> {
     let [binary, text] = ["bin", "txt"].map(|ending| folder.join(format!("{name}.{ending}")));
     // If neither exists, the kind of the model's other files decides which path is returned.
@@ -253,8 +253,9 @@ fn model(
     Ok(([cameras, images, points], Model { cameras: lenses, images: posed, points: cloud, tracks }))
 }
 
-/// Adds the tracks of the COLMAP model in a folder to a scene of another format, if the images listed in both formats have
-/// the same poses, as in datasets that `densify scenegen` writes. Otherwise the model is ignored, as it may belong to another scene.
+/// Adds the tracks of the COLMAP model in a folder to a scene of another format, if the images listed in both formats
+/// have the same poses, as in datasets that `densify scenegen` writes. Otherwise the model is ignored, as it may belong
+/// to another scene.
 pub(super) fn adopt_tracks(root: &Root, scene: &mut Scene) {
     let Ok(Some(choice)) = choose(root, None) else { return };
     let Ok((_, model)) = model(&choice, true) else { return };

@@ -19,7 +19,7 @@ use super::camera;
 use super::{Image, MAX_IMAGES, MAX_POINTS, REMEDY, RENAME};
 use densify_core::files;
 
-/// Longest line accepted `[bytes]`. The longest lines list the observations of an image, about 40 bytes per observation.
+/// Longest line accepted `[bytes]`. The longest lines list the observations of an image, about 40 bytes for each.
 const MAX_LINE: u64 = 64 << 20;
 
 struct Lines<'a> {
@@ -166,15 +166,16 @@ pub(super) fn images(path: &Path) -> Result<Vec<Image>, LoadError> {
         if words == 10 && lines.text()?.split_whitespace().count() % 3 != 0 {
             return Err(lines.fault(
                 "observations",
-                "they do not come in triples (X, Y, point id); an image without observations needs an empty line",
+                "they do not come in triples (X, Y, point id); an image without observations needs \
+                 an empty line",
             ));
         }
     }
     Ok(images)
 }
 
-/// Returns true if a line contains a word that is not a number, such as the name of an image. Only lines of observations
-/// have more than 100 words.
+/// Returns true if a line contains a word that is not a number, such as the name of an image. Only lines of
+/// observations have more than 100 words.
 fn has_words(text: &str) -> bool {
     text.split_whitespace().take(100).any(|word| word.parse::<f64>().is_err())
 }

@@ -2,14 +2,14 @@
 //!
 //! A map is injective on a disc if the symmetric part of its Jacobian is positive definite there: on the segment from
 //! one point to another, the image moves strictly in the direction of the segment. On a circle of radius r the radial
-//! part has the eigenvalues q and (r·q)′, where q is the radial factor; the tangential terms p reduce them by at most 6|p|·r
-//! and the thin-prism terms b by at most 2|b|·r. The distortion is therefore invertible up to the first radius at which
-//! the smaller eigenvalue no longer exceeds the total reduction t.
+//! part has the eigenvalues q and (r·q)′, where q is the radial factor; the tangential terms p reduce them by at most
+//! 6|p|·r and the thin-prism terms b by at most 2|b|·r. The distortion is therefore invertible up to the first radius
+//! at which the smaller eigenvalue no longer exceeds the total reduction t.
 //!
-//! With q = N/M, where N and M are polynomials in s = r², the condition is that M, N − t·M and (N + 2sN′)·M − 2s·N·M′ − t·M² are
-//! positive. Each is bounded from below on whole intervals, so that no radius is skipped: with the
-//! variable counted from the start of the interval, a polynomial is at least its constant coefficient plus its negative
-//! terms at the end of the interval.
+//! With q = N/M, where N and M are polynomials in s = r², the condition is that M, N − t·M and
+//! (N + 2sN′)·M − 2s·N·M′ − t·M² are positive. Each is bounded from below on whole intervals, so that no radius is
+//! skipped: with the variable counted from the start of the interval, a polynomial is at least its constant coefficient
+//! plus its negative terms at the end of the interval.
 
 use super::Distortion;
 

@@ -38,7 +38,7 @@ const SAMPLES: u32 = 64;
 /// Cells along each side of a face that are tested for visibility.
 const CELLS: usize = 128;
 /// Steepest ray of a single pinhole, x/z: 65 degrees for a fisheye, 80 degrees for a distorted pinhole. Up to these
-/// angles, cube faces instead of a single pinhole cost 4 dB in views as wide as the lens's (docs/studies/wide-fisheyes.tsv).
+/// angles, cube faces cost up to 4 dB in test views as wide as the photographs (docs/studies/wide-fisheyes.tsv).
 const STEEPEST: f64 = 2.15;
 const STEEPEST_PERSPECTIVE: f64 = 5.67;
 /// Smallest side of a face that becomes a view, x/z.

@@ -169,7 +169,7 @@ fn folding_and_too_wide_lenses_are_not_inverted() {
 }
 
 #[test]
-fn a_pinhole_sees_only_what_the_lens_saw_and_reaches_every_side_of_it() {
+fn a_pinhole_sees_only_what_the_lens_saw_and_reaches_every_side_of_the_photograph() {
     for (name, lens) in lenses() {
         let pinholes = Pinholes::covering(&lens, false).unwrap();
         for (face, undistortion) in &pinholes.faces {

@@ -80,8 +80,8 @@ fn renamed(bytes: &[u8], old: &str, new: &str) -> Vec<u8> {
     bytes
 }
 
-/// Changes one byte at the offset `own` of each file's own header, and one at the offset `table` of its entry in the table
-/// of contents.
+/// Changes one byte at the offset `own` of each file's own header, and one at the offset `table` of its entry in the
+/// table of contents.
 fn with_edited_headers(
     bytes: &[u8],
     own: usize,
@@ -193,6 +193,8 @@ fn masks_and_points_are_read_from_the_archive() {
 fn models_are_not_datasets() {
     let model = [("meta.json".to_owned(), b"{}".to_vec())];
     assert!(!is_archive(&Packed::of(&pack(&model, "", CompressionMethod::Stored)).path()));
+    let inside = pack(&model, "scene/", CompressionMethod::Stored);
+    assert!(!is_archive(&Packed::of(&inside).path()), "in a folder");
     let archive = Packed::of(&packed(&Made::colmap_txt()));
     assert!(is_archive(&archive.path()) && !is_archive(archive.folder.path()));
     refused("a model", &pack(&model, "", CompressionMethod::Stored), "is not a dataset");

@@ -159,7 +159,7 @@ const COLMAP_BINARY: &[Patch] = &[
     ("points3D", |b| b[51..59].fill(0xff), "points3D.bin, truncated"),
 ];
 
-/// Makes the camera a panorama, whose two parameters repeat the image size, as COLMAP writes it.
+/// Makes the camera a panorama, whose two parameters repeat the image size, as COLMAP writes them.
 fn panorama(cameras: &mut Vec<u8>) {
     cameras[12] = 17;
     cameras.truncate(8 + 24 + 16);

@@ -129,7 +129,15 @@ fn photographs_without_a_pose_are_counted_wherever_they_are() {
     for file in ["d.JPG", "rig/left/e.png"] {
         made.write(&format!("images/{file}"), "");
     }
-    for file in ["Thumbs.db", ".hidden.png", "a.mask.png", "masks/d.png", ".cache/d.png"] {
+    for file in [
+        "Thumbs.db",
+        ".hidden.png",
+        "a.mask.png",
+        "a_mask.png",
+        "masks/d.png",
+        "Mask/d.png",
+        ".cache/d.png",
+    ] {
         made.write(&format!("images/{file}"), "");
     }
     respell_name(&made);

@@ -173,7 +173,7 @@ fn images_are_loaded_at_the_requested_resolution() {
                 assert!((view.camera.fx / f64::from(size.0) - 15.0 / 20.0).abs() < 1e-12);
             }
         }
-        // The folder of reduced images is used if there is one. One image is missing in it.
+        // The folder of reduced images is used if it exists; here, one image is missing in the folder.
         for name in &NAMES[1..] {
             image(&made.file("images_2").join(name), (10, 6), 7);
         }
@@ -217,6 +217,10 @@ fn masks_are_found() {
         (Made::realitycapture(), "masks/b.png.mask.png"),
         (Made::realitycapture(), "images/b.png.mask.png"),
         (Made::colmap_txt(), "images/b.mask.png"),
+        (Made::colmap_txt(), "images/b_mask.png"),
+        (Made::transforms(|_| ()), "images/b_mask.png"),
+        (Made::colmap_txt(), "Masks/b.png"),
+        (Made::transforms(|_| ()), "MASK/b.png"),
         (Made::transforms(|_| ()), "images/.mask/b.png"),
         (
             Made::transforms(|json| json["frames"][1]["mask_path"] = "elsewhere/m.png".into()),
@@ -244,7 +248,7 @@ fn masks_are_found() {
 
 #[test]
 fn folders_whose_masks_belong_to_no_photograph_are_noted() {
-    for file in ["masks/other.png", "images/masks/b.png", "segmentation/other.png"] {
+    for file in ["masks/other.png", "images/masks/b.png", "Segmentation/other.png"] {
         let made = Made::colmap_txt();
         image(&made.file(file), SIZE, 200);
         let folder = file.rsplit_once('/').unwrap().0;
@@ -258,7 +262,7 @@ fn folders_whose_masks_belong_to_no_photograph_are_noted() {
 fn dynamic_masks_are_found_beside_photographs() {
     for made in [Made::colmap_txt(), Made::transforms(|_| ())] {
         write_mask(&made.file("images/dynamic_mask_b.png"), |x| u8::from(x >= 10));
-        for (invert_masks, expected) in [(false, (255, 0)), (true, (0, 1))] {
+        for (invert_masks, expected) in [(false, (255, 0)), (true, (0, 255))] {
             let options = LoadOptions { invert_masks, ..LoadOptions::default() };
             let data = load_with(&made, &options);
             assert_eq!(data.train[0].source.load().unwrap().mask, None);
@@ -281,6 +285,7 @@ fn masks_are_found_in_the_folder_that_is_named() {
         "masks/b.mask.png",
         "moved/b.png.mask.png",
         "moved/b.mask.png",
+        "moved/b_mask.png",
         "moved/.mask/b.png",
         "moved/dynamic_mask_b.png",
     ];

@@ -12,10 +12,11 @@ use write::CompressedPlyWriter;
 const FORMAT: Format = Format {
     name: "compressed-ply",
     extension: "compressed.ply",
-    summary: "PLY of PlayCanvas in 16 bytes, and one per coefficient of colour",
+    summary: "PLY of PlayCanvas: 16 bytes per Gaussian, and one per coefficient of colour",
     reader: Some(Reader {
         recognise: |file| {
-            let is_compressed = file.start.starts_with(START) && read::is_compressed(file.path)?;
+            let is_ply = file.unmarked_start().starts_with(START);
+            let is_compressed = is_ply && read::is_compressed(file.path)?;
             Ok(Match::strong_if(is_compressed))
         },
         read: |file| read::read(file.path),

@@ -34,14 +34,14 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
     let sh_degree = match &sh {
         None => 0,
         Some(sh) => sh_degree(sh).map_err(|rest| {
-            LoadError::damaged(path, "element sh", format!("{rest} coefficients are of no degree"))
+            LoadError::damaged(path, "element sh", format!("no degree has {rest} coefficients"))
         })?,
     };
     let rest = 3 * (sh_coefficients(sh_degree) - 1);
     let other = sh.as_ref().map(|sh| sh.rows).filter(|&rows| rows != vertex.rows);
     if chunk.rows != vertex.rows.div_ceil(CHUNK as u64) || other.is_some() {
         let problem = format!(
-            "{} vertices do not go with {} chunks of 256{}",
+            "{} vertices do not match {} chunks of 256{}",
             vertex.rows,
             chunk.rows,
             other.map_or_else(String::new, |rows| format!(" and {rows} rows of colour"))

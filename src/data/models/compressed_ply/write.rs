@@ -17,7 +17,7 @@ const PACKED: usize = 14;
 /// Holds the packed values of all Gaussians, because all chunks precede them in the file.
 #[derive(Default)]
 pub(super) struct CompressedPlyWriter {
-    /// Gaussians of a chunk that is not full.
+    /// Gaussians of the current chunk, which is not full.
     open: Vec<[f32; PACKED]>,
     chunks: Vec<[f32; BOUNDS.len()]>,
     words: Vec<[u32; WORDS.len()]>,

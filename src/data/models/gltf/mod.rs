@@ -32,8 +32,10 @@ const TEXT: Format = Format {
     extension: "gltf",
     summary: "glTF with KHR_gaussian_splatting as text",
     reader: Some(Reader {
-        // Other formats are JSON too.
-        recognise: |file| Ok(Match::weak_if(file.json()?.is_some())),
+        // Other formats are JSON too; every glTF has an asset.
+        recognise: |file| {
+            Ok(Match::weak_if(file.json()?.is_some_and(|text| text.contains("\"asset\""))))
+        },
         read: |file| read::read_text(file.path, file.json()?.unwrap_or_default()),
         main_file: None,
     }),

@@ -21,11 +21,11 @@ use densify_core::gaussians::{MAX_SH_DEGREE, sh_coefficients, sigmoid};
 
 /// The extension of splats in SPZ.
 const SPZ: &str = "KHR_gaussian_splatting_compression_spz_2";
-/// Extensions that a file may require: those of splats, and those without effect on them.
+/// Extensions that a file may require: the extensions of splats, and extensions without effect on splats.
 const KNOWN: [&str; 4] = [SPLATS, SPZ, "KHR_materials_unlit", "KHR_mesh_quantization"];
 
-/// Largest opacity: 1, and errors of rounding.
-const MOST_OPACITY: f32 = 1.001;
+/// Largest accepted opacity: 1 plus rounding errors.
+const MAX_OPACITY: f32 = 1.001;
 
 /// The parts of a document that splats need.
 #[derive(Default, Deserialize)]
@@ -69,7 +69,7 @@ struct Scene {
 /// Reads a `.glb` of `length` bytes.
 ///
 /// # Errors
-/// When the file is unreadable or contradicts itself, requires what is not supported, or holds no splats.
+/// When the file is unreadable or contradicts itself, requires an unsupported extension, or holds no splats.
 pub(super) fn read_binary(
     path: &Path,
     mut input: impl Read,
@@ -90,14 +90,14 @@ pub(super) fn read_binary(
     let text = String::from_utf8_lossy(&text).into_owned();
     let mut start = Vec::new();
     (&mut input).take(8).read_to_end(&mut start).map_err(LoadError::io(path))?;
-    let inside = match start[..] {
+    let binary_chunk = match start[..] {
         [a, b, c, d, b'B', b'I', b'N', 0] => {
             let bytes = u64::from(u32::from_le_bytes([a, b, c, d]));
             Some(read_exactly(path, "BIN", &mut input, bytes)?)
         }
         _ => None,
     };
-    read(path, &text, inside, length)
+    read(path, &text, binary_chunk, length)
 }
 
 /// Reads a `.gltf`.
@@ -111,7 +111,7 @@ pub(super) fn read_text(path: &Path, text: &str) -> Result<SplatFile, LoadError>
 fn read(
     path: &Path,
     text: &str,
-    mut inside: Option<Vec<u8>>,
+    mut binary_chunk: Option<Vec<u8>>,
     length: u64,
 ) -> Result<SplatFile, LoadError> {
     let document: Document =
@@ -125,7 +125,7 @@ fn read(
     let mut contents = Vec::new();
     for (index, BufferSource { uri }) in document.buffers.iter().enumerate() {
         let bytes = match uri {
-            None => inside.take().filter(|_| index == 0).unwrap_or_default(),
+            None => binary_chunk.take().filter(|_| index == 0).unwrap_or_default(),
             Some(uri) => buffer(path, uri)?,
         };
         total += bytes.len() as u64;
@@ -192,7 +192,11 @@ fn splats(
     if let Some(view) = extension.pointer(&format!("/extensions/{SPZ}/bufferView")) {
         let view = view.as_u64().and_then(|view| usize::try_from(view).ok());
         let bytes = buffers.view(view.unwrap_or(usize::MAX))?;
-        return spz::read::read(path, bytes, bytes.len() as u64);
+        let (mut file, axes) = spz::read::read_as_stored(path, bytes, bytes.len() as u64)?;
+        let ignored =
+            axes.map(|axes| format!("its SPZ states the axes {axes}; those of glTF count"));
+        file.notes.extend(ignored);
+        return Ok(file);
     }
     let stated = |key: &str| extension.get(key).and_then(Value::as_str).unwrap_or_default();
     if !matches!(stated("kernel"), "ellipse" | "") || stated("colorSpace") == "lin_rec709_display" {
@@ -237,7 +241,7 @@ fn splats(
     // Many exporters copy the numbers of a splat PLY.
     for (name, values, most, cause) in [
         ("SCALE", &scales, f32::INFINITY, "a logarithm; glTF stores scales"),
-        ("OPACITY", &opacities, MOST_OPACITY, "a logit; glTF stores opacities"),
+        ("OPACITY", &opacities, MAX_OPACITY, "a logit; glTF stores opacities"),
     ] {
         if let Some(value) = values.iter().find(|value| **value < 0.0 || **value > most) {
             let problem = format!("{value} looks like {cause} as they are");
@@ -251,7 +255,7 @@ fn splats(
         sh.clear();
         sh.extend(bands.iter().flat_map(|band| three(band)));
         let (scale, opacity) = (three(&scales), opacities[row]);
-        // If another program has changed the standard's values, densify's own are stale.
+        // If another program has changed the standard's attributes, densify's own attributes are stale.
         let log_scale = log_scales.as_ref().map(|logs| three(logs));
         let logit = logits.as_ref().map(|logits| logits[row]);
         let logit = logit.filter(|&logit| sigmoid(logit).to_bits() == opacity.to_bits());
@@ -270,7 +274,7 @@ fn splats(
 /// Appends a part; the result has the higher of both degrees.
 ///
 /// # Errors
-/// When the parts state different antialiasing (in SPZ inside glTF).
+/// When the parts, as SPZ inside glTF, state different antialiasing.
 fn join(path: &Path, whole: &mut SplatFile, part: SplatFile) -> Result<(), LoadError> {
     let is_first = whole.gaussians.is_empty();
     if is_first {
@@ -280,16 +284,15 @@ fn join(path: &Path, whole: &mut SplatFile, part: SplatFile) -> Result<(), LoadE
         let problem = "only some of them were trained with antialiasing";
         return Err(LoadError::damaged(path, "meshes", problem));
     }
-    for note in part.notes {
-        if !whole.notes.contains(&note) {
-            whole.notes.push(note);
-        }
-    }
     let degree = whole.gaussians.sh_degree.max(part.gaussians.sh_degree);
     let more = part.gaussians.with_degree(degree);
     whole.gaussians = std::mem::take(&mut whole.gaussians).with_degree(degree);
     whole.gaussians.append(more);
     whole.dropped += part.dropped;
     whole.repaired += part.repaired;
+    // Many parts may have the same note.
+    let is_new = |note: &String| !whole.notes.contains(note);
+    let notes: Vec<String> = part.notes.into_iter().filter(is_new).collect();
+    whole.notes.extend(notes);
     Ok(())
 }

@@ -1,4 +1,4 @@
-//! Numbers of accessors, and those that are no scales or opacities.
+//! Tests of the numbers in accessors, and of numbers that cannot be scales or opacities.
 
 use std::path::Path;
 
@@ -34,7 +34,7 @@ fn signed_integers_keep_their_minimum_unless_normalised() {
     }
 }
 
-/// Exporters that copy a PLY leave logarithms and logits.
+/// Exporters that copy the values of a PLY write logarithms and logits.
 #[test]
 fn logarithms_and_logits_are_refused_with_the_reason() {
     let folder = tempfile::tempdir().unwrap();
@@ -66,7 +66,7 @@ fn logarithms_and_logits_are_refused_with_the_reason() {
         std::fs::write(&path, document.to_string()).unwrap();
         read_model(&path).map(|file| file.gaussians).map_err(|error| error.to_string())
     };
-    // Rounding may lead beyond 1.
+    // Rounding may lead to opacities above 1.
     for (scale, opacity) in [(0.2, 0.9), (0.0, 0.0), (80.0, 1.0), (0.2, 1.000_001)] {
         assert_eq!(read(scale, opacity).map(|model| model.len()), Ok(1), "{scale}, {opacity}");
     }

@@ -12,7 +12,7 @@ use crate::models::{ModelWriter, Shape};
 use densify_core::antialiasing::Antialiasing;
 use densify_core::gaussians::{Gaussians, sh_coefficients, sigmoid};
 
-/// Attributes before those of colour, each with its numbers per Gaussian.
+/// Attributes before those of colour, each with its number of components.
 const ATTRIBUTES: [(&str, usize); 6] = [
     ("POSITION", 3),
     ("ROTATION", 4),

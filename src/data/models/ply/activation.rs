@@ -5,13 +5,14 @@ use crate::models::quantise::{log_of_scale, quantised_logit};
 use crate::models::spatial_order::frame;
 use densify_core::gaussians::Gaussians;
 
-/// Whatever the scales, numbers from 0 to 1 are opacities if the largest is above this. As logits, 0.9 to 1 are opacities of
-/// 0.71 to 0.73.
+/// Whatever the scales are, numbers from 0 to 1 count as opacities if the largest is above this and they spread by more
+/// than [`SPREAD`]. As logits, 0.9 to 1 would be opacities of 0.71 to 0.73.
 const NEAR_OPAQUE: f32 = 0.9;
-/// They must also differ by more than this; logits between 0 and 1 are opacities of 0.5 to 0.73.
+/// Smallest spread of numbers that count as opacities. As logits, 0 to 1 would be opacities of 0.5 to 0.73.
 const SPREAD: f32 = 0.25;
 
-/// Turns plain values into logits and logarithms where there is no doubt; returns notes on them, and on what is in doubt.
+/// Turns plain values into logits and logarithms where there is no doubt; returns notes on these values, and on
+/// values that are in doubt.
 pub(super) fn undo(model: &mut Gaussians) -> Vec<String> {
     let (faintest, most_opaque) = range(&model.opacity_logits);
     let (least, most) = range(model.log_scales.as_flattened());
@@ -56,7 +57,7 @@ fn are_logarithms(model: &Gaussians) -> bool {
     let middle = largest.len() / 2;
     let median = f64::from(*largest.select_nth_unstable_by(middle, f32::total_cmp).1);
     let extent = frame(model).iter().map(|(_, spread)| *spread).fold(0.0, f64::max);
-    // Below ln 2, the standard deviations of half of all Gaussians lie between 1 and 2.
+    // With a median below ln 2, the standard deviations of half of all Gaussians would lie between 1 and 2.
     median > std::f64::consts::LN_2 && median.exp() < extent
 }
 

@@ -7,8 +7,8 @@ use densify_core::gaussians::{MAX_SH_DEGREE, sh_coefficients};
 /// First bytes of every PLY file.
 pub(in crate::models) const START: &[u8] = b"ply";
 
-/// Names of the properties that are read, in the order of the original. Before index [`NORMALS_AT`] the original has
-/// three normals, which are 0.
+/// Names of the properties that are read, in the order of the original trainer, which also writes three normals, all 0,
+/// before index [`NORMALS_AT`].
 pub(super) fn properties(sh_degree: u8) -> impl Iterator<Item = String> {
     let rest = 3 * (sh_coefficients(sh_degree) - 1);
     let named = |names: &[&str]| names.iter().map(|&name| name.to_owned()).collect::<Vec<_>>();

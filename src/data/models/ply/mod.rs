@@ -15,7 +15,7 @@ pub(super) const FORMAT: Format = Format {
     summary: "uncompressed splat PLY with the properties of the original 3DGS trainer",
     reader: Some(Reader {
         // Compressed PLY starts in the same way.
-        recognise: |file| Ok(Match::weak_if(file.start.starts_with(layout::START))),
+        recognise: |file| Ok(Match::weak_if(file.unmarked_start().starts_with(layout::START))),
         read: |file| read::read(file.path),
         main_file: None,
     }),

@@ -1,4 +1,4 @@
-//! Reads a splat PLY by any program that keeps the original property names.
+//! Reads splat PLY files of any program that keeps the original property names.
 
 use std::path::Path;
 
@@ -11,7 +11,7 @@ use crate::ply::{Element, Ply};
 use densify_core::antialiasing::Antialiasing;
 use densify_core::gaussians::sh_coefficients;
 
-/// The way out if a property is missing, by the program that left it out.
+/// The remedy if a property is missing, which depends on the program that left it out.
 fn remedy(vertices: &Element) -> &'static str {
     let has = |name: &str| vertices.find(&[name]).is_some();
     match (has("opacity") && has("scale_1"), has("f_dc_0")) {

@@ -2,7 +2,7 @@
 //! other, so that the pixel to the left predicts the next; channels are independent.
 //!
 //! `image-webp` always subtracts the green channel from the others and predicts from above; this encoder chooses the
-//! transforms that give the smallest file. It has no references to earlier pixels, because pixels hardly ever repeat.
+//! transforms that give the smallest file. It writes no references to earlier pixels, as pixels hardly ever repeat.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -211,7 +211,7 @@ fn put_code(to: &mut Bits, counts: &[u32], symbols: usize) -> Vec<(u16, u8)> {
 
 /// Writes the lengths of a code's words, which are themselves coded, with runs of zeros.
 fn put_lengths(to: &mut Bits, lengths: &[u8]) {
-    // A symbol, then a number and its size in bits.
+    // A symbol, then its extra bits and their number.
     let mut tokens: Vec<(usize, u64, u8)> = Vec::new();
     let mut rest = lengths;
     while let Some(&length) = rest.first() {
@@ -235,7 +235,7 @@ fn put_lengths(to: &mut Bits, lengths: &[u8]) {
     let last = LENGTH_ORDER.iter().rposition(|&at| own_lengths[at] > 0).unwrap_or(0).max(3);
     to.put(last as u64 - 3, 4);
     LENGTH_ORDER[..=last].iter().for_each(|&at| to.put(own_lengths[at].into(), 3));
-    // The number of lengths is that of the symbols.
+    // A length follows for every symbol.
     to.put(0, 1);
     let codes = codes(&own_lengths);
     for (symbol, more, bits) in tokens {
@@ -337,7 +337,7 @@ mod tests {
     }
 
     #[test]
-    fn lengths_are_limited_and_use_every_word() {
+    fn code_lengths_are_limited_and_leave_no_word_unused() {
         // Fibonacci numbers make the longest words.
         let mut counts = vec![1, 1];
         while counts.len() < 40 {

@@ -12,6 +12,7 @@ mod read;
 mod write;
 
 use super::{Format, Match, Reader};
+pub(crate) use read::folder_in_archive;
 use write::SogWriter;
 
 const FORMAT: Format = Format {
@@ -32,7 +33,7 @@ const FORMAT: Format = Format {
 
 inventory::submit! { FORMAT }
 
-/// One entry of the palette for every 1, 2, 4, 8, 16 and 64 Gaussians.
+/// Variants that have one entry of the palette for every 1, 2, 4, 8, 16 and 64 Gaussians.
 const VARIANTS: [Format; 6] = [
     Format { writer: Some(|| Box::new(SogWriter::sharing(1))), ..FORMAT },
     Format { writer: Some(|| Box::new(SogWriter::sharing(2))), ..FORMAT },

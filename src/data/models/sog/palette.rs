@@ -106,7 +106,7 @@ impl Rows<'_> {
         Cluster { error: rows.iter().map(square).sum(), start, end }
     }
 
-    /// Moves the rows of the lower half before those of the other; returns their number.
+    /// Moves the rows of the lower half before those of the upper half; returns the number of rows in the lower half.
     fn halve(&self, rows: &mut [u32], sides: &mut Vec<bool>) -> usize {
         // The first division is at the mean of the coordinate with the largest spread.
         let mean = self.mean(rows);

@@ -13,7 +13,7 @@ pub(super) struct Picture {
 }
 
 /// Width and height `[px]` of an image with `rows` pixels: nearly square, multiples of four.
-pub(super) fn side(rows: usize) -> (usize, usize) {
+pub(super) fn image_size(rows: usize) -> (usize, usize) {
     let width = (rows as f64).sqrt().ceil() as usize;
     let width = width.next_multiple_of(4).max(4);
     (width, rows.div_ceil(width).next_multiple_of(4))
@@ -25,7 +25,7 @@ impl Picture {
         Self { width, height, rgba: Vec::with_capacity(4 * width * height) }
     }
 
-    /// Fills the first `count` pixels; the others repeat the last, which compresses to nothing.
+    /// Fills the first `count` pixels; the remaining pixels repeat the last one, which costs almost no bytes.
     pub(super) fn fill(mut self, count: usize, pixel: impl Fn(usize) -> [u8; 4]) -> Self {
         let last = count.saturating_sub(1);
         let pixels = (0..self.width * self.height).flat_map(|at| pixel(at.min(last)));
@@ -33,8 +33,8 @@ impl Picture {
         self
     }
 
-    /// The smallest of three encodings: by our own encoder, and by one that compresses runs of equal pixels, with and
-    /// without prediction from the pixel above.
+    /// The smallest of three encodings: by our own encoder, and by `image-webp`, which compresses runs of equal pixels,
+    /// with and without prediction from the pixel above.
     pub(super) fn encode(&self) -> io::Result<Vec<u8>> {
         let opaque = self.rgba.as_chunks::<4>().0.iter().all(|pixel| pixel[3] == 255);
         let rgb: Vec<u8>;
@@ -73,7 +73,7 @@ mod tests {
     #[test]
     fn pictures_round_trip() {
         for rows in [1, 5, 300] {
-            let (width, height) = side(rows);
+            let (width, height) = image_size(rows);
             assert!(width * height >= rows && width % 4 == 0 && height % 4 == 0);
             for alpha in [255, 7] {
                 let pixel = |row: usize| [row as u8, (row >> 8) as u8, (row * 31) as u8, alpha];

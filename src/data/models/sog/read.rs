@@ -102,9 +102,31 @@ pub(super) fn read(file: ModelFile<'_>) -> Result<SplatFile, LoadError> {
         });
     }
     let mut archive = ZipReader::open(path, file.input, file.length)?;
-    let text = archive.read(META)?;
+    let Some(folder) = folder_in_archive(archive.names()).map(str::to_owned) else {
+        return Err(LoadError::Data(format!(
+            "{} is a ZIP archive, but no SOG model, which has one {META}; unpack it, and name a file of Gaussian splats",
+            path.display()
+        )));
+    };
+    let text = archive.read(&format!("{folder}{META}"))?;
     let text = String::from_utf8_lossy(&text).into_owned();
-    read_images(path, &text, file.length, &mut |name| archive.read(name))
+    read_images(path, &text, file.length, &mut |name| archive.read(&format!("{folder}{name}")))
+}
+
+/// The folder of a model in an archive with these files, ending in `/`, or nothing if the model is in no folder; `None`
+/// if the archive holds no model. A model in a folder has all other files of the archive beside it.
+pub(crate) fn folder_in_archive<'a>(
+    names: impl Iterator<Item = &'a str> + Clone,
+) -> Option<&'a str> {
+    if names.clone().any(|name| name == META) {
+        return Some("");
+    }
+    let mut files = names.filter(|name| !name.ends_with('/') && !name.starts_with("__MACOSX/"));
+    let is_meta = |name: &str| name.strip_suffix(META).is_some_and(|folder| folder.ends_with('/'));
+    let main = files.clone().find(|name| is_meta(name))?;
+    let folder = &main[..main.len() - META.len()];
+    let is_beside = |name: &str| name.strip_prefix(folder).is_some_and(|name| !name.contains('/'));
+    files.all(is_beside).then_some(folder)
 }
 
 fn read_images(

@@ -8,7 +8,7 @@ use super::VARIANTS;
 use super::codebook::Codebook;
 use super::layout::{ANTIALIASED, FIRST_LARGEST, META, PALETTE_WIDTH};
 use super::palette::{self, Palette};
-use super::picture::{Picture, side};
+use super::picture::{Picture, image_size};
 use crate::models::quantise::{MAX_LOG_SCALE, smallest_three};
 use crate::models::statement::KERNEL;
 use crate::models::write::unfit;
@@ -44,8 +44,8 @@ impl ModelWriter for SogWriter {
     fn held_bytes(&self, Shape { rows, sh_degree, .. }: Shape) -> u64 {
         let bands = 3 * (sh_coefficients(sh_degree) - 1);
         let held = 12 + 12 + 4 + 12 + 1 + 4 + 4 * bands;
-        // The current image: pixels, predicted pixels, and two files of it. Finished images: at most 32 bytes per
-        // Gaussian. And the fit of the palette.
+        // Beside the held Gaussians: the current image (pixels, predicted pixels, and two files), finished images of at
+        // most 32 bytes per Gaussian, and the fit of the palette.
         let picture = 5 * 4;
         let palette = if bands > 0 { palette::row_bytes(bands) } else { 0 };
         ((rows + 64 * PALETTE_WIDTH) * (held + picture + 32 + palette)) as u64 + (1 << 20)
@@ -99,7 +99,7 @@ impl ModelWriter for SogWriter {
     fn finish(&mut self, out: &mut dyn Write) -> io::Result<()> {
         let rows = self.means.len();
         self.level_weights();
-        let (width, height) = side(rows);
+        let (width, height) = image_size(rows);
         let picture = || Picture::new(width, height);
         let mut archive = ZipWriter::new(out);
 

@@ -23,12 +23,13 @@ pub(super) fn frames_bytes(arrays: &[usize]) -> u64 {
     (frames + arrays.iter().max().unwrap_or(&0)) as u64 + ZSTD_MEMORY
 }
 
-/// Largest size of a frame `[bytes]`: blocks of 128 KiB that do not compress are stored behind three bytes.
+/// Largest size of a frame `[bytes]`: blocks of 128 KiB that cannot be compressed are stored after a header of three
+/// bytes.
 fn largest_frame(bytes: usize) -> usize {
     bytes + 3 * bytes.div_ceil(1 << 17) + 32
 }
 
-/// The first 16 bytes. `bytes` are the SH degree, the fractional bits of positions, and flags.
+/// The first 16 bytes of the header. `bytes` are the SH degree, the fractional bits of positions, and the flags.
 fn header(version: u32, rows: u32, bytes: [u8; 3], frames: u8) -> Vec<u8> {
     let words = [MAGIC, version, rows].map(u32::to_le_bytes);
     [words.as_flattened(), &bytes, &[frames]].concat()

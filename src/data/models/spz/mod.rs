@@ -1,10 +1,11 @@
 //! SPZ (Niantic), a quantised and compressed format. Versions 2 to 4 are read; version 3, which every reader accepts,
 //! is written by default, and version 4 by choice.
 //!
-//! Coordinates are used unchanged, as in splat-transform: files do not say in which orientation their program wrote the
-//! scene.
+//! Coordinates are used unchanged, as in splat-transform: most files do not say in which orientation their program wrote
+//! the scene. Those of files that state their axes are converted.
 
 mod containers;
+mod extensions;
 mod layout;
 pub(super) mod read;
 mod write;
@@ -33,7 +34,7 @@ const FORMAT: Format = Format {
 const VERSION_4: Format = Format {
     name: "spz-v4",
     extension: "v4.spz",
-    summary: "SPZ version 4: the same in zstd frames, which some readers do not take",
+    summary: "SPZ version 4: the same values in zstd frames, which some readers do not support",
     // The reader of `spz` reads all versions.
     reader: None,
     writer: Some(|| Box::new(SpzWriter::in_frames())),

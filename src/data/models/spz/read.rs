@@ -6,7 +6,8 @@ use std::path::Path;
 use flate2::bufread::GzDecoder;
 use ruzstd::decoding::StreamingDecoder;
 
-use super::layout::{ANTIALIASED, COLOUR, GZIP, HEADER_OF_VERSION_4, MAGIC};
+use super::extensions::{self, Axes, Extensions};
+use super::layout::{ANTIALIASED, COLOUR, GZIP, HAS_EXTENSIONS, HEADER_OF_VERSION_4, MAGIC};
 use crate::error::LoadError;
 use crate::models::quantise::{from_smallest_three, quantised_logit};
 use crate::models::rows::{Row, Rows, SplatFile};
@@ -19,6 +20,9 @@ use densify_core::gaussians::{MAX_SH_DEGREE, sh_coefficients};
 /// Smallest window that every zstd decoder supports `[bytes]` (RFC 8878, 3.1.1.1.2).
 const WINDOW: u64 = 8 << 20;
 
+/// Largest size of the extensions that are read `[bytes]`.
+const MAX_EXTENSIONS: u64 = 1 << 20;
+
 /// The header of a file.
 struct Header {
     rows: u64,
@@ -26,33 +30,44 @@ struct Header {
     sh_degree: u8,
     fractional_bits: u8,
     is_antialiased: bool,
+    has_extensions: bool,
     /// The arrays in the order of the file: name and bytes per Gaussian.
     arrays: [(&'static str, u64); 6],
 }
 
-/// Reads a file of `length` bytes.
+/// Reads a file of `length` bytes, and converts it from the axes that it states.
 ///
 /// # Errors
 /// When the file is unreadable, damaged, of another version, or of degree 4.
-pub(in crate::models) fn read(
+pub(super) fn read(path: &Path, input: impl BufRead, length: u64) -> Result<SplatFile, LoadError> {
+    let (mut file, axes) = read_as_stored(path, input, length)?;
+    if let Some(axes) = axes {
+        axes.convert(&mut file.gaussians);
+        file.notes.insert(0, format!("converted from the axes {axes} that the file states"));
+    }
+    Ok(file)
+}
+
+/// As [`read`], in the axes of the file, which are also returned if it states them.
+pub(in crate::models) fn read_as_stored(
     path: &Path,
     mut input: impl BufRead,
     length: u64,
-) -> Result<SplatFile, LoadError> {
+) -> Result<(SplatFile, Option<Axes>), LoadError> {
     let start = input.fill_buf().map_err(LoadError::io(path))?;
     if start.starts_with(&GZIP) {
         let mut unzipped = GzDecoder::new(input);
         let header = read_header(path, &mut unzipped, length, 1..=3)?;
-        let arrays = read_consecutive(path, &header, &mut unzipped)?;
+        let (arrays, extensions) = read_consecutive(path, &header, &mut unzipped)?;
         read_to_end(path, "gzip", &mut unzipped)?;
-        return decode(path, &header, &arrays);
+        return decode(path, &header, &arrays, extensions);
     }
     let header = read_header(path, &mut input, length, 1..=4)?;
-    let arrays = match header.version {
+    let (arrays, extensions) = match header.version {
         4 => read_frames(path, &header, &mut input)?,
         _ => read_consecutive(path, &header, &mut input)?,
     };
-    decode(path, &header, &arrays)
+    decode(path, &header, &arrays, extensions)
 }
 
 fn read_header(
@@ -67,6 +82,7 @@ fn read_header(
     let (version, rows) = (words[1], u64::from(words[2]));
     let (sh_degree, fractional_bits) = (bytes[12], bytes[13]);
     let is_antialiased = bytes[14] & ANTIALIASED != 0;
+    let has_extensions = bytes[14] & HAS_EXTENSIONS != 0;
     if words[0] != MAGIC {
         return wrong("it does not begin with `NGSP`".into());
     }
@@ -94,33 +110,51 @@ fn read_header(
             "{rows} Gaussians take {bytes} bytes, too many for a file of {length}"
         ));
     }
-    Ok(Header { rows, version, sh_degree, fractional_bits, is_antialiased, arrays })
+    Ok(Header { rows, version, sh_degree, fractional_bits, is_antialiased, has_extensions, arrays })
 }
 
-/// Reads arrays that follow each other.
+/// Reads arrays that follow each other, and the extensions after them.
 fn read_consecutive(
     path: &Path,
     header: &Header,
     input: &mut dyn Read,
-) -> Result<Vec<Vec<u8>>, LoadError> {
+) -> Result<(Vec<Vec<u8>>, Extensions), LoadError> {
     let read = |(name, bytes): (&str, u64)| read_exactly(path, name, input, header.rows * bytes);
-    header.arrays.into_iter().map(read).collect()
+    let arrays = header.arrays.into_iter().map(read).collect::<Result<_, _>>()?;
+    Ok((arrays, read_extensions(path, header, input)?))
 }
 
-/// Reads the arrays of version 4, each a zstd frame.
+/// Reads the extensions that the header states, to the end of the input.
+fn read_extensions(
+    path: &Path,
+    header: &Header,
+    input: &mut dyn Read,
+) -> Result<Extensions, LoadError> {
+    if !header.has_extensions {
+        return Ok(Extensions::default());
+    }
+    let mut records = Vec::new();
+    let read = input.take(MAX_EXTENSIONS).read_to_end(&mut records);
+    read.map_err(|source| read_error(path, "extensions", source))?;
+    extensions::parse(path, &records)
+}
+
+/// Reads the arrays of version 4, each a zstd frame, and the extensions before them.
 fn read_frames(
     path: &Path,
     header: &Header,
     input: &mut dyn Read,
-) -> Result<Vec<Vec<u8>>, LoadError> {
+) -> Result<(Vec<Vec<u8>>, Extensions), LoadError> {
     let more = read_exactly(path, "header", input, 16)?;
     let [a, b, c, d, ..] = more[..] else { unreachable!("16 bytes") };
     let table = u64::from(u32::from_le_bytes([a, b, c, d]));
     let before = table.checked_sub(HEADER_OF_VERSION_4.into());
     let before =
         before.ok_or_else(|| LoadError::damaged(path, "header", "the table lies in the header"))?;
-    // Extensions by other programs stand between header and table.
-    let skipped = std::io::copy(&mut input.take(before), &mut std::io::sink());
+    // Extensions stand between header and table.
+    let mut between = input.take(before);
+    let extensions = read_extensions(path, header, &mut between)?;
+    let skipped = std::io::copy(&mut between, &mut std::io::sink());
     skipped.map_err(|source| read_error(path, "extensions", source))?;
     // Without bands above 0 there is no frame for them.
     let arrays = header.arrays.iter().filter(|(_, bytes)| *bytes > 0);
@@ -146,10 +180,15 @@ fn read_frames(
         read_to_end(path, name, &mut frame)?;
     }
     arrays.resize(6, Vec::new());
-    Ok(arrays)
+    Ok((arrays, extensions))
 }
 
-fn decode(path: &Path, header: &Header, arrays: &[Vec<u8>]) -> Result<SplatFile, LoadError> {
+fn decode(
+    path: &Path,
+    header: &Header,
+    arrays: &[Vec<u8>],
+    extensions: Extensions,
+) -> Result<(SplatFile, Option<Axes>), LoadError> {
     let mut rows = Rows::new(header.sh_degree);
     let unit = 1.0 / (1u32 << header.fractional_bits) as f32;
     let mut sh = Vec::new();
@@ -176,11 +215,12 @@ fn decode(path: &Path, header: &Header, arrays: &[Vec<u8>]) -> Result<SplatFile,
         });
     }
     let mut file = rows.finish(path)?;
+    file.notes.extend(extensions.notes);
     if header.is_antialiased {
         file.gaussians.antialiasing = Antialiasing::Wide;
         file.notes.push(note(Antialiasing::Wide, "a flag of SPZ"));
     }
-    Ok(file)
+    Ok((file, extensions.axes))
 }
 
 /// Version 2 has x, y, z in a byte each. Later versions have the largest component's index in the order (x, y, z, w),

@@ -1,5 +1,5 @@
-//! Writes SPZ, version 3 or 4. The fixed point of positions and the precision of coefficients follow from the model;
-//! readers need not know them.
+//! Writes SPZ, version 3 or 4. The fixed point of positions and the precision of coefficients are chosen for each
+//! model; every reader can read the result.
 
 use std::io::{self, Write};
 
@@ -72,7 +72,7 @@ impl ModelWriter for SpzWriter {
         let Shape { rows, sh_degree, antialiasing } = shape;
         if u32::try_from(rows).is_err() {
             return Err(unfit(
-                "SPZ counts rows in 32 bits; export fewer, or choose another format, such as ply",
+                "SPZ counts Gaussians in 32 bits; export fewer, or choose another format",
             ));
         }
         self.sh_degree = sh_degree;

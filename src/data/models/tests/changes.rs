@@ -1,4 +1,4 @@
-//! What quantised formats change of models beyond their ranges.
+//! Tests of how much quantised formats change models, also models beyond the formats' ranges.
 
 use super::round_trips::plausible;
 use super::saved;
@@ -8,7 +8,7 @@ use densify_core::gaussians::Gaussians;
 
 const LOSSY: [&str; 4] = ["spz", "spz-v4", "sog", "compressed-ply"];
 
-/// A trained model: 1,000 Gaussians whose colours depend little on direction.
+/// A model like a trained one: 1,000 Gaussians whose colours depend little on direction.
 fn trained() -> Gaussians {
     let mut model = plausible(1_000, 1);
     model.sh.chunks_exact_mut(12).for_each(|row| row[3..].iter_mut().for_each(|v| *v *= 0.1));
@@ -33,16 +33,16 @@ fn changes(format: &str, model: &Gaussians) -> Changes {
 }
 
 #[test]
-fn rounding_is_no_change() {
+fn rounding_does_not_count_as_a_change() {
     for format in LOSSY.into_iter().chain(["ply", "glb"]) {
         let changes = changes(format, &trained());
         assert!(!changes.is_noted(), "{format}: {changes}");
     }
 }
 
-/// Each quantity beyond what a format holds, in whole or spoiled by one Gaussian.
+/// In each case, a quantity of all Gaussians is beyond what a format can hold, or one Gaussian spoils the others.
 #[test]
-fn what_a_format_does_not_hold_is_measured() {
+fn values_that_a_format_cannot_hold_count_as_changes() {
     type Change = fn(&mut Gaussians);
     let cases: [(&str, Change, &[&str], &str); 9] = [
         ("kilometres", |m| grow(m, -8.0), &LOSSY[..2], "scales"),
@@ -69,15 +69,15 @@ fn what_a_format_does_not_hold_is_measured() {
     }
 }
 
-/// What hardly shows is not worth a word: small, faint, or thin from its edge.
+/// Changes that are hardly visible are not noted: of small or faint Gaussians, or of the thin axis of flat ones.
 #[test]
-fn changes_weigh_as_much_as_they_show() {
+fn changes_count_as_much_as_they_are_visible() {
     let mut model = trained();
-    // As thin as a plane, and one in fifty so small that no format with limits holds it.
+    // All Gaussians are as thin as a plane, and one in fifty is so small that no format with limits holds it.
     model.log_scales.iter_mut().for_each(|logs| logs[2] = -15.0);
     model.log_scales.iter_mut().step_by(50).for_each(|logs| *logs = [-13.0; 3]);
     assert!(!changes("spz", &model).is_noted(), "{}", changes("spz", &model));
-    // One in fifty that fills the view.
+    // One in fifty fills the view.
     model.log_scales.iter_mut().step_by(50).for_each(|logs| *logs = [6.4; 3]);
     let found = changes("spz", &model);
     assert!(found.is_unfit() && found.to_string().contains("20 Gaussians"), "{found}");

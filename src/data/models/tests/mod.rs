@@ -1,4 +1,5 @@
-//! The registry, the calls to a writer, the PLY layout, round trips through every format, and files of other programs.
+//! Tests of the registry, the calls to a writer, the PLY layout, round trips through every format, and files of other
+//! programs.
 
 #![allow(clippy::float_cmp, reason = "results are exact")]
 

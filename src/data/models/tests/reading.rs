@@ -1,4 +1,4 @@
-//! The same model in every format, as splat-transform 3.7.0 wrote it; damaged and dishonest files.
+//! Tests of reading: the same model in every format, as splat-transform 3.7.0 wrote it; damaged and dishonest files.
 //!
 //! The files are the fuzz corpora: `ply/twelve.ply` has twelve Gaussians of degree 1, and the others were made from it.
 
@@ -65,12 +65,14 @@ fn every_format_holds_the_same_model() {
     assert_eq!((truth.len(), truth.sh_degree), (12, 1));
     let folder = sog_folder();
     for (path, limits) in [
-        // 11 bits of 4, 10 of them for y; eight bits of 3; bands between −4 and 4.
+        // Positions in 11 bits (y: 10) of a range of 4; colours in eight bits of a range of 3; bands from −4 to 4.
         (corpus("compressed-ply/twelve.ply"), [0.003, 0.002, 0.002, 0.006, 0.016, 0.003]),
-        // 12 fractional bits; sixteenths; 255·0.15 steps; five bits of 2, after eight; nine bits.
+        // Positions with 12 fractional bits; log-scales in sixteenths; colours in steps of 1/(255·0.15); bands in eight
+        // bits, then five, of a range of 2; quaternions in nine bits.
         (corpus("spz/v3.spz"), [0.000_25, 0.032, 0.002, 0.014, 0.036, 0.004]),
         (corpus("spz/v4.spz"), [0.000_25, 0.032, 0.002, 0.014, 0.036, 0.004]),
-        // Sixteen bits of logarithms; codebooks; a palette that two rows may share; bytes of √2, cut off.
+        // Positions in 16 bits of logarithms; scales and colours in codebooks; bands in a palette, where two rows may
+        // share an entry; quaternions in bytes of a range of √2, rounded down.
         (corpus("sog/stored.sog"), [0.000_3, 0.04, 0.004, 0.03, 0.4, 0.03]),
         (corpus("sog/deflated.sog"), [0.000_3, 0.04, 0.004, 0.03, 0.4, 0.03]),
         (folder.path().to_owned(), [0.000_3, 0.04, 0.004, 0.03, 0.4, 0.03]),
@@ -86,6 +88,30 @@ fn every_format_holds_the_same_model() {
     assert!(grey.iter().zip(limits).all(|(f, l)| *f <= l), "{grey:?}");
 }
 
+/// A ZIP archive of these files.
+fn archive(files: &[(&str, &[u8])]) -> Vec<u8> {
+    let mut archive = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+    for (name, contents) in files {
+        archive.start_file(*name, zip::write::SimpleFileOptions::default()).unwrap();
+        std::io::Write::write_all(&mut archive, contents).unwrap();
+    }
+    archive.finish().unwrap().into_inner()
+}
+
+#[test]
+fn an_archive_may_hold_the_folder_of_a_model() {
+    let folder = sog_folder();
+    let mut files = vec![("__MACOSX/scene/._meta.json".to_owned(), Vec::new())];
+    for entry in std::fs::read_dir(folder.path()).unwrap() {
+        let path = entry.unwrap().path();
+        let name = path.file_name().unwrap().to_str().unwrap();
+        files.push((format!("scene/{name}"), std::fs::read(&path).unwrap()));
+    }
+    let files: Vec<_> = files.iter().map(|(name, bytes)| (&**name, &**bytes)).collect();
+    let (_folder, path) = saved("model.sog", archive(&files));
+    assert_eq!(read(&path), read(folder.path()));
+}
+
 #[test]
 fn file_names_do_not_matter() {
     for (name, format) in [("model.ply", "spz/v4.spz"), ("model.spz", "sog/stored.sog")] {
@@ -95,10 +121,19 @@ fn file_names_do_not_matter() {
 }
 
 #[test]
+fn a_byte_order_mark_is_skipped() {
+    for format in ["ply/twelve.ply", "compressed-ply/twelve.ply"] {
+        let plain = std::fs::read(corpus(format)).unwrap();
+        let (_folder, path) = saved("model.ply", ["\u{feff}".as_bytes(), &plain].concat());
+        assert_eq!(read(&path), read(&corpus(format)), "{format}");
+    }
+}
+
+#[test]
 fn nodes_place_their_splats() {
     let placed = read(&corpus("gltf/placed.gltf"));
     let plain = read(&corpus("glb/twelve.glb"));
-    // Into glTF's frame; there (x, y, z) becomes (z, x, y), is doubled and shifted; then back.
+    // A mean is moved into glTF's frame, where (x, y, z) becomes (z, x, y), is doubled and shifted, and then back.
     let expected = |[x, y, z]: [f32; 3]| {
         let [x, y, z] = [-x, -y, z];
         let [x, y, z] = [2.0 * z + 1.0, 2.0 * x + 2.0, 2.0 * y + 3.0];
@@ -178,6 +213,14 @@ fn dishonest_files_are_refused_with_the_reason() {
             &["compressed-ply, glb, gltf, ply, sog, splat, spz", "convert"][..],
         ),
         ("zeros", vec![0; 320], &["convert"]),
+        ("other JSON", b"{\"frames\":[]}".to_vec(), &["not a model", "convert"]),
+        ("levels", b"{\"lodLevels\":1}".to_vec(), &["levels of detail", "meta.json files"]),
+        ("a ZIP", archive(&[("a.ply", b"ply")]), &["ZIP archive, but no SOG", "unpack it"]),
+        (
+            "a model among others",
+            archive(&[("a/meta.json", b"{}"), ("b/meta.json", b"{}")]),
+            &["ZIP archive, but no SOG"],
+        ),
         // The head of a .ksplat: its version, then the number of its sections.
         (
             "a ksplat",
@@ -199,20 +242,20 @@ fn dishonest_files_are_refused_with_the_reason() {
             &["12 vertices", "2 chunks"],
         ),
         (
-            "no word",
+            "no packed_scale",
             text("compressed-ply/twelve.ply", "packed_scale", "packed_s"),
             &["packed_scale"],
         ),
         ("a mesh", text(gltf, "\"KHR_gaussian_splatting\":{", "\"x\":{"), &["no Gaussian splats"]),
         (
-            "needs more",
+            "an unknown required extension",
             text(gltf, "\"extensionsUsed\"", "\"extensionsRequired\":[\"KHR_x\"],\"e\""),
             &["requires KHR_x"],
         ),
         ("linear colours", text(gltf, "srgb_rec709", "lin_rec709"), &["lin_rec709_display"]),
         ("an uneven scale", text(gltf, "[2,2,2]", "[2,2,3]"), &["nodes", "even scale"]),
         (
-            "itself in itself",
+            "a node in itself",
             text(gltf, "\"rotation\":", "\"children\":[0],\"rotation\":"),
             &["contain each other"],
         ),
@@ -239,7 +282,7 @@ fn dishonest_files_are_refused_with_the_reason() {
 }
 
 #[test]
-fn a_folder_of_pictures_is_checked() {
+fn faults_of_a_sog_folder_are_named() {
     let folder = sog_folder();
     let meta = folder.path().join("meta.json");
     let good = std::fs::read_to_string(&meta).unwrap();
@@ -283,7 +326,7 @@ fn shared_models_of_other_programs_load() {
     assert_eq!((guitar.len(), guitar.sh_degree), (90_854, 0));
     assert_eq!(at("playcanvas_test.compressed_sh3.ply").sh_degree, 3);
     assert_eq!(at("gsplat-rs/minimal_v4_degree0.spz").len(), 8);
-    // The same three Gaussians; SPZ is turned about x.
+    // The same three Gaussians; in SPZ they have a half turn about x.
     let ply = at("metalsplatter/test-splat.3-points-from-train.ply");
     let splat = at("metalsplatter/test-splat.3-points-from-train.splat");
     let spz = at("metalsplatter/test-splat.3-points-from-train.spz");

@@ -12,7 +12,7 @@ use crate::models::{Shape, export_formats, find, find_by_extension, read_model};
 use densify_core::antialiasing::Antialiasing;
 use densify_core::gaussians::{Gaussians, sh_coefficients, sigmoid};
 
-/// A model as training makes them: in a few units, most Gaussians small, colours that depend little on direction.
+/// A model like a trained one: a few units wide, with mostly small Gaussians whose colours depend little on direction.
 pub(super) fn plausible(rows: usize, sh_degree: u8) -> Gaussians {
     let mut random = ChaCha8Rng::seed_from_u64(rows as u64);
     let mut value = |reach: f32| random.random_range(-reach..reach);
@@ -68,7 +68,7 @@ fn errors(a: &Gaussians, b: &Gaussians) -> [f32; 5] {
 
 #[test]
 fn formats_in_f32_keep_every_bit() {
-    // Numbers of rows around that of a write of PLY.
+    // Numbers of rows around 256, which the PLY writer writes at once.
     for (name, rows) in
         [("ply", 0), ("ply", 1), ("ply", 255), ("ply", 256), ("ply", 700), ("glb", 100)]
     {
@@ -103,10 +103,11 @@ fn formats_are_lossy_if_a_round_trip_changes_values() {
 
 #[test]
 fn quantised_formats_are_off_by_half_a_step() {
-    // Positions: 11 bits of a chunk, 10 of them for y, 12 fractional bits, 16 bits of a logarithm. Scales: 10 bits
-    // of 3, sixteenths, a codebook, whose entries are far apart where few values are. Opacity: a byte. Colour: compressed PLY has steps of 1/32; SPZ has steps of 1/38 and, by the
-    // error that is allowed, eighths of bands; a codebook and a palette of half as many entries. Quaternions: ten bits
-    // of √2, nine of 1/√2, a byte of √2; the largest component is what the others leave.
+    // In the order compressed PLY, SPZ, SOG. Positions: 11 bits of a chunk's range (y: 10), 12 fractional bits, 16 bits
+    // of a logarithm. Log-scales: 10 bits of a range of 3, sixteenths, a codebook, whose entries are far apart where
+    // there are few values. Opacities: a byte. Colours: steps of 1/32; steps of 1/38 and, within the allowed error,
+    // bands in eighths; a codebook, and a palette with half as many entries as rows. Quaternions: ten bits of √2, nine
+    // of 1/√2, a byte of √2; the largest component follows from the others.
     for (name, limits) in [
         ("compressed-ply", [1.1e-3, 1.6e-3, 2e-3, 0.017, 2e-3]),
         ("spz", [1.3e-4, 0.032, 2e-3, 0.07, 3e-3]),

@@ -301,7 +301,7 @@ pub(super) fn sums_of_four<S: Simd>([a, b, c, d]: [V<S>; 4]) -> [f32; 4] {
 #[inline(always)]
 fn halves<S: Simd>(a: V<S>, c: V<S>) -> V<S> {
     let s = a.s;
-    // Not pulp's own cast, which does not compile for a single lane, where this is never called.
+    // Not pulp's own cast: it does not compile for a single lane, although this function is never called then.
     let pairs = [pulp::bytemuck::cast(a.v), pulp::bytemuck::cast(c.v)];
     let [even, odd]: [S::f64s; 2] = s.deinterleave_shfl_f64s(pairs);
     V { s, v: s.add_f32s(pulp::bytemuck::cast(even), pulp::bytemuck::cast(odd)) }

@@ -1,7 +1,8 @@
 //! Finds the largest run that fits a memory limit: rows, degree, tile lists and image cache.
 //!
-//! The functions are pure; a callback returns the bytes of a size. Guarantees: the result fits; one more row does not
-//! fit, unless another limit applies; and more memory never gives a lower degree, or fewer rows at the same degree.
+//! The functions are pure: the memory that a [`RunSize`] takes comes from a callback. Guarantees: the result fits; one
+//! more row does not fit, unless another limit applies; and more memory never gives a lower degree, or fewer rows at
+//! the same degree.
 
 use std::ops::RangeInclusive;
 
@@ -29,7 +30,7 @@ pub(super) struct SizeRequest {
     pub(crate) min_rows: usize,
     /// Number of rows at the start; the degree is lowered if fewer fit.
     pub(crate) enough_rows: usize,
-    /// Maximum number of rows, wanted or possible, >= 1.
+    /// Maximum number of rows: the number wanted, or the largest possible if that is smaller; >= 1.
     pub(crate) max_rows: usize,
     /// Degrees to choose from; the highest is the one wanted.
     pub(crate) sh_degree: RangeInclusive<u8>,
@@ -43,16 +44,16 @@ pub(super) struct SizeRequest {
     /// Bytes of decoded images; `None`: chosen by the solver.
     pub(crate) image_cache: Option<u64>,
     /// Maximum bytes of decoded images that are kept at the expense of rows.
-    pub(crate) max_images: u64,
+    pub(crate) max_image_bytes: u64,
     /// Bytes of all images when decoded.
-    pub(crate) all_images: u64,
+    pub(crate) all_image_bytes: u64,
 }
 
 /// The result of [`fit`].
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Fit {
     /// The size found.
-    pub(crate) setting: RunSize,
+    pub(crate) size: RunSize,
     /// Memory limits the number of rows.
     pub(crate) by_memory: bool,
     /// Rows that fit at the wanted degree.
@@ -67,20 +68,21 @@ pub(super) const IMAGE_SHARE_DIVISOR: u64 = 8;
 
 impl SizeRequest {
     /// A size with this many pairs per row, and at most 1 / [`IMAGE_SHARE_DIVISOR`] of the memory for images.
-    pub(super) fn setting(&self, rows: usize, sh_degree: u8, pairs: usize) -> RunSize {
+    pub(super) fn size(&self, rows: usize, sh_degree: u8, pairs: usize) -> RunSize {
         let most = self.max_pairs.max(rows);
         let tile_cap = self.tile_cap.unwrap_or_else(|| rows.saturating_mul(pairs).min(most));
         let share = self.memory / IMAGE_SHARE_DIVISOR;
-        let images = || self.all_images.min(share).min(self.max_images);
+        let images = || self.all_image_bytes.min(share).min(self.max_image_bytes);
         let image_cache = self.image_cache.unwrap_or_else(images);
         let images_on_gpu = image_cache.min(share);
         RunSize { rows, sh_degree, tile_cap: tile_cap.max(rows), image_cache, images_on_gpu }
     }
 }
 
-/// Finds the largest size; `None` if not even the fewest rows fit. `bytes` returns the memory of a size. Once above the
-/// limit, this memory must stay above it as rows, pairs or images grow, and images must take at most the size of their
-/// cache plus a constant.
+/// Finds the largest size; `None` if not even the fewest rows fit.
+///
+/// `bytes` returns the memory of a size. Requirements: if a size exceeds the limit, so does every size with more rows,
+/// pairs or images; and images take at most `image_cache` plus a constant.
 ///
 /// The degree is the highest at which enough rows fit, or else the lowest. As many rows as possible are chosen; if all
 /// wanted rows fit, the remaining memory goes to the tile lists and then to the images.
@@ -94,8 +96,8 @@ pub(super) fn fit<E>(
     let mut at_wanted_degree = None;
     let mut found = None;
     for degree in request.sh_degree.clone().rev() {
-        let setting = |rows| request.setting(rows, degree, request.pairs[0]);
-        let rows = largest_where(least, most, |rows| Ok(bytes(&setting(rows))? <= request.memory))?;
+        let size = |rows| request.size(rows, degree, request.pairs[0]);
+        let rows = largest_where(least, most, |rows| Ok(bytes(&size(rows))? <= request.memory))?;
         at_wanted_degree.get_or_insert(rows.unwrap_or(0));
         found = rows.map(|rows| (rows, degree));
         if rows.is_some_and(|rows| rows >= enough) {
@@ -103,27 +105,28 @@ pub(super) fn fit<E>(
         }
     }
     let Some((rows, degree)) = found else { return Ok(None) };
-    let mut setting = request.setting(rows, degree, request.pairs[0]);
+    let mut size = request.size(rows, degree, request.pairs[0]);
     if rows == most {
         for pairs in request.pairs.into_iter().skip(1) {
-            let larger = request.setting(rows, degree, pairs);
+            let larger = request.size(rows, degree, pairs);
             if bytes(&larger)? <= request.memory {
-                setting = larger;
+                size = larger;
             }
         }
         if request.image_cache.is_none() {
-            let all = RunSize { image_cache: request.all_images, ..setting };
-            let left = request.memory.saturating_sub(bytes(&setting)?);
-            // Images in use are counted even if the cache is smaller.
-            setting.image_cache = if bytes(&all)? <= request.memory {
-                request.all_images
+            let all = RunSize { image_cache: request.all_image_bytes, ..size };
+            let left = request.memory.saturating_sub(bytes(&size)?);
+            // Images in use are counted even if the cache is smaller, so a cache of all images may fit although `left`
+            // is too small. So try that first.
+            size.image_cache = if bytes(&all)? <= request.memory {
+                request.all_image_bytes
             } else {
-                setting.image_cache.saturating_add(left).min(request.all_images)
+                size.image_cache.saturating_add(left).min(request.all_image_bytes)
             };
         }
     }
     let at_wanted_degree = at_wanted_degree.unwrap_or(rows);
-    Ok(Some(Fit { setting, by_memory: rows < most, at_wanted_degree }))
+    Ok(Some(Fit { size, by_memory: rows < most, at_wanted_degree }))
 }
 
 /// The smallest memory in which a model fits, in multiples of `step` bytes; `None` if there is none.
@@ -139,7 +142,7 @@ pub(super) fn min_memory<E>(
     // The smallest model with all of its images.
     let all = SizeRequest { memory: u64::MAX, ..request.clone() };
     let least = request.min_rows.clamp(1, request.max_rows.max(1));
-    let most = bytes(&all.setting(least, *request.sh_degree.start(), request.pairs[0]))?;
+    let most = bytes(&all.size(least, *request.sh_degree.start(), request.pairs[0]))?;
     let Ok(most) = usize::try_from(most.div_ceil(step)) else { return Ok(None) };
     let insufficient = largest_where(0, most, |steps| Ok(!fits(steps, &mut bytes)?))?;
     Ok(Some(insufficient.map_or(0, |steps| steps as u64 + 1) * step))

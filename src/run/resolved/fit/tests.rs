@@ -8,43 +8,43 @@ use super::*;
 
 /// Bytes of an imaginary run, which grow like those of real runs.
 #[derive(Debug, Clone)]
-struct Model {
+struct ImaginaryRun {
     fixed: u64,
     per_row: u64,
     per_coefficient: u64,
     per_pair: u64,
     largest_image: u64,
-    all_images: u64,
+    all_image_bytes: u64,
 }
 
-impl Model {
-    fn bytes(&self, setting: &RunSize) -> u64 {
-        let RunSize { rows, sh_degree, tile_cap, image_cache, .. } = *setting;
+impl ImaginaryRun {
+    fn bytes(&self, size: &RunSize) -> u64 {
+        let RunSize { rows, sh_degree, tile_cap, image_cache, .. } = *size;
         let coefficients = (u64::from(sh_degree) + 1).pow(2);
         let rows = rows.next_multiple_of(16) as u64;
         let held = image_cache.max(2 * self.largest_image) + self.largest_image;
         self.fixed
             + rows * (self.per_row + coefficients * self.per_coefficient)
             + tile_cap as u64 * self.per_pair
-            + held.min(self.all_images)
+            + held.min(self.all_image_bytes)
     }
 
     fn fit(&self, request: &SizeRequest) -> Option<Fit> {
-        let bytes = |setting: &RunSize| Ok::<_, Infallible>(self.bytes(setting));
+        let bytes = |size: &RunSize| Ok::<_, Infallible>(self.bytes(size));
         fit(request, bytes).unwrap_or_else(|never| match never {})
     }
 }
 
-fn models() -> impl Strategy<Value = Model> {
+fn runs() -> impl Strategy<Value = ImaginaryRun> {
     let sizes = (0..50_000_000_u64, 1..500_u64, 1..100_u64, 1..80_u64, 1..1_000_000_u64);
     (sizes, 1..300_u64).prop_map(|(sizes, views)| {
         let (fixed, per_row, per_coefficient, per_pair, largest_image) = sizes;
-        let all_images = views * largest_image;
-        Model { fixed, per_row, per_coefficient, per_pair, largest_image, all_images }
+        let all_image_bytes = views * largest_image;
+        ImaginaryRun { fixed, per_row, per_coefficient, per_pair, largest_image, all_image_bytes }
     })
 }
 
-fn request(model: &Model, memory: u64) -> SizeRequest {
+fn request(run: &ImaginaryRun, memory: u64) -> SizeRequest {
     SizeRequest {
         memory,
         min_rows: 1_000,
@@ -55,13 +55,13 @@ fn request(model: &Model, memory: u64) -> SizeRequest {
         pairs: PAIRS,
         max_pairs: u32::MAX as usize,
         image_cache: None,
-        max_images: 1 << 30,
-        all_images: model.all_images,
+        max_image_bytes: 1 << 30,
+        all_image_bytes: run.all_image_bytes,
     }
 }
 
 /// Requests of any memory for runs with or without given sizes.
-fn requests() -> impl Strategy<Value = (Model, SizeRequest)> {
+fn requests() -> impl Strategy<Value = (ImaginaryRun, SizeRequest)> {
     let sizes = (
         0..2_000_000_000_u64,
         prop_oneof![Just(u32::MAX as usize), 1..200_000_usize],
@@ -70,50 +70,50 @@ fn requests() -> impl Strategy<Value = (Model, SizeRequest)> {
         0..=3_u8,
         prop_oneof![Just(PAIRS), Just([1; 3]), Just([4; 3])],
     );
-    (models(), sizes).prop_map(|(model, sizes)| {
+    (runs(), sizes).prop_map(|(run, sizes)| {
         let (memory, max_rows, tile_cap, image_cache, lowest, pairs) = sizes;
         let sh_degree = lowest..=3;
-        let base = request(&model, memory);
+        let base = request(&run, memory);
         let request = SizeRequest { max_rows, tile_cap, image_cache, sh_degree, pairs, ..base };
-        (model, request)
+        (run, request)
     })
 }
 
 /// Checks that the size fits, keeps the given values, and cannot be larger.
-fn check_fit(model: &Model, request: &SizeRequest) -> Result<(), TestCaseError> {
+fn check_fit(run: &ImaginaryRun, request: &SizeRequest) -> Result<(), TestCaseError> {
     let SizeRequest { memory, max_rows: most, tile_cap, image_cache, pairs, .. } = *request;
     let lowest = *request.sh_degree.start();
-    let Some(Fit { setting, by_memory, at_wanted_degree }) = model.fit(request) else {
-        let least = request.setting(1_000.min(most), lowest, pairs[0]);
-        prop_assert!(model.bytes(&least) > memory);
+    let Some(Fit { size, by_memory, at_wanted_degree }) = run.fit(request) else {
+        let least = request.size(1_000.min(most), lowest, pairs[0]);
+        prop_assert!(run.bytes(&least) > memory);
         return Ok(());
     };
-    prop_assert!(model.bytes(&setting) <= memory);
-    prop_assert!(setting.rows <= most && setting.rows <= setting.tile_cap);
-    prop_assert_eq!(by_memory, setting.rows < most);
+    prop_assert!(run.bytes(&size) <= memory);
+    prop_assert!(size.rows <= most && size.rows <= size.tile_cap);
+    prop_assert_eq!(by_memory, size.rows < most);
     // Given values are kept.
-    prop_assert!(setting.sh_degree >= lowest);
-    prop_assert!(tile_cap.is_none_or(|cap| setting.tile_cap == cap.max(setting.rows)));
-    prop_assert!(image_cache.is_none_or(|cache| setting.image_cache == cache));
+    prop_assert!(size.sh_degree >= lowest);
+    prop_assert!(tile_cap.is_none_or(|cap| size.tile_cap == cap.max(size.rows)));
+    prop_assert!(image_cache.is_none_or(|cache| size.image_cache == cache));
     if by_memory {
-        let more = request.setting(setting.rows + 1, setting.sh_degree, pairs[0]);
-        prop_assert!(model.bytes(&more) > memory);
+        let more = request.size(size.rows + 1, size.sh_degree, pairs[0]);
+        prop_assert!(run.bytes(&more) > memory);
     } else {
-        let more = request.setting(setting.rows, setting.sh_degree, pairs[2]);
-        prop_assert!(setting.tile_cap == more.tile_cap || model.bytes(&more) > memory);
-        let images = RunSize { image_cache: model.all_images, ..setting };
+        let more = request.size(size.rows, size.sh_degree, pairs[2]);
+        prop_assert!(size.tile_cap == more.tile_cap || run.bytes(&more) > memory);
+        let images = RunSize { image_cache: run.all_image_bytes, ..size };
         prop_assert!(
             image_cache.is_some()
-                || setting.image_cache == model.all_images
-                || model.bytes(&images) > memory
+                || size.image_cache == run.all_image_bytes
+                || run.bytes(&images) > memory
         );
     }
     // The degree is lowered only if too few rows fit at a higher one.
     let enough = 20_000.min(most);
-    prop_assert!(setting.sh_degree == 3 || at_wanted_degree < enough);
-    if setting.sh_degree < 3 {
-        let higher = request.setting(enough, setting.sh_degree + 1, pairs[0]);
-        prop_assert!(model.bytes(&higher) > memory);
+    prop_assert!(size.sh_degree == 3 || at_wanted_degree < enough);
+    if size.sh_degree < 3 {
+        let higher = request.size(enough, size.sh_degree + 1, pairs[0]);
+        prop_assert!(run.bytes(&higher) > memory);
     }
     Ok(())
 }
@@ -122,47 +122,47 @@ proptest! {
     #![proptest_config(ProptestConfig { failure_persistence: None, ..Default::default() })]
 
     #[test]
-    fn the_result_fits_and_one_more_row_does_not((model, request) in requests()) {
-        check_fit(&model, &request)?;
+    fn the_result_fits_and_one_more_row_does_not((run, request) in requests()) {
+        check_fit(&run, &request)?;
     }
 
     #[test]
     fn more_memory_never_gives_a_smaller_model(
-        model in models(),
+        run in runs(),
         memory in 0..2_000_000_000_u64,
         more in 0..200_000_000_u64,
     ) {
         let size = |memory| {
-            let fit = model.fit(&request(&model, memory));
-            fit.map(|fit| (fit.setting.sh_degree, fit.setting.rows))
+            let fit = run.fit(&request(&run, memory));
+            fit.map(|fit| (fit.size.sh_degree, fit.size.rows))
         };
         prop_assert!(size(memory) <= size(memory + more));
     }
 
     #[test]
-    fn min_memory_is_minimal(model in models(), step in 1..2_000_000_u64) {
-        let request = request(&model, 0);
-        let bytes = |setting: &RunSize| Ok::<_, Infallible>(model.bytes(setting));
+    fn min_memory_is_minimal(run in runs(), step in 1..2_000_000_u64) {
+        let request = request(&run, 0);
+        let bytes = |size: &RunSize| Ok::<_, Infallible>(run.bytes(size));
         let least = min_memory(&request, step, bytes).unwrap_or_else(|never| match never {});
         let least = least.expect("a number");
         prop_assert!(least.is_multiple_of(step));
-        let fits = |memory| model.fit(&SizeRequest { memory, ..request.clone() }).is_some();
+        let fits = |memory| run.fit(&SizeRequest { memory, ..request.clone() }).is_some();
         prop_assert!(fits(least));
         prop_assert!(least < step || !fits(least - step));
     }
 }
 
 #[test]
-fn a_degree_is_lowered_only_for_the_rows_that_the_scene_starts_with() {
-    let model = Model {
+fn a_degree_is_lowered_only_if_the_initial_rows_do_not_fit() {
+    let run = ImaginaryRun {
         fixed: 0,
         per_row: 100,
         per_coefficient: 36,
         per_pair: 0,
         largest_image: 0,
-        all_images: 0,
+        all_image_bytes: 0,
     };
-    // 676, 424, 244 and 136 bytes a row at degrees 3 to 0.
+    // 676, 424, 244 and 136 bytes a row at degrees 3 to 0; 20,000 initial rows.
     for (memory, degree, rows) in [
         (20_000 * 676, 3, 20_000),
         (20_000 * 676 - 1, 2, 31_872),
@@ -170,8 +170,8 @@ fn a_degree_is_lowered_only_for_the_rows_that_the_scene_starts_with() {
         (19_999 * 136, 0, 19_984),
         (1_008 * 136, 0, 1_008),
     ] {
-        let found = model.fit(&request(&model, memory)).expect("it fits").setting;
+        let found = run.fit(&request(&run, memory)).expect("it fits").size;
         assert_eq!((found.sh_degree, found.rows), (degree, rows), "{memory}");
     }
-    assert_eq!(model.fit(&request(&model, 1_008 * 136 - 1)), None);
+    assert_eq!(run.fit(&request(&run, 1_008 * 136 - 1)), None);
 }

@@ -28,7 +28,7 @@ pub(super) fn opacities(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         0.99 + 6e-8,
         0.9999,
     ];
-    // One at a time, so that a row on the other side of a threshold is a single flip.
+    // One alpha per model, so that a threshold decided differently flips only one pixel.
     for alpha in alphas {
         let mut model = Gaussians::default();
         // The mean lies on a pixel's centre, where alpha equals the opacity.
@@ -76,7 +76,7 @@ pub(super) fn layers(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     side_by_side(trial)
 }
 
-/// Many rows in one tile, at most a twentieth of which cover the same pixel, so that the list is read to its end.
+/// Many rows in one tile; at most a twentieth of them cover any one pixel, so that the tile's list is read to its end.
 fn side_by_side(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = axis_camera(16, 16);
     let mut model = Gaussians::default();
@@ -93,7 +93,7 @@ fn side_by_side(trial: &mut Trial<'_>) -> Result<(), BackendError> {
 
 pub(super) fn behind_opaque(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = axis_camera(21, 17);
-    // The last two are clamped to 0.99 at their centre.
+    // Alphas of the last two opacities are clamped to 0.99 at the row's centre.
     for opacity in [0.98, 0.9895, 0.9995, 0.9999] {
         let mut model = Gaussians::default();
         for row in 0..41_u8 {

@@ -44,7 +44,7 @@ fn extreme_coefficients(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     Ok(())
 }
 
-/// Colours at the ends of the range have gradients.
+/// Checks that black and white rows still learn their colour.
 fn black_and_white_learn(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = scenes::camera(24, 24, 24);
     let (width, height) = (camera.width, camera.height);
@@ -64,7 +64,7 @@ fn black_and_white_learn(trial: &mut Trial<'_>) -> Result<(), BackendError> {
             step(&mut *backend, number, &camera, &grey, [0.5; 3], 0)?;
         }
         let after = backend.download()?;
-        // Grey is 0.
+        // The coefficients of grey are 0.
         let moved = model.sh.iter().zip(&after.sh).filter(|(a, b)| b.abs() < a.abs() - 0.05);
         let dead = model.sh.len() - moved.count();
         trial.count(&format!("{label} points"), "colours that did not learn in 200 steps", dead);

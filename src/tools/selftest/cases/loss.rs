@@ -1,4 +1,4 @@
-//! Losses of uniform, equal and nearly equal images, where the usual form of SSIM cancels.
+//! Losses of uniform, equal and nearly equal images, where the usual formula of SSIM suffers from cancellation.
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -32,7 +32,7 @@ fn flat_image(value: u8) -> Image8 {
     Image8 { width, height, rgb, alpha: None, mask: None }
 }
 
-/// The reference's loss, of the target on the background and with the error weighted by the mask.
+/// The reference's loss, with the target composited over the background and the error weighted by the mask.
 fn expected(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Loss {
     let weight = |plane: &Option<Vec<u8>>, p: usize| {
         plane.as_ref().map_or(1.0, |plane| f64::from(plane[p]) / 255.0)
@@ -94,7 +94,7 @@ pub(super) fn uniform_photographs(trial: &mut Trial<'_>) -> Result<(), BackendEr
         let (found, gradient) =
             backend.loss(&scenes::opaque(&rendered, &target), &target, [0.0; 3])?;
         let off = f64::from(found.loss.abs().max((1.0 - found.ssim).abs()));
-        // A GPU divides by 255 within 2.5 units in the last place.
+        // A GPU's division by 255 is accurate to 2.5 units in the last place.
         let tolerance = if matches!(trial.subject, Subject::Gpu(_)) { 3e-7 } else { 0.0 };
         trial.record(&label, "loss of equal images", off, tolerance);
         if tolerance == 0.0 {

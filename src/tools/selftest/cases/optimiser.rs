@@ -13,8 +13,8 @@ const GRADIENTS: [f32; 8] = [0.0, 1e-45, 1e-23, 1e-15, 1e-6, 1.0, 1e19, 1e30];
 /// Row of the gradient whose square overflows.
 const OVERFLOWING: u32 = 7;
 
-/// Length of a first step with zero gradient, in learning rates, after moments m = g and v = g² (Kingma and Ba,
-/// algorithm 1).
+/// Length of a first step with zero gradient, in units of the learning rate, if the moments were m = g and v = g²
+/// before it (Kingma and Ba, algorithm 1).
 fn expected_step(gradient: f32) -> f64 {
     let (m, v) = (0.9 * f64::from(gradient), 0.999 * f64::from(gradient * gradient));
     let (m_hat, v_hat) = (m / (1.0 - 0.9), v / (1.0 - 0.999));

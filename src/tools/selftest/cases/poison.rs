@@ -52,7 +52,7 @@ pub(super) fn poisoned(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     }
     // Finite numbers may be rendered, and change the image; all results stay finite.
     for value in EXTREMES {
-        // Without row 3, an index among the visible rows differs from the row's index.
+        // Without row 3, the extreme rows begin at row 999, which is not a multiple of any vector's length.
         let extreme = remove(&with_value_in_each_slot(&model, value), 3);
         let mut backend = trial.subject.backend(&extreme)?;
         let (image, gradient) = run(&mut *backend)?;

@@ -79,11 +79,11 @@ pub(super) fn lenses(trial: &mut Trial<'_>) -> Result<(), BackendError> {
 
 /// Rows that each touch every tile of a full-HD image; in the long case half a million, whose number of tile
 /// entries exceeds 32 bits. Pixels are opaque after the front rows, so that the image must equal, bit for bit,
-/// that of the front rows alone, which needs no bands.
+/// that of the front rows alone, which is rendered in a single band.
 pub(super) fn large_rows(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     const TILES: u64 = 120 * 68;
     let (rows, front) = if trial.long { (530_000, 128) } else { (300, 128) };
-    // The long case uses the default, which is 16 entries per row.
+    // The long case uses the default cap, which is 16 entries per row.
     let tile_cap = (!trial.long).then_some(rows * TILES as usize / 6);
     let camera = axis_camera(1920, 1080);
     let model = |rows: usize| {

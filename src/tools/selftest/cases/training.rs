@@ -151,7 +151,7 @@ fn train(trial: &mut Trial<'_>, name: &str) -> Result<(), Box<dyn std::error::Er
         let report = trainer.step()?;
         over_budget += usize::from(report.rows > BUDGET || trainer.progress().peak_rows > BUDGET);
         broken += usize::from(!report.output.loss.is_finite());
-        // Between two edits: after one, a number may be out of range until the next step.
+        // Midway between two edits, as a number may be out of range from an edit until the next step.
         if step % 100 == 50 {
             broken += count_out_of_range(&trainer.model()?) + trainer.backend().audit()?.len();
             checks += 1;

@@ -64,30 +64,30 @@ fn rms(a: &[f32], b: &[f32]) -> f64 {
 }
 
 pub(super) fn placements(trial: &mut Trial<'_>) -> Result<(), BackendError> {
-    let here = render_placed(trial, DMat3::IDENTITY, |p| p)?;
+    let base = render_placed(trial, DMat3::IDENTITY, |p| p)?;
     let away = DVec3::new(1.0, -0.7, 0.3);
     for offset in [1e3, 1e5, 1e6, 5e6, 1e8] {
-        let there = render_placed(trial, DMat3::IDENTITY, |p| p + offset * away)?;
-        // 90 dB.
-        trial.record(&format!("offset {offset:e}"), "rms of colours", rms(&there, &here), 3.2e-5);
+        let moved = render_placed(trial, DMat3::IDENTITY, |p| p + offset * away)?;
+        // 3.2e-5 is 90 dB.
+        trial.record(&format!("offset {offset:e}"), "rms of colours", rms(&moved, &base), 3.2e-5);
     }
     for scale in [1e-4, 1e4] {
-        let there = render_placed(trial, DMat3::IDENTITY, |p| p * scale)?;
-        trial.record(&format!("scale {scale:e}"), "rms of colours", rms(&there, &here), 3.2e-5);
+        let moved = render_placed(trial, DMat3::IDENTITY, |p| p * scale)?;
+        trial.record(&format!("scale {scale:e}"), "rms of colours", rms(&moved, &base), 3.2e-5);
     }
     for power in [-20, -1, 7, 20] {
-        let there = render_placed(trial, DMat3::IDENTITY, |p| p * 2.0_f64.powi(power))?;
-        let different = there.iter().zip(&here).filter(|(a, b)| a.to_bits() != b.to_bits()).count();
+        let moved = render_placed(trial, DMat3::IDENTITY, |p| p * 2.0_f64.powi(power))?;
+        let different = moved.iter().zip(&base).filter(|(a, b)| a.to_bits() != b.to_bits()).count();
         trial.count(&format!("scale 2^{power}"), "bits that differ", different);
     }
     for (label, turn) in [
         ("yzx", DMat3::from_cols(DVec3::Y, DVec3::Z, DVec3::X)),
         ("zxy", DMat3::from_cols(DVec3::Z, DVec3::X, DVec3::Y)),
     ] {
-        let there = render_placed(trial, turn, |p| p)?;
-        // 100 dB: sums of three products in another order.
+        let moved = render_placed(trial, turn, |p| p)?;
+        // 1e-5 is 100 dB: the sums of three products are added in another order.
         let label = format!("axes {label}");
-        trial.record(&label, "rms of colours, exchanged axes", rms(&there, &here), 1e-5);
+        trial.record(&label, "rms of colours, exchanged axes", rms(&moved, &base), 1e-5);
     }
     Ok(())
 }

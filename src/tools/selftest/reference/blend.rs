@@ -213,20 +213,21 @@ fn add_exponent(sum: &mut ScreenGradient, splat: &Splat, hit: &Contribution, d_e
     sum.conic[2] += d_exponent * 0.5 * dy * dy;
 }
 
-/// Upper bounds of the contributions of the pixels outside `counted` to each row's statistics, however close
-/// thresholds are decided: largest weight, sum of weights, number of pixels.
+/// Upper bounds of what the pixels not marked in `counted` add to each row's statistics, whichever way a backend
+/// decides thresholds that are close: largest weight, sum of weights, number of pixels.
 pub fn leeway(
     splats: &[Splat],
     order: &[usize],
     view: View<'_>,
     counted: &[bool],
 ) -> Vec<(f64, f64, u32)> {
-    // Without thresholds nothing is skipped; an alpha 10 % below the minimum is never blended.
+    // These rules skip no row that a backend may blend: an alpha 10 % below the minimum is never blended.
     let rules = Rules { alpha_min: 0.9 / 255.0, ..Rules::SMOOTH };
     let mut bounds = vec![(0.0, 0.0, 0); splats.len()];
     for (at, _) in pixels(view).zip(counted).filter(|(_, counted)| !**counted) {
         for hit in trace(splats, order, at, &rules).contributions {
-            // A skipped row in front raises the transmittance by up to 1/255.
+            // A row in front that is blended here but skipped by the backend makes the backend's transmittance up to
+            // 1/255 larger.
             let weight = 1.01 * hit.alpha * hit.transmittance;
             let (largest, sum, pixels) = &mut bounds[hit.row];
             *largest = weight.max(*largest);

@@ -3,8 +3,8 @@
 //! It follows the textbook (Zwicker et al., *EWA Splatting*, IEEE TVCG 8(3), 2002; Kerbl et al.,
 //! *3D Gaussian Splatting*, ACM TOG 42(4), 2023): every pixel visits every row, covariance and conic are plain
 //! matrices, and the spherical harmonics are a table of monomials. The backends do none of that, so that they
-//! and the reference do not share errors. Antialiasing follows Mip-Splatting (Yu et al., CVPR 2024, equation 9). `tests/it/central.rs` checks the gradients by central differences,
-//! `tests/it/oracle/` compares with stored arrays.
+//! and the reference do not share errors. Antialiasing follows Mip-Splatting (Yu et al., CVPR 2024, equation 9).
+//! `tests/it/central.rs` checks the gradients by central differences, `tests/it/oracle/` compares with stored arrays.
 
 pub mod blend;
 pub mod loss;
@@ -46,7 +46,7 @@ impl Rules {
 pub struct Model {
     /// Coefficients of spherical harmonics per row and channel.
     pub coefficients: usize,
-    /// Antialiasing; of a gradient unused.
+    /// Antialiasing; unused in a gradient.
     pub antialiasing: Antialiasing,
     /// Shape: `[rows]`.
     pub means: Vec<[f64; 3]>,

@@ -10,13 +10,13 @@ use crate::text_table::{TextTable, or_dash};
 use densify_core::numbers::grouped;
 use densify_html::{Column, Document, Table};
 
-/// Mean number of Gaussians at the end; a dash without runs.
+/// Mean number of Gaussians at the end; a dash if there are no runs.
 fn final_count(runs: &[&Outcome]) -> String {
     let rows = mean(runs.iter().map(|run| run.rows as f64));
     or_dash(rows.map(|rows| grouped(rows.round() as usize)))
 }
 
-/// Largest number of Gaussians at any instant of any run; a dash without runs.
+/// Largest number of Gaussians at any instant of any run; a dash if there are no runs.
 fn peak_count(runs: &[&Outcome]) -> String {
     let peak = runs.iter().map(|run| run.peak_rows).max();
     let mark = if runs.iter().all(|run| run.kept_its_budget()) { "" } else { " (over)" };
@@ -93,7 +93,7 @@ mod tests {
     }
 
     #[test]
-    fn counts_stand_beside_peaks_for_every_budget() {
+    fn final_counts_and_peaks_are_listed_for_every_budget() {
         let all = [
             run("a", "room", 9000, 0, [8000, 9000]),
             run("a", "room", 9000, 1, [8501, 8999]),

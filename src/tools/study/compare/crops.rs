@@ -1,6 +1,6 @@
 //! Compares crops of renders: the same window of the same view for every policy at equal budget.
 //!
-//! The window is chosen by a rule: of all test photographs, the one with the most edges.
+//! The window is chosen by a fixed rule: of all windows of all test photographs, the one with the most edges.
 
 use std::path::Path;
 
@@ -20,7 +20,7 @@ use densify_train::evaluate::Split;
 use densify_train::output::model_path;
 use densify_train::pictures::{photograph, picture, side_by_side, write_png};
 
-/// Minimum width of an enlarged crop `[px]`. The factor is an integer.
+/// Minimum width of an enlarged crop `[px]`. The enlargement factor is an integer.
 const MIN_WIDTH: u32 = 480;
 /// Space between crops `[px]`.
 const GAP: u32 = 6;

@@ -27,7 +27,7 @@ use policy_variant::PolicyVariant;
 /// Options of a run that the comparison sets itself.
 const OWN_OPTIONS: [&str; 8] =
     ["scene", "policy", "budget", "seed", "iterations", "output", "test_iterations", "view"];
-/// Stands for all policies.
+/// The name that stands for all policies.
 const ALL: &str = "all";
 /// Evaluations during each run, for the curves.
 const EVALUATIONS: u32 = 8;
@@ -50,7 +50,7 @@ Examples:
 /// plots as SVG, and the runs themselves. With --engine the runs can be trained on a cluster.
 ///
 /// Quality is measured on held-out views. Differences are between runs of the same scene, budget and
-/// seed, against the first policy named, with 95 % intervals of their mean from three seeds on;
+/// seed, against the first policy named, with 95 % intervals of their mean for three seeds or more;
 /// policies are ranked by that mean. A run whose peak exceeded its budget is marked and not ranked.
 /// The budget bounds the peak, and some policies end far below it, so the number of Gaussians at the
 /// end is shown beside the peak. Where the geometry is known (built-in scenes, and those that
@@ -70,7 +70,7 @@ pub struct Comparison {
     /// which then has no other budgets
     #[arg(short, long, value_name = "ROWS", value_delimiter = ',', required = true, value_parser = SceneBudget::parse)]
     pub budget: Vec<SceneBudget>,
-    /// Number of runs of each kind, with seeds 0, 1, …
+    /// Number of runs of each policy at each budget, with seeds 0, 1, …
     #[arg(long, value_name = "K", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub seeds: u32,
     /// Length of each run
@@ -117,8 +117,8 @@ impl SceneBudget {
 }
 
 impl Comparison {
-    /// Trains the runs that are not done yet, all with the options `train`, and writes tables and pictures; `None` while a
-    /// scheduler still has runs.
+    /// Trains the runs that are not done yet, all with the options `train`, and writes tables and pictures; `None`
+    /// while a scheduler still has unfinished runs.
     pub fn run(
         &self,
         train: Partial,
@@ -244,7 +244,7 @@ fn scenes_and_budgets(outcomes: &[Outcome]) -> Vec<(&str, usize)> {
 }
 
 /// Difference of a policy from `base` over pairs of runs with the same scene, budget and seed that kept their budgets;
-/// `None` without a pair.
+/// `None` if there is no pair.
 fn difference<'a>(
     outcomes: impl Iterator<Item = &'a Outcome> + Clone,
     policy: &str,

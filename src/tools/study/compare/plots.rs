@@ -64,7 +64,7 @@ fn quality(
         curves: by_policy(policies, |policy| {
             let point = |&budget: &usize| {
                 let runs = at(outcomes, scene, budget).into_iter();
-                let runs = runs.filter(|r| r.factor == *policy && r.kept_its_budget());
+                let runs = runs.filter(|r| r.factor == policy && r.kept_its_budget());
                 Some(((budget as f64).ln(), mean(runs.map(score))?))
             };
             budgets.iter().filter_map(point).collect()
@@ -80,11 +80,10 @@ fn growth(
     policies: &[String],
     observer: &dyn Observer,
 ) -> Vec<Panel> {
-    let first_run = |policy: &String| {
-        runs.iter().filter(|r| r.factor == *policy).min_by_key(|r| r.seed).copied()
-    };
+    let first_run =
+        |policy: &str| runs.iter().filter(|r| r.factor == policy).min_by_key(|r| r.seed).copied();
     let mut records = BTreeMap::new();
-    for run in policies.iter().filter_map(first_run) {
+    for run in policies.iter().filter_map(|policy| first_run(policy)) {
         let steps = steps_of(&output.join("runs").join(&run.run)).unwrap_or_else(|error| {
             observer.say(format_args!("note: {error}; its curves are left out"));
             Vec::new()
@@ -118,7 +117,7 @@ fn growth(
 }
 
 /// One curve per policy; those that repeat a colour are dashed.
-fn by_policy(policies: &[String], points: impl Fn(&String) -> Vec<(f64, f64)>) -> Vec<Curve> {
+fn by_policy(policies: &[String], points: impl Fn(&str) -> Vec<(f64, f64)>) -> Vec<Curve> {
     let curve = |(index, policy): (usize, &String)| Curve {
         name: policy.clone(),
         points: points(policy),

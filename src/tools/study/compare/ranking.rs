@@ -144,7 +144,7 @@ mod tests {
 
     #[test]
     fn ranks_are_by_paired_difference_and_less_error_is_better() {
-        // b is better by 1 in all three seeds, c worse by 1; d like b.
+        // In all three seeds b and d are better than a by 1, and c is worse by 1.
         let gain = [("a", 0.0), ("b", 1.0), ("c", -1.0), ("d", 1.0)];
         let all: Vec<Outcome> = (0..3)
             .flat_map(|seed| gain.map(|(policy, gain)| run(policy, "room", seed, 30.0 + gain)))
@@ -174,9 +174,9 @@ rank  policy  PSNR [dB]  from a                  SSIM  rank    FLIP  rank  runs
     }
 
     #[test]
-    fn a_scene_without_one_policy_does_not_change_its_rank() {
-        // b is better by 1 in the scene where it kept its budget, and broke it in the scene that is easy for both. By its
-        // mean of 31 it would rank behind a with 35.
+    fn a_scene_where_a_policy_broke_its_budget_does_not_change_its_rank() {
+        // b is better by 1 in the hard scene, where it kept its budget; in the easy scene it broke its budget, so that
+        // run does not count. By its mean of 31, b would rank behind a with 35.
         let broken = Outcome { peak_rows: 1001, ..run("b", "easy", 0, 42.0) };
         let [a, b] = [run("a", "hard", 0, 30.0), run("b", "hard", 0, 31.0)];
         let all = [a, run("a", "easy", 0, 40.0), b, broken];

@@ -218,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn options_are_those_of_all_runs_with_their_defaults() {
+    fn options_that_all_runs_share_are_listed_with_the_defaults() {
         let run = |policy: &str, set: &str| Outcome {
             spec: format!("iterations = 9\npolicy = '{policy}'\nknob.alpha_min = '1/64'\n{set}")
                 .parse()

@@ -12,7 +12,7 @@ pub(super) struct Factor {
     pub(super) name: String,
     /// The factor must not change the model at all.
     pub(super) is_exact: bool,
-    /// Levels other than that of `exact`.
+    /// Levels to try, besides the level in the preset `exact`.
     pub(super) levels: Vec<String>,
 }
 

@@ -52,7 +52,7 @@ pub struct Trade {
     /// apply, and some options]`
     #[arg(long, value_name = "NAMES", value_delimiter = ',')]
     pub knobs: Vec<String>,
-    /// Number of runs of each kind, with seeds 0, 1, …
+    /// Number of runs at each level, with seeds 0, 1, …
     #[arg(long, value_name = "K", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub seeds: u32,
     /// Length of each run
@@ -74,7 +74,7 @@ pub struct Trade {
 
 impl Trade {
     /// Trains the runs that are not done yet, all with the options `train`, and writes tables and plots; `None` while a
-    /// scheduler still has runs.
+    /// scheduler still has unfinished runs.
     pub fn run(
         &self,
         train: Partial,

@@ -158,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn colours_go_from_end_to_end() {
+    fn colours_cover_the_whole_scale() {
         assert_eq!(colour(1.0, [1.0, 3.0]), SCALE[0]);
         assert_eq!(colour(2.0, [1.0, 3.0]), SCALE[1]);
         assert_eq!(colour(3.0, [1.0, 3.0]), SCALE[2]);

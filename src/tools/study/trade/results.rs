@@ -154,7 +154,7 @@ mod tests {
     fn effects_are_paired_with_the_exact_run_of_the_same_seed() {
         let results = sample();
         let effect =
-            |level: &str| results.effects.iter().find(|e| e.level == level).expect("there");
+            |level: &str| results.effects.iter().find(|e| e.level == level).expect("a level");
         let equal = effect("1/64");
         assert!(equal.psnr.mean.abs() < 1e-12 && equal.identical == 3);
         assert!((equal.seconds.mean.exp() - 0.9).abs() < 1e-12);

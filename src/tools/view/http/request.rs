@@ -78,7 +78,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Option<Head>, Response> {
     };
     let header = |name: &str| header(parsed.headers, name);
     if header("transfer-encoding")?.is_some() {
-        return Err(Response::error(411, "send the body in one piece, with Content-Length"));
+        return Err(Response::error(411, "send the body with Content-Length, not in chunks"));
     }
     let body = match header("content-length")? {
         None => 0,
@@ -107,7 +107,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Option<Head>, Response> {
     Ok(Some(Head { request, length, body }))
 }
 
-/// The value of a header that may occur once.
+/// The value of a header that may occur at most once.
 fn header(headers: &[httparse::Header<'_>], name: &str) -> Result<Option<String>, Response> {
     let mut found = headers.iter().filter(|header| header.name.eq_ignore_ascii_case(name));
     let first = found.next();

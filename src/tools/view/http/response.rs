@@ -21,7 +21,7 @@ pub(crate) struct Response {
     content_type: &'static str,
     /// Headers in addition to the common ones.
     headers: Vec<(&'static str, String)>,
-    /// Shared, so that a body that every page requests exists once.
+    /// Shared, so that a body that every page requests is in memory only once.
     pub(crate) body: Arc<[u8]>,
 }
 

@@ -68,7 +68,7 @@ fn accept(
             }
             let stream = match stream {
                 Ok((stream, _)) => Arc::new(stream),
-                // The client has left already, or the process is out of file descriptors; both may pass.
+                // The client has left already, or the process is out of file descriptors, which may be temporary.
                 Err(error) => {
                     tracing::debug!("a connection could not be accepted: {error}");
                     thread::sleep(POLL_INTERVAL);
@@ -82,7 +82,7 @@ fn accept(
                 continue;
             };
             let thread = thread::Builder::new().stack_size(STACK);
-            // Without a thread the closure is dropped, which closes the connection and frees its permit.
+            // If no thread can be started, the closure is dropped, which closes the connection and frees its permit.
             let _ = thread.spawn_scoped(scope, move || {
                 let _ = serve_connection(&stream, &permit, respond);
             });
@@ -102,7 +102,7 @@ struct Connection {
 
 #[derive(Debug, Default)]
 struct Connections {
-    /// By number, in order of arrival.
+    /// The open connections by their numbers, which are given in order of arrival.
     open: BTreeMap<u64, Connection>,
     next: u64,
 }
@@ -162,7 +162,7 @@ impl Permit<'_> {
         }
     }
 
-    /// The connection has a request to respond.
+    /// The connection has a request to answer.
     pub(super) fn mark_busy(&self) {
         if let Some(connection) = self.pool.connections().open.get_mut(&self.number) {
             connection.idle_since = None;

@@ -60,7 +60,7 @@ fn read_one(mut stream: &TcpStream, body: usize) -> String {
     String::from_utf8(bytes).unwrap()
 }
 
-/// Requests `/a`, which the server finds.
+/// Requests `/a` and expects status 200.
 fn get(stream: &mut TcpStream) {
     stream.write_all(GET.as_bytes()).unwrap();
     assert!(read_one(stream, 3).contains(" 200 "));

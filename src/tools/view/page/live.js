@@ -6,7 +6,7 @@ const ASK_EVERY = 1000;
 /** Minimum time between two pictures of the changing model [ms]. */
 const LOOK_EVERY = 2000;
 
-/** Follows the run of the scene. `look` requests a new picture. */
+/** Shows the progress of the run in training. `look` requests a new picture. */
 function followTraining(look) {
   const section = byId("training");
   section.hidden = false;
@@ -41,7 +41,7 @@ function followTraining(look) {
       section.dataset.state = "gone";
       return false;
     }
-    say(now);
+    showProgress(now);
     const isDue = performance.now() - lookedAt >= LOOK_EVERY || now.state === "paused";
     if (now.step !== lookedStep && isDue && stage.dataset.state === "sharp") {
       [lookedAt, lookedStep] = [performance.now(), now.step];
@@ -51,7 +51,7 @@ function followTraining(look) {
     return true;
   }
 
-  function say(now) {
+  function showProgress(now) {
     const { state, step, last, rows, budget, seconds, points, tests, edits, checkpoint } = now;
     section.dataset.state = state;
     section.dataset.step = step;
@@ -60,7 +60,7 @@ function followTraining(look) {
     byId("training-progress").max = last;
     byId("training-progress").value = step;
     const words = { preparing: "Preparing", training: "Training", paused: "Paused", stopping: "Stopping", ended: "Measuring and saving" };
-    const left = step && state === "training" ? `, about ${spoken(seconds / step * (last - step))} left` : "";
+    const left = step && state === "training" ? `, about ${formatDuration(seconds / step * (last - step))} left` : "";
     byId("training-state").textContent = `${words[state]}: step ${number(step)} of ${number(last)}${left}.`;
     const loss = points.at(-1)?.loss;
     const psnr = tests.at(-1)?.[1];
@@ -89,13 +89,13 @@ function followTraining(look) {
   }
 
   /** Formats a duration. */
-  function spoken(seconds) {
+  function formatDuration(seconds) {
     if (seconds < 90) return `${Math.ceil(seconds)} s`;
     return seconds < 5400 ? `${Math.round(seconds / 60)} min` : `${(seconds / 3600).toFixed(1)} h`;
   }
 
   /** Draws a curve over the whole length of the run, and shows its newest value. */
-  function curve(id, all, last, word) {
+  function curve(id, all, last, format) {
     const figure = byId(id), points = all.filter(([, y]) => Number.isFinite(y));
     figure.hidden = points.length === 0;
     if (!points.length) return;
@@ -103,8 +103,8 @@ function followTraining(look) {
     const least = Math.min(...values), most = Math.max(...values), range = most - least || 1;
     const place = ([x, y]) => `${(100 * x / last).toFixed(2)},${(38 - 36 * (y - least) / range).toFixed(2)}`;
     figure.querySelector("polyline").setAttribute("points", points.map(place).join(" "));
-    figure.querySelector("output").textContent = word(points.at(-1)[1]);
-    figure.querySelector(".ends").textContent = `${word(least)} to ${word(most)}`;
+    figure.querySelector("output").textContent = format(points.at(-1)[1]);
+    figure.querySelector(".ends").textContent = `${format(least)} to ${format(most)}`;
   }
 
   const again = async () => {

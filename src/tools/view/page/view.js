@@ -214,12 +214,12 @@ async function keepAsking() {
   for (;;) {
     const wait = untilNext();
     if (wait > 0) await pause(wait);
-    else follow();
+    else requestAndShow();
   }
 }
 
 /** Requests a picture of the current state and shows it. */
-async function follow() {
+async function requestAndShow() {
   const begun = performance.now(), asked = version, request = ++requests;
   const isMoving = begun - changedAt < REST || isFlying(), part = isMoving ? coarse : 1;
   const [left, right] = sides();
@@ -227,7 +227,7 @@ async function follow() {
   underway += 1;
   try {
     const frames = await Promise.all([ask(0, left, isMoving, part), right && ask(1, right, isMoving, part)]);
-    // A newer picture has replaced it, on the server or during the transfer.
+    // A newer picture has replaced this one, on the server or during the transfer.
     const isLate = request < newest || !frames[0] || (right && !frames[1]);
     if (isLate) frames.forEach((frame) => frame?.bitmap.close());
     else show(frames, { begun, asked, request, isMoving, part });
@@ -460,33 +460,33 @@ const modeOf = ({ shiftKey, buttons = 0 }) =>
   shiftKey || buttons & 6 ? "pan" : document.querySelector("input[name=drag]:checked").value;
 
 /** Pressed pointers and their last positions, in pixels of the page. */
-const hands = new Map();
+const pointers = new Map();
 let travelled = 0;
 
 marks.addEventListener("pointerdown", (event) => {
   // A mouse or a first finger starts a new gesture.
-  if (event.isPrimary) drop();
+  if (event.isPrimary) endDragging();
   marks.setPointerCapture(event.pointerId);
-  hands.set(event.pointerId, [event.clientX, event.clientY]);
+  pointers.set(event.pointerId, [event.clientX, event.clientY]);
   marks.classList.add("dragging");
   travelled = 0;
 });
 
 // Listens on the whole page, as not every browser honours the capture: dragging continues outside the picture.
 addEventListener("pointermove", (event) => {
-  const before = hands.get(event.pointerId);
+  const before = pointers.get(event.pointerId);
   if (!before) return;
   // The button was released outside the page.
-  if (!event.buttons) return drop();
+  if (!event.buttons) return endDragging();
   const now = [event.clientX, event.clientY];
   const [dx, dy] = add(now, before, -1);
   if (!dx && !dy) return;
   const height = area()[1];
   travelled += Math.hypot(dx, dy);
-  if (travelled < 4 && hands.size === 1) return;
-  if (hands.size === 2) {
+  if (travelled < 4 && pointers.size === 1) return;
+  if (pointers.size === 2) {
     // Two fingers: their centre shifts the scene, their distance moves the camera.
-    const other = [...hands].find(([id]) => id !== event.pointerId)[1];
+    const other = [...pointers].find(([id]) => id !== event.pointerId)[1];
     const spread = (a) => Math.max(10, Math.hypot(a[0] - other[0], a[1] - other[1]));
     dolly(spread(before) / spread(now));
     pan(dx / 2 / height, dy / 2 / height);
@@ -496,22 +496,22 @@ addEventListener("pointermove", (event) => {
     else if (mode === "look") look(radians(camera.fov) * dx / height, radians(camera.fov) * dy / height);
     else orbit(4 * dx / height, 4 * dy / height);
   }
-  hands.set(event.pointerId, now);
+  pointers.set(event.pointerId, now);
 });
 
 /** Ends all dragging. */
-function drop() {
-  hands.clear();
+function endDragging() {
+  pointers.clear();
   marks.classList.remove("dragging");
 }
 
 addEventListener("pointerup", (event) => {
-  if (!hands.delete(event.pointerId)) return;
-  if (!hands.size) drop();
+  if (!pointers.delete(event.pointerId)) return;
+  if (!pointers.size) endDragging();
   const found = travelled < 4 && event.target === marks && cameraAt(event.offsetX, event.offsetY);
   if (found) goTo(found);
 });
-addEventListener("pointercancel", (event) => { if (hands.has(event.pointerId)) drop(); });
+addEventListener("pointercancel", (event) => { if (pointers.has(event.pointerId)) endDragging(); });
 marks.addEventListener("contextmenu", (event) => event.preventDefault());
 marks.addEventListener("wheel", (event) => {
   event.preventDefault();
@@ -541,7 +541,7 @@ const STEPS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowD
 document.addEventListener("keydown", (event) => {
   const { target, key } = event;
   if (!scene || event.ctrlKey || event.metaKey || event.altKey || byId("guide").open) return;
-  // A focused control keeps the keys that it uses itself.
+  // A focused control keeps the keys that it needs itself.
   const needed = STEPS[key] ? "select, input:not([type=checkbox]), [role=slider]" : "select";
   if (target.matches(needed)) return;
   const low = key.toLowerCase();
@@ -559,12 +559,12 @@ document.addEventListener("keydown", (event) => {
   else if (key === "]") step(1);
   else if (low === "r") goHome();
   else if (low === "k") addKey();
-  else if (low === "h" || key === "?") explain();
+  else if (low === "h" || key === "?") showHelp();
   else return;
   event.preventDefault();
 });
 document.addEventListener("keyup", (event) => { pressedKeys.delete(event.key.toLowerCase()); changedAt = performance.now(); wake(); });
-addEventListener("blur", () => { pressedKeys.clear(); drop(); });
+addEventListener("blur", () => { pressedKeys.clear(); endDragging(); });
 
 // ---- The border between two pictures.
 
@@ -726,7 +726,7 @@ function showModels() {
   }));
 }
 
-function fill() {
+function fillPanel() {
   document.title = `${scene.title} · densify view`;
   byId("title").textContent = scene.title;
   showModels();
@@ -768,12 +768,12 @@ function fill() {
 }
 
 /** Opens the help, scrolled to its beginning: on a small screen the focused button is far below. */
-function explain() {
+function showHelp() {
   byId("guide").showModal();
   byId("guide").scrollTop = 0;
 }
 
-function listen() {
+function addListeners() {
   const on = (id, event, action) => byId(id).addEventListener(event, action);
   for (const id of ["left", "right", "sharpness"]) on(id, "change", changed);
   for (const id of ["frusta", "points"]) on(id, "change", draw);
@@ -791,7 +791,7 @@ function listen() {
   on("remove", "click", () => { keys.pop(); showPath(); });
   on("play", "click", play);
   on("save", "click", savePath);
-  on("help", "click", explain);
+  on("help", "click", showHelp);
   on("fold", "click", () => {
     const isFolded = document.body.classList.toggle("folded");
     byId("fold").textContent = isFolded ? "Show panel" : "Hide panel";
@@ -815,13 +815,13 @@ async function open() {
     trouble(`The scene cannot be read: ${error.message}`);
     return;
   }
-  fill();
+  fillPanel();
   goHome();
   showPath();
-  listen();
+  addListeners();
   let isNew = true;
   try { isNew = localStorage.getItem("densify-view") === null; } catch { /* Without storage, show the help. */ }
-  if (isNew) explain();
+  if (isNew) showHelp();
   keepAsking();
   if (scene.live) followTraining(requestPicture);
 }

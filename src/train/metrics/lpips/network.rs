@@ -20,7 +20,8 @@ pub enum Network {
     Alex,
 }
 
-/// A convolution: its number in the published network, input and output channels, side, stride and padding `[px]`.
+/// A convolution: its number in the published network, input and output channels, kernel size, stride and padding
+/// `[px]`.
 pub(super) type Layer = (usize, [usize; 2], usize, usize, usize);
 
 const VGG: [&[Layer]; 5] = [
@@ -165,15 +166,14 @@ impl Stage {
                     sum[1] += b * b;
                 }
             }
-            let lengths: Vec<[f32; 2]> =
+            let inverse_lengths: Vec<[f32; 2]> =
                 sums.iter().map(|sums| sums.map(|sum| 1.0 / (sum.sqrt() + EPSILON))).collect();
             let mut distance = 0.0;
             for (channel, &weight) in self.weights.iter().enumerate() {
                 let mut sum = 0.0_f64;
-                for (lengths, (a, b)) in
-                    lengths.iter().zip(a.row(channel, row).iter().zip(b.row(channel, row)))
-                {
-                    sum += f64::from(a * lengths[0] - b * lengths[1]).powi(2);
+                let values = a.row(channel, row).iter().zip(b.row(channel, row));
+                for (inverse, (a, b)) in inverse_lengths.iter().zip(values) {
+                    sum += f64::from(a * inverse[0] - b * inverse[1]).powi(2);
                 }
                 distance += f64::from(weight) * sum;
             }

@@ -141,6 +141,6 @@ fn options_that_disagree_are_refused() {
     assert!(refused(3, |_, o| o.iterations = 8).contains("8 iterations"));
     assert!(refused(3, |s, _| s.extent = f32::NAN).contains("extent"));
     assert!(refused(3, |s, _| s.budget = 11).contains("budget 10 (scene: 11)"));
-    assert!(refused(3, |_, o| o.rates.quat = 0.0).contains("`quat`"));
+    assert!(refused(3, |_, o| o.rates.quat = -1.0).contains("quat must"));
     assert!(build(&CASE, 3, scene(&CASE, 3), OPTIONS).is_ok());
 }

@@ -21,8 +21,8 @@ use densify_core::image::Image8;
 use scene_cache::Entry;
 pub use scene_cache::cache_folder;
 
-/// Upper bound on the memory while the search tree of a surface is built, as a multiple of the finished surface or of its
-/// file: a triangle takes 86 bytes in the file, up to 200 while the tree is built, and 100 afterwards.
+/// Upper bound on the memory while the search tree of a surface is built, as a multiple of the finished surface or of
+/// its file: a triangle takes 86 bytes in the file, up to 200 while the tree is built, and 100 afterwards.
 const BUILD_FACTOR: u64 = 4;
 
 /// A rendered built-in scene.

@@ -81,7 +81,7 @@ impl Entry {
             ("about", Dtype::U8, vec![about.len()], &about[..]),
             ("positions", Dtype::F64, vec![number, 3], bytemuck::cast_slice(&flat)),
             ("colours", Dtype::U8, vec![number, 3], points.colours.as_flattened()),
-            ("views", Dtype::U32, vec![number], bytemuck::cast_slice(&counts)),
+            ("view_counts", Dtype::U32, vec![number], bytemuck::cast_slice(&counts)),
             ("seen_by", Dtype::U32, vec![seen_by.len()], bytemuck::cast_slice(&seen_by)),
         ] {
             tensors.push((name.to_owned(), TensorView::new(kind, shape, bytes)?));
@@ -122,8 +122,8 @@ fn decode(tensors: &SafeTensors<'_>) -> Option<Rendered> {
     let positions = numbers.as_chunks().0.iter().map(|&point| DVec3::from_array(point)).collect();
     let colours = bytes("colours")?.as_chunks().0.to_vec();
     let mut seen = u32s("seen_by")?.into_iter();
-    let views = u32s("views")?.into_iter();
-    let seen_by = views.map(|count| seen.by_ref().take(count as usize).collect()).collect();
+    let counts = u32s("view_counts")?.into_iter();
+    let seen_by = counts.map(|count| seen.by_ref().take(count as usize).collect()).collect();
     // The other fields of the points are not used by datasets.
     let points = InitPoints { positions, colours, seen_by, ..InitPoints::default() };
     let about: About = serde_json::from_slice(bytes("about")?).ok()?;
@@ -162,11 +162,11 @@ fn evict(folder: &Path, most: u64) -> io::Result<()> {
     let mut entries = Vec::new();
     for entry in fs::read_dir(folder)? {
         let entry = entry?;
-        let known = entry.metadata()?;
-        // Incomplete files that killed processes left behind are counted and removed like entries.
+        let metadata = entry.metadata()?;
+        // Incomplete files left behind by killed processes are counted and removed like entries.
         let is_entry = entry.path().extension().is_some_and(|ending| ending == ENDING);
         if is_entry || entry.file_name().as_encoded_bytes().starts_with(b".densify-") {
-            entries.push((known.modified()?, known.len(), entry.path()));
+            entries.push((metadata.modified()?, metadata.len(), entry.path()));
         }
     }
     entries.sort();

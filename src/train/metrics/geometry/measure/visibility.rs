@@ -70,8 +70,8 @@ impl Visibility {
                 *empty += u32::from(sees_through(&world, &g_buffer, place));
             });
             let surface = ground.truth.surface();
-            let unseen = samples.par_iter_mut().filter(|(_, views)| *views < MIN_VIEWS);
-            unseen.for_each(|(at, views)| {
+            let undecided = samples.par_iter_mut().filter(|(_, views)| *views < MIN_VIEWS);
+            undecided.for_each(|(at, views)| {
                 let (pixel, depth) = ray_camera.project(*at);
                 let is_shown = depth > 0.0 && ray_camera.contains(pixel);
                 *views += u32::from(is_shown && !surface.blocked(ray_camera.centre, *at));

@@ -37,7 +37,7 @@ fn automatic_choices_survive_resuming_and_do_not_depend_on_threads() {
         train(scene.path(), &whole, &format!("{flags} --threads 1 --checkpoint-every 250")).ok();
     assert!(outcome.stdout.contains("left out"), "{}", outcome.stdout);
     let found = report(&whole);
-    // Too few tracks to decide the degree.
+    // The scene has too few tracks to decide the degree.
     let line = "colour   degree 3 (auto): undecided, because fewer than";
     assert!(outcome.stdout.contains(line), "{}", outcome.stdout);
     assert_eq!((&found["sh_degree_from"], &found["sh_degree"]), (&"undecided".into(), &3.into()));
@@ -48,7 +48,7 @@ fn automatic_choices_survive_resuming_and_do_not_depend_on_threads() {
     let stopped = found["rows"]["stopped"].as_u64().unwrap_or(u64::MAX);
     for interval in intervals {
         assert!(rows(interval) as f64 <= limit.round(), "{found}");
-        // Intervals in which the model recovers from an edit decide nothing.
+        // Only settled intervals raise the limit; in the others, the model still recovers from an edit.
         if interval["settled"] == true && interval["step"].as_u64() < Some(stopped) {
             limit = limit.round() * std::f64::consts::SQRT_2;
         }
@@ -86,8 +86,8 @@ fn the_automatic_degree_is_the_same_for_a_built_in_scene_and_its_files() {
     assert!(here.starts_with("colour   degree 0 (auto)"), "{here}");
     let folder_text = text(&folder);
     assert_eq!(line(folder_text), here, "transforms beside a model with tracks");
-    // Memory of this decision is released before anything else is allocated, so the budget is the same as with a given
-    // degree.
+    // The memory for choosing the degree is released before anything else is allocated, so the budget is the same as
+    // with an explicit degree.
     let rows = |degree: &str| {
         planned(&format!("{folder_text} --sh-degree {degree} --memory 64MiB"), "budget ")
     };

@@ -19,6 +19,7 @@ fn first_loss(run: &Path) -> f64 {
     records(&run.join("stats/train.jsonl"))[0]["loss"].as_f64().expect("a loss")
 }
 
+/// Checks that a call was refused and that its output folder `no` was not created.
 fn assert_refused(outcome: &Outcome, root: &Path, words: &[&str]) {
     outcome.refused("--init", words);
     assert!(!root.join("no").exists());
@@ -178,7 +179,7 @@ fn a_model_beyond_the_budget_keeps_its_visible_gaussians() {
     train(scene.path(), &run, 60, &format!("--budget 300 --quiet {NO_EDITS}")).ok();
     let mut large = gaussians(&model_path(&run, 60));
     let visible_rows = large.len();
-    // Adds as many nearly transparent Gaussians, which contribute to no pixel.
+    // Adds the same number of nearly transparent Gaussians, which contribute to no pixel.
     let rows: Vec<usize> = (0..visible_rows).collect();
     let mut faint = large.gather(&rows);
     faint.opacity_logits.fill(-9.0);
@@ -217,13 +218,13 @@ fn unsuitable_models_are_refused_or_reported() {
     std::fs::create_dir(root.path().join("early")).unwrap();
     std::fs::write(root.path().join("early/config.toml"), "").unwrap();
     let early = root.path().join("early");
-    assert_refused(&start(&early, ""), root.path(), &["--init", "early", "has no model"]);
+    assert_refused(&start(&early, ""), root.path(), &["--init", "early", "no saved model"]);
     assert_refused(&start(&file, "--init-points 9"), root.path(), &["--init-points 9", "random"]);
     let cut = root.path().join("cut.ply");
     std::fs::write(&cut, &read(&file)[..2_000]).unwrap();
     assert_refused(&start(&cut, ""), root.path(), &["--init", "cut.ply"]);
 
-    // Models in other coordinates: this one is outside all views.
+    // Models in coordinates other than the dataset's: this one is outside all views.
     let moved = |name: &str, map: fn([f32; 3]) -> [f32; 3]| {
         let mut model = gaussians(&file);
         for mean in &mut model.means {

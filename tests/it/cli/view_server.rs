@@ -135,7 +135,7 @@ impl Page {
     #[cfg(unix)]
     fn end(mut self) -> String {
         let pid = self.program.id().to_string();
-        let sent = Command::new("kill").args(["-INT", &pid]).status().expect("a shell's program");
+        let sent = Command::new("kill").args(["-INT", &pid]).status().expect("`kill` can be run");
         assert!(sent.success());
         let mut rest = String::new();
         self.stdout.read_to_string(&mut rest).expect("text");
@@ -151,7 +151,7 @@ impl Drop for Page {
     }
 }
 
-fn run_of(scene: &Photographs, run: &Path) {
+fn train_run(scene: &Photographs, run: &Path) {
     train(scene.path(), run, 40, "--budget 320 --eval --quiet").ok();
 }
 
@@ -173,7 +173,7 @@ fn psnr(a: &RgbImage, b: &RgbImage) -> f64 {
 fn frames_match_the_images_of_render() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
-    run_of(&scene, &run);
+    train_run(&scene, &run);
     let pictures = root.path().join("pictures");
     call(&format!("render {} -o {} --backend cpu", text(&run), text(&pictures))).ok();
     let page = Page::open(text(&run));
@@ -191,7 +191,7 @@ fn frames_match_the_images_of_render() {
             page.frame(&frame_request("photograph", "test", number, (4000, 1000))).picture();
         let similarity = psnr(&shown, &file.into_rgb8());
         assert!(similarity >= 38.0, "{name}: the photograph is {similarity} dB from its file");
-        // A free camera with the same pose, because the principal points are central.
+        // A free camera with the same pose shows the same picture, because the principal points are central.
         let at = &described["views"]["test"][number];
         let camera = json!({ "camera_to_world": at["camera_to_world"], "fov": at["fov"] });
         let free = json!({ "page": "test", "kind": "render", "width": SIZE.0, "height": SIZE.1, "camera": camera });
@@ -253,7 +253,7 @@ fn frames_match_the_images_of_render() {
 fn foreign_and_malformed_requests_are_refused_without_effect() {
     let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
-    run_of(&scene, &run);
+    train_run(&scene, &run);
     let page = Page::open(text(&run));
     let sound = frame_request("render", "test", 0, SIZE);
     let first = page.frame(&sound).picture();
@@ -328,7 +328,7 @@ fn scenes_show_their_points_and_two_runs_can_be_compared() {
     let points = described["points"]["positions"].as_array().map_or(0, Vec::len);
     assert!(points > 100, "{points}");
     page.frame(&frame_request("render", "test", 0, SIZE)).picture();
-    run_of(&scene, &run);
+    train_run(&scene, &run);
     // Runs in folders of the same name get distinct names.
     let other = root.path().join("above/run");
     train(scene.path(), &other, 4, "--budget 320 --eval --quiet").ok();
@@ -359,7 +359,7 @@ fn scenes_show_their_points_and_two_runs_can_be_compared() {
 fn invalid_calls_are_refused_with_a_remedy() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
-    run_of(&scene, &run);
+    train_run(&scene, &run);
     let run_text = text(&run).to_owned();
     let taken = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
     let port = taken.local_addr().expect("an address").port();
@@ -372,7 +372,7 @@ fn invalid_calls_are_refused_with_a_remedy() {
     let model = densify::train::output::model_path(&run, 40);
     let model = text(&model);
     for (words, expected) in [
-        (format!("{run_text} --port {port}"), vec!["--port", "another program", "name none"]),
+        (format!("{run_text} --port {port}"), vec!["--port", "another program", "give none"]),
         (format!("{run_text} --port 70000"), vec!["--port"]),
         (format!("{run_text} --host nowhere"), vec!["--host"]),
         (format!("{run_text} --host 192.0.2.1"), vec!["--host 192.0.2.1", "this machine"]),
@@ -400,7 +400,7 @@ fn invalid_calls_are_refused_with_a_remedy() {
 fn a_run_in_progress_is_shown_as_last_saved() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
-    run_of(&scene, &run);
+    train_run(&scene, &run);
     // The lock that a training process holds.
     let lock = std::fs::File::create(run.join("densify.lock")).expect("a file");
     lock.lock().expect("a lock");

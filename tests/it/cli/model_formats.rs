@@ -8,8 +8,8 @@ use densify::train::output::model_path;
 use super::{call, count, gaussians, json, read, scratch, text, train};
 use crate::photographs::Photographs;
 
-/// Encodes a model as `.splat`: positions and scales as f32; colour, opacity and quaternion as bytes; no view-dependent
-/// colour.
+/// Encodes a model as `.splat`: positions and scales as f32; colour, opacity and quaternion as bytes; without
+/// view-dependent colour.
 fn as_splat(model: &Gaussians) -> Vec<u8> {
     let byte = |value: f32| value.round().clamp(0.0, 255.0) as u8;
     let row = |row: usize| {

@@ -1,4 +1,4 @@
-//! `train --view`: progress and orders of the live page; viewing does not affect training.
+//! `train --view`: the page that shows a run in progress and controls it; viewing does not affect training.
 
 use std::io::Read;
 use std::net::TcpStream;
@@ -7,7 +7,7 @@ use std::thread;
 
 use serde_json::{Value, json};
 
-use super::view::{Page, frame_request};
+use super::view_server::{Page, frame_request};
 use super::{call, count, json, model, read, read_text, records, resume, scratch, text, train};
 use crate::photographs::{Photographs, SIZE};
 
@@ -35,7 +35,7 @@ impl Page {
     fn wait_for_pause(&self) -> u64 {
         loop {
             let now = self.progress();
-            // An ordered step is counted before it is taken.
+            // After an ordered step, the count changes before the step is taken, so it is read twice.
             if now["state"] == "paused" && self.progress()["step"] == now["step"] {
                 return count(&now, "step");
             }
@@ -53,7 +53,7 @@ impl Page {
     }
 }
 
-/// A request while the camera orbits the scene.
+/// A request for a frame while the camera orbits the scene.
 fn moving_request(at: u32) -> Value {
     let (sine, cosine) = (f64::from(at) * 0.1).sin_cos();
     let pose = [

@@ -6,7 +6,7 @@ use std::path::Path;
 use image::AnimationDecoder;
 use image::codecs::webp::WebPDecoder;
 
-use super::looking::{ITERATIONS, run_of};
+use super::inspecting::{ITERATIONS, train_run};
 use super::{Outcome, WITHOUT_GPU, call, files, json, outcome_of, scratch, text};
 use crate::photographs::Photographs;
 
@@ -19,7 +19,7 @@ fn size(folder: &Path, name: &str) -> (u32, u32) {
 fn a_camera_path_is_rendered_as_frames_and_video() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
-    run_of(&scene, &run);
+    train_run(&scene, &run);
     let frames = root.path().join("frames");
     let video = root.path().join("films/orbit.webp");
     let call_with =
@@ -61,7 +61,7 @@ fn a_camera_path_is_rendered_as_frames_and_video() {
 fn a_camera_path_in_a_file_is_in_the_datasets_coordinates() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
-    run_of(&scene, &run);
+    train_run(&scene, &run);
     // The first training camera of the run, in nerfstudio's format.
     let cameras = json(&run.join("cameras.json"));
     let first = &cameras[0];
@@ -133,7 +133,7 @@ fn ffmpeg_gets_only_the_frames_of_this_call() {
 
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
-    run_of(&scene, &run);
+    train_run(&scene, &run);
     let bin = root.path().join("bin");
     std::fs::create_dir(&bin).unwrap();
     // A % in the path must not become part of ffmpeg's pattern.

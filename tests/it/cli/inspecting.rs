@@ -9,7 +9,7 @@ use crate::photographs::{Photographs, SIZE, VIEWS, name};
 
 pub(super) const ITERATIONS: u32 = 40;
 
-pub(super) fn run_of(scene: &Photographs, run: &Path) {
+pub(super) fn train_run(scene: &Photographs, run: &Path) {
     train(scene.path(), run, ITERATIONS, "--budget 320 --eval --quiet").ok();
 }
 
@@ -33,12 +33,12 @@ fn assert_close(a: &serde_json::Value, b: &serde_json::Value, tolerance: f64) {
 fn eval_reproduces_the_scores_of_training() {
     let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
-    run_of(&scene, &run);
+    train_run(&scene, &run);
     let paths = ["results.json", "per_view.json"].map(|name| run.join(name));
     let trained = paths.clone().map(|path| json(&path));
     paths.iter().for_each(|path| std::fs::remove_file(path).expect("an existing file"));
     let outcome = call(&format!("eval {}", text(&run))).ok();
-    // The model file rounds, because it stores the model in the dataset's coordinates.
+    // Values are rounded when the model file stores them in the dataset's coordinates.
     for (path, trained) in paths.iter().zip(&trained) {
         assert_close(&json(path), trained, 2e-3);
     }
@@ -78,7 +78,7 @@ fn write_weights(path: &Path) {
 fn eval_measures_lpips_with_the_users_weights() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
-    run_of(&scene, &run);
+    train_run(&scene, &run);
     let file = root.path().join("alex.safetensors");
     write_weights(&file);
     let call_with = |file: &Path, more: &str| {
@@ -115,7 +115,7 @@ fn size(folder: &Path, name: &str) -> (u32, u32) {
 fn render_writes_images_of_the_views() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
-    run_of(&scene, &run);
+    train_run(&scene, &run);
     let pictures = root.path().join("pictures");
     let all = "--alpha --depth --side-by-side";
     call(&format!("render {} -o {} {all}", text(&run), text(&pictures))).ok();
@@ -137,7 +137,7 @@ fn render_writes_images_of_the_views() {
     let depth = json(&pictures.join("depth.json"));
     let largest = depth["largest"]["view_00.depth.png"].as_f64().expect("a number");
     assert!((3.0..6.0).contains(&largest), "{largest}");
-    // The pair is the photograph beside the rendering.
+    // The pair shows the photograph on the left and the rendering on the right.
     let pair = open("view_00.pair.png").into_rgb8();
     let (photograph, rendering) = (
         image::open(scene.file("images/view_00.png")).unwrap().into_rgb8(),
@@ -166,7 +166,7 @@ fn render_writes_images_of_the_views() {
 fn a_bare_model_renders_like_its_run() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
-    run_of(&scene, &run);
+    train_run(&scene, &run);
     let render = |words: &str, to: &str| {
         let to = root.path().join(to);
         (call(&format!("render {words} -o {}", text(&to))), to)
