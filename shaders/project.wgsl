@@ -38,15 +38,23 @@ fn project(@builtin(global_invocation_id) id: vec3<u32>) {
     if !sound {
         return;
     }
-    let log2_opacity = log2_sigmoid(row.logit);
+    var log2_opacity = log2_sigmoid(row.logit);
     // Decrease of the exponent from the centre to where alpha is ALPHA_MIN; <= 0 if even the centre is fainter.
-    let reach = log2_opacity + LOG2_REACH;
+    var reach = log2_opacity + LOG2_REACH;
     if reach <= 0.0 {
         return;
     }
     let g = geometry(row);
     if !(g.p.z > frame.centre.w) {
         return;
+    }
+    if LOWERS_OPACITY {
+        // An overflow is found below.
+        log2_opacity += log2_rho(g);
+        reach = log2_opacity + LOG2_REACH;
+        if reach <= 0.0 {
+            return;
+        }
     }
     let factor = conic(g);
     let radius = sqrt(reach) * (1.0 / EXPONENT_SCALE);

@@ -46,17 +46,24 @@ fn project_bwd(@builtin(global_invocation_id) id: vec3<u32>) {
     let mn0 = muu * n0 + muz * n1;
     let mn1 = muz * n0 + mzz * n1;
     let scale2 = g.scale * g.scale;
-    let by_log_scale = (n0 * mn0 + n1 * mn1) * scale2;
+    var by_log_scale = (n0 * mn0 + n1 * mn1) * scale2;
     // Rotation about axis i; j and k are the next two axes, cyclically.
-    let turn = (n0.yzx * mn0.zxy + n1.yzx * mn1.zxy) * (scale2.yzx - scale2.zxy);
+    var turn = (n0.yzx * mn0.zxy + n1.yzx * mn1.zxy) * (scale2.yzx - scale2.zxy);
+    // dL/d(row i of J·W) = Σ_k (L·M·n)[i][k]·sₖ²·axisₖ.
+    var d0 = l1 * mn0 * scale2;
+    var d1 = (l3 * mn1 - l1 * shear * mn0) * scale2;
+    if LOWERS_OPACITY {
+        let rho = rho_gradient(g, scale2, q);
+        by_log_scale += rho.log_scale;
+        turn += rho.turn;
+        d0 += rho.row0;
+        d1 += rho.row1;
+    }
     let v = g.quat.yzw;
     let two = 2.0 * g.quat_inv_norm;
     let by_w = -dot(v, turn) * two;
     let by_v = (g.quat.x * turn + cross(v, turn)) * two;
 
-    // dL/d(row i of J·W) = Σ_k (L·M·n)[i][k]·sₖ²·axisₖ.
-    let d0 = l1 * mn0 * scale2;
-    let d1 = (l3 * mn1 - l1 * shear * mn0) * scale2;
     let db0 = d0.x * g.axis0 + d0.y * g.axis1 + d0.z * g.axis2;
     let db1 = d1.x * g.axis0 + d1.y * g.axis1 + d1.z * g.axis2;
     let r0 = frame.rotation[0].xyz;
@@ -99,6 +106,43 @@ fn project_bwd(@builtin(global_invocation_id) id: vec3<u32>) {
     gradient[to + 2u] = vec4(by_v.yz, by_logit, dm.x);
     gradient[to + 3u] = vec4(dc, dm.y);
     gradient[to + 4u] = vec4(d, 0.0);
+}
+
+// The gradient through the factor of opacities with antialiasing: with respect to log-scales, to rotations about
+// local axes, and to the rows of n.
+struct RhoGradient {
+    log_scale: vec3<f32>,
+    turn: vec3<f32>,
+    row0: vec3<f32>,
+    row1: vec3<f32>,
+}
+
+// q: dL/d(log of the factor).
+fn rho_gradient(g: Geometry, scale2: vec3<f32>, q: f32) -> RhoGradient {
+    let per_det = q * BLUR / g.det;
+    let by_sharp = per_det * (g.cov.x + g.cov.z - BLUR);
+    let inv_norm = 1.0 / sqrt(g.sharp_det);
+    let r0 = g.n0;
+    let r1 = g.n1;
+    let h = inv_norm * vec3(
+        difference_of_products(r0.y, r1.z, r0.z, r1.y),
+        difference_of_products(r0.z, r1.x, r0.x, r1.z),
+        difference_of_products(r0.x, r1.y, r0.y, r1.x),
+    );
+    let unit = g.scale.yzx * g.scale.zxy * h;
+    let unit2 = unit * unit;
+    let length2 = (r0 * r0 + r1 * r1) * scale2;
+    var rho: RhoGradient;
+    rho.log_scale = by_sharp * (unit2.yzx + unit2.zxy) - per_det * length2;
+    let sharp = (g.scale * h.yzx) * (g.scale * h.zxy);
+    let both = by_sharp * sharp + per_det * (r0.yzx * r0.zxy + r1.yzx * r1.zxy);
+    rho.turn = (scale2.zxy - scale2.yzx) * both;
+    let across = by_sharp * inv_norm;
+    let to0 = scale2.yzx * r1.yzx * h.zxy - scale2.zxy * r1.zxy * h.yzx;
+    let to1 = scale2.zxy * r0.zxy * h.yzx - scale2.yzx * r0.yzx * h.zxy;
+    rho.row0 = scale2 * (across * to0 - per_det * r0);
+    rho.row1 = scale2 * (across * to1 - per_det * r1);
+    return rho;
 }
 
 // Σ_k (dc·sh_k) ∇Y_k(d); see src/core/sh.rs.

@@ -7,7 +7,10 @@
 @group(0) @binding(4) var<storage, read> sh2: array<f32>;
 @group(0) @binding(5) var<storage, read> sh3: array<f32>;
 
-const BLUR: f32 = 0.3;
+// Variance added to both diagonal entries of a projected covariance [px²]; with antialiasing, the kernel.
+override BLUR: f32 = 0.3;
+// True if the blur lowers opacities (antialiasing).
+override LOWERS_OPACITY: bool = false;
 // √(½·log₂ e): the conic factors of splats are scaled by this, so that exp becomes exp2.
 const EXPONENT_SCALE: f32 = 0.8493218;
 const COLOUR_MAX: f32 = 1e6;
@@ -44,6 +47,13 @@ fn log2_sigmoid(x: f32) -> f32 {
     return min(x, 0.0) * LOG2_E - log2_of_1_to_2(1.0 + exp_exact(-abs(x)));
 }
 
+// log2 of x >= 0; 0 and subnormal numbers count as 2^−126.
+fn log2_exact(x: f32) -> f32 {
+    let bits = bitcast<u32>(max(x, 1.1754944e-38));
+    let between_1_and_2 = bitcast<f32>((bits & 0x007fffffu) | 0x3f800000u);
+    return f32(bits >> 23u) - 127.0 + log2_of_1_to_2(between_1_and_2);
+}
+
 // The results of the forward projection that the backward pass uses too.
 struct Geometry {
     scale: vec3<f32>,
@@ -62,6 +72,8 @@ struct Geometry {
     // Covariance with blur (a, b, c), and its determinant.
     cov: vec3<f32>,
     det: f32,
+    // The determinant without blur.
+    sharp_det: f32,
 }
 
 // a·b − c·d, with a correction for the rounding error of the second product (Kahan).
@@ -107,9 +119,15 @@ fn geometry(row: Row) -> Geometry {
         difference_of_products(v0.z, v1.x, v0.x, v1.z),
         difference_of_products(v0.x, v1.y, v0.y, v1.x),
     );
-    g.det = dot(across, across) + (a + d) * BLUR + BLUR * BLUR;
+    g.sharp_det = dot(across, across);
+    g.det = g.sharp_det + (a + d) * BLUR + BLUR * BLUR;
     g.cov = vec3(a + BLUR, dot(v0, v1), d + BLUR);
     return g;
+}
+
+// log2 of the factor of opacities with antialiasing.
+fn log2_rho(g: Geometry) -> f32 {
+    return 0.5 * min(log2_exact(min(g.sharp_det / g.det, 1.0)), 0.0);
 }
 
 // Conic factor (l1, r, l3), not scaled.

@@ -91,7 +91,7 @@ pub(super) fn run(
     for format in &formats {
         check_output(&file(&args.output, &formats, format), args.overwrite)?;
     }
-    let RenderingArgs { near, device, data } = &args.rendering;
+    let RenderingArgs { near, antialias, device, data } = &args.rendering;
     let model = model_file(&args.model, args.iteration)?;
     let (scene, data, near, exposure) = if is_model(&args.model) {
         let Some(scene) = args.scene.clone() else {
@@ -115,6 +115,7 @@ pub(super) fn run(
         data,
         exposure,
         near,
+        antialias: *antialias,
         device: device.clone(),
         to: args.to,
         iterations: args.iterations.0,

@@ -9,6 +9,7 @@ use densify_policies::policy::Needs;
 use super::console::Console;
 use super::film::{self, FilmArgs};
 use super::threads::open_machine;
+use densify_core::antialiasing::Antialiasing;
 use densify_core::camera_path;
 use densify_data::views::ViewSource;
 use densify_inspect::{CameraRoute, Channels, FilmSource, PictureFolder, file_names};
@@ -66,6 +67,13 @@ pub(super) struct RenderingArgs {
     /// scene's extent (default: 0.04, or less where the views show points that are nearer)
     #[arg(long, value_name = "FRACTION", help_heading = "Scene")]
     pub(super) near: Option<Fraction>,
+    /// Antialiasing to render with, instead of what the file states: a kernel of 0.3 px² (most programs) or 0.1 (Brush,
+    /// LichtFeld, Mip-Splatting), or none. The PLY of the original trainer does not state it
+    #[arg(
+        long, value_name = "KERNEL", num_args = 0..=1, require_equals = true, default_missing_value = "0.3",
+        help_heading = "Rendering"
+    )]
+    pub(super) antialias: Option<Antialiasing>,
     #[command(flatten)]
     pub(super) device: DeviceSpec,
     #[command(flatten)]
@@ -170,7 +178,8 @@ impl ModelArgument<'_> {
             RunConfig::read(self.model)?;
             let iteration = iteration(self.model, self.iteration)?;
             let moved_to = self.scene.map(Path::to_owned);
-            return open_run(self.model, iteration, moved_to, machine, needs, console);
+            let how = (rendering.antialias, machine);
+            return open_run(self.model, iteration, moved_to, how, needs, console);
         }
         let Some(scene) = self.scene else {
             return Err(Failure::input(format!(
@@ -179,8 +188,8 @@ impl ModelArgument<'_> {
             )));
         };
         let model = model_file(self.model, self.iteration)?;
-        let RenderingArgs { near, data, .. } = rendering;
-        open(&model, scene, data.clone(), (*near, machine), needs, console)
+        let RenderingArgs { near, antialias, data, .. } = rendering;
+        open(&model, scene, data.clone(), (*near, *antialias, machine), needs, console)
     }
 
     /// Opens a model file without a dataset, for a camera path with its own cameras from the file `path`.
@@ -195,7 +204,7 @@ impl ModelArgument<'_> {
         // If the camera path cannot be read, `film::run` reports the error.
         let cameras = camera_path::read(path).map_or_else(|_| Vec::new(), |saved| saved.cameras());
         let (backend, normalisation, sh_degree) =
-            open_alone(&model, (rendering.near, machine), &cameras, console)?;
+            open_alone(&model, (rendering.near, rendering.antialias, machine), &cameras, console)?;
         let background = rendering.data.background.fixed();
         Ok(FilmSource { backend, sh_degree, background, normalisation, cameras: Vec::new() })
     }

@@ -67,7 +67,7 @@ pub(super) fn run(args: &ViewArgs, matches: &ArgMatches, console: &Console) -> R
     // Bind the port first: a failure shows at once, and a model may take long to read.
     let address = ListenAddress { host: args.host, port: args.port, needs_token: false };
     let server = Server::open(address)?;
-    let RenderingArgs { near, device, data } = &args.rendering;
+    let RenderingArgs { near, antialias, device, data } = &args.rendering;
     let machine = open_machine(device, console)?;
     let options = ViewOptions {
         path: &args.path,
@@ -75,6 +75,7 @@ pub(super) fn run(args: &ViewArgs, matches: &ArgMatches, console: &Console) -> R
         dataset: args.scene.clone(),
         iteration: args.iteration,
         near: *near,
+        antialias: *antialias,
         data: data.clone(),
     };
     let scene = view::open(options, machine, console)?;

@@ -4,6 +4,8 @@
 //! quaternion (w, x, y, z; not necessarily normalised), opacity as a logit, and spherical-harmonic
 //! coefficients of its colour: colour = max(0, ½ + Σ Y_k(direction)·sh_k).
 
+use crate::antialiasing::Antialiasing;
+
 /// Number of spherical-harmonic coefficients per channel at `degree`: (degree + 1)².
 pub const fn sh_coefficients(degree: u8) -> usize {
     (degree as usize + 1) * (degree as usize + 1)
@@ -55,6 +57,8 @@ impl ModelArray {
 pub struct Gaussians {
     /// Spherical-harmonic degree, 0..=3; decides the length of `sh`.
     pub sh_degree: u8,
+    /// How the model is rendered where its Gaussians are smaller than a pixel.
+    pub antialiasing: Antialiasing,
     /// The point from which means are measured `[scene units]`: a position is a mean plus this. Other than 0 only outside
     /// training, where coordinates would be too coarse in f32.
     pub origin: [f64; 3],
@@ -71,7 +75,7 @@ pub struct Gaussians {
 }
 
 impl Gaussians {
-    /// Builds a model from its arrays, each row-major.
+    /// Builds a model without antialiasing from its arrays, each row-major.
     ///
     /// # Errors
     /// The first error of `array`.
@@ -82,6 +86,7 @@ impl Gaussians {
         Ok(Self {
             sh_degree,
             origin: [0.0; 3],
+            antialiasing: Antialiasing::None,
             means: in_rows(array(ModelArray::Means)?),
             log_scales: in_rows(array(ModelArray::LogScales)?),
             quats: in_rows(array(ModelArray::Quats)?),
@@ -95,6 +100,7 @@ impl Gaussians {
         Self {
             sh_degree,
             origin: [0.0; 3],
+            antialiasing: Antialiasing::None,
             means: vec![[0.0; 3]; rows],
             log_scales: vec![[0.0; 3]; rows],
             quats: vec![[0.0; 4]; rows],
@@ -113,6 +119,11 @@ impl Gaussians {
             // Adding 0 would change the sign of −0.
             if self.origin[axis] == 0.0 { mean } else { mean + self.origin[axis] }
         })
+    }
+
+    /// True if means are measured from another point than 0.
+    pub fn is_local(&self) -> bool {
+        self.origin.iter().any(|&axis| axis != 0.0)
     }
 
     /// True if means are measured from this point.
@@ -148,12 +159,14 @@ impl Gaussians {
         self
     }
 
-    /// Appends the rows of another model of the same degree. A model without rows takes the other's origin.
+    /// Appends the rows of another model of the same degree and antialiasing. A model without rows takes the other's
+    /// origin.
     ///
     /// # Panics
-    /// When the degrees differ.
+    /// When they differ.
     pub fn append(&mut self, mut other: Self) {
         assert_eq!(self.sh_degree, other.sh_degree, "models of different degrees cannot be joined");
+        assert_eq!(self.antialiasing, other.antialiasing, "models are rendered in different ways");
         if self.is_empty() {
             self.origin = other.origin;
         }
@@ -173,6 +186,7 @@ impl Gaussians {
         Self {
             sh_degree: self.sh_degree,
             origin: self.origin,
+            antialiasing: self.antialiasing,
             means: rows.iter().map(|&row| self.means[row]).collect(),
             log_scales: rows.iter().map(|&row| self.log_scales[row]).collect(),
             quats: rows.iter().map(|&row| self.quats[row]).collect(),

@@ -1,6 +1,7 @@
 //! The basic types that every layer of `densify` uses: cameras, Gaussians, images, colours, the memory ledger, and
 //! safe file access. Formats of models and datasets, devices and threads belong to the layers above.
 
+pub mod antialiasing;
 pub mod budget;
 pub mod camera;
 pub mod camera_path;

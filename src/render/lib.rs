@@ -32,6 +32,7 @@ use densify_policies::policy::{
 pub use adapter::{AdapterChoice, AdapterKind, AdapterSummary};
 pub use audit::{NonFinite, NumberKind};
 pub use choice::{BackendChoice, BackendKind, Device};
+use densify_core::antialiasing::Antialiasing;
 use densify_core::budget::RowBudget;
 use densify_core::camera::Camera;
 use densify_core::colour::{ColourGradient, ColourTransform};
@@ -189,6 +190,9 @@ pub trait Backend: Send {
     /// Spherical-harmonic degree of the model.
     fn sh_degree(&self) -> u8;
 
+    /// Antialiasing of the model, with which it is rendered and trained.
+    fn antialiasing(&self) -> Antialiasing;
+
     /// The largest number of rows; all buffers have this size from the start.
     fn budget(&self) -> usize;
 
@@ -278,7 +282,8 @@ pub trait Backend: Send {
     /// When a row does not exist: a bug in the caller.
     fn download_rows(&self, rows: Range<usize>) -> Result<Gaussians, BackendError> {
         let array = |array| self.download_array(array, rows.clone());
-        Gaussians::from_arrays(self.sh_degree(), array)
+        let model = Gaussians::from_arrays(self.sh_degree(), array)?;
+        Ok(Gaussians { antialiasing: self.antialiasing(), ..model })
     }
 
     /// Copies some rows of one of the model's arrays to the host, row-major.

@@ -7,12 +7,14 @@ use glam::DVec3;
 
 use crate::failure::{Failure, ModelProblem, notes};
 pub use crate::models::{
-    is_model, iteration, iteration_so_far, model_file, name_of, names_of, read_model, write_model,
+    is_model, iteration, iteration_so_far, model_file, name_of, names_of, read_model,
+    read_model_as, write_model,
 };
 use crate::near_plane::NearPlane;
 use crate::observer::{Observer, say_notes};
 use crate::resolved::RunConfig;
 use crate::spec::{DataSpec, DeviceSpec, Fraction};
+use densify_core::antialiasing::Antialiasing;
 use densify_core::camera::Camera;
 use densify_core::gaussians::Gaussians;
 use densify_data::dataset::normalise::Normalisation;
@@ -120,7 +122,7 @@ pub fn open_run(
     run: &Path,
     iteration: u32,
     moved_to: Option<PathBuf>,
-    machine: Machine,
+    (antialias, machine): (Option<Antialiasing>, Machine),
     needs: Needs,
     observer: &dyn Observer,
 ) -> Result<Opened, Failure> {
@@ -129,12 +131,12 @@ pub fn open_run(
     let path = moved_to.unwrap_or_else(|| config.scene_path());
     let model = model_path(run, iteration);
     let near = config.spec.start.near;
-    open(&model, &path, config.spec.data, (near, machine), needs, observer)
+    open(&model, &path, config.spec.data, (near, antialias, machine), needs, observer)
         .map_err(|failure| if was_moved { failure } else { or_moved(failure, &path) })
 }
 
 /// Opens a model, written by any program, with a dataset. Without `near`, the near plane is the [usual one](NearPlane)
-/// of the dataset.
+/// of the dataset. Without `antialias`, the model is rendered as its file states.
 ///
 /// # Errors
 /// When the model, the dataset or the device cannot be opened.
@@ -142,12 +144,12 @@ pub fn open(
     model: &Path,
     dataset: &Path,
     data: DataSpec,
-    (near, machine): (Option<Fraction>, Machine),
+    (near, antialias, machine): (Option<Fraction>, Option<Antialiasing>, Machine),
     needs: Needs,
     observer: &dyn Observer,
 ) -> Result<Opened, Failure> {
     let dataset = load(dataset, &data, observer)?;
-    let model = read_model(model, observer)?;
+    let model = read_model_as(model, antialias, observer)?;
     let sh_degree = model.sh_degree;
     let near = near_plane(near, &dataset, observer);
     let backend = machine.backend_for(&dataset, model, near, needs)?;
@@ -155,17 +157,18 @@ pub fn open(
 }
 
 /// Opens a model without a dataset, for cameras in its own coordinates. Also returns its normalisation and degree.
-/// Without `near`, the near plane follows from the Gaussians of opacity above 0.5 that the cameras see.
+/// Without `near`, the near plane follows from the Gaussians of opacity above 0.5 that the cameras see; without
+/// `antialias`, the model is rendered as its file states.
 ///
 /// # Errors
 /// When the model or the device cannot be opened.
 pub fn open_alone(
     model: &Path,
-    (near, machine): (Option<Fraction>, Machine),
+    (near, antialias, machine): (Option<Fraction>, Option<Antialiasing>, Machine),
     cameras: &[Camera],
     observer: &dyn Observer,
 ) -> Result<(Box<dyn Backend>, Normalisation, u8), Failure> {
-    let model = read_model(model, observer)?;
+    let model = read_model_as(model, antialias, observer)?;
     let normalisation = Normalisation::fit_model(&model);
     let model = normalisation.model_from_world(model);
     let near = say_near_plane(

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use crate::failure::{Failure, ModelProblem, notes};
 use crate::observer::Observer;
+use densify_core::antialiasing::Antialiasing;
 use densify_core::files::{self, WriteError};
 use densify_core::gaussians::Gaussians;
 use densify_data::dataset::is_archive;
@@ -105,12 +106,24 @@ pub fn model_file(named: &Path, asked: Option<u32>) -> Result<PathBuf, Failure> 
 }
 
 /// Reads a file of Gaussian splats, written by any program, in its own coordinates, and reports dropped and repaired
-/// rows.
+/// rows, and what the file states beyond its format.
 ///
 /// # Errors
 /// When it cannot be read.
 pub fn read_model(path: &Path, observer: &dyn Observer) -> Result<Gaussians, Failure> {
-    let file = models::read_model(path)?;
+    read_model_as(path, None, observer)
+}
+
+/// Reads a model as [`read_model`], with the antialiasing given instead of the one that the file states.
+///
+/// # Errors
+/// When it cannot be read.
+pub fn read_model_as(
+    path: &Path,
+    given: Option<Antialiasing>,
+    observer: &dyn Observer,
+) -> Result<Gaussians, Failure> {
+    let mut file = models::read_model(path)?;
     for (number, what) in [
         (file.dropped, "left out: a value is not finite"),
         (file.repaired, "with a zero quaternion, read as unrotated"),
@@ -122,7 +135,28 @@ pub fn read_model(path: &Path, observer: &dyn Observer) -> Result<Gaussians, Fai
     for note in &file.notes {
         observer.say(format_args!("note: {}: {note}", path.display()));
     }
+    if let Some(given) = given {
+        override_antialiasing(&mut file.gaussians, given, path, observer);
+    }
     Ok(file.gaussians)
+}
+
+/// Gives a model the antialiasing of the option; tells the user if its file states another.
+pub(crate) fn override_antialiasing(
+    model: &mut Gaussians,
+    given: Antialiasing,
+    path: &Path,
+    observer: &dyn Observer,
+) {
+    if model.antialiasing != given {
+        let option = notes::antialias_option(observer.spelling(), given);
+        let stated = model.antialiasing;
+        observer.say(format_args!(
+            "note: {}: {option} replaces the antialiasing that the file states: {stated}",
+            path.display()
+        ));
+        model.antialiasing = given;
+    }
 }
 
 /// The model in the coordinates of its file, and their frame. Automatic coordinates are local if f32 is too coarse for
@@ -145,7 +179,7 @@ fn placed<'a>(
         Coordinates::Auto | Coordinates::World => {}
     }
     let coarseness = Coarseness::measure(model);
-    let has_more = model.origin != [0.0; 3];
+    let has_more = model.is_local();
     if !coarseness.is_noted() {
         return within(Frame::WORLD);
     }
@@ -195,6 +229,13 @@ pub fn write_model(
             return Err(Failure::input(format!(
                 "{name} cannot hold this model: {changes}; choose another format, such as {other}"
             )));
+        }
+        if !format.states(model.antialiasing) {
+            observer.say(format_args!(
+                "note: {name} cannot state the kernel of the antialiasing, {}; readers take 0.3 px², which shows small \
+                 Gaussians fainter; ply, glb and sog state it",
+                model.antialiasing
+            ));
         }
         if changes.is_noted() {
             observer.say(format_args!("note: {name}: {changes}; ply and glb hold all values"));

@@ -1,6 +1,7 @@
 //! Checks the reference gradients against central differences in `f64`, without the thresholds that make a
 //! rendering discontinuous and with the depth order held fixed.
 
+use densify::core::antialiasing::Antialiasing;
 use densify::core::camera::Camera;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -62,6 +63,23 @@ fn gradients_of_every_class_match_at_every_degree() {
             // Stored harmonics above the evaluated degree get no gradient.
             let case = format!("degree {} of {degree}", degree - 1);
             check(&mut table, &case, &model, view(&camera, degree - 1), &upstream);
+        }
+    }
+    table.finish();
+}
+
+#[test]
+fn gradients_match_with_antialiasing() {
+    let mut table = Table::new("reference with antialiasing");
+    for kind in [Antialiasing::Wide, Antialiasing::Narrow] {
+        for size in [1.0_f32, 0.2] {
+            let camera = scenes::camera(13, 11, 44);
+            let mut cloud = scenes::cloud(7, 1, &camera, 72);
+            cloud.antialiasing = kind;
+            cloud.log_scales.as_flattened_mut().iter_mut().for_each(|log| *log += size.ln());
+            let upstream = scenes::upstream(&camera, 3);
+            let case = format!("{kind}, {size} times");
+            check(&mut table, &case, &Model::from(&cloud), view(&camera, 1), &upstream);
         }
     }
     table.finish();

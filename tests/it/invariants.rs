@@ -179,6 +179,7 @@ const MODULES: [(&str, &[&str]); 5] = [
     (
         "src/core",
         &[
+            "antialiasing",
             "budget",
             "camera",
             "colour",

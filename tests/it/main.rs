@@ -12,6 +12,7 @@
 //! - Project: `invariants` enforces the dependency rules of ARCHITECTURE.md; `documents` checks the documents.
 
 mod agreement;
+mod antialiasing;
 mod aux_views;
 mod candidates;
 mod central;

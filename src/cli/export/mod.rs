@@ -17,7 +17,7 @@ use densify_data::models::{Coordinates, Format, export_formats, find, find_by_ex
 use densify_inspect::Reference;
 use densify_run::RunConfig;
 use densify_run::failure::{Failure, INPUT};
-use densify_run::finished::{model_file, read_model, write_model};
+use densify_run::finished::{model_file, read_model, read_model_as, write_model};
 use table::WrittenFile;
 
 /// Stands for every format.
@@ -87,7 +87,7 @@ pub(super) fn run(
     for (_, path) in &files {
         check_output(path, args.overwrite)?;
     }
-    let model = read_model(&source, console)?;
+    let model = read_model_as(&source, args.rendering.antialias, console)?;
     let mut reference = match &args.scene {
         None => None,
         Some(scene) => Some(open_reference(args, is_run, scene, &model, console)?),

@@ -181,6 +181,7 @@ mod tests {
     use glam::DMat3;
 
     use super::*;
+    use densify_core::antialiasing::Antialiasing;
 
     #[test]
     fn a_few_cameras_far_from_all_others_are_outliers() {
@@ -265,6 +266,7 @@ mod tests {
     #[test]
     fn models_go_to_the_world_and_back() {
         let model = Gaussians {
+            antialiasing: Antialiasing::Wide,
             means: vec![[0.5, -0.25, 1.0]],
             log_scales: vec![[-3.0, -4.0, 0.5]],
             quats: vec![[1.0, 0.0, 0.0, 0.0]],

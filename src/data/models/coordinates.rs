@@ -44,7 +44,8 @@ impl Frame {
 
     /// The offset that must be stored with the file, if there is one.
     pub fn offset(&self) -> Option<[f64; 3]> {
-        (self.origin != [0.0; 3] && !self.is_double).then_some(self.origin)
+        let is_local = self.origin.iter().any(|&axis| axis != 0.0);
+        (is_local && !self.is_double).then_some(self.origin)
     }
 }
 
@@ -161,7 +162,7 @@ fn step_of_f32(value: f64) -> f64 {
 
 /// A point near the middle of a model, for its local coordinates; the model's own origin if it has one.
 pub fn local_origin(model: &Gaussians) -> [f64; 3] {
-    if model.origin != [0.0; 3] {
+    if model.is_local() {
         return model.origin;
     }
     let frame = frame(model);

@@ -21,6 +21,7 @@ mod siblings;
 mod sidecar;
 mod similarity;
 mod spatial_order;
+mod statement;
 mod unpack;
 mod write;
 mod zip;

@@ -57,7 +57,7 @@ pub(super) fn apply(path: &Path, file: &mut SplatFile) -> Result<(), LoadError> 
         return Err(wrong("bytes", problem));
     }
     let stated = file.gaussians.origin;
-    if stated != [0.0; 3] && !file.gaussians.has_origin(offset) {
+    if file.gaussians.is_local() && !file.gaussians.has_origin(offset) {
         let problem = format!("{offset:?}, but the model's own file says {stated:?}");
         return Err(wrong("offset", problem));
     }

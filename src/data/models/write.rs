@@ -9,17 +9,27 @@ use super::{
     Changes, Format, Frame, PLY, compress_formats, read_model, remove_sidecar, write_sidecar,
 };
 use crate::error::LoadError;
+use densify_core::antialiasing::Antialiasing;
 use densify_core::files::{FileError, WriteError, write_atomically, write_checked};
 use densify_core::gaussians::Gaussians;
 use densify_core::pieces::pieces;
 
-/// Size of a model.
+/// Size of a model, and what a file states about all of it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Shape {
     /// Number of Gaussians.
     pub rows: usize,
     /// Spherical-harmonic degree, 0..=3.
     pub sh_degree: u8,
+    /// Antialiasing.
+    pub antialiasing: Antialiasing,
+}
+
+impl From<&Gaussians> for Shape {
+    fn from(model: &Gaussians) -> Self {
+        let Gaussians { sh_degree, antialiasing, .. } = *model;
+        Self { rows: model.len(), sh_degree, antialiasing }
+    }
 }
 
 /// Writes one model to one file: [`begin`](Self::begin), then [`rows`](Self::rows) for each piece
@@ -37,6 +47,11 @@ pub trait ModelWriter {
 
     /// True if the format stores values with less precision than `f32`, so that what is read back differs.
     fn is_lossy(&self) -> bool {
+        true
+    }
+
+    /// True if files can state this antialiasing; if not, readers use another kernel.
+    fn states(&self, _antialiasing: Antialiasing) -> bool {
         true
     }
 
@@ -120,6 +135,11 @@ impl Format {
         self.writer.is_some_and(|make| make().is_lossy())
     }
 
+    /// [`ModelWriter::states`] of this format; true if densify does not write it.
+    pub fn states(&self, antialiasing: Antialiasing) -> bool {
+        self.writer.is_none_or(|make| make().states(antialiasing))
+    }
+
     /// [`ModelWriter::variants`] of this format; none if densify does not write it.
     pub fn variants(&self) -> &'static [Self] {
         self.writer.map_or(&[], |make| make().variants())
@@ -141,7 +161,7 @@ impl Format {
     pub fn write_in(&self, frame: Frame, model: &Gaussians, out: &mut dyn Write) -> io::Result<()> {
         let mut writer = self.open_writer()?;
         writer.set_frame(frame)?;
-        writer.begin(Shape { rows: model.len(), sh_degree: model.sh_degree }, out)?;
+        writer.begin(model.into(), out)?;
         if writer.wants_spatial_order() {
             let order = spatial_order(model);
             for piece in pieces(model.len()) {

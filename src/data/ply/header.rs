@@ -56,7 +56,7 @@ pub(crate) struct Element {
 pub(super) struct Header {
     pub(super) encoding: Encoding,
     pub(super) elements: Vec<Element>,
-    /// The comments that are not long, in order.
+    /// Texts of the `comment` and `obj_info` lines that are not long, their words one blank apart.
     pub(super) comments: Vec<String>,
     /// Size of the header `[bytes]`.
     pub(super) length: u64,
@@ -160,12 +160,12 @@ impl Header {
             let line = lines.next()?;
             let words: Vec<&str> = line.split_whitespace().collect();
             match words[..] {
-                ["comment", ..] => {
-                    let text = line.trim().strip_prefix("comment").unwrap_or_default().trim();
+                [] => {}
+                ["comment" | "obj_info", ..] => {
+                    let text = words[1..].join(" ");
                     // Other comments of a writer may be long.
-                    comments.extend((text.len() <= MAX_COMMENT).then(|| text.to_owned()));
+                    comments.extend(Some(text).filter(|text| text.len() <= MAX_COMMENT));
                 }
-                [] | ["obj_info", ..] => {}
                 ["format", kind, "1.0"] if encoding.is_none() && elements.is_empty() => {
                     encoding = Some(match kind {
                         "ascii" => Encoding::Ascii,

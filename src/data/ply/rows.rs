@@ -39,6 +39,11 @@ impl<'a> Ply<'a> {
         &self.header.elements
     }
 
+    /// Texts of the comments in the header, their words one blank apart.
+    pub(crate) fn comments(&self) -> &[String] {
+        &self.header.comments
+    }
+
     /// The three numbers after a word in a comment, if there is one. Several must agree.
     pub(crate) fn comment_numbers(&self, word: &str) -> Result<Option<[f64; 3]>, LoadError> {
         let mut found = None;

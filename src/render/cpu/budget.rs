@@ -131,6 +131,7 @@ mod tests {
     use super::*;
     use crate::cpu::CpuBackend;
     use crate::{Backend, MomentStorage, ParameterStorage, Storage};
+    use densify_core::antialiasing::Antialiasing;
     use densify_core::camera::Camera;
     use densify_core::gaussians::Gaussians;
 
@@ -174,6 +175,7 @@ mod tests {
         let model = Gaussians {
             sh_degree: 0,
             origin: [0.0; 3],
+            antialiasing: Antialiasing::None,
             means: vec![[0.0, 0.1, 2.0], [0.3, 0.0, 3.0]],
             log_scales: vec![[-1.5; 3]; 2],
             quats: vec![[1.0, 0.0, 0.0, 0.0]; 2],

@@ -57,6 +57,7 @@ use super::{
 };
 pub(crate) use adam::BiasCorrection;
 use blocks::{Blocks, planes};
+use densify_core::antialiasing::Antialiasing;
 use densify_core::budget::RowBudget;
 use densify_core::camera::Camera;
 use densify_core::gaussians::{Gaussians, ModelArray};
@@ -99,6 +100,7 @@ pub struct CpuBackend {
     rows: usize,
     sh_degree: u8,
     near: f32,
+    antialiasing: Antialiasing,
     shortcuts: Shortcuts,
     params: Parameters,
     moments: Moments,
@@ -169,6 +171,7 @@ impl CpuBackend {
             rows: model.len(),
             sh_degree: model.sh_degree,
             near: options.near,
+            antialiasing: model.antialiasing,
             shortcuts: options.shortcuts,
             params,
             moments: Moments::zeros(trained.clone(), per_row, storage.moments),
@@ -245,6 +248,10 @@ impl Backend for CpuBackend {
 
     fn sh_degree(&self) -> u8 {
         self.sh_degree
+    }
+
+    fn antialiasing(&self) -> Antialiasing {
+        self.antialiasing
     }
 
     fn budget(&self) -> usize {

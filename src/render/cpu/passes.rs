@@ -85,7 +85,8 @@ impl CpuBackend {
         }
         let grid = Grid::new(camera.width, camera.height);
         self.resize_images(&grid);
-        let view = ViewParams::new(camera, self.near, sh_degree.min(self.sh_degree));
+        let view =
+            ViewParams::new(camera, self.near, sh_degree.min(self.sh_degree), self.antialiasing);
         let blending = Blending::from(self.shortcuts);
         let Self {
             threads,

@@ -1,13 +1,16 @@
 //! Stage 1: from rows to splats. Each row's Gaussian is projected onto the image (EWA splatting; Zwicker
 //! et al. 2001, Kerbl et al. 2023, section 4) and its colour evaluated for the view.
 //!
-//! Numerics. With V = J·W·R·S (2×3, rows v₀ and v₁) the projected covariance is Σ = V·Vᵀ + 0.3·I.
-//! - Its determinant comes from the Lagrange identity |v₀ × v₁|² + 0.3(|v₀|² + |v₁|²) + 0.09: all
+//! Numerics. With V = J·W·R·S (2×3, rows v₀ and v₁) the projected covariance is Σ = V·Vᵀ + κ·I; κ is 0.3
+//! px², or that of the model's antialiasing.
+//! - Its determinant comes from the Lagrange identity |v₀ × v₁|² + κ(|v₀|² + |v₁|²) + κ²: all
 //!   terms are positive, whereas a·c − b² loses all precision for needles with an aspect ratio above 1,000:1.
 //! - Its inverse is stored as the Cholesky factor L, Σ⁻¹ = L·Lᵀ: with (u, z) = Lᵀ·d the exponent is
 //!   −½(u² + z²), never positive. L = [[l₁, 0], `[−l₁·r, l₃]`], l₁ = √(c/det), r = b/c, l₃ = 1/√c.
 //!   Inside a splat's footprint the error of u does not depend on which axis is eliminated; the
 //!   choice here makes z constant along an image row.
+//!
+//! With antialiasing the opacity is multiplied by ρ = |v₀ × v₁|/√det Σ, which the backends do in log₂.
 //!
 //! The functions are in one file because the backward pass (`project_bwd`) reuses them and their results.
 
@@ -19,12 +22,11 @@ use super::footprint::Ellipse;
 use super::parameters::ParameterView;
 use super::simd::{Mask, V, WIDTH, each};
 use super::tiles::Grid;
+use densify_core::antialiasing::Antialiasing;
 use densify_core::camera::Camera;
 use densify_core::gaussians::sh_coefficients;
 use densify_core::sh;
 
-/// Variance added to both diagonal entries of a projected covariance `[px²]`.
-pub(super) const BLUR: f32 = 0.3;
 /// Margin around the image, as a fraction of its size, beyond which the direction used in J is clamped:
 /// 0.15 = 0.3/2 (the original clamps at 1.3 tan(fov/2)).
 const FOV_MARGIN: f64 = 0.15;
@@ -50,10 +52,19 @@ pub(crate) struct ViewParams {
     pub(crate) height: u32,
     pub(crate) near: f32,
     pub(crate) sh_degree: u8,
+    /// Variance added to both diagonal entries of a projected covariance `[px²]`.
+    pub(crate) blur: f32,
+    /// True if the blur lowers opacities.
+    pub(crate) lowers_opacity: bool,
 }
 
 impl ViewParams {
-    pub(crate) fn new(camera: &Camera, near: f32, sh_degree: u8) -> Self {
+    pub(crate) fn new(
+        camera: &Camera,
+        near: f32,
+        sh_degree: u8,
+        antialiasing: Antialiasing,
+    ) -> Self {
         let c = camera;
         let low = |p: f64, size: f64, f: f64| ((-FOV_MARGIN * size - p) / f) as f32;
         let high = |p: f64, size: f64, f: f64| (((1.0 + FOV_MARGIN) * size - p) / f) as f32;
@@ -70,6 +81,8 @@ impl ViewParams {
             height: c.height,
             near,
             sh_degree,
+            blur: antialiasing.kernel(),
+            lowers_opacity: antialiasing.is_on(),
         }
     }
 }
@@ -130,6 +143,8 @@ pub(super) struct Geometry<S: Simd> {
     /// Σ's entries with blur, and its determinant.
     pub(super) cov: [V<S>; 3],
     pub(super) det: V<S>,
+    /// The determinant without blur, |v₀ × v₁|².
+    pub(super) sharp_det: V<S>,
 }
 
 #[inline(always)]
@@ -187,7 +202,9 @@ pub(super) fn geometry<S: Simd>(s: S, block: &[f32], at: usize, view: &ViewParam
         difference_of_products(v[0][2], v[1][0], v[0][0], v[1][2]),
         difference_of_products(v[0][0], v[1][1], v[0][1], v[1][0]),
     ];
-    let det = dot(cross, cross) + (a + d) * BLUR + BLUR * BLUR;
+    let sharp_det = dot(cross, cross);
+    let blur = view.blur;
+    let det = sharp_det + (a + d) * blur + blur * blur;
     Geometry {
         scale,
         quat,
@@ -198,14 +215,15 @@ pub(super) fn geometry<S: Simd>(s: S, block: &[f32], at: usize, view: &ViewParam
         ratio,
         clamped,
         n,
-        cov: [a + BLUR, b, d + BLUR],
+        cov: [a + blur, b, d + blur],
         det,
+        sharp_det,
     }
 }
 
 /// a·b − c·d with the rounding error of c·d compensated (Kahan).
 #[inline(always)]
-fn difference_of_products<S: Simd>(a: V<S>, b: V<S>, c: V<S>, d: V<S>) -> V<S> {
+pub(super) fn difference_of_products<S: Simd>(a: V<S>, b: V<S>, c: V<S>, d: V<S>) -> V<S> {
     let cd = c * d;
     let error = c.neg_mul_add(d, cd);
     a.mul_add(b, -cd) + error
@@ -269,6 +287,12 @@ fn log2_sigmoid<S: Simd>(s: S, x: V<S>) -> V<S> {
     x.min(V::zero(s)) * std::f32::consts::LOG2_E - tail
 }
 
+/// log₂ of ρ = √(det S / det Σ): the factor of opacities with antialiasing; at least −63.
+#[inline(always)]
+fn log2_rho<S: Simd>(s: S, g: &Geometry<S>) -> V<S> {
+    (g.sharp_det / g.det).min(V::splat(s, 1.0)).log2().min(V::zero(s)) * 0.5
+}
+
 /// Returns whether |x| <= most; false for NaN.
 #[inline(always)]
 fn below<S: Simd>(x: V<S>, most: f32) -> Mask<S> {
@@ -319,7 +343,10 @@ impl WithSimd for Project<'_> {
                 let sound =
                     each!(i in 3 => below(lanes(s, block, plane::LOG_SCALE + i, at), f32::MAX));
                 let sound = sound[0].and(sound[1]).and(sound[2]).and(below(logit, f32::MAX));
-                let log2_opacity = log2_sigmoid(s, logit);
+                let mut log2_opacity = log2_sigmoid(s, logit);
+                if view.lowers_opacity {
+                    log2_opacity = log2_opacity + log2_rho(s, &g);
+                }
                 // The allowed decrease of the exponent; <= 0 if even the centre is too faint.
                 let reach = log2_opacity + self.log2_reach;
                 let opaque = V::zero(s).lt(reach);

@@ -10,14 +10,20 @@
 //!   is orthogonal to q,
 //! - dL/dV = L·M·W leads on to J and the mean.
 //!
-//! Derived from Σ = V·Vᵀ + 0.3·I, dL/dV = 2·G·V; checked against the float64 reference.
+//! Derived from Σ = V·Vᵀ + κ·I, dL/dV = 2·G·V; checked against the float64 reference.
+//!
+//! Antialiasing adds the gradient through log ρ = ½ log det S − ½ log det Σ, S = V·Vᵀ, whose factor is q. It is
+//! q·(S⁻¹ − Σ⁻¹)·V with respect to V, and Σ⁻¹·V = ρ²·S⁻¹·V + κ·V/det Σ. With n = v₀ × v₁, n̂ = n/|n| and
+//! 1 − ρ² = κ·(tr S + κ)/det Σ, nothing cancels and nothing is divided by ρ:
+//! - dL/dV = q·(1 − ρ²)·[v₁ × n; n × v₀]/|n|² − q·κ·V/det Σ,
+//! - Vᵀ·S⁻¹·V = I − n̂·n̂ᵀ in the frame of the Gaussian's axes, for log-scales and rotations.
 
 use pulp::Simd;
 
 use super::blocks::plane;
 use super::project::{
-    EXPONENT_SCALE, Geometry, ViewParams, conic, direction, dot, geometry, lanes, raw_colour,
-    rotation, sh_basis,
+    EXPONENT_SCALE, Geometry, ViewParams, conic, difference_of_products, direction, dot, geometry,
+    lanes, raw_colour, rotation, sh_basis,
 };
 use super::rasterize_bwd::field;
 use super::simd::{V, WIDTH, each};
@@ -142,35 +148,38 @@ impl BlockGradient {
         let mn0 = each!(k in 3 => muu * n0[k] + muz * n1[k]);
         let mn1 = each!(k in 3 => muz * n0[k] + mzz * n1[k]);
         let scale2 = each!(k in 3 => g.scale[k] * g.scale[k]);
-        for k in 0..3 {
-            put!(plane::LOG_SCALE + k, (n0[k] * mn0[k] + n1[k] * mn1[k]) * scale2[k]);
-        }
-        let turn = each!(i in 3 => {
+        let mut by_log_scale = each!(k in 3 => (n0[k] * mn0[k] + n1[k] * mn1[k]) * scale2[k]);
+        let mut turn = each!(i in 3 => {
             let (j, k) = ((i + 1) % 3, (i + 2) % 3);
             (n0[j] * mn0[k] + n1[j] * mn1[k]) * (scale2[j] - scale2[k])
         });
-        let [w, x, y, z] = g.quat;
-        let two = g.quat_inv_norm * 2.0;
-        let [tx, ty, tz] = turn;
-        put!(plane::QUAT, -(x * tx + y * ty + z * tz) * two);
-        put!(plane::QUAT + 1, (w * tx + y * tz - z * ty) * two);
-        put!(plane::QUAT + 2, (w * ty + z * tx - x * tz) * two);
-        put!(plane::QUAT + 3, (w * tz + x * ty - y * tx) * two);
-
         // dL/d(row i of J·W) = Σ_k (L·M·n)[i][k]·sₖ²·axisₖ.
-        let d0 = each!(k in 3 => l1 * mn0[k] * scale2[k]);
-        let d1 = each!(k in 3 => (l3 * mn1[k] - l1 * shear * mn0[k]) * scale2[k]);
+        let mut d0 = each!(k in 3 => l1 * mn0[k] * scale2[k]);
+        let mut d1 = each!(k in 3 => (l3 * mn1[k] - l1 * shear * mn0[k]) * scale2[k]);
+        if view.lowers_opacity {
+            RhoGradient::new(s, &g, scale2, q, view.blur).add_to(
+                &mut by_log_scale,
+                &mut turn,
+                [&mut d0, &mut d1],
+            );
+        }
+        let by_quat = by_quat(&g, turn);
+        for (p, &x) in (plane::LOG_SCALE..).zip(&by_log_scale).chain((plane::QUAT..).zip(&by_quat))
+        {
+            put!(p, x);
+        }
+
         let [a0, a1, a2] = g.axes;
         let db0 = each!(i in 3 => d0[0] * a0[i] + d0[1] * a1[i] + d0[2] * a2[i]);
         let db1 = each!(i in 3 => d1[0] * a0[i] + d1[1] * a1[i] + d1[2] * a2[i]);
         let rot = rotation(s, view);
-        let (fx, fy) = (c(view.focal[0]), c(view.focal[1]));
+        let focal = [c(view.focal[0]), c(view.focal[1])];
         let (j00, j02) = (dot(db0, rot[0]), dot(db0, rot[2]));
         let (j11, j12) = (dot(db1, rot[1]), dot(db1, rot[2]));
         let Geometry { inv_z, ratio, clamped, .. } = g;
         // J = f/z·[1, 0, −x/z; 0, 1, −y/z], its x/z and y/z constant where clamped.
-        let by_inv_z = fx * (j00 - clamped[0] * j02) + fy * (j11 - clamped[1] * j12);
-        let (focal, j_2) = ([fx, fy], [j02, j12]);
+        let by_inv_z = focal[0] * (j00 - clamped[0] * j02) + focal[1] * (j11 - clamped[1] * j12);
+        let j_2 = [j02, j12];
         let by_ratio = each!(i in 2 => {
             let free = clamped[i].le(ratio[i]).and(ratio[i].le(clamped[i]));
             focal[i] * (dm[i] - free.keep(inv_z * j_2[i]))
@@ -206,5 +215,86 @@ impl BlockGradient {
         // dα/d(logit) = α(1 − o); 1 − o = σ(−logit) keeps its precision near o = 1.
         let logit = lanes(s, block, plane::OPACITY, at);
         put!(plane::OPACITY, q / (c(1.0) + logit.exp()));
+    }
+}
+
+/// dL/d(quaternion), from dL/d(rotation about each local axis).
+#[inline(always)]
+fn by_quat<S: Simd>(g: &Geometry<S>, turn: [V<S>; 3]) -> [V<S>; 4] {
+    let ([w, x, y, z], [tx, ty, tz]) = (g.quat, turn);
+    let two = g.quat_inv_norm * 2.0;
+    [
+        -(x * tx + y * ty + z * tz) * two,
+        (w * tx + y * tz - z * ty) * two,
+        (w * ty + z * tx - x * tz) * two,
+        (w * tz + x * ty - y * tx) * two,
+    ]
+}
+
+/// The gradient through ρ, the factor of opacities with antialiasing; see the module's comment.
+struct RhoGradient<S: Simd> {
+    /// dL/d(log-scale).
+    log_scale: [V<S>; 3],
+    /// dL/d(rotation about local axis).
+    turn: [V<S>; 3],
+    /// dL/d(n[i][k]) = dL/d(V[i][k])·sₖ.
+    rows: [[V<S>; 3]; 2],
+}
+
+impl<S: Simd> RhoGradient<S> {
+    /// `q` is dL/d(log ρ), which equals dL/d(log opacity).
+    #[inline(always)]
+    fn new(s: S, g: &Geometry<S>, scale2: [V<S>; 3], q: V<S>, blur: f32) -> Self {
+        let [r0, r1] = g.n;
+        let per_det = q * blur / g.det;
+        let by_sharp = per_det * (g.cov[0] + g.cov[2] - blur);
+        let inv_norm = V::splat(s, 1.0) / g.sharp_det.sqrt();
+        let next = |i: usize| ((i + 1) % 3, (i + 2) % 3);
+        // n̂ᵢ = sⱼ·sₖ·hᵢ: h stays finite where a scale is 0.
+        let h = each!(i in 3 => {
+            let (j, k) = next(i);
+            difference_of_products(r0[j], r1[k], r0[k], r1[j]) * inv_norm
+        });
+        let unit2 = each!(i in 3 => {
+            let (j, k) = next(i);
+            let unit = g.scale[j] * g.scale[k] * h[i];
+            unit * unit
+        });
+        let log_scale = each!(i in 3 => {
+            let (j, k) = next(i);
+            let length2 = (r0[i] * r0[i] + r1[i] * r1[i]) * scale2[i];
+            by_sharp * (unit2[j] + unit2[k]) - per_det * length2
+        });
+        let turn = each!(i in 3 => {
+            let (j, k) = next(i);
+            let sharp = (g.scale[i] * h[j]) * (g.scale[i] * h[k]);
+            let both = by_sharp * sharp + per_det * (r0[j] * r0[k] + r1[j] * r1[k]);
+            (scale2[k] - scale2[j]) * both
+        });
+        let across = by_sharp * inv_norm;
+        let rows = [
+            each!(i in 3 => {
+                let (j, k) = next(i);
+                let to = scale2[j] * r1[j] * h[k] - scale2[k] * r1[k] * h[j];
+                scale2[i] * (across * to - per_det * r0[i])
+            }),
+            each!(i in 3 => {
+                let (j, k) = next(i);
+                let to = scale2[k] * r0[k] * h[j] - scale2[j] * r0[j] * h[k];
+                scale2[i] * (across * to - per_det * r1[i])
+            }),
+        ];
+        Self { log_scale, turn, rows }
+    }
+
+    #[inline(always)]
+    fn add_to(&self, log_scale: &mut [V<S>; 3], turn: &mut [V<S>; 3], rows: [&mut [V<S>; 3]; 2]) {
+        let [row0, row1] = rows;
+        for k in 0..3 {
+            log_scale[k] = log_scale[k] + self.log_scale[k];
+            turn[k] = turn[k] + self.turn[k];
+            row0[k] = row0[k] + self.rows[0][k];
+            row1[k] = row1[k] + self.rows[1][k];
+        }
     }
 }

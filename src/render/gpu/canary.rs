@@ -9,6 +9,7 @@ use super::{GpuBackend, GpuDevice};
 use crate::cpu::CpuBackend;
 use crate::signals::RecordLayout;
 use crate::{Backend, BackendError, LearningRates, Setup, StepInput, StepOutput};
+use densify_core::antialiasing::Antialiasing;
 use densify_core::camera::Camera;
 use densify_core::gaussians::{Gaussians, sh_coefficients};
 use densify_core::image::Image8;
@@ -30,6 +31,7 @@ fn scene() -> (Gaussians, Camera, Image8) {
     let model = Gaussians {
         sh_degree: 1,
         origin: [0.0; 3],
+        antialiasing: Antialiasing::None,
         means: (0..ROWS).map(|row| draw(row, 0)).map(|[x, y, z]| [0.6 * x, 0.6 * y, z]).collect(),
         log_scales: (0..ROWS).map(|row| draw(row, 1).map(|s| 0.5 * s - 2.0)).collect(),
         quats: (0..ROWS)

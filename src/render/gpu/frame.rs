@@ -7,6 +7,7 @@ use densify_policies::policy::{ErrorScore, Signal};
 use crate::cpu::{SSIM_WEIGHT, ViewParams};
 use crate::signals::SignalPlanes;
 use crate::{StepInput, StepOutput};
+use densify_core::antialiasing::Antialiasing;
 use densify_core::camera::Camera;
 
 /// Side of a tile `[px]`.
@@ -108,7 +109,8 @@ impl Frame {
         near: f32,
         [rows, sh_degree, cap, trained]: [u32; 4],
     ) -> Self {
-        let view = ViewParams::new(camera, near, sh_degree as u8);
+        // The kernels have the antialiasing as constants.
+        let view = ViewParams::new(camera, near, sh_degree as u8, Antialiasing::None);
         let row = |i: usize| {
             let [x, y, z] = view.rotation[i];
             [x, y, z, view.translation[i]]

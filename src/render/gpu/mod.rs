@@ -48,6 +48,7 @@ use super::{
     AdapterSummary, AuxInput, AuxOutput, Backend, BackendError, Inspect, NonFinite, Rendering,
     Setup, Shortcuts, StateArray, StateError, StepInput, StepOutput, Tensor, assert_fits,
 };
+use densify_core::antialiasing::Antialiasing;
 use densify_core::camera::Camera;
 use densify_core::gaussians::{Gaussians, ModelArray, rgb_to_dc};
 use densify_core::memory::Ledger;
@@ -93,6 +94,7 @@ pub struct GpuBackend {
     rows: usize,
     near: f32,
     shortcuts: Shortcuts,
+    antialiasing: Antialiasing,
     planes: SignalPlanes,
     mask: Option<MaskTerm>,
     cadence: Cadence,
@@ -132,7 +134,8 @@ impl GpuBackend {
         let planes = SignalPlanes::new(&options.needs);
         let sizes = memory_plan::sizes(&device, model.sh_degree, options);
         let buffers = Buffers::new(&device, &sizes)?;
-        let launches = launches(&device, &sizes, shortcuts, &buffers)?;
+        let antialiasing = model.antialiasing;
+        let launches = launches(&device, &sizes, (shortcuts, antialiasing), &buffers)?;
         let ledger = memory_plan::ledger(&sizes, &options.needs);
         let gpu = Self {
             ledger,
@@ -143,6 +146,7 @@ impl GpuBackend {
             rows: model.len(),
             near: options.near,
             shortcuts,
+            antialiasing,
             planes,
             mask: options.needs.mask,
             cadence: options.needs.cadence,
@@ -192,7 +196,8 @@ impl GpuBackend {
     /// Reallocates buffers whose size has changed, and binds all buffers again.
     fn rebuild(&mut self) -> Result<(), BackendError> {
         self.buffers.resize(&self.device, &self.sizes)?;
-        self.launches = launches(&self.device, &self.sizes, self.shortcuts, &self.buffers)?;
+        let constants = (self.shortcuts, self.antialiasing);
+        self.launches = launches(&self.device, &self.sizes, constants, &self.buffers)?;
         Ok(())
     }
 
@@ -210,11 +215,18 @@ impl GpuBackend {
 fn launches(
     device: &Device,
     sizes: &Sizes,
-    shortcuts: Shortcuts,
+    (shortcuts, antialiasing): (Shortcuts, Antialiasing),
     buffers: &Buffers,
 ) -> Result<Launches, BackendError> {
     let &Sizes { records, alpha_and_depth, accumulation, counts_dominant, .. } = sizes;
-    let variant = Variant { records, alpha_and_depth, shortcuts, accumulation, counts_dominant };
+    let variant = Variant {
+        records,
+        alpha_and_depth,
+        shortcuts,
+        accumulation,
+        counts_dominant,
+        antialiasing,
+    };
     let pipelines = device.pipelines(variant)?;
     device.guarded("the kernels", 0, |device| Launches::bind(device, &pipelines, buffers, sizes))
 }
@@ -226,6 +238,10 @@ impl Backend for GpuBackend {
 
     fn sh_degree(&self) -> u8 {
         self.sizes.sh_degree
+    }
+
+    fn antialiasing(&self) -> Antialiasing {
+        self.antialiasing
     }
 
     fn budget(&self) -> usize {

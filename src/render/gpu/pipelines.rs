@@ -9,6 +9,7 @@ use super::kernels::{Binding, kernels, parse};
 use crate::Accumulation;
 use crate::Shortcuts;
 use crate::signals::{Field, ParameterSignal, RecordLayout};
+use densify_core::antialiasing::Antialiasing;
 use densify_shaders::STAGES;
 
 /// Compile-time options of the kernels.
@@ -21,6 +22,7 @@ pub(super) struct Variant {
     pub(super) accumulation: Accumulation,
     /// True if the pixels that each row dominates are counted.
     pub(super) counts_dominant: bool,
+    pub(super) antialiasing: Antialiasing,
 }
 
 impl Variant {
@@ -30,6 +32,8 @@ impl Variant {
             ("RECORD".to_owned(), self.records.stride() as f64),
             ("MORE".to_owned(), f64::from(u8::from(self.alpha_and_depth))),
             ("COUNTS_DOMINANT".to_owned(), f64::from(u8::from(self.counts_dominant))),
+            ("BLUR".to_owned(), f64::from(self.antialiasing.kernel())),
+            ("LOWERS_OPACITY".to_owned(), f64::from(u8::from(self.antialiasing.is_on()))),
             ("ALPHA_MIN".to_owned(), f64::from(self.shortcuts.alpha_min)),
             ("LOG2_REACH".to_owned(), f64::from(self.shortcuts.log2_reach())),
             ("TRANSMITTANCE_MIN".to_owned(), f64::from(self.shortcuts.transmittance_min)),

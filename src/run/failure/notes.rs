@@ -3,12 +3,21 @@
 use std::path::Path;
 
 use super::words::model_name;
+use densify_core::antialiasing::Antialiasing;
 use densify_core::memory::Bytes;
 use densify_core::numbers::grouped;
 use densify_core::spelling::Spelling;
 use densify_data::dataset::Note;
 use densify_data::models::{Coarseness, offset_text};
 use densify_render::{Accumulation, AdapterKind, BackendKind, Device};
+
+/// The option `antialias` with a value, which a flag takes only after `=`.
+pub(crate) fn antialias_option(spelling: Spelling, kernel: Antialiasing) -> String {
+    match spelling {
+        Spelling::Terminal => format!("{}={kernel}", spelling.option("antialias")),
+        Spelling::Keyword => spelling.text("antialias", kernel),
+    }
+}
 
 /// The device, with a hint where another choice may be better.
 pub(crate) fn device(s: Spelling, device: &Device) -> String {

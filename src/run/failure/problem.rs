@@ -3,6 +3,7 @@
 
 use std::path::PathBuf;
 
+use densify_core::antialiasing::Antialiasing;
 use densify_data::LoadError;
 use densify_render::{Accumulation, BackendKind};
 
@@ -82,6 +83,8 @@ pub enum ModelProblem {
     InitOutOfView { file: PathBuf, seen: usize, rows: usize },
     /// No Gaussian of the model of `freeze` lies in a training view.
     FreezeOutOfView { file: PathBuf, rows: usize },
+    /// The models of `init` and `freeze` were trained with different antialiasing.
+    AntialiasingDiffers { init: Antialiasing, frozen: Antialiasing },
     /// The model of `freeze` has changed.
     FreezeChanged { file: PathBuf, rows: usize, expected: usize },
     /// A model is in other coordinates than the photographs.

@@ -9,6 +9,7 @@ use densify_core::spelling::Spelling;
 use densify_data::{LoadError, LoadRemedy};
 use densify_render::Accumulation;
 
+use super::notes::antialias_option;
 use super::problem::{
     BackendRemedy, Difference, ModelProblem, OptionProblem, Problem, Remedy, ResumeProblem,
     SizeProblem, TrainRemedy, TrainingProblem,
@@ -287,6 +288,13 @@ impl ModelProblem {
                  {COORDINATES}",
                 file("freeze", model),
                 grouped(*rows)
+            ),
+            Self::AntialiasingDiffers { init, frozen } => format!(
+                "the antialiasing of the model of {} is {init}, that of {} is {frozen}, but both are rendered together; \
+                 choose one with {}",
+                s.option("init"),
+                s.option("freeze"),
+                antialias_option(s, *init)
             ),
             Self::FreezeChanged { file: model, rows, expected } => format!(
                 "{}: it has {} Gaussians, but had {} before; begin a new run",

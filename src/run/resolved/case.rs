@@ -12,12 +12,13 @@ use super::exposure::Exposure;
 use super::fit::RunSize;
 use super::inputs::{Evidence, Inputs, Reading, open_device};
 use super::size::MIN_ROWS;
-use crate::failure::{Failure, OptionProblem, SizeProblem};
+use crate::failure::{Failure, ModelProblem, OptionProblem, SizeProblem};
 use crate::host::Host;
 use crate::near_plane::NearPlane;
 use crate::position_rates::PositionRates;
 use crate::spec::knobs::Knobs;
 use crate::spec::{AbsolutePath, Budget, InitChoice, RunSpec, ShDegree};
+use densify_core::antialiasing::Antialiasing;
 use densify_core::budget::RowBudget;
 use densify_core::memory::Ledger;
 use densify_core::spelling::Spelling;
@@ -261,6 +262,21 @@ impl<'a> Case<'a> {
     /// The total of a budget in which this many rows can be trained.
     pub(super) fn rows_for(&self, trainable: usize) -> usize {
         RowBudget::for_trainable(trainable, self.frozen_rows()).total
+    }
+
+    /// The antialiasing of the run: that of the option, or that of the models it starts from.
+    ///
+    /// # Errors
+    /// When the models of `--init` and `--freeze` differ and no option decides.
+    pub(crate) fn antialiasing(&self) -> Result<Antialiasing, Failure> {
+        let models = [self.inputs.init_model, self.inputs.frozen_model];
+        match (self.spec.start.antialias, models.map(|model| model.map(|m| m.antialiasing))) {
+            (Some(given), _) => Ok(given),
+            (None, [Some(init), Some(frozen)]) if init != frozen => {
+                Err(ModelProblem::AntialiasingDiffers { init, frozen }.into())
+            }
+            (None, [init, frozen]) => Ok(init.or(frozen).unwrap_or_default()),
+        }
     }
 
     fn frozen_rows(&self) -> usize {

@@ -13,6 +13,7 @@ use crate::spec::{
     Assignment, Budget, ImageCache, InitChoice, NOT_OPTIONS, Partial, Rows, RunSpec, ShDegree,
     assignments,
 };
+use densify_core::antialiasing::Antialiasing;
 use densify_core::files::{FileError, write_atomically};
 use densify_data::dataset::is_archive;
 use densify_data::track_colours::Spread;
@@ -69,6 +70,14 @@ pub struct ModelSize {
     pub rows: usize,
     /// Spherical-harmonic degree.
     pub sh_degree: u8,
+    /// Antialiasing; not in the file of a model without it.
+    #[serde(default, skip_serializing_if = "is_none")]
+    pub antialiasing: Antialiasing,
+}
+
+/// True for a model without antialiasing.
+fn is_none(antialiasing: &Antialiasing) -> bool {
+    !antialiasing.is_on()
 }
 
 /// The reason for learning an exposure for each photograph, or not.
@@ -129,6 +138,10 @@ impl RunConfig {
             Init::Model(file) => InitChoice::Model(file.clone()),
         });
         spec.start.freeze.clone_from(&inputs.frozen_file);
+        // A run without antialiasing that did not ask for it says nothing.
+        if let Some(antialiasing) = case.antialiasing().ok().filter(|kind| kind.is_on()) {
+            spec.start.antialias = Some(antialiasing);
+        }
         spec.start.near = Some(choices.near.fraction);
         let rates = Table::try_from(training.rates).map_err(Failure::input)?;
         spec.schedule.lr = assignments(&in_shortest_decimals(rates));

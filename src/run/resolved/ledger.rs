@@ -10,6 +10,7 @@ use super::fit::RunSize;
 use super::geometry_measurement::GeometryMeasurement;
 use super::models::{first_bytes, reading_bytes};
 use crate::companion::CompanionSize;
+use densify_core::antialiasing::Antialiasing;
 use densify_core::gaussians::sh_coefficients;
 use densify_core::memory::{Ledger, Section};
 use densify_core::pieces::ROWS_AT_A_TIME;
@@ -128,7 +129,11 @@ impl Case<'_> {
         // A piece of rows, the same again because allocators keep some freed arrays for a while, and the buffers of the
         // writer.
         let piece = budget.min(ROWS_AT_A_TIME as u64);
-        let held = PLY.held_bytes(Shape { rows: size.rows, sh_degree: degree });
+        let held = PLY.held_bytes(Shape {
+            rows: size.rows,
+            sh_degree: degree,
+            antialiasing: Antialiasing::None,
+        });
         pass("export of the model, checkpoint", 2 * piece * row + held + EXPOSURE_TEXT * exposures);
         if let Some(companion) = self.inputs.companion {
             let sizes = CompanionSize {

@@ -49,7 +49,8 @@ pub(super) fn size_of_model(
     if model.is_empty() {
         return Err(ModelProblem::EmptyModel { option, file: file.to_owned() }.into());
     }
-    Ok(ModelSize { rows: model.len(), sh_degree: model.sh_degree })
+    let (rows, sh_degree) = (model.len(), model.sh_degree);
+    Ok(ModelSize { rows, sh_degree, antialiasing: model.antialiasing })
 }
 
 /// Reads the model that an option names; errors name the option.

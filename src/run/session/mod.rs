@@ -355,7 +355,11 @@ impl<'a> Session<'a> {
         let path = model_path(&self.folder, step);
         let frame = self.choose_frame()?.0;
         let (backend, to_world) = (self.run.trainer.backend(), &self.run.dataset.normalisation);
-        let shape = Shape { rows: backend.rows(), sh_degree: backend.sh_degree() };
+        let shape = Shape {
+            rows: backend.rows(),
+            sh_degree: backend.sh_degree(),
+            antialiasing: backend.antialiasing(),
+        };
         PLY.write_file(&path, shape, frame, |piece| {
             Ok::<_, Failure>(to_world.world_from_model(backend.download_rows(piece)?, frame.origin))
         })?;

@@ -48,6 +48,7 @@ pub(super) fn prepare(
         None => first_model(&run, observer)?,
         Some(checkpoint) => checkpoint.blank_model()?,
     };
+    model.antialiasing = run.case.antialiasing()?;
     let initial_rows =
         checkpoint.map_or(model.len(), |checkpoint| checkpoint.header().trainer.initial_rows);
     let training = ResolvedTraining::new(&run, initial_rows)?;
@@ -148,8 +149,12 @@ fn announce(
     let RunSpec { density, schedule, data, .. } = run.case.spec;
     let summary = run.case.choices.entry.summary;
     observer.say(format_args!("policy   {}: {summary}", density.policy));
+    let kernel = match run.case.antialiasing() {
+        Ok(kind) if kind.is_on() => format!(", antialiasing {kind} px²"),
+        _ => String::new(),
+    };
     observer.say(format_args!(
-        "run      {} iterations, seed {}, degree {}, background {}",
+        "run      {} iterations, seed {}, degree {}, background {}{kernel}",
         grouped(schedule.iterations.0 as usize),
         schedule.seed,
         run.size.sh_degree,

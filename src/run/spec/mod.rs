@@ -24,6 +24,7 @@ use std::path::PathBuf;
 use clap::{ArgAction, Args};
 use serde::{Deserialize, Serialize};
 
+use densify_core::antialiasing::Antialiasing;
 use densify_core::spelling::Spelling;
 use densify_data::dataset::{FarCameras, MaskMode, Resolution};
 use densify_data::models::Coordinates;
@@ -184,6 +185,12 @@ run_spec! {
         /// but never change: they are neither trained, moved nor removed. The Gaussians of --init are trained beside
         /// them; the budget counts frozen and trained Gaussians
         freeze: Option<AbsolutePath> = None, Fixed, value "MODEL";
+
+        /// Train with antialiasing: Gaussians smaller than a pixel are faded by as much as the kernel, 0.3 or 0.1 px²,
+        /// widens them, so that the model also suits other resolutions; none: without (default: as the model of --init
+        /// or --freeze, else none; without KERNEL: 0.3)
+        #[arg(num_args = 0..=1, require_equals = true, default_missing_value = "0.3")]
+        antialias: Option<Antialiasing> = None, Fixed, value "KERNEL";
 
         /// Number of random points to start from (default: half the budget, at most 100k)
         init_points: Option<Rows> = None, Fixed, value "N";

@@ -66,7 +66,7 @@ pub fn merge(
     }
     // The header holds the number of rows, so each block is read twice.
     let mut rows = 0;
-    let mut frame = Frame::WORLD;
+    let (mut frame, mut stated) = (Frame::WORLD, None);
     for &index in &complete {
         let part = read_part(folder, plan, index, observer)?;
         rows += part.len();
@@ -74,12 +74,20 @@ pub fn merge(
         if frame.offset().is_none() {
             frame = Frame::from_origin(part.origin);
         }
+        let antialiasing = *stated.get_or_insert(part.antialiasing);
+        if part.antialiasing != antialiasing {
+            return Err(Failure::input(format!(
+                "{}: its antialiasing is {}, that of the blocks before it {antialiasing}; train it again",
+                plan.block[index].name, part.antialiasing
+            )));
+        }
     }
     if rows > plan.rows {
         let message = format!("{rows} rows, but the plan allows only {}; this is a bug", plan.rows);
         return Err(Failure::new(OTHER, message));
     }
-    let shape = Shape { rows, sh_degree: plan.sh_degree };
+    let antialiasing = stated.unwrap_or_default();
+    let shape = Shape { rows, sh_degree: plan.sh_degree, antialiasing };
     let write = |out: &mut dyn Write| {
         let mut writer = format.open_writer()?;
         writer.set_frame(frame)?;

@@ -315,7 +315,11 @@ impl<'a> Planner<'a> {
         let mut spec = self.spec_of(self.block_options(iterations), rows + self.coarse_rows)?;
         spec.data.views = Some(AbsolutePath(folder.join(VIEWS_FILE)));
         spec.start.init = Some(InitChoice::Model(AbsolutePath(folder.to_owned())));
-        let coarse = Some(ModelSize { rows: self.coarse_rows, sh_degree: self.sh_degree });
+        let coarse = Some(ModelSize {
+            rows: self.coarse_rows,
+            sh_degree: self.sh_degree,
+            antialiasing: spec.start.antialias.unwrap_or_default(),
+        });
         self.memory_of_run(name, &spec, [coarse, coarse])
     }
 

@@ -71,8 +71,7 @@ fn write_scratch(
     model: &Gaussians,
     observer: &dyn Observer,
 ) -> Result<(), Failure> {
-    let is_local = model.origin != [0.0; 3];
-    let coordinates = if is_local { Coordinates::Local } else { Coordinates::World };
+    let coordinates = if model.is_local() { Coordinates::Local } else { Coordinates::World };
     write_model(format, scratch, model, coordinates, observer)?;
     Ok(remove_sidecar(scratch)?)
 }

@@ -15,12 +15,13 @@ use std::path::{Path, PathBuf};
 
 use tempfile::TempPath;
 
+use densify_core::antialiasing::Antialiasing;
 use densify_core::files::{FileError, folder_of, write_atomically};
 use densify_core::gaussians::Gaussians;
 use densify_core::numbers::{gaussians, grouped};
 use densify_data::models::{Coarseness, Format, PLY, local_origin};
 use densify_run::failure::Failure;
-use densify_run::finished::read_model;
+use densify_run::finished::{read_model, read_model_as};
 use densify_run::{DataSpec, DeviceSpec, Fraction, Observer};
 use densify_train::exposure::ExposureModel;
 use evaluator::Evaluator;
@@ -48,6 +49,8 @@ pub struct Options<'a> {
     pub exposure: Option<ExposureModel>,
     /// Near plane, as a fraction of the scene's extent; `None`: the usual near plane of the dataset.
     pub near: Option<Fraction>,
+    /// Antialiasing of the model; `None`: as its file states.
+    pub antialias: Option<Antialiasing>,
     /// Device to compute on.
     pub device: DeviceSpec,
     /// Size to reach.
@@ -115,7 +118,7 @@ pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compre
             "exposure learned again, as in the run; PSNR is measured with the best exposure of each photograph"
         ));
     }
-    let model = in_fine_coordinates(read_model(options.model, observer)?);
+    let model = in_fine_coordinates(read_model_as(options.model, options.antialias, observer)?);
     fit::check(options, &model)?;
     let bytes = fit::file_size(PLY, &model)?;
     let whole = evaluator.evaluate_original(model.clone(), options.model, bytes, observer)?;

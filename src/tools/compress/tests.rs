@@ -42,6 +42,7 @@ fn options<'a>(to: Target, scene: &'a Path, formats: &'a [&'static Format]) -> O
         data: DataSpec::default(),
         exposure: None,
         near: None,
+        antialias: None,
         device: DeviceSpec { backend: BackendChoice::Cpu, ..DeviceSpec::default() },
         to,
         iterations: 12,

@@ -85,8 +85,8 @@ fn train(
         spec.schedule.lr = vec![assignment("sh_rest=1e-30")?];
     }
     let origin = model.origin;
-    let is_local = origin != [0.0; 3];
-    spec.output.coordinates = if is_local { Coordinates::Local } else { Coordinates::World };
+    spec.output.coordinates =
+        if model.is_local() { Coordinates::Local } else { Coordinates::World };
     drop(model);
     let tuned = Run::prepare(&spec)?.model_after_training(observer)?;
     Ok(tuned.with_origin(origin))

@@ -9,6 +9,7 @@ use std::ops::Range;
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 use std::time::Duration;
 
+use densify_core::antialiasing::Antialiasing;
 use densify_core::camera::Camera;
 use densify_core::gaussians::ModelArray;
 use densify_core::image::Image8;
@@ -122,6 +123,10 @@ impl FaultyBackend {
 impl Backend for FaultyBackend {
     fn rows(&self) -> usize {
         self.inner.rows()
+    }
+
+    fn antialiasing(&self) -> Antialiasing {
+        self.inner.antialiasing()
     }
 
     fn sh_degree(&self) -> u8 {

@@ -6,13 +6,15 @@ use glam::{DMat3, DVec3};
 
 use super::picture_kind::PictureKind::{RowAge, RowEdit, RowGradient, RowWeight};
 use super::scene::{LoadedScene, ModelInfo, NO_MODEL, Scene};
+use densify_core::antialiasing::Antialiasing;
 use densify_core::camera_path::Keyframe;
 use densify_core::gaussians::{Gaussians, logit};
 use densify_data::dataset::normalise::Normalisation;
 use densify_data::dataset::{Dataset, PointCloud, SeenDepths, builtin};
 use densify_run::failure::Failure;
 use densify_run::finished::{
-    Machine, is_model, iteration_so_far, load, name_of, names_of, near_plane, or_moved, read_model,
+    Machine, is_model, iteration_so_far, load, name_of, names_of, near_plane, or_moved,
+    read_model_as,
 };
 use densify_run::{DataSpec, Fraction, NearPlane, Observer, RunConfig};
 use densify_train::checkpoint::checkpoint_path;
@@ -43,6 +45,8 @@ pub struct ViewOptions<'a> {
     /// Near plane for a model file or a dataset, as a fraction of the scene's extent; `None`: the usual near plane of
     /// the dataset.
     pub near: Option<Fraction>,
+    /// Antialiasing of all models; `None`: as their files state.
+    pub antialias: Option<Antialiasing>,
     /// Options for reading the dataset; a run has its own.
     pub data: DataSpec,
 }
@@ -61,7 +65,7 @@ pub fn open(
     machine: Machine,
     observer: &dyn Observer,
 ) -> Result<LoadedScene, Failure> {
-    let ViewOptions { path, other, dataset, iteration, near: given, data } = options;
+    let ViewOptions { path, other, dataset, iteration, near: given, antialias, data } = options;
     let paths: Vec<&Path> = std::iter::once(path).chain(other).collect();
     if other.is_some()
         && let Some(path) = paths.iter().find(|path| !is_model(path) && !is_run(path))
@@ -76,7 +80,7 @@ pub fn open(
     // The near plane of models that do not state their own.
     let near;
     let mut loaded = if is_model(path) {
-        let model = read_model(path, observer)?;
+        let model = read_model_as(path, antialias, observer)?;
         let mut loaded;
         (loaded, near) = match dataset {
             Some(dataset) => {
@@ -92,7 +96,7 @@ pub fn open(
         loaded.add_model(names[0].clone(), model, near, None)?;
         loaded
     } else if is_run(path) {
-        let (model, config, iteration) = read_run(path, iteration, observer)?;
+        let (model, config, iteration) = read_run(path, iteration, antialias, observer)?;
         let is_named = dataset.is_some();
         let folder = dataset.unwrap_or_else(|| config.scene_path());
         let dataset = load(&folder, &config.spec.data, observer)
@@ -117,9 +121,9 @@ pub fn open(
     if let Some(other) = other {
         let name = names[1].clone();
         if is_model(other) {
-            loaded.add_model(name, read_model(other, observer)?, near, None)?;
+            loaded.add_model(name, read_model_as(other, antialias, observer)?, near, None)?;
         } else {
-            let (model, config, iteration) = read_run(other, None, observer)?;
+            let (model, config, iteration) = read_run(other, None, antialias, observer)?;
             let name = format!("{name}, iteration {iteration}");
             loaded.add_model_of_run(name, model, (other, iteration, &config), near)?;
             if let Some(note) = first_config.and_then(|first| data_difference(&first, &config)) {
@@ -166,11 +170,12 @@ fn data_difference(first: &RunConfig, other: &RunConfig) -> Option<&'static str>
 fn read_run(
     run: &Path,
     iteration: Option<u32>,
+    antialias: Option<Antialiasing>,
     observer: &dyn Observer,
 ) -> Result<(Gaussians, RunConfig, u32), Failure> {
     let config = RunConfig::read(run)?;
     let (iteration, _) = iteration_so_far(run, iteration, observer)?;
-    let model = read_model(&model_path(run, iteration), observer)?;
+    let model = read_model_as(&model_path(run, iteration), antialias, observer)?;
     Ok((model, config, iteration))
 }
 
@@ -243,6 +248,7 @@ pub(super) fn scene_of(folder: &Path) -> Scene {
         dataset: None,
         iteration: None,
         near: None,
+        antialias: None,
         data: DataSpec::default(),
     };
     open(options, Machine::default(), &densify_run::Silent).expect("a scene").scene

@@ -11,6 +11,7 @@ use glam::DVec3;
 use safetensors::SafeTensors;
 
 use super::*;
+use densify_core::antialiasing::Antialiasing;
 use densify_core::gaussians::Gaussians;
 use densify_core::pieces::ROWS_AT_A_TIME;
 use densify_data::dataset::normalise::Normalisation;
@@ -30,6 +31,7 @@ fn gaussians(rows: usize) -> Gaussians {
     Gaussians {
         sh_degree: 1,
         origin: [0.0; 3],
+        antialiasing: Antialiasing::None,
         means: by(3, 1.0).as_chunks().0.to_vec(),
         log_scales: by(3, 2.0).as_chunks().0.to_vec(),
         quats: by(4, 3.0).as_chunks().0.to_vec(),

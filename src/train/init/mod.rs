@@ -14,6 +14,7 @@ use rand_chacha::rand_core::SeedableRng;
 use rayon::prelude::*;
 
 use crate::schedule;
+use densify_core::antialiasing::Antialiasing;
 use densify_core::gaussians::{Gaussians, logit, rgb_to_dc, sh_coefficients};
 use densify_data::dataset::PointCloud;
 use densify_data::dataset::normalise::EXTENT;
@@ -112,6 +113,7 @@ pub fn initialise(
     let gaussians = Gaussians {
         sh_degree,
         origin: [0.0; 3],
+        antialiasing: Antialiasing::None,
         means: positions.iter().map(|p| p.map(|v| v as f32)).collect(),
         log_scales: log_scales.into_iter().map(|log| [log; 3]).collect(),
         quats: vec![[1.0, 0.0, 0.0, 0.0]; rows],

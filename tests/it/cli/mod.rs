@@ -1,6 +1,7 @@
 //! End-to-end tests of the program: arguments in, exit code, messages and files out.
 
 mod accumulation;
+mod antialiasing;
 mod automatic_sizes;
 mod blocks;
 #[cfg(unix)]

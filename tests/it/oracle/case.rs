@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use densify::core::antialiasing::Antialiasing;
 use densify::core::camera::Camera;
 use densify::core::gaussians::Gaussians;
 use glam::{DMat3, DMat4};
@@ -160,6 +161,7 @@ fn model(arrays: &BTreeMap<String, Vec<f64>>, sh_degree: u8) -> Gaussians {
     Gaussians {
         sh_degree,
         origin: [0.0; 3],
+        antialiasing: Antialiasing::None,
         means: rows(&values("in.means")),
         log_scales: rows(&values("in.log_scales")),
         quats: rows(&values("in.quats")),

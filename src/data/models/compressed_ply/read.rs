@@ -7,6 +7,7 @@ use crate::error::LoadError;
 use crate::models::ply::layout::{OFFSET, sh_degree};
 use crate::models::quantise::{from_smallest_three, quantised_logit};
 use crate::models::rows::{Row, Rows, SplatFile};
+use crate::models::statement::of_comments;
 use crate::ply::{Element, Ply};
 use densify_core::gaussians::{rgb_to_dc, sh_coefficients};
 
@@ -77,6 +78,7 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
         }
     }
 
+    let (antialiasing, note) = of_comments(path, ply.comments())?;
     let mut rows = Rows::new(sh_degree);
     let mut colours = vec![0.0; 3 + rest];
     for (index, words) in vertices.iter().enumerate() {
@@ -90,6 +92,8 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
     }
     let mut file = rows.finish(path)?;
     file.gaussians.origin = ply.comment_numbers(OFFSET)?.unwrap_or_default();
+    file.gaussians.antialiasing = antialiasing;
+    file.notes.extend(note);
     Ok(file)
 }
 

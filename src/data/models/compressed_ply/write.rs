@@ -9,6 +9,7 @@ use super::layout::{BOUNDS, CHUNK, WORDS};
 use crate::models::coordinates::offset_text;
 use crate::models::ply::layout::OFFSET;
 use crate::models::quantise::{MAX_LOG_SCALE, smallest_three};
+use crate::models::statement::comments;
 use crate::models::write::{NO_DOUBLE, unfit};
 use crate::models::{Frame, ModelWriter, Shape};
 use densify_core::gaussians::{Gaussians, dc_to_rgb, sh_coefficients, sigmoid};
@@ -29,7 +30,7 @@ pub(super) struct CompressedPlyWriter {
 }
 
 impl ModelWriter for CompressedPlyWriter {
-    fn held_bytes(&self, Shape { rows, sh_degree }: Shape) -> u64 {
+    fn held_bytes(&self, Shape { rows, sh_degree, .. }: Shape) -> u64 {
         let rest = 3 * (sh_coefficients(sh_degree) - 1);
         let row = size_of::<[u32; WORDS.len()]>() + rest;
         let chunk = size_of::<[f32; BOUNDS.len()]>();
@@ -49,7 +50,8 @@ impl ModelWriter for CompressedPlyWriter {
         Ok(true)
     }
 
-    fn begin(&mut self, Shape { rows, sh_degree }: Shape, out: &mut dyn Write) -> io::Result<()> {
+    fn begin(&mut self, shape: Shape, out: &mut dyn Write) -> io::Result<()> {
+        let Shape { rows, sh_degree, antialiasing } = shape;
         let rest = 3 * (sh_coefficients(sh_degree) - 1);
         self.open.reserve_exact(CHUNK);
         self.chunks.reserve_exact(rows.div_ceil(CHUNK));
@@ -60,7 +62,7 @@ impl ModelWriter for CompressedPlyWriter {
         let mut header = format!(
             "ply\nformat binary_little_endian 1.0\ncomment densify {}\n{}element chunk {}\n",
             env!("CARGO_PKG_VERSION"),
-            offset,
+            comments(antialiasing) + &offset,
             rows.div_ceil(CHUNK)
         );
         header.extend(BOUNDS.iter().map(|name| format!("property float {name}\n")));

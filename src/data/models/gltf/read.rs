@@ -13,6 +13,7 @@ use super::nodes;
 use crate::error::LoadError;
 use crate::models::quantise::{log_of_scale, quantised_logit};
 use crate::models::rows::{Row, Rows, SplatFile};
+use crate::models::statement::KERNEL;
 use crate::models::unpack::read_exactly;
 use crate::models::{siblings, spz};
 use densify_core::files::most_unpacked;
@@ -38,6 +39,8 @@ struct Document {
     nodes: Vec<nodes::Node>,
     scenes: Vec<Scene>,
     scene: usize,
+    /// Free for programs; densify states the antialiasing there.
+    extras: Value,
 }
 
 #[derive(Deserialize)]
@@ -144,7 +147,7 @@ fn read(
             primitives += 1;
             let mut part = splats(&buffers, primitive, extension)?;
             transform.apply(&mut part.gaussians);
-            join(&mut found, part);
+            join(path, &mut found, part)?;
             // Many nodes may show the same data.
             let bytes =
                 4 * (11 + found.gaussians.sh.len() as u64 + 11 * found.gaussians.len() as u64);
@@ -159,6 +162,10 @@ fn read(
             "{} holds no Gaussian splats ({SPLATS}); a mesh is rendered by `densify scenegen`",
             path.display()
         )));
+    }
+    let kernel = document.extras.get(KERNEL).and_then(Value::as_str);
+    if let Some(stated) = kernel.and_then(|kernel| kernel.parse().ok()) {
+        found.gaussians.antialiasing = stated;
     }
     Ok(found)
 }
@@ -265,7 +272,18 @@ fn splats(
 }
 
 /// Appends a part; the result has the higher of both degrees.
-fn join(whole: &mut SplatFile, part: SplatFile) {
+///
+/// # Errors
+/// When the parts, as SPZ inside glTF, state different antialiasing.
+fn join(path: &Path, whole: &mut SplatFile, part: SplatFile) -> Result<(), LoadError> {
+    let is_first = whole.gaussians.is_empty();
+    if is_first {
+        whole.gaussians.antialiasing = part.gaussians.antialiasing;
+    }
+    if whole.gaussians.antialiasing != part.gaussians.antialiasing {
+        let problem = "only some of them were trained with antialiasing";
+        return Err(LoadError::damaged(path, "meshes", problem));
+    }
     let degree = whole.gaussians.sh_degree.max(part.gaussians.sh_degree);
     let more = part.gaussians.with_degree(degree);
     whole.gaussians = std::mem::take(&mut whole.gaussians).with_degree(degree);
@@ -276,4 +294,5 @@ fn join(whole: &mut SplatFile, part: SplatFile) {
     let is_new = |note: &String| !whole.notes.contains(note);
     let notes: Vec<String> = part.notes.into_iter().filter(is_new).collect();
     whole.notes.extend(notes);
+    Ok(())
 }

@@ -6,8 +6,10 @@ use std::io::{self, Write};
 use serde_json::{Value, json};
 
 use super::layout::{HALF_TURN, LOG_SCALE, MAGIC, OPACITY_LOGIT, SHAPES, SPLATS, coefficient};
+use crate::models::statement::KERNEL;
 use crate::models::write::{NO_DOUBLE, unfit};
 use crate::models::{Frame, ModelWriter, Shape};
+use densify_core::antialiasing::Antialiasing;
 use densify_core::gaussians::{Gaussians, sh_coefficients, sigmoid};
 
 /// Attributes before those of colour, each with its number of components.
@@ -25,11 +27,12 @@ const ATTRIBUTES: [(&str, usize); 6] = [
 pub(super) struct GlbWriter {
     sh_degree: u8,
     frame: Frame,
+    antialiasing: Antialiasing,
     columns: Vec<Vec<f32>>,
 }
 
 impl ModelWriter for GlbWriter {
-    fn held_bytes(&self, Shape { rows, sh_degree }: Shape) -> u64 {
+    fn held_bytes(&self, Shape { rows, sh_degree, .. }: Shape) -> u64 {
         let row = ATTRIBUTES.iter().map(|(_, width)| width).sum::<usize>();
         (rows * size_of::<f32>() * (row + 3 * sh_coefficients(sh_degree))) as u64
     }
@@ -46,13 +49,15 @@ impl ModelWriter for GlbWriter {
         Ok(true)
     }
 
-    fn begin(&mut self, Shape { rows, sh_degree }: Shape, _out: &mut dyn Write) -> io::Result<()> {
-        if self.held_bytes(Shape { rows, sh_degree }) > u64::from(u32::MAX - (1 << 16)) {
+    fn begin(&mut self, shape: Shape, _out: &mut dyn Write) -> io::Result<()> {
+        let Shape { rows, sh_degree, antialiasing } = shape;
+        if self.held_bytes(shape) > u64::from(u32::MAX - (1 << 16)) {
             return Err(unfit(
                 "a GLB has at most 4 GiB; choose another format, such as ply or sog",
             ));
         }
         self.sh_degree = sh_degree;
+        self.antialiasing = antialiasing;
         let colours = std::iter::repeat_n(3, sh_coefficients(sh_degree));
         let widths = ATTRIBUTES.iter().map(|(_, width)| *width).chain(colours);
         self.columns = widths.map(|width| Vec::with_capacity(rows * width)).collect();
@@ -133,7 +138,7 @@ impl GlbWriter {
             // In glTF's frame.
             node["translation"] = json!([-x, -y, z]);
         }
-        json!({
+        let mut document = json!({
             "asset": {
                 "version": "2.0", "generator": format!("densify {}", env!("CARGO_PKG_VERSION")),
             },
@@ -152,6 +157,10 @@ impl GlbWriter {
                     "projection": "perspective", "sortingMethod": "cameraDistance",
                 }},
             }]}],
-        })
+        });
+        if self.antialiasing.is_on() {
+            document["extras"] = json!({KERNEL: self.antialiasing});
+        }
+        document
     }
 }

@@ -7,7 +7,9 @@ use super::layout::{NEAR, NORMALS_AT, OFFSET, properties, sh_degree};
 use crate::error::LoadError;
 use crate::models::coordinates::remote_origin;
 use crate::models::rows::{Row, Rows, SplatFile};
+use crate::models::statement::{note as note_of, of_comments};
 use crate::ply::{Element, Ply, Scalar};
+use densify_core::antialiasing::Antialiasing;
 use densify_core::gaussians::sh_coefficients;
 
 /// The remedy if a property is missing, which depends on the program that left it out.
@@ -43,9 +45,12 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
     })?;
     let rest = 3 * (sh_coefficients(sh_degree) - 1);
     let remedy = remedy(&vertices);
-    let columns = properties(sh_degree)
+    let mut columns = properties(sh_degree)
         .map(|name| vertices.column(path, &name, remedy))
         .collect::<Result<Vec<_>, _>>()?;
+    let (antialiasing, note) = of_comments(path, ply.comments())?;
+    let filter = vertices.find(&[FILTER]);
+    columns.extend(filter);
 
     let offset = ply.comment_numbers(OFFSET)?;
     let is_double = |column: &usize| vertices.properties[*column].kind == Scalar::F64;
@@ -68,11 +73,22 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
             // Subtracting 0 keeps the sign of −0.
             *value = (wide - origin) as f32;
         }
-        push(&mut rows, &values, &mut sh, rest);
+        let own = if filter.is_some() { fuse_filter(&mut values) } else { &values };
+        push(&mut rows, own, &mut sh, rest);
     })?;
     let mut file = rows.finish(path)?;
     file.gaussians.origin = offset.unwrap_or(origin);
     file.notes = activation::undo(&mut file.gaussians);
+    if filter.is_some() {
+        file.gaussians.antialiasing = Antialiasing::Narrow;
+        file.notes.push(format!(
+            "the 3D filter of Mip-Splatting was fused into scales and opacities; {}",
+            note_of(Antialiasing::Narrow, "`filter_3D`")
+        ));
+    } else {
+        file.gaussians.antialiasing = antialiasing;
+        file.notes.extend(note);
+    }
     Ok(file)
 }
 
@@ -85,6 +101,29 @@ fn origin_of(path: &Path, vertices: &Element, columns: &[usize]) -> Result<[f64;
         }
     })?;
     Ok(remote_origin(axes))
+}
+
+/// The property that holds the radius f of Mip-Splatting's 3D filter `[scene units]`.
+const FILTER: &str = "filter_3D";
+
+/// Fuses the 3D filter, the last of a Gaussian's values, into its scales s and its opacity o: s′ = √(s² + f²) and
+/// o′ = o·√(Πs²/Πs′²) (Mip-Splatting, equation 7 and `gaussian_model.py`). Returns the values without it.
+fn fuse_filter(values: &mut [f32]) -> &[f32] {
+    let [own @ .., filter] = values else { unreachable!("a row ends with its filter") };
+    let at = own.len() - 8;
+    let filter2 = f64::from(*filter).powi(2);
+    let mut log_factor = 0.0;
+    for log in &mut own[at + 1..at + 4] {
+        let wide = f64::from(*log);
+        // s is 0 where a program writes the logarithm of 0.
+        let fused = 0.5 * ((2.0 * wide).exp() + filter2).ln();
+        log_factor += wide - fused;
+        *log = fused as f32;
+    }
+    // logit o′ = ln(o′/(1 − o′)), where 1/o′ = (1 + e^−logit o)/factor.
+    let inverse = (1.0 + (-f64::from(own[at])).exp()) * (-log_factor).exp();
+    own[at] = -((inverse - 1.0).ln()) as f32;
+    own
 }
 
 /// Adds a Gaussian with these [`properties`]. `sh` is scratch.

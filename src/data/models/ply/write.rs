@@ -4,6 +4,7 @@ use std::io::{self, Write};
 
 use super::layout::{NEAR, NORMALS_AT, OFFSET, properties};
 use crate::models::coordinates::offset_text;
+use crate::models::statement::comments;
 use crate::models::{Frame, ModelWriter, Shape};
 use densify_core::gaussians::{Gaussians, sh_coefficients};
 
@@ -26,7 +27,7 @@ impl PlyWriter {
 }
 
 impl ModelWriter for PlyWriter {
-    fn held_bytes(&self, Shape { rows, sh_degree }: Shape) -> u64 {
+    fn held_bytes(&self, Shape { rows, sh_degree, .. }: Shape) -> u64 {
         (rows.min(CHUNK) * self.row_bytes(sh_degree)) as u64
     }
 
@@ -39,8 +40,10 @@ impl ModelWriter for PlyWriter {
         Ok(true)
     }
 
-    fn begin(&mut self, Shape { rows, sh_degree }: Shape, out: &mut dyn Write) -> io::Result<()> {
-        let mut header = "ply\nformat binary_little_endian 1.0\n".to_owned();
+    fn begin(&mut self, shape: Shape, out: &mut dyn Write) -> io::Result<()> {
+        let Shape { rows, sh_degree, antialiasing } = shape;
+        let mut header =
+            "ply\nformat binary_little_endian 1.0\n".to_owned() + &comments(antialiasing);
         if let Some(offset) = self.frame.offset() {
             header += &format!("comment {OFFSET} {}\n", offset_text(offset));
         } else if self.frame.is_double {

@@ -5,6 +5,8 @@
 
 /// The file that describes the images.
 pub(super) const META: &str = "meta.json";
+/// The `model` in `meta.json` of a model with antialiasing.
+pub(super) const ANTIALIASED: &str = "antialiased";
 /// Entries of the palette in a row of its image.
 pub(super) const PALETTE_WIDTH: usize = 64;
 /// Numbers in a codebook.

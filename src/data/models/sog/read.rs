@@ -5,14 +5,17 @@ use std::path::Path;
 
 use image::{ImageDecoder, ImageFormat};
 use serde::Deserialize;
+use serde_json::Value;
 
-use super::layout::{CODEBOOK, FIRST_LARGEST, META, PALETTE_WIDTH};
+use super::layout::{ANTIALIASED, CODEBOOK, FIRST_LARGEST, META, PALETTE_WIDTH};
 use crate::error::LoadError;
 use crate::models::quantise::{from_smallest_three, quantised_logit};
 use crate::models::rows::{Row, Rows, SplatFile};
+use crate::models::statement::{KERNEL, note};
 use crate::models::zip::ZipReader;
 use crate::models::{ModelFile, siblings};
 use crate::picture_file;
+use densify_core::antialiasing::Antialiasing;
 use densify_core::files::most_unpacked;
 use densify_core::gaussians::sh_coefficients;
 
@@ -22,12 +25,34 @@ struct Meta {
     version: Option<u32>,
     #[serde(default)]
     count: u64,
+    /// The statement of antialiasing in the present and in an earlier form.
+    #[serde(default)]
+    model: Value,
+    #[serde(default)]
+    antialias: Value,
+    /// densify adds the kernel to its program's name.
+    #[serde(default)]
+    asset: Value,
     means: Quantity,
     scales: Quantity,
     quats: Quantity,
     sh0: Quantity,
     #[serde(rename = "shN")]
     bands: Option<Quantity>,
+}
+
+impl Meta {
+    /// The antialiasing, and a sentence on it unless its kernel is stated.
+    fn antialiasing(&self) -> (Antialiasing, Option<String>) {
+        if self.model != ANTIALIASED && self.antialias != true {
+            return (Antialiasing::None, None);
+        }
+        let kernel = self.asset.get(KERNEL).and_then(Value::as_str);
+        match kernel.and_then(|kernel| kernel.parse().ok()) {
+            Some(stated) => (stated, None),
+            None => (Antialiasing::Wide, Some(note(Antialiasing::Wide, META))),
+        }
+    }
 }
 
 /// One quantity: its images, and the meaning of their bytes.
@@ -189,7 +214,11 @@ fn read_images(
             sh: &sh,
         });
     }
-    rows.finish(path)
+    let mut file = rows.finish(path)?;
+    let (antialiasing, note) = meta.antialiasing();
+    file.gaussians.antialiasing = antialiasing;
+    file.notes.extend(note);
+    Ok(file)
 }
 
 /// A full codebook; bytes beyond the file's own numbers decode to NaN.

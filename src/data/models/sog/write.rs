@@ -6,13 +6,15 @@ use serde_json::json;
 
 use super::VARIANTS;
 use super::codebook::Codebook;
-use super::layout::{FIRST_LARGEST, META, PALETTE_WIDTH};
+use super::layout::{ANTIALIASED, FIRST_LARGEST, META, PALETTE_WIDTH};
 use super::palette::{self, Palette};
 use super::picture::{Picture, image_size};
 use crate::models::quantise::{MAX_LOG_SCALE, smallest_three};
+use crate::models::statement::KERNEL;
 use crate::models::write::unfit;
 use crate::models::zip::ZipWriter;
 use crate::models::{Format, ModelWriter, Shape};
+use densify_core::antialiasing::Antialiasing;
 use densify_core::gaussians::{Gaussians, sh_coefficients, sigmoid};
 
 /// Longest side of a WebP `[px]`; it limits the number of Gaussians.
@@ -26,6 +28,7 @@ pub(super) struct SogWriter {
     /// Gaussians per entry of the palette; `None` chooses the number of entries as splat-transform does.
     sharing: Option<usize>,
     sh_degree: u8,
+    antialiasing: Antialiasing,
     means: Vec<[f32; 3]>,
     log_scales: Vec<[f32; 3]>,
     quats: Vec<[u8; 4]>,
@@ -38,7 +41,7 @@ pub(super) struct SogWriter {
 }
 
 impl ModelWriter for SogWriter {
-    fn held_bytes(&self, Shape { rows, sh_degree }: Shape) -> u64 {
+    fn held_bytes(&self, Shape { rows, sh_degree, .. }: Shape) -> u64 {
         let bands = 3 * (sh_coefficients(sh_degree) - 1);
         let held = 12 + 12 + 4 + 12 + 1 + 4 + 4 * bands;
         // Beside the held Gaussians: the current image (pixels, predicted pixels, and two files), finished images of at
@@ -56,13 +59,15 @@ impl ModelWriter for SogWriter {
         &VARIANTS
     }
 
-    fn begin(&mut self, Shape { rows, sh_degree }: Shape, _out: &mut dyn Write) -> io::Result<()> {
+    fn begin(&mut self, shape: Shape, _out: &mut dyn Write) -> io::Result<()> {
+        let Shape { rows, sh_degree, antialiasing } = shape;
         if rows == 0 || rows > MAX_SIDE * (MAX_SIDE / 4 * 4) {
             return Err(unfit(format!(
                 "SOG holds 1 to 268 million Gaussians, not {rows}; choose another format, such as ply"
             )));
         }
         self.sh_degree = sh_degree;
+        self.antialiasing = antialiasing;
         self.means.reserve_exact(rows);
         self.log_scales.reserve_exact(rows);
         self.quats.reserve_exact(rows);
@@ -136,6 +141,10 @@ impl ModelWriter for SogWriter {
             "quats": {"files": ["quats.webp"]},
             "sh0": {"codebook": colours.values(), "files": ["sh0.webp"]},
         });
+        if self.antialiasing.is_on() {
+            meta["model"] = json!(ANTIALIASED);
+            meta["asset"][KERNEL] = json!(self.antialiasing);
+        }
         if self.sh_degree > 0 {
             meta["shN"] = self.bands(&mut archive, (width, height))?;
         }

@@ -29,16 +29,16 @@ fn largest_frame(bytes: usize) -> usize {
     bytes + 3 * bytes.div_ceil(1 << 17) + 32
 }
 
-/// The first 16 bytes of the header. `bytes` are the SH degree and the fractional bits of positions.
-fn header(version: u32, rows: u32, bytes: [u8; 2], frames: u8) -> Vec<u8> {
+/// The first 16 bytes of the header. `bytes` are the SH degree, the fractional bits of positions, and the flags.
+fn header(version: u32, rows: u32, bytes: [u8; 3], frames: u8) -> Vec<u8> {
     let words = [MAGIC, version, rows].map(u32::to_le_bytes);
-    [words.as_flattened(), &bytes, &[0, frames]].concat()
+    [words.as_flattened(), &bytes, &[frames]].concat()
 }
 
 /// Writes version 3.
 pub(super) fn write_gzip(
     rows: u32,
-    bytes: [u8; 2],
+    bytes: [u8; 3],
     arrays: &[Array<'_>],
     out: &mut dyn Write,
 ) -> io::Result<()> {
@@ -53,7 +53,7 @@ pub(super) fn write_gzip(
 /// Writes version 4. All frames are held, because a table of their sizes precedes them.
 pub(super) fn write_frames(
     rows: u32,
-    bytes: [u8; 2],
+    bytes: [u8; 3],
     arrays: &[Array<'_>; 6],
     out: &mut dyn Write,
 ) -> io::Result<()> {

@@ -109,9 +109,11 @@ fn split_record(records: &[u8]) -> Option<(u32, &[u8], &[u8])> {
 mod tests {
     use std::io::{Read, Write};
 
+    use super::super::layout::ANTIALIASED;
     use super::*;
     use crate::models::read_model;
     use crate::models::tests::saved;
+    use densify_core::antialiasing::Antialiasing;
     use densify_fixtures::corpus;
 
     fn record(kind: u32, content: &[u8]) -> Vec<u8> {
@@ -159,6 +161,17 @@ mod tests {
                 assert!(found.notes[0].contains(SYSTEMS[number as usize - 1]), "{:?}", found.notes);
             }
         }
+    }
+
+    #[test]
+    fn axes_and_antialiasing_may_both_be_stated() {
+        let mut bytes = with(4, &record(COORDINATE_SYSTEM, &4_u32.to_le_bytes()));
+        bytes[14] |= ANTIALIASED;
+        let (_folder, path) = saved("model.bin", bytes);
+        let found = read_model(&path).unwrap();
+        assert_eq!(found.gaussians.antialiasing, Antialiasing::Wide);
+        let [axes, antialiasing] = &found.notes[..] else { panic!("{:?}", found.notes) };
+        assert!(axes.contains("RUB") && antialiasing.contains("0.3 px²"), "{:?}", found.notes);
     }
 
     #[test]

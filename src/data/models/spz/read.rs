@@ -7,11 +7,13 @@ use flate2::bufread::GzDecoder;
 use ruzstd::decoding::StreamingDecoder;
 
 use super::extensions::{self, Axes, Extensions};
-use super::layout::{COLOUR, GZIP, HAS_EXTENSIONS, HEADER_OF_VERSION_4, MAGIC};
+use super::layout::{ANTIALIASED, COLOUR, GZIP, HAS_EXTENSIONS, HEADER_OF_VERSION_4, MAGIC};
 use crate::error::LoadError;
 use crate::models::quantise::{from_smallest_three, quantised_logit};
 use crate::models::rows::{Row, Rows, SplatFile};
+use crate::models::statement::note;
 use crate::models::unpack::{DAMAGED, read_error, read_exactly, read_to_end};
+use densify_core::antialiasing::Antialiasing;
 use densify_core::files::most_unpacked;
 use densify_core::gaussians::{MAX_SH_DEGREE, sh_coefficients};
 
@@ -27,6 +29,7 @@ struct Header {
     version: u32,
     sh_degree: u8,
     fractional_bits: u8,
+    is_antialiased: bool,
     has_extensions: bool,
     /// The arrays in the order of the file: name and bytes per Gaussian.
     arrays: [(&'static str, u64); 6],
@@ -78,6 +81,7 @@ fn read_header(
     let words: Vec<u32> = bytes.as_chunks().0.iter().map(|&w| u32::from_le_bytes(w)).collect();
     let (version, rows) = (words[1], u64::from(words[2]));
     let (sh_degree, fractional_bits) = (bytes[12], bytes[13]);
+    let is_antialiased = bytes[14] & ANTIALIASED != 0;
     let has_extensions = bytes[14] & HAS_EXTENSIONS != 0;
     if words[0] != MAGIC {
         return wrong("it does not begin with `NGSP`".into());
@@ -106,7 +110,7 @@ fn read_header(
             "{rows} Gaussians take {bytes} bytes, too many for a file of {length}"
         ));
     }
-    Ok(Header { rows, version, sh_degree, fractional_bits, has_extensions, arrays })
+    Ok(Header { rows, version, sh_degree, fractional_bits, is_antialiased, has_extensions, arrays })
 }
 
 /// Reads arrays that follow each other, and the extensions after them.
@@ -212,6 +216,10 @@ fn decode(
     }
     let mut file = rows.finish(path)?;
     file.notes.extend(extensions.notes);
+    if header.is_antialiased {
+        file.gaussians.antialiasing = Antialiasing::Wide;
+        file.notes.push(note(Antialiasing::Wide, "a flag of SPZ"));
+    }
     Ok((file, extensions.axes))
 }
 

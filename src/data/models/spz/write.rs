@@ -5,10 +5,11 @@ use std::io::{self, Write};
 
 use super::VARIANTS;
 use super::containers::{self, Array, GZIP_MEMORY, frames_bytes};
-use super::layout::COLOUR;
+use super::layout::{ANTIALIASED, COLOUR};
 use crate::models::quantise::smallest_three;
 use crate::models::write::unfit;
 use crate::models::{Format, ModelWriter, Shape};
+use densify_core::antialiasing::Antialiasing;
 use densify_core::gaussians::{Gaussians, sh_coefficients, sigmoid};
 
 /// Fractional bits of positions in files of other writers; small scenes get more.
@@ -34,6 +35,8 @@ pub(super) struct SpzWriter {
     /// Fixed step of coefficients; `None` chooses it for the model.
     step: Option<u8>,
     sh_degree: u8,
+    /// Flags of the header.
+    flags: u8,
     positions: Vec<[f32; 3]>,
     /// The middle one of each Gaussian's log-scales.
     sizes: Vec<f32>,
@@ -45,7 +48,7 @@ pub(super) struct SpzWriter {
 }
 
 impl ModelWriter for SpzWriter {
-    fn held_bytes(&self, Shape { rows, sh_degree }: Shape) -> u64 {
+    fn held_bytes(&self, Shape { rows, sh_degree, .. }: Shape) -> u64 {
         let bands = 3 * (sh_coefficients(sh_degree) - 1);
         let held = (rows * (12 + 4 + 1 + 3 + 3 + 4 + bands)) as u64;
         let arrays = [9, 1, 3, 3, 4, bands].map(|bytes| rows * bytes);
@@ -60,13 +63,20 @@ impl ModelWriter for SpzWriter {
         if self.is_in_frames { &[] } else { &VARIANTS }
     }
 
-    fn begin(&mut self, Shape { rows, sh_degree }: Shape, _out: &mut dyn Write) -> io::Result<()> {
+    fn states(&self, antialiasing: Antialiasing) -> bool {
+        // The flag has no kernel; 0.3 is that of other readers.
+        antialiasing != Antialiasing::Narrow
+    }
+
+    fn begin(&mut self, shape: Shape, _out: &mut dyn Write) -> io::Result<()> {
+        let Shape { rows, sh_degree, antialiasing } = shape;
         if u32::try_from(rows).is_err() {
             return Err(unfit(
                 "SPZ counts Gaussians in 32 bits; export fewer, or choose another format",
             ));
         }
         self.sh_degree = sh_degree;
+        self.flags = if antialiasing.is_on() { ANTIALIASED } else { 0 };
         self.positions.reserve_exact(rows);
         self.sizes.reserve_exact(rows);
         self.opacities.reserve_exact(rows);
@@ -115,7 +125,7 @@ impl ModelWriter for SpzWriter {
             (4 * rows, &rotations),
             (self.bands.len(), &|out| out.write_all(&self.bands)),
         ];
-        let header = [self.sh_degree, fractional_bits];
+        let header = [self.sh_degree, fractional_bits, self.flags];
         if self.is_in_frames {
             containers::write_frames(rows as u32, header, &arrays, out)
         } else {

@@ -13,6 +13,7 @@ use std::ops::Range;
 use std::path::PathBuf;
 
 use super::*;
+use densify_core::antialiasing::Antialiasing;
 use densify_core::files::FileError;
 use densify_core::gaussians::{Gaussians, sh_coefficients};
 use densify_core::pieces::ROWS_AT_A_TIME;
@@ -72,7 +73,8 @@ impl ModelWriter for CallLog {
         shape.rows as u64
     }
 
-    fn begin(&mut self, Shape { rows, sh_degree }: Shape, out: &mut dyn Write) -> io::Result<()> {
+    fn begin(&mut self, shape: Shape, out: &mut dyn Write) -> io::Result<()> {
+        let Shape { rows, sh_degree, .. } = shape;
         write!(out, "begin {rows} {sh_degree};")
     }
 
@@ -89,11 +91,14 @@ impl ModelWriter for CallLog {
 fn a_registered_format_is_found_and_given_every_row_once() {
     let format = find("call-log").unwrap();
     assert_eq!(find_by_extension(Path::new("a/model.LOG.txt")).unwrap().name, format.name);
-    assert_eq!(format.held_bytes(Shape { rows: 7, sh_degree: 0 }), 7);
+    assert_eq!(
+        format.held_bytes(Shape { rows: 7, sh_degree: 0, antialiasing: Antialiasing::None }),
+        7
+    );
     let rows = 2 * ROWS_AT_A_TIME + 4;
     let (folder, whole) = (tempfile::tempdir().unwrap(), model(rows, 1));
     let path = folder.path().join("new/model.log.txt");
-    let shape = Shape { rows, sh_degree: 1 };
+    let shape = Shape { rows, sh_degree: 1, antialiasing: Antialiasing::None };
     format
         .write_file(&path, shape, Frame::WORLD, |rows| Ok::<_, FileError>(piece(&whole, rows)))
         .unwrap();
@@ -127,7 +132,7 @@ fn a_failed_source_leaves_the_old_file() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("model.ply");
     std::fs::write(&path, "old").unwrap();
-    let shape = Shape { rows: ROWS_AT_A_TIME + 1, sh_degree: 0 };
+    let shape = Shape { rows: ROWS_AT_A_TIME + 1, sh_degree: 0, antialiasing: Antialiasing::None };
     let lost = || FileError::malformed(Path::new("lost"), "it is gone");
     let written = PLY.write_file(&path, shape, Frame::WORLD, |rows| match rows.start {
         0 => Ok(model(rows.len(), 0)),
@@ -153,7 +158,9 @@ fn an_unknown_format_names_the_nearest_and_the_list() {
 fn the_writer_of_ply_holds_as_many_bytes_as_it_reports() {
     let whole = model(300, 2);
     let mut writer = PLY.open_writer().unwrap();
-    writer.begin(Shape { rows: 300, sh_degree: 2 }, &mut io::sink()).unwrap();
+    writer
+        .begin(Shape { rows: 300, sh_degree: 2, antialiasing: Antialiasing::None }, &mut io::sink())
+        .unwrap();
 
     /// The largest write.
     struct Largest(usize);
@@ -169,7 +176,10 @@ fn the_writer_of_ply_holds_as_many_bytes_as_it_reports() {
     for rows in [20, 300] {
         let mut largest = Largest(0);
         writer.rows(&piece(&whole, 0..rows), &mut largest).unwrap();
-        assert_eq!(writer.held_bytes(Shape { rows, sh_degree: 2 }), largest.0 as u64);
+        assert_eq!(
+            writer.held_bytes(Shape { rows, sh_degree: 2, antialiasing: Antialiasing::None }),
+            largest.0 as u64
+        );
     }
 }
 

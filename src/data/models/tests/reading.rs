@@ -6,6 +6,7 @@ use std::path::Path;
 
 use super::saved;
 use crate::models::read_model;
+use densify_core::antialiasing::Antialiasing;
 use densify_core::gaussians::{Gaussians, sigmoid};
 use densify_fixtures::{corpus, corpus_files};
 
@@ -349,4 +350,26 @@ fn shared_models_of_other_programs_load() {
     }
     let message = read_model(&folder.join("splat-transform/minimal.ksplat")).unwrap_err();
     assert!(message.to_string().contains("splat-transform"), "{message}");
+}
+
+/// The present statement of the specification, and the earlier one; neither has a kernel.
+#[test]
+fn both_statements_of_sog_are_read() {
+    let folder = sog_folder();
+    let meta = folder.path().join("meta.json");
+    let text = std::fs::read_to_string(&meta).unwrap();
+    let mut parsed: serde_json::Value = serde_json::from_str(&text).unwrap();
+    for (model, antialias, expected) in [
+        (serde_json::json!("antialiased"), serde_json::Value::Null, Antialiasing::Wide),
+        (serde_json::Value::Null, true.into(), Antialiasing::Wide),
+        (serde_json::Value::Null, false.into(), Antialiasing::None),
+        (serde_json::json!("other"), serde_json::Value::Null, Antialiasing::None),
+    ] {
+        (parsed["model"], parsed["antialias"]) = (model, antialias);
+        parsed["asset"] = serde_json::json!({});
+        std::fs::write(&meta, parsed.to_string()).unwrap();
+        let found = read_model(folder.path()).unwrap();
+        assert_eq!(found.gaussians.antialiasing, expected, "{parsed}");
+        assert_eq!(found.notes.len(), usize::from(expected.is_on()), "{:?}", found.notes);
+    }
 }

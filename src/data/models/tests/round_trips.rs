@@ -9,6 +9,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::{piece, saved, written};
 use crate::models::{Shape, export_formats, find, find_by_extension, read_model};
+use densify_core::antialiasing::Antialiasing;
 use densify_core::gaussians::{Gaussians, sh_coefficients, sigmoid};
 
 /// A model like a trained one: a few units wide, with mostly small Gaussians whose colours depend little on direction.
@@ -140,12 +141,31 @@ fn coefficients_of_zero_are_zero_on_average() {
 }
 
 #[test]
+fn every_format_states_the_antialiasing_or_says_that_it_cannot() {
+    for kind in Antialiasing::ALL {
+        let model = Gaussians { antialiasing: kind, ..plausible(300, 1) };
+        for format in export_formats().into_iter().filter(|format| format.name != "call-log") {
+            let found = read(&written(format, &model).unwrap()).antialiasing;
+            let expected = if format.states(kind) { kind } else { Antialiasing::Wide };
+            assert_eq!(found, expected, "{} of {kind}", format.name);
+            let cannot = format.name.starts_with("spz") && kind == Antialiasing::Narrow;
+            assert_eq!(format.states(kind), !cannot, "{}", format.name);
+        }
+    }
+}
+
+#[test]
 fn files_do_not_depend_on_the_pieces_and_equal_models_give_equal_files() {
     let model = plausible(300, 2);
     for format in export_formats().into_iter().filter(|format| format.name != "call-log") {
         let in_pieces = |pieces: &[Range<usize>]| {
             let (mut bytes, mut writer) = (Vec::new(), format.open_writer().unwrap());
-            writer.begin(Shape { rows: 300, sh_degree: 2 }, &mut bytes).unwrap();
+            writer
+                .begin(
+                    Shape { rows: 300, sh_degree: 2, antialiasing: Antialiasing::None },
+                    &mut bytes,
+                )
+                .unwrap();
             for rows in pieces {
                 writer.rows(&piece(&model, rows.clone()), &mut bytes).unwrap();
             }

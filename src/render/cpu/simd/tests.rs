@@ -13,6 +13,7 @@ enum Function {
     Exp2,
     Exp,
     Log2,
+    Log2OfAny,
 }
 
 impl WithSimd for WorstError<'_> {
@@ -29,6 +30,7 @@ impl WithSimd for WorstError<'_> {
                     Function::Exp2 => x.exp2(),
                     Function::Exp => x.exp(),
                     Function::Log2 => x.log2_of_1_to_2(),
+                    Function::Log2OfAny => x.log2(),
                 };
                 y.store(&mut out[at..]);
             }
@@ -55,6 +57,10 @@ fn elementary_functions_are_accurate() {
     assert!(arch.dispatch(exp) < 2e-7);
     let log2 = WorstError(&grid(1.0, 2.0), |x| f64::from(x).log2(), Function::Log2, 1.0);
     assert!(arch.dispatch(log2) < 3e-7);
+    for (from, to) in [(1e-6, 1.0), (0.999, 1.001), (1e-30, 1e-29), (1.0, 1e9)] {
+        let log2 = WorstError(&grid(from, to), |x| f64::from(x).log2(), Function::Log2OfAny, 1.0);
+        assert!(arch.dispatch(log2) < 4e-7, "{from} to {to}");
+    }
 }
 
 struct SumsOfFour;

@@ -19,6 +19,7 @@ use super::*;
 use crate::KeptPhotographs;
 use crate::Shortcuts;
 use crate::signals::RecordLayout;
+use densify_core::antialiasing::Antialiasing;
 use densify_shaders::{Accumulation, STAGES};
 
 /// Capabilities that naga must allow in addition to those of every WebGPU device.
@@ -84,6 +85,7 @@ fn every_override_has_a_value_and_every_signal_a_number() {
         records: RecordLayout::ALL,
         alpha_and_depth: true,
         shortcuts: Shortcuts::default(),
+        antialiasing: Antialiasing::Wide,
         accumulation: Accumulation::Slots,
         counts_dominant: true,
     };

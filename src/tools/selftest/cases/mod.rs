@@ -1,5 +1,6 @@
 //! The cases, one file per kind of difficulty.
 
+mod antialiasing;
 mod blending;
 mod colour;
 mod depth;
@@ -52,6 +53,7 @@ pub fn cases() -> &'static [Case] {
         Case { number: 25, title: "the optimiser after gradients of any size", run: optimiser::moments },
         Case { number: 26, title: "Gaussians that hold NaN, infinity or extreme numbers", run: poison::poisoned },
         Case { number: 27, title: "Gaussians too faint to be visible", run: rows::invisible },
+        Case { number: 28, title: "models trained with antialiasing", run: antialiasing::sizes },
         Case { number: 30, title: "a training run at 64x64 px, checked every 100 steps", run: training::run },
     ]
 }

@@ -3,13 +3,14 @@
 //! It follows the textbook (Zwicker et al., *EWA Splatting*, IEEE TVCG 8(3), 2002; Kerbl et al.,
 //! *3D Gaussian Splatting*, ACM TOG 42(4), 2023): every pixel visits every row, covariance and conic are plain
 //! matrices, and the spherical harmonics are a table of monomials. The backends do none of that, so that they
-//! and the reference do not share errors. `tests/it/central.rs` checks the gradients by central differences,
-//! `tests/it/oracle/` compares with stored arrays.
+//! and the reference do not share errors. Antialiasing follows Mip-Splatting (Yu et al., CVPR 2024, equation 9).
+//! `tests/it/central.rs` checks the gradients by central differences, `tests/it/oracle/` compares with stored arrays.
 
 pub mod blend;
 pub mod loss;
 pub mod project;
 
+use densify_core::antialiasing::Antialiasing;
 use densify_core::camera::Camera;
 use densify_core::gaussians::{Gaussians, sh_coefficients};
 
@@ -26,8 +27,6 @@ pub struct Rules {
     pub transmittance_min: f64,
 }
 
-/// Added to the diagonal of the projected covariance `[px²]`.
-const BLUR: f64 = 0.3;
 /// In the Jacobian of the projection, centres are clamped to the image enlarged by this factor about its own
 /// centre.
 const FRUSTUM_MARGIN: f64 = 1.3;
@@ -47,6 +46,8 @@ impl Rules {
 pub struct Model {
     /// Coefficients of spherical harmonics per row and channel.
     pub coefficients: usize,
+    /// Antialiasing; unused in a gradient.
+    pub antialiasing: Antialiasing,
     /// Shape: `[rows]`.
     pub means: Vec<[f64; 3]>,
     /// Shape: `[rows]`.
@@ -66,6 +67,7 @@ impl From<&Gaussians> for Model {
     fn from(gaussians: &Gaussians) -> Self {
         Self {
             coefficients: sh_coefficients(gaussians.sh_degree),
+            antialiasing: gaussians.antialiasing,
             means: gaussians.means.iter().map(|v| v.map(f64::from)).collect(),
             log_scales: gaussians.log_scales.iter().map(|v| v.map(f64::from)).collect(),
             quats: gaussians.quats.iter().map(|v| v.map(f64::from)).collect(),
@@ -76,10 +78,19 @@ impl From<&Gaussians> for Model {
 }
 
 impl Model {
+    /// Variance added to the diagonal of a projected covariance `[px²]`.
+    fn blur(&self) -> f64 {
+        match self.antialiasing {
+            Antialiasing::None | Antialiasing::Wide => 0.3,
+            Antialiasing::Narrow => 0.1,
+        }
+    }
+
     /// A gradient of zeros.
     pub fn zeros(rows: usize, coefficients: usize) -> Self {
         Self {
             coefficients,
+            antialiasing: Antialiasing::None,
             means: vec![[0.0; 3]; rows],
             log_scales: vec![[0.0; 3]; rows],
             quats: vec![[0.0; 4]; rows],
@@ -215,7 +226,7 @@ pub struct ScreenGradient {
     pub conic: [f64; 3],
     /// dL/d(colour after the clamp at 0).
     pub colour: [f64; 3],
-    /// dL/d(opacity).
+    /// dL/d(opacity as blended).
     pub opacity: f64,
     /// dL/d(camera z) through the depth image only.
     pub depth: f64,

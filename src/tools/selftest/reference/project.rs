@@ -2,7 +2,7 @@
 
 use glam::{DMat3, DVec3};
 
-use super::{BLUR, FRUSTUM_MARGIN, Model, Rules, ScreenGradient, View};
+use super::{FRUSTUM_MARGIN, Model, Rules, ScreenGradient, View};
 
 /// A projected row.
 #[derive(Debug, Clone, Copy)]
@@ -19,7 +19,11 @@ pub struct Splat {
     pub conic: [f64; 3],
     /// Colour before the clamp at 0.
     pub colour: [f64; 3],
-    /// Opacity in (0, 1).
+    /// The row's own opacity in (0, 1).
+    pub own_opacity: f64,
+    /// ρ² = det S/det Σ with antialiasing, else 1; S is the covariance without blur.
+    pub rho2: f64,
+    /// Opacity as blended: the own one times ρ.
     pub opacity: f64,
 }
 
@@ -80,10 +84,17 @@ pub fn project(model: &Model, view: View<'_>, rules: &Rules) -> Vec<Splat> {
             let sigma = geometry.m * geometry.m.transpose();
             // Rows of J·W; covariance = (JW)·Σ·(JW)ᵀ.
             let jw = geometry.jacobian(view).map(|j| geometry.rotation.transpose() * j);
-            let a = jw[0].dot(sigma * jw[0]) + BLUR;
+            let blur = model.blur();
+            let a = jw[0].dot(sigma * jw[0]) + blur;
             let b = jw[0].dot(sigma * jw[1]);
-            let c = jw[1].dot(sigma * jw[1]) + BLUR;
+            let c = jw[1].dot(sigma * jw[1]) + blur;
             let determinant = a * c - b * b;
+            let rho2 = if model.antialiasing.is_on() {
+                ((a - blur) * (c - blur) - b * b).max(0.0) / determinant
+            } else {
+                1.0
+            };
+            let own_opacity = 1.0 / (1.0 + (-model.opacity_logits[row]).exp());
             Splat {
                 in_front: local.z >= rules.near,
                 mean: [
@@ -94,7 +105,9 @@ pub fn project(model: &Model, view: View<'_>, rules: &Rules) -> Vec<Splat> {
                 covariance: [a, b, c],
                 conic: [c / determinant, -b / determinant, a / determinant],
                 colour: colour(model, row, view),
-                opacity: 1.0 / (1.0 + (-model.opacity_logits[row]).exp()),
+                own_opacity,
+                rho2,
+                opacity: own_opacity * rho2.sqrt(),
             }
         })
         .collect()
@@ -120,8 +133,7 @@ pub fn backward(
             continue;
         }
         let (splat, upstream) = (&splats[row], &screen[row]);
-        let o = splat.opacity;
-        gradient.opacity_logits[row] = upstream.opacity * o * (1.0 - o);
+        gradient.opacity_logits[row] = upstream.opacity * splat.opacity * (1.0 - splat.own_opacity);
         let d_mean = geometry_backward(model, row, view, splat, upstream, &mut gradient)
             + colour_backward(model, row, view, splat, upstream, &mut gradient);
         gradient.means[row] = d_mean.to_array();
@@ -145,7 +157,16 @@ fn geometry_backward(
     let [ga, gb, gc] = [upstream.conic[0], 0.5 * upstream.conic[1], upstream.conic[2]];
     let (t00, t01) = (qa * ga + qb * gb, qa * gb + qb * gc);
     let (t10, t11) = (qb * ga + qc * gb, qb * gb + qc * gc);
-    let d_cov = [-(t00 * qa + t01 * qb), -(t00 * qb + t01 * qc), -(t10 * qb + t11 * qc)];
+    let mut d_cov = [-(t00 * qa + t01 * qb), -(t00 * qb + t01 * qc), -(t10 * qb + t11 * qc)];
+    if model.antialiasing.is_on() && splat.rho2 > 0.0 {
+        // Entries of d(ρ²)/d(S): the quotient rule, with the other determinant's own entries.
+        let ([a, b, c], blur, rho2) = (splat.covariance, model.blur(), splat.rho2);
+        let determinant = a * c - b * b;
+        let by_rho2 = upstream.opacity * splat.own_opacity / (2.0 * rho2.sqrt());
+        d_cov[0] += by_rho2 * (c - blur - rho2 * c) / determinant;
+        d_cov[1] -= by_rho2 * b * (1.0 - rho2) / determinant;
+        d_cov[2] += by_rho2 * (a - blur - rho2 * a) / determinant;
+    }
     let jacobian = geometry.jacobian(view);
     let jw = jacobian.map(|j| geometry.rotation.transpose() * j);
     let sigma = geometry.m * geometry.m.transpose();

@@ -67,7 +67,7 @@ fn crops(
         }
         let machine = Machine::default();
         let needs = Needs::default();
-        let mut opened = open_run(&folder, run.iterations, None, machine, needs, &Silent)?;
+        let mut opened = open_run(&folder, run.iterations, None, (None, machine), needs, &Silent)?;
         let views = opened.views(Split::Test)?;
         let background = opened.data.background.fixed();
         let (view, window) = match chosen {

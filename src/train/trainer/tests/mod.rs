@@ -12,6 +12,7 @@ use glam::{DMat3, DVec3};
 
 use super::*;
 use crate::schedule::{Background, RateOptions};
+use densify_core::antialiasing::Antialiasing;
 use densify_core::camera::Camera;
 use densify_core::colour::ColourGradient;
 use densify_core::gaussians::ModelArray;
@@ -48,6 +49,10 @@ impl Backend for CountingBackend {
     fn rows(&self) -> usize {
         self.rows
     }
+    fn antialiasing(&self) -> Antialiasing {
+        Antialiasing::None
+    }
+
     fn sh_degree(&self) -> u8 {
         0
     }

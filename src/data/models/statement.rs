@@ -1,0 +1,103 @@
+//! What files state about a model's antialiasing beside its Gaussians.
+//!
+//! | file | statement |
+//! |---|---|
+//! | PLY of densify | `comment antialiasing 0.3`, and `comment antialiased 1` for other programs |
+//! | PLY of Brush | `comment SplatRenderMode: mip`, with κ = 0.1 if it also says `Exported from Brush` |
+//! | PLY of Postshot | `comment antialiased 1` (splat-transform `read-ply.ts`: case is ignored, the last counts) |
+//! | PLY of Mip-Splatting | property `filter_3D`, whose models have κ = 0.1 |
+//! | SPZ | bit 0 of the header's flags |
+//! | SOG | `"model": "antialiased"`, formerly `"antialias": true`; densify adds κ |
+//! | glTF | nothing; densify writes `extras` |
+//!
+//! The PLY of the original trainer says nothing. Where κ is not stated it is 0.3, except for Brush and Mip-Splatting.
+
+use std::path::Path;
+
+use crate::error::LoadError;
+use densify_core::antialiasing::Antialiasing;
+
+/// Key of κ in comments of PLY and in `extras` of JSON.
+pub(super) const KERNEL: &str = "antialiasing";
+
+/// Lines of a PLY header that state an antialiasing; empty for none.
+pub(super) fn comments(antialiasing: Antialiasing) -> String {
+    if antialiasing.is_on() {
+        format!("comment {KERNEL} {antialiasing}\ncomment antialiased 1\n")
+    } else {
+        String::new()
+    }
+}
+
+/// The antialiasing that the comments of a PLY header state, and a sentence on it unless densify wrote it.
+///
+/// # Errors
+/// When densify's own comment names no kernel.
+pub(super) fn of_comments(
+    path: &Path,
+    comments: &[String],
+) -> Result<(Antialiasing, Option<String>), LoadError> {
+    let unknown = |comment: &str| {
+        let problem = "it names no kernel; 0.3, 0.1 and none are possible";
+        LoadError::damaged(path, format!("comment {comment:?}"), problem)
+    };
+    let (mut own, mut said) = (None, None);
+    let is_of_brush = comments.iter().any(|line| line.starts_with("Exported from Brush"));
+    for comment in comments {
+        let lower = comment.to_lowercase();
+        let words: Vec<&str> = lower.split_whitespace().collect();
+        match words[..] {
+            [KERNEL, kernel] => own = Some(kernel.parse().map_err(|_| unknown(comment))?),
+            ["splatrendermode:", mode] => said = Some((mode == "mip", comment)),
+            ["antialiased", number] => said = Some((number == "1", comment)),
+            _ => {}
+        }
+    }
+    Ok(match (own, said) {
+        (Some(own), _) => (own, None),
+        (None, Some((true, comment))) => {
+            let kind = if is_of_brush { Antialiasing::Narrow } else { Antialiasing::Wide };
+            (kind, Some(note(kind, &format!("`{comment}`"))))
+        }
+        (None, _) => (Antialiasing::None, None),
+    })
+}
+
+/// A sentence on an antialiasing that a file states without its kernel.
+pub(super) fn note(antialiasing: Antialiasing, statement: &str) -> String {
+    let why = match antialiasing {
+        Antialiasing::Narrow => "as the program that wrote it renders",
+        Antialiasing::None | Antialiasing::Wide => "as most programs render",
+    };
+    format!("antialiased ({statement}), with a kernel of {antialiasing} px², {why}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn comments_of_other_programs_are_understood() {
+        use Antialiasing::{Narrow, None, Wide};
+        for (comments, expected, is_noted) in [
+            (&["x"][..], None, false),
+            (&["SplatRenderMode: mip"], Wide, true),
+            (&["Exported from Brush 0.3", "SplatRenderMode: mip"], Narrow, true),
+            (&["SplatRenderMode: mip", "Exported from Brush"], Narrow, true),
+            (&["Exported from Brush", "SplatRenderMode: default"], None, false),
+            (&["Exported from Brush"], None, false),
+            (&["antialiased 1"], Wide, true),
+            (&["Antialiased 1"], Wide, true),
+            (&["antialiased 1", "antialiased 0"], None, false),
+            (&["antialiasing 0.1", "antialiased 1"], Narrow, false),
+            (&["antialiasing none", "antialiased 1"], None, false),
+        ] {
+            let comments: Vec<String> = comments.iter().map(|&text| text.to_owned()).collect();
+            let (found, note) = of_comments(Path::new("x.ply"), &comments).unwrap();
+            assert_eq!((found, note.is_some()), (expected, is_noted), "{comments:?}");
+        }
+        let unknown = of_comments(Path::new("x.ply"), &["antialiasing 0.7".to_owned()]);
+        let message = unknown.unwrap_err().to_string();
+        assert!(message.contains("x.ply") && message.contains("0.7"), "{message}");
+    }
+}
