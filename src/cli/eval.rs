@@ -24,8 +24,8 @@ use densify_train::output::{write_geometry, write_scores};
 ///
 /// Prints the scores of each view and their mean, and writes those of a run to results.json and
 /// per_view.json in its folder (results_train.json and per_view_train.json for the views trained on). For a
-/// file of Gaussian splats nothing is written, and every 8th photograph is measured unless the dataset or an
-/// option selects others. Where the geometry is known (built-in scenes, and those that `densify scenegen`
+/// file of Gaussian splats, and with --antialias, nothing is written. Of a file every 8th photograph is measured unless
+/// the dataset or an option selects others. Where the geometry is known (built-in scenes, and those that `densify scenegen`
 /// wrote), also measures how well the Gaussians match it: in a second table, and in geometry.json
 /// (geometry_train.json).
 #[derive(Debug, Args)]
@@ -116,13 +116,15 @@ pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> R
     if let Some(FittedScore { psnr, ssim, flip, lpips }) = mean.fitted {
         line("fitted", psnr, ssim, flip, lpips);
     }
-    if let Some((_, iteration)) = run {
+    // The scores of a run are those of the model as it was trained.
+    let written = run.filter(|_| args.rendering.antialias.is_none());
+    if let Some((_, iteration)) = written {
         write_scores(model, args.split, iteration, &scores)?;
     }
     let geometry = opened.geometry(&views, &|| false)?;
     if let Some(measured) = &geometry {
         console.result(format_table(measured));
-        if let Some((_, iteration)) = run {
+        if let Some((_, iteration)) = written {
             write_geometry(model, args.split, iteration, measured)?;
         }
     }

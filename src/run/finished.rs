@@ -130,8 +130,8 @@ pub fn open_run(
     let was_moved = moved_to.is_some();
     let path = moved_to.unwrap_or_else(|| config.scene_path());
     let model = model_path(run, iteration);
-    let near = config.spec.start.near;
-    open(&model, &path, config.spec.data, (near, antialias, machine), needs, observer)
+    let near = |dataset: &Dataset| near_plane_of_run(&config, dataset, observer);
+    open_with(&model, &path, config.spec.data.clone(), &near, (antialias, machine), needs, observer)
         .map_err(|failure| if was_moved { failure } else { or_moved(failure, &path) })
 }
 
@@ -148,10 +148,23 @@ pub fn open(
     needs: Needs,
     observer: &dyn Observer,
 ) -> Result<Opened, Failure> {
+    let near = |dataset: &Dataset| near_plane(near, dataset, observer);
+    open_with(model, dataset, data, &near, (antialias, machine), needs, observer)
+}
+
+fn open_with(
+    model: &Path,
+    dataset: &Path,
+    data: DataSpec,
+    near: &dyn Fn(&Dataset) -> f32,
+    (antialias, machine): (Option<Antialiasing>, Machine),
+    needs: Needs,
+    observer: &dyn Observer,
+) -> Result<Opened, Failure> {
     let dataset = load(dataset, &data, observer)?;
     let model = read_model_as(model, antialias, observer)?;
     let sh_degree = model.sh_degree;
-    let near = near_plane(near, &dataset, observer);
+    let near = near(&dataset);
     let backend = machine.backend_for(&dataset, model, near, needs)?;
     Ok(Opened { sh_degree, backend, dataset, data })
 }
@@ -193,6 +206,12 @@ fn seen_depths(model: &Gaussians, normalisation: &Normalisation, cameras: &[Came
 /// points.
 pub fn near_plane(given: Option<Fraction>, dataset: &Dataset, observer: &dyn Observer) -> f32 {
     say_near_plane(NearPlane::choose(given, dataset), observer)
+}
+
+/// The near plane that a run was trained with `[scene units]`.
+pub fn near_plane_of_run(config: &RunConfig, dataset: &Dataset, observer: &dyn Observer) -> f32 {
+    let known = config.spec.start.near.map(NearPlane::distance_of);
+    known.unwrap_or_else(|| near_plane(None, dataset, observer))
 }
 
 fn say_near_plane(near: NearPlane, observer: &dyn Observer) -> f32 {

@@ -152,8 +152,9 @@ pub(crate) fn override_antialiasing(
         let option = notes::antialias_option(observer.spelling(), given);
         let stated = model.antialiasing;
         observer.say(format_args!(
-            "note: {}: {option} replaces the antialiasing that the file states: {stated}",
-            path.display()
+            "note: {}: taken as trained with {option}; the file states {}",
+            path.display(),
+            if stated.is_on() { stated.name() } else { "no antialiasing" }
         ));
         model.antialiasing = given;
     }

@@ -14,6 +14,8 @@
 
 use std::path::Path;
 
+use serde_json::Value;
+
 use crate::error::LoadError;
 use densify_core::antialiasing::Antialiasing;
 
@@ -37,17 +39,13 @@ pub(super) fn of_comments(
     path: &Path,
     comments: &[String],
 ) -> Result<(Antialiasing, Option<String>), LoadError> {
-    let unknown = |comment: &str| {
-        let problem = "it names no kernel; 0.3, 0.1 and none are possible";
-        LoadError::damaged(path, format!("comment {comment:?}"), problem)
-    };
     let (mut own, mut said) = (None, None);
     let is_of_brush = comments.iter().any(|line| line.starts_with("Exported from Brush"));
     for comment in comments {
         let lower = comment.to_lowercase();
         let words: Vec<&str> = lower.split_whitespace().collect();
         match words[..] {
-            [KERNEL, kernel] => own = Some(kernel.parse().map_err(|_| unknown(comment))?),
+            [KERNEL, kernel] => own = Some(known(path, &format!("comment {comment:?}"), kernel)?),
             ["splatrendermode:", mode] => said = Some((mode == "mip", comment)),
             ["antialiased", number] => said = Some((number == "1", comment)),
             _ => {}
@@ -63,6 +61,24 @@ pub(super) fn of_comments(
     })
 }
 
+/// The antialiasing that densify has stated in `holder`, an object of a JSON file.
+///
+/// # Errors
+/// When it names no kernel.
+pub(super) fn of_json(
+    path: &Path,
+    place: &str,
+    holder: &Value,
+) -> Result<Option<Antialiasing>, LoadError> {
+    let Some(stated) = holder.get(KERNEL) else { return Ok(None) };
+    known(path, &format!("{place}.{KERNEL}"), stated.as_str().unwrap_or_default()).map(Some)
+}
+
+fn known(path: &Path, field: &str, kernel: &str) -> Result<Antialiasing, LoadError> {
+    let problem = "it names no kernel; 0.3, 0.1 and none are possible";
+    kernel.parse().map_err(|_| LoadError::damaged(path, field, problem))
+}
+
 /// A sentence on an antialiasing that a file states without its kernel.
 pub(super) fn note(antialiasing: Antialiasing, statement: &str) -> String {
     let why = match antialiasing {
@@ -74,6 +90,8 @@ pub(super) fn note(antialiasing: Antialiasing, statement: &str) -> String {
 
 #[cfg(test)]
 mod tests {
+    use serde_json::json;
+
     use super::*;
 
     #[test]
@@ -99,5 +117,19 @@ mod tests {
         let unknown = of_comments(Path::new("x.ply"), &["antialiasing 0.7".to_owned()]);
         let message = unknown.unwrap_err().to_string();
         assert!(message.contains("x.ply") && message.contains("0.7"), "{message}");
+    }
+
+    #[test]
+    fn an_unknown_kernel_in_json_is_refused() {
+        let found = |json: Value| of_json(Path::new("x.glb"), "extras", &json);
+        assert_eq!(found(json!({})).unwrap(), None);
+        assert_eq!(found(json!({"antialiasing": "0.1"})).unwrap(), Some(Antialiasing::Narrow));
+        for unknown in [json!("0.7"), json!(0.3), json!(null)] {
+            let message = found(json!({"antialiasing": unknown})).unwrap_err().to_string();
+            assert!(
+                message.contains("x.glb") && message.contains("extras.antialiasing"),
+                "{message}"
+            );
+        }
     }
 }

@@ -13,8 +13,8 @@ use densify_data::dataset::normalise::Normalisation;
 use densify_data::dataset::{Dataset, PointCloud, SeenDepths, builtin};
 use densify_run::failure::Failure;
 use densify_run::finished::{
-    Machine, is_model, iteration_so_far, load, name_of, names_of, near_plane, or_moved,
-    read_model_as,
+    Machine, is_model, iteration_so_far, load, name_of, names_of, near_plane, near_plane_of_run,
+    or_moved, read_model_as,
 };
 use densify_run::{DataSpec, Fraction, NearPlane, Observer, RunConfig};
 use densify_train::checkpoint::checkpoint_path;
@@ -101,7 +101,7 @@ pub fn open(
         let folder = dataset.unwrap_or_else(|| config.scene_path());
         let dataset = load(&folder, &config.spec.data, observer)
             .map_err(|failure| if is_named { failure } else { or_moved(failure, &folder) })?;
-        near = near_plane(config.spec.start.near, &dataset, observer);
+        near = near_plane_of_run(&config, &dataset, observer);
         let mut loaded = scene_of_dataset(machine, path, dataset, &config.spec.data);
         let name = format!("{}, iteration {iteration}", names[0]);
         loaded.add_model_of_run(name, model, (path, iteration, &config), near)?;

@@ -53,7 +53,7 @@ fn antialiasing_is_carried_through_every_command() {
     }
     let (found, outcome) = export(&run, "narrow.ply", "--antialias=0.1");
     assert_eq!(found, Narrow);
-    assert!(outcome.stdout.contains("--antialias=0.1 replaces"), "{outcome:?}");
+    assert!(outcome.stdout.contains("trained with --antialias=0.1"), "{outcome:?}");
     let narrow = root.path().join("narrow.ply");
     let (found, outcome) = export(&narrow, "narrow.spz", "");
     assert_eq!(found, Wide);
@@ -67,7 +67,10 @@ fn antialiasing_is_carried_through_every_command() {
         let mean = outcome.stdout.lines().find(|line| line.starts_with("mean"));
         mean.expect("a mean").to_owned()
     };
-    assert_ne!(score(""), score("--antialias=none"));
+    let own = score("");
+    let results = read_text(&run.join("results.json"));
+    assert_ne!(own, score("--antialias=none"));
+    assert_eq!(read_text(&run.join("results.json")), results, "scores with another antialiasing");
 
     // A run from the model trains as it was trained; frozen Gaussians must agree.
     let from = |flags: &str, name: &str| {

@@ -61,6 +61,7 @@ fn config_toml_contains_every_option_of_a_run() {
     // Options without a value in this run are left out.
     let unset = [
         "test_every",
+        "antialias",
         "images",
         "resolution",
         "init_points",

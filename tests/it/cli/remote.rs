@@ -13,7 +13,7 @@ use super::{call, gaussians, json, read, scratch, text, train, write_ply};
 use crate::photographs::Photographs;
 
 /// Easting, northing and height `[m]`. At this northing, the step of f32 is half a metre; the Gaussians have 0.1 to 0.4.
-const UTM: DVec3 = DVec3::new(512_345.5, 5_400_123.25, 81.0);
+const UTM: DVec3 = DVec3::new(512_345.25, 5_400_123.25, 81.0);
 const ITERATIONS: u32 = 60;
 
 /// The PSNR of a run after its last iteration `[dB]`.

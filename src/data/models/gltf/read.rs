@@ -13,7 +13,7 @@ use super::nodes;
 use crate::error::LoadError;
 use crate::models::quantise::{log_of_scale, quantised_logit};
 use crate::models::rows::{Row, Rows, SplatFile};
-use crate::models::statement::KERNEL;
+use crate::models::statement::of_json;
 use crate::models::unpack::read_exactly;
 use crate::models::{siblings, spz};
 use densify_core::files::most_unpacked;
@@ -163,8 +163,7 @@ fn read(
             path.display()
         )));
     }
-    let kernel = document.extras.get(KERNEL).and_then(Value::as_str);
-    if let Some(stated) = kernel.and_then(|kernel| kernel.parse().ok()) {
+    if let Some(stated) = of_json(path, "extras", &document.extras)? {
         found.gaussians.antialiasing = stated;
     }
     Ok(found)

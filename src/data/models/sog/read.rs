@@ -11,7 +11,7 @@ use super::layout::{ANTIALIASED, CODEBOOK, FIRST_LARGEST, META, PALETTE_WIDTH};
 use crate::error::LoadError;
 use crate::models::quantise::{from_smallest_three, quantised_logit};
 use crate::models::rows::{Row, Rows, SplatFile};
-use crate::models::statement::{KERNEL, note};
+use crate::models::statement::{note, of_json};
 use crate::models::zip::ZipReader;
 use crate::models::{ModelFile, siblings};
 use crate::picture_file;
@@ -43,15 +43,14 @@ struct Meta {
 
 impl Meta {
     /// The antialiasing, and a sentence on it unless its kernel is stated.
-    fn antialiasing(&self) -> (Antialiasing, Option<String>) {
+    fn antialiasing(&self, path: &Path) -> Result<(Antialiasing, Option<String>), LoadError> {
         if self.model != ANTIALIASED && self.antialias != true {
-            return (Antialiasing::None, None);
+            return Ok((Antialiasing::None, None));
         }
-        let kernel = self.asset.get(KERNEL).and_then(Value::as_str);
-        match kernel.and_then(|kernel| kernel.parse().ok()) {
+        Ok(match of_json(path, "asset", &self.asset)? {
             Some(stated) => (stated, None),
             None => (Antialiasing::Wide, Some(note(Antialiasing::Wide, META))),
-        }
+        })
     }
 }
 
@@ -215,7 +214,7 @@ fn read_images(
         });
     }
     let mut file = rows.finish(path)?;
-    let (antialiasing, note) = meta.antialiasing();
+    let (antialiasing, note) = meta.antialiasing(path)?;
     file.gaussians.antialiasing = antialiasing;
     file.notes.extend(note);
     Ok(file)
