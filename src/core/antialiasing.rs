@@ -80,7 +80,18 @@ impl Serialize for Antialiasing {
 
 impl<'de> Deserialize<'de> for Antialiasing {
     fn deserialize<D: Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
-        String::deserialize(from)?.parse().map_err(serde::de::Error::custom)
+        /// TOML has numbers without quotes, too.
+        #[derive(Deserialize)]
+        #[serde(untagged, expecting = "expected 0.3, 0.1 or none")]
+        enum Stated {
+            Text(String),
+            Kernel(f64),
+        }
+        let text = match Stated::deserialize(from)? {
+            Stated::Text(text) => text,
+            Stated::Kernel(kernel) => kernel.to_string(),
+        };
+        text.parse().map_err(serde::de::Error::custom)
     }
 }
 
@@ -93,6 +104,10 @@ mod tests {
         for kind in Antialiasing::ALL {
             assert_eq!(kind.to_string().parse(), Ok(kind));
         }
+        let read = |json: &str| serde_json::from_str::<Antialiasing>(json).ok();
+        assert_eq!(read("0.1"), Some(Antialiasing::Narrow));
+        assert_eq!(read("\"0.3\""), Some(Antialiasing::Wide));
+        assert_eq!((read("0.2"), read("true")), (None, None));
         let message = "0.2".parse::<Antialiasing>().unwrap_err().to_string();
         assert!(message.contains("0.2") && message.contains("none"), "{message}");
     }

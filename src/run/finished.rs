@@ -8,7 +8,7 @@ use glam::DVec3;
 use crate::failure::{Failure, ModelProblem, notes};
 pub use crate::models::{
     is_model, iteration, iteration_so_far, model_file, name_of, names_of, read_model,
-    read_model_as, write_model,
+    read_model_as, say_unstated, write_in_frame, write_model,
 };
 use crate::near_plane::NearPlane;
 use crate::observer::{Observer, say_notes};

@@ -11,7 +11,8 @@ use densify_core::files::{self, WriteError};
 use densify_core::gaussians::Gaussians;
 use densify_data::dataset::is_archive;
 use densify_data::models::{
-    self, Coarseness, Coordinates, Format, Frame, fitting_format, is_unfit, local_origin,
+    self, Coarseness, Coordinates, Format, Frame, fitting_format, is_fine, is_unfit, local_origin,
+    sidecar_path,
 };
 use densify_train::checkpoint::newest_step;
 use densify_train::output::{is_in_use, model_path, saved_iterations};
@@ -180,7 +181,7 @@ fn placed<'a>(
         Coordinates::Auto | Coordinates::World => {}
     }
     let coarseness = Coarseness::measure(model);
-    let has_more = model.is_local();
+    let has_more = is_fine(model);
     if !coarseness.is_noted() {
         return within(Frame::WORLD);
     }
@@ -190,10 +191,10 @@ fn placed<'a>(
         return within(local);
     }
     if has_more && coarseness.is_unfit() {
-        return Err(Failure::input(notes::coarse(spelling, &coarseness)));
+        return Err(Failure::input(notes::coarse(spelling, &coarseness, !format.is_lossy())));
     }
     let note = if has_more {
-        notes::coarse(spelling, &coarseness)
+        notes::coarse(spelling, &coarseness, !format.is_lossy())
     } else {
         format!("its coordinates are only f32: {coarseness}; export it from the run that made it")
     };
@@ -214,7 +215,46 @@ pub fn write_model(
     observer: &dyn Observer,
 ) -> Result<(), Failure> {
     let (model, frame) = placed(model, coordinates, format, observer)?;
-    let model = model.as_ref();
+    write_in_frame(format, path, &model, frame, observer)?;
+    say_unstated(format, path, frame, model.antialiasing, observer);
+    Ok(())
+}
+
+/// Tells the user what a file does not state itself: a kernel of antialiasing, and the offset of local coordinates.
+pub fn say_unstated(
+    format: &Format,
+    path: &Path,
+    frame: Frame,
+    antialiasing: Antialiasing,
+    observer: &dyn Observer,
+) {
+    if !format.states(antialiasing) {
+        observer.say(format_args!(
+            "note: {} cannot state the kernel of the antialiasing, {antialiasing}; readers take 0.3 px², which shows \
+             small Gaussians fainter; the other formats state it",
+            format.name
+        ));
+    }
+    if frame.offset().is_some() && !format.states_offset() {
+        observer.say(format_args!(
+            "note: the offset of the local coordinates is in {}; keep both files together",
+            sidecar_path(path).display()
+        ));
+    }
+}
+
+/// Writes a model in another format, measured from the origin of the frame, and tells the observer what the format
+/// changes. An error leaves an existing file as it is.
+///
+/// # Errors
+/// When the format cannot hold the model, or the disk fails.
+pub fn write_in_frame(
+    format: &Format,
+    path: &Path,
+    model: &Gaussians,
+    frame: Frame,
+    observer: &dyn Observer,
+) -> Result<(), Failure> {
     let write = |out: &mut dyn Write| {
         format.write_in(frame, model, out).map_err(|error| match error {
             // The format cannot hold the model; the disk is not at fault.
@@ -230,13 +270,6 @@ pub fn write_model(
             return Err(Failure::input(format!(
                 "{name} cannot hold this model: {changes}; choose another format, such as {other}"
             )));
-        }
-        if !format.states(model.antialiasing) {
-            observer.say(format_args!(
-                "note: {name} cannot state the kernel of the antialiasing, {}; readers take 0.3 px², which shows small \
-                 Gaussians fainter; ply, glb and sog state it",
-                model.antialiasing
-            ));
         }
         if changes.is_noted() {
             observer.say(format_args!("note: {name}: {changes}; ply and glb hold all values"));

@@ -43,7 +43,7 @@ pub(super) struct ExportArgs {
     /// Saved iteration of the run `[default: the last]`
     #[arg(long, value_name = "N")]
     iteration: Option<u32>,
-    /// Coordinates of the file: local ones are relative to an offset, which stands in the file or, for SPZ and SOG, in
+    /// Coordinates of the file: local ones are relative to an offset, which stands in the file or, for SPZ, in
     /// FILE.offset.json. auto: world, or local if f32 is too coarse for world coordinates, as in UTM
     #[arg(long, value_name = "KIND", default_value = "auto")]
     coordinates: Coordinates,

@@ -2,6 +2,7 @@
 //! metre, which is more than most Gaussians. Files may therefore hold coordinates relative to an offset, which stands in a
 //! comment (PLY), in a node (glTF) or in a [sidecar](super::sidecar), or coordinates in f64 (PLY).
 
+use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use super::spatial_order::{frame, middle_and_spread};
@@ -86,11 +87,9 @@ pub struct Coarseness {
 impl Coarseness {
     /// Measures a whole model.
     pub fn measure(model: &Gaussians) -> Self {
-        let frame = frame(model);
-        let middle = std::array::from_fn(|axis| frame[axis].0 + model.origin[axis]);
-        let spread = frame.iter().map(|(_, spread)| *spread).fold(0.0, f64::max);
+        let (middle, spread) = middle_of(model);
         let mut found = Self::default();
-        found.add(model, middle, spread);
+        found.add(model, middle.to_array(), spread);
         found
     }
 
@@ -160,14 +159,35 @@ fn step_of_f32(value: f64) -> f64 {
     f64::from(near.next_up()) - f64::from(near)
 }
 
-/// A point near the middle of a model, for its local coordinates; the model's own origin if it has one.
+/// The middle of a model and its spread along the longest axis `[world units]`.
+pub(super) fn middle_of(model: &Gaussians) -> (DVec3, f64) {
+    let frame = frame(model);
+    let middle = DVec3::from(frame.map(|(middle, _)| middle)) + DVec3::from(model.origin);
+    (middle, largest_spread(&frame))
+}
+
+fn largest_spread(frame: &[(f64, f64); 3]) -> f64 {
+    frame.iter().map(|(_, spread)| *spread).fold(0.0, f64::max)
+}
+
+/// True for a middle that is so far from 0, in spreads, that f32 may be too coarse.
+pub(super) fn is_remote(middle: [f64; 3], spread: f64) -> bool {
+    DVec3::from(middle).length() > REMOTE * spread
+}
+
+/// True if the positions of a model are finer than world coordinates in f32: it is measured from a point near its middle.
+pub fn is_fine(model: &Gaussians) -> bool {
+    let (middle, spread) = middle_of(model);
+    model.is_local() && !is_remote((middle - DVec3::from(model.origin)).to_array(), spread)
+}
+
+/// A point near the middle of a model, for its local coordinates; the model's own origin if that is near.
 pub fn local_origin(model: &Gaussians) -> [f64; 3] {
-    if model.is_local() {
+    if is_fine(model) {
         return model.origin;
     }
-    let frame = frame(model);
-    let spread = frame.iter().map(|(_, spread)| *spread).fold(0.0, f64::max);
-    round_origin(frame.map(|(middle, _)| middle), spread)
+    let (middle, spread) = middle_of(model);
+    round_origin(middle.to_array(), spread)
 }
 
 /// A point near the middle of these coordinates, by axis, if they are so far from 0 that f32 may be too coarse; else 0.
@@ -177,10 +197,8 @@ pub(super) fn remote_origin(axes: [Vec<f64>; 3]) -> [f64; 3] {
         return [0.0; 3];
     }
     let frame = axes.map(middle_and_spread);
-    let spread = frame.iter().map(|(_, spread)| *spread).fold(0.0, f64::max);
-    let middle = frame.map(|(middle, _)| middle);
-    let distance = middle.iter().map(|value| value * value).sum::<f64>().sqrt();
-    if distance > REMOTE * spread { round_origin(middle, spread) } else { [0.0; 3] }
+    let (middle, spread) = (frame.map(|(middle, _)| middle), largest_spread(&frame));
+    if is_remote(middle, spread) { round_origin(middle, spread) } else { [0.0; 3] }
 }
 
 /// A point rounded to the power of ten below `unit`, at most 1e15; a number that is not finite becomes 0.

@@ -33,7 +33,9 @@ use densify_policies::parameters::nearest;
 pub use inventory;
 
 pub use changes::Changes;
-pub use coordinates::{Coarseness, Coordinates, Frame, local_origin, offset_text, round_origin};
+pub use coordinates::{
+    Coarseness, Coordinates, Frame, is_fine, local_origin, offset_text, round_origin,
+};
 pub(crate) use ply::layout::OFFSET as PLY_OFFSET;
 pub use recognise::{Match, ModelFile, Reader, main_file, read_model};
 pub use rows::SplatFile;

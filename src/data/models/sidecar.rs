@@ -40,7 +40,7 @@ pub fn sidecar_path(model: &Path) -> PathBuf {
 pub(super) fn apply(path: &Path, file: &mut SplatFile) -> Result<(), LoadError> {
     let sidecar = sidecar_path(path);
     let text = match files::read_text(&sidecar, MOST_BYTES) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
+        Err(error) if is_absent(&error) => return Ok(()),
         text => text.map_err(LoadError::io(&sidecar))?,
     };
     let remedy = "correct it, or delete it if the model is in the dataset's own coordinates";
@@ -83,9 +83,12 @@ pub fn write_sidecar(model: &Path, offset: [f64; 3], written: &Path) -> Result<(
 pub fn remove_sidecar(model: &Path) -> Result<(), FileError> {
     let sidecar = sidecar_path(model);
     match std::fs::remove_file(&sidecar) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => {
-            Err(FileError::io("remove", &sidecar)(error))
-        }
+        Err(error) if !is_absent(&error) => Err(FileError::io("remove", &sidecar)(error)),
         _ => Ok(()),
     }
+}
+
+/// True if a sidecar does not exist, or cannot because its name would be too long.
+fn is_absent(error: &io::Error) -> bool {
+    matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::InvalidFilename)
 }

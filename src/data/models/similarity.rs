@@ -3,6 +3,7 @@
 
 use glam::{DMat3, DMat4, DQuat, DVec3};
 
+use super::coordinates::{is_remote, middle_of};
 use densify_core::gaussians::{Gaussians, sh_coefficients};
 use densify_core::sh;
 
@@ -40,18 +41,22 @@ impl Similarity {
     }
 
     /// Transforms a model; the identity changes no bit. A translation alone moves the model's origin, so that no position
-    /// is rounded.
+    /// is rounded; with a rotation or a scale, this is done for remote models, for which f32 may be too coarse.
     pub(super) fn apply(&self, model: &mut Gaussians) {
         let Self { rotation, scale, translation } = *self;
         if rotation.abs_diff_eq(DQuat::IDENTITY, 0.0) && scale.to_bits() == 1f64.to_bits() {
             model.origin = (DVec3::from(model.origin) + translation).to_array();
             return;
         }
+        let place = |point: DVec3| scale * (rotation * point) + translation;
+        let (middle, spread) = middle_of(model);
+        let is_far = is_remote(place(middle).to_array(), scale * spread);
+        let origin = if is_far { place(DVec3::from(model.origin)) } else { DVec3::ZERO };
         for row in 0..model.len() {
-            let turned = rotation * DVec3::from(model.position(row));
-            model.means[row] = (scale * turned + translation).as_vec3().to_array();
+            let moved = place(DVec3::from(model.position(row))) - origin;
+            model.means[row] = moved.as_vec3().to_array();
         }
-        model.origin = [0.0; 3];
+        model.origin = origin.to_array();
         for log in model.log_scales.as_flattened_mut() {
             *log = (f64::from(*log) + scale.ln()) as f32;
         }
@@ -166,6 +171,7 @@ mod tests {
         let transform = Similarity::from_matrix(&matrix).unwrap();
         let mut after = before.clone();
         transform.apply(&mut after);
+        assert!(!after.is_local());
         for row in 0..3 {
             let mean = DVec3::from(before.means[row].map(f64::from));
             let found = DVec3::from(after.means[row].map(f64::from));
@@ -176,6 +182,21 @@ mod tests {
                 let (old, new) = (shown(&before, row, d), shown(&after, row, rotation * d));
                 assert!((0..3).all(|c| (old[c] - new[c]).abs() < 2e-5), "{old:?} and {new:?}");
             }
+        }
+    }
+
+    #[test]
+    fn a_remote_model_keeps_its_precision() {
+        let before = model(5, 0);
+        let there = DVec3::new(512_345.25, 5_400_123.5, 81.0);
+        let rotation = DQuat::from_axis_angle(DVec3::Z, 0.7);
+        let matrix = DMat4::from_scale_rotation_translation(DVec3::splat(0.5), rotation, there);
+        let mut after = before.clone();
+        Similarity::from_matrix(&matrix).unwrap().apply(&mut after);
+        assert_eq!(after.origin, there.to_array());
+        for row in 0..5 {
+            let expected = matrix.transform_point3(DVec3::from(before.position(row)));
+            assert!((DVec3::from(after.position(row)) - expected).length() < 1e-6);
         }
     }
 

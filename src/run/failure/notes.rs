@@ -119,18 +119,19 @@ pub(crate) fn other_coordinates(
 }
 
 /// World coordinates are too coarse in f32.
-pub(crate) fn coarse(s: Spelling, coarseness: &Coarseness) -> String {
-    format!(
-        "{coarseness}; {} or {} keeps positions exact",
-        s.text("coordinates", "local"),
-        s.text("coordinates", "double")
-    )
+pub(crate) fn coarse(s: Spelling, coarseness: &Coarseness, may_be_double: bool) -> String {
+    let local = s.text("coordinates", "local");
+    if may_be_double {
+        let double = s.text("coordinates", "double");
+        return format!("{coarseness}; {local} or {double} keeps positions exact");
+    }
+    format!("{coarseness}; {local} keeps positions exact")
 }
 
 /// A file is in local coordinates because those of the world are too coarse.
 pub(crate) fn saved_in_local(s: Spelling, coarseness: &Coarseness, offset: [f64; 3]) -> String {
     format!(
-        "note: saved in local coordinates, relative to the offset {}: {coarseness} ({} or {} saves others)",
+        "note: saved in local coordinates, relative to the offset {}: {coarseness} (choose others with {} or {})",
         offset_text(offset),
         s.text("coordinates", "world"),
         s.text("coordinates", "double")
@@ -146,13 +147,16 @@ pub(crate) fn expected_coarse(
 ) -> String {
     if is_automatic {
         return format!(
-            "coords   local, from the offset {}: {coarseness} ({} or {} saves others)",
+            "coords   local, from the offset {}: {coarseness} (choose others with {} or {})",
             offset_text(offset),
             s.text("coordinates", "world"),
             s.text("coordinates", "double")
         );
     }
-    format!("note: the saved model will be worse than the trained one: {}", coarse(s, coarseness))
+    format!(
+        "note: the saved model will be worse than the trained one: {}",
+        coarse(s, coarseness, true)
+    )
 }
 
 /// The hint on how to learn exposures if the tracks do not show whether they differ.

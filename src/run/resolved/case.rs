@@ -53,6 +53,7 @@ pub(crate) struct Choices {
     pub(crate) knobs: Knobs,
     pub(crate) degree: Degree,
     pub(crate) exposure: Exposure,
+    pub(crate) antialiasing: Antialiasing,
     pub(crate) near: NearPlane,
     pub(crate) position_rates: PositionRates,
     /// Choices that the run makes while it trains.
@@ -167,6 +168,7 @@ impl<'a> Case<'a> {
             knobs,
             degree,
             exposure,
+            antialiasing: antialiasing(spec, &inputs)?,
             near: NearPlane::from_depths(spec.start.near, &seen),
             position_rates: PositionRates::choose(spec, &seen),
             automatic,
@@ -264,21 +266,6 @@ impl<'a> Case<'a> {
         RowBudget::for_trainable(trainable, self.frozen_rows()).total
     }
 
-    /// The antialiasing of the run: that of the option, or that of the models it starts from.
-    ///
-    /// # Errors
-    /// When the models of `--init` and `--freeze` differ and no option decides.
-    pub(crate) fn antialiasing(&self) -> Result<Antialiasing, Failure> {
-        let models = [self.inputs.init_model, self.inputs.frozen_model];
-        match (self.spec.start.antialias, models.map(|model| model.map(|m| m.antialiasing))) {
-            (Some(given), _) => Ok(given),
-            (None, [Some(init), Some(frozen)]) if init != frozen => {
-                Err(ModelProblem::AntialiasingDiffers { init, frozen }.into())
-            }
-            (None, [init, frozen]) => Ok(init.or(frozen).unwrap_or_default()),
-        }
-    }
-
     fn frozen_rows(&self) -> usize {
         self.inputs.frozen_model.map_or(0, |model| model.rows)
     }
@@ -338,4 +325,19 @@ fn check_automatic(spec: &RunSpec) -> Result<(), Failure> {
         return Err(OptionProblem::AutoBudgetWithFreeze.into());
     }
     Ok(())
+}
+
+/// The antialiasing of the run: that of the option, or that of the models it starts from.
+///
+/// # Errors
+/// When the models of `--init` and `--freeze` differ and no option decides.
+fn antialiasing(spec: &RunSpec, inputs: &Inputs) -> Result<Antialiasing, Failure> {
+    let models = [inputs.init_model, inputs.frozen_model];
+    match (spec.start.antialias, models.map(|model| model.map(|model| model.antialiasing))) {
+        (Some(given), _) => Ok(given),
+        (None, [Some(init), Some(frozen)]) if init != frozen => {
+            Err(ModelProblem::AntialiasingDiffers { init, frozen }.into())
+        }
+        (None, [init, frozen]) => Ok(init.or(frozen).unwrap_or_default()),
+    }
 }

@@ -139,8 +139,8 @@ impl RunConfig {
         });
         spec.start.freeze.clone_from(&inputs.frozen_file);
         // A run without antialiasing that did not ask for it says nothing.
-        if let Some(antialiasing) = case.antialiasing().ok().filter(|kind| kind.is_on()) {
-            spec.start.antialias = Some(antialiasing);
+        if choices.antialiasing.is_on() {
+            spec.start.antialias = Some(choices.antialiasing);
         }
         spec.start.near = Some(choices.near.fraction);
         let rates = Table::try_from(training.rates).map_err(Failure::input)?;

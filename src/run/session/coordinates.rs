@@ -38,7 +38,7 @@ impl Session<'_> {
                 if is_automatic {
                     notes::saved_in_local(spelling, &coarseness, local.origin)
                 } else {
-                    format!("note: {}", notes::coarse(spelling, &coarseness))
+                    format!("note: {}", notes::coarse(spelling, &coarseness, true))
                 }
             ));
         }
@@ -48,7 +48,9 @@ impl Session<'_> {
     /// Rounds the means as the saved file does, if that makes a difference, so that its quality is measured. Returns the
     /// means as they were, to be [restored](Self::restore_means).
     pub(super) fn round_means_as_saved(&mut self) -> Result<Option<Vec<f32>>, Failure> {
-        if self.choose_frame()?.1.is_none() {
+        if self.run.spec.output.coordinates != Coordinates::World
+            || self.choose_frame()?.1.is_none()
+        {
             return Ok(None);
         }
         let to_world = self.run.dataset.normalisation;

@@ -79,7 +79,7 @@ fn load(file: &Path, run: &ResolvedRun<'_>, observer: &dyn Observer) -> Result<G
     // Problems with the file were reported when its size was read.
     let model = read("init", file, &Silent)?;
     let mut model = dataset.normalisation.model_from_world(model);
-    apply_antialiasing(&mut model, file, run, observer)?;
+    override_antialiasing(&mut model, run.case.choices.antialiasing, file, observer);
     let seen = in_view(&model, dataset);
     if (seen as f64) < LEAST_IN_VIEW * model.len() as f64 {
         let (file, rows) = (file.to_owned(), model.len());
@@ -103,21 +103,6 @@ fn load(file: &Path, run: &ResolvedRun<'_>, observer: &dyn Observer) -> Result<G
         ));
     }
     Ok(with_degree(model, size.sh_degree, observer))
-}
-
-/// Gives a model the antialiasing of the run.
-///
-/// # Errors
-/// When the models of the run differ and no option decides.
-fn apply_antialiasing(
-    model: &mut Gaussians,
-    file: &Path,
-    run: &ResolvedRun<'_>,
-    observer: &dyn Observer,
-) -> Result<(), Failure> {
-    let antialiasing = run.case.antialiasing()?;
-    override_antialiasing(model, antialiasing, file, observer);
-    Ok(())
 }
 
 /// Truncates colours to a lower degree, with a note, or extends them to a higher one.
@@ -144,7 +129,7 @@ pub(super) fn append_to_frozen(
     };
     let model = read("freeze", file, &Silent)?;
     let mut model = case.inputs.dataset.normalisation.model_from_world(model);
-    apply_antialiasing(&mut model, file, run, observer)?;
+    override_antialiasing(&mut model, run.case.choices.antialiasing, file, observer);
     let (rows, expected) = (model.len(), case.budget(size.rows).frozen);
     if rows != expected {
         let file = file.clone();

@@ -20,6 +20,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use cpu_time::ProcessTime;
+use glam::DVec3;
 
 use crate::failure::{Failure, INPUT, OTHER, TrainingProblem};
 use crate::observer::{Between, Interrupt, Observer};
@@ -132,6 +133,21 @@ fn has_no_results(folder: &Path) -> bool {
     saved_iterations(folder).is_err() && !folder.join(CHECKPOINTS).exists()
 }
 
+/// Writes the cameras of all views in world coordinates, or relative to an offset.
+fn write_cameras(run: &Run, folder: &Path, offset: Option<[f64; 3]>) -> Result<(), FileError> {
+    let to_world = &run.dataset.normalisation;
+    let cameras = run.dataset.test.iter().chain(&run.dataset.train).map(|view| {
+        let mut camera = to_world.world_from_scene_camera(&view.camera);
+        if let Some(offset) = offset {
+            camera.translation += camera.rotation * DVec3::from(offset);
+        }
+        (&*view.name, camera)
+    });
+    write_atomically(&folder.join("cameras.json"), |out| {
+        out.write_all(cameras_json(cameras)?.as_bytes())
+    })
+}
+
 impl<'a> Session<'a> {
     fn start(
         mut run: Run,
@@ -142,13 +158,7 @@ impl<'a> Session<'a> {
         let folder = folder.as_path();
         run.config.write(folder)?;
         let config = run.config.table()?;
-        let to_world = &run.dataset.normalisation;
-        let views = run.dataset.test.iter().chain(&run.dataset.train);
-        let cameras =
-            views.map(|view| (&*view.name, to_world.world_from_scene_camera(&view.camera)));
-        write_atomically(&folder.join("cameras.json"), |out| {
-            out.write_all(cameras_json(cameras)?.as_bytes())
-        })?;
+        write_cameras(&run, folder, None)?;
         let mut checkpoint = None;
         let (logs, totals) = match run.session.take() {
             None => (Logs::create(folder)?, Totals::new()),
@@ -363,6 +373,10 @@ impl<'a> Session<'a> {
         PLY.write_file(&path, shape, frame, |piece| {
             Ok::<_, Failure>(to_world.world_from_model(backend.download_rows(piece)?, frame.origin))
         })?;
+        if let Some(offset) = frame.offset() {
+            // Viewers show the model with these cameras.
+            write_cameras(&self.run, &self.folder, Some(offset))?;
+        }
         if let Some(exposures) = &self.run.trainer.progress().exposures {
             let names = self.run.dataset.train.iter().map(|view| &*view.name);
             let named = named_transforms(exposures, names);

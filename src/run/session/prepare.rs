@@ -48,7 +48,7 @@ pub(super) fn prepare(
         None => first_model(&run, observer)?,
         Some(checkpoint) => checkpoint.blank_model()?,
     };
-    model.antialiasing = run.case.antialiasing()?;
+    model.antialiasing = run.case.choices.antialiasing;
     let initial_rows =
         checkpoint.map_or(model.len(), |checkpoint| checkpoint.header().trainer.initial_rows);
     let training = ResolvedTraining::new(&run, initial_rows)?;
@@ -149,9 +149,11 @@ fn announce(
     let RunSpec { density, schedule, data, .. } = run.case.spec;
     let summary = run.case.choices.entry.summary;
     observer.say(format_args!("policy   {}: {summary}", density.policy));
-    let kernel = match run.case.antialiasing() {
-        Ok(kind) if kind.is_on() => format!(", antialiasing {kind} px²"),
-        _ => String::new(),
+    let antialiasing = run.case.choices.antialiasing;
+    let kernel = if antialiasing.is_on() {
+        format!(", antialiasing {antialiasing} px²")
+    } else {
+        String::new()
     };
     observer.say(format_args!(
         "run      {} iterations, seed {}, degree {}, background {}{kernel}",

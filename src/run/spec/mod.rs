@@ -186,8 +186,8 @@ run_spec! {
         /// them; the budget counts frozen and trained Gaussians
         freeze: Option<AbsolutePath> = None, Fixed, value "MODEL";
 
-        /// Train with antialiasing: Gaussians smaller than a pixel are faded by as much as the kernel, 0.3 or 0.1 px²,
-        /// widens them, so that the model also suits other resolutions; none: without (default: as the model of --init
+        /// Lower the opacity of Gaussians smaller than a pixel, to make up for the kernel (0.3 or 0.1 px²) that widens
+        /// them, so that the model also suits other resolutions; none: no antialiasing (default: as the model of --init
         /// or --freeze, else none; without KERNEL: 0.3)
         #[arg(num_args = 0..=1, require_equals = true, default_missing_value = "0.3")]
         antialias: Option<Antialiasing> = None, Fixed, value "KERNEL";

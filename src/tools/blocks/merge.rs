@@ -9,9 +9,9 @@ use super::{Block, BlockPlan, Task, run_folder};
 use densify_core::files::{WriteError, write_checked};
 use densify_core::gaussians::{Gaussians, sh_coefficients};
 use densify_core::pieces::ROWS_AT_A_TIME;
-use densify_data::models::{Format, Frame, Shape};
+use densify_data::models::{Format, Frame, Shape, offset_text};
 use densify_run::failure::{Failure, OTHER};
-use densify_run::finished::{iteration, read_model};
+use densify_run::finished::{iteration, read_model, say_unstated};
 use densify_run::{Observer, RunConfig, Silent};
 use densify_train::importance::{footprints, largest};
 use densify_train::output::model_path;
@@ -77,7 +77,8 @@ pub fn merge(
         let antialiasing = *stated.get_or_insert(part.antialiasing);
         if part.antialiasing != antialiasing {
             return Err(Failure::input(format!(
-                "{}: its antialiasing is {}, that of the blocks before it {antialiasing}; train it again",
+                "{} was trained with antialiasing {}, but the blocks before it with {antialiasing}; train this block \
+                 again",
                 plan.block[index].name, part.antialiasing
             )));
         }
@@ -106,6 +107,10 @@ pub fn merge(
         Ok::<_, Failure>(format.write_sidecar(frame, output, written)?)
     })?;
     format.remove_old_sidecar(frame, output)?;
+    if let Some(offset) = frame.offset() {
+        observer.say(format_args!("coords   local, from the offset {}", offset_text(offset)));
+    }
+    say_unstated(format, output, frame, antialiasing, observer);
     let bytes = File::open(output).and_then(|file| file.metadata());
     let bytes = bytes.map_err(|error| Failure::input(format!("{}: {error}", output.display())))?;
     Ok(Merged { rows, bytes: bytes.len(), missing })

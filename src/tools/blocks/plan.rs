@@ -20,6 +20,7 @@ use densify_core::gaussians::{MAX_SH_DEGREE, sh_coefficients};
 use densify_core::memory::Bytes;
 use densify_core::numbers::grouped;
 use densify_data::dataset::{Dataset, builtin, view_line};
+use densify_data::models::Coordinates;
 use densify_run::failure::Failure;
 use densify_run::{
     AbsolutePath, Budget, Host, InitChoice, ModelSize, Observer, Partial, RunSpec, ShDegree,
@@ -119,6 +120,11 @@ impl<'a> Planner<'a> {
             return Err(Failure::input(
                 "--exposure auto: each block would decide for itself, and the blocks of a model must agree; give on \
                  or off",
+            ));
+        }
+        if spec.output.coordinates == Coordinates::Double {
+            return Err(Failure::input(
+                "--coordinates double: a merged model has world or local coordinates; give local, or leave it out",
             ));
         }
         let sh_degree = match spec.size.sh_degree {

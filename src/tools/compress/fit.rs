@@ -6,10 +6,10 @@ use std::path::Path;
 use super::{Options, Target};
 use densify_core::gaussians::Gaussians;
 use densify_core::numbers::grouped;
-use densify_data::models::{Coordinates, Format, is_unfit, remove_sidecar};
+use densify_data::models::{Format, Frame, is_unfit, remove_sidecar};
 use densify_run::Observer;
 use densify_run::failure::{Failure, INPUT, OTHER};
-use densify_run::finished::write_model;
+use densify_run::finished::write_in_frame;
 use densify_train::importance::{footprints, largest};
 
 /// Fraction of the size that an estimate aims at: training changes the compression ratio.
@@ -71,8 +71,7 @@ fn write_scratch(
     model: &Gaussians,
     observer: &dyn Observer,
 ) -> Result<(), Failure> {
-    let coordinates = if model.is_local() { Coordinates::Local } else { Coordinates::World };
-    write_model(format, scratch, model, coordinates, observer)?;
+    write_in_frame(format, scratch, model, Frame::from_origin(model.origin), observer)?;
     Ok(remove_sidecar(scratch)?)
 }
 

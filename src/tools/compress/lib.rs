@@ -19,10 +19,10 @@ use densify_core::antialiasing::Antialiasing;
 use densify_core::files::{FileError, folder_of, write_atomically};
 use densify_core::gaussians::Gaussians;
 use densify_core::numbers::{gaussians, grouped};
-use densify_data::models::{Coarseness, Format, PLY, local_origin};
+use densify_data::models::{Coarseness, Format, Frame, PLY, local_origin, offset_text};
 use densify_run::failure::Failure;
-use densify_run::finished::{read_model, read_model_as};
-use densify_run::{DataSpec, DeviceSpec, Fraction, Observer};
+use densify_run::finished::{read_model, read_model_as, say_unstated};
+use densify_run::{DataSpec, DeviceSpec, Fraction, Observer, Silent};
 use densify_train::exposure::ExposureModel;
 use evaluator::Evaluator;
 use fit::Packing;
@@ -153,6 +153,11 @@ pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compre
     };
     let file = file(options.output, allowed_formats, format);
     format.save(&small, &file)?;
+    let (frame, antialiasing) = (Frame::from_origin(small.origin), search.model.antialiasing);
+    if let Some(offset) = frame.offset() {
+        observer.say(format_args!("coords   local, from the offset {}", offset_text(offset)));
+    }
+    say_unstated(format, &file, frame, antialiasing, observer);
     Ok(Compressed { whole, stages: best_stages, attempts, best, file })
 }
 
@@ -186,8 +191,12 @@ impl Search<'_> {
         stages: &mut Vec<Attempt>,
     ) -> Result<Option<(Attempt, Gaussians)>, Failure> {
         let Self { options, observer, scratch, .. } = self;
-        let start = self.start(degree);
         let Packing { format, rows, .. } = *packing;
+        let mut start = self.start(degree);
+        if !format.states(start.antialiasing) {
+            // As the file will be rendered.
+            start.antialiasing = Antialiasing::Wide;
+        }
         let tuned = if self.keeps_everything(packing, degree) {
             start
         } else {
@@ -220,7 +229,7 @@ impl Search<'_> {
     ) -> Result<Attempt, Failure> {
         write_atomically(&self.scratch, |out| format.write(model, out))?;
         // The temporary file has no sidecar.
-        let found = Gaussians { origin: model.origin, ..read_model(&self.scratch, self.observer)? };
+        let found = Gaussians { origin: model.origin, ..read_model(&self.scratch, &Silent)? };
         self.evaluator.evaluate(found, format, bytes)
     }
 }

@@ -11,7 +11,7 @@ use densify_data::models::{Coordinates, Format, PLY};
 use densify_run::failure::Failure;
 use densify_run::finished::read_model;
 use densify_run::{
-    AbsolutePath, Assignment, Budget, InitChoice, Observer, Run, RunSpec, ShDegree, Whole,
+    AbsolutePath, Assignment, Budget, InitChoice, Observer, Run, RunSpec, ShDegree, Silent, Whole,
 };
 use densify_train::exposure::ExposureChoice;
 
@@ -61,7 +61,7 @@ pub(super) fn tune(
             write_atomically(scratch, |out| format.write(&model, out))?;
             let origin = model.origin;
             // The temporary file has no sidecar.
-            model = Gaussians { origin, ..read_model(scratch, observer)? };
+            model = Gaussians { origin, ..read_model(scratch, &Silent)? };
             let setting = (model.len(), adaptation_steps);
             model = train(model, setting, true, options, scratch, observer)?;
         }

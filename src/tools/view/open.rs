@@ -111,6 +111,9 @@ pub fn open(
         if dataset.is_some() {
             return Err(not_viewable(path).and("--scene is for a run or a model"));
         }
+        if antialias.is_some() {
+            return Err(not_viewable(path).and("--antialias is for a run or a model"));
+        }
         let dataset = load(path, &data, observer).map_err(|failure| match builtin::name(path) {
             Some(_) => failure,
             None => not_viewable(path).and(&failure.to_string()),

@@ -19,7 +19,7 @@ struct CameraRecord<'a> {
     fx: f64,
 }
 
-/// JSON of cameras in world coordinates with the names of their images, numbered in order.
+/// JSON of cameras in the coordinates of the model's file with the names of their images, numbered in order.
 pub fn cameras_json<'a>(
     cameras: impl IntoIterator<Item = (&'a str, Camera)>,
 ) -> serde_json::Result<String> {

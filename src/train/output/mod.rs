@@ -3,7 +3,7 @@
 //! ```text
 //! RUN/
 //!   config.toml                                  everything needed to reproduce the run
-//!   cameras.json                                 all cameras, world coordinates
+//!   cameras.json                                 all cameras, in the coordinates of the saved model
 //!   point_cloud/iteration_N/point_cloud.ply      the model
 //!   point_cloud/iteration_N/exposure.json        exposures of the training views
 //!   checkpoints/iteration_N.safetensors          state for continuing the run

@@ -60,6 +60,10 @@ fn antialiasing_is_carried_through_every_command() {
     assert!(outcome.stdout.contains("cannot state the kernel"), "{outcome:?}");
     assert_eq!(export(&narrow, "narrow.sog", "").0, Narrow);
     assert_eq!(export(&run, "none.ply", "--antialias=none").0, None);
+    let small = root.path().join("small.ply");
+    let flags = format!("--to 100 -o {} --iterations 10 --backend cpu", text(&small));
+    call(&format!("compress {} {flags}", text(&run))).ok();
+    assert_eq!(stated(&small), Wide);
 
     // Scores depend on it.
     let score = |flags: &str| {
@@ -86,6 +90,8 @@ fn antialiasing_is_carried_through_every_command() {
     assert_eq!(stated(&model_path(&around, 4)), Narrow);
     let both = format!("--init {} --freeze {}", text(&ply), text(&narrow));
     from(&both, "no").0.refused("both", &["--init", "--freeze", "--antialias"]);
+    call(&format!("plan {} --budget 900 {both}", text(scene.path())))
+        .refused("both", &["--init", "--freeze", "--antialias"]);
     let (outcome, chosen) = from(&format!("{both} --antialias=none"), "chosen");
     outcome.ok();
     assert_eq!(stated(&model_path(&chosen, 4)), None);

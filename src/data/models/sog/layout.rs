@@ -5,6 +5,8 @@
 
 /// The file that describes the images.
 pub(super) const META: &str = "meta.json";
+/// Key of the offset of local coordinates in the `asset` of `meta.json`: densify's own.
+pub(super) const OFFSET: &str = "offset";
 /// The `model` in `meta.json` of a model with antialiasing.
 pub(super) const ANTIALIASED: &str = "antialiased";
 /// Entries of the palette in a row of its image.

@@ -7,11 +7,11 @@ use image::{ImageDecoder, ImageFormat};
 use serde::Deserialize;
 use serde_json::Value;
 
-use super::layout::{ANTIALIASED, CODEBOOK, FIRST_LARGEST, META, PALETTE_WIDTH};
+use super::layout::{ANTIALIASED, CODEBOOK, FIRST_LARGEST, META, OFFSET, PALETTE_WIDTH};
 use crate::error::LoadError;
 use crate::models::quantise::{from_smallest_three, quantised_logit};
 use crate::models::rows::{Row, Rows, SplatFile};
-use crate::models::statement::{note, of_json};
+use crate::models::statement::{KERNEL, note, of_json};
 use crate::models::zip::ZipReader;
 use crate::models::{ModelFile, siblings};
 use crate::picture_file;
@@ -44,12 +44,24 @@ struct Meta {
 impl Meta {
     /// The antialiasing, and a sentence on it unless its kernel is stated.
     fn antialiasing(&self, path: &Path) -> Result<(Antialiasing, Option<String>), LoadError> {
-        if self.model != ANTIALIASED && self.antialias != true {
-            return Ok((Antialiasing::None, None));
-        }
+        let is_on = self.model == ANTIALIASED || self.antialias == true;
         Ok(match of_json(path, "asset", &self.asset)? {
+            Some(stated) if stated.is_on() != is_on => {
+                let problem = format!("it is {stated}, which contradicts `model`");
+                return Err(LoadError::damaged(path, format!("asset.{KERNEL}"), problem));
+            }
             Some(stated) => (stated, None),
-            None => (Antialiasing::Wide, Some(note(Antialiasing::Wide, META))),
+            None if is_on => (Antialiasing::Wide, Some(note(Antialiasing::Wide, META))),
+            None => (Antialiasing::None, None),
+        })
+    }
+
+    /// The offset of local coordinates; 0 for world coordinates.
+    fn offset(&self, path: &Path) -> Result<[f64; 3], LoadError> {
+        let Some(stated) = self.asset.get(OFFSET) else { return Ok([0.0; 3]) };
+        let offset = <[f64; 3]>::deserialize(stated).ok();
+        offset.filter(|offset| offset.iter().all(|axis| axis.is_finite())).ok_or_else(|| {
+            LoadError::damaged(path, format!("asset.{OFFSET}"), "it is not three numbers")
         })
     }
 }
@@ -216,6 +228,7 @@ fn read_images(
     let mut file = rows.finish(path)?;
     let (antialiasing, note) = meta.antialiasing(path)?;
     file.gaussians.antialiasing = antialiasing;
+    file.gaussians.origin = meta.offset(path)?;
     file.notes.extend(note);
     Ok(file)
 }

@@ -6,14 +6,14 @@ use serde_json::json;
 
 use super::VARIANTS;
 use super::codebook::Codebook;
-use super::layout::{ANTIALIASED, FIRST_LARGEST, META, PALETTE_WIDTH};
+use super::layout::{ANTIALIASED, FIRST_LARGEST, META, OFFSET, PALETTE_WIDTH};
 use super::palette::{self, Palette};
 use super::picture::{Picture, image_size};
 use crate::models::quantise::{MAX_LOG_SCALE, smallest_three};
 use crate::models::statement::KERNEL;
-use crate::models::write::unfit;
+use crate::models::write::{NO_DOUBLE, unfit};
 use crate::models::zip::ZipWriter;
-use crate::models::{Format, ModelWriter, Shape};
+use crate::models::{Format, Frame, ModelWriter, Shape};
 use densify_core::antialiasing::Antialiasing;
 use densify_core::gaussians::{Gaussians, sh_coefficients, sigmoid};
 
@@ -29,6 +29,7 @@ pub(super) struct SogWriter {
     sharing: Option<usize>,
     sh_degree: u8,
     antialiasing: Antialiasing,
+    offset: Option<[f64; 3]>,
     means: Vec<[f32; 3]>,
     log_scales: Vec<[f32; 3]>,
     quats: Vec<[u8; 4]>,
@@ -57,6 +58,14 @@ impl ModelWriter for SogWriter {
 
     fn variants(&self) -> &'static [Format] {
         &VARIANTS
+    }
+
+    fn set_frame(&mut self, frame: Frame) -> io::Result<bool> {
+        if frame.is_double {
+            return Err(unfit(NO_DOUBLE));
+        }
+        self.offset = frame.offset();
+        Ok(true)
     }
 
     fn begin(&mut self, shape: Shape, _out: &mut dyn Write) -> io::Result<()> {
@@ -144,6 +153,9 @@ impl ModelWriter for SogWriter {
         if self.antialiasing.is_on() {
             meta["model"] = json!(ANTIALIASED);
             meta["asset"][KERNEL] = json!(self.antialiasing);
+        }
+        if let Some(offset) = self.offset {
+            meta["asset"][OFFSET] = json!(offset);
         }
         if self.sh_degree > 0 {
             meta["shN"] = self.bands(&mut archive, (width, height))?;

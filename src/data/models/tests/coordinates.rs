@@ -4,7 +4,9 @@ use std::path::Path;
 
 use super::round_trips::plausible;
 use super::{saved, written};
-use crate::models::{Frame, PLY, export_formats, find, read_model, sidecar_path};
+use crate::models::{
+    Frame, PLY, export_formats, find, is_fine, local_origin, read_model, sidecar_path,
+};
 use densify_core::gaussians::Gaussians;
 
 /// As in UTM `[m]`.
@@ -55,7 +57,7 @@ fn every_format_keeps_local_coordinates_and_their_offset() {
     }
     let states = ["ply", "compressed-ply", "glb", "spz", "spz-v4", "sog"]
         .map(|name| find(name).unwrap().states_offset());
-    assert_eq!(states, [true, true, true, false, false, false]);
+    assert_eq!(states, [true, true, true, false, false, true]);
 }
 
 #[test]
@@ -126,6 +128,49 @@ fn damaged_sidecars_are_refused_by_file_and_field() {
     PLY.save(&remote(), &path).unwrap();
     std::fs::write(sidecar_path(&path), "{\"offset\": [1, 2, 3]}").unwrap();
     refused(&path, &["model.ply.offset.json", "offset", "512345.5"]);
+}
+
+#[test]
+fn damaged_statements_in_a_sog_are_refused_by_file_and_field() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("model.sog");
+    find("sog").unwrap().save(&remote(), &path).unwrap();
+    let whole = std::fs::read(&path).unwrap();
+    let own = b"\"offset\":[512345.5,5400123.25,-81.125]";
+    let at = find_bytes(&whole, own);
+    for (text, field) in [
+        ("\"offset\":[5]", "asset.offset"),
+        ("\"offset\":7", "asset.offset"),
+        ("\"antialiasing\":\"0.7\"", "asset.antialiasing"),
+        ("\"antialiasing\":\"0.3\"", "asset.antialiasing"),
+    ] {
+        let mut bytes = whole.clone();
+        let text = format!("{text:width$}", width = own.len());
+        bytes[at..at + own.len()].copy_from_slice(text.as_bytes());
+        std::fs::write(&path, bytes).unwrap();
+        refused(&path, &["model.sog", field]);
+    }
+}
+
+#[test]
+fn an_offset_that_gains_nothing_is_not_kept() {
+    let mut model = plausible(300, 1);
+    model.origin = [1.0, 0.0, 0.0];
+    assert!(is_fine(&model));
+    model.means.iter_mut().for_each(|mean| mean[1] += 5.4e6);
+    assert!(!is_fine(&model));
+    assert!((local_origin(&model)[1] - 5.4e6).abs() < 10.0, "{:?}", local_origin(&model));
+}
+
+#[test]
+fn a_name_that_leaves_no_room_for_a_sidecar_needs_none() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join(format!("{}.spz", "n".repeat(246)));
+    let model = plausible(40, 0);
+    find("spz").unwrap().save(&model, &path).unwrap();
+    assert_eq!(read_model(&path).unwrap().gaussians.len(), 40);
+    assert!(find("spz").unwrap().save(&remote(), &path).is_err());
+    assert_eq!(read_model(&path).unwrap().gaussians.len(), 40);
 }
 
 #[test]
