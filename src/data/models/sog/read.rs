@@ -265,3 +265,36 @@ fn decode(path: &Path, name: &str, bytes: &[u8], length: u64) -> Result<Picture,
     let decoded = image::DynamicImage::from_decoder(decoder).map_err(|e| bad(e.to_string()))?;
     Ok(Picture { width: width as usize, rgba: decoded.into_rgba8().into_raw() })
 }
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn statements_that_are_damaged_or_contradict_each_other_are_refused_by_field() {
+        let meta = |asset: Value, model: &str| {
+            let quantity = json!({"files": []});
+            let (means, scales, quats, sh0) = (&quantity, &quantity, &quantity, &quantity);
+            let all = json!({
+                "asset": asset, "model": model,
+                "means": means, "scales": scales, "quats": quats, "sh0": sh0,
+            });
+            serde_json::from_value::<Meta>(all).unwrap()
+        };
+        let path = Path::new("model.sog");
+        let good = meta(json!({"offset": [1, 2, 3.5], "antialiasing": "0.1"}), ANTIALIASED);
+        assert_eq!(good.offset(path).unwrap().map(f64::to_bits), [1.0, 2.0, 3.5].map(f64::to_bits));
+        assert_eq!(good.antialiasing(path).unwrap(), (Antialiasing::Narrow, None));
+        for offset in [json!([5]), json!(7), json!([1, 2, "3"]), json!([1, 2, null])] {
+            let error = meta(json!({"offset": offset}), "").offset(path).unwrap_err().to_string();
+            assert!(error.contains("model.sog") && error.contains("asset.offset"), "{error}");
+        }
+        for (kernel, model) in [("0.7", ANTIALIASED), ("0.3", ""), ("none", ANTIALIASED)] {
+            let error = meta(json!({"antialiasing": kernel}), model).antialiasing(path);
+            let error = error.unwrap_err().to_string();
+            assert!(error.contains("asset.antialiasing"), "{error}");
+        }
+    }
+}

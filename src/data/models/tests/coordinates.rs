@@ -131,28 +131,6 @@ fn damaged_sidecars_are_refused_by_file_and_field() {
 }
 
 #[test]
-fn damaged_statements_in_a_sog_are_refused_by_file_and_field() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("model.sog");
-    find("sog").unwrap().save(&remote(), &path).unwrap();
-    let whole = std::fs::read(&path).unwrap();
-    let own = b"\"offset\":[512345.5,5400123.25,-81.125]";
-    let at = find_bytes(&whole, own);
-    for (text, field) in [
-        ("\"offset\":[5]", "asset.offset"),
-        ("\"offset\":7", "asset.offset"),
-        ("\"antialiasing\":\"0.7\"", "asset.antialiasing"),
-        ("\"antialiasing\":\"0.3\"", "asset.antialiasing"),
-    ] {
-        let mut bytes = whole.clone();
-        let text = format!("{text:width$}", width = own.len());
-        bytes[at..at + own.len()].copy_from_slice(text.as_bytes());
-        std::fs::write(&path, bytes).unwrap();
-        refused(&path, &["model.sog", field]);
-    }
-}
-
-#[test]
 fn an_offset_that_gains_nothing_is_not_kept() {
     let mut model = plausible(300, 1);
     model.origin = [1.0, 0.0, 0.0];
