@@ -38,6 +38,7 @@ INTENDED = [
     Intended("*", "*.out", MEMORY_TABLE, "train prints the table of memory only with -v"),
     Intended("extra/blocks", "*/logs/*.log", MEMORY_TABLE, "train prints the table of memory only with -v"),
     Intended("extra/meshes", "*/scene.json", None, "the notes of the scene generator are in plain English"),
+    Intended("*", "*config.toml", r'^coordinates = "auto"$', "an option that the reference does not have"),
 ]
 
 SCENES = {"spheres": "scene:spheres", "room256": "{data}/room256", "fox": "{data}/fox -r 8"}
