@@ -162,6 +162,17 @@ fn render_writes_images_of_the_views() {
     assert_eq!(files(&train).len(), VIEWS - 2);
 }
 
+/// A run brings its near plane, so nobody is told to give another when it is only measured.
+#[test]
+fn the_near_plane_of_a_run_is_announced_only_when_it_trains() {
+    let scene = Photographs::colmap_text();
+    let (_root, run) = scratch();
+    let said = train(scene.path(), &run, 2, "--budget 320 --eval --near 0.999").ok();
+    assert!(said.stdout.contains("nearer than --near 0.999"), "{said:?}");
+    let said = call(&format!("eval {} --backend cpu", text(&run))).ok();
+    assert!(!said.stdout.contains("--near"), "{said:?}");
+}
+
 #[test]
 fn a_bare_model_renders_like_its_run() {
     let scene = Photographs::colmap_text();
