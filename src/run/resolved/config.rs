@@ -138,7 +138,7 @@ impl RunConfig {
             Init::Model(file) => InitChoice::Model(file.clone()),
         });
         spec.start.freeze.clone_from(&inputs.frozen_file);
-        // A run without antialiasing that did not ask for it says nothing.
+        // Without antialiasing, the option is written only if it was given.
         if choices.antialiasing.is_on() {
             spec.start.antialias = Some(choices.antialiasing);
         }

@@ -109,7 +109,7 @@ impl Exposure {
             ExposureSource::Given if self.is_on => Some(match (self.by_tracks, self.exif_use) {
                 (true, _) => {
                     format!(
-                        "exposure on, from the gains of points in several views{}",
+                        "exposure on, from the colours of points in several views{}",
                         self.exif_views()
                     )
                 }

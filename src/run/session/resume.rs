@@ -110,7 +110,7 @@ fn overlay(mut given: Partial, saved: &RunConfig, origin: &str) -> Result<RunSpe
             _ => {}
         }
     }
-    // A run's folder stands for the model of it that was read.
+    // The folder of a run is accepted in place of the saved path, which names a model in it.
     for option in ["init", "freeze"] {
         let path =
             |options: &Partial| options.get(option).and_then(Value::as_str).map(PathBuf::from);
