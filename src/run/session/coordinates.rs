@@ -45,8 +45,8 @@ impl Session<'_> {
         Ok(if is_automatic { (local, None) } else { (Frame::WORLD, Some(coarseness)) })
     }
 
-    /// Rounds the means as the saved file does, if that makes a difference, so that the quality of the file is measured.
-    /// Returns the exact means, to be [restored](Self::restore_means).
+    /// Rounds the means as the saved file does, if that makes a difference, so that the quality of the file is
+    /// measured. Returns the exact means, to be [restored](Self::restore_means).
     pub(super) fn round_means_as_saved(&mut self) -> Result<Option<Vec<f32>>, Failure> {
         if self.run.spec.output.coordinates != Coordinates::World
             || self.choose_frame()?.1.is_none()

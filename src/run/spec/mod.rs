@@ -172,8 +172,8 @@ run_spec! {
         scene: Option<PathBuf> = None, Free;
 
         /// Source of the first Gaussians: one on each of the dataset's points, random places, or a model in the
-        /// dataset's coordinates: a file by any program, or a run's folder (default: points if the dataset has any, else
-        /// random)
+        /// dataset's coordinates: a file by any program, or a run's folder (default: points if the dataset has any,
+        /// else random)
         ///
         /// If the model has more Gaussians than the budget, those that contribute most to the training views are kept.
         /// Its colours are cut or extended to --sh-degree

@@ -190,8 +190,8 @@ fn subsample(model: &Gaussians, rows: usize) -> Gaussians {
     model.gather(&(0..rows).map(row).collect::<Vec<_>>())
 }
 
-/// Drops rows, the faintest and smallest first, until the model's file is small enough. Returns the model and the size of
-/// its file; `None` if no row is left.
+/// Drops rows, the faintest and smallest first, until the model's file is small enough. Returns the model and the size
+/// of its file; `None` if no row is left.
 pub(super) fn trim(
     to: Target,
     format: &Format,

@@ -1,5 +1,5 @@
-//! Inspection of trained models: pictures and depth, films along camera paths, comparison with other formats, and limits on
-//! scores. Prints nothing.
+//! Inspection of trained models: pictures and depth, films along camera paths, comparison with other formats, and
+//! limits on scores. Prints nothing.
 
 mod animation;
 mod fidelity;

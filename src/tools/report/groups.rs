@@ -59,7 +59,7 @@ pub(super) fn group(runs: &[RunRecord]) -> Result<Vec<Scene>, Failure> {
                 let same = scenes.iter().filter(|(scene, ..)| scene.label.starts_with(&label));
                 let label = match same.count() {
                     0 => label,
-                    others => format!("{label}, read another way ({})", others + 1),
+                    others => format!("{label}, other reading options ({})", others + 1),
                 };
                 let scene = Scene { label, path, data, groups: Vec::new() };
                 scenes.push((scene, place, Vec::new()));
