@@ -10,7 +10,7 @@ use super::console::Console;
 use super::render::{ModelArgument, RenderingArgs};
 use densify_core::numbers::{grouped, percent};
 use densify_data::views::ViewSource;
-use densify_inspect::{Bound, Limit, LimitError, Limits, measured_values};
+use densify_inspect::{Limit, LimitError, Limits, Side, measured_values};
 use densify_run::RunConfig;
 use densify_run::coordinate_check::CoordinateCheck;
 use densify_run::failure::{Failure, INPUT, LIMIT};
@@ -137,9 +137,9 @@ fn in_option_names(error: LimitError) -> Failure {
         LimitError::Unknown { .. } => INPUT,
         LimitError::Exceeded(_) => LIMIT,
     };
-    let message = error.message(|bound| match bound {
-        Bound::Lowest => "--fail-below",
-        Bound::Highest => "--fail-above",
+    let message = error.message(|side| match side {
+        Side::Lowest => "--fail-below",
+        Side::Highest => "--fail-above",
     });
     Failure::new(code, message)
 }

@@ -11,8 +11,8 @@ use densify_core::files::{self, WriteError};
 use densify_core::gaussians::Gaussians;
 use densify_data::dataset::is_archive;
 use densify_data::models::{
-    self, Coarseness, Coordinates, Format, Frame, fitting_format, is_fine, is_unfit, local_origin,
-    sidecar_path,
+    self, Coarseness, Coordinates, Format, Frame, fitting_format, is_finer_than_f32, is_unfit,
+    local_origin, sidecar_path,
 };
 use densify_train::checkpoint::newest_step;
 use densify_train::output::{is_in_use, model_path, saved_iterations};
@@ -181,7 +181,7 @@ fn placed<'a>(
         Coordinates::Auto | Coordinates::World => {}
     }
     let coarseness = Coarseness::measure(model);
-    let is_fine = is_fine(model);
+    let is_fine = is_finer_than_f32(model);
     if !coarseness.is_noted() {
         return in_frame(Frame::WORLD);
     }

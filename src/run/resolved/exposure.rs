@@ -52,7 +52,7 @@ impl Exposure {
         let measured = colours.map(ExposureSpread::measure);
         let decided = measured
             .as_ref()
-            .and_then(|(found, gains)| Some((found.decides(gains.len())?, *found)));
+            .and_then(|(found, gains)| Some((found.decision(gains.len())?, *found)));
         let (is_on, source) = match spec.schedule.exposure {
             ExposureChoice::Off => (false, ExposureSource::Given),
             ExposureChoice::On => (true, ExposureSource::Given),

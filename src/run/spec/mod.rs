@@ -137,7 +137,7 @@ run_spec! {
         views: Option<AbsolutePath> = None, Fixed, value "FILE";
 
         /// Treatment of views whose camera is more than 10 times as far from the others as usual, if at most one view
-        /// in 20 is such a view: structure from motion misplaces some cameras
+        /// in 20 has such a camera: structure from motion misplaces some
         far_cameras: FarCameras = FarCameras::LeaveOut, Fixed, value "WHAT";
 
         /// Keep the full field of view of a distorted lens, and mask pixels that the lens did not see; by default
