@@ -15,7 +15,7 @@ use crate::photographs::Photographs;
 use crate::subject::devices;
 
 const ITERATIONS: u32 = 202;
-/// The step to resume from, within an epoch of 12 views and any interval of `frequent_edits`.
+/// The step to resume from: neither the end of an epoch of 12 views nor a multiple of any interval of `frequent_edits`.
 const HALF: u32 = 101;
 
 fn checkpoint(run: &Path, step: u32) -> std::path::PathBuf {
