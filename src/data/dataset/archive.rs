@@ -166,7 +166,7 @@ fn open(path: &Path) -> Result<ZipArchive<BufReader<File>>, LoadError> {
 /// Largest unpacked size that is accepted `[bytes]`.
 fn max_unpacked_bytes(path: &Path) -> Result<u64, LoadError> {
     let packed = fs::metadata(path).map_err(LoadError::io(path))?.len();
-    Ok(files::most_unpacked(packed))
+    Ok(files::max_unpacked_bytes(packed))
 }
 
 /// Checks the table of contents; returns the size of the unpacked files `[bytes]`.

@@ -85,7 +85,7 @@ pub(super) fn photographs(
         .collect()
 }
 
-/// The headers of a photograph whose image matches its camera.
+/// A photograph's header and lens, after they were checked against each other.
 #[derive(Debug)]
 struct Checked {
     header: ImageHeader,
@@ -200,8 +200,8 @@ fn pinhole_notes<'a>(
         let photographs = lost.map(|(count, _)| count).sum();
         notes.push(if keep_fov {
             Note::Text(format!(
-                "up to {percent:.0} % of {photographs} photographs is beyond what the lens model can invert, and is \
-                 not used"
+                "up to {percent:.0} % of each of {photographs} photographs is beyond what the lens model can invert, and \
+                 is not used"
             ))
         } else {
             Note::Cropped { percent, photographs }
@@ -299,8 +299,8 @@ fn check_mask(mask: &Mask, found: ImageHeader, image: ImageHeader) -> Result<(),
 
 /// Returns true if a mask hides all of a view; `several` is true if its photograph has more than one view.
 fn is_hidden(view: &View, several: bool, mask: &GrayImage, lens: &Lens) -> bool {
-    /// Number of pixels along the longer side of a mask that are tested against each of several views; at most twice as
-    /// many are.
+    /// If a photograph has several views, at least this many pixels along the longer side of its mask are tested, and
+    /// at most twice as many.
     const SAMPLED_SIDE: u32 = 512;
     let (width, height) = mask.dimensions();
     let stride = if several { (width.max(height) / SAMPLED_SIDE).max(1) } else { 1 } as usize;

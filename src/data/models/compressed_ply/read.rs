@@ -7,7 +7,7 @@ use crate::error::LoadError;
 use crate::models::ply::layout::{OFFSET, sh_degree};
 use crate::models::quantise::{from_smallest_three, quantised_logit};
 use crate::models::rows::{Row, Rows, SplatFile};
-use crate::models::statement::of_comments;
+use crate::models::statement::stated_in_comments;
 use crate::ply::{Element, Ply};
 use densify_core::gaussians::{rgb_to_dc, sh_coefficients};
 
@@ -78,7 +78,7 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
         }
     }
 
-    let (antialiasing, note) = of_comments(path, ply.comments())?;
+    let (antialiasing, note) = stated_in_comments(path, ply.comments())?;
     let mut rows = Rows::new(sh_degree);
     let mut colours = vec![0.0; 3 + rest];
     for (index, words) in vertices.iter().enumerate() {

@@ -20,7 +20,7 @@ pub(super) fn image_size(rows: usize) -> (usize, usize) {
 }
 
 impl Picture {
-    /// An image without pixels.
+    /// An image of this size, whose pixels are still to be [filled](Self::fill).
     pub(super) fn new(width: usize, height: usize) -> Self {
         Self { width, height, rgba: Vec::with_capacity(4 * width * height) }
     }

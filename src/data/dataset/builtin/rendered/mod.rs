@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use super::PREFIX;
 use crate::dataset::images::ImageSource;
 use crate::dataset::photographs::{Photograph, target_size};
-use crate::dataset::prepare::{assemble, texts};
+use crate::dataset::prepare::{assemble, text_notes};
 use crate::dataset::tracks::TrackSampler;
 use crate::dataset::{self, Dataset, LoadError, LoadOptions, PointCloud, View};
 use densify_core::camera::Camera;
@@ -153,7 +153,7 @@ fn dataset(
         surface_bytes: Some(about.surface_bytes),
         ..dataset::Scene::default()
     };
-    assemble(path, photographs, read, texts(about.notes), options)
+    assemble(path, photographs, read, text_notes(about.notes), options)
 }
 
 /// Converts the camera of a rendered view.
