@@ -1,5 +1,5 @@
 //! Tests with the meshes of the shared data: valid files render, files that need unsupported extensions are
-//! refused with a message that names these, and each malformed file has the outcome listed in `malformed.tsv`.
+//! refused with a message that names them, and each malformed file has the outcome listed in `malformed.tsv`.
 //!
 //! Most files with a validator's report have no scene, so each is read twice: unchanged, and with a buffer of
 //! zeros and a scene of all its meshes (if it has none, of meshes made from its accessors or buffer views). Some
