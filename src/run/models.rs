@@ -228,7 +228,7 @@ pub fn say_unstated(
     antialiasing: Antialiasing,
     observer: &dyn Observer,
 ) {
-    if !format.states(antialiasing) {
+    if !format.states_antialiasing(antialiasing) {
         observer.say(format_args!(
             "note: {} cannot state the kernel of the antialiasing, {antialiasing}; readers assume 0.3 px², which \
              makes small Gaussians fainter; the other formats state it",

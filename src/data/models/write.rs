@@ -51,7 +51,7 @@ pub trait ModelWriter {
     }
 
     /// True if files can state this antialiasing; if not, readers use another kernel.
-    fn states(&self, _antialiasing: Antialiasing) -> bool {
+    fn states_antialiasing(&self, _antialiasing: Antialiasing) -> bool {
         true
     }
 
@@ -135,9 +135,9 @@ impl Format {
         self.writer.is_some_and(|make| make().is_lossy())
     }
 
-    /// [`ModelWriter::states`] of this format; true if densify does not write it.
-    pub fn states(&self, antialiasing: Antialiasing) -> bool {
-        self.writer.is_none_or(|make| make().states(antialiasing))
+    /// [`ModelWriter::states_antialiasing`] of this format; true if densify does not write it.
+    pub fn states_antialiasing(&self, antialiasing: Antialiasing) -> bool {
+        self.writer.is_none_or(|make| make().states_antialiasing(antialiasing))
     }
 
     /// [`ModelWriter::variants`] of this format; none if densify does not write it.

@@ -193,7 +193,7 @@ impl Search<'_> {
         let Self { options, observer, scratch, .. } = self;
         let Packing { format, rows, .. } = *packing;
         let mut start = self.start(degree);
-        if !format.states(start.antialiasing) {
+        if !format.states_antialiasing(start.antialiasing) {
             // Readers of the file will assume this kernel.
             start.antialiasing = Antialiasing::Wide;
         }

@@ -52,7 +52,7 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
     let bounds = if has_colour_bounds { &BOUNDS[..] } else { &BOUNDS[..12] };
     let bounds = columns(path, &chunk, bounds.iter().map(|&name| name.to_owned()))?;
     let words = columns(path, &vertex, WORDS.iter().map(|&name| name.to_owned()))?;
-    let bytes = match &sh {
+    let coefficients = match &sh {
         None => Vec::new(),
         Some(sh) => columns(path, sh, (0..rest).map(|i| format!("f_rest_{i}")))?,
     };
@@ -71,7 +71,7 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
             "vertex" => ply.each_row(&vertex, &words, |row| {
                 vertices.push([row[0], row[1], row[2], row[3]].map(|word| word as u32));
             })?,
-            "sh" => ply.each_row(&element, &bytes, |row| {
+            "sh" => ply.each_row(&element, &coefficients, |row| {
                 bands.extend(row.iter().map(|&byte| byte as u8));
             })?,
             _ => {}

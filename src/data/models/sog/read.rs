@@ -108,7 +108,10 @@ pub(super) fn read(file: ModelFile<'_>) -> Result<SplatFile, LoadError> {
             let mut bytes = Vec::new();
             let image = siblings::open(path, "files", name)?;
             // No image within the limits is larger.
-            image.take(max_unpacked_bytes(0)).read_to_end(&mut bytes).map_err(LoadError::io(path))?;
+            image
+                .take(max_unpacked_bytes(0))
+                .read_to_end(&mut bytes)
+                .map_err(LoadError::io(path))?;
             Ok(bytes)
         });
     }

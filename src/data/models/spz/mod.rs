@@ -37,7 +37,7 @@ const VERSION_4: Format = Format {
     summary: "SPZ version 4: the same values in zstd frames, which some readers do not support",
     // The reader of `spz` reads all versions.
     reader: None,
-    writer: Some(|| Box::new(SpzWriter::in_frames())),
+    writer: Some(|| Box::new(SpzWriter::version_4())),
     compress_rank: None,
 };
 

@@ -98,7 +98,8 @@ impl Dataset {
     pub fn ground_truth(&self) -> Result<Option<GroundTruth>, LoadError> {
         if let Some(unpacked) = &self.unpacked {
             let found = GroundTruth::open(unpacked.folder());
-            return found.map_err(|error| LoadError::Data(unpacked.named(&error.to_string())));
+            return found
+                .map_err(|error| LoadError::Data(unpacked.with_archive_name(&error.to_string())));
         }
         let Some(name) = super::name(&self.root) else { return Ok(GroundTruth::open(&self.root)?) };
         let scene = Scene::prepare(&Source::Preset(name.to_owned()), &Options::default())?;
