@@ -223,7 +223,7 @@ impl RunConfig {
     /// When there is none, or it is malformed.
     pub fn read(run: &Path) -> Result<Self, Failure> {
         let path = run.join(CONFIG_FILE);
-        let text = densify_core::files::read_text(&path, densify_core::files::MAX_OPTIONS)
+        let text = densify_core::files::read_text(&path, densify_core::files::MAX_OPTIONS_BYTES)
             .map_err(|error| match error.kind() {
                 _ if is_archive(run) => Failure::input(format!(
                     "{} is a ZIP archive, but no SOG model; unpack it, and name a file of Gaussian splats, or the folder of \
