@@ -9,7 +9,7 @@ use crate::resolved::{DegreeSource, ExposureSource, RunConfig};
 use densify_core::files::FileError;
 use densify_core::gaussians::MAX_SH_DEGREE;
 use densify_core::spelling::Spelling;
-use densify_train::output::read_stats;
+use densify_train::output::read_json;
 use densify_train::trainer::{AutoBudget, MIN_GAIN};
 
 /// Path within the folder of the run.
@@ -51,7 +51,7 @@ impl Reductions {
     /// # Errors
     /// When the file cannot be read.
     pub fn read(run: &Path) -> Result<Option<Self>, FileError> {
-        read_stats(&run.join(REQUIREMENTS))
+        read_json(&run.join(REQUIREMENTS))
     }
 }
 
