@@ -167,11 +167,11 @@ fn scenegen_reports_surfaces_seen_by_few_views() {
     let room = format!("scenegen --preset room -o {} --overwrite {small}", text(&folder));
     let stdout = call(&format!("{room} --train 4")).ok().stdout;
     assert!(
-        stdout.contains("note: of 400 points wanted, ") && stdout.contains("--rig"),
+        stdout.contains(" % of 400 points could be placed, ") && stdout.contains("--rig"),
         "{stdout}"
     );
     let stdout = call(&format!("{room} --train 60").replace("--fov 25", "--fov 80")).ok().stdout;
-    assert!(!stdout.contains("points wanted"), "{stdout}");
+    assert!(!stdout.contains("could be placed"), "{stdout}");
 }
 
 #[test]
