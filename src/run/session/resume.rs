@@ -56,7 +56,7 @@ pub fn start(
     let described = given.clone().describe()?;
     let output = described.output_folder()?;
     RunFolder::check(&output, true)?;
-    RunFolder::settle(&output)?;
+    RunFolder::recover(&output)?;
     let staged = RunFolder::staged(&output);
     if let Some(staged) = staged.into_iter().find(|path| newest(path).0.is_some()) {
         return Err(ResumeProblem::InterruptedReplacement { output, staged }.into());

@@ -175,7 +175,7 @@ impl RunFolder {
     ///
     /// # Errors
     /// [`FolderError::InUse`], [`FolderError::File`].
-    pub fn settle(target: &Path) -> Result<(), FolderError> {
+    pub fn recover(target: &Path) -> Result<(), FolderError> {
         if hidden(target, OLD).is_empty() && hidden(target, REPLACED).is_empty() {
             return Ok(());
         }
