@@ -97,7 +97,7 @@ fn shared_cases_of_equal_meaning_give_the_same_images() {
     };
     for [first, others @ ..] in [
         ["ok", "meshlab_tr", "maya_kd0"],
-        ["tex128", "vc128", "vc128"],
+        ["tex128", "vc128", "tex128"],
         ["gltf/plain.gltf", "gltf/skin.gltf", "gltf/morph.gltf"],
     ] {
         let expected = views(&file(&first));

@@ -94,7 +94,12 @@ pub fn percent(value: f64) -> String {
 
 /// Formats a number of Gaussians: `1 Gaussian`, `2,000 Gaussians`.
 pub fn gaussians(number: usize) -> String {
-    format!("{} Gaussian{}", grouped(number), if number == 1 { "" } else { "s" })
+    counted(number, "Gaussian")
+}
+
+/// Formats a number of things: `1 trial`, `2,000 trials`.
+pub fn counted(number: usize, thing: &str) -> String {
+    format!("{} {thing}{}", grouped(number), if number == 1 { "" } else { "s" })
 }
 
 /// Formats 1234567 as 1,234,567.

@@ -15,6 +15,7 @@ use super::undistort::{Pinhole, Undistortion};
 use super::{Frame, LoadOptions, MaskMode, Note, Resolution, View};
 use crate::error::{LoadError, LoadRemedy};
 use densify_core::camera::Camera;
+use densify_core::numbers::counted;
 
 /// Share of a photograph that may be cropped without a note.
 const SILENTLY_CROPPED: f64 = 0.005;
@@ -139,9 +140,8 @@ fn turned_note(frames: &[Frame], checked: &[Checked]) -> Option<String> {
     let turned = || frames.iter().zip(checked).filter(|(_, checked)| checked.header.turn.is_some());
     let (first, _) = turned().next()?;
     Some(format!(
-        "{} photographs lie on their side compared with their cameras and are turned according to their EXIF (first: \
-         {})",
-        turned().count(),
+        "turned according to their EXIF, as they lie on their side compared with their cameras: {} (first: {})",
+        counted(turned().count(), "photograph"),
         first.name
     ))
 }
@@ -151,10 +151,9 @@ fn orientation_note(frames: &[Frame], checked: &[Checked]) -> Option<String> {
     let ambiguous = || frames.iter().zip(checked).filter(|(_, checked)| checked.is_turn_ambiguous);
     let first = &ambiguous().next()?.0.name;
     Some(format!(
-        "{} photographs have an EXIF orientation that asks for a quarter turn, but the pose file states no image size \
-         that would show whether its poses include it; they are used as stored (first: {first}). If the model is \
-         poor, turn the files themselves",
-        ambiguous().count()
+        "used as stored: {} whose EXIF orientation asks for a quarter turn (first: {first}); the pose file states no \
+         image size that would show whether its poses include it. If the model is poor, turn the files themselves",
+        counted(ambiguous().count(), "photograph")
     ))
 }
 

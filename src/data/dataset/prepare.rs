@@ -198,7 +198,7 @@ fn drop_bad(
     if bad as f64 > MAX_BAD_POINTS * total as f64 {
         let path = path.display();
         return Err(LoadError::Data(format!(
-            "{path}: {bad} of {total} points are not finite, more than 1 %; repair the reconstruction"
+            "{path}: {bad} of {total} points are not {condition}, more than 1 %; repair the reconstruction"
         )));
     }
     if bad > 0 {

@@ -47,7 +47,7 @@ pub(super) fn stated_in_comments(
         let words: Vec<&str> = lower.split_whitespace().collect();
         match words[..] {
             [KERNEL, kernel] => {
-                own = Some(parse_kernel(path, &format!("comment {comment:?}"), kernel)?)
+                own = Some(parse_kernel(path, &format!("comment {comment:?}"), kernel)?);
             }
             ["splatrendermode:", mode] => said = Some((mode == "mip", comment)),
             ["antialiased", number] => said = Some((number == "1", comment)),

@@ -59,10 +59,10 @@ impl<'a> Ply<'a> {
             let numbers = numbers.filter(|n| count == 3 && n.iter().all(|value| value.is_finite()));
             let numbers =
                 numbers.ok_or_else(|| wrong(format!("{:?} is not three numbers", text.trim())))?;
-            if found
-                .is_some_and(|found: [f64; 3]| found.map(f64::to_bits) != numbers.map(f64::to_bits))
+            if let Some(other) = found
+                .filter(|other: &[f64; 3]| other.map(f64::to_bits) != numbers.map(f64::to_bits))
             {
-                return Err(wrong(format!("{numbers:?} contradicts the {found:?} before it")));
+                return Err(wrong(format!("{numbers:?} contradicts the {other:?} before it")));
             }
             found = Some(numbers);
         }

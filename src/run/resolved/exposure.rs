@@ -4,7 +4,7 @@ use super::config::ExposureSource;
 use super::inputs::Evidence;
 use crate::failure::notes;
 use crate::spec::RunSpec;
-use densify_core::numbers::grouped;
+use densify_core::numbers::{counted, grouped};
 use densify_core::spelling::Spelling;
 use densify_data::dataset::Dataset;
 use densify_data::track_colours::MIN_TRACKS;
@@ -88,8 +88,8 @@ impl Exposure {
         }
         if let Some(example) = &reported.example {
             found.notes.push(format!(
-                "{} photographs have nonsense in their EXIF, which is not used ({example})",
-                reported.implausible
+                "nonsense in the EXIF of {} is not used ({example})",
+                counted(reported.implausible, "photograph")
             ));
         }
         found
@@ -189,7 +189,7 @@ mod tests {
         }
         let [note] = &found.notes[..] else { panic!("{:?}", found.notes) };
         assert!(
-            note.contains("1 photographs have nonsense") && note.contains("c.jpg says"),
+            note.contains("EXIF of 1 photograph is not") && note.contains("c.jpg says"),
             "{note}"
         );
         // Without any EXIF, all views start alike.

@@ -256,7 +256,6 @@ run_spec! {
     /// Training.
     schedule: ScheduleSpec, "Schedule" {
         /// Length of the run; every schedule scales with it
-        // Without `--preset`, the preset `balanced` sets another value.
         #[arg(short)]
         iterations: Whole<1, { u32::MAX }> = Whole(REFERENCE_ITERATIONS), Longer, value "N";
 

@@ -81,8 +81,7 @@ fn train(
     write_atomically(scratch, |out| PLY.write(&model, out))?;
     let mut spec = describe_run(&model, setting, options, scratch)?;
     if freezes_sh {
-        // With a rate this small, every step is lost to rounding.
-        spec.schedule.lr = vec![assignment("sh_rest=1e-30")?];
+        spec.schedule.lr = vec![assignment("sh_rest=0")?];
     }
     let origin = model.origin;
     spec.output.coordinates =
