@@ -14,7 +14,7 @@ pub const REFERENCE_ITERATIONS: u32 = 30_000;
 const LARGEST: f64 = 1e30;
 
 /// Checks, for [`ConfiguredPolicy::new`], that a parameter is in its range, also when rounded to `f32`, and at
-/// most 1e30 in size. The registry adds the policy's name to the error.
+/// most 1e30 in magnitude. The registry adds the policy's name to the error.
 ///
 /// [`ConfiguredPolicy::new`]: crate::registry::ConfiguredPolicy::new
 ///
@@ -40,7 +40,7 @@ pub fn in_range(parameter: &str, value: f64, range: impl RangeBounds<f64>) -> Po
         Bound::Unbounded => {}
     }
     if !is_moderate {
-        limits.push(format!("at most {LARGEST:e} in size"));
+        limits.push(format!("at most {LARGEST:e} in magnitude"));
     }
     let limits = limits.join(" and ");
     let reason = if is_in_range {
@@ -193,9 +193,12 @@ mod tests {
         let message = reason(in_range("rho", 0.0, open));
         assert_eq!(message, "0 is out of range; it must be greater than 0 and less than 1");
         let message = reason(in_range("rho", f64::NAN, ..));
-        assert_eq!(message, "NaN is out of range; it must be at most 1e30 in size");
+        assert_eq!(message, "NaN is out of range; it must be at most 1e30 in magnitude");
         let message = reason(in_range("rho", 1e39, 0.0..));
-        assert_eq!(message, "1e39 is out of range; it must be at least 0 and at most 1e30 in size");
+        assert_eq!(
+            message,
+            "1e39 is out of range; it must be at least 0 and at most 1e30 in magnitude"
+        );
         let message = reason(in_range("rho", 1e-50, (Bound::Excluded(0.0), Bound::Unbounded)));
         assert_eq!(message, "1e-50 is out of range; it must be greater than 0 as a 32-bit number");
         reason(in_range("rho", f64::INFINITY, 0.0..));

@@ -15,13 +15,13 @@ use crate::sample::{smallest, weighted};
 /// A number per row, accumulated over the auxiliary views of one event. Not part of a policy's saved state, as
 /// it is used in the same event and the next one starts from zero.
 #[derive(Debug, Default)]
-pub struct OverViews {
+pub struct ViewAccumulator {
     step: u32,
     /// Shape: `[rows]`.
     values: Vec<f32>,
 }
 
-impl OverViews {
+impl ViewAccumulator {
     /// Adds the positive values of a view of `step`. Shape: `[rows]`.
     pub fn add(&mut self, step: u32, values: &[f32]) {
         self.combine(step, values, |sum, value| sum + value);
@@ -94,7 +94,7 @@ mod tests {
     const NAN: f32 = f32::NAN;
 
     /// Takes the values at an event of `step` with `rows` rows.
-    fn take(gathered: &mut OverViews, step: u32, rows: usize) -> Option<Vec<f32>> {
+    fn take(gathered: &mut ViewAccumulator, step: u32, rows: usize) -> Option<Vec<f32>> {
         let (scene, signals) =
             (Event::new(1, 1, 1).scene, Signals::zeros(rows, SignalSet::default()));
         gathered.take(&Snapshot { step, scene: &scene, signals: &signals, candidates: &[] })
@@ -102,13 +102,13 @@ mod tests {
 
     #[test]
     fn values_are_gathered_over_the_views_of_one_event() {
-        let mut sums = OverViews::default();
+        let mut sums = ViewAccumulator::default();
         sums.add(5, &[1.0, 2.0, NAN, -3.0]);
         sums.add(5, &[0.5, NAN, 0.0, 4.0]);
         assert_eq!(take(&mut sums, 5, 4), Some(vec![1.5, 2.0, 0.0, 4.0]));
         // The values are gone after the first call.
         assert_eq!(take(&mut sums, 5, 4), None);
-        let mut largest = OverViews::default();
+        let mut largest = ViewAccumulator::default();
         largest.maximum(5, &[0.25, NAN, 0.0, -1.0]);
         largest.maximum(5, &[0.125, 0.5, NAN, -2.0]);
         assert_eq!(take(&mut largest, 5, 4), Some(vec![0.25, 0.5, 0.0, 0.0]));
@@ -116,7 +116,7 @@ mod tests {
 
     #[test]
     fn views_of_another_event_do_not_count() {
-        let mut sums = OverViews::default();
+        let mut sums = ViewAccumulator::default();
         sums.add(5, &[1.0, 2.0]);
         sums.add(6, &[0.5, 0.5]);
         assert_eq!(take(&mut sums, 6, 2), Some(vec![0.5, 0.5]));

@@ -7,12 +7,12 @@ use std::cmp::Ordering;
 
 use crate::rng::{PolicyRng, Purpose};
 
-/// The `k` rows with the largest values, largest first; ties by row, NaN last.
+/// The `k` rows with the largest values, largest first; of equal values the lower row first, NaN last.
 pub fn top_k(values: &[f32], k: usize) -> Vec<u32> {
     largest((0..values.len() as u32).collect(), values, k)
 }
 
-/// Of `rows`, the `k` with the largest `values[row]`, largest first; ties by row, NaN last.
+/// Of `rows`, the `k` with the largest `values[row]`, largest first; of equal values the lower row first, NaN last.
 ///
 /// # Panics
 /// When a row is not in `values`.
@@ -23,7 +23,7 @@ pub fn largest(rows: Vec<u32>, values: &[f32], k: usize) -> Vec<u32> {
     })
 }
 
-/// Of `rows`, the `k` with the smallest `values[row]`, smallest first; ties by row, NaN last.
+/// Of `rows`, the `k` with the smallest `values[row]`, smallest first; of equal values the lower row first, NaN last.
 ///
 /// # Panics
 /// When a row is not in `values`.

@@ -19,7 +19,7 @@ pub enum SignalKind {
     /// The smallest value of a view in which the row was visible, over the same time; +∞ if there was none.
     Minimum,
     /// Computed from the current parameters or age of the row; needs no memory.
-    Present,
+    Current,
     /// Current parameters of the row, this many numbers, copied only at events; needs no memory in between.
     Attribute(usize),
 }
@@ -129,15 +129,15 @@ signals! {
     /// Largest share of a view's pixels that the row dominates: no other has a larger blend weight. In `[0, 1]`.
     DominantPixels: Maximum "image" [];
     /// Current opacity, in (0, 1).
-    Opacity: Present "1" [];
+    Opacity: Current "1" [];
     /// Largest of the three current standard deviations `[scene units]`, > 0.
-    ScaleMax: Present "scene units" [];
+    ScaleMax: Current "scene units" [];
     /// Product of the three current standard deviations `[scene units³]`, >= 0.
-    ScaleProduct: Present "scene units³" [];
+    ScaleProduct: Current "scene units³" [];
     /// Current σ(m) of the row's [mask](crate::policy::MaskTerm), in `[0, 1]`; only if a mask is declared.
-    Mask: Present "1" [];
+    Mask: Current "1" [];
     /// Optimiser steps since the row was created or rewritten, saturating at 65,535.
-    Age: Present "steps" [];
+    Age: Current "steps" [];
     /// Current mean `[scene units]`, in the world coordinates used for training. Their origin is the mean of
     /// the training cameras, and the unit is the distance of the farthest camera, ignoring a few that are far
     /// from all others; if all cameras coincide, it is the median distance of the points. The axes are parallel

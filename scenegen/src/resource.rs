@@ -123,8 +123,7 @@ impl Folder {
         }
         let decoded = percent_decoded(uri).ok_or_else(|| {
             let uri = shortened(uri);
-            let problem =
-                format!("the URI {uri:?} has a % without two hexadecimal digits of UTF-8 after it");
+            let problem = format!("the URI {uri:?} is not percent-encoded UTF-8");
             let remedy = "give the file a name in UTF-8, and write a % in it as %25";
             Error::malformed(&self.file, element, problem, remedy)
         })?;
@@ -201,7 +200,7 @@ pub fn data_uri(uri: &str) -> Option<Vec<u8>> {
 ///
 /// # Errors
 /// When the mark is not that of UTF-8.
-pub(crate) fn without_mark(text: &[u8]) -> Result<&[u8], &'static str> {
+pub(crate) fn without_bom(text: &[u8]) -> Result<&[u8], &'static str> {
     match text {
         [0xff, 0xfe, ..] | [0xfe, 0xff, ..] => Err("it is UTF-16, not UTF-8"),
         _ => Ok(text.strip_prefix(b"\xef\xbb\xbf").unwrap_or(text)),

@@ -183,9 +183,10 @@ impl Level {
     }
 }
 
-fn range(i: u32, count: u32, of: u32) -> (u32, u32) {
-    let (i, count, of) = (u64::from(i), u64::from(count), u64::from(of));
-    ((i * of / count) as u32, ((i + 1) * of / count) as u32)
+/// The `i`-th of `count` parts of `0..total`.
+fn range(i: u32, count: u32, total: u32) -> (u32, u32) {
+    let (i, count, total) = (u64::from(i), u64::from(count), u64::from(total));
+    ((i * total / count) as u32, ((i + 1) * total / count) as u32)
 }
 
 /// Maps a coordinate into `[0, 1]` by the wrap mode. NaN becomes 0.

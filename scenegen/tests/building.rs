@@ -1,5 +1,5 @@
-//! Tests that building the tree needs little more memory than the tree. A separate program, as it measures the
-//! peak memory of the process.
+//! Tests that building the ray-tracing tree needs little more memory than the tree itself. A separate program, as it
+//! measures the peak memory of the process.
 #![allow(clippy::print_stderr, reason = "tests say why they skip")]
 
 mod process;

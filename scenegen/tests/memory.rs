@@ -1,4 +1,4 @@
-//! Tests that memory does not depend on the number of views, as they stream to disk. A separate program, as it
+//! Tests that memory does not depend on the number of views, which stream to disk. A separate program, as it
 //! measures the peak memory of the process.
 #![allow(clippy::print_stderr, reason = "tests say why they skip")]
 

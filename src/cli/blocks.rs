@@ -58,8 +58,8 @@ struct PlanArgs {
     /// Maximum size of the merged model as a PLY file, such as 500MB
     #[arg(long, value_name = "SIZE")]
     bytes: Option<ByteCount>,
-    /// Number of blocks: strips along the longer side of the ground (4), or strips and blocks per strip (3x2); auto:
-    /// the fewest that fit --memory
+    /// Number of blocks: strips along the longer side of the ground (4), or strips times blocks per strip (3x2); auto:
+    /// the fewest whose tasks fit into --memory
     #[arg(long, value_name = "auto|K|KxL", default_value = "auto")]
     blocks: Grid,
     /// Maximum memory of a task, such as 8GiB
@@ -254,7 +254,8 @@ fn run_merge(args: &MergeArgs, console: &Console) -> Result<(), Failure> {
     let blocks = BlockPlan::read(&args.folder)?;
     let merged = merge(&args.folder, &blocks, &args.output, format, args.partial, console)?;
     if !merged.missing.is_empty() {
-        console.say(format_args!("note: incomplete, left out: {}", merged.missing.join(", ")));
+        console
+            .say(format_args!("note: incomplete blocks left out: {}", merged.missing.join(", ")));
     }
     console.result(format_args!(
         "{} ({}): {}, {}",

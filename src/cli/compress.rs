@@ -35,7 +35,7 @@ pub(super) struct CompressArgs {
     /// File to write; its extension selects the format, as for `densify export`
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
-    /// Format of the file, or any for the one that holds the most Gaussians, whose extension is then added to FILE
+    /// Format of the file; any: the format that holds the most Gaussians, whose extension is then added to FILE
     /// `[default: the one with FILE's extension]`
     #[arg(long, value_name = "NAME")]
     format: Option<String>,
@@ -67,7 +67,7 @@ Examples:
   densify compress output/garden-diet --to 20k -o small.ply
   densify compress others.ply --scene data/garden --to 800kB -o garden.spz";
 
-/// Stands for the format that holds the most Gaussians.
+/// Value of `--format` that selects the format that holds the most Gaussians.
 const ANY: &str = "any";
 
 /// Parses the value of `--to`.

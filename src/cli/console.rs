@@ -48,7 +48,7 @@ impl Console {
         // Keeps the log of a host program that has set one up.
         let _ = tracing_subscriber::registry().with(lines).with(filter).try_init();
         if let Some(mistake) = mistake {
-            tracing::warn!("RUST_LOG is not used: {mistake}; write a level, or TARGET=LEVEL,…");
+            tracing::warn!("RUST_LOG is ignored: {mistake}; give a level, or TARGET=LEVEL,…");
         }
         Self { quiet, bars, broken: RefCell::new(None) }
     }
@@ -64,7 +64,7 @@ impl Console {
     pub(super) fn result(&self, line: impl fmt::Display) {
         let written = self.bars.suspend(|| {
             let mut out = io::stdout().lock();
-            writeln!(out, "{}", files::lines(&line.to_string())).and_then(|()| out.flush())
+            writeln!(out, "{}", files::multi_line(&line.to_string())).and_then(|()| out.flush())
         });
         match written {
             // A closed pipe is not a failure.
@@ -91,7 +91,7 @@ impl Console {
 
     /// Prints an error on standard error.
     pub(super) fn error(&self, failure: &Failure) {
-        let message = files::lines(&failure.words(Spelling::Terminal));
+        let message = files::multi_line(&failure.words(Spelling::Terminal));
         self.bars.suspend(|| {
             let _ = writeln!(io::stderr().lock(), "error: {message}");
         });

@@ -10,7 +10,7 @@ use super::console::Console;
 use super::render::{ModelArgument, RenderingArgs};
 use densify_core::numbers::{grouped, percent};
 use densify_data::views::ViewSource;
-use densify_inspect::{Bound, Limit, LimitError, Limits, measured_values};
+use densify_inspect::{Limit, LimitError, Limits, Side, measured_values};
 use densify_run::RunConfig;
 use densify_run::coordinate_check::CoordinateCheck;
 use densify_run::failure::{Failure, INPUT, LIMIT};
@@ -24,9 +24,9 @@ use densify_train::output::{write_geometry, write_scores};
 ///
 /// Prints the scores of each view and their mean, and writes those of a run to results.json and
 /// per_view.json in its folder (results_train.json and per_view_train.json for the views trained on). For a
-/// file of Gaussian splats, and with --antialias, nothing is written. Of a file every 8th photograph is measured unless
-/// the dataset or an option selects others. Where the geometry is known (built-in scenes, and those that `densify scenegen`
-/// wrote), also measures how well the Gaussians match it: in a second table, and in geometry.json
+/// file of Gaussian splats, and with --antialias, nothing is written. For a file, every 8th photograph is measured
+/// unless the dataset or an option selects others. Where the geometry is known (built-in scenes, and those that
+/// `densify scenegen` wrote), also measures how well the Gaussians match it: in a second table, and in geometry.json
 /// (geometry_train.json).
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
@@ -75,7 +75,7 @@ Examples:
 pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> Result<(), Failure> {
     let model = &args.model;
     let limits = Limits { lowest: &args.fail_below, highest: &args.fail_above };
-    // A folder without config.toml is refused, whatever else it holds: it is not a run.
+    // A folder without config.toml is not a run, and is refused whatever else it holds.
     let run = if is_model(model) {
         None
     } else {
@@ -89,7 +89,7 @@ pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> R
     let mut opened = argument.open(&rendering, geometry::needs(), matches, console)?;
     let views = opened.views(args.split)?;
     let knows_geometry = opened.dataset.surface_bytes.is_some();
-    limits.check_keys(knows_geometry, lpips.is_some()).map_err(in_option_names)?;
+    limits.check_keys(knows_geometry, lpips.is_some()).map_err(with_option_names)?;
     let background = opened.data.background.fixed();
     let width = opened.dataset.train.iter().chain(&opened.dataset.test);
     let width = width.map(|view| view.name.chars().count()).max().unwrap_or(0).max(6);
@@ -116,7 +116,7 @@ pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> R
     if let Some(FittedScore { psnr, ssim, flip, lpips }) = mean.fitted {
         line("fitted", psnr, ssim, flip, lpips);
     }
-    // The scores of a run are those of the model as it was trained.
+    // Scores with another antialiasing than the trained one are not those of the run.
     let written = run.filter(|_| args.rendering.antialias.is_none());
     if let Some((_, iteration)) = written {
         write_scores(model, args.split, iteration, &scores)?;
@@ -128,18 +128,18 @@ pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> R
             write_geometry(model, args.split, iteration, measured)?;
         }
     }
-    limits.check(&measured_values(&mean, geometry.as_ref())).map_err(in_option_names)
+    limits.check(&measured_values(&mean, geometry.as_ref())).map_err(with_option_names)
 }
 
-/// The failure, with the names of the options.
-fn in_option_names(error: LimitError) -> Failure {
+/// The failure; its message names the options.
+fn with_option_names(error: LimitError) -> Failure {
     let code = match error {
         LimitError::Unknown { .. } => INPUT,
         LimitError::Exceeded(_) => LIMIT,
     };
-    let message = error.message(|bound| match bound {
-        Bound::Lowest => "--fail-below",
-        Bound::Highest => "--fail-above",
+    let message = error.message(|side| match side {
+        Side::Lowest => "--fail-below",
+        Side::Highest => "--fail-above",
     });
     Failure::new(code, message)
 }
@@ -162,15 +162,18 @@ fn format_table(geometry: &Geometry) -> String {
         ("F-score at 0.5 %".to_owned(), percent(centres.f_score_half_percent)),
         ("F-score at 1 %".to_owned(), percent(centres.f_score_one_percent)),
         ("floaters".to_owned(), grouped(floaters.count)),
-        ("floaters, share of rows".to_owned(), percent(floaters.of_rows)),
+        ("floaters, share of Gaussians".to_owned(), percent(floaters.of_rows)),
         ("floaters, share of weight".to_owned(), percent(floaters.of_weight)),
     ];
     for width in thin {
         let name = format!("thin structures found, {} px wide", width.width);
         lines.push((name, percent(width.recall)));
     }
-    lines.push(("rows blended per pixel".to_owned(), plain(redundancy.blended_per_pixel, "")));
-    lines.push(("rows with weights below 1 %".to_owned(), percent(redundancy.below_one_percent)));
+    lines.push(("Gaussians blended per pixel".to_owned(), plain(redundancy.blended_per_pixel, "")));
+    lines.push((
+        "Gaussians with weights below 1 %".to_owned(),
+        percent(redundancy.below_one_percent),
+    ));
     let width = lines.iter().map(|(name, _)| name.chars().count()).max().unwrap_or(0);
     let mut text = String::from("\ngeometry");
     for (name, value) in lines {

@@ -18,8 +18,8 @@ const MAX_FRAMES: u32 = 100_000;
 pub(super) struct FilmArgs {
     /// Render along a camera path instead of the dataset's views: orbit (once around the centre of the cameras' view),
     /// spiral (two turns in front of it), or a camera path saved by the page of `densify view` or by nerfstudio's
-    /// viewer (JSON). It must be in the dataset's coordinates. The page's paths are; nerfstudio's
-    /// are if it trained with `--orientation-method none --center-method none --auto-scale-poses False`
+    /// viewer (JSON). A file must be in the dataset's coordinates, as the page writes it; nerfstudio uses these
+    /// coordinates if it trained with `--orientation-method none --center-method none --auto-scale-poses False`
     #[arg(long, value_name = "orbit|spiral|FILE")]
     pub(super) path: Option<CameraRoute>,
     /// Number of frames `[default: 120; for a file, its seconds times its fps, or one per camera]`
@@ -64,7 +64,7 @@ pub(super) fn run(
         fps: args.fps,
         video: args.video.as_deref(),
     };
-    let film = Film::make(route, options, output, channels, source).map_err(in_option_names)?;
+    let film = Film::make(route, options, output, channels, source).map_err(with_option_names)?;
     console.result(format_args!("{} frames in {}", film.frames, output.display()));
     if let Some(video) = &args.video {
         console.result(format_args!("film in {}", video.display()));
@@ -72,8 +72,8 @@ pub(super) fn run(
     Ok(())
 }
 
-/// The failure, with the names of the options.
-fn in_option_names(error: FilmError) -> Failure {
+/// The failure; its message names the options.
+fn with_option_names(error: FilmError) -> Failure {
     match error {
         FilmError::Path(error) => Failure::input(format!("--path: {error}")),
         FilmError::NoSize => {

@@ -9,9 +9,10 @@ use toml::{Table, Value};
 use densify_run::failure::Failure;
 use densify_run::{Partial, RunSpec};
 
-/// Gives every option of a run in `command` the default that it has in [`RunSpec`].
+/// Gives every option of a run in `command` its default: that of the default preset, else that of [`RunSpec`].
 pub(super) fn with_defaults(command: Command) -> Command {
-    let defaults = RunSpec::default().table().unwrap_or_default();
+    let spec = Partial::default().describe().unwrap_or_default();
+    let defaults = spec.table().unwrap_or_default();
     command.mut_args(|arg| {
         let default = defaults.get(arg.get_id().as_str());
         match default.filter(|_| arg.get_default_values().is_empty()) {

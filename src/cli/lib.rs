@@ -107,8 +107,8 @@ enum Command {
     /// Prints the memory that a run would take, without training.
     ///
     /// Takes the options of `densify train` and prints the memory that the run would reserve, buffer by
-    /// buffer, and then how many Gaussians fit the same memory at each degree of colour and with
-    /// images of full, half and quarter size. Writes nothing.
+    /// buffer, and then how many Gaussians fit the same memory at each spherical-harmonic degree and
+    /// with images of full, half and quarter size. Writes nothing.
     #[command(after_help = PLAN_EXAMPLES)]
     Plan(Box<train::TrainArgs>),
     Eval(Box<eval::EvalArgs>),

@@ -14,7 +14,7 @@ use densify_run::failure::Failure;
 pub(super) struct PoliciesArgs {
     /// Policy to explain: its decisions, source and parameters
     name: Option<String>,
-    /// A second word, which is not expected
+    /// A second name, which is refused
     #[arg(hide = true)]
     more: Option<String>,
 }

@@ -9,7 +9,7 @@ use indicatif::{ProgressBar, ProgressState, ProgressStyle};
 use super::console::Console;
 use densify_core::numbers::{duration, grouped};
 
-/// Interval between lines without a terminal.
+/// Interval between lines of progress when standard error is not a terminal.
 const LINE_INTERVAL: Duration = Duration::from_secs(30);
 /// Interval between redraws of the bar.
 const REDRAW_INTERVAL: Duration = Duration::from_millis(100);
@@ -55,7 +55,7 @@ impl<'a> Progress<'a> {
         let smooth = self.loss.map_or(loss, |before| before + LOSS_SMOOTHING * (loss - before));
         self.loss = Some(smooth);
         let text =
-            || format!("loss {smooth:.4}  rows {} of {}", grouped(rows), grouped(self.budget));
+            || format!("loss {smooth:.4}  {} of {} Gaussians", grouped(rows), grouped(self.budget));
         if let Some(bar) = &self.bar {
             if self.drawn.elapsed() >= REDRAW_INTERVAL || step == self.iterations {
                 bar.set_message(text());

@@ -60,10 +60,10 @@ pub(super) struct RenderArgs {
     rendering: RenderingArgs,
 }
 
-/// The device to render on, and the dataset options for a file, which has none of its own.
+/// The device to render on, and the dataset options, which only a model file needs: a run has its own.
 #[derive(Debug, Clone, Args)]
 pub(super) struct RenderingArgs {
-    /// Nearest distance to a camera at which Gaussians of a file are drawn, as a fraction of the
+    /// Smallest distance from a camera at which Gaussians of a file are rendered, as a fraction of the
     /// scene's extent (default: 0.04, or less where the views show points that are nearer)
     #[arg(long, value_name = "FRACTION", help_heading = "Scene")]
     pub(super) near: Option<Fraction>,
@@ -136,7 +136,7 @@ pub(super) fn run(
     Ok(())
 }
 
-/// Fails if an option was given that only a file needs, because a run has its own value.
+/// Fails if an option was given that applies only to a model file; a run has its own value.
 pub(super) fn refuse_scene_options(matches: &ArgMatches) -> Result<(), Failure> {
     let scene = DataSpec::augment_args(clap::Command::new("scene"));
     let names = scene.get_arguments().map(|argument| argument.get_id().as_str()).chain(["near"]);
@@ -192,7 +192,7 @@ impl ModelArgument<'_> {
         open(&model, scene, data.clone(), (*near, *antialias, machine), needs, console)
     }
 
-    /// Opens a model file without a dataset, for a camera path with its own cameras from the file `path`.
+    /// Opens a model file without a dataset, for the camera path in the file `path`.
     fn open_without_dataset(
         &self,
         path: &Path,

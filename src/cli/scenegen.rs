@@ -69,7 +69,7 @@ pub(super) struct ScenegenArgs {
     /// COLMAP's OPENCV_FISHEYE and OPENCV. Test views keep the pinhole camera
     #[arg(long, value_name = "LENS", help_heading = "Cameras")]
     lens: Option<Lens>,
-    /// Put people into this share of the training views, at another place in each view, and mask them
+    /// Put people into this share of the training views, at a different place in each, and mask them
     #[arg(long, value_name = "SHARE", help_heading = "Cameras", default_value_t = 0.0)]
     passers_by: f64,
     /// Random displacement of the cameras, as a share of their distance
@@ -269,11 +269,10 @@ pub(super) fn run(args: &ScenegenArgs, console: &Console) -> Result<(), Failure>
     let wanted = args.points as f64 * (1.0 - args.dropout);
     if (written.points as f64) < 0.5 * wanted {
         console.say(format_args!(
-            "note: of {} points wanted, {:.0} % were found where three views see the surface; to see more \
-             of it, add views (--train), widen --fov, or choose another --rig (inside for rooms); or train \
-             with --init random",
-            grouped(args.points),
-            100.0 * written.points as f64 / args.points as f64
+            "note: only {:.0} % of {} points could be placed, because each must be seen by three views; add views \
+             (--train), widen --fov, or choose another --rig (inside for rooms); or train with --init random",
+            100.0 * written.points as f64 / args.points as f64,
+            grouped(args.points)
         ));
     }
     Ok(())

@@ -15,7 +15,7 @@ use densify_selftest::{Case, Finding, Subject, SubjectReport, cases, markdown, t
 
 /// Compares this machine with a float64 renderer in numerically hard cases.
 ///
-/// Needles, thousands of layers, saturated opacities, images of one pixel, rows that hold NaN: images,
+/// Needles, thousands of layers, saturated opacities, images of one pixel, Gaussians with NaN: images,
 /// gradients, losses and optimiser steps are compared with those of a second renderer, which
 /// shares no arithmetic with the first. Prints the largest error of each kind, its place and its
 /// tolerance. Include this table in a bug report.
@@ -27,8 +27,8 @@ pub(super) struct SelftestArgs {
     /// Only these cases, by number
     #[arg(value_name = "CASE")]
     only: Vec<u8>,
-    /// Also run the parts of cases that take minutes: half a million rows as large as the image, which takes
-    /// some 800 MiB, and runs of 30,000 steps
+    /// Also run the parts of cases that take minutes: half a million Gaussians as large as the image, in
+    /// about 800 MiB, and runs of 30,000 steps
     #[arg(long)]
     long: bool,
     /// Write the table as Markdown
@@ -49,7 +49,7 @@ Examples:
   densify selftest --all --long --markdown selftest.md
                                                 on all of them, in full, into a file";
 
-/// Some cases compare the bits of two runs; on a GPU no other accumulation reproduces them.
+/// Some cases compare two runs bit by bit; on a GPU, only this accumulation is reproducible.
 const ACCUMULATION: Option<Accumulation> = Some(Accumulation::Slots);
 
 pub(super) fn run(args: &SelftestArgs, console: &Console) -> Result<(), Failure> {

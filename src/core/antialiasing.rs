@@ -2,8 +2,8 @@
 //!
 //! Every renderer widens a projected Gaussian of covariance S `[px²]` to B = S + κ·I, so that it covers a pixel. With
 //! antialiasing it also lowers the opacity by ρ = √(det S / det B), so that the widening adds no light (Yu et al.,
-//! *Mip-Splatting*, CVPR 2024, equation 9). A model must be rendered as it was trained: without ρ, the small Gaussians of
-//! an antialiased model are too opaque.
+//! *Mip-Splatting*, CVPR 2024, equation 9). A model must be rendered as it was trained: without ρ, the small Gaussians
+//! of an antialiased model are too opaque.
 
 use std::fmt::{self, Display};
 use std::str::FromStr;
@@ -56,7 +56,7 @@ impl Display for Antialiasing {
     }
 }
 
-/// A text that names no antialiasing.
+/// The text is not the name of an antialiasing.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
     "`{0}` is not an antialiasing kernel; choose 0.3, 0.1 (Mip-Splatting, Brush, LichtFeld) or none"
@@ -80,7 +80,7 @@ impl Serialize for Antialiasing {
 
 impl<'de> Deserialize<'de> for Antialiasing {
     fn deserialize<D: Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
-        /// TOML has numbers without quotes, too.
+        /// The kernel may be given as text or as a number.
         #[derive(Deserialize)]
         #[serde(untagged, expecting = "expected 0.3, 0.1 or none")]
         enum Stated {

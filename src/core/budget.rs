@@ -35,7 +35,7 @@ impl RowBudget {
         row < self.frozen
     }
 
-    /// The row's index as policies count, without the frozen rows; `None` for a frozen row.
+    /// The row's index among the trained rows, which policies use; `None` for a frozen row.
     pub fn trained_row(self, row: u32) -> Option<u32> {
         row.checked_sub(u32::try_from(self.frozen).ok()?)
     }

@@ -79,7 +79,7 @@ impl ColourTransform {
         let behind = self.behind(background);
         let offset = self.offset.map(f64::from);
         let matrix = std::array::from_fn(|i| {
-            // Σ gᵢ·C, where C are the colours before the transform, without their share of background.
+            // Σ gᵢ·C over the colours C before the transform, minus the background's contribution.
             let exposed = DVec3::from(sums.by_colour[i]) - sums.plain[i] * DVec3::from(offset);
             let plain = inverse * exposed;
             let through = sums.behind[i] * DVec3::from(behind.map(f64::from));

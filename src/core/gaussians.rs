@@ -59,8 +59,8 @@ pub struct Gaussians {
     pub sh_degree: u8,
     /// How the model is rendered where its Gaussians are smaller than a pixel.
     pub antialiasing: Antialiasing,
-    /// The point from which means are measured `[scene units]`: a position is a mean plus this. Other than 0 only outside
-    /// training, where coordinates would be too coarse in f32.
+    /// The point from which means are measured `[scene units]`: a position is a mean plus this. It is
+    /// 0 during training; elsewhere it may be nonzero, for scenes whose coordinates would be too coarse in f32.
     pub origin: [f64; 3],
     /// Means, relative to `origin` `[scene units]`. Shape: `[rows]`.
     pub means: Vec<[f32; 3]>,
@@ -163,10 +163,13 @@ impl Gaussians {
     /// origin.
     ///
     /// # Panics
-    /// When they differ.
+    /// When degree or antialiasing differ.
     pub fn append(&mut self, mut other: Self) {
         assert_eq!(self.sh_degree, other.sh_degree, "models of different degrees cannot be joined");
-        assert_eq!(self.antialiasing, other.antialiasing, "models are rendered in different ways");
+        assert_eq!(
+            self.antialiasing, other.antialiasing,
+            "models with different antialiasing cannot be joined"
+        );
         if self.is_empty() {
             self.origin = other.origin;
         }

@@ -11,12 +11,13 @@ use serde_json::Value;
 /// The maximum number of rows that 32-bit row numbers can address.
 const MAX_ROWS: f64 = u32::MAX as f64;
 
-/// Parses a number of rows: `200000`, `28k`, `1.5M`.
+/// Parses a number of Gaussians: `200000`, `28k`, `1.5M`.
 ///
 /// # Errors
 /// A message with the spellings accepted.
 pub fn rows(text: &str) -> Result<usize, String> {
-    let wrong = || format!("`{text}` is not a number of rows; write it as 200000, 200k or 1.5M");
+    let wrong =
+        || format!("`{text}` is not a number of Gaussians; write it as 200000, 200k or 1.5M");
     let (number, factor) = match text.char_indices().last() {
         Some((at, 'k' | 'K')) => (&text[..at], 1e3),
         Some((at, 'm' | 'M')) => (&text[..at], 1e6),
@@ -33,7 +34,9 @@ pub fn rows(text: &str) -> Result<usize, String> {
         return Err(wrong());
     }
     if !(1.0..=MAX_ROWS).contains(&whole) {
-        return Err(format!("`{text}` is out of range; a model has between 1 and 4 billion rows"));
+        return Err(format!(
+            "`{text}` is out of range; a model has between 1 and 4 billion Gaussians"
+        ));
     }
     Ok(whole as usize)
 }
@@ -91,7 +94,12 @@ pub fn percent(value: f64) -> String {
 
 /// Formats a number of Gaussians: `1 Gaussian`, `2,000 Gaussians`.
 pub fn gaussians(number: usize) -> String {
-    format!("{} Gaussian{}", grouped(number), if number == 1 { "" } else { "s" })
+    counted(number, "Gaussian")
+}
+
+/// Formats a number of things: `1 trial`, `2,000 trials`.
+pub fn counted(number: usize, thing: &str) -> String {
+    format!("{} {thing}{}", grouped(number), if number == 1 { "" } else { "s" })
 }
 
 /// Formats 1234567 as 1,234,567.

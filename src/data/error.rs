@@ -53,7 +53,7 @@ pub enum LoadRemedy {
     InvertMasks(bool),
     /// Hold out fewer views.
     LargerTestEvery,
-    /// Keep the usable field of view of a lens that folds over.
+    /// Keep the usable field of view of a lens whose distortion is not invertible.
     KeepFieldOfView,
     /// Name a folder that holds a COLMAP model.
     ColmapModel,

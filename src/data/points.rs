@@ -55,8 +55,8 @@ impl PointCloud {
     }
 }
 
-/// Reads the vertices of a PLY file as points, and a note if they have no colours; other elements are skipped. Positions
-/// may be of any type, and non-finite. A model of Gaussian splats gives the colours of its Gaussians, and their world
+/// Reads the vertices of a PLY file as points, and a note if they have no colours; other elements are skipped.
+/// Positions may be of any type and may be non-finite. In a model of Gaussian splats, points are Gaussians, with world
 /// positions even if the file has local coordinates.
 ///
 /// # Errors
@@ -75,7 +75,7 @@ pub fn read_points(path: &Path) -> Result<(PointCloud, Option<String>), LoadErro
     ]
     .map(|names| vertices.find_in_any_case(&names));
     let coefficients = ["f_dc_0", "f_dc_1", "f_dc_2"].map(|name| vertices.find(&[name]));
-    // The share of a full colour is `offset + factor · value / full`.
+    // A colour from 0 to 1 is `offset + factor · value / full`.
     let (mut offset, mut factor, mut full) = (0.0, 1.0, 1.0);
     if let [Some(r), Some(g), Some(b)] = channels {
         full = full_scale(path, &vertices, [r, g, b])?;
@@ -128,7 +128,8 @@ fn full_scale(path: &Path, vertices: &Element, channels: [usize; 3]) -> Result<f
     match scale {
         Some((.., full)) => Ok(full),
         None if is_real => {
-            let problem = format!("they reach {most}, which is no colour of 0 to 1, 255 or 65535");
+            let problem =
+                format!("they reach {most}, but colours must be from 0 to 1, 255 or 65535");
             Err(LoadError::damaged(path, "colours of the vertices", problem))
         }
         None => Ok(largest),
@@ -188,9 +189,9 @@ mod tests {
         assert!(message.contains("property z"), "{message}");
     }
 
-    /// Models of Gaussian splats have coefficients, of which 0 is grey.
+    /// Models of Gaussian splats hold SH coefficients of colours; 0 is mid-grey.
     #[test]
-    fn colours_of_other_names_are_read_and_none_are_noted() {
+    fn colours_of_other_names_are_read_and_missing_ones_are_noted() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("file.ply");
         for (names, colour, expected) in [
@@ -212,7 +213,7 @@ mod tests {
         }
     }
 
-    /// Models in local coordinates have one.
+    /// Models in local coordinates state an offset.
     #[test]
     fn an_offset_in_the_header_is_added_to_positions() {
         let folder = tempfile::tempdir().unwrap();

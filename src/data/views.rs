@@ -56,8 +56,8 @@ impl DatasetViews {
         Self { views, cache }
     }
 
-    /// Checks that at least one view shows something. For this, images that cannot be transparent are not decoded,
-    /// and the others only up to the first one with a visible pixel.
+    /// Checks that at least one view has a visible pixel. Decodes only images that may be transparent, and stops at the
+    /// first view with a visible pixel.
     ///
     /// # Errors
     /// When every pixel of every view of the dataset `root` is transparent.

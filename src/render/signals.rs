@@ -166,7 +166,7 @@ const fn planes(kind: SignalKind) -> usize {
         SignalKind::Sum | SignalKind::Count | SignalKind::Maximum | SignalKind::Minimum => 1,
         // The previous epoch, and the current one.
         SignalKind::EpochMaximum => 2,
-        SignalKind::Present | SignalKind::Attribute(_) => 0,
+        SignalKind::Current | SignalKind::Attribute(_) => 0,
     }
 }
 
@@ -222,7 +222,7 @@ impl SignalPlanes {
                     saved.push((format!("{signal:?}.previous"), previous));
                     saved.push((format!("{signal:?}.current"), current));
                 }
-                SignalKind::Present | SignalKind::Attribute(_) => {}
+                SignalKind::Current | SignalKind::Attribute(_) => {}
             }
         }
         saved

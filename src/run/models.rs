@@ -11,8 +11,8 @@ use densify_core::files::{self, WriteError};
 use densify_core::gaussians::Gaussians;
 use densify_data::dataset::is_archive;
 use densify_data::models::{
-    self, Coarseness, Coordinates, Format, Frame, fitting_format, is_fine, is_unfit, local_origin,
-    sidecar_path,
+    self, Coarseness, Coordinates, Format, Frame, fitting_format, is_finer_than_f32, is_unfit,
+    local_origin, sidecar_path,
 };
 use densify_train::checkpoint::newest_step;
 use densify_train::output::{is_in_use, model_path, saved_iterations};
@@ -106,8 +106,8 @@ pub fn model_file(named: &Path, asked: Option<u32>) -> Result<PathBuf, Failure> 
     }
 }
 
-/// Reads a file of Gaussian splats, written by any program, in its own coordinates, and reports dropped and repaired
-/// rows, and what the file states beyond its format.
+/// Reads a file of Gaussian splats, written by any program, in its own coordinates, and tells the user about dropped
+/// and repaired rows, and the notes on the file.
 ///
 /// # Errors
 /// When it cannot be read.
@@ -153,7 +153,7 @@ pub(crate) fn override_antialiasing(
         let option = notes::antialias_option(observer.spelling(), given);
         let stated = model.antialiasing;
         observer.say(format_args!(
-            "note: {}: taken as trained with {option}; the file states {}",
+            "note: {}: assumed to be trained with {option}; the file states {}",
             path.display(),
             if stated.is_on() { stated.name() } else { "no antialiasing" }
         ));
@@ -161,45 +161,45 @@ pub(crate) fn override_antialiasing(
     }
 }
 
-/// The model in the coordinates of its file, and their frame. Automatic coordinates are local if f32 is too coarse for
-/// world coordinates, unless the model itself has only world coordinates in f32, and the format keeps these exactly.
+/// The model in the coordinates of the file to write, and their frame. Automatic coordinates are local if f32 is too
+/// coarse for world coordinates. A model that itself has only world coordinates in f32 keeps them in lossless formats.
 fn placed<'a>(
     model: &'a Gaussians,
     coordinates: Coordinates,
     format: &Format,
     observer: &dyn Observer,
 ) -> Result<(Cow<'a, Gaussians>, Frame), Failure> {
-    let within = |frame: Frame| {
+    let in_frame = |frame: Frame| {
         let is_there = model.has_origin(frame.origin);
         let moved = || Cow::Owned(model.clone().with_origin(frame.origin));
         Ok((if is_there { Cow::Borrowed(model) } else { moved() }, frame))
     };
     let (local, spelling) = (Frame::from_origin(local_origin(model)), observer.spelling());
     match coordinates {
-        Coordinates::Local => return within(local),
-        Coordinates::Double => return within(Frame { is_double: true, ..local }),
+        Coordinates::Local => return in_frame(local),
+        Coordinates::Double => return in_frame(Frame { is_double: true, ..local }),
         Coordinates::Auto | Coordinates::World => {}
     }
     let coarseness = Coarseness::measure(model);
-    let has_more = is_fine(model);
+    let is_fine = is_finer_than_f32(model);
     if !coarseness.is_noted() {
-        return within(Frame::WORLD);
+        return in_frame(Frame::WORLD);
     }
-    if coordinates == Coordinates::Auto && (has_more || format.is_lossy()) {
+    if coordinates == Coordinates::Auto && (is_fine || format.is_lossy()) {
         observer
             .say(format_args!("{}", notes::saved_in_local(spelling, &coarseness, local.origin)));
-        return within(local);
+        return in_frame(local);
     }
-    if has_more && coarseness.is_unfit() {
+    if is_fine && coarseness.is_unfit() {
         return Err(Failure::input(notes::coarse(spelling, &coarseness, !format.is_lossy())));
     }
-    let note = if has_more {
+    let note = if is_fine {
         notes::coarse(spelling, &coarseness, !format.is_lossy())
     } else {
         format!("its coordinates are only f32: {coarseness}; export it from the run that made it")
     };
     observer.say(format_args!("note: {note}"));
-    within(Frame::WORLD)
+    in_frame(Frame::WORLD)
 }
 
 /// Writes a model in another format, and tells the observer what the format and the coordinates change. An error leaves
@@ -228,10 +228,10 @@ pub fn say_unstated(
     antialiasing: Antialiasing,
     observer: &dyn Observer,
 ) {
-    if !format.states(antialiasing) {
+    if !format.states_antialiasing(antialiasing) {
         observer.say(format_args!(
-            "note: {} cannot state the kernel of the antialiasing, {antialiasing}; readers take 0.3 px², which shows \
-             small Gaussians fainter; the other formats state it",
+            "note: {} cannot state the kernel of the antialiasing, {antialiasing}; readers assume 0.3 px², which \
+             makes small Gaussians fainter; the other formats state it",
             format.name
         ));
     }

@@ -20,9 +20,9 @@ pub struct Interrupt {
     pub exit_code: u8,
 }
 
-/// An observer's answer after it has looked at the model.
+/// What the run is to do next, as the observer decides between two steps.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Between {
+pub enum NextAction {
     /// Continue with the next step.
     Step,
     /// Write a checkpoint, then ask again.
@@ -69,8 +69,8 @@ pub trait Observer {
 
     /// Called before every step, so that the model can be rendered while training waits; rendering changes nothing. The
     /// history of rows is known if there is a [companion](crate::Companion).
-    fn between_steps(&self, _model: &mut dyn Backend, _rows: Option<&RowHistory>) -> Between {
-        Between::Step
+    fn between_steps(&self, _model: &mut dyn Backend, _rows: Option<&RowHistory>) -> NextAction {
+        NextAction::Step
     }
 
     /// Training has ended or failed.

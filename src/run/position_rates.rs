@@ -1,8 +1,8 @@
-//! The learning rates of positions in a long capture.
+//! The learning rates of positions where a view shows only a small part of the scene.
 //!
-//! They are shares of the extent, and were chosen for cameras around an object, where the extent is about the distance
-//! of what a view shows. In a long capture the extent is the length of the route: steps as large would throw Gaussians
-//! across what a view shows.
+//! The default rates are fractions of the extent, chosen for cameras around an object, where the extent is about the
+//! distance of what a view shows. Along a route, the extent is the length of the route: such steps would throw
+//! Gaussians across everything that a view shows.
 
 use densify_data::dataset::SeenDepths;
 use densify_data::dataset::normalise::EXTENT;
@@ -36,7 +36,7 @@ impl PositionRates {
         let Self { factor, depth } = self;
         (factor < 1.0).then(|| {
             format!(
-                "rates    those of positions times {factor:.2}: half of what the views show is nearer than {depth:.2} of \
+                "rates    position rates times {factor:.2}: half of what the views show is nearer than {depth:.2} of \
                  the extent"
             )
         })

@@ -58,8 +58,8 @@ pub struct Mean {
     pub fitted: Option<FittedScore>,
 }
 
-/// Scores of a rendering, or means of several. In [`ViewScore`] and [`Mean`], they are the scores after a factor and an
-/// offset per channel were fitted to the photograph.
+/// Scores of a rendering, or means of several. In [`ViewScore`] and [`Mean`] they are measured after fitting a factor
+/// and an offset per channel to the photograph; [`Comparison::score`] returns them without a fit.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct FittedScore {
     /// Peak signal-to-noise ratio `[dB]`.

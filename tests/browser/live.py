@@ -39,14 +39,14 @@ def check(browser: Browser, url: str, run: Path, folder: Path | None) -> None:
 
     # A hidden page requests no pictures, so it does not slow training down; shown again, it is updated.
     hide = "Object.defineProperty(document, 'hidden', { configurable: true, value: true });"
-    seen = "document.dispatchEvent(new Event('visibilitychange'));"
-    browser.run(hide + seen)
+    notify = "document.dispatchEvent(new Event('visibilitychange'));"
+    browser.run(hide + notify)
     browser.wait_for("underway === 0", "a requested picture does not arrive")
     before = browser.run("requestPicture(); return requests")
     time.sleep(0.5)
     after = browser.run("return requests")
     assert after == before, f"a hidden page requests {after - before} pictures"
-    browser.run("delete document.hidden;" + seen)
+    browser.run("delete document.hidden;" + notify)
     browser.wait_for(f"requests > {before}", "a page that is shown again requests no picture")
 
     click("pause")

@@ -116,11 +116,11 @@ const turn = (now) => {
 };
 requestAnimationFrame(turn);
 """
-# The size that the page chooses for coarse pictures, relative to full size, after a picture of size 0.5 with 1000
-# bytes, at a microsecond per byte. Arguments: the times to render it and until it arrived, and the latency [ms].
+# The size that the page chooses for coarse pictures, relative to full size, after a picture of size 0.5 and 1000 bytes
+# at a microsecond per byte. Arguments [ms]: the time to render that picture, the time until it arrived, the latency.
 COARSE_SIZE = """
-const [milliseconds, took, alone] = arguments;
-[latency, perByte] = [alone, 1e-3];
+const [milliseconds, took, knownLatency] = arguments;
+[latency, perByte] = [knownLatency, 1e-3];
 pace([{ bitmap: { width: 1, height: 1 }, bytes: 1000, milliseconds, held: milliseconds, took }], performance.now() - took, true, 0.5);
 return coarse;
 """

@@ -1,7 +1,7 @@
 //! Reads arbitrary bytes as a file of each format that comes from other programs. Whatever the bytes are, a reader
 //! accepts or refuses them: it never panics, hangs, or allocates more than the size of the file justifies.
 //!
-//! Formats of models and datasets are those of their registries. `cargo fuzz` runs without end (see CONTRIBUTING.md),
+//! The formats of models and datasets come from their registries. `cargo fuzz` runs without end (see CONTRIBUTING.md),
 //! `tests/it/fuzz.rs` runs briefly in every test run. Both use the same corpora.
 
 use std::path::Path;

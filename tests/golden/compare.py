@@ -32,10 +32,10 @@ VARYING = (
     ("*trade.out", r"(?<=\.\d\d) +\d+\.\d{3} +\d+\.\d{3}$"),  # time and peak memory of a knob
     ("*policies.out", r" \([\w/.]+\.rs:\d+\)"),  # where a policy is registered
 )
-# Lines of printed text whose figures follow from measured memory, and so may differ a little.
+# Lines of printed text whose figures depend on measured memory, and so may differ.
 LOOSE_LINES = re.compile(r"program and dataset|^  (total|left|degree \d) |--memory \d+MiB holds|"
                          r"^(coarse|block-\S+|merge) ")
-# Largest accepted difference of these figures, as a share of the larger one.
+# Largest accepted difference between two such figures, as a share of the larger one.
 LOOSE = 0.4
 FIGURE = re.compile(r"(?<![\w.])[-+]?\d+(?:,\d{3})*(?:\.\d+)?(?:e[-+]?\d+)?")
 
@@ -90,7 +90,7 @@ def lines_difference(left: str, right: str):
 
 
 def words_difference(left: str, right: str):
-    """Compares figures, in any order. Returns "" if only words differ."""
+    """The first difference between the figures of two texts, in any order; "" if only words differ."""
     left, right = without_varying_columns(left), without_varying_columns(right)
     if left == right:
         return None

@@ -136,7 +136,7 @@ def main(densify: str, modules: str, *models: str) -> None:
 
 
 def check(densify: str, modules: Path, model: Path, folder: Path) -> None:
-    other, validator = modules / ".bin/splat-transform", modules / "gltf-validator"
+    splat_transform, validator = modules / ".bin/splat-transform", modules / "gltf-validator"
     run = lambda *words: subprocess.run([str(word) for word in words], check=True)
     truth = rows(model)
     at, right, up, back = camera(truth)
@@ -150,7 +150,7 @@ def check(densify: str, modules: Path, model: Path, folder: Path) -> None:
 
     def picture(file: Path) -> Path:
         rendered = folder / f"{file.name}.webp"
-        run(other, "-q", "-w", "-g", 0, file, *view, rendered)
+        run(splat_transform, "-q", "-w", "-g", 0, file, *view, rendered)
         return rendered
 
     run(densify, "render", model, "--path", frames, "--size", size, "-o", folder / "own")
@@ -162,9 +162,9 @@ def check(densify: str, modules: Path, model: Path, folder: Path) -> None:
     for name, least in EXPORTS.items():
         ours, theirs = folder / f"ours.{name}", folder / f"theirs.{name}"
         run(densify, "export", model, "-o", ours)
-        run(other, "-q", "-w", ours, read_by_other)
+        run(splat_transform, "-q", "-w", ours, read_by_other)
         compare(truth, rows(read_by_other), f"{ours.name} read by splat-transform")
-        run(other, "-q", "-w", "-g", "cpu", model, theirs)
+        run(splat_transform, "-q", "-w", "-g", "cpu", model, theirs)
         quality, their_quality = (psnr(picture(file), of_ply) for file in (ours, theirs))
         print(f"{name}, rendered by splat-transform: {quality:.2f} dB to the PLY; its own export {their_quality:.2f} dB")
         # A model early in training loses more to the format's precision.
@@ -175,7 +175,7 @@ def check(densify: str, modules: Path, model: Path, folder: Path) -> None:
     run(densify, "export", model, "-o", ours)
     run("node", Path(__file__).with_name("validate.js"), validator, ours)
     compare(truth, glb_rows(ours), "ours.glb")
-    run(other, "-q", "-w", model, theirs)
+    run(splat_transform, "-q", "-w", model, theirs)
     run(densify, "export", theirs, "-o", read_by_densify, "--overwrite")
     compare(truth, rows(read_by_densify), "theirs.glb read by densify")
     print(f"{model}: the same in every format, in both directions")

@@ -9,8 +9,8 @@ use glam::{DMat3, DVec3};
 
 use crate::subject::{all, make};
 
-/// A white Gaussian of 0.02 units and opacity 0.9 as PLY, with these lines before its vertices and these properties
-/// after its own.
+/// A PLY of one white Gaussian with scale 0.02 and opacity 0.9. `comments` are lines of its header, `more` are further
+/// properties.
 fn one(comments: &str, more: &[(&str, f32)]) -> Vec<u8> {
     let names =
         "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3";
@@ -25,7 +25,7 @@ fn one(comments: &str, more: &[(&str, f32)]) -> Vec<u8> {
     [header.into_bytes(), values.flat_map(f32::to_le_bytes).collect()].concat()
 }
 
-/// Checks the grey of the pixel over the Gaussian, which there is 0.2 px wide, and what the file states.
+/// Checks the antialiasing that a file states, and the grey of the pixel at the Gaussian, whose scale there is 0.2 px.
 fn check(file: &Path, stated: Antialiasing, grey: f32) {
     let model = read_model(file).expect("a model").gaussians;
     assert_eq!(model.antialiasing, stated, "{}", file.display());
@@ -43,20 +43,21 @@ fn check(file: &Path, stated: Antialiasing, grey: f32) {
 }
 
 #[test]
-fn small_gaussians_are_as_opaque_as_their_files_state() {
+fn small_gaussians_are_rendered_with_the_stated_antialiasing() {
     let folder = tempfile::tempdir().expect("a folder");
     let mip = "comment SplatRenderMode: mip\n";
     let brush = format!("comment Exported from Brush\n{mip}");
-    // A filter as wide as the Gaussian: its area doubles, and its opacity is multiplied by 2^(−3/2).
+    // A 3D filter as wide as the Gaussian doubles its variances and multiplies its opacity by 2^(−3/2). At a
+    // projected variance of 0.08 px², the kernel of 0.1 px² then multiplies it by 0.08 / 0.18.
     let filter = [("filter_3D", 0.02)];
-    let fused = 0.9 * 0.5_f32.powf(1.5) * 255.0 * (0.08 / 0.18);
+    let filtered = 0.9 * 0.5_f32.powf(1.5) * 255.0 * (0.08 / 0.18);
     for (comments, more, stated, grey) in [
         ("", &[][..], Antialiasing::None, 229.5),
         (mip, &[], Antialiasing::Wide, 27.0),
         (&brush, &[], Antialiasing::Narrow, 65.6),
         ("comment antialiased 1\n", &[], Antialiasing::Wide, 27.0),
         ("comment antialiasing 0.1\n", &[], Antialiasing::Narrow, 65.6),
-        ("", &filter, Antialiasing::Narrow, fused),
+        ("", &filter, Antialiasing::Narrow, filtered),
     ] {
         let file = folder.path().join("one.ply");
         std::fs::write(&file, one(comments, more)).expect("a file");
@@ -66,7 +67,7 @@ fn small_gaussians_are_as_opaque_as_their_files_state() {
 
 #[test]
 #[ignore = "needs the shared cases: set DENSIFY_SHARED"]
-fn shared_models_with_antialiasing_have_their_grey() {
+fn shared_models_with_antialiasing_have_the_expected_grey() {
     for (name, stated, grey) in
         [("one_mip", Antialiasing::Wide, 27.0), ("one_mip_brush", Antialiasing::Narrow, 66.0)]
     {

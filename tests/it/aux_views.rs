@@ -279,7 +279,7 @@ fn points_lie_on_surfaces_and_follow_alpha_on(subject: &Subject) {
     positions.sort_unstable();
     positions.dedup();
     assert_eq!(positions.len(), 40, "a pixel was sampled twice");
-    // Opaque pixels are sampled more often, so the mean alpha of the sample exceeds that of all blended pixels.
+    // Opaque pixels are sampled more often, so the sample has a higher mean alpha (`error`) than all blended pixels.
     let mean = first.points.iter().map(|p| p.error).sum::<f32>() / 40.0;
     let all = AuxRequest { points: u32::MAX, ..request.clone() };
     let all_points = observe_view(&all, 0).points;

@@ -85,8 +85,8 @@ impl Tree {
             let text = read(path);
             let is_code = |line: &&str| !line.trim_start().starts_with("//");
             let code: String = text.lines().filter(is_code).flat_map(|line| [line, "\n"]).collect();
-            tree.words.push(code.split(|c: char| !is_of_name(c)).map(str::to_owned).collect());
-            let flags = code.split(is_no_flag).filter(|word| word.starts_with("--"));
+            tree.words.push(code.split(|c: char| !is_in_name(c)).map(str::to_owned).collect());
+            let flags = code.split(is_not_in_flag).filter(|word| word.starts_with("--"));
             tree.flags.extend(flags.map(str::to_owned));
         }
         tree
@@ -118,7 +118,7 @@ impl Tree {
     /// True if everything that a code span names exists.
     fn has(&self, document: &str, span: &str) -> bool {
         let mut flags =
-            span.split(is_no_flag).filter(|word| word.len() > 2 && word.starts_with("--"));
+            span.split(is_not_in_flag).filter(|word| word.len() > 2 && word.starts_with("--"));
         let is_flag = |flag: &str| {
             // Flags are declared as fields: `--sh-degree` is `sh_degree`.
             let field = flag.trim_start_matches('-').replace('-', "_");
@@ -136,7 +136,7 @@ impl Tree {
             return self.folders.iter().any(|path| is_tail(folder, path));
         }
         let names: Vec<&str> = span.trim_end_matches("()").split("::").collect();
-        let are_names = names.iter().all(|name| !name.is_empty() && name.chars().all(is_of_name));
+        let are_names = names.iter().all(|name| !name.is_empty() && name.chars().all(is_in_name));
         let is_symbol = names.len() > 1 || span.contains('_') || is_camel_case(span);
         !are_names || !is_symbol || self.knows(&names)
     }
@@ -159,11 +159,11 @@ fn words(text: &str) -> usize {
     text.split_whitespace().count()
 }
 
-fn is_of_name(c: char) -> bool {
+fn is_in_name(c: char) -> bool {
     c.is_ascii_alphanumeric() || c == '_'
 }
 
-fn is_no_flag(c: char) -> bool {
+fn is_not_in_flag(c: char) -> bool {
     !(c.is_ascii_alphanumeric() || c == '-')
 }
 

@@ -17,7 +17,7 @@ use crate::subject::{GREY, all, make_with, normalised, repeatable, step_input};
 
 /// Step of the central difference, to either side.
 const STEP: f64 = 1e-6;
-const SOME: ColourTransform = ColourTransform {
+const EXPOSURE: ColourTransform = ColourTransform {
     matrix: [[1.2, 0.05, -0.1], [0.02, 0.7, 0.15], [-0.05, 0.1, 1.3]],
     offset: [0.03, -0.06, 0.11],
 };
@@ -108,7 +108,7 @@ fn gradients_match_the_reference_and_central_differences() {
         let (width, height) = scene.size();
         let model = Model::from(&scene.model);
         let image = render(&model, scene.view(), &Rules::STANDARD);
-        let (truth, at) = (scene.truth(), numbers(&SOME));
+        let (truth, at) = (scene.truth(), numbers(&EXPOSURE));
         let compared = |exposure: &[f64; 12]| {
             loss(&scene.exposed(&image.rgb, &image.alpha, exposure), &truth, width, height)
         };
@@ -140,7 +140,7 @@ fn gradients_match_the_reference_and_central_differences() {
         let by_row = by_row.model;
         for subject in all() {
             let mut backend = backend(&subject, &scene);
-            let output = step(&mut *backend, &scene, Some(&SOME));
+            let output = step(&mut *backend, &scene, Some(&EXPOSURE));
             let case = format!("{}, alpha {with_alpha}", subject.name());
             let off = (f64::from(output.loss) - compared(&at).loss).abs();
             table.check(&case, "loss", off, 1e-5);
@@ -193,7 +193,7 @@ fn exposures_do_not_depend_on_the_number_of_threads() {
         let Subject::Native { instructions, .. } = Subject::NATIVE else { unreachable!() };
         let subject = Subject::Native { instructions, threads: Some(threads) };
         let mut backend = backend(&subject, &scene);
-        (step(&mut *backend, &scene, Some(&SOME)), backend.download().expect("a model"))
+        (step(&mut *backend, &scene, Some(&EXPOSURE)), backend.download().expect("a model"))
     };
     let one = run(1);
     assert!((2..5).all(|threads| run(threads) == one));
@@ -233,14 +233,14 @@ fn auxiliary_views_and_candidates_apply_the_exposure() {
             camera: &scene.camera,
             target: &scene.target,
             background: GREY,
-            exposure: Some(&SOME),
+            exposure: Some(&EXPOSURE),
             sh_degree: 1,
             request: &request,
         });
         let seen = seen.expect("a small image is rendered");
-        let output = step(&mut *backend, &scene, Some(&SOME));
+        let output = step(&mut *backend, &scene, Some(&EXPOSURE));
         assert!((seen.loss - output.loss).abs() < 1e-6, "{}", subject.name());
-        let grey = SOME.inverse().apply([128.0 / 255.0; 3]);
+        let grey = EXPOSURE.inverse().apply([128.0 / 255.0; 3]);
         let list: &[Candidate] = backend.candidates();
         assert!(!list.is_empty(), "{}", subject.name());
         for Candidate { colour, .. } in list {

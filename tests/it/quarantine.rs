@@ -1,4 +1,4 @@
-//! Non-finite rows: every one is found and stays marked, and other rows are not affected. Case 25 of the
+//! Non-finite rows: every one is found and stays non-finite, and other rows are not affected. Case 25 of the
 //! [selftest](densify::selftest) covers gradients whose square overflows.
 
 use densify::core::gaussians::{Gaussians, ModelArray};

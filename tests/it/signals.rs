@@ -44,7 +44,7 @@ fn views() -> Views {
     let mut second = Camera { width: 38, height: 50, ..first };
     second.translation.x += 0.3;
     let cameras = vec![first, scenes::rounded(&second)];
-    // A step of length zero normalises quaternions with the rounding of training.
+    // Normalised, because even steps with learning rates of 0 normalise quaternions.
     let model = normalised(scenes::cloud(21, 2, &first, 62));
     let target = |camera: &Camera| scenes::noisy((camera.width, camera.height), 0.0, 63).1;
     let mut targets: Vec<_> = cameras.iter().map(target).collect();
@@ -335,7 +335,7 @@ fn the_largest_weight_covers_the_previous_epoch() {
     }
 }
 
-/// They agree bit for bit, for all kinds of storage and also for rows that an edit has moved.
+/// Signals and parameters agree bit for bit, for all kinds of storage, even for rows that an edit has moved.
 #[test]
 fn attribute_signals_equal_the_parameters() {
     let views = views();

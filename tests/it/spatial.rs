@@ -118,7 +118,7 @@ impl ViewSource for One {
     }
 }
 
-/// The model after the event and the number of refused rows, with zero learning rates.
+/// The model after the event, with negligible learning rates, and the number of refused edits.
 fn trained(policy: Spatial, backend: Box<dyn Backend>, camera: &Camera) -> (Gaussians, usize) {
     let budget = backend.budget();
     let scene = scene_of(budget);

@@ -145,7 +145,7 @@ pub(crate) fn cases_on(subject: &Subject, default: u32) -> ProptestConfig {
     ProptestConfig { cases, ..base }
 }
 
-/// The input of a training step towards an image, at the degree of the model.
+/// The input of a training step towards an image.
 pub(crate) fn step_input<'a>(
     step: u32,
     camera: &'a Camera,

@@ -46,13 +46,13 @@ fn undeclared_features_need_no_memory() {
         }
         let error = promise(device, &needs(&[Signal::ErrorScore]));
         assert!(promise(device, &with_edges) > error, "{name}: edges");
-        // Values that steps compute anyway, and numbers of the run, need no memory.
+        // Noise, loss terms and the weights of an error score that is not requested need no memory.
         let free = Needs {
             noise: Some(NoiseTerm { strength: 1.0, sharpness: 100.0, opacity: 0.005 }),
             loss_terms: LossTerms { opacity: 0.01, scale: 0.01 },
             error_score: edges,
             ..none()
         };
-        assert_eq!(promise(device, &free), least, "{name}: free signals need memory");
+        assert_eq!(promise(device, &free), least, "{name}: {free:?} needs memory");
     }
 }

@@ -132,7 +132,7 @@ fn run_event(
     Ok(ops)
 }
 
-/// Shows the views to a copy: only declared columns and points, or everything.
+/// Shows the views to a policy: only declared columns and points, or everything.
 fn observe(
     policy: &mut dyn DensityPolicy,
     step: u32,
@@ -162,7 +162,7 @@ fn observe(
     Ok(())
 }
 
-/// Lets a copy plan, given only declared inputs or everything.
+/// Has a policy write its plan, from declared inputs only or from everything.
 fn plan(
     policy: &mut dyn DensityPolicy,
     scenario: &Scenario,

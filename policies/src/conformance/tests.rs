@@ -175,10 +175,10 @@ impl DensityPolicy for Faulty {
 
     fn resolution(&self, step: u32) -> f64 {
         let is_too_far = self.has(Fault::ShrinksImagesTooFar) && step > 90;
-        let is_other = self.has(Fault::ShrinksImagesUnsaved) && self.unsaved > 2;
+        let shrinks_unsaved = self.has(Fault::ShrinksImagesUnsaved) && self.unsaved > 2;
         if is_too_far {
             0.4
-        } else if is_other {
+        } else if shrinks_unsaved {
             0.5
         } else {
             1.0

@@ -39,12 +39,13 @@ impl Diet {
         importance: &[f32],
         exempt: &dyn Fn(u32) -> bool,
     ) -> PolicyResult {
-        let code_size = match self.params.newborn_size {
+        let size_as_published = match self.params.newborn_size {
             NewbornSize::Pixel => None,
             NewbornSize::Code => Some(squared_geometric_mean(now.signal(Signal::ScaleMax)?)),
         };
         let seeds = now.candidates.iter().map(|candidate| {
-            let scale = code_size.unwrap_or(self.params.size_pixels as f32 * candidate.pixel_size);
+            let size_in_pixels = self.params.size_pixels as f32 * candidate.pixel_size;
+            let scale = size_as_published.unwrap_or(size_in_pixels);
             let opacity = self.params.newborn_opacity as f32;
             let seed = Seed::round(candidate.position, candidate.colour, scale, opacity);
             (candidate.error, seed)

@@ -19,7 +19,7 @@
 //! densified: small ones (up to `small` · scene extent) are cloned, the others split in two (`split`).
 //! The remaining candidates are counted as denied, and the gradient statistics are reset.
 //!
-//! **Eviction** prunes the Gaussians with the lowest importance, but no candidates. Importance is the
+//! **Eviction** prunes the least important Gaussians that are not candidates. Importance is the
 //! largest blend weight α·T over all pixels of the views chosen by `importance`. New Gaussians are
 //! protected for an epoch, but at most `protect` steps; if there are not enough others, they are
 //! evicted too, the oldest first.
@@ -31,8 +31,8 @@
 //! `rho_c` · budget over the whole run, an equal part at each insertion. Where there is no room, the
 //! least important Gaussians are evicted. The list of collected pixels is then cleared.
 //!
-//! **Pruning**, every `prune_every` steps until growth and compensation have ended, evicts Gaussians above
-//! the budget. (This happens only if the loaded model was too large.)
+//! **Pruning**, every `prune_every` steps until growth and compensation have ended, evicts Gaussians while there
+//! are more than the budget. (This happens only if the loaded model was too large.)
 //!
 //! Some defaults differ from paper and code, based on runs of 2,000 to 7,000 steps:
 //! `split` is `long-axis`; `full_depth` suppresses floaters that fit a single photograph; `rho` and

@@ -6,6 +6,7 @@ use super::*;
 use crate::event::{Event, Outcome, assert_conforms, assert_grows_like_vanilla, build, due_steps};
 use crate::parameters::REFERENCE_ITERATIONS;
 use crate::policy::SignalSet;
+
 fn run(event: &Event, set: &str) -> Outcome {
     event.run("eagles", set)
 }
@@ -56,10 +57,10 @@ fn the_schedule_is_the_published_one() {
         let scene = SceneInfo { iterations, ..Event::new(1, 1, 1).scene };
         due_steps("eagles", set, &scene)
     };
-    let none = "grow_every = 0\nreset_every = 0";
-    assert_eq!(due(none, REFERENCE_ITERATIONS), [5100, 10_200, 15_300, 20_400, 25_500]);
+    let prunes_only = "grow_every = 0\nreset_every = 0";
+    assert_eq!(due(prunes_only, REFERENCE_ITERATIONS), [5100, 10_200, 15_300, 20_400, 25_500]);
     // 7,000/30,000 of 5,100 and 27,000: 1190 and 6300.
-    assert_eq!(due(none, 7000), [1190, 2380, 3570, 4760, 5950]);
+    assert_eq!(due(prunes_only, 7000), [1190, 2380, 3570, 4760, 5950]);
     let growth = due("prune_every = 0\nreset_every = 0", REFERENCE_ITERATIONS);
     assert_eq!((growth.len(), growth[0], growth.last()), (139, 625, Some(&17_875)));
     let resets = due("prune_every = 0\ngrow_every = 0", REFERENCE_ITERATIONS);

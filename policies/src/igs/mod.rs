@@ -204,9 +204,8 @@ impl DensityPolicy for Igs {
         if !self.grow.is_due(step) || self.is_final(step) {
             return 0;
         }
-        // The first growth after a recovery prune.
-        let since = step - self.params.grow_every.min(step);
-        let after_prune = (since..step).any(|step| self.is_recovery_prune(step));
+        let last_growth = step - self.params.grow_every.min(step);
+        let after_prune = (last_growth..step).any(|step| self.is_recovery_prune(step));
         if after_prune { u32::MAX } else { self.params.views }
     }
 

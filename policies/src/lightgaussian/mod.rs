@@ -68,7 +68,7 @@
 //! | reset_opacity | 0.01 | 0 to 1, both excluded | | largest opacity after a reset |
 //! | white_reset_at | 500 | >= 0 | step | one more reset, on a white background only; 0: never |
 //! | governor | false | | | grow along a curve instead of by `tau` |
-//! | schedule | "twice" | twice, once | | the published schedule |
+//! | schedule | "twice" | twice, once | | number of prunes |
 //! | first_at | 16000 | >= 0 | step | first prune of `twice`; 0: none |
 //! | first_share | 0.5 | 0 to 1 | Gaussians | share that it removes |
 //! | second_at | 24000 | >= 0 | step | second prune of `twice`; 0: none |
@@ -89,7 +89,7 @@ use crate::plan::EditPlan;
 use crate::policy::{
     AuxColumn, AuxRequest, AuxView, DensityPolicy, Needs, PolicyResult, SceneInfo, Signal, Snapshot,
 };
-use crate::prune::{OverViews, Victims};
+use crate::prune::{Victims, ViewAccumulator};
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
 use crate::vanilla::Vanilla;
@@ -112,7 +112,7 @@ pub struct LightGaussian {
     params: LightGaussianParams,
     growth: Vanilla,
     /// Number of pixels or blend weights, summed over the views of the event. Shape: `[rows]`.
-    hits: OverViews,
+    hits: ViewAccumulator,
 }
 
 impl ConfiguredPolicy for LightGaussian {
@@ -126,7 +126,7 @@ impl ConfiguredPolicy for LightGaussian {
     fn new(params: LightGaussianParams, scene: &SceneInfo) -> PolicyResult<Self> {
         params.check()?;
         let growth = Vanilla::new(params.growth.clone(), scene)?;
-        Ok(Self { growth, hits: OverViews::default(), params })
+        Ok(Self { growth, hits: ViewAccumulator::default(), params })
     }
 }
 
@@ -203,13 +203,13 @@ impl LightGaussian {
             // The blend weight includes the opacity.
             Hit::BlendWeight => 1.0,
         };
-        let largest = match self.params.volume {
+        let max_volume = match self.params.volume {
             Volume::Plain => f32::INFINITY,
             Volume::Clipped => percentile_90(volume),
         };
         let significance = |(row, (&hits, &volume)): (usize, (&f32, &f32))| {
             // `min` would replace NaN by the limit.
-            let volume = if volume > largest { largest } else { volume };
+            let volume = if volume > max_volume { max_volume } else { volume };
             let volume = f64::from(volume).powf(self.params.volume_power);
             let significance = f64::from(hits) * f64::from(per_hit(row)) * volume;
             if significance > 0.0 { significance as f32 } else { 0.0 }

@@ -71,7 +71,7 @@ fn volume_counts_by_its_tenth_root() {
 fn significance(event: &Event, set: &str, pixels: &[f32]) -> Vec<f32> {
     let growth = Vanilla::new(Default::default(), &event.scene).unwrap();
     let params: LightGaussianParams = toml::from_str(set).unwrap();
-    let policy = LightGaussian { params, growth, hits: OverViews::default() };
+    let policy = LightGaussian { params, growth, hits: ViewAccumulator::default() };
     let signals = event.signals(SignalSet::from([Signal::Opacity, Signal::ScaleProduct]));
     let (step, scene) = (event.step, &event.scene);
     let now = Snapshot { step, scene, signals: &signals, candidates: &[] };

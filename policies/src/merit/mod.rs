@@ -50,7 +50,7 @@
 //! | grow_every | 100 | >= 0 | steps | interval of events; 0: never |
 //! | curve_until | 30000 | >= 0 | step | step at which the curve reaches the budget |
 //! | rho | 0.25 | >= 0 | budget | minimum number of Gaussians replaced in the whole run |
-//! | replaceable | 0.15 | >= 0 | median importance | less important Gaussians are replaced; 0: only `rho` |
+//! | replaceable | 0.15 | >= 0 | median importance | Gaussians below this importance are replaced; 0: none beyond `rho` |
 //! | most_rho | 2.0 | >= 0 | budget | maximum number of Gaussians replaced in the whole run |
 //! | gradient | "abs" | abs, screen | | screen gradient, with absolute values or without |
 //! | colour_weight | 30.0 | >= 0 | | weight of the colour gradient; 0: none |

@@ -95,7 +95,7 @@ use crate::policy::{
     AuxColumn, AuxRequest, AuxView, Candidate, DensityPolicy, Needs, PixelMap, PolicyResult, Rate,
     RateOverrides, SceneInfo, Signal, SignalSet, Snapshot,
 };
-use crate::prune::{OverViews, Victims};
+use crate::prune::{Victims, ViewAccumulator};
 use crate::quota::share_of_budget;
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
@@ -120,12 +120,12 @@ crate::register_policy!(
 pub struct MiniSplatting {
     params: MiniSplattingParams,
     growth: Vanilla,
-    /// Surface points of the current event. This and the next two are not saved, as each event starts from
+    /// Surface points of the current event. This field and the next two are not saved, as each event starts from
     /// zero.
     surface: Vec<Candidate>,
-    importance: OverViews,
+    importance: ViewAccumulator,
     /// Number of pixels that each row dominates.
-    dominated: OverViews,
+    dominated: ViewAccumulator,
 }
 
 impl ConfiguredPolicy for MiniSplatting {
@@ -141,8 +141,8 @@ impl ConfiguredPolicy for MiniSplatting {
         Ok(Self {
             growth: Vanilla::new(params.growth.clone(), scene)?,
             surface: Vec::new(),
-            importance: OverViews::default(),
-            dominated: OverViews::default(),
+            importance: ViewAccumulator::default(),
+            dominated: ViewAccumulator::default(),
             params,
         })
     }

@@ -62,7 +62,7 @@ impl Needs {
     /// Checks that this factor on the sides of images is within the declared range.
     ///
     /// # Errors
-    /// When it is NaN, above 1 or below the declared minimum; the message has both.
+    /// When it is NaN, above 1 or below the declared minimum; the message has the factor and the minimum.
     pub fn check_resolution(&self, factor: f64) -> Result<(), String> {
         let least = self.least_resolution.unwrap_or(1.0);
         if (least..=1.0).contains(&factor) {

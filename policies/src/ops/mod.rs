@@ -267,8 +267,8 @@ impl RowOps {
                 "{rows_before} rows before, {counts:?}, {added} added; this does not give {rows_after} rows after"
             )
         })?;
-        let is_child = |family: &&Family| family.fate == ParentFate::BecomesChild;
-        let updated = self.updates.len() + self.families.iter().filter(is_child).count();
+        let is_rewritten = |family: &&Family| family.fate == ParentFate::BecomesChild;
+        let updated = self.updates.len() + self.families.iter().filter(is_rewritten).count();
         require(counts.updated == updated, || format!("{updated} updated, but {counts:?}"))?;
         valid(self.decay.and_then(|decay| decay.bad_field()), || "the decay".to_owned())?;
         require(self.clamp_opacity.is_none_or(in_open_unit), || {

@@ -1,4 +1,4 @@
-//! # radsplat — growth as in `vanilla`, then pruning of Gaussians that are visible in no pixel
+//! # radsplat — growth as in `vanilla`, then pruning of Gaussians with little weight in every pixel
 //!
 //! Grows a model as `vanilla` does, and at two later steps prunes the Gaussians whose weight is negligible in
 //! every pixel of every training view. The rest of the run trains the remaining Gaussians.
@@ -75,7 +75,7 @@ use crate::plan::EditPlan;
 use crate::policy::{
     AuxColumn, AuxRequest, AuxView, DensityPolicy, Needs, PolicyResult, SceneInfo, Snapshot,
 };
-use crate::prune::{OverViews, Victims};
+use crate::prune::{Victims, ViewAccumulator};
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
 use crate::vanilla::{Vanilla, VanillaParams};
@@ -121,7 +121,7 @@ pub struct RadSplat {
     params: RadSplatParams,
     growth: Vanilla,
     /// Largest blend weight in the views of the event. Shape: `[rows]`.
-    weight: OverViews,
+    weight: ViewAccumulator,
 }
 
 impl ConfiguredPolicy for RadSplat {
@@ -133,7 +133,7 @@ impl ConfiguredPolicy for RadSplat {
     fn new(params: RadSplatParams, scene: &SceneInfo) -> PolicyResult<Self> {
         in_range("min_weight", params.min_weight, 0.0..=1.0)?;
         let growth = Vanilla::new(params.growth.clone(), scene)?;
-        Ok(Self { growth, weight: OverViews::default(), params })
+        Ok(Self { growth, weight: ViewAccumulator::default(), params })
     }
 }
 

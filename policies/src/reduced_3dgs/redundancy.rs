@@ -195,9 +195,10 @@ mod tests {
             let half_axes = logs.map(|log| (2.0 * log).exp());
             let surface = [0, 1, 2].map(|k: usize| half_axes[k] * unit[k] / length);
             let normal = [0, 1, 2].map(|k: usize| surface[k] / half_axes[k].powi(2));
-            let steep = normal.iter().map(|x| x * x).sum::<f64>().sqrt();
+            let normal_length = normal.iter().map(|x| x * x).sum::<f64>().sqrt();
             let distance = (3.0 * logs[0]).exp();
-            let centre = [0, 1, 2].map(|k: usize| surface[k] + distance * normal[k] / steep);
+            let centre =
+                [0, 1, 2].map(|k: usize| surface[k] + distance * normal[k] / normal_length);
             let meets = |radius| sphere_meets(centre, radius, half_axes);
             // Rounding matters if the surface is far from the origin and the distance small.
             let error = 1e-6 * distance + 1e-12 * half_axes.iter().fold(0.0, |a: f64, b| a.max(*b));
@@ -233,8 +234,8 @@ mod tests {
     #[test]
     fn redundancy_is_the_smallest_count_of_the_intersected_spheres() {
         // Balls of radius 1 at 0, 2, 4 and 20, with spheres of radius 1.1: the surface of the next ball is 1 away
-        // from each mean. Counts: 2, 3, 2, 1. The second row also
-        // intersects the first row's sphere, so its redundancy is 2.
+        // from each mean. Counts: 2, 3, 2, 1. The second row also intersects the first row's sphere, so its redundancy
+        // is 2.
         let pixel = 1.1 / 0.866_025_4;
         let xs = [0.0, 2.0, 4.0, 20.0];
         assert_eq!(redundancy(&xs, &[[1.0; 3]; 4], &[pixel; 4], 30), [2.0, 2.0, 2.0, 1.0]);

@@ -62,7 +62,7 @@ fn the_fainter_half_of_the_redundant_is_pruned() {
 }
 
 #[test]
-fn spheres_are_as_large_as_the_smallest_pixel() {
+fn the_smallest_pixel_determines_the_size_of_a_sphere() {
     // Balls 1.45 apart: the next surface is 0.45 away from each mean. √3/2 · 0.577 = 0.5 reaches it;
     // √3/2 · 0.51 = 0.44 does not, nor do half-axes of 2.6/3.
     let shifted = event(1000, &[0.0, 1.45, 2.9, -1.45, -2.9, 40.0]);

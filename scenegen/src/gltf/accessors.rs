@@ -215,18 +215,18 @@ impl<'a> Buffers<'a> {
             return Err(fault(path, name, "its sparse indices have an unknown componentType"));
         };
         let count = usize::try_from(sparse.count.0).unwrap_or(usize::MAX);
-        let of_indices = Layout { component: component.0, size: 1, count, normalised: false };
+        let index_layout = Layout { component: component.0, size: 1, count, normalised: false };
         let view = self.view(sparse.indices.buffer_view.value(), name)?;
-        let width_of_index = component.0.size();
+        let index_width = component.0.size();
         let packing =
-            Packing { offset: sparse.indices.byte_offset.0, stride: None, width: width_of_index };
-        let targets = unpack(view, &packing, &of_indices, unsigned_integer)
+            Packing { offset: sparse.indices.byte_offset.0, stride: None, width: index_width };
+        let targets = unpack(view, &packing, &index_layout, unsigned_integer)
             .ok_or_else(|| beyond(path, name))?;
-        let of_values = Layout { count, ..*layout };
+        let value_layout = Layout { count, ..*layout };
         let view = self.view(sparse.values.buffer_view.value(), name)?;
         let packing = Packing { offset: sparse.values.byte_offset.0, stride: None, width };
         let replacements =
-            unpack(view, &packing, &of_values, &convert).ok_or_else(|| beyond(path, name))?;
+            unpack(view, &packing, &value_layout, &convert).ok_or_else(|| beyond(path, name))?;
         for (&target, new) in targets.iter().zip(replacements.chunks_exact(layout.size)) {
             let at = target as usize * layout.size;
             let Some(old) = values.get_mut(at..at + layout.size) else {

@@ -44,8 +44,9 @@ impl Reader<'_> {
         let base_texture = texture(pbr.base_color_texture.as_ref().map(texture_use), true)?;
         let is_transparent = source.alpha_mode != Checked::Valid(JsonAlpha::Opaque);
         if is_transparent && base_texture.is_none() && pbr.base_color_texture.is_some() {
-            let feature = format!("{name}: the texture that says where it is transparent");
-            let remedy = "store it as PNG or JPEG, with one of the first two sets of coordinates";
+            let feature = format!("{name}: the texture that defines its transparency");
+            let remedy =
+                "store it as PNG or JPEG, with one of the first two sets of texture coordinates";
             return Err(Error::unsupported(path, &feature, remedy));
         }
         let metal_rough_texture =

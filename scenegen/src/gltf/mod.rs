@@ -78,7 +78,7 @@ struct Reader<'a> {
 pub(crate) fn load(path: &Path) -> Result<Model, Error> {
     let bytes = resource::read(path)?;
     let (text, blob) = split(path, &bytes)?;
-    let text = resource::without_mark(text).map_err(|problem| fault(path, "JSON", problem))?;
+    let text = resource::without_bom(text).map_err(|problem| fault(path, "JSON", problem))?;
     if text.len() > MAX_JSON {
         return Err(fault(path, "JSON", "it is larger than 64 MiB"));
     }
@@ -195,7 +195,7 @@ fn split<'a>(path: &Path, bytes: &'a [u8]) -> Result<(&'a [u8], Option<&'a [u8]>
 }
 
 /// Refuses unsupported versions, unsupported extensions that the file requires, and any use of [`GEOMETRY`]. This
-/// comes first, as what they change in a file may look like an error.
+/// check comes first, because an unsupported feature may make a valid file look malformed.
 fn refuse_unsupported(path: &Path, text: &[u8]) -> Result<(), Error> {
     #[derive(serde::Deserialize)]
     #[serde(rename_all = "camelCase")]
@@ -223,7 +223,7 @@ fn refuse_unsupported(path: &Path, text: &[u8]) -> Result<(), Error> {
     if let Some(name) = unknown.or_else(|| used.find(|name| GEOMETRY.contains(&name.as_str()))) {
         let shown = resource::shortened(name);
         let feature =
-            format!("the extension {shown}, which the file requires or places surfaces with,");
+            format!("the extension {shown}, which the file requires or uses for its geometry,");
         return Err(Error::unsupported(path, &feature, remedy(name)));
     }
     Ok(())

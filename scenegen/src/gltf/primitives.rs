@@ -90,7 +90,7 @@ impl Reader<'_> {
         }
         let material = self.material(primitive.material.map(|index| index.value()))?;
         for pose in matrices.chunks(per_pose) {
-            let of = |vertex: usize| if per_pose == 1 { 0 } else { vertex };
+            let matrix_of = |vertex: usize| if per_pose == 1 { 0 } else { vertex };
             let normal_matrices: Vec<_> =
                 pose.iter().map(|world| world.matrix3.inverse().transpose()).collect();
             let mirrored: Vec<bool> =
@@ -98,7 +98,7 @@ impl Reader<'_> {
             let first = self.model.positions.len();
             for vertex in 0..count {
                 let p = Vec3::from(positions.get::<3>(vertex)).as_dvec3();
-                let p = pose[of(vertex)].transform_point3(p);
+                let p = pose[matrix_of(vertex)].transform_point3(p);
                 if !p.is_finite() {
                     return Err(self.fault(element, format!("vertex {vertex} is not finite")));
                 }
@@ -106,11 +106,13 @@ impl Reader<'_> {
             }
             let model = &mut self.model;
             let normal = |i, v: [f32; 3]| {
-                (normal_matrices[of(i)] * Vec3::from(v).as_dvec3()).as_vec3().normalize_or_zero()
+                (normal_matrices[matrix_of(i)] * Vec3::from(v).as_dvec3())
+                    .as_vec3()
+                    .normalize_or_zero()
             };
             let tangent = |i, [x, y, z, w]: [f32; 4]| {
-                let t = pose[of(i)].matrix3 * DVec3::new(x.into(), y.into(), z.into());
-                let side = if mirrored[of(i)] { -1.0 } else { 1.0 };
+                let t = pose[matrix_of(i)].matrix3 * DVec3::new(x.into(), y.into(), z.into());
+                let side = if mirrored[matrix_of(i)] { -1.0 } else { 1.0 };
                 t.as_vec3().normalize_or_zero().extend(w * side)
             };
             let colour = |_, v: [f32; 4]| Vec4::from(v).clamp(Vec4::ZERO, Vec4::splat(1e4));
@@ -123,7 +125,7 @@ impl Reader<'_> {
             }
             pad(&mut model.colours, converted(colours.as_ref(), colour), place, Vec4::ONE);
             model.triangles.extend(triangles.iter().map(|&[a, b, c]| {
-                let [b, c] = if mirrored[of(a as usize)] { [c, b] } else { [b, c] };
+                let [b, c] = if mirrored[matrix_of(a as usize)] { [c, b] } else { [b, c] };
                 [a, b, c].map(|i| i + first as u32)
             }));
             model.triangle_materials.resize(model.triangles.len(), material);

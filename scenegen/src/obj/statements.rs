@@ -86,7 +86,7 @@ pub(super) fn for_each(
             return Ok(());
         }
         let bytes: &[u8] = if line == 1 {
-            resource::without_mark(&text).map_err(|problem| fault(path, line, problem))?
+            resource::without_bom(&text).map_err(|problem| fault(path, line, problem))?
         } else {
             &text
         };

@@ -189,11 +189,11 @@ impl Surface {
     /// The local ray for a world ray. Its origin is moved to the point where it enters the bounding box: single
     /// precision then does not have to cover the distance to the box. `None` if the ray misses the box.
     pub(crate) fn enter(&self, origin: DVec3, direction: DVec3, range: f64) -> Option<LocalRay> {
-        self.enter_after(origin, direction, range).map(|(ray, _)| ray)
+        self.enter_with_distance(origin, direction, range).map(|(ray, _)| ray)
     }
 
     /// [`Surface::enter`], and the distance to the box `[local units]`.
-    pub(crate) fn enter_after(
+    pub(crate) fn enter_with_distance(
         &self,
         origin: DVec3,
         direction: DVec3,

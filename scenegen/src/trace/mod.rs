@@ -78,7 +78,7 @@ impl Rays {
 
     /// Adds a ray, if it hits the bounding box.
     fn add(&mut self, surface: &Surface, index: u32, origin: DVec3, direction: DVec3) {
-        if let Some((ray, entry)) = surface.enter_after(origin, direction, f64::INFINITY) {
+        if let Some((ray, entry)) = surface.enter_with_distance(origin, direction, f64::INFINITY) {
             self.rays[self.count] = ray;
             self.index[self.count] = index;
             self.entry[self.count] = entry;

@@ -20,7 +20,7 @@ use densify_run::failure::{Failure, INPUT};
 use densify_run::finished::{model_file, read_model, read_model_as, write_model};
 use table::WrittenFile;
 
-/// Stands for every format.
+/// Value of `--format` that selects every format.
 const ALL: &str = "all";
 
 /// Writes a trained model in another format, or in all.
@@ -43,7 +43,7 @@ pub(super) struct ExportArgs {
     /// Saved iteration of the run `[default: the last]`
     #[arg(long, value_name = "N")]
     iteration: Option<u32>,
-    /// Coordinates of the file: local ones are relative to an offset, which stands in the file or, for SPZ, in
+    /// Coordinates of the file: local ones are relative to an offset, stored in the file or, for SPZ, in
     /// FILE.offset.json. auto: world, or local if f32 is too coarse for world coordinates, as in UTM
     #[arg(long, value_name = "KIND", default_value = "auto")]
     coordinates: Coordinates,

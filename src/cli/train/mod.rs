@@ -130,7 +130,7 @@ fn print_preset(spec: &RunSpec, console: &Console) -> Result<(), Failure> {
     let iterations = spec.schedule.iterations.0.to_string();
     match preset.levels.iter().find(|(name, _)| *name == "iterations") {
         Some((_, of_preset)) if *of_preset != iterations => console.say(format_args!(
-            "preset   none: --iterations {iterations} is given, and {name} is {of_preset} iterations"
+            "preset   none: --iterations {iterations} overrides {name}, which has {of_preset}"
         )),
         _ => console.say(format_args!("preset   {preset}")),
     }
@@ -140,7 +140,7 @@ fn print_preset(spec: &RunSpec, console: &Console) -> Result<(), Failure> {
 /// Shows a run on the console, and stops it on a signal.
 pub(super) struct Follower<'a> {
     console: &'a Console,
-    /// Show details too.
+    /// True if details are shown, too.
     verbose: bool,
     progress: RefCell<Option<Progress<'a>>>,
     interrupts: RefCell<Option<Interrupts>>,

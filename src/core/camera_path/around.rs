@@ -11,12 +11,12 @@ use crate::camera::Camera;
 const KEYFRAMES: u32 = 48;
 /// Number of turns of a spiral.
 const TURNS: f64 = 2.0;
-/// Directions count as coplanar if at most this fraction of their squared length is normal to the plane, that is,
-/// for a mean roll of up to 13°.
+/// Directions count as coplanar if at most this fraction of their squared length is normal to the plane, which allows
+/// a root mean square roll of 13°.
 const MAX_NORMAL_FRACTION: f64 = 0.05;
 /// Coplanar directions count as collinear if at most this fraction is along their second axis.
 const MAX_LINE_FRACTION: f64 = 0.1;
-/// The quantile of the cameras' offsets that a spiral reaches.
+/// The quantile of the cameras' offsets that is the radius of a spiral.
 const REACH_QUANTILE: f64 = 0.9;
 
 /// Common properties of a set of cameras.
@@ -139,8 +139,8 @@ pub fn orbit(cameras: &[Camera]) -> CameraPath {
     CameraPath { keyframes: (0..KEYFRAMES).map(keyframe).collect(), is_loop: true }
 }
 
-/// A spiral of two turns around the centre of the cameras that looks at their focus and reaches the 90 %
-/// quantile of their offsets (*Local Light Field Fusion*, Mildenhall et al. 2019).
+/// A spiral of two turns around the centre of the cameras, looking at their focus. Its radii are the 90 % quantiles of
+/// their offsets from the centre (*Local Light Field Fusion*, Mildenhall et al. 2019).
 ///
 /// # Panics
 /// If there are no cameras.

@@ -11,7 +11,7 @@ use crate::files;
 
 /// Maximum size of a file `[bytes]`.
 const MAX_BYTES: u64 = 64 << 20;
-/// Maximum number of keyframes of a path, and of its frames.
+/// Maximum number of keyframes of a path, and maximum number of frames.
 const MAX_KEYFRAMES: usize = 100_000;
 /// The size of frames if the file gives none `[px]`; only the poses and the aspect ratio matter then.
 const ANY_SIZE: (u32, u32) = (1600, 900);
@@ -149,7 +149,7 @@ pub fn parse_keyframe(numbers: &[f64], fov: f64) -> Result<Keyframe, String> {
     let is_rotation =
         volume > 0.0 && (volume / (lengths[0] * lengths[1] * lengths[2]) - 1.0).abs() < 1e-2;
     if !is_rotation {
-        return Err("camera_to_world is not a rotation: it bends or mirrors the axes".to_owned());
+        return Err("camera_to_world is not a rotation: it shears or mirrors the axes".to_owned());
     }
     // OpenCV's y and z axes point the other way.
     let axes = DMat3::from_cols(axes.x_axis, -axes.y_axis, -axes.z_axis);

@@ -178,8 +178,8 @@ fn invalid_files_are_refused_with_the_reason() {
         (pose(unit, "0"), "fov is 0"),
         (pose(unit, "180"), "fov is 180"),
         (pose("1,0,0,0, 0,1,0,0, 0,0,-1,0, 0,0,0,1", "50"), "mirrors"),
-        (pose("1,1,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,1", "50"), "bends"),
-        (pose("0,0,0,0, 0,0,0,0, 0,0,0,0, 0,0,0,1", "50"), "bends"),
+        (pose("1,1,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,1", "50"), "shears"),
+        (pose("0,0,0,0, 0,0,0,0, 0,0,0,0, 0,0,0,1", "50"), "shears"),
         (r#"{"camera_type": "fisheye", "camera_path": []}"#.to_owned(), "fisheye"),
     ] {
         let refused = parse(&text).unwrap_err();

@@ -75,15 +75,15 @@ mod faults {
         static INJECTION: RefCell<Injection> = RefCell::default();
     }
 
-    /// Runs `f` with a fault, or with short writes if there is none. Also returns the number of times that the fault
-    /// occurred.
+    /// Runs `f` with a fault; with `None`, every write accepts at most one byte instead. Also returns the number of
+    /// times that the fault occurred.
     pub fn with_fault<T>(fault: Option<Fault>, f: impl FnOnce() -> T) -> (T, u32) {
         INJECTION.replace(Injection { fault, count: 0, short_writes: fault.is_none() });
         let done = f();
         (done, INJECTION.take().count)
     }
 
-    /// Fails if the operation has a fault.
+    /// Fails if the fault applies to this operation and path.
     ///
     /// # Errors
     /// The error of the fault.

@@ -11,5 +11,6 @@ pub use atomic::{
 };
 pub use error::FileError;
 pub use read::{
-    MAX_OPTIONS, folder_of, lines, most_unpacked, one_line, open, read_text, wrong_kind,
+    MAX_OPTIONS_BYTES, folder_of, max_unpacked_bytes, multi_line, one_line, open, read_text,
+    wrong_kind,
 };

@@ -5,10 +5,10 @@ use std::fs::{File, OpenOptions};
 use std::io::{self, Read};
 use std::path::Path;
 
-/// The message about text in another encoding, often caused by a file name in the text.
+/// The message for text in another encoding, often caused by a file name in the text.
 pub(super) const NOT_UTF8: &str = "it is not text in UTF-8; save it as UTF-8, and rename files whose names are in another encoding";
 /// The maximum size of a file of options `[bytes]`.
-pub const MAX_OPTIONS: u64 = 4 << 20;
+pub const MAX_OPTIONS_BYTES: u64 = 4 << 20;
 
 /// Opens a file for reading. Pipes, sockets and devices are refused without waiting for their data.
 ///
@@ -54,20 +54,20 @@ pub fn read_text(path: &Path, limit: u64) -> io::Result<String> {
 }
 
 /// The maximum unpacked size of a compressed file of `packed` bytes `[bytes]`.
-pub fn most_unpacked(packed: u64) -> u64 {
+pub fn max_unpacked_bytes(packed: u64) -> u64 {
     /// The limit for small files.
-    const LEAST: u64 = 64 << 20;
+    const MIN_LIMIT: u64 = 64 << 20;
     /// Limit per byte of a larger file. Models unpack to 2 to 5 times their size, or up to 20 times if
-    /// they have little colour; tables of text unpack to up to 10 times their size.
+    /// they have little colour; text tables to up to 10 times their size.
     const RATIO: u64 = 100;
-    LEAST.max(packed.saturating_mul(RATIO))
+    MIN_LIMIT.max(packed.saturating_mul(RATIO))
 }
 
-/// Recognises, by its first bytes, a kind of file that is often found in place of data. Returns a message with the
+/// Recognises, by its first bytes, a file that is often found in place of the real one; returns a message with the
 /// remedy.
 pub fn wrong_kind(start: &[u8]) -> Option<&'static str> {
     if start.starts_with(b"version https://git-lfs") {
-        Some("it is a pointer of Git LFS, not the file itself; fetch that with `git lfs pull`")
+        Some("it is a Git LFS pointer, not the file itself; fetch the file with `git lfs pull`")
     } else if start.starts_with(&[0xff, 0xfe]) || start.starts_with(&[0xfe, 0xff]) {
         Some("it is text in UTF-16; save it as UTF-8")
     } else {
@@ -81,7 +81,7 @@ pub fn one_line(text: &str) -> String {
 }
 
 /// Escapes control characters except line breaks and tabs.
-pub fn lines(text: &str) -> String {
+pub fn multi_line(text: &str) -> String {
     escaped(text, &['\n', '\t'])
 }
 
@@ -148,6 +148,6 @@ mod tests {
     fn control_characters_are_escaped() {
         let text = "a\x1b[31m\r\nü\u{9b}";
         assert_eq!(one_line(text), "a\\u{1b}[31m\\r\\nü\\u{9b}");
-        assert_eq!(lines(text), "a\\u{1b}[31m\\r\nü\\u{9b}");
+        assert_eq!(multi_line(text), "a\\u{1b}[31m\\r\nü\\u{9b}");
     }
 }

@@ -10,12 +10,13 @@ pub fn peak_resident() -> Option<u64> {
     status_line("VmHWM:")
 }
 
-/// Reads a line of `/proc/self/status` `[bytes]`; `None` if there is none.
+/// The value of a line of `/proc/self/status` `[bytes]`; `None` if there is no such line.
 pub fn status_line(key: &str) -> Option<u64> {
     parse_status(&std::fs::read_to_string("/proc/self/status").ok()?, key)
 }
 
-/// Parses a line of `/proc/<pid>/status`, such as "VmRSS:     1234 kB" (proc(5): kB means 1,024 bytes), in bytes.
+/// The value of a line in the text of `/proc/<pid>/status` `[bytes]`, such as "VmRSS:     1234 kB" (proc(5): kB means
+/// 1,024 bytes).
 pub fn parse_status(status: &str, key: &str) -> Option<u64> {
     let value = status.lines().find_map(|line| line.strip_prefix(key))?;
     let kibibytes: u64 = value.trim().strip_suffix("kB")?.trim().parse().ok()?;

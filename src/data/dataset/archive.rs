@@ -62,10 +62,10 @@ pub(super) fn is_zip(path: &Path) -> bool {
 pub(super) fn load(path: &Path, options: &LoadOptions) -> Result<Dataset, LoadError> {
     let unpacked = Arc::new(Unpacked::new(path)?);
     let mut dataset = Dataset::load_folder(&unpacked.folder, options)
-        .map_err(|error| unpacked.named_error(error))?;
+        .map_err(|error| unpacked.error_with_archive_name(error))?;
     for note in &mut dataset.notes {
         if let Note::Text(text) = note {
-            *text = unpacked.named(text);
+            *text = unpacked.with_archive_name(text);
         }
     }
     let (bytes, place) = (Bytes(unpacked.bytes), unpacked.temporary.path().display());
@@ -128,7 +128,7 @@ impl Unpacked {
     }
 
     /// Replaces the temporary folder with the archive's name in a message.
-    pub(super) fn named(&self, text: &str) -> String {
+    pub(super) fn with_archive_name(&self, text: &str) -> String {
         let archive = self.archive.to_string_lossy();
         [&*self.folder, self.temporary.path()].iter().fold(text.to_owned(), |text, folder| {
             text.replace(&*folder.to_string_lossy(), &archive)
@@ -136,14 +136,14 @@ impl Unpacked {
     }
 
     /// Replaces the temporary folder with the archive's name in an error.
-    fn named_error(&self, error: LoadError) -> LoadError {
+    fn error_with_archive_name(&self, error: LoadError) -> LoadError {
         match error {
-            LoadError::Data(problem) => LoadError::Data(self.named(&problem)),
+            LoadError::Data(problem) => LoadError::Data(self.with_archive_name(&problem)),
             LoadError::Remedied { problem, remedy } => {
-                LoadError::Remedied { problem: self.named(&problem), remedy }
+                LoadError::Remedied { problem: self.with_archive_name(&problem), remedy }
             }
             LoadError::NoMasks { listing, inverted } => {
-                LoadError::NoMasks { listing: self.shown(&listing), inverted }
+                LoadError::NoMasks { listing: self.path_in_archive(&listing), inverted }
             }
             // The view list is the user's own file, outside the archive.
             LoadError::ViewList { .. } => error,
@@ -151,7 +151,7 @@ impl Unpacked {
     }
 
     /// Replaces the temporary folder with the archive's name in a path.
-    pub(super) fn shown(&self, path: &Path) -> PathBuf {
+    pub(super) fn path_in_archive(&self, path: &Path) -> PathBuf {
         let rest = path.strip_prefix(&self.folder);
         let rest = rest.or_else(|_| path.strip_prefix(self.temporary.path()));
         rest.map_or_else(|_| path.to_owned(), |rest| self.archive.join(rest))
@@ -166,7 +166,7 @@ fn open(path: &Path) -> Result<ZipArchive<BufReader<File>>, LoadError> {
 /// Largest unpacked size that is accepted `[bytes]`.
 fn max_unpacked_bytes(path: &Path) -> Result<u64, LoadError> {
     let packed = fs::metadata(path).map_err(LoadError::io(path))?.len();
-    Ok(files::most_unpacked(packed))
+    Ok(files::max_unpacked_bytes(packed))
 }
 
 /// Checks the table of contents; returns the size of the unpacked files `[bytes]`.

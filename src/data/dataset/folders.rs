@@ -164,7 +164,7 @@ impl Folders {
             _ => &images,
         };
         let mut names = Vec::new();
-        // If the dataset lies in the chosen folder, its subfolders are not searched: they hold no further photographs.
+        // If the dataset lies in the chosen folder, that folder's subfolders are not searched for further photographs.
         let is_deep = !self.chosen.as_ref().is_some_and(|folder| folder.contains(&self.root));
         add_photographs(folder, "", is_deep, &mut names);
         // Names may have several Unicode spellings.
@@ -181,6 +181,7 @@ impl Folders {
         )
     }
 
+    /// The path of an image inside its folder of images.
     pub(super) fn inside_images(&self, value: &str) -> String {
         let value = relative(value);
         match value.strip_prefix("images/") {
@@ -189,6 +190,7 @@ impl Folders {
         }
     }
 
+    /// The path of an image below the dataset's folder.
     pub(super) fn below_root(&self, value: &str) -> String {
         let value = relative(value);
         if self.within_images { format!("images/{value}") } else { value }

@@ -100,7 +100,7 @@ impl FrameLists {
             if let Some(name) = unmatched().map(|(name, _)| name).min() {
                 let more = match unmatched().count() - 1 {
                     0 => String::new(),
-                    more => format!(", nor {more} more of its names"),
+                    more => format!(", and {more} more names match no frame"),
                 };
                 let problem = format!("no frame has the file_path {name:?}{more}");
                 return Some((field, problem));
@@ -124,10 +124,12 @@ impl FrameLists {
         note(&self.validation, "are held out for validation: neither trained on nor tested");
         note(
             &self.both,
-            "are listed for training and for tests, so that their scores are not those of new views",
+            "are listed for training and for tests, so their scores are not those of new views",
         );
         if self.lists[0].is_some() && !self.names_any(1) && !self.names_any(2) {
-            notes.push(format!("{file}: frames are listed for training and none for tests, so that no view is held out"));
+            notes.push(format!(
+                "{file}: frames are listed for training and none for tests, so no view is held out"
+            ));
         }
         notes
     }

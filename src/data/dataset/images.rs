@@ -258,7 +258,7 @@ fn header_of(path: &Path, file: &mut File) -> Result<ImageHeader, LoadError> {
     }
     .map_err(|problem| LoadError::image(path, problem))?;
     if let Some(name) = transfer::high_range(Cursor::new(&start)) {
-        let problem = format!("its values are {name}, of high dynamic range");
+        let problem = format!("its values are {name} (high dynamic range)");
         return Err(LoadError::malformed(path, "cICP", problem, "convert the image to sRGB"));
     }
     let pixels = u64::from(header.width) * u64::from(header.height);

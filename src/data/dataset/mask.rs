@@ -75,7 +75,7 @@ impl Mask {
     }
 }
 
-/// The values of a mask. If none exceeds 1, the mask is one of 0 and 1, as arrays of truth values are often saved: 1 then
+/// The values of a mask. If none exceeds 1, the mask consists of 0 and 1, as Boolean arrays are often saved, and 1
 /// counts as 255.
 fn values(mask: DynamicImage) -> GrayImage {
     let mut values = match mask {

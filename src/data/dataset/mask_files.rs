@@ -1,7 +1,7 @@
 //! Finds mask files by the names that programs give them.
 //!
-//! COLMAP's and nerfstudio's masks are in `masks/` and folders with similar names; RealityCapture's mask layers, 3DGRUT's
-//! masks and instant-ngp's dynamic masks are beside the photographs.
+//! COLMAP's and nerfstudio's masks are in `masks/` and folders with similar names; RealityCapture's mask layers,
+//! 3DGRUT's masks and instant-ngp's dynamic masks are beside the photographs.
 
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
@@ -71,7 +71,7 @@ pub(super) fn unused_masks_note(dataset: &Path) -> Option<String> {
     let all = folders(dataset).into_iter().map(|name| dataset.join(name));
     let folder = all.chain([dataset.join("images/masks")]).find(holds_files)?;
     Some(format!(
-        "{} contains the mask of no photograph: masks belong in the dataset's folder `masks/`, in the same subfolders as \
+        "{} contains no mask of any photograph: masks belong in the dataset's folder `masks/`, in the same subfolders as \
          the photographs and named after them as NAME.EXT.png or NAME.png",
         folder.display()
     ))

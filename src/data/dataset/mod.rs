@@ -168,7 +168,7 @@ struct Frame {
     reduced: Option<u32>,
     mask: Option<MaskFile>,
     lens: Lens,
-    /// Header of the image, if the pose file states no image size, so that the lens is for the size of the image.
+    /// Header of the image, if the pose file states no image size; the lens then has the size of the image.
     header: Option<ImageHeader>,
     rotation: DMat3,
     translation: DVec3,

@@ -1,8 +1,8 @@
 //! Moves scenes to normalised coordinates in f64, so that remote and tiny scenes lose no precision in f32.
 //!
-//! The unit of the scene is the largest distance of a training camera from the mean of all, as in NeRF++
-//! (Zhang et al. 2020, §4); 3DGS calls 1.1 times that the extent. Rotations stay the same, and with them quaternions and
-//! spherical harmonics.
+//! The unit of the scene is the largest distance of a training camera from the mean of all, as in NeRF++ (Zhang et al.
+//! 2020, §4); 3DGS calls 1.1 times that the extent. Rotations stay the same, and with them quaternions and spherical
+//! harmonics.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -72,8 +72,8 @@ impl Normalisation {
     /// The identity.
     pub const IDENTITY: Self = Self { centre: DVec3::ZERO, scale: 1.0 };
 
-    /// Normalises a model without cameras: the median of its means becomes the origin, and four fifths of them are within
-    /// distance 1.
+    /// Normalises a model without cameras: the median of its means becomes the origin, and four fifths of them are
+    /// within distance 1.
     pub fn fit_model(model: &Gaussians) -> Self {
         let middle = |axis: usize| {
             let along = model.means.iter().map(|mean| f64::from(mean[axis]));

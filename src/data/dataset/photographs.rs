@@ -15,6 +15,7 @@ use super::undistort::{Pinhole, Undistortion};
 use super::{Frame, LoadOptions, MaskMode, Note, Resolution, View};
 use crate::error::{LoadError, LoadRemedy};
 use densify_core::camera::Camera;
+use densify_core::numbers::counted;
 
 /// Share of a photograph that may be cropped without a note.
 const SILENTLY_CROPPED: f64 = 0.005;
@@ -85,7 +86,7 @@ pub(super) fn photographs(
         .collect()
 }
 
-/// The headers of a photograph whose image matches its camera.
+/// A photograph's header and lens, after they were checked against each other.
 #[derive(Debug)]
 struct Checked {
     header: ImageHeader,
@@ -139,9 +140,8 @@ fn turned_note(frames: &[Frame], checked: &[Checked]) -> Option<String> {
     let turned = || frames.iter().zip(checked).filter(|(_, checked)| checked.header.turn.is_some());
     let (first, _) = turned().next()?;
     Some(format!(
-        "{} photographs lie on their side compared with their cameras and are turned according to their EXIF (first: \
-         {})",
-        turned().count(),
+        "turned according to their EXIF, as they lie on their side compared with their cameras: {} (first: {})",
+        counted(turned().count(), "photograph"),
         first.name
     ))
 }
@@ -151,10 +151,9 @@ fn orientation_note(frames: &[Frame], checked: &[Checked]) -> Option<String> {
     let ambiguous = || frames.iter().zip(checked).filter(|(_, checked)| checked.is_turn_ambiguous);
     let first = &ambiguous().next()?.0.name;
     Some(format!(
-        "{} photographs have an EXIF orientation that asks for a quarter turn, but the pose file states no image size \
-         that would show whether its poses include it; they are used as stored (first: {first}). If the model is \
-         poor, turn the files themselves",
-        ambiguous().count()
+        "used as stored: {} whose EXIF orientation asks for a quarter turn (first: {first}); the pose file states no \
+         image size that would show whether its poses include it. If the model is poor, turn the files themselves",
+        counted(ambiguous().count(), "photograph")
     ))
 }
 
@@ -200,8 +199,8 @@ fn pinhole_notes<'a>(
         let photographs = lost.map(|(count, _)| count).sum();
         notes.push(if keep_fov {
             Note::Text(format!(
-                "up to {percent:.0} % of {photographs} photographs is beyond what the lens model can invert, and is \
-                 not used"
+                "up to {percent:.0} % of each of {photographs} photographs is beyond what the lens model can invert, and \
+                 is not used"
             ))
         } else {
             Note::Cropped { percent, photographs }
@@ -299,8 +298,8 @@ fn check_mask(mask: &Mask, found: ImageHeader, image: ImageHeader) -> Result<(),
 
 /// Returns true if a mask hides all of a view; `several` is true if its photograph has more than one view.
 fn is_hidden(view: &View, several: bool, mask: &GrayImage, lens: &Lens) -> bool {
-    /// Number of pixels along the longer side of a mask that are tested against each of several views; at most twice as
-    /// many are.
+    /// If a photograph has several views, at least this many pixels along the longer side of its mask are tested, and
+    /// at most twice as many.
     const SAMPLED_SIDE: u32 = 512;
     let (width, height) = mask.dimensions();
     let stride = if several { (width.max(height) / SAMPLED_SIDE).max(1) } else { 1 } as usize;

@@ -17,7 +17,7 @@ use densify_core::files::one_line;
 /// Largest fraction of unusable points.
 const MAX_BAD_POINTS: f64 = 0.01;
 
-/// Checks the frames of a format's reader, and assembles the dataset.
+/// Checks the frames that the reader of a format returned, and assembles the dataset.
 pub(super) fn prepare(
     path: &Path,
     mut scene: Scene,
@@ -36,7 +36,7 @@ pub(super) fn prepare(
 }
 
 /// Notes that name no option.
-pub(super) fn texts(notes: Vec<String>) -> Vec<Note> {
+pub(super) fn text_notes(notes: Vec<String>) -> Vec<Note> {
     notes.into_iter().map(Note::Text).collect()
 }
 
@@ -198,7 +198,7 @@ fn drop_bad(
     if bad as f64 > MAX_BAD_POINTS * total as f64 {
         let path = path.display();
         return Err(LoadError::Data(format!(
-            "{path}: {bad} of {total} points are not finite, more than 1 %; repair the reconstruction"
+            "{path}: {bad} of {total} points are not {condition}, more than 1 %; repair the reconstruction"
         )));
     }
     if bad > 0 {

@@ -23,7 +23,7 @@ use super::lens::models::Term;
 use super::lens::{Distortion, Lens, Projection};
 use super::paths::{DataPath, Root, relative};
 use super::pose::{check_lens, checked_pose};
-use super::prepare::texts;
+use super::prepare::text_notes;
 use super::transforms::usual_points;
 use super::{Frame, LoadError, LoadOptions, Scene};
 use densify_core::files;
@@ -159,7 +159,7 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
     let (points, note) = points.unwrap_or_default();
     notes.extend(note);
     let listing = path.to_owned();
-    let (notes, rest) = (texts(notes), Scene::default());
+    let (notes, rest) = (text_notes(notes), Scene::default());
     Ok(Some(Scene { listing, frames, first_missing, points, points_file, notes, ..rest }))
 }
 

@@ -1,7 +1,8 @@
-//! The depths at which cameras see the points of a scene, by share of the picture.
+//! The depths at which cameras see the points of a scene, weighted by area in the picture.
 //!
-//! Each picture is cut into cells, and each cell shows its nearest point: points behind it are hidden, and a wall counts
-//! by its area in the picture, not by its number of points. This needs no tracks, so that it is the same for every format.
+//! Each picture is cut into cells, and each cell shows its nearest point: points behind it are hidden, and a wall
+//! counts by its area in the picture, not by its number of points. No tracks are needed, so this works the same for
+//! every format.
 
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
@@ -12,7 +13,7 @@ use densify_core::camera::Camera;
 const CELLS: usize = 16;
 /// Maximum number of cameras that are used, equally spaced in their list: the depths then take 1 MiB.
 const MAX_CAMERAS: usize = 1 << 10;
-/// Maximum number of pairs of a camera and a point that are used: a fifth of a second of one thread.
+/// Maximum number of pairs of a camera and a point that are used; they take one thread a fifth of a second.
 const MAX_PAIRS: usize = 1 << 24;
 
 /// The depth of the nearest point in each cell of each picture, ascending.
@@ -42,13 +43,13 @@ impl SeenDepths {
         Self(depths)
     }
 
-    /// The depth below which this share of what is seen lies; `None` if no camera sees a point.
+    /// The depth below which this share of the cells that show a point lies; `None` if no camera sees a point.
     pub fn quantile(&self, share: f64) -> Option<f64> {
         let place = (share * self.0.len() as f64) as usize;
         self.0.get(place).map(|&depth| f64::from(depth))
     }
 
-    /// The share of what is seen that is nearer than `depth`.
+    /// The share of the cells that show a point whose depth is below `depth`.
     pub fn share_below(&self, depth: f64) -> f64 {
         let count = self.0.partition_point(|&seen| f64::from(seen) < depth);
         count as f64 / self.0.len().max(1) as f64

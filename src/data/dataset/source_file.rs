@@ -44,7 +44,11 @@ impl SourceFile {
 
     /// The same file as a part of an archive, whose name messages show.
     pub(super) fn in_archive(self, archive: &Arc<Unpacked>) -> Self {
-        Self { path: archive.shown(&self.path), archive: Some(Arc::clone(archive)), ..self }
+        Self {
+            path: archive.path_in_archive(&self.path),
+            archive: Some(Arc::clone(archive)),
+            ..self
+        }
     }
 
     /// Length of the file `[bytes]`; 0 if it no longer exists.

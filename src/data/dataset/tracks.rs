@@ -21,7 +21,8 @@ pub struct Tracks {
     pub positions: Vec<DVec3>,
     /// sRGB colours from the reconstruction. Shape: `[tracks]`.
     pub colours: Vec<[u8; 3]>,
-    /// Indices of training views, ascending and distinct, at least `MIN_VIEWS` per track. Shape: `[tracks]`, then views.
+    /// Indices of training views, ascending and distinct, at least `MIN_VIEWS` per track. Shape: `[tracks]`, then
+    /// views.
     pub views: Vec<Vec<u32>>,
 }
 

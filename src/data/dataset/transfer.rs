@@ -34,7 +34,8 @@ pub(super) fn exponent(input: impl BufRead + Seek) -> Option<f64> {
     }
 }
 
-/// The name of the transfer function if the values have a high dynamic range, which no factor converts to sRGB.
+/// The name of the transfer function if the values have a high dynamic range; converting them to sRGB would need tone
+/// mapping.
 pub(super) fn high_range(input: impl BufRead + Seek) -> Option<&'static str> {
     match stated(input)? {
         Transfer::HighRange(name) => Some(name),

@@ -21,7 +21,7 @@ use super::lens::{Distortion, Lens, Projection};
 use super::mask_files::MaskFile;
 use super::paths::{DataPath, Root, relative};
 use super::pose::{check_lens, checked_pose};
-use super::prepare::texts;
+use super::prepare::text_notes;
 use super::{Frame, LoadError, LoadOptions, Note, Scene, Split, colmap};
 
 /// The pair of files that defines its own test split.
@@ -186,7 +186,7 @@ fn read(
     }
     let points_file = points_file((root, folders), &top, declared, &mut notes)?;
     let (own_split, listing) = (lists.define_the_split(), path.clone());
-    let (notes, rest) = (texts(notes), Scene::default());
+    let (notes, rest) = (text_notes(notes), Scene::default());
     let mut scene = Scene { frames, first_missing, notes, points_file, listing, own_split, ..rest };
     if declared != DeclaredSplit::Test
         && let Some(file) = &scene.points_file

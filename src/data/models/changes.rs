@@ -3,7 +3,7 @@
 
 use std::fmt;
 
-use super::spatial_order::frame;
+use super::spatial_order::middles_and_spreads;
 use densify_core::gaussians::{Gaussians, sigmoid};
 use densify_core::numbers::gaussians;
 use densify_core::sh;
@@ -33,7 +33,7 @@ pub struct Changes {
 }
 
 impl Changes {
-    /// Compares the model with what was read back from its file, which has the model's rows in this order.
+    /// Compares the model with `found`, which was read back from its file and has the model's rows in this `order`.
     pub(super) fn measure(model: &Gaussians, order: &[usize], found: &Gaussians) -> Self {
         let mut changes = Self::default();
         if found.len() < model.len() {
@@ -41,10 +41,10 @@ impl Changes {
             (changes.by_quantity[0], changes.share) = ((model.len() - found.len(), 1.0), 1.0);
             return changes;
         }
-        let (frame, bases) = (frame(model), bases(model.sh_degree));
+        let (axes, bases) = (middles_and_spreads(model), bases(model.sh_degree));
         let mut total = f64::MIN_POSITIVE;
         for (place, &row) in order.iter().enumerate() {
-            let weight = weight(model, row, &frame);
+            let weight = weight(model, row, &axes);
             total += weight;
             let mut is_changed = false;
             let row_changes = row_changes(model, row, found, place, &bases);
@@ -118,14 +118,14 @@ fn row_changes(
     ]
 }
 
-/// An estimate of the share of an image that a Gaussian covers, times its opacity. Its distance from the model's
-/// centre, or the model's spread if that is larger, stands for its distance from the cameras.
-fn weight(model: &Gaussians, row: usize, frame: &[(f64, f64); 3]) -> f64 {
+/// An estimate of the share of an image that a Gaussian covers, times its opacity. Its distance from the cameras is
+/// estimated from its distance from the model's middle and from the model's spread.
+fn weight(model: &Gaussians, row: usize, axes: &[(f64, f64); 3]) -> f64 {
     let [_, middle, largest] = sorted(model.log_scales[row].map(size));
     let squares = model.means[row]
         .iter()
-        .zip(frame)
-        .map(|(&mean, (centre, spread))| (f64::from(mean) - centre).powi(2) + spread.powi(2));
+        .zip(axes)
+        .map(|(&mean, (middle, spread))| (f64::from(mean) - middle).powi(2) + spread.powi(2));
     let covered = (middle * largest / squares.sum::<f64>()).min(1.0);
     covered * f64::from(sigmoid(model.opacity_logits[row]))
 }

@@ -1,11 +1,12 @@
-//! Coordinates in the files of models. In f32, a place 5,000 km from the origin (the northing of UTM) has a step of half a
-//! metre, which is more than most Gaussians. Files may therefore hold coordinates relative to an offset, which stands in a
-//! comment (PLY), in a node (glTF) or in a [sidecar](super::sidecar), or coordinates in f64 (PLY).
+//! Coordinates in the files of models. In f32, coordinates of 5,000 km (northings of UTM) have steps of half a metre,
+//! which is larger than most Gaussians. Files may therefore hold coordinates relative to an offset, which is stored in
+//! a comment (PLY), in a node (glTF), in `meta.json` (SOG) or in a [sidecar](super::sidecar), or coordinates in f64
+//! (PLY).
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
-use super::spatial_order::{frame, middle_and_spread};
+use super::spatial_order::{middle_and_spread, middles_and_spreads};
 use densify_core::gaussians::{Gaussians, sigmoid};
 use densify_core::numbers::gaussians;
 
@@ -55,19 +56,19 @@ pub fn offset_text(offset: [f64; 3]) -> String {
     offset.map(|value| value.to_string()).join(" ")
 }
 
-/// Error of a rounded position above which the position counts as coarse (root mean square) `[Gaussian's size]`. A tenth
-/// changes a pixel by less than a twentieth of the Gaussian's contrast.
+/// Error of a rounded position above which the position counts as coarse (root mean square) `[Gaussian's size]`. A
+/// tenth changes a pixel by less than a twentieth of the Gaussian's contrast.
 const COARSE: f64 = 0.1;
 /// Error above which a position counts as lost: a half, as in [`super::Changes`].
 const LOST: f64 = 0.5;
-/// Share of the visible area, estimated as in [`Coarseness::add`], from which on coarse coordinates are avoided, or the user
-/// is told.
+/// Share of the visible area, estimated as in [`Coarseness::add`], from which on coarse coordinates are avoided, or the
+/// user is told.
 const NOTED: f64 = 0.01;
 /// Share of the visible area from which on lost positions make a file unfit.
 const UNFIT: f64 = 0.25;
 
-/// Distance of a model from the origin, in medians of its Gaussians' distances from its middle, from which on f32 may be
-/// too coarse.
+/// A model is remote, so that f32 may be too coarse, if its middle is farther from the origin than this many times its
+/// spread (the median distance of its Gaussians from the middle, along the longest axis).
 const REMOTE: f64 = 50.0;
 
 /// A comparison of the step of f32 at the world coordinates of Gaussians with the sizes of these Gaussians.
@@ -75,8 +76,8 @@ const REMOTE: f64 = 50.0;
 pub struct Coarseness {
     /// Number of Gaussians whose positions are coarse.
     rows: usize,
-    /// Estimates of the visible area: of all Gaussians, of those whose positions are coarse, and of those whose positions
-    /// are lost.
+    /// Estimates of the visible area: of all Gaussians, of those whose positions are coarse, and of those whose
+    /// positions are lost.
     total: f64,
     coarse: f64,
     lost: f64,
@@ -87,14 +88,14 @@ pub struct Coarseness {
 impl Coarseness {
     /// Measures a whole model.
     pub fn measure(model: &Gaussians) -> Self {
-        let (middle, spread) = middle_of(model);
+        let (middle, spread) = middle_and_largest_spread(model);
         let mut found = Self::default();
         found.add(model, middle.to_array(), spread);
         found
     }
 
-    /// Adds rows of a scene with this middle and extent `[world units]`: cameras are about as far away from a Gaussian as
-    /// it is from the middle, or as the extent if that is more.
+    /// Adds rows of a scene with this middle and extent `[world units]`, from which a Gaussian's distance from the
+    /// cameras is estimated.
     pub fn add(&mut self, rows: &Gaussians, middle: [f64; 3], extent: f64) {
         for row in 0..rows.len() {
             let position = rows.position(row);
@@ -139,7 +140,7 @@ impl std::fmt::Display for Coarseness {
             f,
             "so far from the origin, f32 has steps of up to {}, and shifts {} ({:.1} % of the visible area) by more than \
              {:.0} % of their size",
-            shortest(self.step),
+            two_digits(self.step),
             gaussians(self.rows),
             100.0 * self.coarse / self.total.max(f64::MIN_POSITIVE),
             100.0 * COARSE
@@ -147,8 +148,8 @@ impl std::fmt::Display for Coarseness {
     }
 }
 
-/// A step in two digits: 0.5, 0.031, 9.5e-7.
-fn shortest(step: f64) -> String {
+/// A step with two significant digits: 0.5, 0.031, 9.5e-7.
+fn two_digits(step: f64) -> String {
     let rounded: f64 = format!("{step:.1e}").parse().unwrap_or(step);
     if rounded >= 1e-3 || rounded == 0.0 { format!("{rounded}") } else { format!("{rounded:e}") }
 }
@@ -160,33 +161,34 @@ fn step_of_f32(value: f64) -> f64 {
 }
 
 /// The middle of a model and its spread along the longest axis `[world units]`.
-pub(super) fn middle_of(model: &Gaussians) -> (DVec3, f64) {
-    let frame = frame(model);
-    let middle = DVec3::from(frame.map(|(middle, _)| middle)) + DVec3::from(model.origin);
-    (middle, largest_spread(&frame))
+pub(super) fn middle_and_largest_spread(model: &Gaussians) -> (DVec3, f64) {
+    let axes = middles_and_spreads(model);
+    let middle = DVec3::from(axes.map(|(middle, _)| middle)) + DVec3::from(model.origin);
+    (middle, largest_spread(&axes))
 }
 
-fn largest_spread(frame: &[(f64, f64); 3]) -> f64 {
-    frame.iter().map(|(_, spread)| *spread).fold(0.0, f64::max)
+fn largest_spread(axes: &[(f64, f64); 3]) -> f64 {
+    axes.iter().map(|(_, spread)| *spread).fold(0.0, f64::max)
 }
 
-/// True for a middle that is so far from 0, in spreads, that f32 may be too coarse.
+/// True if a model with this middle and spread is [remote](REMOTE).
 pub(super) fn is_remote(middle: [f64; 3], spread: f64) -> bool {
     DVec3::from(middle).length() > REMOTE * spread
 }
 
-/// True if the positions of a model are finer than world coordinates in f32: it is measured from a point near its middle.
-pub fn is_fine(model: &Gaussians) -> bool {
-    let (middle, spread) = middle_of(model);
+/// True if a model has an origin of its own near its middle, so that its positions are finer than world coordinates in
+/// f32.
+pub fn is_finer_than_f32(model: &Gaussians) -> bool {
+    let (middle, spread) = middle_and_largest_spread(model);
     model.is_local() && !is_remote((middle - DVec3::from(model.origin)).to_array(), spread)
 }
 
 /// A point near the middle of a model, for its local coordinates; the model's own origin if that is near.
 pub fn local_origin(model: &Gaussians) -> [f64; 3] {
-    if is_fine(model) {
+    if is_finer_than_f32(model) {
         return model.origin;
     }
-    let (middle, spread) = middle_of(model);
+    let (middle, spread) = middle_and_largest_spread(model);
     round_origin(middle.to_array(), spread)
 }
 
@@ -196,8 +198,8 @@ pub(super) fn remote_origin(axes: [Vec<f64>; 3]) -> [f64; 3] {
     if axes.iter().flatten().all(is_exact) {
         return [0.0; 3];
     }
-    let frame = axes.map(middle_and_spread);
-    let (middle, spread) = (frame.map(|(middle, _)| middle), largest_spread(&frame));
+    let axes = axes.map(middle_and_spread);
+    let (middle, spread) = (axes.map(|(middle, _)| middle), largest_spread(&axes));
     if is_remote(middle, spread) { round_origin(middle, spread) } else { [0.0; 3] }
 }
 
@@ -226,7 +228,7 @@ mod tests {
         for (value, step) in [(5e6, 0.5), (-5e5, 0.031_25), (1.0, f64::from(f32::EPSILON))] {
             assert_eq!(step_of_f32(value), step);
         }
-        assert_eq!([0.5, 0.031_25, 9.53e-7].map(shortest), ["0.5", "0.031", "9.5e-7"]);
+        assert_eq!([0.5, 0.031_25, 9.53e-7].map(two_digits), ["0.5", "0.031", "9.5e-7"]);
     }
 
     #[test]

@@ -34,7 +34,7 @@ pub use inventory;
 
 pub use changes::Changes;
 pub use coordinates::{
-    Coarseness, Coordinates, Frame, is_fine, local_origin, offset_text, round_origin,
+    Coarseness, Coordinates, Frame, is_finer_than_f32, local_origin, offset_text, round_origin,
 };
 pub(crate) use ply::layout::OFFSET as PLY_OFFSET;
 pub use recognise::{Match, ModelFile, Reader, main_file, read_model};

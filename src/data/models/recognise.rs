@@ -1,7 +1,7 @@
 //! Opens a model of any format, recognised by its content and never by its name.
 //!
 //! A file's own statements about its size are never trusted: memory is allocated only for bytes that exist, and
-//! compressed data may expand only up to [`files::most_unpacked`].
+//! compressed data may expand only up to [`files::max_unpacked_bytes`].
 
 use std::cell::OnceCell;
 use std::fs::File;
@@ -14,7 +14,7 @@ use densify_core::files;
 
 /// Number of bytes at the start of a file that are used to recognise its format.
 const START: u64 = 64;
-/// Largest file that is JSON, such as glTF with its buffers inside `[bytes]`.
+/// Largest accepted JSON file, such as glTF with embedded buffers `[bytes]`.
 const MAX_JSON: u64 = 1 << 30;
 
 /// The functions that recognise and read a format's files.

@@ -20,7 +20,7 @@ pub struct SplatFile {
     pub dropped: usize,
     /// Gaussians whose zero quaternion was replaced with the identity.
     pub repaired: usize,
-    /// Notes, one sentence each, on values that were read otherwise than the format says, or may have to be.
+    /// Notes for the user, one sentence each, on how the file was interpreted and what was ignored.
     pub notes: Vec<String>,
 }
 

@@ -1,8 +1,8 @@
-//! The sidecar of a model in local coordinates, for formats without a place for the offset: `NAME.spz.offset.json` beside
-//! `NAME.spz`.
+//! The sidecar of a model in local coordinates, for formats without a place for the offset: `NAME.spz.offset.json`
+//! beside `NAME.spz`.
 //!
-//! `{"offset": [x, y, z], "bytes": n}`: a position in the dataset's coordinates is a coordinate of the file plus the offset.
-//! `bytes` is the size of the file that the sidecar belongs to; it may be missing.
+//! `{"offset": [x, y, z], "bytes": n}`: a position in the dataset's coordinates is a coordinate of the file plus the
+//! offset. `bytes` is the size of the file that the sidecar belongs to; it may be missing.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -65,8 +65,8 @@ pub(super) fn apply(path: &Path, file: &mut SplatFile) -> Result<(), LoadError> 
     Ok(())
 }
 
-/// Writes the sidecar of a file that will get the name `model` and now is at `written`. As it names the file's size, it
-/// cannot be taken for that of a file which is there still.
+/// Writes the sidecar of the file at `written`, which will be renamed to `model`. The sidecar states the size of that
+/// file, so that it is not taken for the sidecar of an older file at `model`.
 ///
 /// # Errors
 /// When it cannot be written.
@@ -76,7 +76,7 @@ pub fn write_sidecar(model: &Path, offset: [f64; 3], written: &Path) -> Result<(
     write_atomically(&sidecar_path(model), |out| writeln!(out, "{sidecar}"))
 }
 
-/// Removes the sidecar of a former file with this name.
+/// Removes the sidecar of a previous file with this name.
 ///
 /// # Errors
 /// When it cannot be removed.

@@ -3,7 +3,7 @@
 
 use glam::{DMat3, DMat4, DQuat, DVec3};
 
-use super::coordinates::{is_remote, middle_of};
+use super::coordinates::{is_remote, middle_and_largest_spread};
 use densify_core::gaussians::{Gaussians, sh_coefficients};
 use densify_core::sh;
 
@@ -40,8 +40,9 @@ impl Similarity {
         })
     }
 
-    /// Transforms a model; the identity changes no bit. A translation alone moves the model's origin, so that no position
-    /// is rounded; with a rotation or a scale, this is done for remote models, for which f32 may be too coarse.
+    /// Transforms a model; the identity changes no bit. A pure translation only moves the model's origin, so that no
+    /// position is rounded. With a rotation or a scale, only remote models, for which f32 may be too coarse, keep an
+    /// origin of their own.
     pub(super) fn apply(&self, model: &mut Gaussians) {
         let Self { rotation, scale, translation } = *self;
         if rotation.abs_diff_eq(DQuat::IDENTITY, 0.0) && scale.to_bits() == 1f64.to_bits() {
@@ -49,7 +50,7 @@ impl Similarity {
             return;
         }
         let place = |point: DVec3| scale * (rotation * point) + translation;
-        let (middle, spread) = middle_of(model);
+        let (middle, spread) = middle_and_largest_spread(model);
         let is_far = is_remote(place(middle).to_array(), scale * spread);
         let origin = if is_far { place(DVec3::from(model.origin)) } else { DVec3::ZERO };
         for row in 0..model.len() {

@@ -3,8 +3,8 @@
 use densify_core::curve::morton_code;
 use densify_core::gaussians::Gaussians;
 
-/// The centre and the spread of a model along each axis: medians, so that outliers have no effect.
-pub(super) fn frame(model: &Gaussians) -> [(f64, f64); 3] {
+/// The middle and the spread of a model along each axis: medians, so that outliers have no effect.
+pub(super) fn middles_and_spreads(model: &Gaussians) -> [(f64, f64); 3] {
     [0, 1, 2].map(|axis| {
         middle_and_spread(model.means.iter().map(|mean| f64::from(mean[axis])).collect())
     })
@@ -22,12 +22,12 @@ pub(super) fn middle_and_spread(mut values: Vec<f64>) -> (f64, f64) {
     (centre, values.select_nth_unstable_by(middle, f64::total_cmp).1.max(f64::MIN_POSITIVE))
 }
 
-/// The rows of a model in the order of the curve, whose scale is that of the [`frame`].
+/// The rows of a model in the order of the curve, which is scaled by the model's spread along each axis.
 pub(super) fn spatial_order(model: &Gaussians) -> Vec<usize> {
-    let frame = frame(model);
+    let axes = middles_and_spreads(model);
     let place = |row: usize| {
         let mean = model.means[row].map(f64::from);
-        morton_code(std::array::from_fn(|i| (mean[i] - frame[i].0) / (2.0 * frame[i].1)))
+        morton_code(std::array::from_fn(|i| (mean[i] - axes[i].0) / (2.0 * axes[i].1)))
     };
     let mut rows: Vec<usize> = (0..model.len()).collect();
     rows.sort_by_cached_key(|&row| (place(row), row));

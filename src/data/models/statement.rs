@@ -10,7 +10,8 @@
 //! | SOG | `"model": "antialiased"`, formerly `"antialias": true`; densify adds κ |
 //! | glTF | nothing; densify writes `extras` |
 //!
-//! The PLY of the original trainer says nothing. Where κ is not stated it is 0.3, except for Brush and Mip-Splatting.
+//! The PLY of the original trainer says nothing. κ is the variance of the kernel `[px²]`; where it is not stated it is
+//! 0.3, except for Brush and Mip-Splatting.
 
 use std::path::Path;
 
@@ -34,8 +35,8 @@ pub(super) fn comments(antialiasing: Antialiasing) -> String {
 /// The antialiasing that the comments of a PLY header state, and a sentence on it unless densify wrote it.
 ///
 /// # Errors
-/// When densify's own comment names no kernel.
-pub(super) fn of_comments(
+/// When densify's own comment states an unknown kernel.
+pub(super) fn stated_in_comments(
     path: &Path,
     comments: &[String],
 ) -> Result<(Antialiasing, Option<String>), LoadError> {
@@ -45,7 +46,9 @@ pub(super) fn of_comments(
         let lower = comment.to_lowercase();
         let words: Vec<&str> = lower.split_whitespace().collect();
         match words[..] {
-            [KERNEL, kernel] => own = Some(known(path, &format!("comment {comment:?}"), kernel)?),
+            [KERNEL, kernel] => {
+                own = Some(parse_kernel(path, &format!("comment {comment:?}"), kernel)?);
+            }
             ["splatrendermode:", mode] => said = Some((mode == "mip", comment)),
             ["antialiased", number] => said = Some((number == "1", comment)),
             _ => {}
@@ -64,18 +67,18 @@ pub(super) fn of_comments(
 /// The antialiasing that densify has stated in `holder`, an object of a JSON file.
 ///
 /// # Errors
-/// When it names no kernel.
-pub(super) fn of_json(
+/// When the stated kernel is unknown.
+pub(super) fn stated_in_json(
     path: &Path,
     place: &str,
     holder: &Value,
 ) -> Result<Option<Antialiasing>, LoadError> {
     let Some(stated) = holder.get(KERNEL) else { return Ok(None) };
-    known(path, &format!("{place}.{KERNEL}"), stated.as_str().unwrap_or_default()).map(Some)
+    parse_kernel(path, &format!("{place}.{KERNEL}"), stated.as_str().unwrap_or_default()).map(Some)
 }
 
-fn known(path: &Path, field: &str, kernel: &str) -> Result<Antialiasing, LoadError> {
-    let problem = "it names no kernel; 0.3, 0.1 and none are possible";
+fn parse_kernel(path: &Path, field: &str, kernel: &str) -> Result<Antialiasing, LoadError> {
+    let problem = "the kernel is unknown; 0.3, 0.1 and none are possible";
     kernel.parse().map_err(|_| LoadError::damaged(path, field, problem))
 }
 
@@ -111,17 +114,17 @@ mod tests {
             (&["antialiasing none", "antialiased 1"], None, false),
         ] {
             let comments: Vec<String> = comments.iter().map(|&text| text.to_owned()).collect();
-            let (found, note) = of_comments(Path::new("x.ply"), &comments).unwrap();
+            let (found, note) = stated_in_comments(Path::new("x.ply"), &comments).unwrap();
             assert_eq!((found, note.is_some()), (expected, is_noted), "{comments:?}");
         }
-        let unknown = of_comments(Path::new("x.ply"), &["antialiasing 0.7".to_owned()]);
+        let unknown = stated_in_comments(Path::new("x.ply"), &["antialiasing 0.7".to_owned()]);
         let message = unknown.unwrap_err().to_string();
         assert!(message.contains("x.ply") && message.contains("0.7"), "{message}");
     }
 
     #[test]
     fn an_unknown_kernel_in_json_is_refused() {
-        let found = |json: Value| of_json(Path::new("x.glb"), "extras", &json);
+        let found = |json: Value| stated_in_json(Path::new("x.glb"), "extras", &json);
         assert_eq!(found(json!({})).unwrap(), None);
         assert_eq!(found(json!({"antialiasing": "0.1"})).unwrap(), Some(Antialiasing::Narrow));
         for unknown in [json!("0.7"), json!(0.3), json!(null)] {

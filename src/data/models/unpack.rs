@@ -9,7 +9,7 @@ use crate::error::LoadError;
 /// Maximum number of bytes that are read after the expected ones to reach the checksum.
 const MAX_TAIL: u64 = 1 << 20;
 
-/// Message for damaged compressed data; the decoders' own messages are names from their code.
+/// Message for damaged compressed data; the decoders' own messages are internal identifiers.
 pub(super) const DAMAGED: &str = "the compressed data is damaged";
 
 /// Reads `bytes` bytes for `field`.
@@ -41,7 +41,7 @@ pub(super) fn read_to_end(path: &Path, field: &str, input: &mut dyn Read) -> Res
     rest.map(drop).map_err(|source| read_error(path, field, source))
 }
 
-/// Turns a read error into one that distinguishes errors of the system from damaged data.
+/// Converts a read error: errors of the operating system are kept, all others mean damaged data.
 pub(super) fn read_error(path: &Path, field: &str, source: io::Error) -> LoadError {
     match source.kind() {
         _ if source.raw_os_error().is_some() => LoadError::io(path)(source),

@@ -51,7 +51,7 @@ pub trait ModelWriter {
     }
 
     /// True if files can state this antialiasing; if not, readers use another kernel.
-    fn states(&self, _antialiasing: Antialiasing) -> bool {
+    fn states_antialiasing(&self, _antialiasing: Antialiasing) -> bool {
         true
     }
 
@@ -60,8 +60,8 @@ pub trait ModelWriter {
         &[]
     }
 
-    /// Takes note of what coordinates are measured from, before [`begin`](Self::begin). Returns true if the file will
-    /// say so itself; else a [sidecar](super::sidecar_path) must. World coordinates need neither.
+    /// Sets the frame of the coordinates, before [`begin`](Self::begin). Returns true if files of this format can state
+    /// it; otherwise a [sidecar](super::sidecar_path) must. World coordinates need no statement.
     ///
     /// # Errors
     /// [`io::ErrorKind::InvalidInput`] for coordinates in f64, unless the format has them.
@@ -135,9 +135,9 @@ impl Format {
         self.writer.is_some_and(|make| make().is_lossy())
     }
 
-    /// [`ModelWriter::states`] of this format; true if densify does not write it.
-    pub fn states(&self, antialiasing: Antialiasing) -> bool {
-        self.writer.is_none_or(|make| make().states(antialiasing))
+    /// [`ModelWriter::states_antialiasing`] of this format; true if densify does not write it.
+    pub fn states_antialiasing(&self, antialiasing: Antialiasing) -> bool {
+        self.writer.is_none_or(|make| make().states_antialiasing(antialiasing))
     }
 
     /// [`ModelWriter::variants`] of this format; none if densify does not write it.
@@ -145,8 +145,8 @@ impl Format {
         self.writer.map_or(&[], |make| make().variants())
     }
 
-    /// Writes a model that is in memory as a whole, in the order that suits the format. The model's origin is lost unless
-    /// the format [has a place](Self::states_offset) for it.
+    /// Writes a model that is in memory as a whole, in the order that suits the format. The model's origin is lost
+    /// unless the format [has a place](Self::states_offset) for it.
     ///
     /// # Errors
     /// Those of [`ModelWriter`].
@@ -194,8 +194,8 @@ impl Format {
         self.writer.is_some_and(|make| make().set_frame(Frame::default()).unwrap_or(false))
     }
 
-    /// Writes the sidecar that a file with this frame needs, before the file at `written` gets its name `path`. Afterwards,
-    /// [`remove_old_sidecar`](Self::remove_old_sidecar) completes the pair.
+    /// Writes the sidecar, if a file with this frame needs one, before the file at `written` is renamed to `path`.
+    /// Afterwards, [`remove_old_sidecar`](Self::remove_old_sidecar) completes the pair.
     ///
     /// # Errors
     /// When it cannot be written.
@@ -211,7 +211,7 @@ impl Format {
         }
     }
 
-    /// Removes a sidecar that the file which had this name before has left, if the new one needs none.
+    /// Removes the sidecar of a previous file at `path`, unless the new file needs one.
     ///
     /// # Errors
     /// When it cannot be removed.
@@ -234,9 +234,9 @@ impl Format {
         self.remove_old_sidecar(frame, path)
     }
 
-    /// Writes a model to a file that appears only when it is complete, with its sidecar if it needs one. `rows` is asked
-    /// for one piece after the other, as a second copy of the model may not fit into memory; each has the origin of the
-    /// frame.
+    /// Writes a model to a file that appears only when it is complete, with its sidecar if it needs one. `rows` is
+    /// asked for one piece after the other, as a second copy of the model may not fit into memory; each has the origin
+    /// of the frame.
     ///
     /// # Errors
     /// Those of `rows`, [`ModelWriter`] and [`write_checked`].

@@ -11,7 +11,7 @@ use zip::result::ZipError;
 use super::unpack::{read_exactly, read_to_end};
 use super::write::unfit;
 use crate::error::LoadError;
-use densify_core::files::most_unpacked;
+use densify_core::files::max_unpacked_bytes;
 
 /// The date of all files, 1 January 1980 in MS-DOS format: equal models give equal files.
 const DATE: u16 = 1 << 5 | 1;
@@ -33,7 +33,7 @@ impl<'a, R: Read + Seek> ZipReader<'a, R> {
         Ok(Self { path, length, files })
     }
 
-    /// The names of all files; names that are no text are left out.
+    /// The names of all files; names that are not valid text are left out.
     pub(super) fn names(&self) -> Vec<Cow<'_, str>> {
         self.files.file_names().flatten().collect()
     }
@@ -48,7 +48,7 @@ impl<'a, R: Read + Seek> ZipReader<'a, R> {
             other => LoadError::damaged(path, name, other),
         })?;
         let bytes = file.size();
-        if bytes > most_unpacked(*length) {
+        if bytes > max_unpacked_bytes(*length) {
             let problem = format!("{bytes} bytes are too many for an archive of {length}");
             return Err(LoadError::damaged(path, name, problem));
         }

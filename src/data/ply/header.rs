@@ -56,7 +56,7 @@ pub(crate) struct Element {
 pub(super) struct Header {
     pub(super) encoding: Encoding,
     pub(super) elements: Vec<Element>,
-    /// Texts of the `comment` and `obj_info` lines that are not long, their words one blank apart.
+    /// Texts of the `comment` and `obj_info` lines, except long ones, with single spaces between words.
     pub(super) comments: Vec<String>,
     /// Size of the header `[bytes]`.
     pub(super) length: u64,
@@ -87,7 +87,7 @@ impl Scalar {
         }
     }
 
-    /// The largest value of an integer type, and infinity of another.
+    /// The largest value of an integer type; infinity for a floating-point type.
     pub(crate) fn largest(self) -> f64 {
         match self {
             Self::I8 => 127.0,
@@ -107,7 +107,7 @@ impl Element {
         self.find_by(names, |own, name| own == name)
     }
 
-    /// As [`find`](Self::find), whatever the case of the letters in the file.
+    /// As [`find`](Self::find), ignoring case.
     pub(crate) fn find_in_any_case(&self, names: &[&str]) -> Option<usize> {
         self.find_by(names, str::eq_ignore_ascii_case)
     }
@@ -163,7 +163,7 @@ impl Header {
                 [] => {}
                 ["comment" | "obj_info", ..] => {
                     let text = words[1..].join(" ");
-                    // Other comments of a writer may be long.
+                    // Comments that are used are short; others may be long.
                     comments.extend(Some(text).filter(|text| text.len() <= MAX_COMMENT));
                 }
                 ["format", kind, "1.0"] if encoding.is_none() && elements.is_empty() => {
@@ -187,7 +187,7 @@ impl Header {
                         .flatten();
                     let rows = rows.filter(|&rows| rows < MAX_ROWS);
                     let rows = rows.ok_or_else(|| {
-                        lines.fault("the number of rows is not a number, or above 2^32")
+                        lines.fault("the number of rows is not an integer below 2^32")
                     })?;
                     if elements.iter().any(|element| element.name == name) {
                         return Err(lines.fault(format!("the element {name:?} occurs twice")));

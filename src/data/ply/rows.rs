@@ -39,18 +39,18 @@ impl<'a> Ply<'a> {
         &self.header.elements
     }
 
-    /// Texts of the comments in the header, their words one blank apart.
+    /// Texts of the comments in the header, except long ones, with single spaces between words.
     pub(crate) fn comments(&self) -> &[String] {
         &self.header.comments
     }
 
-    /// The three numbers after a word in a comment, if there is one. Several must agree.
-    pub(crate) fn comment_numbers(&self, word: &str) -> Result<Option<[f64; 3]>, LoadError> {
+    /// The three numbers after `prefix` in a comment; `None` without such a comment. Several such comments must agree.
+    pub(crate) fn comment_numbers(&self, prefix: &str) -> Result<Option<[f64; 3]>, LoadError> {
         let mut found = None;
-        let texts = self.header.comments.iter().filter_map(|comment| comment.strip_prefix(word));
+        let texts = self.header.comments.iter().filter_map(|comment| comment.strip_prefix(prefix));
         for text in texts.filter(|text| text.starts_with(' ')) {
             let wrong = |problem: String| {
-                let field = format!("header comment {word:?}");
+                let field = format!("header comment {prefix:?}");
                 LoadError::damaged(self.path, field, problem)
             };
             let numbers: Vec<f64> = text.split_whitespace().map_while(|n| n.parse().ok()).collect();
@@ -59,10 +59,10 @@ impl<'a> Ply<'a> {
             let numbers = numbers.filter(|n| count == 3 && n.iter().all(|value| value.is_finite()));
             let numbers =
                 numbers.ok_or_else(|| wrong(format!("{:?} is not three numbers", text.trim())))?;
-            if found
-                .is_some_and(|found: [f64; 3]| found.map(f64::to_bits) != numbers.map(f64::to_bits))
+            if let Some(other) = found
+                .filter(|other: &[f64; 3]| other.map(f64::to_bits) != numbers.map(f64::to_bits))
             {
-                return Err(wrong(format!("{numbers:?} contradicts the {found:?} before it")));
+                return Err(wrong(format!("{numbers:?} contradicts the {other:?} before it")));
             }
             found = Some(numbers);
         }

@@ -155,8 +155,8 @@ fn neighbourhood(image: &Image8, pixel: glam::DVec2) -> Option<([u8; 3], [u8; 3]
     Some((centre, lowest, highest))
 }
 
-/// Fits the gains of the views and the colours of the tracks in one channel. Exposures are factors in sRGB-encoded values
-/// too, because the sRGB curve is nearly a power.
+/// Fits the gains of the views and the colours of the tracks in one channel. An exposure is nearly a factor on
+/// sRGB-encoded values, too, because the sRGB curve is nearly a power function.
 fn fit(by_track: &[&[Observation]], views: usize, channel: usize) -> Fit {
     let (mut gains, mut is_known) = (vec![1.0_f32; views], vec![false; views]);
     let mut references = vec![0.0_f32; by_track.len()];

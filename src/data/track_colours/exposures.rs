@@ -1,8 +1,8 @@
 //! Decides before training whether the photographs of a scene differ in exposure, from the colours of tracks.
 //!
-//! A gain per view and channel is fitted to the colours in which the views show the same points. Exposures differ if the
-//! gains differ and also explain most of the differences between colours. Highlights, wrong points and noise change gains
-//! a little too, but leave the colours different.
+//! A gain per view and channel is fitted to the colours in which the views show the same points. Exposures differ if
+//! the gains differ and also explain most of the differences between colours. Highlights, wrong points and noise also
+//! change gains a little, but the gains do not explain their differences.
 
 use serde::{Deserialize, Serialize};
 
@@ -35,8 +35,8 @@ pub struct ExposureSpread {
 }
 
 impl ExposureSpread {
-    /// Measures the spread. Also returns the gains of all views, normalised to a geometric mean of 1; views with too few
-    /// trusted colours have gain 1.
+    /// Measures the spread. Also returns the gains of all views, normalised to a geometric mean of 1; views with too
+    /// few trusted colours have gain 1.
     pub fn measure(colours: &TrackColours) -> (Self, Vec<[f32; 3]>) {
         let known: Vec<usize> = (0..colours.views()).filter(|&view| colours.knows(view)).collect();
         let mean = |function: &dyn Fn([f32; 3]) -> [f64; 3]| {
@@ -94,8 +94,8 @@ impl ExposureSpread {
         (spread, gains)
     }
 
-    /// True if exposures are to be learned; `None` if too few tracks or views are known for a decision.
-    pub fn decides(&self, views: usize) -> Option<bool> {
+    /// Whether exposures should be learned; `None` if too few tracks or views were measured for a decision.
+    pub fn decision(&self, views: usize) -> Option<bool> {
         let is_enough = self.tracks >= MIN_TRACKS && 2 * self.views > views;
         let differ = self.stops >= MIN_STOPS && self.with_gains <= MAX_UNEXPLAINED * self.alike;
         is_enough.then_some(differ)
@@ -117,7 +117,7 @@ mod tests {
             (ExposureSpread { tracks: MIN_TRACKS - 1, ..enough }, None),
             (ExposureSpread { views: 5, ..enough }, None),
         ] {
-            assert_eq!(found.decides(10), expected, "{found:?}");
+            assert_eq!(found.decision(10), expected, "{found:?}");
         }
     }
 }

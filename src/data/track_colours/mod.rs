@@ -6,14 +6,14 @@
 //! of differences are excluded:
 //!
 //! - Reconstructed points lie on edges and corners, where the colour changes more within a pixel than by any highlight.
-//!   So the difference is the distance of the track's colour (the median over its views) from the range of *all* colours
-//!   within a pixel.
+//!   So the difference is the distance of the track's colour (the median over its views) from the range of *all*
+//!   colours within a pixel.
 //! - The point may be occluded in some views. The quarter of its views that differ most is ignored.
 //! - The point may not lie on a surface. A point counts as on a surface if most views show the colour that the
 //!   reconstruction gives it; if fewer than half of all points do, no decision is made.
 //!
-//! The spread of a track is the root mean square over its remaining views. Highlights may cover a small part of a scene,
-//! so the 95th percentile of the tracks decides. Only photographs, poses and the reconstruction are used.
+//! The spread of a track is the root mean square over its remaining views. Highlights may cover a small part of a
+//! scene, so the 95th percentile of the tracks decides. Only photographs, poses and the reconstruction are used.
 //!
 //! This differs from the per-Gaussian rule of Reduced-3DGS (Papantonakis et al. 2024, section 4.2),
 //! which needs a trained model and therefore cannot save memory while training.

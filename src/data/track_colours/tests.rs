@@ -75,7 +75,7 @@ fn exposures_are_found_where_gains_explain_the_colours() {
         (ExposureSpread { tracks: MIN_TRACKS, ..found }, gains)
     };
     let (differ, gains) = found(&|view, _, value| value * exposures[view]);
-    assert_eq!(differ.decides(VIEWS), Some(true), "{differ:?}");
+    assert_eq!(differ.decision(VIEWS), Some(true), "{differ:?}");
     assert!((differ.stops - 0.6).abs() < 0.05 && differ.with_gains < 1.0, "{differ:?}");
     let mean = exposures.iter().map(|e: &f32| e.ln()).sum::<f32>() / VIEWS as f32;
     for (gains, exposure) in gains.iter().zip(exposures) {
@@ -86,14 +86,14 @@ fn exposures_are_found_where_gains_explain_the_colours() {
     let brightest = exposures[5] / mean.exp();
     assert!(gains[5].iter().all(|gain| (gain - brightest).abs() < 0.01), "{gains:?}");
     let (alike, gains) = found(&|_, _, value| value);
-    assert_eq!(alike.decides(VIEWS), Some(false), "{alike:?}");
+    assert_eq!(alike.decision(VIEWS), Some(false), "{alike:?}");
     assert!(gains.iter().flatten().all(|gain| (gain - 1.0).abs() < 1e-6), "{gains:?}");
     // Each square has a factor of its own in each view.
     let (noise, _) = found(&|view, square, value| {
         value * (0.6 + 0.1 * ((view * 31 + square * 17 + view * square * 7) % 9) as f32)
     });
-    assert_eq!(noise.decides(VIEWS), Some(false), "{noise:?}");
-    assert_eq!(differ.decides(2 * VIEWS), None, "half of the views are unknown");
+    assert_eq!(noise.decision(VIEWS), Some(false), "{noise:?}");
+    assert_eq!(differ.decision(2 * VIEWS), None, "half of the views are unknown");
 }
 
 #[test]

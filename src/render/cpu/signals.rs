@@ -188,7 +188,7 @@ impl Accumulators {
             let attribute = ParameterSignal::new(signal);
             let planes = self.planes.of_signal(signal);
             let value = |row: usize| -> f32 {
-                if signal.kind() == SignalKind::Present {
+                if signal.kind() == SignalKind::Current {
                     return present(signal, row, params, masks, ages);
                 }
                 let parts = planes.clone().map(|plane| self.blocks.get(row, plane));

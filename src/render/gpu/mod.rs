@@ -272,7 +272,7 @@ impl Backend for GpuBackend {
                 self.read_attribute(&attribute, signals.get_mut(signal).unwrap_or_default())?;
                 continue;
             }
-            let values = if signal.kind() == SignalKind::Present {
+            let values = if signal.kind() == SignalKind::Current {
                 self.present(signal)?
             } else {
                 let planes = self.planes.of_signal(signal);

@@ -169,7 +169,7 @@ impl From<BackendError> for Failure {
 impl Failure {
     /// A failure of a backend: the message, which ends with the error, and its remedy.
     fn from_backend(error: &BackendError, message: impl ToString) -> Self {
-        let (code, remedy) = BackendRemedy::of(error);
+        let (code, remedy) = BackendRemedy::for_error(error);
         Self::with_remedy(code, message, remedy)
     }
 
@@ -183,7 +183,7 @@ impl Failure {
 
 impl BackendRemedy {
     /// The remedy for an error, and the exit code: that of bad input if other arguments would avoid the error.
-    fn of(error: &BackendError) -> (u8, Self) {
+    fn for_error(error: &BackendError) -> (u8, Self) {
         match error {
             BackendError::OutOfMemory { .. } => (DEVICE, Self::LessMemory),
             BackendError::Threads(_) => (DEVICE, Self::FewerThreads),

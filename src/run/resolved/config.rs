@@ -138,7 +138,7 @@ impl RunConfig {
             Init::Model(file) => InitChoice::Model(file.clone()),
         });
         spec.start.freeze.clone_from(&inputs.frozen_file);
-        // A run without antialiasing that did not ask for it says nothing.
+        // Without antialiasing, the option is written only if it was given.
         if choices.antialiasing.is_on() {
             spec.start.antialias = Some(choices.antialiasing);
         }
@@ -223,7 +223,7 @@ impl RunConfig {
     /// When there is none, or it is malformed.
     pub fn read(run: &Path) -> Result<Self, Failure> {
         let path = run.join(CONFIG_FILE);
-        let text = densify_core::files::read_text(&path, densify_core::files::MAX_OPTIONS)
+        let text = densify_core::files::read_text(&path, densify_core::files::MAX_OPTIONS_BYTES)
             .map_err(|error| match error.kind() {
                 _ if is_archive(run) => Failure::input(format!(
                     "{} is a ZIP archive, but no SOG model; unpack it, and name a file of Gaussian splats, or the folder of \

@@ -9,7 +9,7 @@ use densify_data::dataset::PointCloud;
 use densify_data::models::{Coarseness, Coordinates};
 use densify_train::init;
 
-/// Size of a trained Gaussian relative to one of as many that are evenly spread over the same points.
+/// Size of a trained Gaussian relative to its size if as many Gaussians were spread evenly over the same surfaces.
 const TRAINED_SIZE: f64 = 0.5;
 /// Largest number of points that are used: with more, their spacing varies little.
 const MOST_POINTS: usize = 200_000;

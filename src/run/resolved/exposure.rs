@@ -4,7 +4,7 @@ use super::config::ExposureSource;
 use super::inputs::Evidence;
 use crate::failure::notes;
 use crate::spec::RunSpec;
-use densify_core::numbers::grouped;
+use densify_core::numbers::{counted, grouped};
 use densify_core::spelling::Spelling;
 use densify_data::dataset::Dataset;
 use densify_data::track_colours::MIN_TRACKS;
@@ -52,7 +52,7 @@ impl Exposure {
         let measured = colours.map(ExposureSpread::measure);
         let decided = measured
             .as_ref()
-            .and_then(|(found, gains)| Some((found.decides(gains.len())?, *found)));
+            .and_then(|(found, gains)| Some((found.decision(gains.len())?, *found)));
         let (is_on, source) = match spec.schedule.exposure {
             ExposureChoice::Off => (false, ExposureSource::Given),
             ExposureChoice::On => (true, ExposureSource::Given),
@@ -88,8 +88,8 @@ impl Exposure {
         }
         if let Some(example) = &reported.example {
             found.notes.push(format!(
-                "{} photographs have nonsense in their EXIF, which is not used ({example})",
-                reported.implausible
+                "nonsense in the EXIF of {} is not used ({example})",
+                counted(reported.implausible, "photograph")
             ));
         }
         found
@@ -109,7 +109,7 @@ impl Exposure {
             ExposureSource::Given if self.is_on => Some(match (self.by_tracks, self.exif_use) {
                 (true, _) => {
                     format!(
-                        "exposure on, from the gains of points in several views{}",
+                        "exposure on, from the colours of points in several views{}",
                         self.exif_views()
                     )
                 }
@@ -189,7 +189,7 @@ mod tests {
         }
         let [note] = &found.notes[..] else { panic!("{:?}", found.notes) };
         assert!(
-            note.contains("1 photographs have nonsense") && note.contains("c.jpg says"),
+            note.contains("EXIF of 1 photograph is not") && note.contains("c.jpg says"),
             "{note}"
         );
         // Without any EXIF, all views start alike.

@@ -164,7 +164,7 @@ impl Case<'_> {
             // opacities, then a plan.
             let row = float + (2 * float).max(bytes_per_row(&Needs::default()) as u64);
             let removal = if self.choices.automatic.rows { budget * row } else { 0 };
-            // Means as they were, while those of the saved file are measured.
+            // A copy of the exact means, while the model is measured with its means rounded as in the saved file.
             let rounds = self.spec.output.coordinates == Coordinates::World
                 && self.inputs.dataset.normalisation.is_remote();
             let means = if rounds { 3 * float * budget } else { 0 };

@@ -257,8 +257,8 @@ pub(super) fn rows_at(
     Ok(fit.map(|fit| fit.size.rows))
 }
 
-/// Bytes in which a run of these rows and this degree fits, with the shortest tile lists and without decoded images
-/// that are kept. What a larger size takes beyond them is for speed.
+/// The fewest bytes for a run of these rows and this degree: with the shortest tile lists, and without a cache of
+/// decoded images unless one is given. What a larger size takes beyond them is for speed.
 pub(super) fn needed_bytes(case: &Case<'_>, size: &RunSize) -> Result<u64, Failure> {
     let request = request(case, u64::MAX)?;
     let request = SizeRequest { image_cache: Some(case.image_cache().unwrap_or(0)), ..request };

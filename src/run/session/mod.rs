@@ -23,7 +23,7 @@ use cpu_time::ProcessTime;
 use glam::DVec3;
 
 use crate::failure::{Failure, INPUT, OTHER, TrainingProblem};
-use crate::observer::{Between, Interrupt, Observer};
+use crate::observer::{Interrupt, NextAction, Observer};
 use densify_core::files::{FileError, write_atomically};
 use densify_data::models::{PLY, Shape};
 use densify_data::views::ViewSource;
@@ -214,8 +214,8 @@ impl<'a> Session<'a> {
         loop {
             let (model, rows) = self.run.trainer.backend_and_history();
             match self.observer.between_steps(model, rows) {
-                Between::Checkpoint => self.try_checkpoint(),
-                Between::Step => return,
+                NextAction::Checkpoint => self.try_checkpoint(),
+                NextAction::Step => return,
             }
         }
     }

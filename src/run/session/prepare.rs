@@ -16,7 +16,7 @@ use densify_core::numbers::grouped;
 use densify_data::dataset::PointCloud;
 use densify_data::views::DatasetViews;
 use densify_train::checkpoint::Fingerprint;
-use densify_train::init::restart;
+use densify_train::init::apply_start_rule;
 use densify_train::schedule::RateOptions;
 use densify_train::trainer::{TrainOptions, Trainer};
 
@@ -59,7 +59,7 @@ pub(super) fn prepare(
     if checkpoint.is_none() {
         // A given model keeps its opacities and scales, even if the policy prescribes initial ones.
         if file.is_none() {
-            restart(&mut model, &training.declared.start);
+            apply_start_rule(&mut model, &training.declared.start);
         }
         model = append_to_frozen(&run, model, observer)?;
     }

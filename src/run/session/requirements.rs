@@ -8,8 +8,9 @@ use serde::{Deserialize, Serialize};
 use crate::resolved::{DegreeSource, ExposureSource, RunConfig};
 use densify_core::files::FileError;
 use densify_core::gaussians::MAX_SH_DEGREE;
+use densify_core::numbers::counted;
 use densify_core::spelling::Spelling;
-use densify_train::output::read_stats;
+use densify_train::output::read_json;
 use densify_train::trainer::{AutoBudget, MIN_GAIN};
 
 /// Path within the folder of the run.
@@ -51,7 +52,7 @@ impl Reductions {
     /// # Errors
     /// When the file cannot be read.
     pub fn read(run: &Path) -> Result<Option<Self>, FileError> {
-        read_stats(&run.join(REQUIREMENTS))
+        read_json(&run.join(REQUIREMENTS))
     }
 }
 
@@ -173,8 +174,8 @@ fn rows_removed(auto: &AutoBudget) -> Option<LeftOut> {
     (removed > 0).then(|| LeftOut {
         what: format!("{removed} rows of low weight"),
         evidence: format!(
-            "in each of {} trials, hiding rows cost less than {MIN_GAIN:.2} dB per halving",
-            removals.len()
+            "hiding rows cost less than {MIN_GAIN:.2} dB per halving in each of {}",
+            counted(removals.len(), "trial")
         ),
         loss: format!("{change:.3} dB in all on training views, measured at removal"),
     })
@@ -251,7 +252,7 @@ mod tests {
             ],
         };
         let text = line(&config, Some(&auto_budget));
-        for words in ["beyond 1000", "step 300", "0.04 dB", "100 rows", "1 trials", "-0.015 dB"] {
+        for words in ["beyond 1000", "step 300", "0.04 dB", "100 rows", "1 trial", "-0.015 dB"] {
             assert!(text.contains(words), "{words}: {text}");
         }
     }

@@ -56,7 +56,7 @@ pub fn start(
     let described = given.clone().describe()?;
     let output = described.output_folder()?;
     RunFolder::check(&output, true)?;
-    RunFolder::settle(&output)?;
+    RunFolder::recover(&output)?;
     let staged = RunFolder::staged(&output);
     if let Some(staged) = staged.into_iter().find(|path| newest(path).0.is_some()) {
         return Err(ResumeProblem::InterruptedReplacement { output, staged }.into());
@@ -110,7 +110,7 @@ fn overlay(mut given: Partial, saved: &RunConfig, origin: &str) -> Result<RunSpe
             _ => {}
         }
     }
-    // A run's folder stands for the model of it that was read.
+    // The folder of a run is accepted in place of the saved path, which names a model in it.
     for option in ["init", "freeze"] {
         let path =
             |options: &Partial| options.get(option).and_then(Value::as_str).map(PathBuf::from);

@@ -66,8 +66,8 @@ impl Run {
         prepare::prepare(spec, resumed, host)
     }
 
-    /// Trains to the end, writes nothing, and returns the model in the dataset's own coordinates, measured from its origin or,
-    /// unless the description asks for world coordinates, from a point in a remote scene.
+    /// Trains to the end, writes nothing, and returns the model in the dataset's own coordinates. In a scene far from
+    /// the origin, these are local unless the description asks for world coordinates.
     ///
     /// # Errors
     /// When a view cannot be read, the device fails, or the observer asks to stop.

@@ -71,7 +71,7 @@ impl Session<'_> {
             }
         }
         self.observer.say(format_args!(
-            "rows     {}, at most {} of {}",
+            "rows     {}, peak {}, budget {}",
             grouped(trainer.rows()),
             grouped(trainer.progress().peak_rows),
             grouped(config.budget)

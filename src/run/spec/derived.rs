@@ -94,8 +94,8 @@ impl RunSpec {
         Knobs::from_table(&table).map_err(|error| OptionProblem::value("knob", error).into())
     }
 
-    /// The learning rates: the defaults for a run of this length, overlaid with those of the policy, reduced in a long
-    /// capture by `position_factor` and if the run starts from a model, and overlaid with `--lr`.
+    /// The learning rates: the defaults for a run of this length, overlaid with those of the policy, those of positions
+    /// times `position_factor`, all reduced if the run starts from a model, and overlaid with `--lr`.
     ///
     /// # Errors
     /// When there is no such rate, or its value is not allowed.

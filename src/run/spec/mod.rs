@@ -137,7 +137,7 @@ run_spec! {
         views: Option<AbsolutePath> = None, Fixed, value "FILE";
 
         /// Treatment of views whose camera is more than 10 times as far from the others as usual, if at most one view
-        /// in 20 is such a view: structure from motion misplaces some cameras
+        /// in 20 has such a camera: structure from motion misplaces some
         far_cameras: FarCameras = FarCameras::LeaveOut, Fixed, value "WHAT";
 
         /// Keep the full field of view of a distorted lens, and mask pixels that the lens did not see; by default
@@ -172,7 +172,8 @@ run_spec! {
         scene: Option<PathBuf> = None, Free;
 
         /// Source of the first Gaussians: one on each of the dataset's points, random places, or a model in the
-        /// dataset's coordinates: a file by any program, or a run's folder (default: points if the dataset has any, else random)
+        /// dataset's coordinates: a file by any program, or a run's folder (default: points if the dataset has any,
+        /// else random)
         ///
         /// If the model has more Gaussians than the budget, those that contribute most to the training views are kept.
         /// Its colours are cut or extended to --sh-degree
@@ -255,7 +256,6 @@ run_spec! {
     /// Training.
     schedule: ScheduleSpec, "Schedule" {
         /// Length of the run; every schedule scales with it
-        // Without `--preset`, the preset `balanced` sets another value.
         #[arg(short)]
         iterations: Whole<1, { u32::MAX }> = Whole(REFERENCE_ITERATIONS), Longer, value "N";
 
@@ -265,8 +265,8 @@ run_spec! {
 
         /// Set a learning rate: mean_start, mean_end, log_scale, quat, opacity, sh_dc, sh_rest; for all but the means
         /// also NAME_end; fade: final factor of opacity, sh_dc and sh_rest, which starts to act after the share
-        /// fade_from of the run; boost: initial factor of all (1 for runs of 30,000). A rate of 0 freezes its values. May
-        /// be repeated
+        /// fade_from of the run; boost: initial factor of all (1 for runs of 30,000). A rate of 0 freezes its values.
+        /// May be repeated
         #[serde(with = "as_table")]
         lr: Vec<Assignment> = Vec::new(), Fixed, value "NAME=RATE";
 

@@ -60,7 +60,7 @@ impl Partial {
     /// As [`new`](Self::new), and when the file cannot be read.
     pub fn read(path: &Path) -> Result<Self, Failure> {
         let read = || {
-            let text = files::read_text(path, files::MAX_OPTIONS).map_err(Failure::input)?;
+            let text = files::read_text(path, files::MAX_OPTIONS_BYTES).map_err(Failure::input)?;
             let mut table: Table = text
                 .parse()
                 .map_err(|error: toml::de::Error| Failure::input(error.to_string().trim()))?;

@@ -57,7 +57,7 @@ impl Budget {
         }
     }
 
-    /// True if Gaussians must improve the model to stay.
+    /// True for `auto`, with or without a limit.
     pub fn is_auto(self) -> bool {
         matches!(self, Self::Auto(_))
     }

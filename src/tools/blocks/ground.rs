@@ -26,7 +26,7 @@ pub struct Ground {
 
 impl Ground {
     /// Fits the plane to the camera centres by least squares. If they are on a line, the plane contains this line and
-    /// is level in the images.
+    /// is as level as it can be, assuming upright images.
     pub fn fit(cameras: &[Camera]) -> Self {
         let count = cameras.len().max(1) as f64;
         let origin = cameras.iter().map(Camera::centre).sum::<DVec3>() / count;

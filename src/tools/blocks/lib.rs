@@ -1,10 +1,10 @@
 //! Trains a large scene in blocks and merges their models. A plan describes the runs and their memory.
 //!
-//! The ground is divided into cells of equal work (`cells.rs`). A coarse run trains the whole scene. Each block is then a
-//! run of its own: it trains on the views that see its cell (`visibility.rs`), starts from the coarse Gaussians in and
-//! around the cell, and renders the other visible Gaussians as frozen (`task.rs`). Its Gaussians within the cell become
-//! its part of the merged model (`merge.rs`). Every block has a share of the budget, so the merged model stays within
-//! it. `densify_launch` starts the tasks. Prints nothing.
+//! The ground is divided into cells of equal work (`cells.rs`). A coarse run trains the whole scene. Each block is then
+//! a run of its own: it trains on the views that see its cell (`visibility.rs`), starts from the coarse Gaussians in
+//! and around the cell, and renders the other visible Gaussians as frozen (`task.rs`). Its Gaussians within the cell
+//! become its part of the merged model (`merge.rs`). Every block has a share of the budget, so the merged model stays
+//! within the budget. `densify_launch` starts the tasks. Prints nothing.
 
 mod cells;
 mod ground;

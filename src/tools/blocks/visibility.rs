@@ -1,5 +1,5 @@
-//! Determines which views see which points: from the tracks of the reconstruction, or else by projecting the points into
-//! the images.
+//! Determines which views see which points: from the tracks of the reconstruction, or else by projecting the points
+//! into the images.
 
 use glam::DVec3;
 use rayon::prelude::*;

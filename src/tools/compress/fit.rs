@@ -150,7 +150,8 @@ pub(super) fn packings(options: &Options<'_>, model: &Gaussians) -> Result<Vec<P
     Ok(packings)
 }
 
-/// Number of rows of this model with which the file meets the target; `None` if not even one row fits.
+/// Estimates with how many rows of this model the file meets the target; [`trim`] drops any that are too many. `None` if
+/// not even one row fits.
 pub(super) fn rows_that_fit(
     to: Target,
     format: &Format,
@@ -190,8 +191,8 @@ fn subsample(model: &Gaussians, rows: usize) -> Gaussians {
     model.gather(&(0..rows).map(row).collect::<Vec<_>>())
 }
 
-/// Drops rows, the faintest and smallest first, until the model's file is small enough. Returns the model and the size of
-/// its file; `None` if no row is left.
+/// Drops rows, the faintest and smallest first, until the model's file is small enough. Returns the model and the size
+/// of its file; `None` if no row is left.
 pub(super) fn trim(
     to: Target,
     format: &Format,

@@ -1,9 +1,9 @@
 //! Compresses a trained model: fewer Gaussians and fewer colour coefficients, fine-tuned, in a file of limited size.
 //!
 //! Gaussians are pruned by importance, at most half of them at once, with training in between (`tune.rs`).
-//! View-dependent colour is dropped per Gaussian where this is invisible (`colour.rs`). The best trade between Gaussians
-//! and colour depends on the scene, so several degrees and accuracies of colour are tried, each with as many Gaussians as
-//! fit (`fit.rs`). The attempt whose file, read back, has the highest PSNR of the training views is kept
+//! View-dependent colour is dropped per Gaussian where this is invisible (`colour.rs`). The best trade-off between
+//! Gaussians and colour depends on the scene, so several degrees and accuracies of colour are tried, each with as many
+//! Gaussians as fit (`fit.rs`). The attempt whose file, read back, has the highest PSNR of the training views is kept
 //! (`evaluator.rs`).
 
 mod colour;
@@ -182,8 +182,8 @@ impl Search<'_> {
         packing.is_whole && degree == self.model.sh_degree
     }
 
-    /// Compresses the model with this packing and degree, and evaluates its file; `None` if no row fits. The result of each
-    /// stage but the last is added to `stages`.
+    /// Compresses the model with this packing and degree, and evaluates its file; `None` if no row fits. The result of
+    /// each stage but the last is added to `stages`.
     fn attempt(
         &self,
         packing: &Packing,
@@ -193,8 +193,8 @@ impl Search<'_> {
         let Self { options, observer, scratch, .. } = self;
         let Packing { format, rows, .. } = *packing;
         let mut start = self.start(degree);
-        if !format.states(start.antialiasing) {
-            // As the file will be rendered.
+        if !format.states_antialiasing(start.antialiasing) {
+            // Readers of the file will assume this kernel.
             start.antialiasing = Antialiasing::Wide;
         }
         let tuned = if self.keeps_everything(packing, degree) {

@@ -81,8 +81,7 @@ fn train(
     write_atomically(scratch, |out| PLY.write(&model, out))?;
     let mut spec = describe_run(&model, setting, options, scratch)?;
     if freezes_sh {
-        // Rates must be positive; with a rate this small, every step is lost to rounding.
-        spec.schedule.lr = vec![assignment("sh_rest=1e-30")?];
+        spec.schedule.lr = vec![assignment("sh_rest=0")?];
     }
     let origin = model.origin;
     spec.output.coordinates =
@@ -96,8 +95,8 @@ fn assignment(text: &str) -> Result<Assignment, Failure> {
     text.parse().map_err(Failure::input)
 }
 
-/// The budget and the iterations of each stage. There are at least `least` stages, each budget is at least half of the one
-/// before, and the last stage is twice as long as the others.
+/// The budget and the iterations of each stage. There are at least `least` stages, each budget is at least half of the
+/// one before, and the last stage is twice as long as the others.
 fn stages((whole, rows): (usize, usize), iterations: u32, least: u32) -> Vec<(usize, u32)> {
     let ratio = whole as f64 / rows.max(1) as f64;
     let count = (ratio.log2().ceil() as u32).max(least).min(iterations);

@@ -1,5 +1,5 @@
-//! Inspection of trained models: pictures and depth, films along camera paths, comparison with other formats, and limits on
-//! scores. Prints nothing.
+//! Inspection of trained models: pictures and depth, films along camera paths, comparison with other formats, and
+//! limits on scores. Prints nothing.
 
 mod animation;
 mod fidelity;
@@ -9,5 +9,5 @@ mod pictures;
 
 pub use fidelity::Reference;
 pub use film::{CameraRoute, Film, FilmError, FilmOptions, FilmSource};
-pub use limits::{Bound, Limit, LimitError, Limits, measured_values};
+pub use limits::{Limit, LimitError, Limits, Side, measured_values};
 pub use pictures::{Channels, PictureFolder, file_names};

@@ -32,7 +32,7 @@ impl FromStr for Limit {
 
 /// The side of a limit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Bound {
+pub enum Side {
     /// No smaller value is allowed.
     Lowest,
     /// No larger value is allowed.
@@ -54,7 +54,7 @@ pub enum LimitError {
     /// No value has this key.
     Unknown {
         /// The limit's side.
-        bound: Bound,
+        side: Side,
         /// Its key.
         key: String,
         /// The keys that exist.
@@ -63,7 +63,7 @@ pub enum LimitError {
         has_geometry: bool,
     },
     /// Values beyond their limits, each with its side and limit; a value that was not measured is NaN.
-    Exceeded(Vec<(f64, Bound, Limit)>),
+    Exceeded(Vec<(f64, Side, Limit)>),
 }
 
 /// The values that limits may name: the scores, and every number of geometry.json by its path.
@@ -99,9 +99,9 @@ fn flatten(prefix: &str, value: &Value, values: &mut BTreeMap<String, f64>) {
 }
 
 impl Limits<'_> {
-    fn each(&self) -> impl Iterator<Item = (Bound, &Limit)> {
-        let lowest = self.lowest.iter().map(|limit| (Bound::Lowest, limit));
-        lowest.chain(self.highest.iter().map(|limit| (Bound::Highest, limit)))
+    fn each(&self) -> impl Iterator<Item = (Side, &Limit)> {
+        let lowest = self.lowest.iter().map(|limit| (Side::Lowest, limit));
+        lowest.chain(self.highest.iter().map(|limit| (Side::Highest, limit)))
     }
 
     /// Checks, before anything is measured, that every limit names a value that will be measured.
@@ -113,12 +113,12 @@ impl Limits<'_> {
         let lpips = has_lpips.then_some(0.0);
         let mean = Mean { psnr: 0.0, ssim: 0.0, flip: 0.0, lpips, fitted: None };
         let known = measured_values(&mean, has_geometry.then_some(&example));
-        for (bound, Limit { key, .. }) in self.each() {
+        for (side, Limit { key, .. }) in self.each() {
             // The number of thin structures is known only after measuring, so any index is accepted.
             let zero_if_index = |part| if str::parse::<u32>(part).is_ok() { "0" } else { part };
             let with_index_0 = key.split('.').map(zero_if_index).collect::<Vec<_>>().join(".");
             if !known.contains_key(&with_index_0) {
-                return Err(LimitError::unknown(bound, key, &known));
+                return Err(LimitError::unknown(side, key, &known));
             }
         }
         Ok(())
@@ -130,16 +130,16 @@ impl Limits<'_> {
     /// [`LimitError::Exceeded`] with every such value; [`LimitError::Unknown`] for a key that does not exist.
     pub fn check(&self, values: &BTreeMap<String, f64>) -> Result<(), LimitError> {
         let mut exceeded = Vec::new();
-        for (bound, limit) in self.each() {
+        for (side, limit) in self.each() {
             let Some(&value) = values.get(&limit.key) else {
-                return Err(LimitError::unknown(bound, &limit.key, values));
+                return Err(LimitError::unknown(side, &limit.key, values));
             };
-            let is_kept = match bound {
-                Bound::Lowest => value >= limit.bound,
-                Bound::Highest => value <= limit.bound,
+            let is_kept = match side {
+                Side::Lowest => value >= limit.bound,
+                Side::Highest => value <= limit.bound,
             };
             if !is_kept {
-                exceeded.push((value, bound, limit.clone()));
+                exceeded.push((value, side, limit.clone()));
             }
         }
         if exceeded.is_empty() { Ok(()) } else { Err(LimitError::Exceeded(exceeded)) }
@@ -147,16 +147,16 @@ impl Limits<'_> {
 }
 
 impl LimitError {
-    fn unknown(bound: Bound, key: &str, known: &BTreeMap<String, f64>) -> Self {
+    fn unknown(side: Side, key: &str, known: &BTreeMap<String, f64>) -> Self {
         let has_geometry = known.contains_key("depth.rmse");
         let known = known.keys().cloned().collect();
-        Self::Unknown { bound, key: key.to_owned(), known, has_geometry }
+        Self::Unknown { side, key: key.to_owned(), known, has_geometry }
     }
 
     /// The message, with each side's option spelled as `spell` says.
-    pub fn message(&self, spell: impl Fn(Bound) -> &'static str) -> String {
+    pub fn message(&self, spell: impl Fn(Side) -> &'static str) -> String {
         match self {
-            Self::Unknown { bound, key, known, has_geometry } => {
+            Self::Unknown { side, key, known, has_geometry } => {
                 let geometry = if *has_geometry {
                     ""
                 } else {
@@ -166,13 +166,13 @@ impl LimitError {
                     if key == "lpips" { "; LPIPS is measured with --lpips FILE" } else { "" };
                 format!(
                     "{}: nothing called `{key}` is measured; there are {}{geometry}{lpips}",
-                    spell(*bound),
+                    spell(*side),
                     known.join(", ")
                 )
             }
             Self::Exceeded(values) => {
-                let line = |(value, bound, Limit { key, bound: number }): &(f64, Bound, Limit)| {
-                    format!("{key} is {value}, beyond {} {key}={number}", spell(*bound))
+                let line = |(value, side, Limit { key, bound }): &(f64, Side, Limit)| {
+                    format!("{key} is {value}, beyond {} {key}={bound}", spell(*side))
                 };
                 values.iter().map(line).collect::<Vec<_>>().join("\n")
             }
@@ -182,9 +182,9 @@ impl LimitError {
 
 impl fmt::Display for LimitError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let name = |bound| match bound {
-            Bound::Lowest => "lowest",
-            Bound::Highest => "highest",
+        let name = |side| match side {
+            Side::Lowest => "lowest",
+            Side::Highest => "highest",
         };
         f.write_str(&self.message(name))
     }

@@ -160,7 +160,7 @@ const SUBMITTED_FILE: &str = "submitted.toml";
 
 /// IDs of the jobs submitted from a folder, as text; `None` if there were none.
 pub fn submitted_jobs(folder: &Path) -> Option<String> {
-    let text = files::read_text(&folder.join(SUBMITTED_FILE), files::MAX_OPTIONS).ok()?;
+    let text = files::read_text(&folder.join(SUBMITTED_FILE), files::MAX_OPTIONS_BYTES).ok()?;
     let before = toml::from_str::<Submitted>(&text).map(|record| record.jobs.join(", "));
     Some(before.unwrap_or_else(|_| "unknown".to_owned()))
 }
@@ -251,7 +251,7 @@ fn run_scheduler(program: &str, arguments: &[&str], remedy: &str) -> Result<Stri
     Err(Failure::input(format!(
         "`{program} {}` failed: {}",
         arguments.join(" "),
-        files::lines(&text(&output.stderr))
+        files::multi_line(&text(&output.stderr))
     )))
 }
 

@@ -56,10 +56,12 @@ pub(super) fn group(runs: &[RunRecord]) -> Result<Vec<Scene>, Failure> {
             .position(|(scene, other, _)| *other == place && scene.data == data)
             .unwrap_or_else(|| {
                 let label = scene_name(&path);
-                let same = scenes.iter().filter(|(scene, ..)| scene.label.starts_with(&label));
-                let label = match same.count() {
+                let again = scenes.iter().filter(|(_, other, _)| *other == place).count();
+                let is_taken = scenes.iter().any(|(scene, ..)| scene.label == label);
+                let label = match again {
+                    0 if is_taken => files::one_line(&path.display().to_string()),
                     0 => label,
-                    others => format!("{label}, read another way ({})", others + 1),
+                    others => format!("{label}, other reading options ({})", others + 1),
                 };
                 let scene = Scene { label, path, data, groups: Vec::new() };
                 scenes.push((scene, place, Vec::new()));

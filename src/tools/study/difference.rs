@@ -113,8 +113,8 @@ fn half_interval_over_seeds(values: &[f64]) -> Option<f64> {
 }
 
 /// Half the width of the interval of the mean if scenes are resampled first and then their seeds. The variance of a
-/// bootstrap over `n` scenes is too small by (n − 1)/n. Percentiles of the bootstrap would not cover the mean often enough
-/// with few scenes (Efron and Tibshirani 1993, chapters 8 and 12).
+/// bootstrap over `n` scenes is too small by the factor (n − 1)/n. With few scenes, percentiles of the bootstrap
+/// would not cover the mean often enough (Efron and Tibshirani 1993, chapters 8 and 12).
 fn half_interval_over_scenes(scenes: &[Vec<f64>]) -> Option<f64> {
     let n = scenes.len();
     let factor = student_factor(n)? * (n as f64 / (n as f64 - 1.0)).sqrt();

@@ -108,7 +108,7 @@ impl PlannedRun {
         let path = task_file(output, name);
         let within = |problem: String| Failure::input(format!("{}: {problem}", path.display()));
         let text =
-            files::read_text(&path, files::MAX_OPTIONS).map_err(|e| within(e.to_string()))?;
+            files::read_text(&path, files::MAX_OPTIONS_BYTES).map_err(|e| within(e.to_string()))?;
         toml::from_str(&text).map_err(|e| within(e.to_string().trim().to_owned()))
     }
 
@@ -125,7 +125,8 @@ impl PlannedRun {
 
     /// The outcome that [`Self::train_and_record`] has written for the same description.
     pub(super) fn recorded(&self, output: &Path) -> Option<Outcome> {
-        let text = files::read_text(&record_file(output, &self.name()), files::MAX_OPTIONS).ok()?;
+        let text =
+            files::read_text(&record_file(output, &self.name()), files::MAX_OPTIONS_BYTES).ok()?;
         let outcome: Outcome = serde_json::from_str(&text).ok()?;
         outcome.is_of(&self.spec).then_some(outcome)
     }

@@ -225,7 +225,7 @@ fn distance(
     Rendering { width, height, alpha, depth, .. }: &Rendering,
 ) -> Option<f64> {
     let at = (*height / 2) as usize * *width as usize + (*width / 2) as usize;
-    // The request was for a photograph, so nothing was rendered.
+    // Nothing is rendered for a request for a photograph.
     if alpha.is_empty() {
         return None;
     }

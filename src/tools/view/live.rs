@@ -21,7 +21,7 @@ use super::{Server, description, encoder};
 use densify_core::memory::{Ledger, Section};
 use densify_render::{Backend, Device};
 use densify_run::failure::{Failure, OTHER};
-use densify_run::{Between, Companion, CompanionSize, Interrupt, Observer, Run};
+use densify_run::{Companion, CompanionSize, Interrupt, NextAction, Observer, Run};
 use densify_train::evaluate::Mean;
 use densify_train::metrics::scratch_bytes;
 use densify_train::output::StepRecord;
@@ -219,15 +219,15 @@ impl Observer for LiveObserver<'_> {
         self.observer.end();
     }
 
-    fn between_steps(&self, model: &mut dyn Backend, rows: Option<&RowHistory>) -> Between {
+    fn between_steps(&self, model: &mut dyn Backend, rows: Option<&RowHistory>) -> NextAction {
         self.render_next(model, rows, Duration::ZERO);
         loop {
             match self.run_status.next_action() {
-                Action::Checkpoint => return Between::Checkpoint,
-                Action::Step | Action::Stop => return Between::Step,
+                Action::Checkpoint => return NextAction::Checkpoint,
+                Action::Step | Action::Stop => return NextAction::Step,
                 // A closed page cannot send the command to continue.
                 Action::Wait if self.observer.interrupt().is_some() || self.queue.is_closed() => {
-                    return Between::Step;
+                    return NextAction::Step;
                 }
                 Action::Wait => self.render_next(model, rows, POLL_INTERVAL),
             }
@@ -274,7 +274,7 @@ mod tests {
                 queue.close();
                 is_paused
             });
-            assert_eq!(live.between_steps(&mut *backend, None), Between::Step);
+            assert_eq!(live.between_steps(&mut *backend, None), NextAction::Step);
             assert!(queue.is_closed() && waits.join().expect("it ends"), "the run was not paused");
         });
     }

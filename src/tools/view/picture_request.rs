@@ -112,7 +112,7 @@ fn check(body: RequestBody, scene: &Scene) -> Result<PictureRequest, String> {
         return Err(format!("model must be less than {}", scene.models.len()));
     }
     let camera = match (camera, view) {
-        (Some(camera), None) => Viewpoint::Free(key(&camera, scene)?),
+        (Some(camera), None) => Viewpoint::Free(parse_camera(&camera, scene)?),
         (None, Some(ViewBody { split, number })) => {
             let views = scene.views[split as usize].len();
             if number >= views {
@@ -132,7 +132,7 @@ fn check(body: RequestBody, scene: &Scene) -> Result<PictureRequest, String> {
     Ok(PictureRequest { pane: (page, place), kind, model, size, is_moving, camera })
 }
 
-fn key(camera: &CameraBody, scene: &Scene) -> Result<Keyframe, String> {
+fn parse_camera(camera: &CameraBody, scene: &Scene) -> Result<Keyframe, String> {
     let key = camera_path::parse_keyframe(&camera.camera_to_world, camera.fov)?;
     if !FIELDS.contains(&camera.fov) {
         let (least, most) = (FIELDS.start(), FIELDS.end());

@@ -100,7 +100,7 @@ impl Routes<'_> {
             Err(RenderError::Failed(message)) => Response::error(500, message),
             Err(RenderError::Closed) => Response::error(
                 503,
-                "no more pictures are rendered; start densify again when it has ended",
+                "densify renders no more pictures; once it has ended, start it again",
             ),
         }
     }

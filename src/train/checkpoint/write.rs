@@ -18,8 +18,8 @@ use densify_core::gaussians::ModelArray;
 use densify_core::pieces::pieces;
 use densify_render::{Backend, BackendError, StateArray, Tensor, Values};
 
-/// Writes the header of a checkpoint, and the model and state of the backend. The file appears under its name when it is
-/// complete and on disk; an existing file stays until then.
+/// Writes the header of a checkpoint, and the model and state of the backend. The file appears under its name when it
+/// is complete and on disk; an existing file stays until then.
 ///
 /// # Errors
 /// [`CheckpointError::File`], [`CheckpointError::Backend`].

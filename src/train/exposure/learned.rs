@@ -24,8 +24,8 @@ const BETA1: f32 = 0.9;
 /// Decay rate of Adam's second moment. It must forget the first gradients, because a view has only a few hundred steps,
 /// not thousands like a Gaussian, and its gradients fall by orders of magnitude.
 const BETA2: f32 = 0.99;
-/// Adam's epsilon. It is smaller than every relevant gradient, such as that of a hundredth of a photograph's pixels being
-/// off by 1/255.
+/// Adam's epsilon. It is smaller than every relevant gradient, such as that of a hundredth of a photograph's pixels
+/// being off by 1/255.
 const EPSILON: f32 = 1e-8;
 /// Weight of the squared differences from the identity in the loss. The rest of the loss rises by about five times the
 /// square of an error in a factor, so that the regularisation shifts a factor by less than a five-hundredth of its
@@ -136,7 +136,7 @@ impl Exposures {
         let (found, expected) = (self.views.len(), other.views.len());
         if found != expected || self.model != other.model {
             return Err(format!(
-                "its exposures are of {found} views ({:?}); this run has {expected} ({:?})",
+                "its exposures are for {found} views ({:?}); this run has {expected} ({:?})",
                 self.model, other.model
             ));
         }
@@ -165,8 +165,8 @@ fn is_learned(model: ExposureModel, number: usize) -> bool {
     model == ExposureModel::Matrix || number >= 9 || number.is_multiple_of(4)
 }
 
-/// The exposures by name of view, as JSON: 3x4 matrices that transform a colour of the model, extended by a 1, to that of
-/// the photograph.
+/// The exposures by name of view, as JSON: 3x4 matrices that turn (r, g, b, 1) of the model into the colour of the
+/// photograph.
 pub fn named_transforms<'a>(
     exposures: &Exposures,
     names: impl Iterator<Item = &'a str>,

@@ -13,22 +13,22 @@ const MAX_DIFFERENCE: f64 = 0.5;
 /// A difference that is accepted even if the spreads are small `[stops]`.
 const NEGLIGIBLE_DIFFERENCE: f64 = 0.3;
 
-/// The use made of exposures from EXIF.
+/// How exposures from EXIF were used.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum ExifUse {
     /// No exposure from EXIF was needed or usable.
     Unused,
     /// Number of views that start with the exposure from EXIF.
     Views(usize),
-    /// Not used, because they contradict the track colours.
+    /// Not used, because EXIF contradicts the track colours.
     Contradicted {
         /// Root mean square difference `[stops]`.
         by: f64,
     },
 }
 
-/// Sets the gains of views without `known` track colours from exposures in EXIF `[stops]`. Afterwards the geometric mean of
-/// all known gains is 1.
+/// Sets the gains of views without `known` track colours from exposures in EXIF `[stops]`. Afterwards the geometric
+/// mean of all known gains is 1.
 ///
 /// # Panics
 /// When the slices have different lengths.
@@ -116,7 +116,7 @@ mod tests {
         let tracks = [-1.0, 0.0, 1.0, 0.0];
         let mut gains = tracks.map(gain);
         gains[3] = [1.0; 3];
-        // EXIF has errors of a tenth of a stop, and another zero point.
+        // EXIF is off by up to a tenth of a stop, and has another zero point.
         let stops = [Some(4.1), Some(5.0), Some(5.9), Some(6.0)];
         let known = [true, true, true, false];
         assert_eq!(complete_gains(&mut gains, &known, &stops), ExifUse::Views(1));

@@ -29,8 +29,8 @@ const DISTANCE_FLOOR: f64 = 1e-4 * SCENE_DIAMETER;
 const SINGLE_POINT_SCALE: f64 = 0.01 * SCENE_DIAMETER;
 /// Initial opacity.
 const OPACITY: f64 = 0.1;
-/// Colours stay half an 8-bit step away from 0 and 1, because the renderer clamps colours at 0, where black would have no
-/// gradient.
+/// Colours stay half an 8-bit step away from 0 and 1, because the renderer clamps colours at 0, where black would have
+/// no gradient.
 const COLOUR_MARGIN: f64 = 1.0 / 510.0;
 
 /// Numbers of points that were used and dropped.
@@ -52,7 +52,7 @@ pub struct InitReport {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum InitError {
     /// The budget is 0.
-    #[error("a budget of 0 Gaussians leaves no model")]
+    #[error("the budget is 0 Gaussians; it must be at least 1")]
     NoBudget,
     /// There is no such degree.
     #[error("spherical-harmonic degree {0} is not one of 0 to 3")]
@@ -65,8 +65,8 @@ pub enum InitError {
     TooManyPoints(usize),
 }
 
-/// Creates one Gaussian per point, in normalised coordinates. If there are more points than `budget`, the seed determines
-/// a random subset. Gaussians close in space are mostly close in order, too.
+/// Creates one Gaussian per point, in normalised coordinates. If there are more points than `budget`, the seed
+/// determines a random subset. Gaussians close in space are mostly close in order, too.
 ///
 /// # Errors
 /// When there is no usable point, and when the budget or the degree is invalid.
@@ -135,7 +135,7 @@ fn finite(points: &PointCloud) -> Vec<usize> {
 }
 
 /// Applies the initial opacity and scale that a policy requests.
-pub fn restart(model: &mut Gaussians, rule: &StartRule) {
+pub fn apply_start_rule(model: &mut Gaussians, rule: &StartRule) {
     if let Some(opacity) = rule.opacity {
         model.opacity_logits.fill(logit(opacity));
     }

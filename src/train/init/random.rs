@@ -14,13 +14,13 @@ const HALF_CUBE: f64 = 1.0 / 3.0;
 const BACKGROUND_DEPTHS: (f64, f64) = (2.0 / 3.0, 4.0);
 /// Depths in scenes without a focus `[scene units]`; the cameras are within a radius of 1.
 const FREE_DEPTHS: (f64, f64) = (0.25, 5.0);
-/// Smallest colour and width of the range: the middle half, away from clamping.
+/// Smallest value of a random colour, and width of the range of values: the middle half, away from clamping.
 const COLOURS: (u8, u8) = (64, 128);
 
 /// Random points in view of the cameras, in normalised coordinates, with random colours.
 ///
 /// If the cameras look at one object, the points fill a cube around it. With a `background` (images without alpha) only
-/// every other point lies in the cube; the rest are spread over the views, uniformly in image position and inverse
+/// half of the points lie in the cube; the others are spread over the views, uniformly in image position and inverse
 /// depth. If the cameras have no common focus (a room from inside, a street), all points are spread over the views.
 /// Equal arguments give equal points.
 pub fn random_points(count: usize, cameras: &[Camera], background: bool, seed: u64) -> PointCloud {

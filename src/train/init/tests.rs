@@ -198,9 +198,9 @@ fn policies_may_change_the_initial_opacity_and_scale() {
         ..Gaussians::default()
     };
     let before = model.clone();
-    restart(&mut model, &StartRule::default());
+    apply_start_rule(&mut model, &StartRule::default());
     assert_eq!(model, before);
-    restart(&mut model, &StartRule { opacity: Some(0.5), scale: 0.1 });
+    apply_start_rule(&mut model, &StartRule { opacity: Some(0.5), scale: 0.1 });
     assert_eq!(model.opacity_logits, [0.0, 0.0]);
     let tenth = 0.1_f32.ln();
     assert_eq!(model.log_scales[1], [tenth, 1.0 + tenth, -2.0 + tenth]);

@@ -7,7 +7,7 @@ use densify_render::BackendError;
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum MetricError {
     /// The number of values of the render, or of a channel of the target, does not match the target's size.
-    #[error("the {part} has {found} values, the target of {width}x{height} px needs {expected}")]
+    #[error("{found} values in the {part}; an image of {width}x{height} px needs {expected}")]
     Size {
         /// The render, or the target's colours, coverage or mask.
         part: &'static str,

@@ -4,7 +4,7 @@ use serde::Serialize;
 
 use densify_core::camera::Camera;
 
-/// One camera. Positions are in world coordinates.
+/// One camera, in the coordinates of the saved model.
 #[derive(Debug, Serialize)]
 struct CameraRecord<'a> {
     id: usize,
@@ -13,13 +13,14 @@ struct CameraRecord<'a> {
     height: u32,
     /// The camera's centre.
     position: [f64; 3],
-    /// Rows of `world_from_camera`, whose columns are the camera's axes (x right, y down, z forward).
+    /// The rows of the matrix `world_from_camera`, whose columns are the camera's axes (x right, y down, z forward).
     rotation: [[f64; 3]; 3],
     fy: f64,
     fx: f64,
 }
 
-/// JSON of cameras in the coordinates of the model's file with the names of their images, numbered in order.
+/// JSON of cameras with the names of their images, numbered in order. The cameras are in the coordinates of the saved
+/// model.
 pub fn cameras_json<'a>(
     cameras: impl IntoIterator<Item = (&'a str, Camera)>,
 ) -> serde_json::Result<String> {

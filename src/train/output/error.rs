@@ -46,13 +46,13 @@ pub enum FolderError {
         /// The part of a run that it lacks.
         missing: &'static str,
     },
-    /// A file is neither a model nor the folder of a run.
+    /// The path is a file that is not a model.
     #[error("{} is neither a model nor a run; {MODEL_OR_RUN}", path.display())]
     NotAModel {
         /// The file.
         path: PathBuf,
     },
-    /// There is no file.
+    /// The path does not exist.
     #[error("{} does not exist; {MODEL_OR_RUN}", path.display())]
     NotFound {
         /// The path.
@@ -76,8 +76,8 @@ pub enum FolderError {
                 staging.display()
             ),
             Some(aside) => format!(
-                "moving back failed too: files of the run that was to be replaced are in {}, and of the \
-                 new one in {}; leave them there, the next run in the folder completes or undoes the replacement",
+                "moving the files back failed, too: those of the old run are in {}, and those of the new run in {}; \
+                 leave them there: the next run in the folder completes or undoes the replacement",
                 aside.display(),
                 staging.display()
             ),

@@ -65,11 +65,11 @@ pub fn events_of(run: &Path) -> Result<Vec<EditEvent>, FileError> {
 
 /// Reads `stats/summary.json`; `None` without the file, as during training.
 pub fn summary_of(run: &Path) -> Result<Option<Summary>, FileError> {
-    read_stats(&run.join("stats/summary.json"))
+    read_json(&run.join("stats/summary.json"))
 }
 
 /// Reads a JSON file; `None` if it does not exist.
-pub fn read_stats<T: DeserializeOwned>(path: &Path) -> Result<Option<T>, FileError> {
+pub fn read_json<T: DeserializeOwned>(path: &Path) -> Result<Option<T>, FileError> {
     let parsed = text_of(path)?.map(|text| serde_json::from_str(&text));
     parsed.transpose().map_err(|e| FileError::malformed(path, e))
 }
@@ -105,7 +105,7 @@ fn entry_of<T: DeserializeOwned>(path: &Path, iteration: u32) -> Result<Option<T
 
 /// Reads the entries of a file; empty if it does not exist.
 pub(super) fn read_entries(path: &Path) -> Result<Map<String, Value>, FileError> {
-    Ok(read_stats(path)?.unwrap_or_default())
+    Ok(read_json(path)?.unwrap_or_default())
 }
 
 /// Reads the text of a file; `None` if it does not exist.

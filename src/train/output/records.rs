@@ -38,8 +38,8 @@ impl RecordLog {
         Ok(Self { file, path: path.to_owned() })
     }
 
-    /// Continues a log, truncated to the length that it had at the checkpoint. Also returns whether the log was still that
-    /// long; records that it had lost are not restored.
+    /// Continues a log, truncated to the length that it had at the checkpoint. Also returns whether it was at least
+    /// that long; if it was shorter, the missing records stay lost.
     ///
     /// # Errors
     /// [`FileError::Io`].

@@ -39,8 +39,8 @@ impl TensorBoard {
         Ok(board)
     }
 
-    /// Continues the event file `name` in a folder, truncated to the length that it had at the checkpoint. Starts another
-    /// file if it is missing or shorter, or if `name` is not the name of an event file.
+    /// Continues the event file `name` in a folder, truncated to the length that it had at the checkpoint. Starts
+    /// another file if it is missing or shorter, or if `name` is not the name of an event file.
     ///
     /// # Errors
     /// [`FileError::Io`].

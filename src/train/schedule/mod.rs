@@ -54,8 +54,8 @@ pub struct RateOptions {
     pub fade: f64,
     /// Share of the run after which these step sizes fade, in (0, 1].
     pub fade_from: f64,
-    /// Initial factor of all step sizes, > 0. It falls log-linearly to 1 at the end of the run, so that the last steps are
-    /// as fine as in a long run.
+    /// Initial factor of all step sizes, > 0. It falls log-linearly to 1 at the end of the run, so that the last steps
+    /// are as fine as in a long run.
     pub boost: f64,
 }
 
@@ -86,15 +86,15 @@ impl RateOptions {
     };
 
     /// The default step sizes of a run. Runs of fewer than 30,000 iterations start with b = (30,000 / iterations)^0.6
-    /// times the published step sizes, at most 5 times, and the step size of colour bands 1–3 keeps an additional factor
-    /// of min(b, 2) to the end.
+    /// times the published step sizes, at most 5 times, and the step size of colour bands 1–3 keeps an additional
+    /// factor of min(b, 2) to the end.
     ///
     /// Short runs must reach the same result in fewer steps. In measurements on three scenes at 2,000–3,000 iterations,
     /// the published step sizes left Gaussians far from their optimum, with training views as blurred as test views.
-    /// View-dependent colour, which has the smallest steps and starts last, still lagged behind: twice its step size gave
-    /// +0.39, +0.23 and +0.18 dB (cup, three seeds), +0.20 (office), +0.59 (beercan) and −0.04 (room256); four times gave
-    /// less. It costs quality where colour does not depend on the view: −0.76 dB on the built-in `scene:room` (the
-    /// published value of `sh_rest` is 1.25e-4).
+    /// View-dependent colour, which has the smallest steps and starts last, still lagged behind: twice its step size
+    /// gave +0.39, +0.23 and +0.18 dB (cup, three seeds), +0.20 (office), +0.59 (beercan) and −0.04 (room256); four
+    /// times gave less. It costs quality where colour does not depend on the view: −0.76 dB on the built-in
+    /// `scene:room`, where the published `sh_rest` of 1.25e-4 is better.
     pub fn for_run(iterations: u32) -> Self {
         let shortage = f64::from(REFERENCE_ITERATIONS) / f64::from(iterations.max(1));
         let boost = shortage.powf(0.6).clamp(1.0, 5.0);
@@ -102,8 +102,8 @@ impl RateOptions {
         Self { boost, sh_rest: published.sh_rest * boost.min(2.0) as f32, ..published }
     }
 
-    /// The final step sizes for the whole run, for models that are trained already: larger steps would cost such models
-    /// 4 to 6 dB at first.
+    /// These rates with the final step sizes in the whole run, for models that are trained already: larger steps would
+    /// cost such models 4 to 6 dB at first.
     #[must_use]
     pub fn fine(self) -> Self {
         Self {
@@ -174,7 +174,7 @@ impl RateOptions {
         }
     }
 
-    /// What is wrong with the first value that is not allowed, with its name.
+    /// The name of the first invalid value, and the values allowed; `None` if all are valid.
     pub fn problem(&self) -> Option<String> {
         let end = |end: Option<f32>| f64::from(end.unwrap_or(1.0));
         let starts = [
@@ -211,7 +211,7 @@ pub enum InitRates {
     /// The final step sizes of a run: the model keeps what it has learned
     #[default]
     Fine,
-    /// The step sizes of a run from its start: the model may change much
+    /// The step sizes of a run from its start: the model may change a lot
     Full,
 }
 
@@ -223,8 +223,8 @@ pub fn scaled(steps: u32, iterations: u32) -> u32 {
     u32::try_from(rounded.max(1)).unwrap_or(u32::MAX)
 }
 
-/// Spherical-harmonic degree of iteration `step`: it starts at 0 and rises by one every 1,000 steps of a run of 30,000, up
-/// to `highest`.
+/// Spherical-harmonic degree of iteration `step`: it starts at 0 and rises by one every 1,000 steps of a run of 30,000,
+/// up to `highest`.
 pub fn sh_degree(step: u32, iterations: u32, highest: u8) -> u8 {
     let reached = step / scaled(1_000, iterations);
     u8::try_from(reached).unwrap_or(u8::MAX).min(highest).min(MAX_SH_DEGREE)
@@ -310,7 +310,8 @@ impl Serialize for Background {
     }
 }
 
-/// The order of training views in an epoch (0-based): a random permutation of `0..views` that depends on seed and epoch.
+/// The order of training views in an epoch (0-based): a random permutation of `0..views` that depends on seed and
+/// epoch.
 pub fn view_order(views: usize, seed: u64, epoch: u32) -> Vec<usize> {
     let mut order: Vec<usize> = (0..views).collect();
     let mut draws = random_stream(seed, Purpose::Views, u64::from(epoch));
@@ -321,8 +322,8 @@ pub fn view_order(views: usize, seed: u64, epoch: u32) -> Vec<usize> {
     order
 }
 
-/// A random sample of `count` training views without replacement, or of all views if there are fewer, that depends on
-/// seed and step. Used for views that are rendered for the policy's decisions and the automatic budget.
+/// A random sample of `count` training views without replacement that depends on seed and step; all views if there are
+/// fewer. Used for views that are rendered for the policy's decisions and the automatic budget.
 pub fn fresh_views(views: usize, count: usize, seed: u64, step: u32) -> Vec<usize> {
     let mut chosen: Vec<usize> = (0..views).collect();
     let mut draws = random_stream(seed, Purpose::FreshViews, u64::from(step));
@@ -330,8 +331,8 @@ pub fn fresh_views(views: usize, count: usize, seed: u64, step: u32) -> Vec<usiz
     chosen
 }
 
-/// Keeps a uniform random sample of `count` values: the first elements of a Fisher–Yates shuffle, implemented here because
-/// the sampling functions of a library may change with its version.
+/// Keeps a uniform random sample of `count` values: the first elements of a Fisher–Yates shuffle, implemented here
+/// because the sampling functions of a library may change with its version.
 pub(crate) fn sample(values: &mut Vec<usize>, count: usize, rng: &mut ChaCha8Rng) {
     for place in 0..count {
         let other = place + below(rng, (values.len() - place) as u64) as usize;
@@ -348,7 +349,7 @@ enum Purpose {
     FreshViews = 3,
 }
 
-/// The random stream number `counter` for a purpose. ChaCha is a hash of (key, stream, position).
+/// Stream number `counter` of the random numbers for a purpose. ChaCha is a hash of (key, stream, position).
 fn random_stream(seed: u64, purpose: Purpose, counter: u64) -> ChaCha8Rng {
     let mut key = [0_u8; 32];
     key[..8].copy_from_slice(&seed.to_le_bytes());

@@ -40,7 +40,7 @@ pub enum TrainError {
     },
     /// Rows have non-finite values: too many of them, or any with [`OnNan::Stop`](super::OnNan::Stop).
     #[error(
-        "step {step}: {count} of {rows} rows hold numbers that are not finite, first {first}; \
+        "step {step}: {count} of {rows} Gaussians have non-finite values, the first in {first}; \
          lower the learning rates, and check the scene's scale and cameras"
     )]
     NonFinite {

@@ -1,8 +1,8 @@
 //! The training loop, for any policy and any device.
 //!
 //! Views come from a [`ViewSource`], pixels and gradients from a [`Backend`], edits of rows from a [`DensityPolicy`]. A
-//! step (Kerbl et al. 2023, section 5) takes the next view of the epoch, runs forward pass, backward pass and optimiser,
-//! and then an edit if the policy is due. Policies see the model after the optimiser's step.
+//! step (Kerbl et al. 2023, section 5) takes the next view of the epoch, runs forward pass, backward pass and
+//! optimiser, and then an edit if the policy is due. Policies see the model after the optimiser's step.
 
 mod auto_budget;
 mod edit;
@@ -100,8 +100,8 @@ impl<V: ViewSource> Trainer<V> {
         })
     }
 
-    /// Enables automatic choices, before the first step. To choose the number of rows, the backend must also have been
-    /// created with [`growth_signals`].
+    /// Enables automatic choices; call it before the first step. To choose the number of rows, the backend must also
+    /// have been created with [`growth_signals`].
     #[must_use]
     pub fn with_auto_choices(mut self, choices: AutoChoices) -> Self {
         if choices.rows {
@@ -115,11 +115,11 @@ impl<V: ViewSource> Trainer<V> {
         self
     }
 
-    /// Enables learning of exposures from initial ones, before the first step. The backend must have been created for
-    /// exposures.
+    /// Enables learning of exposures, with their initial values; call it before the first step. The backend must have
+    /// been created for exposures.
     ///
     /// # Panics
-    /// When the number of exposures is not that of views, which is a bug in the caller.
+    /// When the numbers of exposures and of views differ, which is a bug in the caller.
     #[must_use]
     pub fn with_exposures(mut self, exposures: Option<Exposures>) -> Self {
         let count = exposures.as_ref().map_or(self.views.count(), Exposures::count);
@@ -186,7 +186,7 @@ impl<V: ViewSource> Trainer<V> {
         Ok(StepReport { step, view, output, rows: self.backend.rows(), events })
     }
 
-    /// A random sample of `count` scored views, or all of them if there are fewer, that depends on seed and step.
+    /// A random sample of `count` scored views that depends on seed and step; all of them if there are fewer.
     fn sample_scored_views(&self, count: usize, step: u32) -> Vec<usize> {
         let drawn = schedule::fresh_views(self.scored.len(), count, self.options.seed, step);
         drawn.into_iter().map(|place| self.scored[place]).collect()

@@ -1,7 +1,7 @@
-//! Finds training views that nearly duplicate another; these are not rendered for a policy's scores.
+//! Finds near-duplicate training views; only the first of each group is rendered for a policy's scores.
 //!
-//! A view that nearly repeats another, such as the next frame of a video, costs as much as any other and adds nothing to a
-//! score. All views are trained on nevertheless, and all test views are evaluated.
+//! A near-duplicate, such as the next frame of a video, costs as much as any other view and adds nothing to a score.
+//! All views are trained on nevertheless, and all test views are evaluated.
 
 use densify_core::camera::Camera;
 use densify_data::views::ViewSource;

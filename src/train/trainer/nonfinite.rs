@@ -5,8 +5,8 @@ use densify_data::views::ViewSource;
 
 /// Number of steps between audits, in addition to those before the policy's edits.
 pub(super) const AUDIT_EVERY: u32 = 100;
-/// Largest share of the rows that an audit may remove. So few have a negligible effect; more of them mean that the run
-/// diverges. One row may always be removed.
+/// Largest share of the rows that an audit may remove. Removing so few has a negligible effect; more non-finite rows
+/// mean that the run diverges. A single row may always be removed.
 const MAX_SHARE: f64 = 1e-3;
 /// Largest number of rows that an audit names in the log.
 const MAX_NAMED: usize = 10;

@@ -47,8 +47,8 @@ impl<V: ViewSource> Trainer<V> {
     }
 }
 
-/// Calls the policy, which may be third-party code: if it panics, the run ends with an error that names it, and the
-/// model can still be read. Unwinding is safe because the policy is not called again, and because its calls change
+/// Calls the policy, which may be third-party code: if it panics, the run ends with an error that names the policy, and
+/// the model can still be read. Unwinding is safe because the policy is not called again, and because its calls change
 /// nothing but the plan, which is dropped.
 ///
 /// # Errors

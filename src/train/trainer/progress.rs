@@ -15,8 +15,8 @@ impl<V: ViewSource> Trainer<V> {
         &self.state
     }
 
-    /// Number of training views that are not rendered for the policy's scores because they are near-duplicates; 0 if the
-    /// policy renders no views.
+    /// Number of training views that are not rendered for the policy's scores because they are near-duplicates; 0 if
+    /// the policy renders no views.
     pub fn unscored_views(&self) -> usize {
         if self.needs.aux.is_some() { self.views.count() - self.scored.len() } else { 0 }
     }

@@ -16,8 +16,8 @@ pub struct StepReport {
     pub output: StepOutput,
     /// Number of rows after the step.
     pub rows: usize,
-    /// The edits of this step: removal of rows with non-finite values, removal by the automatic budget, and the policy's
-    /// edit.
+    /// The edits of this step: removal of rows with non-finite values, removal by the automatic budget, and the
+    /// policy's edit.
     pub events: Vec<EditEvent>,
 }
 

@@ -40,7 +40,7 @@ impl RowHistory {
     /// # Panics
     /// When the plan is for another number of rows, which is a bug in the caller.
     pub fn record(&mut self, ops: &RowOps, step: u32) {
-        assert_eq!(ops.rows_before, self.created.len(), "a plan for other rows");
+        assert_eq!(ops.rows_before, self.created.len(), "the plan is for another number of rows");
         let seeded = ops.seeds.iter().map(|(slot, _)| *slot);
         let new = || ops.child_slots.iter().copied().chain(seeded.clone());
         let slots = new().max().map_or(0, |slot| slot as usize + 1).max(ops.rows_before);

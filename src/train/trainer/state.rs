@@ -50,8 +50,8 @@ impl<V: ViewSource> Trainer<V> {
         Ok(TrainerState { policy: call_policy(|| self.policy.save())?, ..self.state.clone() })
     }
 
-    /// Continues a run from `state`. This trainer must be new, with the same options and views, and its backend must have
-    /// the model and the backend state of the same step.
+    /// Continues a run from `state`. This trainer must be new, with the same options and views, and its backend must
+    /// have the model and the backend state of the same step.
     ///
     /// # Errors
     /// [`PolicyError`] if the policy rejects its state, or if the exposures do not match; then the trainer must not be

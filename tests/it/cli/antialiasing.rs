@@ -1,4 +1,4 @@
-//! `train --antialias`: the models it makes state their antialiasing, and every command keeps it or says so.
+//! `train --antialias`: models state their antialiasing, and every command keeps it or reports the change.
 
 use densify::core::antialiasing::Antialiasing::{self, Narrow, None, Wide};
 use densify::train::output::model_path;
@@ -27,7 +27,7 @@ fn antialiasing_is_carried_through_every_command() {
     let header = String::from_utf8_lossy(&read(&model_path(&plain, 20))[..200]).into_owned();
     assert!(!header.contains("comment"), "{header}");
 
-    // A run that was stopped continues with it, and refuses another.
+    // A resumed run keeps its antialiasing and refuses another.
     let whole = read(&ply);
     for file in ["point_cloud/iteration_20", "checkpoints/iteration_20.safetensors"] {
         let path = run.join(file);
@@ -42,7 +42,7 @@ fn antialiasing_is_carried_through_every_command() {
     resume(scene.path(), &run, "").ok();
     assert!(read(&ply) == whole);
 
-    // Formats state it; SPZ cannot state the smaller kernel, which the user is told.
+    // All formats state the antialiasing. SPZ cannot state the narrow kernel, and `export` says so.
     let export = |from: &Path, name: &str, flags: &str| {
         let to = root.path().join(name);
         let outcome = call(&format!("export {} -o {} {flags}", text(from), text(&to))).ok();
@@ -65,7 +65,7 @@ fn antialiasing_is_carried_through_every_command() {
     call(&format!("compress {} {flags}", text(&run))).ok();
     assert_eq!(stated(&small), Wide);
 
-    // Scores depend on it.
+    // Scores depend on the antialiasing.
     let score = |flags: &str| {
         let outcome = call(&format!("eval {} --backend cpu {flags}", text(&run))).ok();
         let mean = outcome.stdout.lines().find(|line| line.starts_with("mean"));
@@ -74,9 +74,13 @@ fn antialiasing_is_carried_through_every_command() {
     let own = score("");
     let results = read_text(&run.join("results.json"));
     assert_ne!(own, score("--antialias=none"));
-    assert_eq!(read_text(&run.join("results.json")), results, "scores with another antialiasing");
+    assert_eq!(
+        read_text(&run.join("results.json")),
+        results,
+        "scores with another antialiasing were saved"
+    );
 
-    // A run from the model trains as it was trained; frozen Gaussians must agree.
+    // A run that starts from a model trains with its antialiasing; the models of --init and --freeze must agree.
     let from = |flags: &str, name: &str| {
         let to = root.path().join(name);
         let flags = format!("--budget 900 --quiet {flags}");

@@ -82,10 +82,10 @@ fn the_automatic_degree_is_the_same_for_a_built_in_scene_and_its_files() {
         line.unwrap_or_else(|| panic!("{}", outcome.stdout)).to_owned()
     };
     let line = |scene: &str| planned(&format!("{scene} --sh-degree auto --budget 2k"), "colour ");
-    let here = line("scene:spheres");
-    assert!(here.starts_with("colour   degree 0 (auto)"), "{here}");
+    let built_in = line("scene:spheres");
+    assert!(built_in.starts_with("colour   degree 0 (auto)"), "{built_in}");
     let folder_text = text(&folder);
-    assert_eq!(line(folder_text), here, "transforms beside a model with tracks");
+    assert_eq!(line(folder_text), built_in, "transforms beside a model with tracks");
     // The memory for choosing the degree is released before anything else is allocated, so the budget is the same as
     // with an explicit degree.
     let rows = |degree: &str| {

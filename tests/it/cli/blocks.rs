@@ -90,7 +90,7 @@ fn blocks_are_trained_and_merged_into_one_model() {
         status(&folder)
     );
     let part = merge("--partial").ok().stdout;
-    assert!(part.contains("incomplete, left out: block-1-0"), "{part}");
+    assert!(part.contains("incomplete blocks left out: block-1-0"), "{part}");
     let part = gaussians(&merged).len();
     assert!((1..rows).contains(&part), "{part} of {rows}");
     blocks("submit", &folder).ok();

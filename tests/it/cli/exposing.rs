@@ -61,7 +61,7 @@ fn a_run_killed_before_its_first_checkpoint_restarts_from_the_same_exposures() {
         assert!(!files(&part).keys().any(|name| name.ends_with(".safetensors")));
         let again = resume(&scene, &part, "").ok().stdout;
         assert!(again.contains("begins at its start"), "{again}");
-        let messages = ["exposure on, from the gains of points", "exposure on (auto)"];
+        let messages = ["exposure on, from the colours of points", "exposure on (auto)"];
         assert!(messages.iter().any(|message| again.contains(message)), "{again}");
         assert!(model(&part, 20) == model(&whole, 20), "--exposure {choice}");
         let learned = "point_cloud/iteration_20/exposure.json";

@@ -55,7 +55,7 @@ fn written_scenes_match_the_built_in_ones_in_all_formats() {
     }
 }
 
-/// In a long corridor most of the wall that a camera shows is nearer than the usual share of the cameras' extent.
+/// In a long corridor, most of what a camera shows is nearer than the usual near plane, a share of the cameras' extent.
 #[test]
 #[ignore = "needs the shared cases: set DENSIFY_SHARED"]
 fn near_walls_of_the_shared_corridor_are_not_hidden() {
@@ -67,7 +67,7 @@ fn near_walls_of_the_shared_corridor_are_not_hidden() {
     let options = "--eval -b 20k -i 1200 --threads 1 --quiet";
     call(&format!("train {} -o {} {options}", text(&scene), text(&run))).ok();
     let psnr = json(&run.join("results.json"))["ours_1200"]["PSNR"].as_f64().expect("a score");
-    // 15.7 dB at the usual share, 19.6 dB where nothing is hidden.
+    // 15.7 dB with the usual near plane, 19.6 dB if nothing is hidden.
     assert!(psnr > 19.2, "{psnr} dB");
 }
 
@@ -167,11 +167,11 @@ fn scenegen_reports_surfaces_seen_by_few_views() {
     let room = format!("scenegen --preset room -o {} --overwrite {small}", text(&folder));
     let stdout = call(&format!("{room} --train 4")).ok().stdout;
     assert!(
-        stdout.contains("note: of 400 points wanted, ") && stdout.contains("--rig"),
+        stdout.contains(" % of 400 points could be placed, ") && stdout.contains("--rig"),
         "{stdout}"
     );
     let stdout = call(&format!("{room} --train 60").replace("--fov 25", "--fov 80")).ok().stdout;
-    assert!(!stdout.contains("points wanted"), "{stdout}");
+    assert!(!stdout.contains("could be placed"), "{stdout}");
 }
 
 #[test]
@@ -211,7 +211,7 @@ fn invalid_input_is_refused_and_writes_nothing() {
 
 #[test]
 fn presets_are_listed() {
-    // Built-in scenes without the option or the prefix that names them.
+    // A built-in scene named without `--preset` or `scene:` is refused with the correct spelling.
     call("scenegen room").refused("a built-in scene", &["--preset room", "train scene:room"]);
     call("scenegen scene:town:4").refused("a built-in scene", &["--preset town:4"]);
     call("train room").refused("a built-in scene", &["scene:room"]);

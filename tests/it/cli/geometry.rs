@@ -13,8 +13,8 @@ use super::{call, count, json, scratch, text};
 
 const BUDGET: u64 = 800;
 const STEPS: u32 = 1000;
-/// The best settings found for a hard stop at the budget: growth five times as often as by default (the minimum
-/// interval for such a short run is 100 steps), and no opacity resets, from which a short run does not recover.
+/// `vanilla` stops growing at the budget, a hard stop. These are the best settings found for it: growth five times as
+/// often as by default (at least 100 steps apart), and no opacity resets, from which a short run does not recover.
 const HARD_STOP: &str = "--policy-set vanilla.grow_every=20 --policy-set vanilla.reset_every=0";
 
 /// A built-in scene written to a temporary folder.

@@ -52,7 +52,7 @@ fn a_run_can_start_from_any_model() {
     outcome.ok();
     assert!(first_loss(&other) < 1.1 * from_model + 0.01, "{}", first_loss(&other));
 
-    // A learning rate of 0 freezes what it is for.
+    // A learning rate of 0 freezes its parameters.
     let (outcome, still) = init(&ply, "still", "--budget 300 --lr mean_start=0");
     outcome.ok();
     let [before, after] = [&ply, &model_path(&still, 20)].map(|file| gaussians(file));

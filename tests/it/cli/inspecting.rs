@@ -101,7 +101,7 @@ fn eval_measures_lpips_with_the_users_weights() {
     let without = call(&format!("eval {} --fail-above lpips=1", text(&run)));
     without.refused("no weights are given", &["lpips", "--lpips FILE"]);
     std::fs::write(&file, "no weights").unwrap();
-    let words = ["--lpips", "alex.safetensors", "no safetensors file", "docs/metrics.md"];
+    let words = ["--lpips", "alex.safetensors", "not a safetensors file", "docs/metrics.md"];
     call_with(&file, "").refused("no weights are in the file", &words);
 }
 

@@ -102,7 +102,7 @@ fn a_run_killed_anywhere_resumes_to_the_same_bytes() {
     train(scene.path(), &whole, ITERATIONS, &format!("--quiet {FLAGS}")).ok();
     let expected = outcome(&whole, ITERATIONS);
     let mut rng = ChaCha8Rng::seed_from_u64(11);
-    let (mut killed, mut within_a_write) = (0, 0);
+    let (mut killed, mut during_a_write) = (0, 0);
     for number in 0.. {
         let run = root.path().join(format!("run{number}"));
         // Repeats the same call, like a supervisor.
@@ -113,7 +113,7 @@ fn a_run_killed_anywhere_resumes_to_the_same_bytes() {
             if moment.wait(&mut child, &run) {
                 child.kill().expect("it can be killed");
                 killed += 1;
-                within_a_write += usize::from(is_writing(&run.join("checkpoints")));
+                during_a_write += usize::from(is_writing(&run.join("checkpoints")));
             }
             let ended = child.wait_with_output().expect("the program ends");
             let stderr = String::from_utf8_lossy(&ended.stderr);
@@ -129,7 +129,7 @@ fn a_run_killed_anywhere_resumes_to_the_same_bytes() {
             break;
         }
     }
-    assert!(within_a_write > 0, "no kill hit the writing of a checkpoint");
+    assert!(during_a_write > 0, "no kill hit the writing of a checkpoint");
 }
 
 /// Starts a run, sends signals to it and waits for its end. Returns its exit code and message.

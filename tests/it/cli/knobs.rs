@@ -89,7 +89,8 @@ fn presets_set_the_number_of_iterations_unless_it_is_given() {
     }
     // The printed cost of `balanced` was measured at its own number of iterations, so it is not printed for others.
     let stdout = short(scene.path(), &output, "").ok().stdout;
-    let line = format!("preset   none: --iterations {ITERATIONS} is given, and balanced is 24000");
+    let line =
+        format!("preset   none: --iterations {ITERATIONS} overrides balanced, which has 24000");
     assert!(stdout.contains(&line), "{stdout}");
 }
 

@@ -243,7 +243,7 @@ fn foreign_requests_and_idle_connections_do_not_affect_training() {
     page.order("pause");
     let step = page.wait_for_pause();
     let stop = json!({ "order": "stop" }).to_string();
-    let sent = |path: &str, more: &str| {
+    let send_stop = |path: &str, more: &str| {
         let whole = format!("{path}order");
         let request = format!(
             "POST {whole} HTTP/1.1\r\nHost: {}\r\nConnection: close\r\nContent-Length: {}\r\n{more}\r\n{stop}",
@@ -261,7 +261,7 @@ fn foreign_requests_and_idle_connections_do_not_affect_training() {
         (&*page.path, format!("{json}Origin: null\r\n"), 403),
         (&*page.path, "Content-Type: text/plain\r\n".to_owned(), 415),
     ] {
-        assert_eq!(sent(path, &more), status, "{path} {more}");
+        assert_eq!(send_stop(path, &more), status, "{path} {more}");
     }
     for order in ["{}", "{\"order\": \"explode\"}", "{\"order\": \"stop\", \"path\": \"/\"}"] {
         assert_eq!(page.try_post("order", "", order).expect("a reply").status, 400, "{order}");

@@ -36,9 +36,9 @@ fn budget(outcome: &Outcome) -> &str {
     lines.find(|line| line.starts_with("budget ")).expect("a budget")
 }
 
-/// `plan` says how much of the memory is only for speed; the rest holds the same Gaussians.
+/// `plan` reports the least memory that holds the budget, and how much more serves only speed.
 #[test]
-fn the_memory_that_a_budget_needs_holds_it() {
+fn the_reported_least_memory_holds_the_budget() {
     let scene = Photographs::colmap_text();
     let planned = plan(scene.path(), "--budget 300k").ok().stdout;
     let needed = planned.split("\nneeded   ").nth(1).expect("a line");

@@ -148,8 +148,8 @@ fn resume(scene: &Path, run: &Path, flags: &str) -> Outcome {
     call(&format!("train {} -o {} --resume {flags}", text(scene), text(run)))
 }
 
-/// Flags that make a policy act often. Intervals do not shrink with the run, so a policy would hardly act in a short
-/// one.
+/// Flags that make a policy edit often. Default intervals do not shrink below 100 steps, so it would hardly edit in a
+/// short run.
 fn frequent_edits(policy: &PolicyEntry) -> String {
     let intervals = policy.parameters().into_iter().filter_map(|(name, default)| {
         let default =

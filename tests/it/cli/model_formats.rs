@@ -95,10 +95,10 @@ fn every_command_accepts_models_of_any_format() {
         train(scene.path(), &from, 1, &flags).ok();
         let summary = json(&from.join("stats/summary.json"));
         assert!(count(&summary, "peak_rows") >= whole.len() as u64, "{format}: {summary}");
-        let resumed = json(&from.join("results.json"))["ours_1"]["PSNR"].as_f64().unwrap();
+        let after = json(&from.join("results.json"))["ours_1"]["PSNR"].as_f64().unwrap();
         assert!(
-            (resumed - own).abs() < tolerance + 1.0,
-            "{format}: {resumed} after a step, {own} before"
+            (after - own).abs() < tolerance + 1.0,
+            "{format}: {after} after a step, {own} before"
         );
         std::fs::remove_dir_all(&from).unwrap();
     }

@@ -1,4 +1,4 @@
-//! Scenes in coordinates that f32 cannot hold, as in UTM: what is saved is what was trained, or the user is told.
+//! Scenes in coordinates too large for f32, as in UTM: saved models keep their quality, or a note says otherwise.
 
 #![allow(clippy::float_cmp, reason = "results are exact")]
 
@@ -12,7 +12,7 @@ use glam::DVec3;
 use super::{call, gaussians, json, read, scratch, text, train, write_ply};
 use crate::photographs::Photographs;
 
-/// Easting, northing and height `[m]`. At this northing, the step of f32 is half a metre; the Gaussians have 0.1 to 0.4.
+/// Easting, northing and height `[m]`. At this northing, f32 resolves half a metre; Gaussians measure 0.1 to 0.4.
 const UTM: DVec3 = DVec3::new(512_345.25, 5_400_123.25, 81.0);
 const ITERATIONS: u32 = 60;
 
@@ -43,7 +43,7 @@ fn means_in_checkpoint(run: &Path) -> Vec<u8> {
 }
 
 #[test]
-fn a_remote_scene_is_saved_as_it_was_trained_or_the_user_is_told() {
+fn a_remote_model_keeps_its_quality_or_a_note_says_otherwise() {
     let (scene, far) = (Photographs::colmap_text(), Photographs::colmap_text_at(UTM));
     let root = tempfile::tempdir().unwrap();
     let run = |name: &str, scene: &Photographs, flags: &str| {
@@ -63,8 +63,8 @@ fn a_remote_scene_is_saved_as_it_was_trained_or_the_user_is_told() {
         assert!((found - near).abs() < 0.05, "{name}: {found} of {near}");
         let saved = evaluated(&file, &far);
         assert!((saved - near).abs() < 0.05, "{name}: {saved} of {near}");
-        let is_told = said.contains("coords   local") && said.contains("note: saved in local");
-        assert_eq!(is_told, name == "auto", "{name}: {said}");
+        let is_noted = said.contains("coords   local") && said.contains("note: saved in local");
+        assert_eq!(is_noted, name == "auto", "{name}: {said}");
         files.push(file);
     }
     let [automatic, local, double] = &files[..] else { panic!("three") };
@@ -76,7 +76,7 @@ fn a_remote_scene_is_saved_as_it_was_trained_or_the_user_is_told() {
     );
     assert!(head(double).contains("property double x"), "{}", head(double));
 
-    // World coordinates are worse, which is said before and measured after training; training itself is the same.
+    // World coordinates lose quality: a note says so before training, and scores show it. Training itself is the same.
     let flags = "--coordinates world --test-iterations 30";
     let (file, found, said) = run("world", &far, flags);
     assert!(found < near - 1.0, "{found} of {near}");

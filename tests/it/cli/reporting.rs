@@ -252,7 +252,7 @@ fn reports_average_seeds_compare_policies_and_separate_scenes() {
     let page = read_text(&file);
     assert_self_contained(&page);
     for words in
-        ["3 runs of 3 scenes", "Views of garden<", "Views of garden, read another way (2)<"]
+        ["3 runs of 3 scenes", "Views of garden<", "Views of garden, other reading options (2)<"]
     {
         assert!(page.contains(words), "{words} is not in the report");
     }

@@ -38,7 +38,7 @@ const SIGNALS: [Signal; 6] = [
 ];
 /// Index in [`SIGNALS`] of the number of views in which a row was visible.
 const SEEN: usize = 3;
-const SAME: Update = Update { keep_moments: false, ..Update::NONE };
+const RESET_MOMENTS: Update = Update { keep_moments: false, ..Update::NONE };
 
 fn view() -> Camera {
     scenes::camera(33, 25, 71)
@@ -64,7 +64,7 @@ fn trained(subject: &Subject, budget: usize) -> Box<dyn Differentiable> {
     step(&mut *backend, &view(), 2);
     let mut plan = EditPlan::new(ROWS, budget).allowing(&needs());
     for row in (0..ROWS as u32).step_by(3) {
-        plan.update(row, SAME).expect("the row is free");
+        plan.update(row, RESET_MOMENTS).expect("the row is free");
     }
     backend.apply(&plan.compile(), SEED, 2).expect("a plan is applied");
     step(&mut *backend, &view(), 3);

@@ -38,18 +38,19 @@ fn backend(model: &Gaussians, device: &GpuDevice) -> Box<dyn Differentiable> {
     faint(&Subject::Gpu(device.clone()), model)
 }
 
-/// Returns true if the driver ended its loops early. Checks that this is reported, and that llvmpipe ends them early.
-fn ended_early<T>(result: &Result<T, Failure>, device: &GpuDevice, more: bool) -> bool {
+/// Returns true if the driver ended its loops early. Checks that llvmpipe does, and that the message says so and, if
+/// `suggests_slots`, suggests accumulation in slots.
+fn ended_early<T>(result: &Result<T, Failure>, device: &GpuDevice, suggests_slots: bool) -> bool {
     let Err(error) = result else {
-        let breaks_off = device.adapter().name.contains("llvmpipe");
-        assert!(!breaks_off, "{} processed the whole list", name(device));
+        let is_llvmpipe = device.adapter().name.contains("llvmpipe");
+        assert!(!is_llvmpipe, "{} processed the whole list", name(device));
         return false;
     };
     let message = error.to_string();
     for word in [&*device.adapter().name, "ends loops before they", "--backend cpu"] {
         assert!(message.contains(word), "{word} is not in {message}");
     }
-    assert_eq!(message.contains("--knob accumulation=slots"), more, "{message}");
+    assert_eq!(message.contains("--knob accumulation=slots"), suggests_slots, "{message}");
     true
 }
 
@@ -60,8 +61,8 @@ fn a_list_too_long_to_render_is_an_error() {
     let expected = faint(&Subject::NATIVE, &model).render(&camera, GREY, 0).expect("a small image");
     for device in devices_by_accumulation() {
         let found = backend(&model, device).render(&camera, GREY, 0).map_err(Failure::from);
-        let more = device.accumulation() != Accumulation::Slots;
-        if !ended_early(&found, device, more) {
+        let suggests_slots = device.accumulation() != Accumulation::Slots;
+        if !ended_early(&found, device, suggests_slots) {
             let mut table = Table::new(&format!("300,000 rows in a tile, {}", name(device)));
             let found = found.expect("a complete rendering").rgb;
             let error = found.iter().zip(&expected.rgb).map(|(a, b)| (a - b).abs());

@@ -159,10 +159,12 @@ fn all_walls(model: &mut Model) -> (Vec<Walls>, Vec<Walls>) {
         [0.7, 0.8, 0.6],
     ];
     let mut houses: Vec<Walls> =
-        plaster_tints.iter().map(|&tint| of_tint(model, plastered, tint)).collect();
-    houses.extend([[0.75, 0.34, 0.24], [0.8, 0.6, 0.4]].map(|tint| of_tint(model, bricks, tint)));
+        plaster_tints.iter().map(|&tint| tinted_walls(model, plastered, tint)).collect();
+    houses.extend(
+        [[0.75, 0.34, 0.24], [0.8, 0.6, 0.4]].map(|tint| tinted_walls(model, bricks, tint)),
+    );
     let flats = [[0.9, 0.88, 0.84], [0.8, 0.7, 0.6], [0.65, 0.72, 0.78]];
-    (houses, flats.map(|tint| of_tint(model, panels, tint)).to_vec())
+    (houses, flats.map(|tint| tinted_walls(model, panels, tint)).to_vec())
 }
 
 /// Roof tiles in rows.
@@ -187,7 +189,7 @@ fn walls(model: &mut Model, pattern: WallPattern, width: f64) -> [TextureRef; 3]
     ]
 }
 
-fn of_tint(model: &mut Model, images: [TextureRef; 3], tint: [f32; 3]) -> Walls {
+fn tinted_walls(model: &mut Model, images: [TextureRef; 3], tint: [f32; 3]) -> Walls {
     let [ground, upper, plain] = images.map(|image| tinted(model, "wall", image, tint));
     Walls { ground, upper, plain }
 }

@@ -24,7 +24,7 @@ pub(super) const FORMAT: DatasetFormat = DatasetFormat {
     name: "colmap",
     title: "COLMAP",
     file: "sparse/0/cameras.bin",
-    files: "sparse/0/cameras.bin or .txt, with any number or none for 0, also below colmap/",
+    files: "sparse/0/cameras.bin or .txt, also in sparse/, sparse/N/ or colmap/sparse/",
     read,
 };
 
@@ -117,8 +117,10 @@ fn choose(root: &Root, chosen: Option<&Path>) -> Result<Option<Choice>, LoadErro
         let folder = root.path().join(folder);
         if !is_model(&folder) {
             let there = if models.is_empty() { "none".to_owned() } else { models.join(", ") };
-            let problem =
-                format!("{}: this is no COLMAP model (the dataset has {there})", folder.display());
+            let problem = format!(
+                "{}: this is not a COLMAP model (the dataset has {there})",
+                folder.display()
+            );
             return Err(LoadError::Remedied { problem, remedy: LoadRemedy::ColmapModel });
         }
         return Ok(Some(Choice { root: Root::new(&folder)?, folder, others: None }));
@@ -274,8 +276,8 @@ pub(super) fn adopt_tracks(root: &Root, scene: &mut Scene) {
         let here = centre(frame.rotation, frame.translation);
         let there = centre(image.rotation, image.translation);
         let moved = here.distance(there) > SAME_POSE * (1.0 + there.length());
-        let turned = frame.rotation.abs_diff_eq(image.rotation, SAME_POSE);
-        if moved || !turned {
+        let same_rotation = frame.rotation.abs_diff_eq(image.rotation, SAME_POSE);
+        if moved || !same_rotation {
             return;
         }
         frame.id = Some(image.id);

@@ -39,7 +39,8 @@ pub(crate) struct Lens {
     /// Distance from the centre of the plane up to which rays are mapped: there the distortion ceases to be invertible,
     /// or the projection ends.
     reach: f64,
-    /// True if the distortion folds over beyond `reach`; false if the projection ends there.
+    /// True if the distortion folds over beyond `reach`, so that different rays meet in one pixel; false if the
+    /// projection ends there.
     folds: bool,
 }
 

@@ -1,8 +1,8 @@
 //! Replaces a lens with pinhole cameras: one, or the faces of a cube around the camera if the field of view is too
 //! wide.
 //!
-//! By default each image is the largest axis-aligned rectangle that the lens saw completely. With `keep_fov` it contains
-//! everything that the lens saw, and the rest is masked.
+//! By default each image is the largest axis-aligned rectangle that the lens saw completely. With `keep_fov` it
+//! contains everything that the lens saw, and the rest is masked.
 
 use glam::{DMat3, DVec2, DVec3};
 

@@ -203,7 +203,7 @@ const TRANSFORMS: &[Replacement] = &[
     (
         "/train_filenames",
         "[\"images/a.png\", \"images/z.png\", \"images/y.png\"]",
-        "transforms.json, train_filenames, no frame has, images/y.png, nor 1 more",
+        "transforms.json, train_filenames, no frame has, images/y.png, and 1 more",
     ),
     ("/val_filenames", "[\"a.png\"]", "transforms.json, val_filenames, no frame has, a.png"),
     ("/test_filenames", "[\"../a.png\"]", "transforms.json, test_filenames, `..`"),

@@ -181,7 +181,7 @@ fn a_photograph_that_lies_on_its_side_compared_with_its_camera_is_turned() {
         assert_eq!((image.width, image.height), SIZE);
         assert_eq!(image.rgb[..3], left, "{orientation}");
         assert_ne!(image.rgb[57..60], left, "{orientation}");
-        assert_noted(&data, "1 photographs lie on, b.png");
+        assert_noted(&data, "lie on, 1 photograph, b.png");
         // Turning needs memory for two copies of the image.
         let bytes = view.source.working_bytes();
         assert!(bytes >= 2 * 3 * u64::from(SIZE.0 * SIZE.1), "{bytes}");
@@ -243,7 +243,7 @@ fn an_ambiguous_orientation_is_noted() {
     ] {
         write_exif(&made.file("images/b.png"), turned(6));
         let data = load(&made);
-        let is_noted = |note: &Note| note.contains("1 photographs have an EXIF orientation");
+        let is_noted = |note: &Note| note.contains("used as stored: 1 photograph whose");
         assert_eq!(data.notes.iter().any(is_noted), is_named, "{:?}", data.notes);
     }
 }

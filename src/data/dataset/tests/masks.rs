@@ -52,7 +52,7 @@ fn folders_whose_masks_belong_to_no_photograph_are_noted() {
         let made = Made::colmap_txt();
         image(&made.file(file), SIZE, 200);
         let folder = file.rsplit_once('/').unwrap().0;
-        assert_noted(&load(&made), &format!("{folder}, the mask of no photograph"));
+        assert_noted(&load(&made), &format!("{folder}, no mask of any photograph"));
     }
     assert!(!load(&Made::colmap_txt()).notes.iter().any(|note| note.contains("mask")));
 }

@@ -7,7 +7,7 @@ use crate::error::LoadError;
 use crate::models::ply::layout::{OFFSET, sh_degree};
 use crate::models::quantise::{from_smallest_three, quantised_logit};
 use crate::models::rows::{Row, Rows, SplatFile};
-use crate::models::statement::of_comments;
+use crate::models::statement::stated_in_comments;
 use crate::ply::{Element, Ply};
 use densify_core::gaussians::{rgb_to_dc, sh_coefficients};
 
@@ -52,7 +52,7 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
     let bounds = if has_colour_bounds { &BOUNDS[..] } else { &BOUNDS[..12] };
     let bounds = columns(path, &chunk, bounds.iter().map(|&name| name.to_owned()))?;
     let words = columns(path, &vertex, WORDS.iter().map(|&name| name.to_owned()))?;
-    let bytes = match &sh {
+    let coefficients = match &sh {
         None => Vec::new(),
         Some(sh) => columns(path, sh, (0..rest).map(|i| format!("f_rest_{i}")))?,
     };
@@ -71,14 +71,14 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
             "vertex" => ply.each_row(&vertex, &words, |row| {
                 vertices.push([row[0], row[1], row[2], row[3]].map(|word| word as u32));
             })?,
-            "sh" => ply.each_row(&element, &bytes, |row| {
+            "sh" => ply.each_row(&element, &coefficients, |row| {
                 bands.extend(row.iter().map(|&byte| byte as u8));
             })?,
             _ => {}
         }
     }
 
-    let (antialiasing, note) = of_comments(path, ply.comments())?;
+    let (antialiasing, note) = stated_in_comments(path, ply.comments())?;
     let mut rows = Rows::new(sh_degree);
     let mut colours = vec![0.0; 3 + rest];
     for (index, words) in vertices.iter().enumerate() {

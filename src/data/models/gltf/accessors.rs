@@ -78,7 +78,7 @@ impl Buffers<'_> {
             5120 | 5121 => 1,
             5122 | 5123 => 2,
             5126 => 4,
-            _ => return Err(wrong("its numbers are neither floats nor bytes or shorts")),
+            _ => return Err(wrong("its numbers must be floats, bytes or shorts")),
         };
         let number = |bytes: &[u8]| match (accessor.component_type, bytes) {
             (5120, &[a]) => (f32::from(a as i8) * scale(127.0)).max(least),

@@ -13,10 +13,10 @@ use super::nodes;
 use crate::error::LoadError;
 use crate::models::quantise::{log_of_scale, quantised_logit};
 use crate::models::rows::{Row, Rows, SplatFile};
-use crate::models::statement::of_json;
+use crate::models::statement::stated_in_json;
 use crate::models::unpack::read_exactly;
 use crate::models::{siblings, spz};
-use densify_core::files::most_unpacked;
+use densify_core::files::max_unpacked_bytes;
 use densify_core::gaussians::{MAX_SH_DEGREE, sh_coefficients, sigmoid};
 
 /// The extension of splats in SPZ.
@@ -83,7 +83,7 @@ pub(super) fn read_binary(
     };
     let header = words("header", 5)?;
     if header[1] != 2 || header[4] != u32::from_le_bytes(*b"JSON") {
-        let problem = "it is not glTF 2.0 that begins with its JSON";
+        let problem = "it is not glTF 2.0 whose first chunk is JSON";
         return Err(LoadError::damaged(path, "header", problem));
     }
     let text = read_exactly(path, "JSON", &mut input, u64::from(header[3]))?;
@@ -151,7 +151,7 @@ fn read(
             // Many nodes may show the same data.
             let bytes =
                 4 * (11 + found.gaussians.sh.len() as u64 + 11 * found.gaussians.len() as u64);
-            if bytes > most_unpacked(total) {
+            if bytes > max_unpacked_bytes(total) {
                 let problem = "they show more splats than a file of this size can hold";
                 return Err(LoadError::damaged(path, "nodes", problem));
             }
@@ -163,7 +163,7 @@ fn read(
             path.display()
         )));
     }
-    if let Some(stated) = of_json(path, "extras", &document.extras)? {
+    if let Some(stated) = stated_in_json(path, "extras", &document.extras)? {
         found.gaussians.antialiasing = stated;
     }
     Ok(found)

@@ -1,8 +1,8 @@
-//! Recognises opacities and scales that a program has written as they are. A splat PLY has logits and logarithms instead,
-//! but exporters of several feed-forward models leave out one conversion or both.
+//! Recognises opacities and scales that a program has written as plain values. A splat PLY holds logits and logarithms,
+//! but exporters of several feed-forward models omit one conversion or both.
 
 use crate::models::quantise::{log_of_scale, quantised_logit};
-use crate::models::spatial_order::frame;
+use crate::models::spatial_order::middles_and_spreads;
 use densify_core::gaussians::Gaussians;
 
 /// Whatever the scales are, numbers from 0 to 1 count as opacities if the largest is above this and they spread by more
@@ -27,7 +27,7 @@ pub(super) fn undo(model: &mut Gaussians) -> Vec<String> {
             *value = quantised_logit(*value);
         }
         notes.push(
-            "its opacities lie between 0 and 1, so that they are read as opacities, not as logits"
+            "its opacities lie between 0 and 1, so they are read as opacities, not as logits"
                 .to_owned(),
         );
     }
@@ -36,27 +36,27 @@ pub(super) fn undo(model: &mut Gaussians) -> Vec<String> {
             *value = log_of_scale(*value);
         }
         notes.push(
-            "none of its scales is negative, so that they are read as standard deviations, not as logarithms"
+            "none of its scales is negative, so they are read as standard deviations, not as logarithms"
                 .to_owned(),
         );
     } else if are_scales {
         notes.push(format!(
-            "its scales may be standard deviations, of which a splat PLY holds the logarithms: none is negative, and every \
-             Gaussian is read as larger than {:.3}; if they are, export their logarithms",
+            "its scales may be standard deviations instead of logarithms: none is negative, so every Gaussian is read as \
+             larger than {:.3}; if they are, export their logarithms",
             least.exp()
         ));
     }
     notes
 }
 
-/// True if scales are plausible as logarithms: some Gaussians are much larger than others, but most are smaller than the
-/// model.
+/// True if scales are plausible as logarithms: some Gaussians are much larger than others, but most are smaller than
+/// the model.
 fn are_logarithms(model: &Gaussians) -> bool {
     let mut largest: Vec<f32> =
         model.log_scales.iter().map(|logs| logs.iter().copied().fold(0.0, f32::max)).collect();
     let middle = largest.len() / 2;
     let median = f64::from(*largest.select_nth_unstable_by(middle, f32::total_cmp).1);
-    let extent = frame(model).iter().map(|(_, spread)| *spread).fold(0.0, f64::max);
+    let extent = middles_and_spreads(model).iter().map(|(_, spread)| *spread).fold(0.0, f64::max);
     // With a median below ln 2, the standard deviations of half of all Gaussians would lie between 1 and 2.
     median > std::f64::consts::LN_2 && median.exp() < extent
 }

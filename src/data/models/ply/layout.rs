@@ -26,14 +26,14 @@ pub(super) fn properties(sh_degree: u8) -> impl Iterator<Item = String> {
     .flatten()
 }
 
-/// Begins the comment that names the offset of local coordinates, before three numbers: a position in the dataset's
+/// Start of the comment that states the offset of local coordinates as three numbers: a position in the dataset's
 /// coordinates is (x, y, z) plus the offset.
 pub(crate) const OFFSET: &str = "densify offset";
-/// Begins the comment that names a point near the model, if x, y and z are `double`. Measured from there, positions are
-/// exact in f32.
+/// Start of the comment that states a point near the model, if x, y and z are `double`. Measured from there, positions
+/// are exact in f32.
 pub(super) const NEAR: &str = "densify near";
 
-/// Where the normals stand among the [`properties`].
+/// Index of the normals among the [`properties`].
 pub(super) const NORMALS_AT: usize = 3;
 
 /// The degree with as many coefficients above band 0 as an element has `f_rest_*` properties.

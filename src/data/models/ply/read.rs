@@ -7,7 +7,7 @@ use super::layout::{NEAR, NORMALS_AT, OFFSET, properties, sh_degree};
 use crate::error::LoadError;
 use crate::models::coordinates::remote_origin;
 use crate::models::rows::{Row, Rows, SplatFile};
-use crate::models::statement::{note as note_of, of_comments};
+use crate::models::statement::{note as note_of, stated_in_comments};
 use crate::ply::{Element, Ply, Scalar};
 use densify_core::antialiasing::Antialiasing;
 use densify_core::gaussians::sh_coefficients;
@@ -22,7 +22,7 @@ fn remedy(vertices: &Element) -> &'static str {
         }
         (true, false) => {
             "its Gaussians have plain colours; nerfstudio exports the coefficients with `ns-export gaussian-splat \
-             --ply-color-mode sh_coeffs`; of red, green and blue between 0 and 1 they are (colour - 0.5) / 0.2820948"
+             --ply-color-mode sh_coeffs`; for red, green and blue from 0 to 1, they are (colour - 0.5) / 0.2820948"
         }
         _ => {
             "a splat PLY needs x y z, f_dc_0..2, opacity, scale_0..2 and rot_0..3 (a point cloud is not a splat file; \
@@ -48,7 +48,7 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
     let mut columns = properties(sh_degree)
         .map(|name| vertices.column(path, &name, remedy))
         .collect::<Result<Vec<_>, _>>()?;
-    let (antialiasing, note) = of_comments(path, ply.comments())?;
+    let (antialiasing, note) = stated_in_comments(path, ply.comments())?;
     let filter = vertices.find(&[FILTER]);
     columns.extend(filter);
 

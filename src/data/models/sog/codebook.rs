@@ -29,7 +29,8 @@ impl Codebook {
             let bin = &mut bins[bin.min(BINS - 1)];
             *bin = [bin[0] + weight, bin[1] + weight * f64::from(value)];
         }
-        // The best density of codebook entries is the cube root of the density of values (Panter and Dite 1951).
+        // The optimal density of entries is proportional to the cube root of the density of values (Panter and Dite
+        // 1951).
         let density: Vec<f64> = bins.iter().map(|bin| bin[0].cbrt()).collect();
         let total: f64 = density.iter().sum();
         let (mut book, mut sum) = (Vec::with_capacity(ENTRIES), 0.0);
@@ -103,7 +104,8 @@ mod tests {
         let book = Codebook::fit(&many, |_| 1.0);
         let error = |&v: &f32| (book.values()[usize::from(book.nearest(v))] - v).powi(2);
         let rms = (many.iter().map(error).sum::<f32>() / many.len() as f32).sqrt();
-        // The least possible mean square, (∫∛density)³/12/256² (Panter and Dite), is 0.0019²; even spacing has 0.00226².
+        // The least possible mean square, (∫∛density)³/12/256² (Panter and Dite), is 0.0019²; even spacing has
+        // 0.00226².
         assert!(rms < 0.001_95, "{rms}");
     }
 

@@ -9,7 +9,7 @@ pub(super) const META: &str = "meta.json";
 pub(super) const OFFSET: &str = "offset";
 /// The `model` in `meta.json` of a model with antialiasing.
 pub(super) const ANTIALIASED: &str = "antialiased";
-/// Entries of the palette in a row of its image.
+/// Palette entries per row of its image.
 pub(super) const PALETTE_WIDTH: usize = 64;
 /// Numbers in a codebook.
 pub(super) const CODEBOOK: usize = 256;

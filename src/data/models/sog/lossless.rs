@@ -227,7 +227,7 @@ fn put_lengths(to: &mut Bits, lengths: &[u8]) {
     let mut counts = [0; 19];
     tokens.iter().for_each(|(symbol, ..)| counts[*symbol] += 1);
     let mut own_lengths = code_lengths(&counts, 7);
-    // A code of a single length has words without bits, but is written with length 1.
+    // The words of a code with a single symbol have no bits, but their length is written as 1.
     let is_single = counts.iter().filter(|count| **count > 0).count() == 1;
     if is_single {
         own_lengths = counts.map(|count| u8::from(count > 0)).to_vec();
@@ -246,7 +246,7 @@ fn put_lengths(to: &mut Bits, lengths: &[u8]) {
 }
 
 /// The lengths of a Huffman code (1952) with words of at most `most` bits; 0 for values that do not occur. The counts
-/// are levelled until no word is too long.
+/// are flattened until no word is too long.
 fn code_lengths(counts: &[u32], most: u8) -> Vec<u8> {
     let mut counts = counts.to_vec();
     loop {

@@ -5,6 +5,9 @@ use std::io;
 use super::lossless;
 use image_webp::{ColorType, EncoderParams, WebPEncoder};
 
+/// Largest width and height `[px]`: the largest multiple of four that WebP allows.
+pub(super) const MAX_SIDE: usize = 16_380;
+
 /// An image. Shape of `rgba`: `[height, width, 4]`.
 pub(super) struct Picture {
     width: usize,
@@ -15,12 +18,12 @@ pub(super) struct Picture {
 /// Width and height `[px]` of an image with `rows` pixels: nearly square, multiples of four.
 pub(super) fn image_size(rows: usize) -> (usize, usize) {
     let width = (rows as f64).sqrt().ceil() as usize;
-    let width = width.next_multiple_of(4).max(4);
+    let width = width.next_multiple_of(4).clamp(4, MAX_SIDE);
     (width, rows.div_ceil(width).next_multiple_of(4))
 }
 
 impl Picture {
-    /// An image without pixels.
+    /// An image of this size, whose pixels are still to be [filled](Self::fill).
     pub(super) fn new(width: usize, height: usize) -> Self {
         Self { width, height, rgba: Vec::with_capacity(4 * width * height) }
     }

@@ -11,12 +11,12 @@ use super::layout::{ANTIALIASED, CODEBOOK, FIRST_LARGEST, META, OFFSET, PALETTE_
 use crate::error::LoadError;
 use crate::models::quantise::{from_smallest_three, quantised_logit};
 use crate::models::rows::{Row, Rows, SplatFile};
-use crate::models::statement::{KERNEL, note, of_json};
+use crate::models::statement::{KERNEL, note, stated_in_json};
 use crate::models::zip::ZipReader;
 use crate::models::{ModelFile, siblings};
 use crate::picture_file;
 use densify_core::antialiasing::Antialiasing;
-use densify_core::files::most_unpacked;
+use densify_core::files::max_unpacked_bytes;
 use densify_core::gaussians::sh_coefficients;
 
 /// The parts of `meta.json` that are needed.
@@ -30,7 +30,7 @@ struct Meta {
     model: Value,
     #[serde(default)]
     antialias: Value,
-    /// densify adds the kernel to its program's name.
+    /// Names the program; densify adds the kernel of antialiasing and the offset.
     #[serde(default)]
     asset: Value,
     means: Quantity,
@@ -45,7 +45,7 @@ impl Meta {
     /// The antialiasing, and a sentence on it unless its kernel is stated.
     fn antialiasing(&self, path: &Path) -> Result<(Antialiasing, Option<String>), LoadError> {
         let is_on = self.model == ANTIALIASED || self.antialias == true;
-        Ok(match of_json(path, "asset", &self.asset)? {
+        Ok(match stated_in_json(path, "asset", &self.asset)? {
             Some(stated) if stated.is_on() != is_on => {
                 let problem = format!("it is {stated}, which contradicts `model`");
                 return Err(LoadError::damaged(path, format!("asset.{KERNEL}"), problem));
@@ -108,14 +108,18 @@ pub(super) fn read(file: ModelFile<'_>) -> Result<SplatFile, LoadError> {
             let mut bytes = Vec::new();
             let image = siblings::open(path, "files", name)?;
             // No image within the limits is larger.
-            image.take(most_unpacked(0)).read_to_end(&mut bytes).map_err(LoadError::io(path))?;
+            image
+                .take(max_unpacked_bytes(0))
+                .read_to_end(&mut bytes)
+                .map_err(LoadError::io(path))?;
             Ok(bytes)
         });
     }
     let mut archive = ZipReader::open(path, file.input, file.length)?;
     let Some(folder) = folder_in_archive(&archive.names()).map(str::to_owned) else {
         return Err(LoadError::Data(format!(
-            "{} is a ZIP archive, but no SOG model, which has one {META}; unpack it, and name a file of Gaussian splats",
+            "{} is a ZIP archive, but no SOG model (it needs exactly one {META}); unpack it, and name a file of Gaussian \
+             splats",
             path.display()
         )));
     };
@@ -124,8 +128,8 @@ pub(super) fn read(file: ModelFile<'_>) -> Result<SplatFile, LoadError> {
     read_images(path, &text, file.length, &mut |name| archive.read(&format!("{folder}{name}")))
 }
 
-/// The folder of a model in an archive with these files, ending in `/`, or nothing if the model is in no folder; `None`
-/// if the archive holds no model. A model in a folder has all other files of the archive beside it.
+/// The folder of the SOG model in an archive with these files. It ends in `/`, and is empty if the model is at the top
+/// level. `None` if the archive holds no model, or files outside the model's folder.
 pub(crate) fn folder_in_archive<'a, N: AsRef<str>>(names: &'a [N]) -> Option<&'a str> {
     let names = names.iter().map(AsRef::as_ref);
     if names.clone().any(|name| name == META) {
@@ -258,7 +262,7 @@ fn decode(path: &Path, name: &str, bytes: &[u8], length: u64) -> Result<Picture,
     }
     let decoder = reader.into_decoder().map_err(|error| bad(error.to_string()))?;
     let (width, height) = decoder.dimensions();
-    let limit = most_unpacked(length.max(bytes.len() as u64));
+    let limit = max_unpacked_bytes(length.max(bytes.len() as u64));
     if 4 * u64::from(width) * u64::from(height) > limit || decoder.total_bytes() > limit {
         return Err(bad(format!("{width}×{height} pixels are too many for a file of its size")));
     }

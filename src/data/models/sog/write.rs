@@ -8,7 +8,7 @@ use super::VARIANTS;
 use super::codebook::Codebook;
 use super::layout::{ANTIALIASED, FIRST_LARGEST, META, OFFSET, PALETTE_WIDTH};
 use super::palette::{self, Palette};
-use super::picture::{Picture, image_size};
+use super::picture::{MAX_SIDE, Picture, image_size};
 use crate::models::quantise::{MAX_LOG_SCALE, smallest_three};
 use crate::models::statement::KERNEL;
 use crate::models::write::{NO_DOUBLE, unfit};
@@ -17,8 +17,6 @@ use crate::models::{Format, Frame, ModelWriter, Shape};
 use densify_core::antialiasing::Antialiasing;
 use densify_core::gaussians::{Gaussians, sh_coefficients, sigmoid};
 
-/// Longest side of a WebP `[px]`; it limits the number of Gaussians.
-const MAX_SIDE: usize = 16_383;
 /// Maximum number of palette entries: an index has 16 bits.
 const MAX_PALETTE: usize = 1 << 16;
 
@@ -70,7 +68,7 @@ impl ModelWriter for SogWriter {
 
     fn begin(&mut self, shape: Shape, _out: &mut dyn Write) -> io::Result<()> {
         let Shape { rows, sh_degree, antialiasing } = shape;
-        if rows == 0 || rows > MAX_SIDE * (MAX_SIDE / 4 * 4) {
+        if rows == 0 || rows > MAX_SIDE * MAX_SIDE {
             return Err(unfit(format!(
                 "SOG holds 1 to 268 million Gaussians, not {rows}; choose another format, such as ply"
             )));

@@ -12,8 +12,8 @@ use crate::error::LoadError;
 use crate::models::similarity::{Similarity, mirror_x};
 use densify_core::gaussians::Gaussians;
 
-/// The directions of the axes x, y, z by the number that states them, from 1: left or right, up or down, forwards or
-/// backwards.
+/// The directions of the axes x, y, z (left, right, up, down, forwards, backwards), by their number in files, which
+/// counts from 1.
 const SYSTEMS: [&str; 16] = [
     "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF", "LFD", "RFD", "LFU", "RFU", "LBD",
     "RBD", "LBU", "RBU",
@@ -81,15 +81,15 @@ pub(super) fn parse(path: &Path, mut records: &[u8]) -> Result<Extensions, LoadE
         let number = content.first_chunk().map(|&bytes| u32::from_le_bytes(bytes));
         found.axes = match number {
             Some(0) => {
-                found.notes.push("the axes are stated to be unspecified".into());
+                found.notes.push("the file says that its axes are unspecified".into());
                 None
             }
             Some(number) if number as usize <= SYSTEMS.len() => {
                 Some(Axes(SYSTEMS[number as usize - 1]))
             }
             other => {
-                let number = other.map_or("no number".into(), |number| number.to_string());
-                let problem = format!("the axes are {number}, but 1 to {} exist", SYSTEMS.len());
+                let number = other.map_or("no number".into(), |number| format!("number {number}"));
+                let problem = format!("the axes have {number}, but 1 to {} exist", SYSTEMS.len());
                 return Err(LoadError::damaged(path, "SPZ_ADOBE_coordinate_system", problem));
             }
         };

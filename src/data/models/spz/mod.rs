@@ -1,8 +1,8 @@
 //! SPZ (Niantic), a quantised and compressed format. Versions 2 to 4 are read; version 3, which every reader accepts,
 //! is written by default, and version 4 by choice.
 //!
-//! Coordinates are used unchanged, as in splat-transform: most files do not say in which orientation their program wrote
-//! the scene. Those of files that state their axes are converted.
+//! Coordinates are used as stored, as in splat-transform, because most files do not state their axes. If a file does,
+//! they are converted.
 
 mod containers;
 mod extensions;
@@ -37,7 +37,7 @@ const VERSION_4: Format = Format {
     summary: "SPZ version 4: the same values in zstd frames, which some readers do not support",
     // The reader of `spz` reads all versions.
     reader: None,
-    writer: Some(|| Box::new(SpzWriter::in_frames())),
+    writer: Some(|| Box::new(SpzWriter::version_4())),
     compress_rank: None,
 };
 

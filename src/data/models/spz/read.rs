@@ -14,7 +14,7 @@ use crate::models::rows::{Row, Rows, SplatFile};
 use crate::models::statement::note;
 use crate::models::unpack::{DAMAGED, read_error, read_exactly, read_to_end};
 use densify_core::antialiasing::Antialiasing;
-use densify_core::files::most_unpacked;
+use densify_core::files::max_unpacked_bytes;
 use densify_core::gaussians::{MAX_SH_DEGREE, sh_coefficients};
 
 /// Smallest window that every zstd decoder supports `[bytes]` (RFC 8878, 3.1.1.1.2).
@@ -105,7 +105,7 @@ fn read_header(
         ("bands", rest),
     ];
     let bytes = rows * arrays.iter().map(|(_, bytes)| bytes).sum::<u64>();
-    if bytes > most_unpacked(length) {
+    if bytes > max_unpacked_bytes(length) {
         return wrong(format!(
             "{rows} Gaussians take {bytes} bytes, too many for a file of {length}"
         ));

@@ -30,8 +30,7 @@ const MAX_STEP: u8 = 31;
 /// depends on all of them.
 #[derive(Default)]
 pub(super) struct SpzWriter {
-    /// True for version 4.
-    is_in_frames: bool,
+    is_version_4: bool,
     /// Fixed step of coefficients; `None` chooses it for the model.
     step: Option<u8>,
     sh_degree: u8,
@@ -52,7 +51,7 @@ impl ModelWriter for SpzWriter {
         let bands = 3 * (sh_coefficients(sh_degree) - 1);
         let held = (rows * (12 + 4 + 1 + 3 + 3 + 4 + bands)) as u64;
         let arrays = [9, 1, 3, 3, 4, bands].map(|bytes| rows * bytes);
-        held + if self.is_in_frames { frames_bytes(&arrays) } else { GZIP_MEMORY }
+        held + if self.is_version_4 { frames_bytes(&arrays) } else { GZIP_MEMORY }
     }
 
     fn wants_spatial_order(&self) -> bool {
@@ -60,10 +59,10 @@ impl ModelWriter for SpzWriter {
     }
 
     fn variants(&self) -> &'static [Format] {
-        if self.is_in_frames { &[] } else { &VARIANTS }
+        if self.is_version_4 { &[] } else { &VARIANTS }
     }
 
-    fn states(&self, antialiasing: Antialiasing) -> bool {
+    fn states_antialiasing(&self, antialiasing: Antialiasing) -> bool {
         // The flag has no kernel; 0.3 is that of other readers.
         antialiasing != Antialiasing::Narrow
     }
@@ -126,7 +125,7 @@ impl ModelWriter for SpzWriter {
             (self.bands.len(), &|out| out.write_all(&self.bands)),
         ];
         let header = [self.sh_degree, fractional_bits, self.flags];
-        if self.is_in_frames {
+        if self.is_version_4 {
             containers::write_frames(rows as u32, header, &arrays, out)
         } else {
             containers::write_gzip(rows as u32, header, &arrays, out)
@@ -135,9 +134,8 @@ impl ModelWriter for SpzWriter {
 }
 
 impl SpzWriter {
-    /// A writer of version 4.
-    pub(super) fn in_frames() -> Self {
-        Self { is_in_frames: true, ..Self::default() }
+    pub(super) fn version_4() -> Self {
+        Self { is_version_4: true, ..Self::default() }
     }
 
     /// A writer of version 3 with a fixed step of coefficients.

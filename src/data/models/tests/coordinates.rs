@@ -5,7 +5,7 @@ use std::path::Path;
 use super::round_trips::plausible;
 use super::{saved, written};
 use crate::models::{
-    Frame, PLY, export_formats, find, is_fine, local_origin, read_model, sidecar_path,
+    Frame, PLY, export_formats, find, is_finer_than_f32, local_origin, read_model, sidecar_path,
 };
 use densify_core::gaussians::Gaussians;
 
@@ -134,9 +134,9 @@ fn damaged_sidecars_are_refused_by_file_and_field() {
 fn an_offset_that_gains_nothing_is_not_kept() {
     let mut model = plausible(300, 1);
     model.origin = [1.0, 0.0, 0.0];
-    assert!(is_fine(&model));
+    assert!(is_finer_than_f32(&model));
     model.means.iter_mut().for_each(|mean| mean[1] += 5.4e6);
-    assert!(!is_fine(&model));
+    assert!(!is_finer_than_f32(&model));
     assert!((local_origin(&model)[1] - 5.4e6).abs() < 10.0, "{:?}", local_origin(&model));
 }
 

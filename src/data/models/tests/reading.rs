@@ -352,9 +352,9 @@ fn shared_models_of_other_programs_load() {
     assert!(message.to_string().contains("splat-transform"), "{message}");
 }
 
-/// The present statement of the specification, and the earlier one; neither has a kernel.
+/// The current form of the statement of antialiasing, and the earlier one; neither states a kernel.
 #[test]
-fn both_statements_of_sog_are_read() {
+fn both_antialiasing_statements_of_sog_are_read() {
     let folder = sog_folder();
     let meta = folder.path().join("meta.json");
     let text = std::fs::read_to_string(&meta).unwrap();

@@ -146,10 +146,10 @@ fn every_format_states_the_antialiasing_or_says_that_it_cannot() {
         let model = Gaussians { antialiasing: kind, ..plausible(300, 1) };
         for format in export_formats().into_iter().filter(|format| format.name != "call-log") {
             let found = read(&written(format, &model).unwrap()).antialiasing;
-            let expected = if format.states(kind) { kind } else { Antialiasing::Wide };
+            let expected = if format.states_antialiasing(kind) { kind } else { Antialiasing::Wide };
             assert_eq!(found, expected, "{} of {kind}", format.name);
             let cannot = format.name.starts_with("spz") && kind == Antialiasing::Narrow;
-            assert_eq!(format.states(kind), !cannot, "{}", format.name);
+            assert_eq!(format.states_antialiasing(kind), !cannot, "{}", format.name);
         }
     }
 }

@@ -17,7 +17,7 @@ fn cloud(camera: &Camera, size: f32, antialiasing: Antialiasing) -> Gaussians {
     model
 }
 
-/// One Gaussian with these standard deviations at distance 1, where a pixel is 1/64 wide `[px]`.
+/// One Gaussian with these standard deviations `[px]` at distance 1, where a pixel is 1/64 wide.
 fn one(sizes_px: [f32; 3], quat: [f32; 4], antialiasing: Antialiasing) -> Gaussians {
     let mut model = Gaussians { antialiasing, ..Gaussians::default() };
     let scale = sizes_px.map(|size| size / 64.0);

@@ -43,7 +43,7 @@ pub fn cases() -> &'static [Case] {
         Case { number: 15, title: "equal depths", run: depth::equal_depths },
         Case { number: 16, title: "depths one bit apart, from 0.01 to a million", run: depth::depth_order },
         Case { number: 17, title: "extreme opacity logits", run: blending::logits },
-        Case { number: 18, title: "colours of any size; black and white ones learn", run: colour::colours },
+        Case { number: 18, title: "SH coefficients of any size; black and white Gaussians learn", run: colour::colours },
         Case { number: 19, title: "a camera at the mean of a Gaussian", run: depth::camera_at_mean },
         Case { number: 20, title: "distant, tiny and huge scenes", run: world::placements },
         Case { number: 21, title: "awkward image sizes", run: sizes::images },

@@ -90,9 +90,9 @@ pub(super) fn quaternions(trial: &mut Trial<'_>) -> Result<(), BackendError> {
 
 pub(super) fn needles(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = axis_camera(48, 48);
-    // In the gradient of the long axis a much larger part, from the short axis of dL/dΣ, must cancel: larger by
-    // the squared ratio of the widths. With the usual formula, which has the inverse of Σ, the gradient is lost
-    // entirely at 300 px.
+    // In the gradient of the long axis, terms from the short axis of dL/dΣ must cancel; they are larger than the
+    // result by the squared ratio of the widths. The usual formula, which contains the inverse of Σ, loses the
+    // gradient entirely at 300 px.
     trial.limits.interior = 1e-3;
     for (sigma_px, tolerance) in [(10.0_f32, 1e-3), (100.0, 5e-3), (1000.0, 1e-1)] {
         trial.gradient_tolerance = tolerance;

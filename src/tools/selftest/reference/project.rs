@@ -21,9 +21,9 @@ pub struct Splat {
     pub colour: [f64; 3],
     /// The row's own opacity in (0, 1).
     pub own_opacity: f64,
-    /// ρ² = det S/det Σ with antialiasing, else 1; S is the covariance without blur.
+    /// ρ² = det S/det C with antialiasing, else 1; C is the projected covariance, and S the same without blur.
     pub rho2: f64,
-    /// Opacity as blended: the own one times ρ.
+    /// Opacity as blended: `own_opacity` times ρ.
     pub opacity: f64,
 }
 
@@ -159,13 +159,13 @@ fn geometry_backward(
     let (t10, t11) = (qb * ga + qc * gb, qb * gb + qc * gc);
     let mut d_cov = [-(t00 * qa + t01 * qb), -(t00 * qb + t01 * qc), -(t10 * qb + t11 * qc)];
     if model.antialiasing.is_on() && splat.rho2 > 0.0 {
-        // Entries of d(ρ²)/d(S): the quotient rule, with the other determinant's own entries.
+        // By the quotient rule, d(ρ²)/dS = (adj S − ρ²·adj C)/det C, as S and C differ by a constant.
         let ([a, b, c], blur, rho2) = (splat.covariance, model.blur(), splat.rho2);
         let determinant = a * c - b * b;
-        let by_rho2 = upstream.opacity * splat.own_opacity / (2.0 * rho2.sqrt());
-        d_cov[0] += by_rho2 * (c - blur - rho2 * c) / determinant;
-        d_cov[1] -= by_rho2 * b * (1.0 - rho2) / determinant;
-        d_cov[2] += by_rho2 * (a - blur - rho2 * a) / determinant;
+        let d_rho2 = upstream.opacity * splat.own_opacity / (2.0 * rho2.sqrt());
+        d_cov[0] += d_rho2 * (c - blur - rho2 * c) / determinant;
+        d_cov[1] -= d_rho2 * b * (1.0 - rho2) / determinant;
+        d_cov[2] += d_rho2 * (a - blur - rho2 * a) / determinant;
     }
     let jacobian = geometry.jacobian(view);
     let jw = jacobian.map(|j| geometry.rotation.transpose() * j);

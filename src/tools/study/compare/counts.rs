@@ -3,7 +3,7 @@
 //! Budgets bound the peak, and policies are compared at equal budgets. Some policies end far below their peak, which
 //! matters if the cost of storage or display is more important than that of training.
 
-use super::{Outcome, at};
+use super::{Outcome, outcomes_at};
 use crate::difference::mean;
 use crate::distinct;
 use crate::text_table::{TextTable, or_dash};
@@ -46,7 +46,7 @@ pub(super) fn add_tables(document: &mut Document, outcomes: &[Outcome], policies
         let mut table = Table::new(std::iter::once(Column::text("policy")).chain(columns));
         for policy in policies {
             let runs = |scene: &&str| {
-                let mut runs = at(outcomes, scene, budget);
+                let mut runs = outcomes_at(outcomes, scene, budget);
                 runs.retain(|run| run.factor == *policy);
                 runs
             };

@@ -7,7 +7,7 @@ use std::path::Path;
 use densify_policies::policy::Needs;
 use image::{RgbImage, imageops};
 
-use super::{Outcome, at, scenes_and_budgets};
+use super::{Outcome, outcomes_at, scenes_and_budgets};
 use crate::Picture;
 use crate::window::Window;
 use densify_core::image::SharedImage;
@@ -34,7 +34,7 @@ pub(super) fn draw(
 ) -> Result<Vec<Picture>, Failure> {
     let mut pictures = Vec::new();
     for (scene, budget) in scenes_and_budgets(outcomes) {
-        let (crops, names) = crops(output, &at(outcomes, scene, budget), observer)?;
+        let (crops, names) = crops(output, &outcomes_at(outcomes, scene, budget), observer)?;
         if crops.is_empty() {
             continue;
         }

@@ -231,7 +231,7 @@ fn budgets(given: &[SceneBudget], labels: &[String]) -> Result<Vec<Vec<usize>>, 
 }
 
 /// The outcomes of a scene at a budget.
-fn at<'a>(outcomes: &'a [Outcome], scene: &str, budget: usize) -> Vec<&'a Outcome> {
+fn outcomes_at<'a>(outcomes: &'a [Outcome], scene: &str, budget: usize) -> Vec<&'a Outcome> {
     outcomes.iter().filter(|run| run.scene == scene && run.budget == budget).collect()
 }
 

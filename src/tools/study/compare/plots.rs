@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use super::{Outcome, at, scenes_and_budgets};
+use super::{Outcome, outcomes_at, scenes_and_budgets};
 use crate::Picture;
 use crate::difference::mean;
 use crate::distinct;
@@ -39,7 +39,7 @@ pub(super) fn draw(
                 "{scene}, {} rows: rows, PSNR and memory over iterations, first seed",
                 grouped(budget)
             );
-            let growth = growth(output, &at(outcomes, scene, budget), policies, observer);
+            let growth = growth(output, &outcomes_at(outcomes, scene, budget), policies, observer);
             let plot = svg(&growth, PANEL)?;
             let file = format!("growth-{scene}-{budget}.svg");
             pictures.push(plot::write(output, file, caption, &plot)?);
@@ -63,7 +63,7 @@ fn quality(
         has_legend: true,
         curves: by_policy(policies, |policy| {
             let point = |&budget: &usize| {
-                let runs = at(outcomes, scene, budget).into_iter();
+                let runs = outcomes_at(outcomes, scene, budget).into_iter();
                 let runs = runs.filter(|r| r.factor == policy && r.kept_its_budget());
                 Some(((budget as f64).ln(), mean(runs.map(score))?))
             };

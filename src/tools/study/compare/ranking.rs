@@ -24,7 +24,8 @@ const SCORES: [Score; 3] = [
 struct Standing {
     /// Mean over its runs that kept their budget.
     mean: Option<f64>,
-    /// Difference from the first policy; `None` for that policy itself, and without a pair of runs that kept their budgets.
+    /// Difference from the first policy; `None` for that policy itself, and without a pair of runs that kept their
+    /// budgets.
     difference: Option<Difference>,
     /// Rank by mean difference, 1 for the best, shared by equal ones; `None` without a difference.
     rank: Option<usize>,
@@ -37,8 +38,8 @@ impl Standing {
 }
 
 impl Score {
-    /// The standing of each policy. Ranks are by the mean of paired differences, not by the policies' means, which would
-    /// cover different scenes if a run broke its budget.
+    /// The standing of each policy. Ranks are by the mean of paired differences, not by the policies' means, which
+    /// would cover different scenes if a run broke its budget.
     fn standings(&self, outcomes: &[Outcome], policies: &[String]) -> Vec<Standing> {
         let first = policies.first().map_or("", String::as_str);
         let standing = |policy: &String| {

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use toml::{Table, Value};
 
-use super::{Outcome, at, counts, difference, ranking, scenes_and_budgets};
+use super::{Outcome, counts, difference, outcomes_at, ranking, scenes_and_budgets};
 use crate::difference::{INTERVALS, mean};
 use crate::distinct;
 use crate::text_table::number_or_dash;
@@ -40,7 +40,7 @@ pub(super) fn document(outcomes: &[Outcome], policies: &[String]) -> Document {
     }
     counts::add_tables(&mut document, outcomes, policies);
     for (scene, budget) in scenes_and_budgets(outcomes) {
-        let here = at(outcomes, scene, budget);
+        let here = outcomes_at(outcomes, scene, budget);
         document.section(&format!("{scene}, {} rows", grouped(budget)));
         let columns = [
             "policy",

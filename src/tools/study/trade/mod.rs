@@ -24,7 +24,7 @@ use results::Results;
 const OWN_OPTIONS: [&str; 8] =
     ["scene", "budget", "seed", "iterations", "output", "knob", "preset", "view"];
 
-/// The factor of a run with the preset `exact`, in which no knob is changed.
+/// The factor of a run with the preset `exact`, in which no factor is changed.
 const BASE: &str = "";
 
 const EXAMPLES: &str = "\
@@ -94,7 +94,7 @@ impl Trade {
         study.finish("trade", &document, report::summary(&results)).map(Some)
     }
 
-    /// All runs in the order of training, each with at most one knob changed: seed after seed, so that an interrupted
+    /// All runs in the order of training, each with at most one factor changed: seed after seed, so that an interrupted
     /// study is still fair.
     fn plan_runs(&self, factors: &[Factor], shared: &Partial) -> Result<Vec<PlannedRun>, Failure> {
         let labels = labels(&self.scenes)?;
@@ -122,7 +122,7 @@ impl Trade {
     }
 }
 
-/// The base run with a knob at a level.
+/// The base run with a factor at a level.
 fn with_level(base: &PlannedRun, factor: &str, level: &str) -> PlannedRun {
     let is_plain = |c: char| c.is_ascii_alphanumeric() || "._".contains(c);
     let mut spec = base.spec.clone();
@@ -141,7 +141,7 @@ fn with_level(base: &PlannedRun, factor: &str, level: &str) -> PlannedRun {
 
 /// The options and knobs that a factor at a level sets. For a preset these are its levels, with its iterations in
 /// proportion to those of the study.
-fn settings(knob: &str, level: &str, iterations: u32) -> Vec<(String, String)> {
+fn settings(factor: &str, level: &str, iterations: u32) -> Vec<(String, String)> {
     let setting = |&(name, value): &(&str, &str)| {
         let value = match (name, value.parse::<u64>()) {
             ("iterations", Ok(own)) => {
@@ -152,9 +152,9 @@ fn settings(knob: &str, level: &str, iterations: u32) -> Vec<(String, String)> {
         };
         (name.to_owned(), value)
     };
-    match (knob, preset(level)) {
+    match (factor, preset(level)) {
         ("preset", Ok(preset)) => preset.levels.iter().map(setting).collect(),
-        _ => vec![(knob.to_owned(), level.to_owned())],
+        _ => vec![(factor.to_owned(), level.to_owned())],
     }
 }
 

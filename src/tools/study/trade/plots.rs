@@ -45,13 +45,13 @@ pub(super) fn draw(output: &Path, results: &Results) -> Result<Vec<Picture>, Fai
 fn points(results: &Results, scene: &str) -> Vec<Point> {
     let Some(base) = results.mean(scene, "", "", PSNR) else { return Vec::new() };
     let levels = results.effects.iter().map(|e| (&*e.factor.name, &*e.level));
-    let point = |(knob, level): (&str, &str)| {
-        let name = if knob.is_empty() { "exact".to_owned() } else { format!("{knob}={level}") };
+    let point = |(factor, level): (&str, &str)| {
+        let name = if factor.is_empty() { "exact".to_owned() } else { format!("{factor}={level}") };
         Some(Point {
             name,
-            seconds: results.mean(scene, knob, level, SECONDS)?.exp(),
-            psnr: results.mean(scene, knob, level, PSNR)? - base,
-            peak: results.peak_mib(scene, knob, level)?,
+            seconds: results.mean(scene, factor, level, SECONDS)?.exp(),
+            psnr: results.mean(scene, factor, level, PSNR)? - base,
+            peak: results.peak_mib(scene, factor, level)?,
             is_optimal: false,
         })
     };

@@ -1,4 +1,4 @@
-//! The effect of each knob at each level.
+//! The effect of each factor at each level.
 
 use super::levels::Factor;
 use super::{BASE, Outcome, Trade};
@@ -57,16 +57,16 @@ impl Results {
     }
 
     /// The runs with a factor at a level.
-    pub(super) fn runs(&self, knob: &str, level: &str) -> impl Iterator<Item = &Outcome> {
-        self.outcomes.iter().filter(move |run| run.factor == knob && run.level == level)
+    pub(super) fn runs(&self, factor: &str, level: &str) -> impl Iterator<Item = &Outcome> {
+        self.outcomes.iter().filter(move |run| run.factor == factor && run.level == level)
     }
 
     /// The runs with a factor at a level, each with the `exact` run of the same scene and seed.
-    fn pairs(&self, knob: &str, level: &str) -> Vec<(&Outcome, &Outcome)> {
+    fn pairs(&self, factor: &str, level: &str) -> Vec<(&Outcome, &Outcome)> {
         let base = |run: &Outcome| {
             self.runs(BASE, "").find(|base| (&base.scene, base.seed) == (&run.scene, run.seed))
         };
-        self.runs(knob, level).filter_map(|run| Some((run, base(run)?))).collect()
+        self.runs(factor, level).filter_map(|run| Some((run, base(run)?))).collect()
     }
 
     fn effect(&self, factor: &Factor, level: &str) -> Option<Effect> {
@@ -96,27 +96,27 @@ impl Results {
     pub(super) fn mean(
         &self,
         scene: &str,
-        knob: &str,
+        factor: &str,
         level: &str,
         measure: Measure,
     ) -> Option<f64> {
-        let runs = self.runs(knob, level).filter(|run| run.scene == scene);
+        let runs = self.runs(factor, level).filter(|run| run.scene == scene);
         mean(runs.map(measure).collect::<Option<Vec<f64>>>()?)
     }
 
     /// Mean peak memory of the runs with a factor at a level in a scene `[MiB]`.
-    pub(super) fn peak_mib(&self, scene: &str, knob: &str, level: &str) -> Option<f64> {
-        self.mean(scene, knob, level, PEAK).map(|peak| peak.exp() / f64::from(1 << 20))
+    pub(super) fn peak_mib(&self, scene: &str, factor: &str, level: &str) -> Option<f64> {
+        self.mean(scene, factor, level, PEAK).map(|peak| peak.exp() / f64::from(1 << 20))
     }
 }
 
 /// Results for tests.
 #[cfg(test)]
 pub(super) fn sample() -> Results {
-    let outcome = |knob: &str, level: &str, seed, psnr: f64, seconds: f64| Outcome {
+    let outcome = |factor: &str, level: &str, seed, psnr: f64, seconds: f64| Outcome {
         peak_bytes: Some(64 << 20),
         seconds,
-        ..crate::outcome::sample(knob, level, seed, psnr)
+        ..crate::outcome::sample(factor, level, seed, psnr)
     };
     let outcomes = (0..3).flat_map(|seed| {
         let by = f64::from(seed);

@@ -4,13 +4,13 @@
 /** Interval between requests of the progress [ms]. */
 const ASK_EVERY = 1000;
 /** Minimum time between two pictures of the changing model [ms]. */
-const LOOK_EVERY = 2000;
+const PICTURE_EVERY = 2000;
 
-/** Shows the progress of the run in training. `look` requests a new picture. */
-function followTraining(look) {
+/** Shows the progress of the run in training, and requests pictures of its changing model. */
+function followTraining(requestPicture) {
   const section = byId("training");
   section.hidden = false;
-  let before = null, lookedAt = 0, lookedStep = -1;
+  let before = null, requestedAt = 0, requestedStep = -1;
   const number = (value) => value.toLocaleString("en");
 
   const order = async (what) => {
@@ -42,10 +42,10 @@ function followTraining(look) {
       return false;
     }
     showProgress(now);
-    const isDue = performance.now() - lookedAt >= LOOK_EVERY || now.state === "paused";
-    if (now.step !== lookedStep && isDue && stage.dataset.state === "sharp") {
-      [lookedAt, lookedStep] = [performance.now(), now.step];
-      look();
+    const isDue = performance.now() - requestedAt >= PICTURE_EVERY || now.state === "paused";
+    if (now.step !== requestedStep && isDue && stage.dataset.state === "sharp") {
+      [requestedAt, requestedStep] = [performance.now(), now.step];
+      requestPicture();
     }
     before = now;
     return true;

@@ -1,5 +1,5 @@
-// The page of densify view: requests and shows pictures, and moves the camera. One file without a build step; its parts,
-// in order: vectors, the camera, requesting and showing pictures, marks, moving, the panel.
+// The page of densify view: requests and shows pictures, and moves the camera. One file without a build step; its
+// parts, in order: vectors, the camera, requesting and showing pictures, marks, moving, the panel.
 "use strict";
 
 const byId = (id) => document.getElementById(id);
@@ -284,10 +284,10 @@ const rested = () => Math.round(performance.now() - changedAt);
  * rendering and transfer only, as fewer pixels shorten neither the latency nor the work of the browser.
  */
 function pace(frames, begun, isMoving, part) {
-  const all = frames.filter(Boolean), most = (of) => Math.max(...all.map(of));
-  const total = (of) => all.reduce((sum, frame) => sum + of(frame), 0);
+  const all = frames.filter(Boolean), most = (value) => Math.max(...all.map(value));
+  const total = (value) => all.reduce((sum, frame) => sum + value(frame), 0);
   const bytes = total((frame) => frame.bytes), making = total((frame) => frame.milliseconds);
-  const took = most((frame) => frame.took), away = most((frame) => frame.took - frame.held);
+  const took = most((frame) => frame.took), transfer = most((frame) => frame.took - frame.held);
   const { bitmap, milliseconds } = frames[0];
   const size = `${bitmap.width} × ${bitmap.height}`;
   const now = performance.now(), since = Math.max(begun, shownAt);
@@ -296,15 +296,15 @@ function pace(frames, begun, isMoving, part) {
   spacing = most((frame) => frame.held);
   if (isMoving) {
     // The time that each of the pending requests may take to keep the pace.
-    const may = clamp(inFlight() * PACE - latency, PACE / 2, PACE);
-    coarse = clamp(part * clamp(Math.sqrt(may / (making + bytes * perByte)), 0.8, 1.1), 0.12, 1);
+    const allowed = clamp(inFlight() * PACE - latency, PACE / 2, PACE);
+    coarse = clamp(part * clamp(Math.sqrt(allowed / (making + bytes * perByte)), 0.8, 1.1), 0.12, 1);
     paces = [...paces.slice(-11), now - since];
     const mean = paces.reduce((sum, x) => sum + x, 0) / paces.length;
     stage.dataset.rate = (1000 / mean).toFixed(1);
     byId("status").textContent = `${size} · ${Math.round(1000 / mean)} pictures/s · ${took.toFixed(0)} ms`;
   } else {
     // The sharp picture is the largest, which gives the best estimate of the time per byte.
-    perByte = Math.max(0, away - latency) / bytes;
+    perByte = Math.max(0, transfer - latency) / bytes;
     const [seen, every] = frames.find((frame) => frame?.measured)?.measured ?? [0, 0];
     const how = seen < every ? `measured in ${seen} of ${every} training views` : `sharp after ${rested()} ms, drawn in ${milliseconds.toFixed(0)}`;
     byId("status").textContent = `${size} · ${how}`;
@@ -356,8 +356,8 @@ function draw() {
 
 function caption({ kind, model }) {
   const { label, needs_photograph: isPhotograph } = kindOf(kind);
-  const of = scene.models.length > 1 && !(isPhotograph && kind === "photograph") ? `, ${scene.models[model].name}` : "";
-  return label + of;
+  const suffix = scene.models.length > 1 && !(isPhotograph && kind === "photograph") ? `, ${scene.models[model].name}` : "";
+  return label + suffix;
 }
 
 /** Explains the colours of the first picture that represents numbers. */
@@ -642,8 +642,8 @@ function showPath() {
 /** The rotation as a quaternion (w, x, y, z). */
 function quaternion({ camera_to_world: m }) {
   const s = (a, b, c) => Math.sqrt(Math.max(0, 1 + a * m[0] + b * m[5] + c * m[10])) / 2;
-  const sign = (x, of) => of < 0 ? -x : x;
-  return [s(1, 1, 1), sign(s(1, -1, -1), m[9] - m[6]), sign(s(-1, 1, -1), m[2] - m[8]), sign(s(-1, -1, 1), m[4] - m[1])];
+  const withSign = (x, other) => other < 0 ? -x : x;
+  return [s(1, 1, 1), withSign(s(1, -1, -1), m[9] - m[6]), withSign(s(-1, 1, -1), m[2] - m[8]), withSign(s(-1, -1, 1), m[4] - m[1])];
 }
 
 /** Sets the camera to a position on the path, a Catmull-Rom spline, in intervals from its first camera. */
@@ -734,14 +734,14 @@ function fillPanel() {
   byId("right").append(option("", "nothing"));
   const isOfModel = (kind) => kind !== "photograph";
   scene.models.forEach(({ name }, model) => {
-    const of = scene.models.length > 1 ? `, ${name}` : "";
+    const suffix = scene.models.length > 1 ? `, ${name}` : "";
     for (const list of [byId("left"), byId("right")]) {
       for (const [title, isRows] of [["Pictures", false], ["Single Gaussians", true]]) {
         const group = document.createElement("optgroup");
-        group.label = title + of;
+        group.label = title + suffix;
         for (const { kind, label } of scene.kinds) {
           if (kind.startsWith("row") !== isRows || model && !isOfModel(kind)) continue;
-          group.append(option(`${kind}:${model}`, isOfModel(kind) ? label + of : label));
+          group.append(option(`${kind}:${model}`, isOfModel(kind) ? label + suffix : label));
         }
         list.append(group);
       }

@@ -31,13 +31,13 @@ const FEATURE_WIDTH: f64 = 0.082;
 const FEATURE_EXPONENT: f64 = 0.5;
 
 /// Linear sRGB to CIE XYZ, D65.
-const XYZ_OF_RGB: [[f64; 3]; 3] = [
+const XYZ_FROM_RGB: [[f64; 3]; 3] = [
     [0.412_390_799_265_959_5, 0.357_584_339_383_878, 0.180_480_788_401_834_3],
     [0.212_639_005_871_510_4, 0.715_168_678_767_756, 0.072_192_315_360_733_71],
     [0.019_330_818_715_591_85, 0.119_194_779_794_626, 0.950_532_152_249_660_6],
 ];
-/// Inverse of [`XYZ_OF_RGB`].
-const RGB_OF_XYZ: [[f64; 3]; 3] = [
+/// Inverse of [`XYZ_FROM_RGB`].
+const RGB_FROM_XYZ: [[f64; 3]; 3] = [
     [3.240_969_941_904_521_5, -1.537_383_177_570_093_5, -0.498_610_760_293_003_3],
     [-0.969_243_636_280_879_8, 1.875_967_501_507_720_6, 0.041_555_057_407_175_6],
     [0.055_630_079_696_993_6, -0.203_976_958_888_976_5, 1.056_971_514_242_878_6],
@@ -78,8 +78,8 @@ pub fn flip_map(
     Ok(blocks.concat())
 }
 
-/// Applies `block_result` to the pixels of each block of rows and their errors; returns the results in order. The error of
-/// masked pixels is 0.
+/// Applies `block_result` to the pixels of each block of rows and their errors; returns the results in order. The error
+/// of masked pixels is 0.
 fn differences<T: Send>(
     pair: &Pair<'_>,
     block_result: impl Fn(&mut dyn Iterator<Item = (usize, f64)>) -> T + Sync,
@@ -150,8 +150,8 @@ fn product(matrix: &[[f64; 3]; 3], v: [f64; 3]) -> [f64; 3] {
 
 /// XYZ relative to that of white, whose components are the sums of the matrix's rows.
 fn relative_xyz(rgb: [f64; 3]) -> [f64; 3] {
-    let xyz = product(&XYZ_OF_RGB, rgb);
-    [0, 1, 2].map(|i| xyz[i] / XYZ_OF_RGB[i].iter().sum::<f64>())
+    let xyz = product(&XYZ_FROM_RGB, rgb);
+    [0, 1, 2].map(|i| xyz[i] / XYZ_FROM_RGB[i].iter().sum::<f64>())
 }
 
 /// CIELAB without the cube root, so that filtering is linear: (Y, Cx, Cz).
@@ -161,11 +161,11 @@ fn opponents(rgb: [f64; 3]) -> [f64; 3] {
 }
 
 /// Inverse of [`opponents`].
-fn rgb_of_opponents([luminance, cx, cz]: [f64; 3]) -> [f64; 3] {
+fn rgb_from_opponents([luminance, cx, cz]: [f64; 3]) -> [f64; 3] {
     let y = (luminance + 16.0) / 116.0;
     let relative = [y + cx / 500.0, y, y - cz / 200.0];
-    let white = XYZ_OF_RGB.map(|row| row.iter().sum::<f64>());
-    product(&RGB_OF_XYZ, [0, 1, 2].map(|i| relative[i] * white[i]))
+    let white = XYZ_FROM_RGB.map(|row| row.iter().sum::<f64>());
+    product(&RGB_FROM_XYZ, [0, 1, 2].map(|i| relative[i] * white[i]))
 }
 
 /// CIELAB of a linear colour, chroma scaled with lightness (equation 5).
@@ -183,10 +183,10 @@ fn linear(encoded: f64) -> f64 {
 
 /// The kernels of both pipelines along one axis. Every filter is a sum of separable ones.
 struct Filters {
-    /// Kernels of the terms of each opponent channel; applied along both axes, they have the weight of the term.
+    /// One kernel per term of each opponent channel. Applied along both axes, it has the weight of the term.
     sensitivity: [Vec<Vec<f64>>; 3],
-    /// A Gaussian as wide as features, with sum 1, and its first and second derivatives, whose positive taps sum to 1 and
-    /// negative taps to −1.
+    /// A Gaussian as wide as features, with sum 1, and its first and second derivatives, whose positive taps sum to 1
+    /// and negative taps to −1.
     feature: [Vec<f64>; 3],
 }
 
@@ -224,7 +224,7 @@ impl Filters {
     }
 }
 
-/// A function at −radius, …, radius.
+/// The values of a function at −radius, …, radius.
 fn sampled(radius: f64, function: impl Fn(f64) -> f64) -> Vec<f64> {
     let radius = radius as i32;
     (-radius..=radius).map(|x| function(f64::from(x))).collect()
@@ -278,7 +278,7 @@ fn responses(
     let edges = [derivative(1, smooth), derivative(0, first_derivative)];
     let points = [derivative(2, smooth), derivative(0, second_derivative)];
     let response = |i: usize| {
-        let rgb = rgb_of_opponents([0, 1, 2].map(|c| filtered[c][i]));
+        let rgb = rgb_from_opponents([0, 1, 2].map(|c| filtered[c][i]));
         PixelResponse {
             colour: hunt_adjusted_lab(rgb.map(|v| v.clamp(0.0, 1.0))),
             features: [&edges, &points].map(|[x, y]| x[i].hypot(y[i])),

@@ -1,8 +1,9 @@
 //! Measures how well Gaussians match the surface that the images were rendered from, if it is known.
 //!
-//! The model and the cameras are in normalised coordinates; everything is measured in the world coordinates of the mesh,
-//! in `f64`. Lengths are fractions of the diagonal of the mesh's bounding box. The weight w of a row is the sum of its
-//! blend weights α·T over all pixels of all training views. Samples have a fixed seed, so that results are reproducible.
+//! The model and the cameras are in normalised coordinates; everything is measured in the world coordinates of the
+//! mesh, in `f64`. Lengths are fractions of the diagonal of the mesh's bounding box. The weight w of a row is the sum
+//! of its blend weights α·T over all pixels of all training views. Samples have a fixed seed, so that results are
+//! reproducible.
 
 mod measure;
 
@@ -21,7 +22,7 @@ pub struct Geometry {
     /// Median angle between the surface's normal and the shortest axis of the Gaussian at a pixel
     /// `[degrees]`, in 0..=90. The Gaussian is the densest at the surface point among the eight of
     /// opacity above 0.1 with the nearest centres; it approximates the one with the largest blend
-    /// weight. Over every nth pixel of [`DepthErrors`], so that there are up to 2,000 per view.
+    /// weight. Measured at up to 2,000 pixels per view, evenly spaced among those of [`DepthErrors`].
     #[serde(deserialize_with = "or_nan")]
     pub normal_error: f64,
     /// Distances between centres and surface.
@@ -88,8 +89,8 @@ pub struct Floaters {
     pub of_weight: f64,
 }
 
-/// Pixels that show thin structures of about the same width. A pixel counts as found if its alpha is above 0.5, its depth
-/// error below the thickness plus 1 % of the depth, and its mean colour error over the channels below 0.1.
+/// Pixels that show thin structures of about the same width. A pixel counts as found if its alpha is above 0.5, its
+/// depth error below the thickness plus 1 % of the depth, and its mean colour error over the channels below 0.1.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct ThinRecall {
     /// Width in the image, to the nearest power of two `[px]`.
@@ -133,8 +134,8 @@ pub fn needs() -> Needs {
 }
 
 /// Peak memory for [`measure`] in addition to the backend and the surface `[bytes]`: per row, two copies of the model
-/// (while it is read or downloaded), position, axes, sums and two search trees; per pixel, the renders, and the surface's
-/// depth and normals and their files; samples and angles.
+/// (while it is read or downloaded), position, axes, sums and two search trees; per pixel, the renders, and the
+/// surface's depth and normals and their files; samples and angles.
 pub fn bytes(rows: usize, sh_degree: u8, image: (u32, u32), views: usize) -> u64 {
     let row = 2 * 4 * (11 + 3 * densify_core::gaussians::sh_coefficients(sh_degree) as u64) + 512;
     let pixels = u64::from(image.0) * u64::from(image.1);

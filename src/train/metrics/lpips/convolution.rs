@@ -1,4 +1,4 @@
-//! Convolution with a rectifier, as products of small matrices.
+//! Convolution followed by ReLU, as products of small matrices.
 //!
 //! Sixteen pixels are processed together. The kernel's inputs for them are gathered once and then multiplied by the
 //! weights of six outputs at a time, whose 6×16 sums stay in registers.
@@ -16,7 +16,7 @@ const PIXELS: usize = 16;
 /// Number of outputs processed together.
 const OUTPUTS: usize = 6;
 
-/// A convolution followed by a rectifier.
+/// A convolution followed by ReLU.
 #[derive(Debug)]
 pub(super) struct Convolution {
     /// Numbers of input and output channels.
@@ -63,8 +63,8 @@ impl Convolution {
         first..end.min(height)
     }
 
-    /// Computes some rows of the result. `image` contains at least the rows on which they depend; rows beyond are outside
-    /// the whole image.
+    /// Computes some rows of the result. `image` must contain the rows on which they depend, except those outside the
+    /// whole image, which count as 0.
     pub(super) fn run(&self, image: &Activation, rows: Range<usize>) -> Activation {
         let width = self.output_side(image.width);
         let pixels = rows.len() * width;

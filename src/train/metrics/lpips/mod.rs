@@ -3,9 +3,9 @@
 //! version 0.1).
 //!
 //! The published weights are not part of this project; the user provides them in a file ([`Lpips::open`]). Two networks
-//! are supported, VGG-16 and AlexNet, each with five stages. After each stage the features of a pixel are scaled to unit
-//! length; the squared differences between both images, weighted by feature, are averaged over the image, and the five
-//! averages are added.
+//! are supported, VGG-16 and AlexNet, each with five stages. After each stage the features of a pixel are scaled to
+//! unit length; the squared differences between both images, weighted by feature, are averaged over the image, and the
+//! five averages are added.
 
 mod convolution;
 mod network;
@@ -41,8 +41,8 @@ impl Lpips {
     /// LPIPS of a render against a target, >= 0; 0 for equal images.
     ///
     /// `rendered`: shape `[height, width, 3]`, clamped to `[0, 1]` here. Targets with coverage are composited on
-    /// `background`, in `[0, 1]`. A mask scales the differences of pixels at the input of the network. NaN if the render
-    /// contains a NaN.
+    /// `background`, in `[0, 1]`. A mask scales the differences of pixels at the input of the network. NaN if the
+    /// render contains a NaN.
     ///
     /// # Errors
     /// When the sizes differ, the image is too small for the network, or the target's mask ignores every pixel.

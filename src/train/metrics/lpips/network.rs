@@ -99,7 +99,7 @@ impl Activation {
     }
 }
 
-/// A stage: convolutions with rectifiers, the weights of feature differences, and the pooling before the next stage.
+/// A stage: convolutions with ReLU, the weights of feature differences, and the pooling before the next stage.
 #[derive(Debug)]
 pub(super) struct Stage {
     pub(super) convolutions: Vec<Convolution>,

@@ -41,8 +41,8 @@ impl Lpips {
     /// Reads the weights of VGG-16 or AlexNet, whichever the file contains.
     ///
     /// # Errors
-    /// When the file cannot be read, is longer than 256 MiB, is not a safetensors file, or lacks the arrays of both
-    /// networks, with names and shapes of the package `lpips` and finite 32-bit floats.
+    /// When the file cannot be read, is longer than 256 MiB, is not a safetensors file, or does not contain all arrays
+    /// of one of the networks, with the names and shapes of the package `lpips` and finite 32-bit floats.
     pub fn open(path: &Path) -> Result<Self, LpipsError> {
         let read = |source| LpipsError::Read { path: path.to_owned(), source };
         let mut bytes = Vec::new();
@@ -57,7 +57,7 @@ impl Lpips {
             return Err(format!("it is longer than {MAX_BYTES} bytes"));
         }
         let file = SafeTensors::deserialize(bytes)
-            .map_err(|e| format!("it is no safetensors file ({e})"))?;
+            .map_err(|e| format!("it is not a safetensors file ({e})"))?;
         let has = |name: &str| file.names().contains(&name);
         let network = if has("net.slice1.2.weight") {
             Network::Vgg

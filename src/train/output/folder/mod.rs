@@ -64,8 +64,8 @@ pub fn is_in_use(run: &Path) -> bool {
 
 /// The folder that a run writes to, locked against other processes while this value lives.
 ///
-/// A new run writes in place. A run that replaces another writes to a hidden folder inside it and replaces the old run in
-/// [`finish`](Self::finish); until then the old run is unchanged.
+/// A new run writes in place. A run that replaces another writes to a hidden folder inside it and replaces the old run
+/// in [`finish`](Self::finish); until then the old run is unchanged.
 #[derive(Debug)]
 pub struct RunFolder {
     target: PathBuf,
@@ -135,8 +135,8 @@ impl RunFolder {
     /// files of the run are removed; incomplete files of a killed process are removed in any case.
     ///
     /// # Errors
-    /// [`FolderError`] if a process is training there, and if a restart would remove models, checkpoints, or files that do
-    /// not belong to a run.
+    /// [`FolderError`] if a process is training there, and if a restart would remove models, checkpoints, or files that
+    /// do not belong to a run.
     pub fn resume(target: &Path, restart: bool) -> Result<Self, FolderError> {
         Self::check(target, true)?;
         let folder = Self::lock(target)?;
@@ -175,7 +175,7 @@ impl RunFolder {
     ///
     /// # Errors
     /// [`FolderError::InUse`], [`FolderError::File`].
-    pub fn settle(target: &Path) -> Result<(), FolderError> {
+    pub fn recover(target: &Path) -> Result<(), FolderError> {
         if hidden(target, OLD).is_empty() && hidden(target, REPLACED).is_empty() {
             return Ok(());
         }
@@ -201,8 +201,8 @@ impl RunFolder {
         self.staged.as_ref().map_or_else(|| self.target.clone(), staged)
     }
 
-    /// Replaces the existing run, if there is one, and removes interrupted runs that would have replaced it; returns the
-    /// folder.
+    /// Replaces the existing run, if there is one, and removes interrupted runs that would have replaced it; returns
+    /// the folder.
     ///
     /// # Errors
     /// [`FolderError::NotReplaced`] with the hidden folder of the new run; the old run stays.

@@ -1,5 +1,5 @@
-//! Replaces one run by another by renaming files within the folder, so that an interruption at any time can be completed
-//! or undone.
+//! Replaces one run by another by renaming files within the folder, so that an interruption at any time can be
+//! completed or undone.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -51,8 +51,8 @@ pub(super) fn replace(target: &Path, suffix: &str) -> Result<(), ReplaceError> {
     Ok(())
 }
 
-/// Ends interrupted replacements: if the old run was being moved away, the replacement is undone; if the new run was being
-/// moved in, it is completed.
+/// Ends interrupted replacements: if the old run was being moved away, the replacement is undone; if the new run was
+/// being moved in, it is completed.
 pub(super) fn recover(target: &Path) -> Result<(), FileError> {
     for old in hidden(target, OLD) {
         move_run(&old, target)?;

@@ -113,7 +113,7 @@ fn a_stuck_replacement_is_reported_and_recovered() {
         assert_eq!(aside_folder.is_some(), aside.is_some(), "{what}");
         assert_eq!(error.contains("is unchanged"), aside.is_none(), "{what}");
         assert!(aside_folder.is_none_or(|name| error.contains(&name)), "{what}");
-        RunFolder::settle(root.path()).unwrap();
+        RunFolder::recover(root.path()).unwrap();
         assert_eq!(fs::read_to_string(root.path().join("config.toml")).unwrap(), valid, "{what}");
         assert_eq!(root.path().join("cameras.json").exists(), valid == "old", "{what}");
     }
@@ -169,7 +169,7 @@ fn an_interrupted_replacement_is_completed_or_undone_by_the_next_run() {
             let folder = if is_in { String::new() } else { format!("{NEW}x/") };
             write(&root.path().join(folder + name), "new");
         }
-        RunFolder::settle(root.path()).unwrap();
+        RunFolder::recover(root.path()).unwrap();
         // A replacement that had not started is discarded when the next run starts.
         drop(RunFolder::resume(root.path(), false).unwrap());
         let (names, text) = match moved_in {

@@ -10,8 +10,8 @@ use densify_core::pieces::pieces;
 use densify_data::views::ViewSource;
 
 impl<V: ViewSource> Trainer<V> {
-    /// Largest number of rows that a plan may result in; at least the current number, so that a model that starts with more
-    /// is not reduced.
+    /// Largest number of rows that a plan may result in. It is at least the current number, so that a model that starts
+    /// above the limit is not reduced.
     pub(in crate::trainer) fn row_limit(&self) -> usize {
         let budget = self.backend.budget();
         let limit = self.state.auto_budget.as_ref().map_or(budget, |auto| auto.limit.min(budget));

@@ -1,5 +1,5 @@
-//! The automatic budget: a limit on the number of rows that rises while more rows improve the images, and falls while rows
-//! can be removed without loss.
+//! The automatic budget: a limit on the number of rows that rises while more rows improve the images, and falls while
+//! rows can be removed without loss.
 //!
 //! The run is divided into intervals. At the end of each, before the policy's edit, the PSNR of a few training views
 //! (the probe views) is measured. In the first half of the run the limit then rises by half a doubling, up to the
@@ -12,9 +12,9 @@
 //! [`MAX_DROP`] below the best of the last [`RECENT`] intervals, the interval is not evaluated: the limit stays the
 //! same, and no row is removed.
 //!
-//! After growth, rows with low weights are pruned. At the end of each later interval the rows are sorted by their largest
-//! blend weight in any view. Tenths of them are hidden one after another and removed as long as the PSNR falls by less
-//! than [`MIN_GAIN`] per halving. The comparison uses the same model at the same step, so it has no noise. It
+//! After growth, rows with low weights are pruned. At the end of each later interval the rows are sorted by their
+//! largest blend weight in any view. Tenths of them are hidden one after another and removed as long as the PSNR falls
+//! by less than [`MIN_GAIN`] per halving. The comparison uses the same model at the same step, so it has no noise. It
 //! overestimates the loss, because the remaining rows will adapt.
 //!
 //! Measuring does not change the model or any other state: rows are hidden only by their opacity logits, which are

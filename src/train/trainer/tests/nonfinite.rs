@@ -33,7 +33,7 @@ fn many_nonfinite_rows_end_the_run() {
         assert_eq!(error.is_some(), ends, "{unsound} of {rows}");
         if let Some(error) = error {
             let message = error.to_string();
-            let count = format!("step 9: {unsound} of {rows} rows");
+            let count = format!("step 9: {unsound} of {rows} Gaussians");
             assert!(
                 message.starts_with(&count) && message.contains("opacity of row 0"),
                 "{message}"

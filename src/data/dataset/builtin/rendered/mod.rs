@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use super::PREFIX;
 use crate::dataset::images::ImageSource;
 use crate::dataset::photographs::{Photograph, target_size};
-use crate::dataset::prepare::{assemble, texts};
+use crate::dataset::prepare::{assemble, text_notes};
 use crate::dataset::tracks::TrackSampler;
 use crate::dataset::{self, Dataset, LoadError, LoadOptions, PointCloud, View};
 use densify_core::camera::Camera;
@@ -98,7 +98,8 @@ impl Dataset {
     pub fn ground_truth(&self) -> Result<Option<GroundTruth>, LoadError> {
         if let Some(unpacked) = &self.unpacked {
             let found = GroundTruth::open(unpacked.folder());
-            return found.map_err(|error| LoadError::Data(unpacked.named(&error.to_string())));
+            return found
+                .map_err(|error| LoadError::Data(unpacked.with_archive_name(&error.to_string())));
         }
         let Some(name) = super::name(&self.root) else { return Ok(GroundTruth::open(&self.root)?) };
         let scene = Scene::prepare(&Source::Preset(name.to_owned()), &Options::default())?;
@@ -153,7 +154,7 @@ fn dataset(
         surface_bytes: Some(about.surface_bytes),
         ..dataset::Scene::default()
     };
-    assemble(path, photographs, read, texts(about.notes), options)
+    assemble(path, photographs, read, text_notes(about.notes), options)
 }
 
 /// Converts the camera of a rendered view.

@@ -159,7 +159,7 @@ fn rows_on_the_surface_have_no_error() {
     let mean = 0.05 * (2f64.sqrt() + 1f64.asinh()) / 6.0 / DIAGONAL;
     close(g.centres.completeness, mean, 0.01 * mean);
     close(g.centres.chamfer, g.centres.completeness, 1e-6);
-    // Recall: of every cell, the disc within 0.5 % of the diagonal from the centre.
+    // The recall is the share of each cell that is within 0.5 % of the diagonal from its centre.
     let recall = std::f64::consts::PI * (0.005 * DIAGONAL / 0.05).powi(2);
     close(g.centres.f_score_half_percent, 2.0 * recall / (1.0 + recall), 0.01);
     assert_eq!((g.floaters.count, g.floaters.of_weight), (0, 0.0));
