@@ -174,18 +174,19 @@ fn placed<'a>(
         let moved = || Cow::Owned(model.clone().with_origin(frame.origin));
         Ok((if is_there { Cow::Borrowed(model) } else { moved() }, frame))
     };
-    let (local, spelling) = (Frame::from_origin(local_origin(model)), observer.spelling());
+    let local = || Frame::from_origin(local_origin(model));
     match coordinates {
-        Coordinates::Local => return in_frame(local),
-        Coordinates::Double => return in_frame(Frame { is_double: true, ..local }),
+        Coordinates::Local => return in_frame(local()),
+        Coordinates::Double => return in_frame(Frame { is_double: true, ..local() }),
         Coordinates::Auto | Coordinates::World => {}
     }
     let coarseness = Coarseness::measure(model);
-    let is_fine = is_finer_than_f32(model);
     if !coarseness.is_noted() {
         return in_frame(Frame::WORLD);
     }
+    let (is_fine, spelling) = (is_finer_than_f32(model), observer.spelling());
     if coordinates == Coordinates::Auto && (is_fine || format.is_lossy()) {
+        let local = local();
         observer
             .say(format_args!("{}", notes::saved_in_local(spelling, &coarseness, local.origin)));
         return in_frame(local);
@@ -262,7 +263,7 @@ pub fn write_in_frame(
             error => WriteError::Io(error),
         })
     };
-    files::write_checked(path, write, |written| {
+    format.write_checked(path, frame, write, |written| {
         let (name, changes) = (format.name, format.changes(model, written)?);
         if changes.is_unfit() {
             // The file is discarded, so that the caller can try another format.
@@ -274,9 +275,8 @@ pub fn write_in_frame(
         if changes.is_noted() {
             observer.say(format_args!("note: {name}: {changes}; ply and glb hold all values"));
         }
-        Ok::<_, Failure>(format.write_sidecar(frame, path, written)?)
-    })?;
-    Ok(format.remove_old_sidecar(frame, path)?)
+        Ok(())
+    })
 }
 
 #[cfg(test)]

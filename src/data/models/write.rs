@@ -15,7 +15,7 @@ use densify_core::gaussians::Gaussians;
 use densify_core::pieces::pieces;
 
 /// Size of a model, and what a file states about all of it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Shape {
     /// Number of Gaussians.
     pub rows: usize,
@@ -23,12 +23,14 @@ pub struct Shape {
     pub sh_degree: u8,
     /// Antialiasing.
     pub antialiasing: Antialiasing,
+    /// Frame of the coordinates.
+    pub frame: Frame,
 }
 
 impl From<&Gaussians> for Shape {
     fn from(model: &Gaussians) -> Self {
-        let Gaussians { sh_degree, antialiasing, .. } = *model;
-        Self { rows: model.len(), sh_degree, antialiasing }
+        let Gaussians { sh_degree, antialiasing, origin, .. } = *model;
+        Self { rows: model.len(), sh_degree, antialiasing, frame: Frame::from_origin(origin) }
     }
 }
 
@@ -60,16 +62,14 @@ pub trait ModelWriter {
         &[]
     }
 
-    /// Sets the frame of the coordinates, before [`begin`](Self::begin). Returns true if files of this format can state
-    /// it; otherwise a [sidecar](super::sidecar_path) must. World coordinates need no statement.
-    ///
-    /// # Errors
-    /// [`io::ErrorKind::InvalidInput`] for coordinates in f64, unless the format has them.
-    fn set_frame(&mut self, frame: Frame) -> io::Result<bool> {
-        if frame.is_double {
-            return Err(unfit(NO_DOUBLE));
-        }
-        Ok(false)
+    /// True if files state the offset of local coordinates; if not, a [sidecar](super::sidecar_path) must.
+    fn states_offset(&self) -> bool {
+        false
+    }
+
+    /// True if files can hold coordinates in f64; if not, [`begin`](Self::begin) is never called for them.
+    fn has_double(&self) -> bool {
+        false
     }
 
     /// Writes what precedes the Gaussians.
@@ -79,7 +79,7 @@ pub trait ModelWriter {
     fn begin(&mut self, shape: Shape, out: &mut dyn Write) -> io::Result<()>;
 
     /// Takes the next Gaussians, some thousand at a time, in the dataset's own coordinates, measured from the origin of
-    /// the [frame](Self::set_frame).
+    /// the [frame](Shape::frame).
     ///
     /// # Errors
     /// As [`begin`](Self::begin).
@@ -91,10 +91,6 @@ pub trait ModelWriter {
     /// As [`begin`](Self::begin).
     fn finish(&mut self, out: &mut dyn Write) -> io::Result<()>;
 }
-
-/// The problem of a format without coordinates in f64.
-pub(super) const NO_DOUBLE: &str =
-    "only ply holds coordinates in f64; choose that format, or local coordinates";
 
 /// True if a writer failed because its format cannot hold the model, and not because of the disk.
 pub fn is_unfit(error: &io::Error) -> bool {
@@ -116,13 +112,26 @@ pub(super) fn unfit(problem: impl Into<String>) -> io::Error {
 }
 
 impl Format {
-    /// A writer of one file.
+    /// Begins a file with a model of this shape. The caller passes all rows to the writer, then
+    /// [finishes](ModelWriter::finish) it.
     ///
     /// # Errors
-    /// When densify does not write the format.
-    pub fn open_writer(&self) -> io::Result<Box<dyn ModelWriter>> {
+    /// Those of `out`, and [`io::ErrorKind::InvalidInput`] if densify does not write the format or the format cannot
+    /// hold the model.
+    pub fn open_writer(
+        &self,
+        shape: Shape,
+        out: &mut dyn Write,
+    ) -> io::Result<Box<dyn ModelWriter>> {
         let problem = || format!("densify does not write {}; choose another format", self.name);
-        self.writer.map(|make| make()).ok_or_else(|| unfit(problem()))
+        let mut writer = self.writer.map(|make| make()).ok_or_else(|| unfit(problem()))?;
+        if shape.frame.is_double && !writer.has_double() {
+            return Err(unfit(
+                "only ply holds coordinates in f64; choose that format, or local coordinates",
+            ));
+        }
+        writer.begin(shape, out)?;
+        Ok(writer)
     }
 
     /// [`ModelWriter::held_bytes`] of this format; 0 if densify does not write it.
@@ -159,9 +168,7 @@ impl Format {
     /// # Errors
     /// Those of [`ModelWriter`].
     pub fn write_in(&self, frame: Frame, model: &Gaussians, out: &mut dyn Write) -> io::Result<()> {
-        let mut writer = self.open_writer()?;
-        writer.set_frame(frame)?;
-        writer.begin(model.into(), out)?;
+        let mut writer = self.open_writer(Shape { frame, ..model.into() }, out)?;
         if writer.wants_spatial_order() {
             let order = spatial_order(model);
             for piece in pieces(model.len()) {
@@ -191,35 +198,30 @@ impl Format {
 
     /// True if files of this format name the origin of their coordinates.
     pub fn states_offset(&self) -> bool {
-        self.writer.is_some_and(|make| make().set_frame(Frame::default()).unwrap_or(false))
+        self.writer.is_some_and(|make| make().states_offset())
     }
 
-    /// Writes the sidecar, if a file with this frame needs one, before the file at `written` is renamed to `path`.
-    /// Afterwards, [`remove_old_sidecar`](Self::remove_old_sidecar) completes the pair.
+    /// Does the same as [`write_checked`], and writes the sidecar if a file with this frame needs one. The sidecar of a
+    /// previous file at `path` is replaced or removed.
     ///
     /// # Errors
-    /// When it cannot be written.
-    pub fn write_sidecar(
+    /// Those of [`write_checked`], and when the sidecar cannot be written or removed.
+    pub fn write_checked<E: From<FileError>>(
         &self,
-        frame: Frame,
         path: &Path,
-        written: &Path,
-    ) -> Result<(), FileError> {
-        match frame.offset().filter(|_| !self.states_offset()) {
-            Some(offset) => write_sidecar(path, offset, written),
-            None => Ok(()),
+        frame: Frame,
+        write: impl FnOnce(&mut dyn Write) -> Result<(), WriteError<E>>,
+        check: impl FnOnce(&Path) -> Result<(), E>,
+    ) -> Result<(), E> {
+        let offset = frame.offset().filter(|_| !self.states_offset());
+        write_checked(path, write, |written| {
+            check(written)?;
+            offset.map_or(Ok(()), |offset| Ok(write_sidecar(path, offset, written)?))
+        })?;
+        if offset.is_none() {
+            remove_sidecar(path)?;
         }
-    }
-
-    /// Removes the sidecar of a previous file at `path`, unless the new file needs one.
-    ///
-    /// # Errors
-    /// When it cannot be removed.
-    pub fn remove_old_sidecar(&self, frame: Frame, path: &Path) -> Result<(), FileError> {
-        match frame.offset().filter(|_| !self.states_offset()) {
-            Some(_) => Ok(()),
-            None => remove_sidecar(path),
-        }
+        Ok(())
     }
 
     /// Writes a model that is in memory as a whole to a file that appears only when it is complete, with its sidecar if
@@ -229,9 +231,7 @@ impl Format {
     /// Those of [`ModelWriter`] and [`write_atomically`].
     pub fn save(&self, model: &Gaussians, path: &Path) -> Result<(), FileError> {
         let frame = Frame::from_origin(model.origin);
-        let write = |out: &mut dyn Write| Ok::<_, WriteError<FileError>>(self.write(model, out)?);
-        write_checked(path, write, |written| self.write_sidecar(frame, path, written))?;
-        self.remove_old_sidecar(frame, path)
+        self.write_checked(path, frame, |out| Ok(self.write(model, out)?), |_| Ok(()))
     }
 
     /// Writes a model to a file that appears only when it is complete, with its sidecar if it needs one. `rows` is
@@ -244,19 +244,15 @@ impl Format {
         &self,
         path: &Path,
         shape: Shape,
-        frame: Frame,
         mut rows: impl FnMut(Range<usize>) -> Result<Gaussians, E>,
     ) -> Result<(), E> {
         let write = |out: &mut dyn Write| {
-            let mut writer = self.open_writer()?;
-            writer.set_frame(frame)?;
-            writer.begin(shape, out)?;
+            let mut writer = self.open_writer(shape, out)?;
             for piece in pieces(shape.rows) {
                 writer.rows(&rows(piece).map_err(WriteError::Source)?, out)?;
             }
             Ok(writer.finish(out)?)
         };
-        write_checked(path, write, |written| Ok(self.write_sidecar(frame, path, written)?))?;
-        Ok(self.remove_old_sidecar(frame, path)?)
+        self.write_checked(path, shape.frame, write, |_| Ok(()))
     }
 }

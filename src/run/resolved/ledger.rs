@@ -16,7 +16,7 @@ use densify_core::memory::{Ledger, Section};
 use densify_core::pieces::ROWS_AT_A_TIME;
 use densify_data::dataset::images::ImageDemand;
 use densify_data::dataset::{Dataset, View};
-use densify_data::models::{Coordinates, PLY, Shape};
+use densify_data::models::{Coordinates, Frame, PLY, Shape};
 use densify_render::{KeptPhotographs, MomentStorage, Setup, Shortcuts, Storage};
 use densify_train::exposure::Exposures;
 use densify_train::metrics::{geometry, scratch_bytes};
@@ -133,6 +133,10 @@ impl Case<'_> {
             rows: size.rows,
             sh_degree: degree,
             antialiasing: Antialiasing::None,
+            frame: Frame {
+                is_double: self.spec.output.coordinates == Coordinates::Double,
+                ..Frame::WORLD
+            },
         });
         pass("export of the model, checkpoint", 2 * piece * row + held + EXPOSURE_TEXT * exposures);
         if let Some(companion) = self.inputs.companion {

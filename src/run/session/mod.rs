@@ -369,8 +369,9 @@ impl<'a> Session<'a> {
             rows: backend.rows(),
             sh_degree: backend.sh_degree(),
             antialiasing: backend.antialiasing(),
+            frame,
         };
-        PLY.write_file(&path, shape, frame, |piece| {
+        PLY.write_file(&path, shape, |piece| {
             Ok::<_, Failure>(to_world.world_from_model(backend.download_rows(piece)?, frame.origin))
         })?;
         if let Some(offset) = frame.offset() {

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use super::status::is_complete;
 use super::{Block, BlockPlan, Task, run_folder};
-use densify_core::files::{WriteError, write_checked};
+use densify_core::files::WriteError;
 use densify_core::gaussians::{Gaussians, sh_coefficients};
 use densify_core::pieces::ROWS_AT_A_TIME;
 use densify_data::models::{Format, Frame, Shape, offset_text};
@@ -88,11 +88,9 @@ pub fn merge(
         return Err(Failure::new(OTHER, message));
     }
     let antialiasing = stated.unwrap_or_default();
-    let shape = Shape { rows, sh_degree: plan.sh_degree, antialiasing };
+    let shape = Shape { rows, sh_degree: plan.sh_degree, antialiasing, frame };
     let write = |out: &mut dyn Write| {
-        let mut writer = format.open_writer()?;
-        writer.set_frame(frame)?;
-        writer.begin(shape, out)?;
+        let mut writer = format.open_writer(shape, out)?;
         for &index in &complete {
             let part = read_part(folder, plan, index, &Silent).map_err(WriteError::Source)?;
             let part = part.with_origin(frame.origin);
@@ -103,10 +101,7 @@ pub fn merge(
         }
         Ok(writer.finish(out)?)
     };
-    write_checked(output, write, |written| {
-        Ok::<_, Failure>(format.write_sidecar(frame, output, written)?)
-    })?;
-    format.remove_old_sidecar(frame, output)?;
+    format.write_checked(output, frame, write, |_| Ok::<_, Failure>(()))?;
     if let Some(offset) = frame.offset() {
         observer.say(format_args!("coords   local, from the offset {}", offset_text(offset)));
     }

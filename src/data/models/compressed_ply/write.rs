@@ -10,8 +10,7 @@ use crate::models::coordinates::offset_text;
 use crate::models::ply::layout::OFFSET;
 use crate::models::quantise::{MAX_LOG_SCALE, smallest_three};
 use crate::models::statement::comments;
-use crate::models::write::{NO_DOUBLE, unfit};
-use crate::models::{Frame, ModelWriter, Shape};
+use crate::models::{ModelWriter, Shape};
 use densify_core::gaussians::{Gaussians, dc_to_rgb, sh_coefficients, sigmoid};
 
 /// Number of values per Gaussian that are packed chunk by chunk: position, log-scale, colour, opacity and quaternion.
@@ -20,7 +19,6 @@ const PACKED: usize = 14;
 /// Holds the packed values of all Gaussians, because all chunks precede them in the file.
 #[derive(Default)]
 pub(super) struct CompressedPlyWriter {
-    frame: Frame,
     /// Gaussians of the current chunk, which is not full.
     open: Vec<[f32; PACKED]>,
     chunks: Vec<[f32; BOUNDS.len()]>,
@@ -42,23 +40,19 @@ impl ModelWriter for CompressedPlyWriter {
         true
     }
 
-    fn set_frame(&mut self, frame: Frame) -> io::Result<bool> {
-        if frame.is_double {
-            return Err(unfit(NO_DOUBLE));
-        }
-        self.frame = frame;
-        Ok(true)
+    fn states_offset(&self) -> bool {
+        true
     }
 
     fn begin(&mut self, shape: Shape, out: &mut dyn Write) -> io::Result<()> {
-        let Shape { rows, sh_degree, antialiasing } = shape;
+        let Shape { rows, sh_degree, antialiasing, frame } = shape;
         let rest = 3 * (sh_coefficients(sh_degree) - 1);
         self.open.reserve_exact(CHUNK);
         self.chunks.reserve_exact(rows.div_ceil(CHUNK));
         self.words.reserve_exact(rows);
         self.bands.reserve_exact(rows * rest);
         let comment = |offset| format!("comment {OFFSET} {}\n", offset_text(offset));
-        let offset = self.frame.offset().map(comment).unwrap_or_default();
+        let offset = frame.offset().map(comment).unwrap_or_default();
         let mut header = format!(
             "ply\nformat binary_little_endian 1.0\ncomment densify {}\n{}element chunk {}\n",
             env!("CARGO_PKG_VERSION"),

@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 
 use super::layout::{HALF_TURN, LOG_SCALE, MAGIC, OPACITY_LOGIT, SHAPES, SPLATS, coefficient};
 use crate::models::statement::KERNEL;
-use crate::models::write::{NO_DOUBLE, unfit};
+use crate::models::write::unfit;
 use crate::models::{Frame, ModelWriter, Shape};
 use densify_core::antialiasing::Antialiasing;
 use densify_core::gaussians::{Gaussians, sh_coefficients, sigmoid};
@@ -41,16 +41,12 @@ impl ModelWriter for GlbWriter {
         false
     }
 
-    fn set_frame(&mut self, frame: Frame) -> io::Result<bool> {
-        if frame.is_double {
-            return Err(unfit(NO_DOUBLE));
-        }
-        self.frame = frame;
-        Ok(true)
+    fn states_offset(&self) -> bool {
+        true
     }
 
     fn begin(&mut self, shape: Shape, _out: &mut dyn Write) -> io::Result<()> {
-        let Shape { rows, sh_degree, antialiasing } = shape;
+        let Shape { rows, sh_degree, antialiasing, frame } = shape;
         if self.held_bytes(shape) > u64::from(u32::MAX - (1 << 16)) {
             return Err(unfit(
                 "a GLB has at most 4 GiB; choose another format, such as ply or sog",
@@ -58,6 +54,7 @@ impl ModelWriter for GlbWriter {
         }
         self.sh_degree = sh_degree;
         self.antialiasing = antialiasing;
+        self.frame = frame;
         let colours = std::iter::repeat_n(3, sh_coefficients(sh_degree));
         let widths = ATTRIBUTES.iter().map(|(_, width)| *width).chain(colours);
         self.columns = widths.map(|width| Vec::with_capacity(rows * width)).collect();

@@ -17,37 +17,38 @@ pub(super) struct PlyWriter {
     frame: Frame,
 }
 
-impl PlyWriter {
-    /// Size of a Gaussian: position, normal, opacity, scales, rotation and colours `[bytes]`.
-    fn row_bytes(&self, sh_degree: u8) -> usize {
-        let wider =
-            if self.frame.is_double { 3 * (size_of::<f64>() - size_of::<f32>()) } else { 0 };
-        size_of::<f32>() * (14 + 3 * sh_coefficients(sh_degree)) + wider
-    }
+/// Size of a Gaussian: position, normal, opacity, scales, rotation and colours `[bytes]`.
+fn row_bytes(sh_degree: u8, frame: Frame) -> usize {
+    let wider = if frame.is_double { 3 * (size_of::<f64>() - size_of::<f32>()) } else { 0 };
+    size_of::<f32>() * (14 + 3 * sh_coefficients(sh_degree)) + wider
 }
 
 impl ModelWriter for PlyWriter {
-    fn held_bytes(&self, Shape { rows, sh_degree, .. }: Shape) -> u64 {
-        (rows.min(CHUNK) * self.row_bytes(sh_degree)) as u64
+    fn held_bytes(&self, Shape { rows, sh_degree, frame, .. }: Shape) -> u64 {
+        (rows.min(CHUNK) * row_bytes(sh_degree, frame)) as u64
     }
 
     fn is_lossy(&self) -> bool {
         false
     }
 
-    fn set_frame(&mut self, frame: Frame) -> io::Result<bool> {
-        self.frame = frame;
-        Ok(true)
+    fn states_offset(&self) -> bool {
+        true
+    }
+
+    fn has_double(&self) -> bool {
+        true
     }
 
     fn begin(&mut self, shape: Shape, out: &mut dyn Write) -> io::Result<()> {
-        let Shape { rows, sh_degree, antialiasing } = shape;
+        let Shape { rows, sh_degree, antialiasing, frame } = shape;
+        self.frame = frame;
         let mut header =
             "ply\nformat binary_little_endian 1.0\n".to_owned() + &comments(antialiasing);
-        if let Some(offset) = self.frame.offset() {
+        if let Some(offset) = frame.offset() {
             header += &format!("comment {OFFSET} {}\n", offset_text(offset));
-        } else if self.frame.is_double {
-            header += &format!("comment {NEAR} {}\n", offset_text(self.frame.origin));
+        } else if frame.is_double {
+            header += &format!("comment {NEAR} {}\n", offset_text(frame.origin));
         }
         header += &format!("element vertex {rows}\n");
         for (index, name) in properties(sh_degree).enumerate() {
@@ -56,7 +57,7 @@ impl ModelWriter for PlyWriter {
                     header += &format!("property float {normal}\n");
                 }
             }
-            let is_wide = self.frame.is_double && index < NORMALS_AT;
+            let is_wide = frame.is_double && index < NORMALS_AT;
             header += &format!("property {} {name}\n", if is_wide { "double" } else { "float" });
         }
         header += "end_header\n";
@@ -64,7 +65,8 @@ impl ModelWriter for PlyWriter {
     }
 
     fn rows(&mut self, rows: &Gaussians, out: &mut dyn Write) -> io::Result<()> {
-        let mut chunk = Vec::with_capacity(rows.len().min(CHUNK) * self.row_bytes(rows.sh_degree));
+        let row_bytes = row_bytes(rows.sh_degree, self.frame);
+        let mut chunk = Vec::with_capacity(rows.len().min(CHUNK) * row_bytes);
         for row in 0..rows.len() {
             if self.frame.is_double {
                 chunk.extend(rows.position(row).into_iter().flat_map(f64::to_le_bytes));

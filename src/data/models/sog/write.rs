@@ -11,9 +11,9 @@ use super::palette::{self, Palette};
 use super::picture::{MAX_SIDE, Picture, image_size};
 use crate::models::quantise::{MAX_LOG_SCALE, smallest_three};
 use crate::models::statement::KERNEL;
-use crate::models::write::{NO_DOUBLE, unfit};
+use crate::models::write::unfit;
 use crate::models::zip::ZipWriter;
-use crate::models::{Format, Frame, ModelWriter, Shape};
+use crate::models::{Format, ModelWriter, Shape};
 use densify_core::antialiasing::Antialiasing;
 use densify_core::gaussians::{Gaussians, sh_coefficients, sigmoid};
 
@@ -58,16 +58,12 @@ impl ModelWriter for SogWriter {
         &VARIANTS
     }
 
-    fn set_frame(&mut self, frame: Frame) -> io::Result<bool> {
-        if frame.is_double {
-            return Err(unfit(NO_DOUBLE));
-        }
-        self.offset = frame.offset();
-        Ok(true)
+    fn states_offset(&self) -> bool {
+        true
     }
 
     fn begin(&mut self, shape: Shape, _out: &mut dyn Write) -> io::Result<()> {
-        let Shape { rows, sh_degree, antialiasing } = shape;
+        let Shape { rows, sh_degree, antialiasing, frame } = shape;
         if rows == 0 || rows > MAX_SIDE * MAX_SIDE {
             return Err(unfit(format!(
                 "SOG holds 1 to 268 million Gaussians, not {rows}; choose another format, such as ply"
@@ -75,6 +71,7 @@ impl ModelWriter for SogWriter {
         }
         self.sh_degree = sh_degree;
         self.antialiasing = antialiasing;
+        self.offset = frame.offset();
         self.means.reserve_exact(rows);
         self.log_scales.reserve_exact(rows);
         self.quats.reserve_exact(rows);

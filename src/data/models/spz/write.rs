@@ -68,7 +68,7 @@ impl ModelWriter for SpzWriter {
     }
 
     fn begin(&mut self, shape: Shape, _out: &mut dyn Write) -> io::Result<()> {
-        let Shape { rows, sh_degree, antialiasing } = shape;
+        let Shape { rows, sh_degree, antialiasing, .. } = shape;
         if u32::try_from(rows).is_err() {
             return Err(unfit(
                 "SPZ counts Gaussians in 32 bits; export fewer, or choose another format",

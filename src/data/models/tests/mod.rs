@@ -13,7 +13,6 @@ use std::ops::Range;
 use std::path::PathBuf;
 
 use super::*;
-use densify_core::antialiasing::Antialiasing;
 use densify_core::files::FileError;
 use densify_core::gaussians::{Gaussians, sh_coefficients};
 use densify_core::pieces::ROWS_AT_A_TIME;
@@ -91,17 +90,12 @@ impl ModelWriter for CallLog {
 fn a_registered_format_is_found_and_given_every_row_once() {
     let format = find("call-log").unwrap();
     assert_eq!(find_by_extension(Path::new("a/model.LOG.txt")).unwrap().name, format.name);
-    assert_eq!(
-        format.held_bytes(Shape { rows: 7, sh_degree: 0, antialiasing: Antialiasing::None }),
-        7
-    );
+    assert_eq!(format.held_bytes((&model(7, 0)).into()), 7);
     let rows = 2 * ROWS_AT_A_TIME + 4;
     let (folder, whole) = (tempfile::tempdir().unwrap(), model(rows, 1));
     let path = folder.path().join("new/model.log.txt");
-    let shape = Shape { rows, sh_degree: 1, antialiasing: Antialiasing::None };
-    format
-        .write_file(&path, shape, Frame::WORLD, |rows| Ok::<_, FileError>(piece(&whole, rows)))
-        .unwrap();
+    let pieces = |rows| Ok::<_, FileError>(piece(&whole, rows));
+    format.write_file(&path, (&whole).into(), pieces).unwrap();
     let expected = format!("begin {rows} 1;{ROWS_AT_A_TIME};{ROWS_AT_A_TIME};4;finish");
     assert_eq!(std::fs::read_to_string(&path).unwrap(), expected);
 }
@@ -132,9 +126,9 @@ fn a_failed_source_leaves_the_old_file() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("model.ply");
     std::fs::write(&path, "old").unwrap();
-    let shape = Shape { rows: ROWS_AT_A_TIME + 1, sh_degree: 0, antialiasing: Antialiasing::None };
+    let shape = Shape { rows: ROWS_AT_A_TIME + 1, ..(&model(0, 0)).into() };
     let lost = || FileError::malformed(Path::new("lost"), "it is gone");
-    let written = PLY.write_file(&path, shape, Frame::WORLD, |rows| match rows.start {
+    let written = PLY.write_file(&path, shape, |rows| match rows.start {
         0 => Ok(model(rows.len(), 0)),
         _ => Err(lost()),
     });
@@ -157,10 +151,8 @@ fn an_unknown_format_names_the_nearest_and_the_list() {
 #[test]
 fn the_writer_of_ply_holds_as_many_bytes_as_it_reports() {
     let whole = model(300, 2);
-    let mut writer = PLY.open_writer().unwrap();
-    writer
-        .begin(Shape { rows: 300, sh_degree: 2, antialiasing: Antialiasing::None }, &mut io::sink())
-        .unwrap();
+    let shape = Shape::from(&whole);
+    let mut writer = PLY.open_writer(shape, &mut io::sink()).unwrap();
 
     /// The largest write.
     struct Largest(usize);
@@ -176,10 +168,7 @@ fn the_writer_of_ply_holds_as_many_bytes_as_it_reports() {
     for rows in [20, 300] {
         let mut largest = Largest(0);
         writer.rows(&piece(&whole, 0..rows), &mut largest).unwrap();
-        assert_eq!(
-            writer.held_bytes(Shape { rows, sh_degree: 2, antialiasing: Antialiasing::None }),
-            largest.0 as u64
-        );
+        assert_eq!(writer.held_bytes(Shape { rows, ..shape }), largest.0 as u64);
     }
 }
 

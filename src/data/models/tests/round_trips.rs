@@ -8,7 +8,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::{piece, saved, written};
-use crate::models::{Shape, export_formats, find, find_by_extension, read_model};
+use crate::models::{export_formats, find, find_by_extension, read_model};
 use densify_core::antialiasing::Antialiasing;
 use densify_core::gaussians::{Gaussians, sh_coefficients, sigmoid};
 
@@ -159,13 +159,8 @@ fn files_do_not_depend_on_the_pieces_and_equal_models_give_equal_files() {
     let model = plausible(300, 2);
     for format in export_formats().into_iter().filter(|format| format.name != "call-log") {
         let in_pieces = |pieces: &[Range<usize>]| {
-            let (mut bytes, mut writer) = (Vec::new(), format.open_writer().unwrap());
-            writer
-                .begin(
-                    Shape { rows: 300, sh_degree: 2, antialiasing: Antialiasing::None },
-                    &mut bytes,
-                )
-                .unwrap();
+            let mut bytes = Vec::new();
+            let mut writer = format.open_writer((&model).into(), &mut bytes).unwrap();
             for rows in pieces {
                 writer.rows(&piece(&model, rows.clone()), &mut bytes).unwrap();
             }
