@@ -48,7 +48,7 @@ impl Window {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OpacityResets {
     regular: Window,
-    /// Step of the reset on a white background, if any.
+    /// Step of the additional reset of a scene on a white background.
     white: Option<u32>,
     /// Largest opacity after a reset, in (0, 1).
     max_opacity: f32,
@@ -98,9 +98,9 @@ pub fn concave_curve(window: Window, step: u32, start: usize, end: usize) -> usi
     }
     let events = (until.saturating_sub(from) / every).max(1);
     let event = (step / every).saturating_sub(from / every);
-    let x = (f64::from(event) / f64::from(events)).min(1.0);
+    let progress = (f64::from(event) / f64::from(events)).min(1.0);
     let (start, end) = (start as f64, end as f64);
-    (start + (end - start) * (2.0 * x - x * x)).floor() as usize
+    (start + (end - start) * (2.0 * progress - progress * progress)).floor() as usize
 }
 
 /// Divides a sum over views by the number of views that saw the row. 0 if no view saw it or the mean is not
@@ -250,7 +250,7 @@ mod tests {
         let frequent = Window { every: 100, ..window };
         assert_eq!(concave_curve(frequent, 14_900, 0, 145 * 145), 145 * 145 - 1);
         assert_eq!(concave_curve(Window { every: 0, ..window }, 900, 7, 9), 7);
-        // Nothing grows where the end is below the start.
+        // If the end is below the start, the curve falls and nothing grows.
         assert!(concave_curve(window, 1000, 100, 50) < 100);
     }
 

@@ -54,10 +54,10 @@
 //! | most_rho | 2.0 | >= 0 | budget | maximum number of Gaussians replaced in the whole run |
 //! | gradient | "abs" | abs, screen | | screen gradient, with absolute values or without |
 //! | colour_weight | 30.0 | >= 0 | | weight of the colour gradient; 0: none |
-//! | full_depth | 0.8 | >= 0 | scene extent | nearer views count less in g; 0: all count equally |
+//! | full_depth | 0.8 | >= 0 | scene extent | depth below which a view counts less in g; 0: all count equally |
 //! | least_views | 3 | >= 0 | views | minimum number of views in which a parent is seen |
 //! | protect | 100 | 0 to 65535 | steps | longest protection of newborns; 0: none |
-//! | small | 0.01 | >= 0 | scene extent | largest size that is cloned; 0: all are split |
+//! | small | 0.01 | >= 0 | scene extent | Gaussians up to this size are cloned, larger ones split; 0: all are split |
 //! | split_share | 0.45 | 0 to 1, both excluded | | d of the split |
 //! | child_opacity | 0.6 | 0 to 1, 0 excluded | | factor on the opacity in a split |
 //! | min_opacity | 0.005 | 0 to 1 | | Gaussians below this opacity are pruned |
