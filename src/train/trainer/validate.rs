@@ -34,8 +34,10 @@ pub(super) fn check_options(
     let frozen = options.frozen;
     let expected = RowBudget::for_trainable(scene.budget, frozen).total;
     if budget != expected || rows > budget || rows < frozen {
-        let of_scene = scene.budget;
-        return bad(format!("{rows} rows, {frozen} frozen, budget {budget} (scene: {of_scene})"));
+        let trained = scene.budget;
+        return bad(format!(
+            "{rows} rows ({frozen} frozen) and budget {budget} do not fit the scene's budget {trained}"
+        ));
     }
     Ok(())
 }
