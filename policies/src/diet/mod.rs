@@ -191,7 +191,7 @@ pub struct Diet {
     surface: Vec<Candidate>,
     /// Largest blend weight of each row in the auxiliary views of the current event. Not saved, as the same event
     /// uses and clears them.
-    fresh_weights: Vec<f32>,
+    weight_max: Vec<f32>,
 }
 
 impl ConfiguredPolicy for Diet {
@@ -221,7 +221,7 @@ impl ConfiguredPolicy for Diet {
             insert: Window { from, until, every: if compensates { insert_every } else { 0 } },
             protected_age: params.protect.min(scene.train_views) as f32,
             surface: Vec::new(),
-            fresh_weights: Vec::new(),
+            weight_max: Vec::new(),
             params,
         })
     }
@@ -282,9 +282,10 @@ impl DensityPolicy for Diet {
             self.surface.extend_from_slice(view.points);
             return Ok(());
         }
-        self.fresh_weights.resize(view.rows, 0.0);
-        for (so_far, &weight) in self.fresh_weights.iter_mut().zip(view.column(AuxColumn::WeightMax)?) {
-            *so_far = so_far.max(weight);
+        self.weight_max.resize(view.rows, 0.0);
+        for (max, &weight) in self.weight_max.iter_mut().zip(view.column(AuxColumn::WeightMax)?)
+        {
+            *max = max.max(weight);
         }
         Ok(())
     }
@@ -294,12 +295,12 @@ impl DensityPolicy for Diet {
             self.reinit(now.scene.extent, plan);
             return Ok(());
         }
-        let mut fresh_weights = std::mem::take(&mut self.fresh_weights);
+        let mut weight_max = std::mem::take(&mut self.weight_max);
         let importance = match self.params.importance {
             Importance::Epochs => now.signal(Signal::WeightMax)?,
             Importance::Fresh => {
-                fresh_weights.resize(now.rows(), 0.0);
-                &fresh_weights
+                weight_max.resize(now.rows(), 0.0);
+                &weight_max
             }
         };
         let grows = self.grow.is_due(now.step);

@@ -1,4 +1,4 @@
-//! The number of new rows per event: those that the curve allows and those that replace others.
+//! The number of new rows per event: the rows that the curve allows and those that replace others.
 
 use super::{Merit, MeritParams};
 use crate::plan::EditPlan;
@@ -35,10 +35,10 @@ impl Merit {
 
 /// The upper median of the finite values; 0 if there are none.
 fn median(values: &[f32]) -> f32 {
-    let mut numbers: Vec<f32> = values.iter().copied().filter(|value| value.is_finite()).collect();
-    let middle = numbers.len() / 2;
-    if numbers.is_empty() {
+    let mut finite: Vec<f32> = values.iter().copied().filter(|value| value.is_finite()).collect();
+    let middle = finite.len() / 2;
+    if finite.is_empty() {
         return 0.0;
     }
-    *numbers.select_nth_unstable_by(middle, f32::total_cmp).1
+    *finite.select_nth_unstable_by(middle, f32::total_cmp).1
 }

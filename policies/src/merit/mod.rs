@@ -32,7 +32,7 @@
 //!
 //! **Pruning.** Gaussians below `min_opacity` are pruned. If there is no room for new Gaussians, the least
 //! important ones that are not parents are pruned. Newborns (younger than an epoch, at most `protect` steps)
-//! are pruned only if there are no others, the oldest first.
+//! are pruned only if there are too few others, the oldest first.
 //!
 //! **Children.** A Gaussian larger than `small` is split along its longest axis: with d = `split_share`, two
 //! halves at ±3d standard deviations, their longest axis 1 − d times the parent's, the others √(1 − d²) times,
@@ -146,9 +146,9 @@ impl DensityPolicy for Merit {
     fn plan(&mut self, now: &Snapshot<'_>, _rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
         plan.cause("grow");
         let opacity = now.signal(Signal::Opacity)?;
-        let least = self.params.min_opacity as f32;
+        let min_opacity = self.params.min_opacity as f32;
         // False for NaN.
-        let is_alive = |row: u32| opacity[row as usize] >= least;
+        let is_alive = |row: u32| opacity[row as usize] >= min_opacity;
         let mut dead: Vec<u32> = (0..now.rows() as u32).filter(|&row| !is_alive(row)).collect();
         spare_one(&mut dead, opacity);
         plan.prune_all(dead);
@@ -198,16 +198,16 @@ impl Merit {
     ) -> PolicyResult<Vec<u32>> {
         let gradient = self.gradient(now)?;
         let views = now.signal(Signal::VisibleCount)?;
-        let least = self.params.least_views as f32;
+        let least_views = self.params.least_views as f32;
         let is_eligible = |row: &u32| {
             let index = *row as usize;
-            plan.is_free(*row) && gradient[index] > 0.0 && views[index] >= least
+            plan.is_free(*row) && gradient[index] > 0.0 && views[index] >= least_views
         };
         let rows: Vec<u32> = (0..now.rows() as u32).filter(is_eligible).collect();
         Ok(largest(rows, &gradient, births))
     }
 
-    /// Prunes the `count` least important rows that are not parents; newborns only if there are no others,
+    /// Prunes the `count` least important rows that are not parents; newborns only if there are too few others,
     /// the oldest first.
     fn prune_least(
         &self,

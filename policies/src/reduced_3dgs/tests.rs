@@ -33,7 +33,7 @@ fn opacities(crowd: [f32; 6]) -> Vec<f32> {
 }
 
 #[test]
-fn the_fainter_half_of_the_redundant_is_pruned() {
+fn the_fainter_half_of_the_redundant_rows_is_pruned() {
     // R is 1 for twenty rows and 6 for six: mean 56/26 = 2.154, standard deviation √(25·20·6/26/25) = 2.148.
     // The six are above 4.302. Their median opacity is (0.3 + 0.4)/2 = 0.35.
     let event = crowd(1000).with(Signal::Opacity, &opacities([0.1, 0.2, 0.3, 0.4, 0.6, 0.9]));
@@ -45,7 +45,7 @@ fn the_fainter_half_of_the_redundant_is_pruned() {
     // R must exceed `min_redundancy`.
     assert_eq!(pruned("min_redundancy = 5.9"), [20, 21, 22]);
     assert!(pruned("min_redundancy = 6.0").is_empty());
-    // With two neighbours R is 3, which is not more than 3.
+    // With two neighbours R is 3, which does not exceed the default `min_redundancy` of 3.
     assert!(pruned("neighbours = 2").is_empty());
     assert_eq!(pruned("neighbours = 3"), [20, 21, 22]);
     let done = run(&event, "");
@@ -53,8 +53,8 @@ fn the_fainter_half_of_the_redundant_is_pruned() {
     assert!(done.ops.reset_signals.contains(Signal::PixelSizeMin));
     // With the default `min_redundancy`, an R of 3 is not enough and 4 is.
     let at = |xs: &[f32]| {
-        let fades: Vec<f32> = (0..xs.len()).map(|row| 0.1 + 0.1 * row as f32).collect();
-        let event = self::event(1000, xs).with(Signal::Opacity, &fades);
+        let opacity: Vec<f32> = (0..xs.len()).map(|row| 0.1 + 0.1 * row as f32).collect();
+        let event = self::event(1000, xs).with(Signal::Opacity, &opacity);
         run(&event, "faint_opacity = 0.0\ndeviations = 0.0").pruned
     };
     assert!(at(&[0.0, 0.0, 0.0, 9.0]).is_empty());
@@ -79,7 +79,7 @@ fn the_smallest_pixel_determines_the_size_of_a_sphere() {
 }
 
 #[test]
-fn the_faintest_are_pruned() {
+fn the_faintest_rows_are_pruned() {
     // 101 rows: the 3 % quantile is the fourth lowest opacity, and below it are three.
     let xs: Vec<f32> = (0..101).map(|row| 10.0 * row as f32).collect();
     let all = |first: f32, step: f32| -> Vec<f32> {
@@ -130,7 +130,7 @@ fn prunes_are_every_thousand_steps_except_at_resets() {
     let until = prunes(policy("prune_until = 27000", REFERENCE_ITERATIONS));
     assert_eq!(until, thousands(&|k| k <= 27 && ![3, 6, 9, 12].contains(&k)));
     assert!(prunes(policy("prune_every = 0", REFERENCE_ITERATIONS)).is_empty());
-    // 7,000/30,000 of 1,000 is 233.
+    // 1,000 · 7,000/30,000 = 233.3.
     let short = find("reduced-3dgs").unwrap();
     let scene = SceneInfo { iterations: 7000, ..Event::new(1, 1, 1).scene };
     let table = short.effective(&Default::default(), &scene).unwrap();

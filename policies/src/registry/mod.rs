@@ -65,7 +65,7 @@ pub struct PolicyEntry {
     pub name: &'static str,
     /// One-line description.
     pub summary: &'static str,
-    /// Publication.
+    /// The publication that the policy is from.
     pub source: &'static str,
     doc: &'static str,
     place: (&'static str, u32),
