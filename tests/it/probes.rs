@@ -41,7 +41,11 @@ fn needs() -> Needs {
 }
 
 /// The state of a run after [`MEASURED_AT`] steps with or without measurements.
-fn state_of_run(backend: Box<dyn Backend>, dataset: &Dataset, measures: bool) -> (Gaussians, Vec<Tensor>) {
+fn state_of_run(
+    backend: Box<dyn Backend>,
+    dataset: &Dataset,
+    measures: bool,
+) -> (Gaussians, Vec<Tensor>) {
     let scene = SceneInfo {
         extent: 1.0,
         train_views: dataset.train.len() as u32,

@@ -11,8 +11,8 @@ use proptest::test_runner::{TestCaseResult, TestRunner};
 
 use crate::subject::{BLUE, bits, cases_on, class, make_with, on_each, repeatable};
 
-/// A Gaussian: position in camera space as image fractions and depth, log-scales, quaternion, opacity logit and the seed
-/// of its colours.
+/// A Gaussian: position in camera space as image fractions and depth, log-scales, quaternion, opacity logit and the
+/// seed of its colours.
 type Row = ([f64; 3], [f32; 3], [f32; 4], f32, f32);
 
 fn row() -> impl Strategy<Value = Row> {

@@ -59,7 +59,11 @@ fn run(backend: &mut dyn Differentiable, camera: &Camera) -> Run {
 
 /// Clears the number of bands, which may differ.
 fn without_bands((image_bits, model, outputs): Run) -> Run {
-    (image_bits, model, outputs.into_iter().map(|output| StepOutput { bands: 1, ..output }).collect())
+    (
+        image_bits,
+        model,
+        outputs.into_iter().map(|output| StepOutput { bands: 1, ..output }).collect(),
+    )
 }
 
 /// Covers all kinds of parameter storage and equal depths.

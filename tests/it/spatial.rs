@@ -202,12 +202,14 @@ fn rows_are_split_moved_and_painted_by_position() {
             let [a, b, c] = model.log_scales[row];
             for part in [place, next] {
                 assert!(close(after.log_scales[part], [a, b - 2.0_f32.ln(), c]), "row {part}");
-                let offset = [0, 1, 2].map(|i| f64::from(after.means[part][i] - model.means[row][i]));
+                let offset =
+                    [0, 1, 2].map(|i| f64::from(after.means[part][i] - model.means[row][i]));
                 // Half a standard deviation along the second axis, which the rotation turns into the third.
                 let second_axis = column(model.quats[row], 1);
                 let along: f64 = (0..3).map(|i| offset[i] * second_axis[i]).sum();
                 assert!((along.abs() - 0.5 * f64::from(b).exp()).abs() < 1e-5, "row {part}");
-                let turned: f64 = (0..3).map(|i| column(after.quats[part], 2)[i] * second_axis[i]).sum();
+                let turned: f64 =
+                    (0..3).map(|i| column(after.quats[part], 2)[i] * second_axis[i]).sum();
                 assert!((turned + 1.0).abs() < 1e-5, "row {part}: {turned}");
             }
             next += 1;

@@ -150,8 +150,8 @@ pub(super) fn packings(options: &Options<'_>, model: &Gaussians) -> Result<Vec<P
     Ok(packings)
 }
 
-/// Estimates with how many rows of this model the file meets the target; [`trim`] drops any that are too many. `None` if
-/// not even one row fits.
+/// Estimates with how many rows of this model the file meets the target; [`trim`] drops any that are too many. `None`
+/// if not even one row fits.
 pub(super) fn rows_that_fit(
     to: Target,
     format: &Format,

@@ -67,7 +67,8 @@ fn page_bytes(
     let full_size_pixels = u64::from(largest_image.0) * u64::from(largest_image.1);
     // Resizing converts colours and alpha to floats.
     let resizing = full_size_pixels * (3 + 4 * float);
-    let encoding = pixels * bytes_per_pixel + resizing + photograph + scratch_bytes(largest_image.0, threads);
+    let encoding =
+        pixels * bytes_per_pixel + resizing + photograph + scratch_bytes(largest_image.0, threads);
     let connections = http::MAX_CONNECTIONS as u64 * CONNECTION_BYTES;
     let responses = MAX_WAITING as u64 * picture;
     let status = run_status::BYTES + POINTS_BYTES + views as u64 * VIEW_BYTES;

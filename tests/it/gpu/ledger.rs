@@ -16,7 +16,7 @@ fn device_allocations_match_the_ledger() {
     let mask = MaskTerm { start: 1.0, rate: 0.01, weight: 5e-4, threshold: 0.01 };
     let columns = vec![AuxColumn::PixelCount, AuxColumn::MapSum];
     // The numbers per gradient record: nine, one more for the error, and another for the weight of scores.
-    let asked = [
+    let cases = [
         (needs(&[]), 9),
         (needs(&[Signal::WeightedError]), 10),
         (needs(&[Signal::Position, Signal::Colour]), 9),
@@ -38,7 +38,7 @@ fn device_allocations_match_the_ledger() {
         ),
     ];
     for (device, (needs, numbers)) in
-        devices_by_accumulation().flat_map(|device| asked.iter().map(move |asked| (device, asked)))
+        devices_by_accumulation().flat_map(|device| cases.iter().map(move |case| (device, case)))
     {
         let camera = scenes::camera(40, 30, 32);
         let model = scenes::cloud(20, 3, &camera, 42);

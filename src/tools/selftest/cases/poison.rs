@@ -4,7 +4,7 @@ use super::GREEN;
 use crate::compare::class;
 use crate::reference::CLASSES;
 use crate::scenes;
-use crate::trial::{Trial, count_non_finite, count_different};
+use crate::trial::{Trial, count_different, count_non_finite};
 use crate::values::{EXTREMES, POISON, SLOTS, remove, slot_mut, slot_name};
 use densify_core::gaussians::Gaussians;
 use densify_render::{BackendError, Differentiable};
@@ -26,7 +26,8 @@ pub(super) fn poisoned(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = scenes::camera(49, 40, 19);
     let model = scenes::cloud(SOUND, 3, &camera, 32);
     let upstream = scenes::narrowed(&scenes::upstream(&camera, 5));
-    let run = |backend: &mut dyn Differentiable| backend.differentiate(&camera, GREEN, 3, &upstream);
+    let run =
+        |backend: &mut dyn Differentiable| backend.differentiate(&camera, GREEN, 3, &upstream);
     // The bits of the image and of the gradients of the sound rows.
     let bits = |backend: &mut dyn Differentiable| -> Result<Vec<u32>, BackendError> {
         let (image, gradient) = run(backend)?;
@@ -68,7 +69,11 @@ pub(super) fn poisoned(trial: &mut Trial<'_>) -> Result<(), BackendError> {
                 let row = SOUND - 1 + slot;
                 let own = &all[row * per_row..(row + 1) * per_row];
                 let label = format!("{value:e} in {}", slot_name(slot));
-                trial.count(&label, "NaN or infinity in its own gradient", count_non_finite(&[own]));
+                trial.count(
+                    &label,
+                    "NaN or infinity in its own gradient",
+                    count_non_finite(&[own]),
+                );
             }
         }
     }

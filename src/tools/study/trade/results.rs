@@ -92,7 +92,7 @@ impl Results {
         })
     }
 
-    /// Mean of a quantity over the runs with a factor at a level in a scene; `None` if it was not measured in every run.
+    /// Mean of a quantity over the runs with a factor at a level in a scene; `None` if any run did not measure it.
     pub(super) fn mean(
         &self,
         scene: &str,
