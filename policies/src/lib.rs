@@ -39,7 +39,7 @@
 //!
 //! 1. **A manual page**: the leading `//!` block, with a table of the parameters. `densify policies NAME`
 //!    prints it, and [`conformance::check_manual`] compares it with the code. A cell in the column `range` holds
-//!    `>= a`, `> a`, `a to b` (with `, a excluded`, `, b excluded` or `, both excluded` if need be), a list of
+//!    `>= a`, `> a`, `a to b` (optionally followed by `, a excluded`, `, b excluded` or `, both excluded`), a list of
 //!    words, or nothing.
 //! 2. **Parameters**: a struct with defaults, which `--policy-set NAME.parameter=value` overrides. Those
 //!    listed in [`STEP_PARAMETERS`](registry::ConfiguredPolicy::STEP_PARAMETERS), as a step or an interval,

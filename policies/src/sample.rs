@@ -37,7 +37,7 @@ pub fn smallest(rows: Vec<u32>, values: &[f32], k: usize) -> Vec<u32> {
 /// Draws `k` distinct rows without replacement, each with a probability proportional to its weight among the
 /// remaining ones. Returned in the order drawn; fewer than `k` if fewer weights are positive.
 ///
-/// The rows with the smallest −ln(u) / weight are drawn; this is an exponential variable whose rate is the
+/// The rows with the smallest keys −ln(u) / weight are drawn; a key is an exponential variable whose rate is the
 /// weight (Efraimidis and Spirakis, *Weighted random sampling with a reservoir*, 2006). Rows with zero,
 /// negative or NaN weights are never drawn; those with infinite weights always come first.
 pub fn weighted(weights: &[f32], k: usize, rng: &PolicyRng) -> Vec<u32> {

@@ -9,7 +9,7 @@
 //! ## Method
 //!
 //! **Growth** is that of `vanilla`, with its parameters: clones and splits by screen gradient, pruning by
-//! opacity and size, opacity resets, and a hard stop at the budget (or `governor`).
+//! opacity and size, opacity resets, and a hard stop at the budget (with `governor`, a growth curve).
 //!
 //! **Mask.** Each Gaussian has a parameter m, initially `mask_start`. The Gaussian is rendered with opacity and
 //! scales multiplied by 1\[σ(m) > `min_mask`\], whose derivative is taken to be that of σ(m)

@@ -55,7 +55,7 @@
 //!   - `long-axis`: two halves along the parent's longest axis that keep its two ends, with `child_opacity`
 //!     times the parent's opacity, as in `igs`. With d = `split_share` they are placed at ±3d standard
 //!     deviations; their longest axis is 1 − d times the parent's, the others √(1 − d²).
-//! - `shift`: the offset of a clone from its parent. Σ sums over the views since the last growth, dL/dμ is
+//! - `shift`: the offset of a clone from its parent. Σ sums over the views since the last growth step, dL/dμ is
 //!   the loss gradient with respect to the mean, s the parent's largest standard deviation. Splits
 //!   are not shifted.
 //!   - `descent`: −`kappa` · s · Σ dL/dμ / Σ |dL/dμ|: against the gradient, by at most `kappa` · s, and by
@@ -73,8 +73,8 @@
 //!   - `fresh`: `fresh_views` random training views, rendered for each event that may evict, as in the
 //!     code. This costs up to a hundred renders per growth step, and a Gaussian visible only in other views
 //!     counts as unimportant.
-//! - `reinit_at`: at this step the whole model is replaced, as the code does at step 5000 of outdoor
-//!   scenes (after Mini-Splatting). All training views are rendered; in each,
+//! - `reinit_at`: at this step the whole model is replaced, as the code does at step 5000 for outdoor
+//!   scenes, following Mini-Splatting. All training views are rendered; in each,
 //!   ⌊`reinit_share` · budget / views⌋ pixels (at least 1) are drawn without replacement in proportion
 //!   to their accumulated alpha. Each becomes a Gaussian with the ground-truth colour at the point where
 //!   its ray is closest to the Gaussian with the largest blend weight. Its size is the root mean
@@ -128,7 +128,7 @@
 //! | error | "l1-dssim" | l1-dssim, l1, grad | | error that ranks pixels |
 //! | depth | "max-weight" | max-weight, median | | surface point on a pixel's ray |
 //! | nms | true | | | non-maximum suppression of pixels |
-//! | min_alpha | 0.5 | 0 to 1 | | smallest accumulated alpha of a pixel |
+//! | min_alpha | 0.5 | 0 to 1 | | smallest accumulated alpha of a collected pixel |
 //! | newborn_size | "pixel" | pixel, code | | size of inserted Gaussians |
 //! | size_pixels | 2.0 | > 0 | pixels | size of inserted Gaussians for `pixel` |
 //! | newborn_opacity | 0.1 | 0 to 1, both excluded | | opacity of inserted Gaussians |
@@ -283,8 +283,7 @@ impl DensityPolicy for Diet {
             return Ok(());
         }
         self.weight_max.resize(view.rows, 0.0);
-        for (max, &weight) in self.weight_max.iter_mut().zip(view.column(AuxColumn::WeightMax)?)
-        {
+        for (max, &weight) in self.weight_max.iter_mut().zip(view.column(AuxColumn::WeightMax)?) {
             *max = max.max(weight);
         }
         Ok(())

@@ -17,8 +17,8 @@
 //! and yield fewer and smoother Gaussians.
 //!
 //! **Growth** is that of `vanilla`, with its parameters, but ends later and has longer intervals: clones and
-//! splits by screen gradient, pruning by opacity and size, opacity resets, and a hard stop at the budget (or
-//! `governor`).
+//! splits by screen gradient, pruning by opacity and size, opacity resets, and a hard stop at the budget
+//! (with `governor`, a growth curve).
 //!
 //! **Pruning.** A Gaussian's influence is the sum of its blend weights α·T over all pixels of the views
 //! trained on since the last prune, or since it was created. Every `prune_every` steps before `prune_until`,

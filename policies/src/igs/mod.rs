@@ -47,8 +47,8 @@
 //!   in a run of any length.
 //! - The published code splits, then prunes. A plan has one edit per Gaussian: if a Gaussian is drawn and
 //!   its children would be pruned in the same event, it is pruned itself. The result is the same.
-//! - `recover` counts optimiser steps and does not scale with the length of the run, but is at most half
-//!   the interval of resets, so that the prune comes before the next reset.
+//! - `recover` is a number of optimiser steps, so it does not scale with the length of the run; it is at most
+//!   half the interval of resets, so that the prune comes before the next reset.
 //! - The published code averages gradients from step 500 on; here the first growth step averages over
 //!   all steps before it.
 //! - The published code divides edge scores by their mean over all Gaussians; here the mean is over the
@@ -342,9 +342,8 @@ impl Igs {
         if self.is_recovery_prune(now.step) {
             plan.cause("recovery-prune");
             let children = drawn.iter().map(|row| &after[*row as usize]);
-            let left = after.iter().chain(children).copied().filter(|&o| o >= min_opacity);
-            min_opacity =
-                limit_of_share(left.collect(), self.params.recovery_share).max(min_opacity);
+            let left = after.iter().chain(children).copied().filter(|&o| o >= limit);
+            limit = limit_of_share(left.collect(), self.params.recovery_share).max(limit);
         }
         let is_kept = |row: &u32| after[*row as usize] >= limit;
         let mut dead: Vec<u32> = (0..now.rows() as u32).filter(|row| !is_kept(row)).collect();

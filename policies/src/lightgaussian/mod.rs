@@ -10,7 +10,7 @@
 //! ## Method
 //!
 //! **Growth** is that of `vanilla`, with its parameters: clones and splits by screen gradient, pruning by
-//! opacity and size, opacity resets, and a hard stop at the budget (or `governor`). It ends at
+//! opacity and size, opacity resets, and a hard stop at the budget (with `governor`, a growth curve). It ends at
 //! `grow_until`, before the first prune.
 //!
 //! **Pruning.** With `schedule = "twice"`, the share `first_share` of all Gaussians is pruned at step
@@ -25,7 +25,7 @@
 //! if both prunes fall on one step, only the first takes place.
 //!
 //! - `hit` is the contribution of a pixel: `opacity`, the opacity o, as in the published code; or
-//!   `blend-weight`, the Gaussian's weight α·T in it, so that a Gaussian hidden behind others counts less.
+//!   `blend-weight`, the Gaussian's weight α·T in the pixel, so that a Gaussian hidden behind others counts less.
 //!   The paper uses the opacity times the transmittance T; the blend weight also falls off towards the
 //!   Gaussian's edge. The published figures are for `opacity`, the default.
 //! - `volume` is V: `plain`, as in the published code; or `clipped`, as in the paper, min(V / V90, 1),
@@ -43,8 +43,8 @@
 //!
 //! - The published code divides V by a volume V_ref that 90 % of the Gaussians exceed. V_ref is the same for
 //!   all Gaussians and does not change their order, so it is left out.
-//! - ⌊share · N⌋ of N Gaussians are pruned; the published code also prunes those of equal significance.
-//!   The last Gaussian is never pruned.
+//! - ⌊share · N⌋ of N Gaussians are pruned; the published code also prunes the others whose
+//!   significance is that of the last pruned one. The last Gaussian is never pruned.
 //! - Training views that nearly duplicate another are not rendered (`--full` renders all).
 //! - The published pipeline continues with distilled spherical harmonics and quantised vectors. They reduce
 //!   the file size of a finished model and are not part of density control.

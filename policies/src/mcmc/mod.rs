@@ -278,7 +278,7 @@ impl Mcmc {
 /// The opacity, at least `least`, of each of `members` equal rows that replace one of opacity
 /// `opacity`, and the factor on their standard deviations.
 fn share(opacity: f64, members: u32, least: f64) -> (f64, f64) {
-    // The largest number below 1 as an f32.
+    // Just below 1, also as an f32.
     let most = 1.0 - f64::from(f32::EPSILON);
     let opacity = opacity.clamp(0.0, most);
     let share = (1.0 - (1.0 - opacity).powf(1.0 / f64::from(members))).clamp(least, most);

@@ -1,7 +1,7 @@
 //! # merit — replaces all hardly visible Gaussians
 //!
-//! Fills the budget slowly and keeps replacing: Gaussians that are hardly visible in any view make room for
-//! children of Gaussians that have large gradients in several views. The number of replacements adapts to
+//! Fills the budget slowly and keeps replacing Gaussians: those that are hardly visible in any view make room for
+//! children of those with large gradients in several views. The number of replacements adapts to
 //! the scene: the more Gaussians are badly placed, the more are replaced.
 //!
 //! Source: our own; docs/comparison.md has the figures. The turnover, the gradient with its colour term and the

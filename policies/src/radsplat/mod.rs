@@ -10,7 +10,7 @@
 //! ## Method
 //!
 //! **Growth** is that of `vanilla`, with its parameters: clones and splits by screen gradient, pruning by
-//! opacity and size, opacity resets, and a hard stop at the budget (or `governor`). It ends at
+//! opacity and size, opacity resets, and a hard stop at the budget (with `governor`, a growth curve). It ends at
 //! `grow_until`, before the first prune.
 //!
 //! **Pruning.** At the steps `first_at` and `second_at` all training views are rendered. A Gaussian's

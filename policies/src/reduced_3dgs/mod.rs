@@ -9,7 +9,7 @@
 //! ## Method
 //!
 //! **Growth** is that of `vanilla`, with its parameters: clones and splits by screen gradient, pruning by
-//! opacity and size, opacity resets, and a hard stop at the budget (or `governor`).
+//! opacity and size, opacity resets, and a hard stop at the budget (with `governor`, a growth curve).
 //!
 //! **Redundancy.** No view can separate Gaussians within one pixel. Each Gaussian therefore has a sphere
 //! around its mean with radius r = √3/2 · p, half the diagonal of a cube with edge p, where p is the smallest
