@@ -155,7 +155,7 @@ mod tests {
     use super::*;
     use crate::models::tests::model;
 
-    /// Colour of a Gaussian from a direction.
+    /// Colour of a Gaussian in a direction.
     fn shown(model: &Gaussians, row: usize, d: DVec3) -> [f64; 3] {
         let mut y = [0f32; 16];
         y[0] = sh::C0;

@@ -1,4 +1,4 @@
-//! What files state about a model's antialiasing beside its Gaussians.
+//! What files state about a model's antialiasing, in addition to its Gaussians.
 //!
 //! | file | statement |
 //! |---|---|

@@ -12,7 +12,7 @@ use densify_core::files;
 /// Longest number accepted in an ascii file `[bytes]`.
 const MAX_WORD: usize = 128;
 
-/// A PLY file with its header read.
+/// A PLY file whose header has been read.
 pub(crate) struct Ply<'a> {
     path: &'a Path,
     input: BufReader<File>,

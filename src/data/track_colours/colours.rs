@@ -28,7 +28,7 @@ pub(super) struct Observation {
 /// Peak memory for reading and measuring the colours of tracks, in addition to an image `[bytes]`.
 pub fn bytes(tracks: &Tracks) -> u64 {
     let colours: usize = tracks.views.iter().map(Vec::len).sum();
-    // The observations, and two differences per channel of each, of which medians are taken.
+    // The observations and, for each, two differences per channel, whose medians are taken.
     (colours * (size_of::<Observation>() + 6 * size_of::<f32>())) as u64
 }
 

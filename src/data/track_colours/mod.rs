@@ -6,8 +6,8 @@
 //! of differences are excluded:
 //!
 //! - Reconstructed points lie on edges and corners, where the colour changes more within a pixel than by any highlight.
-//!   So the difference is the distance of the track's colour (the median over its views) from the range of *all*
-//!   colours within a pixel.
+//!   The difference in a view is therefore the distance of the track's colour (the median over its views) from the
+//!   range of *all* colours within a pixel.
 //! - The point may be occluded in some views. The quarter of its views that differ most is ignored.
 //! - The point may not lie on a surface. A point counts as on a surface if most views show the colour that the
 //!   reconstruction gives it; if fewer than half of all points do, no decision is made.
@@ -29,7 +29,7 @@ pub use colours::{TrackColours, bytes};
 
 /// Smallest number of measured tracks for a decision.
 pub const MIN_TRACKS: usize = 500;
-/// The 95th percentiles from which on degrees 1, 2 and 3 are chosen `[1/255]`, fitted to the scenes of
+/// The smallest 95th percentiles for which degrees 1, 2 and 3 are chosen `[1/255]`, fitted to the scenes of
 /// `docs/studies/sh-degree-auto.tsv`.
 const THRESHOLDS: [f64; 3] = [1.0, 2.0, 3.0];
 /// Largest difference between a point's colour in the reconstruction and in a view, if the point lies on a surface

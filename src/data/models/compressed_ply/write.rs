@@ -1,7 +1,7 @@
 //! Writes compressed splat PLY.
 //!
-//! A coefficient is a byte that stands for a value between −4 and 4, but never for 0. Coefficients of 0, as in bands
-//! that were not trained, alternate between the two nearest values, so that the colour is right on average.
+//! A byte stands for a coefficient between −4 and 4, but never for 0. Coefficients of 0, as in bands that were not
+//! trained, alternate between the two nearest values, so that the colour is right on average.
 
 use std::io::{self, Write};
 
@@ -93,7 +93,7 @@ impl ModelWriter for CompressedPlyWriter {
                 }
             }
             if self.open.len() == CHUNK {
-                self.close();
+                self.pack_chunk();
             }
         }
         Ok(())
@@ -101,7 +101,7 @@ impl ModelWriter for CompressedPlyWriter {
 
     fn finish(&mut self, out: &mut dyn Write) -> io::Result<()> {
         if !self.open.is_empty() {
-            self.close();
+            self.pack_chunk();
         }
         for value in self.chunks.as_flattened() {
             out.write_all(&value.to_le_bytes())?;
@@ -115,7 +115,7 @@ impl ModelWriter for CompressedPlyWriter {
 
 impl CompressedPlyWriter {
     /// Packs the open chunk.
-    fn close(&mut self) {
+    fn pack_chunk(&mut self) {
         let mut bounds = [0.0; BOUNDS.len()];
         for (axis, at) in (0..9).map(|axis| (axis, axis / 3 * 6 + axis % 3)) {
             let values = || self.open.iter().map(|row| row[axis]);

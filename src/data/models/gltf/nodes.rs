@@ -34,7 +34,7 @@ impl Node {
     }
 }
 
-/// The meshes below the roots, or of all nodes if there are no roots, each with its transform into the frame of the
+/// The meshes below the roots, or of all nodes if no roots are given, each with its transform into the frame of the
 /// other formats.
 pub(super) fn placed_meshes(
     path: &Path,

@@ -9,13 +9,13 @@ use std::collections::BinaryHeap;
 
 use Predictor::{Above, Left, Mean, Select};
 
-/// Symbols of each channel's code; green shares its code with the lengths of references, which are not used.
+/// Number of symbols in each channel's code; green shares its code with the lengths of references, which are not used.
 const SYMBOLS: [usize; 4] = [280, 256, 256, 256];
-/// Symbols of the code of distances.
+/// Number of symbols in the code of distances.
 const DISTANCES: usize = 40;
 /// Channels of RGBA in the order of their codes.
 const CHANNELS: [usize; 4] = [1, 0, 2, 3];
-/// Longest code word.
+/// Length of the longest code word `[bits]`.
 const MAX_BITS: u8 = 15;
 /// Order in which the code of lengths stores its own lengths.
 const LENGTH_ORDER: [usize; 19] =
@@ -38,15 +38,15 @@ struct Transforms {
     predictor: Option<Predictor>,
 }
 
-/// A stream of bits, the lowest first.
+/// Writes a stream of bits, the lowest first.
 #[derive(Default)]
-struct Bits {
+struct BitWriter {
     bytes: Vec<u8>,
     pending: u64,
     count: u32,
 }
 
-impl Bits {
+impl BitWriter {
     fn put(&mut self, value: u64, bits: u8) {
         self.pending |= value << self.count;
         self.count += u32::from(bits);
@@ -82,7 +82,7 @@ pub(super) fn encode(rgba: &[u8], (width, height): (usize, usize)) -> Vec<u8> {
     let none = Transforms { subtracts_green: false, predictor: None };
     let transforms = best.map_or(none, |(_, transforms)| transforms);
 
-    let mut to = Bits::default();
+    let mut to = BitWriter::default();
     to.put(0x2f, 8);
     to.put(width as u64 - 1, 14);
     to.put(height as u64 - 1, 14);
@@ -189,14 +189,14 @@ fn entropy(counts: &[u32]) -> f64 {
 }
 
 /// Writes a code with one symbol, whose code word has no bits.
-fn put_single(to: &mut Bits, symbol: u8) {
+fn put_single(to: &mut BitWriter, symbol: u8) {
     // A simple code with one symbol of eight bits.
     to.put(0b101, 3);
     to.put(symbol.into(), 8);
 }
 
 /// Writes a code for values with these counts; returns the bits and the length of each code word.
-fn put_code(to: &mut Bits, counts: &[u32], symbols: usize) -> Vec<(u16, u8)> {
+fn put_code(to: &mut BitWriter, counts: &[u32], symbols: usize) -> Vec<(u16, u8)> {
     let used: Vec<usize> = (0..counts.len()).filter(|&symbol| counts[symbol] > 0).collect();
     if let [] | [_] = used[..] {
         put_single(to, used.first().map_or(0, |&symbol| symbol as u8));
@@ -210,7 +210,7 @@ fn put_code(to: &mut Bits, counts: &[u32], symbols: usize) -> Vec<(u16, u8)> {
 }
 
 /// Writes the lengths of a code's words, which are themselves coded, with runs of zeros.
-fn put_lengths(to: &mut Bits, lengths: &[u8]) {
+fn put_lengths(to: &mut BitWriter, lengths: &[u8]) {
     // A symbol, then its extra bits and their number.
     let mut tokens: Vec<(usize, u64, u8)> = Vec::new();
     let mut rest = lengths;
@@ -245,13 +245,13 @@ fn put_lengths(to: &mut Bits, lengths: &[u8]) {
     }
 }
 
-/// The lengths of a Huffman code (1952) with words of at most `most` bits; 0 for values that do not occur. The counts
-/// are flattened until no word is too long.
-fn code_lengths(counts: &[u32], most: u8) -> Vec<u8> {
+/// The lengths of a Huffman code (1952) with words of at most `max_bits` bits; 0 for values that do not occur. The
+/// counts are flattened until no word is too long.
+fn code_lengths(counts: &[u32], max_bits: u8) -> Vec<u8> {
     let mut counts = counts.to_vec();
     loop {
         let lengths = huffman(&counts);
-        if lengths.iter().all(|length| *length <= most) {
+        if lengths.iter().all(|length| *length <= max_bits) {
             return lengths;
         }
         for count in counts.iter_mut().filter(|count| **count > 0) {

@@ -21,8 +21,8 @@ use densify_core::image::Image8;
 use scene_cache::Entry;
 pub use scene_cache::cache_folder;
 
-/// Upper bound on the memory while the search tree of a surface is built, as a multiple of the finished surface or of
-/// its file: a triangle takes 86 bytes in the file, up to 200 while the tree is built, and 100 afterwards.
+/// Upper bound on the memory for building a surface's search tree, as a multiple of the size of the surface or its
+/// file: a triangle takes 86 bytes in the file, up to 200 while the tree is built, and 100 afterwards.
 const BUILD_FACTOR: u64 = 4;
 
 /// A rendered built-in scene.
@@ -34,7 +34,7 @@ struct Rendered {
     points: InitPoints,
 }
 
-/// Metadata of a scene, available without building it.
+/// Metadata of a scene, which the cache holds beside the images and points.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 struct About {
     views: Vec<RenderedView>,
@@ -57,10 +57,10 @@ pub(in crate::dataset) fn load(
     let preset: PresetSpec = name.parse()?;
     let entry = options.cache.as_deref();
     let entry = entry.and_then(|folder| Entry::new(folder, &preset.to_string(), &parameters));
-    let kept = entry.as_ref().and_then(Entry::read);
-    // Another program may have written an entry with another number of images.
-    if let Some(kept) = kept.filter(|kept| kept.frames.len() == kept.about.views.len()) {
-        return dataset(path, kept, options);
+    let cached = entry.as_ref().and_then(Entry::read);
+    // Another program may have written an entry in which images are missing.
+    if let Some(cached) = cached.filter(|cached| cached.frames.len() == cached.about.views.len()) {
+        return dataset(path, cached, options);
     }
     let scene = Scene::prepare(&source, &parameters)?;
     let (frames, points) = render(&scene);
@@ -73,7 +73,7 @@ pub(in crate::dataset) fn load(
     dataset(path, rendered, options)
 }
 
-/// Renders all views and collects points; depths and normals, which only the points need, are dropped.
+/// Renders all views and collects points. Depths, normals and triangles are then dropped, as nothing else needs them.
 fn render(scene: &Scene) -> (Vec<Frame>, InitPoints) {
     let mut collector = scene.point_collector();
     let mut frames = Vec::with_capacity(scene.views.len());
@@ -97,8 +97,8 @@ impl Dataset {
     /// When the surface exists but cannot be read.
     pub fn ground_truth(&self) -> Result<Option<GroundTruth>, LoadError> {
         if let Some(unpacked) = &self.unpacked {
-            let found = GroundTruth::open(unpacked.folder());
-            return found
+            let surface = GroundTruth::open(unpacked.folder());
+            return surface
                 .map_err(|error| LoadError::Data(unpacked.with_archive_name(&error.to_string())));
         }
         let Some(name) = super::name(&self.root) else { return Ok(GroundTruth::open(&self.root)?) };
