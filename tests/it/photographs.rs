@@ -99,9 +99,8 @@ fn shots() -> &'static [Shot] {
         let mut backend = make(&Subject::NATIVE, &blobs());
         let shoot = |view: usize| {
             let camera = camera(view);
-            let rendering =
-                backend.render(&camera, [0.0; 3], 0).expect("a small image is rendered");
-            Shot { camera, rgb: rendering.rgb, alpha: rendering.alpha }
+            let image = backend.render(&camera, [0.0; 3], 0).expect("a small image is rendered");
+            Shot { camera, rgb: image.rgb, alpha: image.alpha }
         };
         (0..VIEWS).map(shoot).collect()
     })

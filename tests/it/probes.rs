@@ -41,11 +41,7 @@ fn needs() -> Needs {
 }
 
 /// The state of a run after [`MEASURED_AT`] steps with or without measurements.
-fn state_of_run(
-    backend: Box<dyn Backend>,
-    dataset: &Dataset,
-    measures: bool,
-) -> (Gaussians, Vec<Tensor>) {
+fn state(backend: Box<dyn Backend>, dataset: &Dataset, measures: bool) -> (Gaussians, Vec<Tensor>) {
     let scene = SceneInfo {
         extent: 1.0,
         train_views: dataset.train.len() as u32,
@@ -90,7 +86,7 @@ fn measuring_does_not_change_the_run() {
     for (subject, storage) in stored.into_iter().chain(device) {
         let [without, with] = [false, true].map(|measures| {
             let setup = Setup { storage, needs: needs(), ..Setup::default() };
-            state_of_run(make_with(&subject, &model, setup), &dataset, measures)
+            state(make_with(&subject, &model, setup), &dataset, measures)
         });
         assert!(with == without, "{}, {storage:?}", subject.name());
     }

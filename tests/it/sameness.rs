@@ -50,20 +50,16 @@ fn bits((image, gradient): &(Rendering, ModelGradient)) -> Vec<u32> {
 /// Renders once, then trains.
 fn run(backend: &mut dyn Differentiable, camera: &Camera) -> Run {
     let degree = backend.sh_degree();
-    let image_bits = bits(&differentiate(backend, camera, degree));
+    let bits = bits(&differentiate(backend, camera, degree));
     let (_, target) = scenes::noisy((camera.width, camera.height), 0.0, 3);
     let step = |n| backend.train_step(&step_input(n, camera, &target, degree));
     let outputs: Vec<_> = (1..=4).map(step).collect::<Result<_, _>>().expect("small images");
-    (image_bits, backend.download().expect("a model"), outputs)
+    (bits, backend.download().expect("a model"), outputs)
 }
 
 /// Clears the number of bands, which may differ.
-fn without_bands((image_bits, model, outputs): Run) -> Run {
-    (
-        image_bits,
-        model,
-        outputs.into_iter().map(|output| StepOutput { bands: 1, ..output }).collect(),
-    )
+fn without_bands((bits, model, outputs): Run) -> Run {
+    (bits, model, outputs.into_iter().map(|output| StepOutput { bands: 1, ..output }).collect())
 }
 
 /// Covers all kinds of parameter storage and equal depths.

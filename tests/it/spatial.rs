@@ -205,11 +205,10 @@ fn rows_are_split_moved_and_painted_by_position() {
                 let offset =
                     [0, 1, 2].map(|i| f64::from(after.means[part][i] - model.means[row][i]));
                 // Half a standard deviation along the second axis, which the rotation turns into the third.
-                let second_axis = column(model.quats[row], 1);
-                let along: f64 = (0..3).map(|i| offset[i] * second_axis[i]).sum();
+                let axis = column(model.quats[row], 1);
+                let along: f64 = (0..3).map(|i| offset[i] * axis[i]).sum();
                 assert!((along.abs() - 0.5 * f64::from(b).exp()).abs() < 1e-5, "row {part}");
-                let turned: f64 =
-                    (0..3).map(|i| column(after.quats[part], 2)[i] * second_axis[i]).sum();
+                let turned: f64 = (0..3).map(|i| column(after.quats[part], 2)[i] * axis[i]).sum();
                 assert!((turned + 1.0).abs() < 1e-5, "row {part}: {turned}");
             }
             next += 1;

@@ -84,8 +84,7 @@ pub fn merge(
         }
     }
     if rows > plan.rows {
-        let message =
-            format!("{rows} Gaussians, but the plan allows only {}; this is a bug", plan.rows);
+        let message = format!("{rows} Gaussians, but the plan allows {}; this is a bug", plan.rows);
         return Err(Failure::new(OTHER, message));
     }
     let antialiasing = first_antialiasing.unwrap_or_default();

@@ -116,14 +116,12 @@ mod tests {
                 .iter()
                 .any(|known| names.iter().any(|name| name.contains(known)))
         });
-        let path_options: Vec<&str> = paths.map(|arg| arg.get_id().as_str()).collect();
-        assert!(path_options.len() > PATHS.len(), "{path_options:?}");
+        let paths: Vec<&str> = paths.map(|arg| arg.get_id().as_str()).collect();
+        assert!(paths.len() > PATHS.len(), "{paths:?}");
         // `exposure_model` is an enumeration, and the output folder is not published at all.
         let others = ["exposure_model", "output"];
-        let unknown: Vec<_> = path_options
-            .iter()
-            .filter(|name| !PATHS.contains(name) && !others.contains(name))
-            .collect();
+        let unknown: Vec<_> =
+            paths.iter().filter(|name| !PATHS.contains(name) && !others.contains(name)).collect();
         assert!(unknown.is_empty(), "{unknown:?} may hold a path of this machine");
     }
 

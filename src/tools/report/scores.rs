@@ -152,11 +152,7 @@ fn tabulate_scene(scene: &Scene, runs: &[RunRecord]) -> Markup {
         }
         if scene.groups.len() > 1 {
             let is_first = std::ptr::eq(group, first);
-            row.push(if is_first {
-                DASH.to_owned()
-            } else {
-                difference_from_first(group, first, runs)
-            });
+            row.push(if is_first { DASH.to_owned() } else { psnr_difference(group, first, runs) });
         }
         row
     };
@@ -180,13 +176,12 @@ fn values_by_seed(
 
 /// Formats the mean with its interval, as `30.12 [29.95, 30.29]`.
 fn format_mean(values: &[Pair<'_>], digits: usize) -> String {
-    let Some(difference) = Difference::new(values) else { return DASH.to_owned() };
-    let within =
-        difference.format_interval(|[low, high]| format!("{low:.digits$}, {high:.digits$}"));
-    format!("{:.digits$}{within}", difference.mean)
+    let Some(value) = Difference::new(values) else { return DASH.to_owned() };
+    let interval = value.format_interval(|[low, high]| format!("{low:.digits$}, {high:.digits$}"));
+    format!("{:.digits$}{interval}", value.mean)
 }
 
-fn difference_from_first(group: &Group, first: &Group, runs: &[RunRecord]) -> String {
+fn psnr_difference(group: &Group, first: &Group, runs: &[RunRecord]) -> String {
     let psnr = |run: &RunRecord| run.score().map(|mean| mean.psnr);
     let base = values_by_seed(first, runs, psnr);
     let pair = |pair: Pair<'static>| {

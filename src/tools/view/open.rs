@@ -97,11 +97,10 @@ pub fn open(
         loaded
     } else if is_run(path) {
         let (model, config, iteration) = read_run(path, iteration, antialias, observer)?;
-        let is_dataset_given = dataset.is_some();
+        let is_given = dataset.is_some();
         let folder = dataset.unwrap_or_else(|| config.scene_path());
-        let dataset = load(&folder, &config.spec.data, observer).map_err(|failure| {
-            if is_dataset_given { failure } else { or_moved(failure, &folder) }
-        })?;
+        let dataset = load(&folder, &config.spec.data, observer)
+            .map_err(|failure| if is_given { failure } else { or_moved(failure, &folder) })?;
         near = near_plane_of_run(&config, &dataset, observer);
         let mut loaded = scene_of_dataset(machine, path, dataset, &config.spec.data);
         let name = format!("{}, iteration {iteration}", names[0]);

@@ -168,10 +168,7 @@ mod tests {
             let unfinished =
                 measured.backend.as_ref().map(|backend| backend.download().expect("a model"));
             assert_eq!(unfinished.is_none(), views == 2, "the backend outlives the last view");
-            assert!(
-                unfinished.is_none_or(|unfinished| unfinished == model),
-                "measuring changed the model"
-            );
+            assert!(unfinished.is_none_or(|rest| rest == model), "measuring changed the model");
         }
         let before = (measured.weight.clone(), measured.gradient.clone());
         measured.measure_more(&scene, 0, Duration::ZERO).expect("nothing to do");

@@ -151,13 +151,7 @@ fn check_images(table: &mut Table, case: &Case, camera: usize, results: &Results
 
 /// Stored statistics omit pixels near a threshold, but computed ones cannot. Each must lie between the stored value and
 /// that value plus the largest possible contribution of the omitted pixels.
-fn check_statistics(
-    table: &mut Table,
-    case: &Case,
-    camera: usize,
-    results: &Results,
-    tolerance: f64,
-) {
+fn check_statistics(table: &mut Table, case: &Case, camera: usize, results: &Results, limit: f64) {
     let splats = project(&Model::from(&case.model), view(case, camera), &Rules::STANDARD);
     let away = case.away_from_thresholds(camera);
     let leeways = leeway(&splats, &by_depth(&splats), view(case, camera), &away);
@@ -166,10 +160,10 @@ fn check_statistics(
     for (row, &(max, sum, pixels)) in leeways.iter().enumerate() {
         let least = stored("max_weight", row);
         let error = beyond(results.max_weight[row], least, least.max(max));
-        table.check(&case.name, "max_weight", error, tolerance);
+        table.check(&case.name, "max_weight", error, limit);
         let least = stored("sum_weight", row);
         let error = beyond(results.sum_weight[row], least, least + sum) / least.max(1.0);
-        table.check(&case.name, "sum_weight", error, tolerance);
+        table.check(&case.name, "sum_weight", error, limit);
         let least = stored("n_pixels", row);
         let error = beyond(results.pixels[row], least, least + f64::from(pixels));
         table.check(&case.name, "n_pixels", error, 0.0);

@@ -68,11 +68,10 @@ pub(super) fn moments(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         }
     }
     // The audit reports exactly the row whose moment overflows.
-    let reported = backend.audit()?;
+    let audit = backend.audit()?;
     let is_expected =
         |u: &densify_render::NonFinite| u.row == OVERFLOWING && u.kind == NumberKind::Moment;
-    let wrong =
-        usize::from(reported.is_empty()) + reported.iter().filter(|u| !is_expected(u)).count();
+    let wrong = usize::from(audit.is_empty()) + audit.iter().filter(|u| !is_expected(u)).count();
     trial.count("gradient 1e30", "Gaussians missed or wrongly reported by the audit", wrong);
     let mut plan = EditPlan::new(backend.rows(), backend.budget());
     let _ = plan.prune(OVERFLOWING);

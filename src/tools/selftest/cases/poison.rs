@@ -69,11 +69,7 @@ pub(super) fn poisoned(trial: &mut Trial<'_>) -> Result<(), BackendError> {
                 let row = SOUND - 1 + slot;
                 let own = &all[row * per_row..(row + 1) * per_row];
                 let label = format!("{value:e} in {}", slot_name(slot));
-                trial.count(
-                    &label,
-                    "NaN or infinity in its own gradient",
-                    count_non_finite(&[own]),
-                );
+                trial.count(&label, "NaN or infinity in its gradient", count_non_finite(&[own]));
             }
         }
     }

@@ -103,12 +103,7 @@ pub(super) fn needles(trial: &mut Trial<'_>) -> Result<(), BackendError> {
             let log_scales = measured.log_scales[0].map(f64::from);
             let found = by_covariance(&model, log_scales, measured.quats[0].map(f64::from));
             let exact = by_covariance(&model, expected.log_scales[0], expected.quats[0]);
-            trial.record(
-                &label,
-                "gradient of the covariance",
-                relative_error(&found, &exact),
-                1e-3,
-            );
+            trial.record(&label, "covariance gradient", relative_error(&found, &exact), 1e-3);
         }
     }
     // The exponent may be off by 1e-2 here, and alpha with it.

@@ -154,13 +154,9 @@ impl Comparison {
         for variant in &variants {
             variant.check(smallest, self.iterations)?;
         }
-        let test_iterations =
-            (1..EVALUATIONS).map(|i| i64::from((self.iterations * i / EVALUATIONS).max(1)));
-        let shared = Partial::option(
-            "test_iterations",
-            test_iterations.map(Value::from).collect::<Vec<_>>(),
-        )
-        .over(shared);
+        let steps = (1..EVALUATIONS).map(|i| i64::from((self.iterations * i / EVALUATIONS).max(1)));
+        let shared = Partial::option("test_iterations", steps.map(Value::from).collect::<Vec<_>>())
+            .over(shared);
         let mut runs = Vec::new();
         for seed in 0..self.seeds {
             for ((scene, label), budgets) in self.scenes.iter().zip(&labels).zip(&budgets) {
