@@ -108,7 +108,7 @@ struct RayPacket<'a> {
 }
 
 impl<'a> RayPacket<'a> {
-    /// Prepares a packet; `None` for a single ray, or if the largest components of the directions differ in axis or sign.
+    /// Prepares a packet; `None` for a single ray, or if the directions' largest components differ in axis or sign.
     fn new(rays: &'a [LocalRay]) -> Option<Self> {
         if !(2..=LANES).contains(&rays.len()) {
             return None;
@@ -279,8 +279,8 @@ impl Surface {
         best
     }
 
-    /// Finds the rays that have an occluder (see [`Surface::occluder`]), of at most [`LANES`] rays; returns them as bits.
-    /// The triangle in slot `hint` is tested first; `hint` is set to the slot of the last occluder found.
+    /// The rays that have an occluder (see [`Surface::occluder`]), of at most [`LANES`] rays, as bits. The triangle in
+    /// slot `hint` is tested first; `hint` is set to the slot of the last occluder found.
     pub(crate) fn occluded_each(
         &self,
         rays: &[LocalRay],

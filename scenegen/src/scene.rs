@@ -281,8 +281,8 @@ impl Scene {
             return Ok(());
         }
         Err(Error::Input(format!(
-            "{}: none of the {} views shows a surface: the cameras look past the mesh or at the backs of one-sided faces, or \
-             its materials are transparent; choose another --rig or --radius, or correct the materials",
+            "{}: none of the {} views shows a surface: the cameras look past the mesh or at the backs of one-sided \
+             faces, or its materials are transparent; choose another --rig or --radius, or correct the materials",
             self.name,
             self.views.len()
         )))

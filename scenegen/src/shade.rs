@@ -217,8 +217,8 @@ impl Lighting {
         diffuse + self.specular_bounce(shaded, seen, sampling)
     }
 
-    /// Radiance from a direction: that of the sky or, with `bounce`, of the directly lit surface in front of it. Without
-    /// `bounce`, surfaces are black.
+    /// Radiance from a direction: that of the sky or, with `bounce`, of the directly lit surface in front of it.
+    /// Without `bounce`, surfaces are black.
     fn incoming(
         &self,
         shaded: &ShadedSurface<'_>,
@@ -523,7 +523,7 @@ impl TrianglePoint<'_> {
         (bump.x * tangent + bump.y * bitangent + bump.z * normal).normalize_or(normal)
     }
 
-    /// The direction of increasing u, and the handedness, 1 or −1; `None` if the texture coordinates do not define them.
+    /// The direction of increasing u, and the handedness, 1 or −1; `None` if texture coordinates do not define them.
     fn tangent_of_uvs(&self, texture: &TextureRef) -> Option<(Vec3, f32)> {
         let uvs = &self.model.uvs[texture.uv_set.min(1)];
         let [ta, tb, tc] = self.indices.map(|i| uvs.get(i).map(|&uv| texture.transformed(uv)));

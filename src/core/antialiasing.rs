@@ -1,9 +1,9 @@
 //! The antialiasing that a model was trained with: how renderers treat Gaussians that are smaller than a pixel.
 //!
-//! Every renderer widens a projected Gaussian of covariance S `[px²]` to B = S + κ·I, so that it covers about a pixel.
-//! With antialiasing, the renderer also multiplies the opacity by ρ = √(det S / det B), so that the widening adds no light (Yu et al.,
-//! *Mip-Splatting*, CVPR 2024, equation 9). A model must be rendered as it was trained: without ρ, the small Gaussians
-//! of an antialiased model are too opaque.
+//! Every renderer widens a projected Gaussian of covariance S `[px²]` to B = S + κ·I, so that it covers about a
+//! pixel. With antialiasing, the renderer also multiplies the opacity by ρ = √(det S / det B), so that the widening
+//! adds no light (Yu et al., *Mip-Splatting*, CVPR 2024, equation 9). A model must be rendered as it was trained:
+//! without ρ, the small Gaussians of an antialiased model are too opaque.
 
 use std::fmt::{self, Display};
 use std::str::FromStr;

@@ -152,7 +152,8 @@ impl Reader<'_> {
                 }
             },
         };
-        let mut reference = TextureRef { uv_set: uv_set as usize, sampler, ..TextureRef::new(number) };
+        let mut reference =
+            TextureRef { uv_set: uv_set as usize, sampler, ..TextureRef::new(number) };
         if let Some(t) = used.transform {
             let ([x, y], [sx, sy], angle) = (t.offset.0, t.scale.0, t.rotation.0);
             // The rotation is counter-clockwise in an image whose v points down.

@@ -21,8 +21,8 @@ use crate::resource::{self, EXPANSION, MAX_DECODED};
 
 /// Largest radiance: the largest half float.
 const BRIGHTEST: f32 = 65_504.0;
-/// Number of columns of the reduced image that is averaged; it has half as many rows. `CELLS` and `AVERAGES` are sufficient
-/// for the sharpest lobe, which is about 20 degrees wide.
+/// Number of columns of the reduced image that is averaged; it has half as many rows. `CELLS` and `AVERAGES` are
+/// sufficient for the sharpest lobe, which is about 20 degrees wide.
 const CELLS: usize = 96;
 /// Number of columns of a blurred copy.
 const AVERAGES: usize = 48;

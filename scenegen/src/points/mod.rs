@@ -50,7 +50,7 @@ pub struct InitPoints {
     pub positions: Vec<DVec3>,
     /// sRGB colours. Shape: `[points]`.
     pub colours: Vec<[u8; 3]>,
-    /// World positions on the surface, from which `positions` differ by noise or, for outliers, by a random displacement.
+    /// World positions on the surface, from which `positions` differ by noise or, for outliers, by a displacement.
     /// Image features are projections of these. Shape: `[points]`.
     pub found_at: Vec<DVec3>,
     /// Indices of the training views that see each point of `found_at` and have its point of `positions` in front of

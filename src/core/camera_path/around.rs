@@ -44,8 +44,8 @@ impl Rig {
         let centre = mean(&Camera::centre);
         let forward = mean(&Camera::forward).normalize_or(cameras[0].forward());
         let up = mean(&|camera| -camera.rotation.row(1)).normalize_or(-cameras[0].rotation.row(1));
-        // The point x nearest to all lines of sight (camera centre c, direction f) solves Σ (I − ffᵀ)(x − c) = 0. A small
-        // weight on the mean position keeps the system solvable when all cameras look the same way.
+        // The point x nearest to all lines of sight (camera centre c, direction f) solves Σ (I − ffᵀ)(x − c) = 0. A
+        // small weight on the mean position keeps the system solvable when all cameras look the same way.
         let (mut matrix, mut rhs) = (DMat3::IDENTITY * 1e-9, centre * 1e-9);
         for camera in cameras {
             let f = camera.forward();

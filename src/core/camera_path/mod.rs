@@ -48,9 +48,9 @@ impl Keyframe {
 }
 
 impl CameraPath {
-    /// Interpolates the camera of frame `frame`, counted from 0, of `frames`. A loop's last frame is one step before its
-    /// first; any other path ends at its last keyframe. Positions, rotations and fields of view follow a Catmull-Rom spline,
-    /// so that speed is continuous.
+    /// Interpolates the camera of frame `frame`, counted from 0, of `frames`. A loop's last frame is one step before
+    /// its first; any other path ends at its last keyframe. Positions, rotations and fields of view follow a
+    /// Catmull-Rom spline, so that speed is continuous.
     pub fn frame(&self, frame: u32, frames: u32) -> Keyframe {
         let count = self.keyframes.len();
         let (steps, intervals) =

@@ -98,8 +98,8 @@ impl Ledger {
         }
     }
 
-    /// Peak memory `[bytes]`: that of the process itself plus that of the largest phase (loading, training, or measuring
-    /// after training).
+    /// Peak memory `[bytes]`: that of the process itself plus that of the largest phase (loading, training, or
+    /// measuring after training).
     pub fn total(&self) -> u64 {
         peak(&self.lines.iter().collect::<Vec<_>>())
     }
@@ -111,7 +111,7 @@ impl Ledger {
         peak(&lines.collect::<Vec<_>>())
     }
 
-    /// Sum of all buffers in GPU memory `[bytes]`. They stay allocated from the start of training to the end of the run.
+    /// Sum of all buffers in GPU memory `[bytes]`. They stay allocated from the start of training to the run's end.
     pub fn on_device(&self) -> u64 {
         sum(self.lines.iter().filter(|line| line.on_device).map(|line| line.bytes))
     }
@@ -129,8 +129,8 @@ fn peak(lines: &[&LedgerLine]) -> u64 {
 /// Finds the lines whose buffers exist at the peak: those of the process and those of the largest phase.
 ///
 /// Only the largest line counts in each of [`Section::Passing`], [`Section::Before`] and [`Section::After`], as the
-/// buffers of such a section never coexist. Buffers in GPU memory coexist with those of [`Section::After`], but not with
-/// those of [`Section::Before`].
+/// buffers of such a section never coexist. Buffers in GPU memory coexist with those of [`Section::After`], but not
+/// with those of [`Section::Before`].
 fn held_at_peak(lines: &[&LedgerLine]) -> Vec<bool> {
     let largest = |section| {
         let indices = (0..lines.len()).filter(|&i| lines[i].section == section);
