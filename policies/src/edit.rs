@@ -307,7 +307,7 @@ mod tests {
         let clone = crate::adc::clone_at([0.0; 3]);
         assert_eq!(clone.bad_field(), None);
         assert_eq!(Offspring { children: 0, ..clone }.bad_field(), Some("children"));
-        let at = |placement| Offspring { placement, ..clone }.bad_field();
+        let placed = |placement| Offspring { placement, ..clone }.bad_field();
         let scaled = |scale| Offspring { scale, ..clone }.bad_field();
         let opaque = |opacity| Offspring { opacity, ..clone }.bad_field();
         for bad in not_positive() {
@@ -320,14 +320,14 @@ mod tests {
             assert_eq!(opaque(OpacityRule::Scaled(bad)), Some("opacity"), "{bad}");
         }
         for bad in NOT_FINITE {
-            assert_eq!(at(Placement::LongAxis { sigmas: bad }), Some("placement"), "{bad}");
-            assert_eq!(at(Placement::Offset([0.0, bad, 0.0])), Some("placement"), "{bad}");
-            assert_eq!(at(Placement::Axes([0.0, 0.0, bad])), Some("placement"), "{bad}");
+            assert_eq!(placed(Placement::LongAxis { sigmas: bad }), Some("placement"), "{bad}");
+            assert_eq!(placed(Placement::Offset([0.0, bad, 0.0])), Some("placement"), "{bad}");
+            assert_eq!(placed(Placement::Axes([0.0, 0.0, bad])), Some("placement"), "{bad}");
             let turned = Offspring { turn: [1.0, bad, 0.0, 0.0], ..clone };
             assert_eq!(turned.bad_field(), Some("turn"), "{bad}");
         }
         assert_eq!(Offspring { turn: [0.0; 4], ..clone }.bad_field(), Some("turn"));
-        assert_eq!(at(Placement::LongAxis { sigmas: -1.0 }), Some("placement"));
+        assert_eq!(placed(Placement::LongAxis { sigmas: -1.0 }), Some("placement"));
         assert_eq!(opaque(OpacityRule::Set(1.0)), Some("opacity"));
         assert_eq!(opaque(OpacityRule::Scaled(1.0)), None);
     }

@@ -52,10 +52,10 @@ impl<'a> Neighbours<'a> {
     /// 0 if there are none.
     ///
     /// # Panics
-    /// When there is no such point.
+    /// When `index` is not the index of a point.
     pub fn mean_square_distance(&self, index: usize) -> f64 {
-        let mut found = [NOT_FOUND; AVERAGED];
-        let found = self.nearest(index, &mut found).iter();
+        let mut buffer = [NOT_FOUND; AVERAGED];
+        let found = self.nearest(index, &mut buffer).iter();
         let (count, sum) = found.fold((0.0, 0.0), |(n, sum), near| (n + 1.0, sum + near.square));
         if count > 0.0 { sum / count } else { 0.0 }
     }
@@ -137,9 +137,9 @@ fn split(points: &[[f64; 3]], order: &mut [u32], axes: &mut [u8]) {
     }
     let middle = order.len() / 2;
     let width = |axis: usize| {
-        let at = order.iter().map(|&index| points[index as usize][axis]);
+        let xs = order.iter().map(|&index| points[index as usize][axis]);
         let (low, high) =
-            at.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), x| (low.min(x), high.max(x)));
+            xs.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), x| (low.min(x), high.max(x)));
         high - low
     };
     let widths = [width(0), width(1), width(2)];

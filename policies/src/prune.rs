@@ -68,8 +68,8 @@ impl Victims {
     /// # Panics
     /// For `Lowest`, when `measure` has fewer values than the model has rows.
     pub fn prune(self, plan: &mut EditPlan, measure: &[f32], count: usize, rng: &PolicyRng) {
-        let left = plan.rows() - plan.pruned();
-        let count = count.min(left.saturating_sub(1));
+        let rows_left = plan.rows() - plan.pruned();
+        let count = count.min(rows_left.saturating_sub(1));
         let rows = 0..plan.rows() as u32;
         let victims = match self {
             Self::Lowest => {

@@ -45,12 +45,13 @@ pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Resu
     let events = due.len().min(scenario.max_events());
     for (event, &step) in due.iter().take(events).enumerate() {
         let rows = model.rows;
-        let at = |(check, reason): Failure| (check, format!("step {step}, {rows} rows: {reason}"));
+        let locate =
+            |(check, reason): Failure| (check, format!("step {step}, {rows} rows: {reason}"));
         if event == events / 3 || event == 2 * events / 3 {
-            copies.push((Check::RestoresState, restored(&*policy, build()?).map_err(at)?));
+            copies.push((Check::RestoresState, restored(&*policy, build()?).map_err(locate)?));
         }
         let ops = run_event(&mut *policy, &mut copies, &needs, scenario, &mut model, step);
-        let ops = ops.map_err(at)?;
+        let ops = ops.map_err(locate)?;
         edits |= ops.edits_rows();
         model.apply(&ops);
     }

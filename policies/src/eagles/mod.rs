@@ -178,8 +178,8 @@ impl DensityPolicy for Eagles {
         if step >= whole_from {
             return 1.0;
         }
-        let done = f64::from(step) / f64::from(whole_from);
-        (1.0 - (1.0 - first) * 0.5 * (1.0 + (PI * done).cos())).clamp(first, 1.0)
+        let progress = f64::from(step) / f64::from(whole_from);
+        (1.0 - (1.0 - first) * 0.5 * (1.0 + (PI * progress).cos())).clamp(first, 1.0)
     }
 
     fn plan(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {

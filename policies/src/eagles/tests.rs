@@ -35,16 +35,16 @@ fn the_least_influential_rows_are_pruned_and_sums_are_reset() {
 
 #[test]
 fn the_resolution_rises_along_half_a_cosine() {
-    let at = |set: &str, step| {
+    let factor = |set: &str, step| {
         let policy = build("eagles", set, &Event::new(1, 1, 1).scene);
         (policy.resolution(step) * 1e6).round() / 1e6
     };
     // 1 − 0.7·½·(1 + cos(π·t/21,000)): 1 − 0.7·¾ at a third, 1 − 0.35 at half, 1 − 0.7·¼ at two thirds of 21,000.
-    let factors = [0, 7000, 10_500, 14_000, 20_999, 21_000, 30_000].map(|step| at("", step));
+    let factors = [0, 7000, 10_500, 14_000, 20_999, 21_000, 30_000].map(|step| factor("", step));
     assert_eq!(factors, [0.3, 0.475, 0.65, 0.825, 1.0, 1.0, 1.0]);
-    assert_eq!([1, 500].map(|step| at("whole_from = 0", step)), [1.0, 1.0]);
-    assert_eq!(at("first_resolution = 1.0", 1), 1.0);
-    assert_eq!(at("first_resolution = 0.5\nwhole_from = 100", 50), 0.75);
+    assert_eq!([1, 500].map(|step| factor("whole_from = 0", step)), [1.0, 1.0]);
+    assert_eq!(factor("first_resolution = 1.0", 1), 1.0);
+    assert_eq!(factor("first_resolution = 0.5\nwhole_from = 100", 50), 0.75);
     let scene = Event::new(1, 1, 1).scene;
     let declared = |set: &str| build("eagles", set, &scene).needs(&scene).least_resolution;
     assert_eq!(declared(""), Some(0.3));

@@ -53,7 +53,7 @@ fn only_candidates_with_edges_are_split() {
         split
     };
     assert_eq!((sorted(14_500), sorted(14_600)), (vec![0, 2], vec![0, 1, 2, 3]));
-    let none = event.with(Signal::ScreenGradientAbs, &[7.9e-4; 4]);
+    let below_tau = event.with(Signal::ScreenGradientAbs, &[7.9e-4; 4]);
     assert!(run(&Event { step: 14_600, ..none }, "").split.is_empty());
 }
 
@@ -105,8 +105,8 @@ fn faint_rows_are_pruned_at_each_growth_step_and_first_at_step_300() {
     // and the one remaining row is split, not the pruned ones, which have stronger edges.
     let budget = 24;
     let edges = vec![view(&[1e9, 1.0, 1e9, 1e9])];
-    let both = Event { step: 600, budget, views: edges, ..event };
-    let both = run(&both, "first_prune_at = 600");
+    let event = Event { step: 600, budget, views: edges, ..event };
+    let both = run(&event, "first_prune_at = 600");
     assert_eq!((both.pruned, both.split), (vec![0, 2, 3], vec![1]));
 }
 
@@ -136,15 +136,15 @@ fn rows_are_split_before_they_are_pruned() {
 
 #[test]
 fn the_last_growth_step_prunes_nothing() {
-    let at = |step, set: &str| {
+    let pruned = |step, set: &str| {
         let faint = event(step, &[0.0; 2], 9).with(Signal::Opacity, &[0.5, 0.004]);
         run(&faint.with_all(Signal::ScreenGradientAbs, 0.0), set).pruned
     };
-    assert_eq!([at(14_800, ""), at(14_900, "")], [vec![1], vec![]]);
-    assert_eq!(at(14_900, "prune_last = true"), [1]);
+    assert_eq!([pruned(14_800, ""), pruned(14_900, "")], [vec![1], vec![]]);
+    assert_eq!(pruned(14_900, "prune_last = true"), [1]);
     // In a shorter run, of 7,000 iterations, growth ends before step 3,500.
     let short = "grow_until = 3500\ngrow_from = 117";
-    assert_eq!([at(3_300, short), at(3_400, short)], [vec![1], vec![]]);
+    assert_eq!([pruned(3_300, short), pruned(3_400, short)], [vec![1], vec![]]);
     // A split row with children of 0.6 · 0.004 is kept, too. NaN is still pruned.
     let split = event(14_900, &[1.0; 2], 9).with(Signal::Opacity, &[0.004, f32::NAN]);
     let done = run(&split, "");
@@ -221,18 +221,18 @@ fn the_limit_is_the_first_value_at_or_above_the_quantile() {
 
 #[test]
 fn opacities_are_reset_four_times() {
-    let at = |step| run(&event(step, &[1.0], 10), "").ops.clamp_opacity;
+    let limit = |step| run(&event(step, &[1.0], 10), "").ops.clamp_opacity;
     let four = [3000, 6000, 9000, 12_000];
-    assert_eq!(four.map(at), [Some(0.05); 4]);
-    assert_eq!([at(3100), at(14_900)], [None; 2]);
+    assert_eq!(four.map(limit), [Some(0.05); 4]);
+    assert_eq!([limit(3100), limit(14_900)], [None; 2]);
     let scene = Event::new(1, 1, 1).scene;
     let due = |set: &str, scene| {
         due_steps("igs", &format!("grow_every = 0\nfirst_prune_at = 0\n{set}"), scene)
     };
     assert_eq!(due("", &scene), [3000, 3300, 6000, 6300, 9000, 12_000]);
     assert_eq!(due("resets = 2", &scene), [3000, 3300, 6000, 6300]);
-    let all = "resets = 9\nrecoveries = 9";
-    assert_eq!(due(all, &scene), [3000, 3300, 6000, 6300, 9000, 9300, 12_000, 12_300]);
+    let nine = "resets = 9\nrecoveries = 9";
+    assert_eq!(due(nine, &scene), [3000, 3300, 6000, 6300, 9000, 9300, 12_000, 12_300]);
     // No recovery prune without a reset.
     assert_eq!(due("resets = 1\nrecoveries = 9", &scene), [3000, 3300]);
     assert_eq!(due("recovery_share = 0", &scene), four);
@@ -251,8 +251,8 @@ fn all_views_are_rendered_after_a_recovery_prune() {
     };
     assert_eq!(views(u32::MAX), [3400, 6400]);
     // The growth steps from 600 to 14,500 except these two.
-    let some = views(10);
-    assert_eq!((some.len(), some[0], some.last()), (138, 600, Some(&14_500)));
+    let ten_views = views(10);
+    assert_eq!((ten_views.len(), ten_views[0], ten_views.last()), (138, 600, Some(&14_500)));
 }
 
 #[test]

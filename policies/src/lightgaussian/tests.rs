@@ -87,12 +87,12 @@ fn the_largest_tenth_of_volumes_is_clipped() {
     volume[8] = 64_f32.powi(10);
     volume[9] = 128_f32.powi(10);
     let event = event(16_000, 20).with(Signal::ScaleProduct, &volume);
-    let at = |set: &str| {
+    let factors = |set: &str| {
         let all = significance(&event, set, &[2.0; 20]);
         [6, 7, 8, 9].map(|row: usize| (all[row] * 1e4).round() / 1e4)
     };
-    assert_eq!(at(""), [1.0, 32.0, 64.0, 128.0]);
-    assert_eq!(at("volume = \"clipped\""), [1.0, 32.0, 32.0, 32.0]);
+    assert_eq!(factors(""), [1.0, 32.0, 64.0, 128.0]);
+    assert_eq!(factors("volume = \"clipped\""), [1.0, 32.0, 32.0, 32.0]);
     assert_eq!(percentile_90(&[1.0, 3.0, 2.0]), 3.0);
     assert_eq!(percentile_90(&[1.0, 9.0, 3.0, 2.0, 0.0, 0.0, 0.0, 0.0, 8.0, 0.0]), 8.0);
     assert!(percentile_90(&[]).is_infinite());
@@ -107,18 +107,18 @@ fn rows_with_nan_have_no_significance() {
 #[test]
 fn the_published_shares_leave_30_percent() {
     // 1,000 → 500 → 300, the second share being 0.5·0.8; once: 1,000 → 340.
-    let at = |step, rows: usize, set: &str| {
+    let rows_after = |step, rows: usize, set: &str| {
         let mut event = event(step, rows);
         event.views = vec![view(&vec![1.0; rows], &vec![1.0; rows])];
         run(&event, set).ops.rows_after
     };
-    assert_eq!([at(16_000, 1000, ""), at(24_000, 500, "")], [500, 300]);
-    assert_eq!(at(20_000, 1000, "schedule = \"once\""), 340);
+    assert_eq!([rows_after(16_000, 1000, ""), rows_after(24_000, 500, "")], [500, 300]);
+    assert_eq!(rows_after(20_000, 1000, "schedule = \"once\""), 340);
     // ⌊0.5·7⌋ = 3.
-    assert_eq!(at(16_000, 7, ""), 4);
+    assert_eq!(rows_after(16_000, 7, ""), 4);
     // The last row is kept.
-    assert_eq!(at(16_000, 7, "first_share = 1.0"), 1);
-    assert_eq!(at(16_000, 1, ""), 1);
+    assert_eq!(rows_after(16_000, 7, "first_share = 1.0"), 1);
+    assert_eq!(rows_after(16_000, 1, ""), 1);
 }
 
 #[test]

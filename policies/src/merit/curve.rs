@@ -21,7 +21,7 @@ impl Merit {
     /// within the limits of `rho` and `most_rho`.
     pub(super) fn turnover(&self, now: &Snapshot<'_>, plan: &EditPlan) -> PolicyResult<usize> {
         let MeritParams { rho, most_rho, replaceable, .. } = self.params;
-        let part = |share| event_quota(share, self.events, now.step, plan.budget());
+        let quota = |share| event_quota(share, self.events, now.step, plan.budget());
         let importance = now.signal(Signal::WeightMax)?;
         let limit = replaceable as f32 * median(importance);
         let age = self.ages(now)?;
@@ -29,7 +29,7 @@ impl Merit {
             plan.is_free(row) && self.is_old(age, row) && importance[row as usize] < limit
         };
         let unimportant = (0..now.rows() as u32).filter(is_unimportant).count();
-        Ok(unimportant.min(part(most_rho)).max(part(rho)))
+        Ok(unimportant.min(quota(most_rho)).max(quota(rho)))
     }
 }
 

@@ -113,14 +113,14 @@ fn parents_are_ranked_by_mean_screen_and_colour_gradients() {
         .with(Signal::ScreenGradientAbs, &[4.0, 1.5, 8.0, 0.0])
         .with(Signal::ScreenGradient, &[0.1, 0.0, 0.0, 0.9])
         .with(Signal::ColourGradient, &[0.0, 0.06, 0.0, 0.0]);
-    let one = |set: &str| run(&event, &format!("curve_until = 8500\n{set}")).cloned;
-    assert_eq!(one("colour_weight = 30.0"), [1]);
-    assert_eq!(one(""), [0]);
-    assert_eq!(one("least_views = 0"), [2]);
-    assert_eq!(one("gradient = \"screen\""), [3]);
-    let more = Event { budget: 9, ..event.clone() };
+    let parent = |set: &str| run(&event, &format!("curve_until = 8500\n{set}")).cloned;
+    assert_eq!(parent("colour_weight = 30.0"), [1]);
+    assert_eq!(parent(""), [0]);
+    assert_eq!(parent("least_views = 0"), [2]);
+    assert_eq!(parent("gradient = \"screen\""), [3]);
+    let roomy = Event { budget: 9, ..event.clone() };
     // A row without a gradient has no children.
-    let all = run(&more, "curve_until = 8500\nleast_views = 0").cloned;
+    let all = run(&roomy, "curve_until = 8500\nleast_views = 0").cloned;
     assert_eq!(all, [2, 0, 1]);
 }
 

@@ -233,8 +233,8 @@ fn signals_are_reset_alone_or_all_together() {
         plan.compile().reset_signals
     };
     let only = |signals: &[Signal]| Reset::Only(signals.iter().copied().collect());
-    let some = reset(&[only(&[Signal::WeightSum]), only(&[Signal::VisibleCount])]);
-    assert_eq!(some, SignalSet::from([Signal::VisibleCount, Signal::WeightSum]));
+    let two = reset(&[only(&[Signal::WeightSum]), only(&[Signal::VisibleCount])]);
+    assert_eq!(two, SignalSet::from([Signal::VisibleCount, Signal::WeightSum]));
     // Signals of the current state and signals kept per epoch are not reset.
     assert!(reset(&[only(&[Signal::Opacity, Signal::WeightMax])]).is_empty());
     let all = reset(&[only(&[Signal::WeightSum]), Reset::Signals]);
