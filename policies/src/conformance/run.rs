@@ -45,8 +45,7 @@ pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Resu
     let events = due.len().min(scenario.max_events());
     for (event, &step) in due.iter().take(events).enumerate() {
         let rows = model.rows;
-        let locate =
-            |(check, reason): Failure| (check, format!("step {step}, {rows} rows: {reason}"));
+        let locate = |(check, e): Failure| (check, format!("step {step}, {rows} rows: {e}"));
         if event == events / 3 || event == 2 * events / 3 {
             copies.push((Check::RestoresState, restored(&*policy, build()?).map_err(locate)?));
         }
