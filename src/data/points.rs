@@ -36,9 +36,9 @@ impl PointCloud {
         self.positions.is_empty()
     }
 
-    /// At most `most` of the points, at equal intervals in their order.
-    pub fn thinned(&self, most: usize) -> Self {
-        let stride = self.len().div_ceil(most.max(1)).max(1);
+    /// At most `limit` of the points, at equal intervals in their order.
+    pub fn thinned(&self, limit: usize) -> Self {
+        let stride = self.len().div_ceil(limit.max(1)).max(1);
         Self {
             positions: self.positions.iter().copied().step_by(stride).collect(),
             colours: self.colours.iter().copied().step_by(stride).collect(),

@@ -26,7 +26,7 @@ const MAX_FILES: usize = 4_000_000;
 const MAX_OUTER_FOLDERS: usize = 8;
 /// Names of files and folders that operating systems add to archives.
 const SYSTEM_FILES: [&str; 4] = ["__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini"];
-const REMEDY: &str = "pack the folder again, or unpack the archive and give the unpacked folder instead";
+const REMEDY: &str = "pack the folder again, or unpack the archive and give that folder instead";
 
 /// The files of an archive in a temporary folder, which is removed when this value is dropped.
 #[derive(Debug)]

@@ -185,8 +185,8 @@ impl ImageSource {
             decoded.apply_orientation(turn);
         }
         if (decoded.width(), decoded.height()) != (header.width, header.height) {
-            let found = (decoded.width(), decoded.height());
-            return Err(LoadError::size(&self.file.path, found, (header.width, header.height)));
+            let size = (decoded.width(), decoded.height());
+            return Err(LoadError::size(&self.file.path, size, (header.width, header.height)));
         }
         let mut image = pack(decoded);
         if let Some(mask) = &self.mask {

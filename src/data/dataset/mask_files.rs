@@ -56,11 +56,11 @@ fn precedence(name: &str) -> Option<usize> {
 pub(super) fn folders(dataset: &Path) -> Vec<String> {
     let entries = dataset.read_dir().into_iter().flatten().flatten();
     let names = entries.filter_map(|entry| entry.file_name().into_string().ok());
-    let mut found: Vec<String> =
+    let mut folders: Vec<String> =
         names.filter(|name| is_mask_folder(name) && dataset.join(name).is_dir()).collect();
     // Names in lower case come first.
-    found.sort_by_cached_key(|name| (precedence(name), std::cmp::Reverse(name.clone())));
-    found
+    folders.sort_by_cached_key(|name| (precedence(name), std::cmp::Reverse(name.clone())));
+    folders
 }
 
 /// Note about a folder of masks, for datasets in which no photograph has a mask.

@@ -153,8 +153,8 @@ impl Normalisation {
             return model.with_origin(origin);
         }
         for row in 0..model.len() {
-            let place = point(DVec3::from(model.position(row)));
-            model.means[row] = (place - DVec3::from(origin)).as_vec3().to_array();
+            let moved = point(DVec3::from(model.position(row)));
+            model.means[row] = (moved - DVec3::from(origin)).as_vec3().to_array();
         }
         model.origin = origin;
         for value in model.log_scales.as_flattened_mut() {

@@ -288,12 +288,12 @@ fn photograph(
 }
 
 /// Checks that a mask has the proportions of its photograph.
-fn check_mask(mask: &Mask, found: ImageHeader, image: ImageHeader) -> Result<(), LoadError> {
-    let (found, size) = ((found.width, found.height), (image.width, image.height));
-    if is_proportional(found, size) {
+fn check_mask(mask: &Mask, header: ImageHeader, image: ImageHeader) -> Result<(), LoadError> {
+    let (size, expected) = ((header.width, header.height), (image.width, image.height));
+    if is_proportional(size, expected) {
         return Ok(());
     }
-    Err(LoadError::size(&mask.file.path, found, size))
+    Err(LoadError::size(&mask.file.path, size, expected))
 }
 
 /// Returns true if a mask hides all of a view; `several` is true if its photograph has more than one view.

@@ -45,8 +45,8 @@ impl SeenDepths {
 
     /// The depth below which this share of the measured depths lies; `None` if no camera sees a point.
     pub fn quantile(&self, share: f64) -> Option<f64> {
-        let place = (share * self.0.len() as f64) as usize;
-        self.0.get(place).map(|&depth| f64::from(depth))
+        let index = (share * self.0.len() as f64) as usize;
+        self.0.get(index).map(|&depth| f64::from(depth))
     }
 
     /// The share of the measured depths that are below `depth`.

@@ -111,10 +111,10 @@ impl TrackSampler {
 }
 
 fn keep_every_second<T>(values: &mut Vec<T>) {
-    let mut place = 0;
+    let mut index = 0;
     values.retain(|_| {
-        place += 1;
-        place % 2 == 1
+        index += 1;
+        index % 2 == 1
     });
 }
 

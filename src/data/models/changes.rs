@@ -43,11 +43,11 @@ impl Changes {
         }
         let (axes, bases) = (middles_and_spreads(model), bases(model.sh_degree));
         let mut total = f64::MIN_POSITIVE;
-        for (place, &row) in order.iter().enumerate() {
+        for (index, &row) in order.iter().enumerate() {
             let weight = weight(model, row, &axes);
             total += weight;
             let mut is_changed = false;
-            let row_changes = row_changes(model, row, saved, place, &bases);
+            let row_changes = row_changes(model, row, saved, index, &bases);
             for (at, (change, (.., limit))) in row_changes.into_iter().zip(QUANTITIES).enumerate() {
                 // The change is NaN if both values are infinite.
                 if change > limit || change.is_nan() {
@@ -93,21 +93,21 @@ fn row_changes(
     model: &Gaussians,
     row: usize,
     saved: &Gaussians,
-    place: usize,
+    index: usize,
     bases: &[[f32; 16]],
 ) -> [f64; 4] {
-    let [old, new] = [&model.log_scales[row], &saved.log_scales[place]].map(|logs| logs.map(size));
+    let [old, new] = [&model.log_scales[row], &saved.log_scales[index]].map(|logs| logs.map(size));
     // The thinnest axis of a flat Gaussian is visible only from its edge, so the middle axis sets the scale.
     let middle = sorted(old)[1];
     let shift = (0..3).map(|axis| {
-        let [a, b] = [&model.means[row], &saved.means[place]].map(|mean| f64::from(mean[axis]));
+        let [a, b] = [&model.means[row], &saved.means[index]].map(|mean| f64::from(mean[axis]));
         (a - b).powi(2)
     });
     let scale = (0..3).map(|axis| (new[axis] - old[axis]).abs() / old[axis].max(middle));
-    let [was, is] = [model.opacity_logits[row], saved.opacity_logits[place]]
+    let [was, is] = [model.opacity_logits[row], saved.opacity_logits[index]]
         .map(|logit| f64::from(sigmoid(logit)));
     let colour = bases.iter().map(|basis| {
-        let [a, b] = [model.sh_of(row), saved.sh_of(place)].map(|sh| colour(sh, basis));
+        let [a, b] = [model.sh_of(row), saved.sh_of(index)].map(|sh| colour(sh, basis));
         (0..3).map(|channel| f64::from(a[channel] - b[channel]).powi(2)).sum::<f64>()
     });
     [

@@ -89,9 +89,9 @@ impl Coarseness {
     /// Measures a whole model.
     pub fn measure(model: &Gaussians) -> Self {
         let (middle, spread) = middle_and_largest_spread(model);
-        let mut found = Self::default();
-        found.add(model, middle.to_array(), spread);
-        found
+        let mut coarseness = Self::default();
+        coarseness.add(model, middle.to_array(), spread);
+        coarseness
     }
 
     /// Adds rows of a scene with this middle and extent `[world units]`, from which a Gaussian's distance from the

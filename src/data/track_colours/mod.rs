@@ -67,7 +67,7 @@ impl Spread {
 /// Measures how much the colours of tracks change with the view, after correcting exposures.
 pub fn measure(tracks: &Tracks, colours: &TrackColours) -> Spread {
     let (mut each, mut on_surface, mut buffer) = (Vec::new(), 0, Vec::new());
-    for (place, seen) in colours.by_track().enumerate() {
+    for (index, seen) in colours.by_track().enumerate() {
         let Some(first) = seen.first() else { continue };
         let own = tracks.colours[first.track as usize].map(f32::from);
         let mut differences = |from: [f32; 3]| -> Vec<f64> {
@@ -80,15 +80,15 @@ pub fn measure(tracks: &Tracks, colours: &TrackColours) -> Spread {
         };
         let to_own = differences(own);
         on_surface += usize::from(to_own[(to_own.len() - 1) / 2] < SAME_COLOUR * SAME_COLOUR);
-        let to_reference = differences(colours.reference(place));
+        let to_reference = differences(colours.reference(index));
         let counted = ((to_reference.len() as f64 * AGREEING).round() as usize).max(1);
         let sum: f64 = to_reference.iter().take(counted).sum();
         each.push((sum / counted as f64).sqrt());
     }
     each.sort_unstable_by(f64::total_cmp);
     let percentile = |fraction: f64| {
-        let place = (fraction * each.len().saturating_sub(1) as f64).round() as usize;
-        each.get(place).copied().unwrap_or(0.0)
+        let index = (fraction * each.len().saturating_sub(1) as f64).round() as usize;
+        each.get(index).copied().unwrap_or(0.0)
     };
     let tracks = each.len().max(1) as f64;
     Spread {

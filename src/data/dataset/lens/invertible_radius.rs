@@ -87,9 +87,9 @@ fn lower_bound(polynomial: &[f64], from: f64, to: f64) -> f64 {
     }
     let length = to - from;
     let (mut bound, mut power) = (0.0, 1.0);
-    for (place, &coefficient) in shifted.iter().enumerate() {
+    for (index, &coefficient) in shifted.iter().enumerate() {
         // The constant counts whatever its sign is; `coefficient.min(0.0)` would hide NaN.
-        let least = if place > 0 && coefficient > 0.0 { 0.0 } else { coefficient };
+        let least = if index > 0 && coefficient > 0.0 { 0.0 } else { coefficient };
         bound += least * power;
         power *= length;
     }

@@ -110,10 +110,10 @@ impl Distortion {
     /// Sets the coefficient of a term.
     pub(crate) fn set(&mut self, term: Term, value: f64) {
         match term {
-            A(place) => self.radial[place] = value,
-            B(place) => self.denominator[place] = value,
-            P(place) => self.tangential[place] = value,
-            S(place) => self.prism[place] = value,
+            A(index) => self.radial[index] = value,
+            B(index) => self.denominator[index] = value,
+            P(index) => self.tangential[index] = value,
+            S(index) => self.prism[index] = value,
             // For ω = 0 the model is a pinhole.
             Omega if value == 0.0 => {}
             Omega => self.plane = Projection::Fov(value),

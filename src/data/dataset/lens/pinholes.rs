@@ -138,7 +138,7 @@ fn inscribed(
     let row = SAMPLES as usize + 1;
     let (mut low, mut high) = (DVec2::NEG_INFINITY, DVec2::INFINITY);
     for at in 0..row {
-        let border = |place: usize| seen[place].1.ok().map(&flat);
+        let border = |index: usize| seen[index].1.ok().map(&flat);
         low.x = low.x.max(border(at * row)?.x);
         high.x = high.x.min(border(at * row + row - 1)?.x);
         low.y = low.y.max(border(at)?.y);
@@ -159,10 +159,10 @@ fn visible_part(
     let step = (within.high - within.low) / CELLS as f64;
     let at = |x: usize, y: usize| within.low + step * DVec2::new(x as f64, y as f64);
     let is_seen = |x, y| {
-        let place = lens.project(turn * at(x, y).extend(1.0));
+        let pixel = lens.project(turn * at(x, y).extend(1.0));
         // The ray of a border pixel is projected back to the border up to rounding.
         let inside = |p: DVec2| (p.cmpge(DVec2::splat(-1e-6)) & p.cmple(lens.size() + 1e-6)).all();
-        place.is_some_and(inside)
+        pixel.is_some_and(inside)
     };
     let row = CELLS + 1;
     let corners: Vec<bool> = (0..row * row).map(|i| is_seen(i % row, i / row)).collect();

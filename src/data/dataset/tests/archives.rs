@@ -265,7 +265,7 @@ fn damaged_archives_are_refused() {
         let archive = Packed::new(&whole[..kept]);
         let message = archive.load().unwrap_err().to_string();
         assert!(message.contains("my scan.zip"), "{kept}: {message}");
-        let remedy = "pack the folder again, or unpack the archive and give the unpacked folder instead";
+        let remedy = "pack the folder again, or unpack the archive and give that folder instead";
         assert!(kept < 2 || message.contains(remedy), "{kept}: {message}");
     }
     let nothing = pack(&[], "", CompressionMethod::Stored);

@@ -87,8 +87,8 @@ impl ModelWriter for CompressedPlyWriter {
             self.open.push([x, y, z, s, t, u, r, g, b, opacity, w, i, j, k]);
             for channel in 0..3 {
                 for &value in sh[3..].iter().skip(channel).step_by(3) {
-                    let place = self.open.len() + self.bands.len() % (sh.len() - 3);
-                    let byte = if value == 0.0 { 127 + (place % 2) as u8 } else { band(value) };
+                    let index = self.open.len() + self.bands.len() % (sh.len() - 3);
+                    let byte = if value == 0.0 { 127 + (index % 2) as u8 } else { band(value) };
                     self.bands.push(byte);
                 }
             }

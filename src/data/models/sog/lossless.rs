@@ -130,8 +130,8 @@ fn riff_file(data: &[u8]) -> Vec<u8> {
 
 /// The pixels after the transforms.
 fn residuals(pixels: &[[u8; 4]], width: usize, transforms: Transforms) -> Vec<[u8; 4]> {
-    let at = |place: usize| {
-        let [r, g, b, a] = pixels[place];
+    let at = |index: usize| {
+        let [r, g, b, a] = pixels[index];
         if transforms.subtracts_green {
             [r.wrapping_sub(g), g, b.wrapping_sub(g), a]
         } else {
@@ -141,12 +141,12 @@ fn residuals(pixels: &[[u8; 4]], width: usize, transforms: Transforms) -> Vec<[u
     let Some(predictor) = transforms.predictor else {
         return (0..pixels.len()).map(at).collect();
     };
-    let predicted = |place: usize| match (place % width, place / width) {
+    let predicted = |index: usize| match (index % width, index / width) {
         (0, 0) => [0, 0, 0, 255],
-        (_, 0) => at(place - 1),
-        (0, _) => at(place - width),
+        (_, 0) => at(index - 1),
+        (0, _) => at(index - width),
         _ => {
-            let (left, above) = (at(place - 1), at(place - width));
+            let (left, above) = (at(index - 1), at(index - width));
             match predictor {
                 Left => left,
                 Above => above,
@@ -154,7 +154,7 @@ fn residuals(pixels: &[[u8; 4]], width: usize, transforms: Transforms) -> Vec<[u
                     std::array::from_fn(|i| ((u16::from(left[i]) + u16::from(above[i])) / 2) as u8)
                 }
                 Select => {
-                    let corner = at(place - width - 1);
+                    let corner = at(index - width - 1);
                     let distance = |pixel: &[u8; 4]| -> u32 {
                         pixel.iter().zip(corner).map(|(a, b)| u32::from(a.abs_diff(b))).sum()
                     };
@@ -163,8 +163,8 @@ fn residuals(pixels: &[[u8; 4]], width: usize, transforms: Transforms) -> Vec<[u
             }
         }
     };
-    let residual = |place: usize| {
-        let (pixel, predicted) = (at(place), predicted(place));
+    let residual = |index: usize| {
+        let (pixel, predicted) = (at(index), predicted(index));
         std::array::from_fn(|i| pixel[i].wrapping_sub(predicted[i]))
     };
     (0..pixels.len()).map(residual).collect()
