@@ -4,7 +4,7 @@ use crate::companion::Companion;
 use crate::observer::{Observer, Silent};
 use crate::process::ProcessMemory;
 
-/// The surroundings of a run, which its caller provides.
+/// The services that the caller of a run provides.
 #[derive(Clone, Copy)]
 pub struct Host<'a> {
     /// Receives all messages and progress, and may stop the run.
