@@ -107,9 +107,9 @@ impl SignalPlanes {
                     | Signal::Colour => continue,
                 };
                 let to = &mut block[plane * WIDTH + at..(plane + 1) * WIDTH];
-                let was = V::load(s, to);
+                let old = V::load(s, to);
                 let is_sum = matches!(signal.kind(), SignalKind::Sum | SignalKind::Count);
-                (if is_sum { was + x } else { was.max(x) }).store(to);
+                (if is_sum { old + x } else { old.max(x) }).store(to);
             }
         }
     }
@@ -189,7 +189,7 @@ impl Accumulators {
             let planes = self.planes.of_signal(signal);
             let value = |row: usize| -> f32 {
                 if signal.kind() == SignalKind::Current {
-                    return present(signal, row, params, masks, ages);
+                    return current_value(signal, row, params, masks, ages);
                 }
                 let parts = planes.clone().map(|plane| self.blocks.get(row, plane));
                 value_of(signal, parts.reduce(f32::max).unwrap_or(0.0))
@@ -219,7 +219,7 @@ impl Accumulators {
 }
 
 /// The value of a signal that depends only on the row's current state.
-fn present(
+fn current_value(
     signal: Signal,
     row: usize,
     params: &Parameters,

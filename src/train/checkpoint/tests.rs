@@ -300,17 +300,14 @@ fn the_newest_usable_checkpoint_is_found_and_two_are_kept() {
 fn differences_of_datasets_are_named() {
     let one = header(ROWS).dataset;
     assert_eq!(one.difference(&one), None);
-    let difference = |change: fn(&mut Fingerprint)| {
+    let after = |change: fn(&mut Fingerprint)| {
         let mut other = one.clone();
         change(&mut other);
         one.difference(&other).unwrap()
     };
-    assert_eq!(difference(|f| f.train.count = 4), "3 views to train on, now 4");
-    assert_eq!(difference(|f| f.test.names = 0), "the names of the views held out differ");
-    assert_eq!(difference(|f| f.train.cameras = 0), "the cameras of the views to train on differ");
-    assert_eq!(
-        difference(|f| f.train.images = 0),
-        "the image files of the views to train on differ"
-    );
-    assert!(difference(|f| f.normalisation.scale = 2.0).contains("scale"));
+    assert_eq!(after(|f| f.train.count = 4), "3 views to train on, now 4");
+    assert_eq!(after(|f| f.test.names = 0), "the names of the views held out differ");
+    assert_eq!(after(|f| f.train.cameras = 0), "the cameras of the views to train on differ");
+    assert_eq!(after(|f| f.train.images = 0), "the image files of the views to train on differ");
+    assert!(after(|f| f.normalisation.scale = 2.0).contains("scale"));
 }

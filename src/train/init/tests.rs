@@ -37,8 +37,7 @@ fn rows_follow_a_curve_through_space() {
     };
     origins.dedup();
     let in_order: Vec<usize> = (0..1000).collect();
-    let [along_curve, unsorted] = [path_length(&origins), path_length(&in_order)];
-    assert!(along_curve < 0.2 * unsorted, "{along_curve} {unsorted}");
+    assert!(path_length(&origins) < 0.2 * path_length(&in_order));
     origins.sort_unstable();
     assert_eq!(origins, in_order);
 }

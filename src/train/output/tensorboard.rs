@@ -47,9 +47,8 @@ impl TensorBoard {
     pub fn resume(folder: &Path, name: &str, bytes: u64) -> Result<Self, FileError> {
         let path = folder.join(name);
         let is_event_file = name.starts_with(PREFIX) && !name.contains(['/', '\\']);
-        let is_long_enough =
-            || path.symlink_metadata().is_ok_and(|m| m.is_file() && m.len() >= bytes);
-        if !is_event_file || !is_long_enough() {
+        let is_whole = || path.symlink_metadata().is_ok_and(|m| m.is_file() && m.len() >= bytes);
+        if !is_event_file || !is_whole() {
             return Self::create(folder);
         }
         let file = OpenOptions::new().append(true).open(&path);

@@ -183,7 +183,7 @@ fn linear(encoded: f64) -> f64 {
 
 /// The one-dimensional kernels of both pipelines. Every filter is a sum of separable filters.
 struct Filters {
-    /// One kernel per term of each opponent channel, scaled so that applying it along both axes gives the term's weight.
+    /// One kernel per term of each opponent channel; applied along both axes, it has the weight of the term.
     sensitivity: [Vec<Vec<f64>>; 3],
     /// A Gaussian as wide as features, with sum 1, and its first and second derivatives, whose positive taps sum to 1
     /// and negative taps to −1.

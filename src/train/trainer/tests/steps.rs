@@ -140,9 +140,7 @@ fn contradictory_options_are_refused() {
     assert!(refused(2, |_, _| ()).contains("2 views"));
     assert!(refused(3, |_, o| o.iterations = 8).contains("8 iterations"));
     assert!(refused(3, |s, _| s.extent = f32::NAN).contains("extent"));
-    assert!(
-        refused(3, |s, _| s.budget = 11).contains("budget 10 do not fit the scene's budget 11")
-    );
+    assert!(refused(3, |s, _| s.budget = 11).contains("budget 10 (scene's: 11)"));
     assert!(refused(3, |_, o| o.rates.quat = -1.0).contains("quat must"));
     assert!(build(&CASE, 3, scene(&CASE, 3), OPTIONS).is_ok());
 }

@@ -13,12 +13,9 @@ pub(super) fn errors(
     scene: &KnownScene<'_>,
 ) -> Result<CentreErrors, EvaluateError> {
     let diagonal = scene.diagonal();
-    let solid_rows = SolidRows::new(rows);
-    let to_centres: Vec<f64> = visibility
-        .samples
-        .par_iter()
-        .map(|&sample| solid_rows.distance(sample) / diagonal)
-        .collect();
+    let solid = SolidRows::new(rows);
+    let to_centres: Vec<f64> =
+        visibility.samples.par_iter().map(|&sample| solid.distance(sample) / diagonal).collect();
     let to_mesh: Vec<(f64, f64)> = rows
         .distances
         .iter()

@@ -16,16 +16,16 @@ use densify_render::{Backend, Rendering};
 const COVERED: f32 = 0.5;
 /// Maximum number of pixels per view in which normals are compared.
 const MAX_NORMALS: usize = 2000;
-/// Depth error allowed in a thin structure that counts as found, in addition to its thickness `[fraction of the depth]`.
+/// Depth error allowed in a found pixel of a thin structure, in addition to the thickness `[fraction of the depth]`.
 const DEPTH_SLACK: f64 = 0.01;
-/// Colour error allowed in a thin structure that counts as found, mean over channels, in `[0, 1]`.
+/// Colour error allowed in a found pixel of a thin structure, mean over channels, in `[0, 1]`.
 const COLOUR_SLACK: f32 = 0.1;
 
 /// Sums over the pixels of the views added so far.
 pub(super) struct Pixels<'a> {
     rows: &'a Rows,
     scene: &'a KnownScene<'a>,
-    solid_rows: SolidRows,
+    solid: SolidRows,
     surface_pixels: usize,
     covered_pixels: usize,
     squared_errors: f64,
@@ -41,7 +41,7 @@ impl<'a> Pixels<'a> {
         Ok(Self {
             rows,
             scene,
-            solid_rows: SolidRows::new(rows),
+            solid: SolidRows::new(rows),
             surface_pixels: 0,
             covered_pixels: 0,
             squared_errors: 0.0,
@@ -81,12 +81,12 @@ impl<'a> Pixels<'a> {
         let covered: Vec<usize> =
             shown.iter().copied().filter(|&i| rendering.alpha[i] > COVERED).collect();
         let step = covered.len().div_ceil(MAX_NORMALS).max(1);
-        let (rows, solid_rows) = (self.rows, &self.solid_rows);
+        let (rows, solid) = (self.rows, &self.solid);
         let angles = covered.par_iter().step_by(step).filter_map(|&i| {
             let place =
                 ray_camera.centre + f64::from(g_buffer.depth[i]) * ray_camera.direction(at(i));
             let truth = Vec3::from(g_buffer.normals[i]).as_dvec3();
-            let normal = solid_rows.normal(rows, place)?;
+            let normal = solid.normal(rows, place)?;
             Some(angle(normal, truth))
         });
         let angles: Vec<f64> = angles.collect();
