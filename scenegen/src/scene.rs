@@ -220,7 +220,7 @@ impl Scene {
         } else if is_file && !has_own_lights {
             model.lights.push(sun());
         }
-        let lighting_with = |sky, grid| {
+        let build = |sky, grid| {
             Lighting::new(&model.lights, &surface, sky, (ambient, options.shadows, grid))
         };
         let mut exposure = options.exposure.unwrap_or(1.0);
@@ -228,8 +228,7 @@ impl Scene {
         if has_own_lights || options.sky.is_some() {
             let sky_is_fill = options.sky.is_none();
             if options.exposure.is_none() {
-                let unfilled =
-                    lighting_with(if sky_is_fill { Sky::uniform(0.0) } else { sky.clone() }, 1);
+                let unfilled = build(if sky_is_fill { Sky::uniform(0.0) } else { sky.clone() }, 1);
                 let (surface, model, flags) = (&surface, &model, &flags);
                 let tracer =
                     Tracer { surface, model, flags, lighting: &unfilled, exposure: 1.0, seed: 0 };
@@ -240,7 +239,7 @@ impl Scene {
                 sky = sky.dimmed(0.4 / exposure);
             }
         }
-        let lighting = lighting_with(sky.clone(), options.grid);
+        let lighting = build(sky.clone(), options.grid);
         let name_of = |split: &str, i: usize| format!("{split}/r_{i:03}");
         let views = |cameras: &[Camera], split: Split, folder: &str| {
             let view =
@@ -348,7 +347,7 @@ fn check(options: &Options) -> Result<(), Error> {
     }
     if !(0.0..=MAX_JITTER).contains(&options.exposure_jitter) {
         let stops = options.exposure_jitter;
-        let problem = format!("{stops} stops is not between 0 and {MAX_JITTER}");
+        let problem = format!("{stops} is not between 0 and {MAX_JITTER} stops");
         return Err(Error::option("--exposure-jitter", problem));
     }
     if options.exposure.is_some_and(|e| !(e > 0.0 && e.is_finite())) {

@@ -236,25 +236,24 @@ impl Lighting {
         let Some(hit) = shaded.surface.closest(&ray, None, None, solid) else {
             return self.sky.radiance(direction);
         };
-        let (source, _) = Point::read(shaded, &ray, &hit, 0.0);
-        if source.is_unlit() {
-            return source.base;
+        let (lit, _) = Point::read(shaded, &ray, &hit, 0.0);
+        if lit.is_unlit() {
+            return lit.base;
         }
-        let emitted = if source.material.is_light { Vec3::ZERO } else { source.emitted };
-        let mut total =
-            emitted + source.diffuse_colour() * self.sky.irradiance(source.shading) / PI;
+        let emitted = if lit.material.is_light { Vec3::ZERO } else { lit.emitted };
+        let mut total = emitted + lit.diffuse_colour() * self.sky.irradiance(lit.shading) / PI;
         for light in &self.lights {
             let u = || sampling.draws.square();
-            let Some((to_light, distance, irradiance)) = incident_light(light, source.position, u)
+            let Some((to_light, distance, irradiance)) = incident_light(light, lit.position, u)
             else {
                 continue;
             };
-            let cos = source.shading.dot(to_light);
+            let cos = lit.shading.dot(to_light);
             if cos > 0.0
-                && source.geometric.dot(to_light) > 0.0
-                && self.occluded(shaded, &[shadow_ray(&source, to_light, distance)], sampling) == 0
+                && lit.geometric.dot(to_light) > 0.0
+                && self.occluded(shaded, &[shadow_ray(&lit, to_light, distance)], sampling) == 0
             {
-                total += source.diffuse_colour() / PI * cos * irradiance;
+                total += lit.diffuse_colour() / PI * cos * irradiance;
             }
         }
         total

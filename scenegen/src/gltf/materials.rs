@@ -152,15 +152,14 @@ impl Reader<'_> {
                 }
             },
         };
-        let mut reference =
-            TextureRef { uv_set: uv_set as usize, sampler, ..TextureRef::new(number) };
+        let mut usage = TextureRef { uv_set: uv_set as usize, sampler, ..TextureRef::new(number) };
         if let Some(t) = used.transform {
             let ([x, y], [sx, sy], angle) = (t.offset.0, t.scale.0, t.rotation.0);
             // The rotation is counter-clockwise in an image whose v points down.
             let (sin, cos) = angle.sin_cos();
-            reference.transform = [[sx * cos, sy * sin, x], [-sx * sin, sy * cos, y]];
+            usage.transform = [[sx * cos, sy * sin, x], [-sx * sin, sy * cos, y]];
         }
-        Ok(Some(reference))
+        Ok(Some(usage))
     }
 
     fn image(&mut self, index: usize, srgb: bool) -> Result<Texture, Error> {

@@ -201,15 +201,15 @@ impl Materials {
                 number
             }
         };
-        let mut reference = TextureRef::new(number);
+        let mut usage = TextureRef::new(number);
         if map.clamp {
-            reference.sampler.wrap_u = Wrap::Clamp;
-            reference.sampler.wrap_v = Wrap::Clamp;
+            usage.sampler.wrap_u = Wrap::Clamp;
+            usage.sampler.wrap_v = Wrap::Clamp;
         }
         // Scale and offset assume that v points up.
         let (s, o) = (map.scale, map.offset);
-        reference.transform = [[s.x, 0.0, o.x], [0.0, s.y, 1.0 - s.y - o.y]];
-        Ok(reference)
+        usage.transform = [[s.x, 0.0, o.x], [0.0, s.y, 1.0 - s.y - o.y]];
+        Ok(usage)
     }
 }
 

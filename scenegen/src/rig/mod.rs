@@ -130,10 +130,7 @@ impl Rig {
     fn check(&self) -> Result<(), Error> {
         for side in [self.width, self.height] {
             if !(1..=16_384).contains(&side) {
-                return Err(Error::option(
-                    "--size",
-                    format!("{side} px is not between 1 and 16384"),
-                ));
+                return Err(Error::option("--size", format!("{side} is not between 1 and 16384")));
             }
         }
         if u64::from(self.width) * u64::from(self.height) > 1 << 28 {
@@ -141,7 +138,7 @@ impl Rig {
         }
         for (option, least, count) in [("--train", 1, self.train), ("--test", 0, self.test)] {
             if !(least..=100_000).contains(&count) {
-                let problem = format!("{count} views is not between {least} and 100000");
+                let problem = format!("{count} is not between {least} and 100000");
                 return Err(Error::option(option, problem));
             }
         }
@@ -154,10 +151,8 @@ impl Rig {
             return Err(Error::option("--radius", problem));
         }
         if !(self.jitter >= 0.0 && self.jitter <= 0.5) {
-            return Err(Error::option(
-                "--jitter",
-                format!("{} is not between 0 and 0.5", self.jitter),
-            ));
+            let problem = format!("{} is not between 0 and 0.5", self.jitter);
+            return Err(Error::option("--jitter", problem));
         }
         Ok(())
     }

@@ -93,9 +93,8 @@ pub fn read(path: &Path) -> Result<SavedCameraPath, CameraPathError> {
 }
 
 pub(super) fn parse(text: &str) -> Result<SavedCameraPath, String> {
-    let saved: SavedFile = serde_json::from_str(text).map_err(|e| {
-        format!("it is not a nerfstudio camera path ({e}); save one in nerfstudio's viewer")
-    })?;
+    let saved: SavedFile = serde_json::from_str(text)
+        .map_err(|e| format!("it is not a nerfstudio camera path ({e}); save one in its viewer"))?;
     if let Some(kind) = saved.camera_type.filter(|kind| !kind.eq_ignore_ascii_case("perspective")) {
         return Err(format!("camera_type is {kind:?}; only perspective cameras can be rendered"));
     }
