@@ -199,9 +199,8 @@ impl BlendedBatch {
                     pair += 1;
                 }
                 // Where the product underflows, the transmittance behind has underflowed too.
-                let transmittance = &mut transmittance[p][at..];
-                let t = V::load(s, transmittance) / product.max(c(f32::MIN_POSITIVE));
-                t.store(transmittance);
+                let t = V::load(s, &transmittance[p][at..]) / product.max(c(f32::MIN_POSITIVE));
+                t.store(&mut transmittance[p][at..]);
             }
             start += reached.count_ones() as usize;
             ends[p] = start;

@@ -57,8 +57,8 @@ const MAX_LINES: usize = CONVOLVED * TOGETHER + 2;
 pub(super) struct LossBuffers {
     /// e, y − ½, and three derivatives. Shape: `[image rows, pitch]` each.
     planes: [Vec<[f32; WIDTH]>; 5],
-    /// Errors per pixel (means over the channels) that select candidates, and that rows accumulate; each empty unless
-    /// requested. Shape as above.
+    /// Errors per pixel (means over the channels), if requested: those that select candidates, and those that rows
+    /// accumulate. Shape as above.
     errors: [Vec<[f32; WIDTH]>; 2],
     segments: Segments,
     weights: PixelWeights,

@@ -86,8 +86,7 @@ impl<'a> Pixels<'a> {
             let place =
                 ray_camera.centre + f64::from(g_buffer.depth[i]) * ray_camera.direction(at(i));
             let truth = Vec3::from(g_buffer.normals[i]).as_dvec3();
-            let normal = solid.normal(rows, place)?;
-            Some(angle(normal, truth))
+            Some(angle(solid.normal(rows, place)?, truth))
         });
         let angles: Vec<f64> = angles.collect();
         self.angles.extend(angles);
