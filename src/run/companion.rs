@@ -25,6 +25,6 @@ pub struct CompanionSize<'a> {
     pub photograph: u64,
     /// Number of views, training and test.
     pub views: usize,
-    /// Worker threads.
+    /// Number of worker threads.
     pub threads: usize,
 }

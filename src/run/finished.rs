@@ -28,7 +28,7 @@ use densify_train::output::model_path;
 /// A device that renders models, and the threads that it may use.
 #[derive(Debug, Default)]
 pub struct Machine {
-    /// Processor threads; `None`: all.
+    /// Number of processor threads; `None`: all.
     threads: Option<usize>,
     device: Device,
 }

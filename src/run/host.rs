@@ -1,4 +1,4 @@
-//! Services that the caller of a run provides: an observer, and a way to measure the process's memory.
+//! Services that the caller of a run provides: an observer, a way to measure the process's memory, and a companion.
 
 use crate::companion::Companion;
 use crate::observer::{Observer, Silent};

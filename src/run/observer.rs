@@ -20,7 +20,7 @@ pub struct Interrupt {
     pub exit_code: u8,
 }
 
-/// The observer's decision, between two steps, what the run does next.
+/// The observer's decision between two steps: what the run does next.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum NextAction {
     /// Continue with the next step.
@@ -55,7 +55,7 @@ pub trait Observer {
     /// A step is done.
     fn step(&self, _step: u32, _loss: f32, _rows: usize) {}
 
-    /// A record of the log, over the steps since the previous record.
+    /// A record was added to the log; it covers the steps since the previous record.
     fn recorded(&self, _record: &StepRecord) {}
 
     /// The rows were edited.

@@ -35,7 +35,7 @@ pub const LIMIT: u8 = 4;
 /// Exit code if the device is unsuitable or lost, or there is too little memory.
 pub const DEVICE: u8 = 3;
 
-/// The failure of a run or a command. Displayed with options spelled as on a terminal.
+/// The failure of a run or a command. It is displayed with options spelled as on a terminal.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("{}", self.words(Spelling::Terminal))]
 pub struct Failure {

@@ -159,7 +159,7 @@ pub(crate) fn expected_coarse(
     )
 }
 
-/// The hint on how to learn exposures if the tracks do not show whether they differ.
+/// The hint on how to learn exposures if the tracks do not show whether exposures differ.
 pub(crate) fn learn_exposures(s: Spelling) -> String {
     format!("{} learns exposures anyway", s.text("exposure", "on"))
 }

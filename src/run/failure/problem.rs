@@ -87,7 +87,7 @@ pub enum ModelProblem {
     AntialiasingDiffers { init: Antialiasing, frozen: Antialiasing },
     /// The model of `freeze` has changed.
     FreezeChanged { file: PathBuf, rows: usize, expected: usize },
-    /// A model is in other coordinates than the photographs.
+    /// A model is in other coordinates than the dataset.
     OtherCoordinates { option: Option<&'static str>, file: PathBuf, correlation: f64 },
     /// The test split has no views.
     NoTestViews,

@@ -31,9 +31,9 @@ const RANDOM_POINTS: usize = 100_000;
 /// Resident memory by which a process that resumes a run may exceed the process that began it `[bytes]`. The ledger
 /// reserves more than this for the allocator.
 const RESUME_TOLERANCE: u64 = 1 << 20;
-/// Threads that decode training views ahead of the trainer.
+/// Number of threads that decode training views ahead of the trainer.
 pub(crate) const DECODERS: usize = 2;
-/// Threads that decode test views.
+/// Number of threads that decode test views.
 pub(crate) const TEST_DECODERS: usize = 1;
 
 /// A run before its size is known. Cases with other sizes and options share the inputs.
@@ -58,7 +58,7 @@ pub(crate) struct Choices {
     pub(crate) position_rates: PositionRates,
     /// Choices that the run makes while it trains.
     pub(crate) automatic: AutoChoices,
-    /// Threads that train and measure.
+    /// Number of threads that train and measure.
     pub(crate) threads: usize,
 }
 

@@ -11,7 +11,7 @@ pub(crate) struct GeometryMeasurement {
     pub(crate) device: Device,
     /// Setup of the backend, for any number of rows.
     pub(crate) setup: Setup,
-    /// Threads that measure.
+    /// Number of threads that measure.
     pub(crate) threads: usize,
     /// Memory of the known surface `[bytes]`.
     pub(crate) surface: u64,

@@ -38,7 +38,7 @@ use densify_train::trainer::{StepReport, TrainError};
 use geometry::measure;
 use records::{Logs, Totals};
 
-/// The file beside a model with the exposures of its training views.
+/// The file beside a model with the exposures of the training views.
 const EXPOSURES: &str = "exposure.json";
 /// Steps between two records of the log.
 const RECORD_EVERY: u32 = 10;

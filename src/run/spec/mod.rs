@@ -215,9 +215,9 @@ run_spec! {
         ///
         /// Options that are given are kept: --budget (the smaller of the two limits applies), --sh-degree, --tile-cap,
         /// --image-cache. The others are chosen: as many Gaussians as fit; degree 3, or a lower one if at degree 3
-        /// fewer fit than the scene starts with; decoded photographs take at most an eighth, and those that do not fit
-        /// in it are decoded again; tile lists hold 4 pairs per Gaussian, up to 16 where --budget leaves room. `densify
-        /// plan` shows the result
+        /// fewer fit than the scene starts with; decoded photographs take at most an eighth of the memory, and those
+        /// that do not fit into it are decoded again; tile lists hold 4 pairs per Gaussian, up to 16 where --budget
+        /// leaves room. `densify plan` shows the result
         memory: Option<ByteCount> = None, Fixed, value "BYTES";
 
         /// Maximum number of (Gaussian, tile) pairs in memory; views with more are processed in bands, which is exact

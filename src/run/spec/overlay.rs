@@ -114,7 +114,7 @@ impl Partial {
         }
     }
 
-    /// Overlays other options with these, which win; tables are joined key by key.
+    /// Overlays `lower` with these options, which win; tables are joined key by key.
     #[must_use]
     pub fn over(self, mut lower: Self) -> Self {
         join(self.0, &mut lower.0);

@@ -129,7 +129,7 @@ pub(super) fn fit<E>(
     Ok(Some(Fit { size, by_memory: rows < most, at_wanted_degree }))
 }
 
-/// The smallest memory in which a model fits, in multiples of `step` bytes; `None` if there is none.
+/// The smallest memory in which a model fits, in multiples of `step` bytes; `None` if none suffices.
 pub(super) fn min_memory<E>(
     request: &SizeRequest,
     step: u64,
@@ -148,8 +148,8 @@ pub(super) fn min_memory<E>(
     Ok(Some(insufficient.map_or(0, |steps| steps as u64 + 1) * step))
 }
 
-/// The largest number in `least..=most` for which `holds` is true; it must be true up to some number
-/// and false above.
+/// The largest number in `least..=most` for which `holds` returns true, which it must do up to some number and not
+/// above it.
 pub(super) fn largest_where<E>(
     least: usize,
     most: usize,
