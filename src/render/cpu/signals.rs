@@ -189,7 +189,7 @@ impl Accumulators {
             let planes = self.planes.of_signal(signal);
             let value = |row: usize| -> f32 {
                 if signal.kind() == SignalKind::Current {
-                    return current_value(signal, row, params, masks, ages);
+                    return present(signal, row, params, masks, ages);
                 }
                 let parts = planes.clone().map(|plane| self.blocks.get(row, plane));
                 value_of(signal, parts.reduce(f32::max).unwrap_or(0.0))
@@ -219,7 +219,7 @@ impl Accumulators {
 }
 
 /// The value of a signal that depends only on the row's current state.
-fn current_value(
+fn present(
     signal: Signal,
     row: usize,
     params: &Parameters,
