@@ -88,7 +88,7 @@ impl Unpacked {
     fn new(path: &Path) -> Result<Self, LoadError> {
         let mut archive = open(path)?;
         let max_bytes = max_unpacked_bytes(path)?;
-        let bytes = check(path, &mut archive, max_bytes)?;
+        let bytes = checked_size(path, &mut archive, max_bytes)?;
         let temporary = tempfile::Builder::new()
             .prefix("densify-zip-")
             .tempdir()
@@ -170,7 +170,7 @@ fn max_unpacked_bytes(path: &Path) -> Result<u64, LoadError> {
 }
 
 /// Checks the table of contents; returns the size of the unpacked files `[bytes]`.
-fn check<R: Read + io::Seek>(
+fn checked_size<R: Read + io::Seek>(
     path: &Path,
     archive: &mut ZipArchive<R>,
     max_bytes: u64,

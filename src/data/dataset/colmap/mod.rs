@@ -274,9 +274,9 @@ pub(super) fn adopt_tracks(root: &Root, scene: &mut Scene) {
             continue;
         };
         let centre = |rotation: DMat3, t: DVec3| -(rotation.transpose() * t);
-        let here = centre(frame.rotation, frame.translation);
-        let there = centre(image.rotation, image.translation);
-        let moved = here.distance(there) > SAME_POSE * (1.0 + there.length());
+        let frame_at = centre(frame.rotation, frame.translation);
+        let image_at = centre(image.rotation, image.translation);
+        let moved = frame_at.distance(image_at) > SAME_POSE * (1.0 + image_at.length());
         let same_rotation = frame.rotation.abs_diff_eq(image.rotation, SAME_POSE);
         if moved || !same_rotation {
             return;

@@ -29,7 +29,7 @@ pub(crate) enum PinholeError {
     Folds(f64),
     /// No pinhole image of a useful size shows a part of the photograph.
     #[error("no part of the photograph can be shown by a pinhole camera")]
-    Nothing,
+    NothingVisible,
 }
 
 /// Samples along a side of the photograph. Between two samples, a border that bulges by 100 px over the whole side
@@ -82,7 +82,7 @@ impl Pinholes {
             let bounds = bounds.unwrap_or(Rectangle { low: at, high: at });
             Some(Rectangle { low: bounds.low.min(at), high: bounds.high.max(at) })
         });
-        let bounds = bounds.ok_or(PinholeError::Nothing)?;
+        let bounds = bounds.ok_or(PinholeError::NothingVisible)?;
         let inner = if is_forward && is_whole && !keep_fov { inscribed(&seen, flat) } else { None };
         let faces = if let Some(inner) = inner.filter(|inner| inner.is_within(steepest)) {
             // A distorted pinhole keeps its image size.
@@ -99,7 +99,7 @@ impl Pinholes {
             cube().into_iter().filter_map(face).collect::<Vec<_>>()
         };
         if faces.is_empty() {
-            return Err(PinholeError::Nothing);
+            return Err(PinholeError::NothingVisible);
         }
         let shown = |ray: DVec3| faces.iter().any(|(_, face)| face.shows(ray));
         let lost = seen.iter().filter(|(_, ray)| !ray.is_ok_and(shown)).count();

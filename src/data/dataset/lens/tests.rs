@@ -231,7 +231,7 @@ fn a_distortion_that_folds_over_is_refused_or_used_up_to_the_fold() {
     let nan = lens("OPENCV", &[210.0, 214.0, 150.0, 92.0, f64::NAN, 0.0, 0.0, 0.0]);
     assert!(
         Pinholes::covering(&nan, false).is_err()
-            && Pinholes::covering(&nan, true) == Err(PinholeError::Nothing)
+            && Pinholes::covering(&nan, true) == Err(PinholeError::NothingVisible)
     );
     // An image that does not contain the optical axis, such as a crop, is still usable.
     let aside = lens("OPENCV", &[210.0, 214.0, -40.0, 92.0, 0.058, 0.0, 0.0, 0.0]);

@@ -270,17 +270,17 @@ fn masks_and_points_of_another_machine_are_found_too() {
         made
     };
     let load = |made: &Made| load_with(made, &options);
-    let place = |data: &Dataset| data.test[0].source.mask.clone().unwrap().file.path;
+    let mask_path = |data: &Dataset| data.test[0].source.mask.clone().unwrap().file.path;
     let found = made();
     for path in ["masks/hidden.png", "masks/b.png", "hidden.png"] {
         image(&found.file(path), (20, 12), 255);
     }
     let data = load(&found);
     assert_eq!((data.train.len(), data.test.len(), data.points.len()), (2, 1, 200));
-    assert!(place(&data).ends_with("masks/hidden.png"));
+    assert!(mask_path(&data).ends_with("masks/hidden.png"));
     // Otherwise the mask is found by the photograph's name; a file of the mask's bare name may be a photograph.
     found.remove("masks/hidden.png");
-    assert!(place(&load(&found)).ends_with("masks/b.png"));
+    assert!(mask_path(&load(&found)).ends_with("masks/b.png"));
     found.remove("masks/b.png");
     refused("phones", &found, &options, "frames[1].mask_path, hidden.png, `masks/`");
     // Points that were not copied with the photographs are left out.

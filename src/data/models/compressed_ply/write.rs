@@ -22,7 +22,7 @@ const PACKED: usize = 14;
 pub(super) struct CompressedPlyWriter {
     frame: Frame,
     /// Gaussians of the current chunk, which is not full.
-    open: Vec<[f32; PACKED]>,
+    current: Vec<[f32; PACKED]>,
     chunks: Vec<[f32; BOUNDS.len()]>,
     words: Vec<[u32; WORDS.len()]>,
     /// Channel by channel. Shape: `[rows, 3·coefficients]`.
@@ -34,8 +34,8 @@ impl ModelWriter for CompressedPlyWriter {
         let rest = 3 * (sh_coefficients(sh_degree) - 1);
         let row = size_of::<[u32; WORDS.len()]>() + rest;
         let chunk = size_of::<[f32; BOUNDS.len()]>();
-        let open = CHUNK * size_of::<[f32; PACKED]>();
-        (rows * row + rows.div_ceil(CHUNK) * chunk + open) as u64
+        let current = CHUNK * size_of::<[f32; PACKED]>();
+        (rows * row + rows.div_ceil(CHUNK) * chunk + current) as u64
     }
 
     fn wants_spatial_order(&self) -> bool {
@@ -53,7 +53,7 @@ impl ModelWriter for CompressedPlyWriter {
     fn begin(&mut self, shape: Shape, out: &mut dyn Write) -> io::Result<()> {
         let Shape { rows, sh_degree, antialiasing } = shape;
         let rest = 3 * (sh_coefficients(sh_degree) - 1);
-        self.open.reserve_exact(CHUNK);
+        self.current.reserve_exact(CHUNK);
         self.chunks.reserve_exact(rows.div_ceil(CHUNK));
         self.words.reserve_exact(rows);
         self.bands.reserve_exact(rows * rest);
@@ -84,15 +84,15 @@ impl ModelWriter for CompressedPlyWriter {
             let [r, g, b] = [sh[0], sh[1], sh[2]].map(dc_to_rgb);
             let opacity = sigmoid(rows.opacity_logits[row]);
             let [s, t, u] = scale;
-            self.open.push([x, y, z, s, t, u, r, g, b, opacity, w, i, j, k]);
+            self.current.push([x, y, z, s, t, u, r, g, b, opacity, w, i, j, k]);
             for channel in 0..3 {
                 for &value in sh[3..].iter().skip(channel).step_by(3) {
-                    let index = self.open.len() + self.bands.len() % (sh.len() - 3);
+                    let index = self.current.len() + self.bands.len() % (sh.len() - 3);
                     let byte = if value == 0.0 { 127 + (index % 2) as u8 } else { band(value) };
                     self.bands.push(byte);
                 }
             }
-            if self.open.len() == CHUNK {
+            if self.current.len() == CHUNK {
                 self.pack_chunk();
             }
         }
@@ -100,7 +100,7 @@ impl ModelWriter for CompressedPlyWriter {
     }
 
     fn finish(&mut self, out: &mut dyn Write) -> io::Result<()> {
-        if !self.open.is_empty() {
+        if !self.current.is_empty() {
             self.pack_chunk();
         }
         for value in self.chunks.as_flattened() {
@@ -114,15 +114,15 @@ impl ModelWriter for CompressedPlyWriter {
 }
 
 impl CompressedPlyWriter {
-    /// Packs the open chunk.
+    /// Packs the current chunk.
     fn pack_chunk(&mut self) {
         let mut bounds = [0.0; BOUNDS.len()];
         for (axis, at) in (0..9).map(|axis| (axis, axis / 3 * 6 + axis % 3)) {
-            let values = || self.open.iter().map(|row| row[axis]);
+            let values = || self.current.iter().map(|row| row[axis]);
             bounds[at] = values().fold(f32::INFINITY, f32::min);
             bounds[at + 3] = values().fold(f32::NEG_INFINITY, f32::max);
         }
-        for row in &self.open {
+        for row in &self.current {
             let share = |axis: usize| {
                 let at = axis / 3 * 6 + axis % 3;
                 let (least, most) = (bounds[at], bounds[at + 3]);
@@ -137,7 +137,7 @@ impl CompressedPlyWriter {
             self.words.push([three(0), quaternion(quat), three(3), colour]);
         }
         self.chunks.push(bounds);
-        self.open.clear();
+        self.current.clear();
     }
 }
 

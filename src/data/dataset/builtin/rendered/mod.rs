@@ -28,15 +28,15 @@ const BUILD_FACTOR: u64 = 4;
 /// A rendered built-in scene.
 #[derive(Debug, PartialEq)]
 struct Rendered {
-    about: About,
+    summary: Summary,
     /// The images of all views, in order.
     frames: Vec<Frame>,
     points: InitPoints,
 }
 
-/// Metadata of a scene, which the cache holds beside the images and points.
+/// Views and notes of a scene, which the cache holds in addition to images and points.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
-struct About {
+struct Summary {
     views: Vec<RenderedView>,
     notes: Vec<String>,
     /// As [`Dataset::surface_bytes`].
@@ -57,16 +57,16 @@ pub(in crate::dataset) fn load(
     let preset: PresetSpec = name.parse()?;
     let entry = options.cache.as_deref();
     let entry = entry.and_then(|folder| Entry::new(folder, &preset.to_string(), &parameters));
-    let cached = entry.as_ref().and_then(Entry::read);
+    let hit = entry.as_ref().and_then(Entry::read);
     // Another program may have written an entry in which images are missing.
-    if let Some(cached) = cached.filter(|cached| cached.frames.len() == cached.about.views.len()) {
-        return dataset(path, cached, options);
+    if let Some(hit) = hit.filter(|hit| hit.frames.len() == hit.summary.views.len()) {
+        return dataset(path, hit, options);
     }
     let scene = Scene::prepare(&source, &parameters)?;
     let (frames, points) = render(&scene);
     let surface_bytes = BUILD_FACTOR * scene.surface.bytes() as u64;
-    let about = About { views: scene.views, notes: scene.model.notes, surface_bytes };
-    let rendered = Rendered { about, frames, points };
+    let summary = Summary { views: scene.views, notes: scene.model.notes, surface_bytes };
+    let rendered = Rendered { summary, frames, points };
     if let Some(entry) = entry {
         entry.write(&rendered);
     }
@@ -125,11 +125,11 @@ impl From<densify_scenegen::Error> for LoadError {
 /// When the options leave no view to train on.
 fn dataset(
     path: &Path,
-    Rendered { about, frames, points }: Rendered,
+    Rendered { summary, frames, points }: Rendered,
     options: &LoadOptions,
 ) -> Result<Dataset, LoadError> {
     let mut photographs: Vec<Photograph> = (0..)
-        .zip(&about.views)
+        .zip(&summary.views)
         .zip(frames)
         .map(|((number, view), frame)| {
             let camera = camera(&view.camera);
@@ -151,10 +151,10 @@ fn dataset(
         points: PointCloud { positions: points.positions, colours: points.colours },
         tracks: sampler.finish(),
         own_split: true,
-        surface_bytes: Some(about.surface_bytes),
+        surface_bytes: Some(summary.surface_bytes),
         ..dataset::Scene::default()
     };
-    assemble(path, photographs, read, text_notes(about.notes), options)
+    assemble(path, photographs, read, text_notes(summary.notes), options)
 }
 
 /// Converts the camera of a rendered view.

@@ -13,7 +13,7 @@ use glam::DVec3;
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, TensorView};
 
-use super::{About, Rendered};
+use super::{Rendered, Summary};
 use densify_core::files::write_atomically;
 
 /// Largest total size of all entries `[bytes]`; the least recently used entries are removed first.
@@ -65,9 +65,9 @@ impl Entry {
 
     fn try_write(
         &self,
-        Rendered { about, frames, points }: &Rendered,
+        Rendered { summary, frames, points }: &Rendered,
     ) -> Result<(), Box<dyn std::error::Error>> {
-        let about = serde_json::to_vec(about)?;
+        let summary = serde_json::to_vec(summary)?;
         let flat: Vec<f64> = points.positions.iter().flat_map(DVec3::to_array).collect();
         let counts: Vec<u32> = points.seen_by.iter().map(|views| views.len() as u32).collect();
         let seen_by = points.seen_by.concat();
@@ -78,7 +78,7 @@ impl Entry {
             tensors.push((image_name(index), TensorView::new(Dtype::U8, shape, &frame.rgba)?));
         }
         for (name, kind, shape, bytes) in [
-            ("about", Dtype::U8, vec![about.len()], &about[..]),
+            ("about", Dtype::U8, vec![summary.len()], &summary[..]),
             ("positions", Dtype::F64, vec![number, 3], bytemuck::cast_slice(&flat)),
             ("colours", Dtype::U8, vec![number, 3], points.colours.as_flattened()),
             ("view_counts", Dtype::U32, vec![number], bytemuck::cast_slice(&counts)),
@@ -126,8 +126,8 @@ fn decode(tensors: &SafeTensors<'_>) -> Option<Rendered> {
     let seen_by = counts.map(|count| seen.by_ref().take(count as usize).collect()).collect();
     // The other fields of the points are not used by datasets.
     let points = InitPoints { positions, colours, seen_by, ..InitPoints::default() };
-    let about: About = serde_json::from_slice(bytes("about")?).ok()?;
-    Some(Rendered { about, frames: frames?, points })
+    let summary: Summary = serde_json::from_slice(bytes("about")?).ok()?;
+    Some(Rendered { summary, frames: frames?, points })
 }
 
 fn frame(image: &TensorView<'_>) -> Option<Frame> {
@@ -207,8 +207,8 @@ mod tests {
         let camera = Camera::looking(DVec3::new(0.1, 0.2, 0.3), DVec3::X, DVec3::Y, 0.7, (2, 1));
         let view = |name: &str, split| View { name: name.to_owned(), split, camera };
         let views = vec![view("train/r_000", Split::Train), view("test/r_000", Split::Test)];
-        let about = About { views, notes: vec!["a note".to_owned()], surface_bytes: 5 };
-        Rendered { about, frames: vec![frame(3), frame(250)], points }
+        let summary = Summary { views, notes: vec!["a note".to_owned()], surface_bytes: 5 };
+        Rendered { summary, frames: vec![frame(3), frame(250)], points }
     }
 
     fn has_colon(path: &Path) -> bool {
