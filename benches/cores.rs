@@ -20,7 +20,7 @@ use densify_policies::policy::{CandidateRequest, DepthMode, ErrorMode, Needs, Si
 
 use steps::{median, ms};
 
-/// Numbers of cores to predict for.
+/// Numbers of cores for which the speed-up is predicted.
 const CORES: [usize; 2] = [16, 64];
 
 /// Median times of a training step.

@@ -2,7 +2,7 @@
 //!
 //! Woop, Benthin and Wald, "Watertight Ray/Triangle Intersection" (JCGT 2013): the triangle is
 //! sheared into the ray's space, where two triangles that share an edge evaluate exactly the same
-//! products for it with opposite signs, so that a ray cannot pass between them. If an edge function is
+//! products for this edge with opposite signs, so that a ray cannot pass between them. If an edge function is
 //! exactly zero, all three are evaluated again in f64, in which the products are exact.
 
 use glam::Vec3;

@@ -16,7 +16,7 @@ const MAX_ANGLE: f64 = 85.0;
 /// Number of angles at which a lens is tested for monotonicity.
 const STEPS: u32 = 2000;
 
-/// The projection of a lens: the distance from the image's centre at which it images an angle from its axis.
+/// The projection of a lens: the distance from the image's centre at which an angle from the axis is imaged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum LensKind {

@@ -38,7 +38,7 @@ pub struct Model {
     pub lights: Vec<Light>,
     /// The source's cameras.
     pub cameras: Vec<FileCamera>,
-    /// Notes for the user from loading.
+    /// Notes for the user about what was ignored or replaced when the source was loaded.
     pub notes: Vec<String>,
 }
 
@@ -162,9 +162,9 @@ pub enum LightKind {
     Area {
         /// A corner.
         corner: DVec3,
-        /// One side.
+        /// One side, as a vector from the corner.
         u: DVec3,
-        /// The other side.
+        /// The other side, as a vector from the corner.
         v: DVec3,
     },
 }

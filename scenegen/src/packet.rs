@@ -100,7 +100,7 @@ struct RayPacket<'a> {
     sheared: [ShearedRay; LANES],
     /// The coordinate axes that are x, y and z of the sheared spaces.
     axes: [usize; 3],
-    /// Origins along these axes.
+    /// Coordinates of the origins along these axes.
     origin: [[f32; LANES]; 3],
     /// Shears of x and y along z.
     shear: [[f32; LANES]; 2],

@@ -82,7 +82,7 @@ impl Folder {
         Ok(Self { file: file.to_owned(), folder })
     }
 
-    /// The path of a reference; the file need not exist.
+    /// The path of the file that `reference` names; the file need not exist.
     pub(crate) fn resolve(&self, element: &str, reference: &str) -> Result<PathBuf, Error> {
         let refuse = |problem| Err(self.refused(element, reference, problem));
         if reference.is_empty() || reference.len() > MAX_NAME {

@@ -26,7 +26,7 @@ const LIFT: f32 = 2.5e-3;
 /// Reflectance of a dielectric at normal incidence.
 const DIELECTRIC: f32 = 0.04;
 
-/// The method that computes light from the sky and from other surfaces.
+/// The method of computing the light from the sky and from other surfaces.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Ambient {

@@ -122,7 +122,7 @@ impl Reader<'_> {
             return Err(self.fault(name, "there is no such texture"));
         };
         let uv_set = used.transform.and_then(|t| t.tex_coord).unwrap_or(used.uv_set);
-        // This index is the gltf crate's for a missing source: the image is then defined by an extension.
+        // The gltf crate reads a missing source as this index; an extension then defines the image.
         let unsupported = if texture.source.value() == u32::MAX as usize {
             Some("its image is defined by an extension")
         } else {

@@ -145,7 +145,7 @@ fn normalise(value: &mut Value) {
             map.values_mut().for_each(normalise);
         }
         Value::Number(number) => {
-            // Beyond 2^53, not every integer has a float.
+            // Floats above 2^53 cannot represent every integer.
             let float = number.as_f64().filter(|v| v.fract() == 0.0 && (0.0..9e15).contains(v));
             if let Some(float) = float {
                 *value = Value::from(float as u64);

@@ -31,7 +31,7 @@ impl Source<'_> {
 }
 
 impl Reader<'_> {
-    /// Adds the triangles of a primitive to the model at all places of its mesh.
+    /// Adds the triangles of a primitive to the model, placed in the world by `places`.
     pub(super) fn primitive(
         &mut self,
         primitive: &Primitive,

@@ -19,7 +19,7 @@ const CANDIDATES: f64 = 2.0;
 const GRADIENT_FLOOR: f64 = 0.5;
 /// Side of the cubes that are dropped as a whole, as a share of the diagonal.
 const PATCH: f64 = 0.02;
-/// Relative depth difference up to which a view sees a point.
+/// Largest relative difference between a point's depth and the visible depth at which a view sees the point.
 const SAME_DEPTH: f64 = 1e-3;
 
 /// Number and errors of initial points.

@@ -121,7 +121,7 @@ impl Rig {
         let middle = 0.5 * (lo + hi);
         let mut place = lo + place;
         if test {
-            // Not farther out, where there may be nothing to see.
+            // Towards the centre, because there may be nothing to see farther out.
             place -= 0.5 * cell * (place - middle + 1e-9 * cell).signum();
         }
         let [low, high] = DOWNWARD_ANGLES.map(f64::to_radians);

@@ -57,8 +57,8 @@ pub fn read_text(path: &Path, limit: u64) -> io::Result<String> {
 pub fn max_unpacked_bytes(packed: u64) -> u64 {
     /// The limit for small files.
     const MIN_LIMIT: u64 = 64 << 20;
-    /// Limit per packed byte of a larger file. Models unpack to 2 to 5 times their packed size (up to 20 times if their
-    /// colours vary little), text tables to up to 10 times.
+    /// Limit per packed byte of a larger file. Models unpack to 2 to 5 times their packed size (up to 20 times if they
+    /// have little colour information), text tables to up to 10 times.
     const RATIO: u64 = 100;
     MIN_LIMIT.max(packed.saturating_mul(RATIO))
 }
